@@ -32,7 +32,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS", "same"))
 #: In the environment of every process that the tests start, also of one whose parent has died.
 RUN_VARIABLE = "IRIS_TEST_RUN"
 #: Time for processes that end by themselves after the last test, on a busy machine [s].
-ENDING_S = 30.0
+ENDING_S = 120.0
 
 
 def _find_test_processes() -> list[psutil.Process]:

@@ -179,9 +179,9 @@ def _network_command(part: str) -> list[str]:
 
 
 def _emulate(words: list[str], folder: Path) -> None:
-    """Run an `emulate` command of the network page; its people must see something."""
+    """Run an `emulate` command of the network page; its people must see something, joining included."""
     done = subprocess.run(
-        [sys.executable, "-m", "iris_session.cli.main", *words, "--behaviour", "observer", "--seconds", "2", "--json"],
+        [sys.executable, "-m", "iris_session.cli.main", *words, "--behaviour", "observer", "--seconds", "12", "--json"],
         cwd=folder,
         capture_output=True,
         text=True,
@@ -254,7 +254,7 @@ def test_example_of_a_user_loop_is_joined_until_it_ends(name: str, tmp_path: Pat
 
 @pytest.mark.e2e
 def test_policy_example_moves_its_robot(serve: str, run_python: Callable[..., str]) -> None:
-    output = run_python((ROOT / "examples" / "policy.py").read_text(encoding="utf-8"), serve, "1.5")
+    output = run_python((ROOT / "examples" / "policy.py").read_text(encoding="utf-8"), serve, "6")
     moved = re.search(r"tip moved (\d+) mm", output)
     assert moved, output
     assert int(moved[1]) > 20

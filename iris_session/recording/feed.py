@@ -60,8 +60,9 @@ BACKLOG_BYTES: Final = 512 << 20
 BACKLOG_BATCHES: Final = 4
 #: Share of the backlog above which only what verification needs is kept: rows, keyframes, scenes.
 JOURNAL_SHARE: Final = 0.75
-#: Maximum time without a status while closing. A recorder that writes sends one every half second.
-SILENCE_S: Final = 1.0
+#: Maximum time without a status while closing. A recorder that writes sends one every half second; a busy machine or
+#: its disk may stand still for longer.
+SILENCE_S: Final = 3.0
 #: Maximum length of each list of one batch. A flush comes long before, unless the caller never takes a step.
 BATCH_ITEMS: Final = 4096
 #: Maximum number of participants whose names a later recorder gets; batches that it gets again are about past ones too.

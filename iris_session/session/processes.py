@@ -441,7 +441,7 @@ class SessionProcesses:
                 fault = f"the end of the recording is missing: {fault}"
             elif feed.stats.dropped_rows:
                 fault = f"{feed.stats.dropped_rows} steps are missing in the recording: {feed.stats.drop_reason}"
-        # A recorder that hangs has had its time: everything is to end within two seconds.
+        # A recorder that hangs has had its time: everything is to end within four seconds.
         if recorder is not None and not recorder.close(FINISH_S if is_accepted else HANGING_EXIT_S) and not fault:
             fault = "the recorder did not end in order: the end of the recording may be missing"
         if self._note_writer is not None:

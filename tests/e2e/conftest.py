@@ -13,6 +13,7 @@ from typing import Any, Final
 import pytest
 
 from iris_session.client import Client
+from iris_session.client import client as client_module
 from tests.e2e.browser import Browser, Page, printed_address, require_browser
 from tests.e2e.scenario import Hand, Scenario
 from tests.e2e.session_process import (
@@ -44,6 +45,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         name, path = item.path.name, item.path
         places.setdefault(path, (LONGEST.index(name) if name in LONGEST else len(LONGEST)) * len(items) + len(places))
     items.sort(key=lambda item: (places[item.path], "shared_session" in getattr(item, "fixturenames", ())))
+
+
+@pytest.fixture(autouse=True)
+def _wait_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let clients wait for answers as long as the tests do: a busy machine may stop a process for seconds."""
+    monkeypatch.setattr(client_module, "DEFAULT_TIMEOUT_S", DEADLINE_S)
+    for waiting in (Client.connect, Client.wait_for, Client.status, Client.request):
+        monkeypatch.setattr(waiting, "__defaults__", (DEADLINE_S,))
 
 
 @pytest.fixture

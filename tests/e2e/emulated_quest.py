@@ -79,6 +79,8 @@ FEEDBACK: Final = "(irisSession.state.feedback.get('{}') ?? {{ hold_reason: '', 
 T_WORLD_TRACKING: Final[PoseTuple] = ((-0.4, 0.3, -0.75), quat_from_yaw(math.radians(35.0)))
 HEAD: Final[PoseTuple] = ((0.0, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0))
 ATTEMPTS: Final = 8
+#: The session's answer to what is pressed takes so long at most, also while the page draws slowly [s].
+ANSWER_S: Final = 5.0
 
 
 class EmulatedQuest:
@@ -118,6 +120,26 @@ class EmulatedQuest:
         """Press a button of the right controller."""
         self.evaluate(f"quest.controllers.right.updateButtonValue({json.dumps(button)}, {value})")
 
+    def press_until(self, button: str, condition: Callable[[], object], what: str) -> None:
+        """Press a button until a condition holds: what is pressed while the page stands still does not count, and a
+        person presses again.
+        """
+        for _ in range(ATTEMPTS):
+            self.press(button, 1.0)
+            if self.scenario.wait_for(condition, ANSWER_S):
+                return
+            self.press(button, 0.0)
+            self.wait(f"{HEADSET}.reading.inputs.every((one) => one.trigger === 0 && one.buttons === 0)")
+        raise AssertionError(f"not by pressing {button}: {what}\n{self.page.describe()}")
+
+    def tap_until(self, condition: Callable[[], object], what: str) -> None:
+        """Tap at nothing until a condition holds, as `press_until`."""
+        for _ in range(ATTEMPTS):
+            self.tap_at_nothing()
+            if self.scenario.wait_for(condition, ANSWER_S):
+                return
+        raise AssertionError(f"not by a tap: {what}\n{self.page.describe()}")
+
     def tap_at_nothing(self) -> None:
         """Press the trigger of the right controller for a moment, while it points at the sky."""
         self.evaluate("quest.controllers.right.quaternion.set(Math.SQRT1_2, 0, 0, Math.SQRT1_2)")
@@ -145,11 +167,16 @@ class EmulatedQuest:
             self.wait(f"{opened} || !{HEADSET}.hands.driven.has('right')")
             rejected = self.read_feedback(robot)["rejected"]
             self.press("squeeze", 1.0)
-            if self.scenario.wait_for(lambda: is_driven(self.host, robot, self.person.id), 5.0):
+            if self.scenario.wait_for(lambda: is_driven(self.host, robot, self.person.id), ANSWER_S):
                 return
             feedback = self.read_feedback(robot)
             assert_only_late(rejected, feedback["rejected"], [feedback["hold_reason"]])
         raise AssertionError(f"{robot} does not follow\n{self.page.describe()}")
+
+    def has_state_since(self, session_ns: int) -> bool:
+        """Return whether the director's state is as new as a session time."""
+        state = self.host.scene.state
+        return state is not None and state.header.session_time >= session_ns
 
     def read_feedback(self, robot: str) -> dict[str, Any]:
         """Return what the session says of a robot to its holder."""
@@ -172,7 +199,8 @@ class EmulatedQuest:
             assert tip
             target = add(tip[0], motion)
             self.glide(add(begin[0], motion), 2.0)
-            self.scenario.run_for(1.0)
+            rested_ns = self.host.session_now_ns() + 1_000_000_000
+            self.run_until(lambda: self.has_state_since(rested_ns), "a second passes")  # noqa: B023
             bodies = [event.body for event in self.scenario.events["host"][seen:]]
             held = [b for b in bodies if isinstance(b, EngagementChanged) and b.robot == robot and not b.engaged]
             if not held and is_driven(self.host, robot, self.person.id):  # it may have ended before `seen`

@@ -24,6 +24,7 @@ import psutil
 import pytest
 
 from iris_session.cli.main import main
+from iris_session.recording import NotARecordingError, Recording
 from tests.loopback import make_loopback_address
 
 #: Deadline of every condition [s]: ten times the worst case on an idle machine, because others may use it too.
@@ -161,6 +162,12 @@ class SessionProcess:
         """Kill the authority. Front and recorder notice it."""
         self.process.kill()
         self.process.wait()
+
+    def count_recorded_rows(self) -> int:
+        """Return how many steps are in the file so far; on a busy machine none for seconds."""
+        with contextlib.suppress(NotARecordingError), Recording.open(self.recording, warn=False) as recording:
+            return recording.count_rows()
+        return 0
 
     def verify(self) -> dict[str, Any]:
         """Verify the recording, which must be identical. Return the report of `iris-session verify --json`."""

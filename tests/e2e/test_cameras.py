@@ -235,19 +235,35 @@ def test_a_process_that_hangs_is_named(
     ann = watch(server, "room")
     wait_for_frames(ann, "room", 2)
     assert run_in_process("doctor", server.address)[0] in (0, 1)
-    (camera,) = find_cameras(server)
-    camera.send_signal(signal.SIGSTOP)
+
+    def stop_camera() -> psutil.Process:
+        wait_for_frames(ann, "room", 2)
+        (camera,) = find_cameras(server)
+        camera.send_signal(signal.SIGSTOP)
+        return camera
+
+    camera = stop_camera()
+
+    def stop_successor() -> None:
+        """Stop the process again that was replaced before all was seen, as on a busy machine."""
+        nonlocal camera
+        if is_replaced(server, camera):
+            camera = stop_camera()
 
     def is_stale() -> bool:
         ann.sleep(0.1)
         told = find_stream(ann, "room")
         return told is not None and told.stale
 
-    wait_until(is_stale, "the stream is stale")
-    _, text, _ = run_in_process("doctor", server.address)
-    assert re.search("streams .*room", text), text
+    def is_named() -> bool:
+        stop_successor()
+        wait_until(is_stale, "the stream is stale")
+        return re.search("streams .*room", run_in_process("doctor", server.address)[1]) is not None
+
+    wait_until(is_named, "the doctor names the stream")
 
     def is_warned() -> bool:
+        stop_successor()
         ann.sleep(0.5)  # a status is asked for rarely
         return any("'room' hangs" in warning for warning in ann.status().warnings)
 
@@ -425,17 +441,26 @@ def test_a_camera_by_hand_ends_by_ctrl_c_and_waits_for_its_session(
     process = run_camera(str(camera_file), "--address", server.address)
     ann = watch(server, "room")
     wait_for_frames(ann, "room", 2)
-    result = run_in_process("cloud", "inspect", server.address, "--json", "--seconds", "2")
-    told = {one["stream"]: one for one in json.loads(result[1])["streams"]}
-    assert told["room"]["hz"] > 0.0
+    told: dict[str, Any] = {}
+
+    def is_measured() -> bool:
+        result = run_in_process("cloud", "inspect", server.address, "--json", "--seconds", "2")
+        told.update({one["stream"]: one for one in json.loads(result[1])["streams"]})
+        return all(one["hz"] > 0.0 for one in told.values())  # else the machine stood still meanwhile
+
+    wait_until(is_measured, "frames come while they are measured")
     assert 8.0 <= told["room"]["bytes_per_point"] < 8.2
     assert set(told) == {"room", "room-front"}
     stages = ["camera process", "to the front", "in the front", "to the client", "decoding"]
     assert list(told["room"]["ages_ms"]) == stages
     assert list(told["room-front"]["ages_ms"]) == stages[:-1]
-    _, text, _ = run_in_process("cloud", "inspect", server.address, "--seconds", "1")
-    for some in (stages, stages[:-1]):
-        assert re.search("age [0-9]+ ms, median: " + ", ".join(f"{one} -?[0-9.]+" for one in some) + "\n", text), text
+    lines = [", ".join(f"{one} -?[0-9.]+" for one in some) for some in (stages, stages[:-1])]
+
+    def are_shown() -> bool:
+        _, text, _ = run_in_process("cloud", "inspect", server.address, "--seconds", "1")
+        return all(re.search(f"age [0-9]+ ms, median: {line}\n", text) for line in lines)
+
+    wait_until(are_shown, "the ages are shown")
     server.children()["front.main"].kill()
     wait_for_frames(ann, "room", 2)
     again = run_command("cloud", "run", str(camera_file), "--address", server.address, cwd=tmp_path)

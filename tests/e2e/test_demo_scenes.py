@@ -15,8 +15,8 @@ __all__ = ["robot_models"]
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 60.0)]
 
 
-def run_demo(folder: Path, *arguments: str, max_takes: int = 1) -> dict[str, Any]:
-    """Run a demo, which must succeed within so many attempts. Return its result."""
+def run_demo(folder: Path, *arguments: str, max_takes: int = 2) -> dict[str, Any]:
+    """Run a demo, which must succeed within so many attempts: a busy machine spoils one. Return its result."""
     done = run_command("demo", *arguments, *DEMO_OPTIONS, cwd=folder, timeout_s=DEMO_S)
     assert done.stdout, done.stderr[-3000:]
     result: dict[str, Any] = json.loads(done.stdout)
@@ -30,7 +30,7 @@ def run_demo(folder: Path, *arguments: str, max_takes: int = 1) -> dict[str, Any
 @pytest.mark.long
 @pytest.mark.usefixtures("robot_models")
 def test_aloha_operators_exchange_boards(tmp_path: Path) -> None:
-    result = run_demo(tmp_path, "aloha", max_takes=2)  # a board is dropped in about one of twelve, by physics alone
+    result = run_demo(tmp_path, "aloha", max_takes=3)  # a board is dropped in about one of twelve, by physics alone
     found = {h["object"]: (h["giver"], h["receiver"]) for h in result["handovers"]}
     assert found == {
         "red_board": ("south/right", "north/left"),

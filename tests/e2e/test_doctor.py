@@ -76,6 +76,20 @@ def run_doctor(*arguments: str, home: Path | None = None) -> Diagnosis:
     return Diagnosis(done.returncode, done.stdout)
 
 
+def examine(*arguments: str, expected: set[str], home: Path | None = None) -> Diagnosis:
+    """Run the doctor, which must find these checks failed and no others.
+
+    It is right to find more while this machine stands still: then, at most twice, it is run anew. What it is to find is
+    planted, and stays.
+    """
+    for _ in range(3):
+        found = run_doctor(*arguments, home=home)
+        if found.failed() == expected:
+            break
+    assert found.failed() == expected, found.troubles()
+    return found
+
+
 @contextlib.contextmanager
 def reserve_two_ports() -> Iterator[tuple[socket.socket, socket.socket]]:
     """Reserve two adjacent ports: yield their sockets, lower first. Nothing listens on them yet."""
@@ -175,33 +189,28 @@ def home(tmp_path: Path) -> Path:
 
 @pytest.mark.long
 def test_key_that_is_not_on_the_allow_list(encrypted: SessionProcess, home: Path) -> None:
-    found = run_doctor(encrypted.address, home=home)
+    found = examine(encrypted.address, home=home, expected={"key"})
     found.assert_names("key", "iris-session pair")
-    assert found.failed() == {"key"}
 
 
 def test_wrong_join_code(encrypted: SessionProcess, home: Path) -> None:
-    found = run_doctor(encrypted.address, "--code", "7KQ2-M4XD-9PTR", home=home)
+    found = examine(encrypted.address, "--code", "7KQ2-M4XD-9PTR", home=home, expected={"code"})
     found.assert_names("code")
-    assert found.failed() == {"code"}
 
 
 @pytest.mark.long
 def test_role_that_the_key_does_not_allow(encrypted: SessionProcess, home: Path) -> None:
     KeyHome().clients.allow_key("looker", KeyHome(home).load_identity().public, ("observer",))
-    found = run_doctor(encrypted.address, "--role", "director", home=home)
+    found = examine(encrypted.address, "--role", "director", home=home, expected={"role"})
     found.assert_names("role")
-    assert found.failed() == {"role"}
-    well = run_doctor(encrypted.address, home=home)
-    assert well.failed() == set(), well.troubles()
+    well = examine(encrypted.address, home=home, expected=set())
     assert well.checks["key"]["state"] == "ok"
 
 
 def test_changed_server_key(encrypted: SessionProcess, home: Path) -> None:
     KeyHome(home).known_servers.pin(encrypted.address, "arm", KeyPair.generate().public)
-    found = run_doctor(encrypted.address, home=home)
+    found = examine(encrypted.address, home=home, expected={"server_key"})
     found.assert_names("server_key", "iris-session keys forget")
-    assert found.failed() == {"server_key"}
 
 
 #: Unique, because the beacons of other tests' sessions are heard, too.
@@ -236,8 +245,7 @@ def open_clients(server: SessionProcess) -> Iterator[Callable[..., Client]]:
 
 
 def test_healthy_session_passes_and_no_participant_stays(plain: SessionProcess) -> None:
-    found = run_doctor(plain.address)
-    assert found.failed() == set(), found.troubles()
+    found = examine(plain.address, expected=set())
     assert found.status == int(any(check["state"] == "failed" for check in found.checks.values()))
     with Client(plain.address, role="observer", alignment="not_needed", name="look") as client:
         wait_until(
@@ -246,8 +254,7 @@ def test_healthy_session_passes_and_no_participant_stays(plain: SessionProcess) 
 
 
 def test_session_given_by_name(plain: SessionProcess) -> None:
-    found = run_doctor("--session", SESSION_NAME)
-    assert found.failed() == set(), found.troubles()
+    found = examine("--session", SESSION_NAME, expected=set())
     assert found.document["address"] == plain.address
     assert found.document["report"]["session_name"] == SESSION_NAME
 
@@ -286,11 +293,10 @@ class Forwarder:
 def test_firewall_that_opens_only_the_control_port(plain: SessionProcess) -> None:
     port = int(plain.address.rsplit(":", 1)[1])
     with contextlib.closing(Forwarder(port)):
-        found = run_doctor(f"127.0.0.2:{port}")
+        found = examine(f"127.0.0.2:{port}", expected={"state"})
     found.assert_names("state", "(state)")
     assert found.checks["join"]["state"] == "ok"
     assert found.checks["introduction"]["state"] == "warning"
-    assert found.failed() == {"state"}
 
 
 def test_missing_alignment_missing_lease_and_stopped_client(plain: SessionProcess) -> None:
@@ -303,11 +309,10 @@ def test_missing_alignment_missing_lease_and_stopped_client(plain: SessionProces
             "carl's robot",
         )
         carl.send_signal(signal.SIGSTOP)
-        found = run_doctor(plain.address)
+        found = examine(plain.address, expected={"alignment", "clients"})
         found.assert_names("alignment", "bob")
         found.assert_names("leases", "bob", "left: ann", "right: carl", state="warning")
         found.assert_names("clients", "carl")
-        assert found.failed() == {"alignment", "clients"}, found.troubles()
         assert found.status == 1
         bob.close()
 

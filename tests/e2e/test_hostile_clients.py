@@ -209,7 +209,7 @@ FLOOD_NAMES = {
     "snapshots": "get_snapshot",
 }  # fmt: skip
 #: Longer than any test: a flood ends when its process is killed [s].
-FLOOD_S = 100.0
+FLOOD_S = 300.0
 #: Ages of state up to it are accepted: the flooding client itself occupies a processor of a busy machine [ms].
 BUSY_MS = 100.0
 
@@ -225,18 +225,18 @@ class TwoClients:
         self.hand: Hand = self.scenario.add_hand(self.ann, "left")
         self.hand.pose = self.hand.tip
         self.scenario.engage(self.hand)
-        while {p.name for p in self.eve.status().participants if p.reported} != {"Ann", "Eve"}:
+        while {p.name for p in self.eve.status(DEADLINE_S).participants if p.reported} != {"Ann", "Eve"}:
             self.scenario.run_for(0.5)
         self.usual_ms = max(self.measure_age_ms() for _ in range(2))
 
     def row(self, name: str) -> ParticipantReport:
-        return next(p for p in self.eve.status().participants if p.name == name)
+        return next(p for p in self.eve.status(DEADLINE_S).participants if p.name == name)
 
     def measure_age_ms(self) -> float:
         """Return the p99 of the age of state that Eve reports, once a second."""
         self.scenario.run_for(1.0)
-        age = self.row("Eve").state_age
-        assert age is not None
+        while (age := self.row("Eve").state_age) is None:  # on a busy machine she has just reconnected
+            self.scenario.run_for(0.5)
         return age.p99
 
     def is_undisturbed(self) -> bool:
@@ -256,7 +256,7 @@ class TwoClients:
     def has_both(self) -> bool:
         """Return whether Ann and Eve are in the session. Asks below the rate limit."""
         self.scenario.run_for(0.3)
-        return {p.name for p in self.eve.status().participants if p.connected} >= {"Ann", "Eve"}
+        return {p.name for p in self.eve.status(DEADLINE_S).participants if p.connected} >= {"Ann", "Eve"}
 
     def count_floods(self) -> int:
         """Return the number of floods in the audit events of Eve."""
@@ -266,7 +266,7 @@ class TwoClients:
     def is_reported(self, what: str) -> bool:
         """Return whether the status warns of a flood of this name. Asks below the rate limit."""
         self.scenario.run_for(0.3)
-        return any("flood" in text and text.endswith(f": {what}") for text in self.eve.status().warnings)
+        return any("flood" in text and text.endswith(f": {what}") for text in self.eve.status(DEADLINE_S).warnings)
 
 
 @pytest.fixture(scope="module")

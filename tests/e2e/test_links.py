@@ -17,6 +17,7 @@ from iris_session.client import Client
 from iris_session.netsim.process import ImpairmentProcess
 from iris_session.protocol.server_messages import EngagementChanged, SamplesRejected
 from tests.e2e.scenario import Hand, Scenario
+from tests.e2e.session_time import run_ticks
 from tests.loopback import make_loopback_address
 
 pytestmark = pytest.mark.e2e
@@ -40,6 +41,7 @@ class LinkScenario:
         #: Longest time, since driving began, without an iteration of the test's own loop or without state over the
         #: direct connection: delays of the machine, not of the link.
         self.longest_stall_s = 0.0
+        self._driven_ns = 0
         self._polled_s = self._state_s = time.monotonic()
         self._seq = -1
         self._poll, scenario.poll = scenario.poll, self._poll_timed  # type: ignore[method-assign]
@@ -55,11 +57,13 @@ class LinkScenario:
     def reset_stall(self) -> None:
         """Forget the stalls so far."""
         self.longest_stall_s, self._polled_s, self._state_s = 0.0, *[time.monotonic()] * 2
+        self._driven_ns = self.watcher.session_now_ns()
 
     def assert_engaged(self, robot: str) -> None:
-        """Check that the engagement of `robot` did not end, unless the machine delayed samples or steps."""
-        engaged = [engaged for _, engaged, _ in self.list_engagements(robot)]
-        assert engaged == [True] or self.longest_stall_s > 0.06, self.list_engagements(robot)
+        """Check that the engagement of `robot` did not end since driving began, unless the machine delayed samples or
+        steps."""
+        ended = [ns for ns, engaged, _ in self.list_engagements(robot) if not engaged and ns > self._driven_ns]
+        assert not ended or self.longest_stall_s > 0.06, self.list_engagements(robot)
 
     def start_proxy(self, *addresses: str, profile: str = "good-wifi") -> ImpairmentProcess:
         links = dict.fromkeys(addresses or (LINK,), profile)
@@ -128,14 +132,15 @@ def test_blackout_of_five_seconds(linked: LinkScenario) -> None:
     anns_hand = linked.drive(linked.make_client("ann"), "left")
     linked.drive(scenario.join("bob"), "right")
     ann = anns_hand.client
+    scenario.keep_engaged(anns_hand)  # on a busy machine a sample was late while bob joined
     me, before = ann.participant_id, watcher.mirror.leases["left"]
-    assert linked.list_engagements("left")[-1][1]
+    scenario.run_until(lambda: linked.list_engagements("left")[-1][1], "the robot of ann follows")
     proxy.execute("stall")
     scenario.run_until(lambda: not linked.list_engagements("left")[-1][1], "the robot of ann holds")
     held_ns, _, reason = linked.list_engagements("left")[-1]
     assert held_ns - linked.get_last_applied_ns("left") <= (170 + 1000 * linked.longest_stall_s) * MS, "150 ms"
-    assert reason in ("stale", "no_sample")
-    scenario.run_for(1.0)
+    assert reason in ("stale", "no_sample") or (reason == "gap" and linked.longest_stall_s > 0.06)
+    run_ticks(scenario, watcher, 1.0)
     resting = watcher.scene.tip_pose("left")
     assert resting is not None
     bobs_samples: list[int] = []
@@ -150,7 +155,7 @@ def test_blackout_of_five_seconds(linked: LinkScenario) -> None:
     now = watcher.scene.tip_pose("left")
     assert now is not None
     assert distance(resting[0], now[0]) < 5e-4
-    assert not watcher.mirror.participants[me].connected
+    scenario.run_until(lambda: not watcher.mirror.participants[me].connected, "ann is silent")
     assert watcher.mirror.leases["left"].holder == me, "in the grace period"
     proxy.execute("resume")
     resumed_ns = watcher.session_now_ns()
@@ -163,7 +168,7 @@ def test_blackout_of_five_seconds(linked: LinkScenario) -> None:
         lambda: watcher.mirror.leases["left"].lease_version > before.lease_version, "ann's lease is resumed"
     )
     assert watcher.mirror.leases["left"].holder == me
-    scenario.run_for(0.3)  # the clutch is still closed, which must move nothing
+    run_ticks(scenario, watcher, 0.3)  # the clutch is still closed, which must move nothing
     now = watcher.scene.tip_pose("left")
     assert now is not None
     assert distance(resting[0], now[0]) < 5e-4

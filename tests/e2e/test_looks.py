@@ -15,6 +15,7 @@ from tests.e2e import session_program
 from tests.e2e.scenario import Scenario
 from tests.e2e.session_process import (
     COMMAND,
+    DEADLINE_S,
     DEMO_OPTIONS,
     DEMO_S,
     SessionProcess,
@@ -98,6 +99,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sessions]:
         killed = scenarios[1]
         killed.drive("ann", "left", (0.0, 0.03, 0.0))
         killed.run_for(1.0)
+        killed.run_until(killed.server.count_recorded_rows, "the recorder has written rows")
         killed.server.children()["recording.process"].kill()  # the next rows are in a part of their own
         killed.run_until((killed.server.folder / "session.part2.rrd").exists, "the next part of the recording")
         killed.run_for(1.0)
@@ -109,7 +111,8 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sessions]:
         killed.run_for(1.0)
         servers[-1].finish()
         for path in (servers[0].recording, resumed):
-            wait_until(lambda path=path: scan_file(path).indexed, f"{path} has its index")  # type: ignore[misc]
+            # It is written when a processor has nothing else to do.
+            wait_until(lambda path=path: scan_file(path).indexed, f"{path} has its index", 3 * DEADLINE_S)  # type: ignore[misc]
         yield Sessions(servers[0].recording, servers[1].recording, resumed)
     finally:
         for scenario in scenarios:

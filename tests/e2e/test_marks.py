@@ -141,8 +141,12 @@ def test_fingertip_may_look_and_is_denied_to_drive_until_a_tip_is_calibrated(sce
         return RejectReason.VIEW_ONLY in rejected and DenialReason.VIEW_ONLY in notices
 
     scenario.run_until(was_told, "the session says why")
-    scenario.run_until(lambda: "left" in bob.client.feedback, "feedback")
-    assert bob.client.feedback["left"].hold_reason == HoldReason.VIEW_ONLY
+
+    def is_held_because_of_it() -> bool:
+        """On a busy machine the robot may hold for another reason meanwhile: samples came too late."""
+        return "left" in bob.client.feedback and bob.client.feedback["left"].hold_reason == HoldReason.VIEW_ONLY
+
+    scenario.run_until(is_held_because_of_it, "feedback says why the robot holds")
     assert not scenario.is_following(hand)
     hand.clutch, hand.device, bob.device = False, RIGHT, RIGHT
     found = bob.turn_in_a_hole()

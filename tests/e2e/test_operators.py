@@ -19,6 +19,7 @@ from iris_session.protocol.names import DenialReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentChanged, LeaseChanged, SamplesRejected
 from tests.e2e.scenario import Hand, Scenario, is_driven
 from tests.e2e.session_process import SessionProcess
+from tests.e2e.session_time import run_ticks, wait_for_new_state
 
 pytestmark = pytest.mark.e2e
 
@@ -58,9 +59,9 @@ def test_operator_moves_the_robot_and_it_holds_without_samples(scenario: Scenari
     )
     hand.velocity = (0.0, 0.1, 0.0)
     hand.sending = False
-    scenario.run_for(0.8)  # 150 ms until stale, then it decelerates
+    run_ticks(scenario, hand.client, 0.8)  # 150 ms until stale, then it decelerates
     resting = hand.tip
-    scenario.run_for(0.5)
+    run_ticks(scenario, hand.client, 0.5)
     assert distance(resting[0], hand.tip[0]) < 5e-4
 
 
@@ -77,10 +78,10 @@ def test_killed_client_resumes_its_lease(
     scenario.run_until(lambda: watcher.mirror.leases["left"].expires_ns > 0, "the grace period of the lease begins")
     ann = watcher.mirror.participants[lease.holder]
     assert not ann.connected
-    scenario.run_for(0.5)
+    run_ticks(scenario, watcher, 0.5)
     resting = watcher.scene.tip_pose("left")
     assert resting is not None
-    scenario.run_for(0.5)
+    run_ticks(scenario, watcher, 0.5)
     now = watcher.scene.tip_pose("left")
     assert now is not None
     assert distance(resting[0], now[0]) < 5e-4
@@ -241,14 +242,14 @@ def check_estop(scenario: Scenario, hand: Hand, director: Client) -> None:
     scenario.run_for(0.3)
     hand.client.estop("test")
     scenario.run_until(lambda: director.mirror.estop, "the e-stop is known")
-    scenario.run_for(0.4)
+    run_ticks(scenario, hand.client, 0.4)
     resting = hand.tip
-    scenario.run_for(0.4)
+    run_ticks(scenario, hand.client, 0.4)
     assert distance(resting[0], hand.tip[0]) < 5e-4
     with pytest.raises(DeniedError):
         hand.client.clear_estop()
     director.clear_estop()
-    scenario.run_for(0.3)
+    run_ticks(scenario, hand.client, 0.3)
     assert distance(resting[0], hand.tip[0]) < 5e-4, (
         "a closed clutch must not move the robot after the e-stop was cleared"
     )
@@ -258,10 +259,11 @@ def check_estop(scenario: Scenario, hand: Hand, director: Client) -> None:
 def check_pause(scenario: Scenario, hand: Hand, director: Client) -> None:
     director.control("pause")
     scenario.run_until(lambda: hand.client.mirror.paused, "paused")
+    wait_for_new_state(scenario, director)
     assert director.scene.state is not None
-    scenario.run_for(0.2)
     tick = director.scene.state.header.tick
     scenario.run_for(0.3)
+    wait_for_new_state(scenario, director)
     assert director.scene.state.header.tick == tick
     director.control("step", 5)
     scenario.run_until(
@@ -294,8 +296,8 @@ def test_four_headsets_drive_four_arms(
     try:
         watcher = scenario.join("watcher", "observer")
         for i in range(4):
-            emulate(scenario.server.address, f"name=op{i},behaviour=wander,robot=arm{i + 1},seed={i}")
-        scenario.run_until(lambda: all(is_driven(watcher, f"arm{i + 1}") for i in range(4)), "four arms move", 60.0)
+            emulate(scenario.server.address, f"name=op{i},behaviour=wander,robot=arm{i + 1},seed={i}", seconds=300.0)
+        scenario.run_until(lambda: all(is_driven(watcher, f"arm{i + 1}") for i in range(4)), "four arms move", 120.0)
         scenario.run_for(2.0)
         scenario.server.finish()
     finally:
@@ -312,23 +314,19 @@ def sweep_hand(scenario: Scenario, hand: Hand, metres: float, scale: float) -> N
     """
     start, y = hand.tip[0], hand.pose[0][1]
 
-    def has_moved() -> bool:
+    def have_moved() -> bool:
         nonlocal start, y
         if not scenario.is_following(hand):
             hand.velocity = (0.0, 0.0, 0.0)
             scenario.engage(hand)
             start, y = hand.tip[0], hand.pose[0][1]
-        hand.velocity = (0.0, 0.1, 0.0)
-        return hand.pose[0][1] >= y + metres
+        moved = hand.pose[0][1] - y
+        hand.velocity = (0.0, 0.1 if moved < metres else 0.0, 0.0)
+        return moved >= metres and abs(distance(hand.tip[0], start) - scale * moved) < 1e-3
 
-    scenario.run_until(has_moved, "the hand has moved")
-    hand.velocity = (0.0, 0.0, 0.0)
-    expected = scale * (hand.pose[0][1] - y)
-    scenario.run_until(
-        lambda: abs(distance(hand.tip[0], start) - expected) < 1e-3, f"the tip has moved by {expected:.3f} m"
-    )
-    scenario.run_for(0.4)
-    assert distance(hand.tip[0], start) == pytest.approx(expected, abs=2e-3)
+    scenario.run_until(have_moved, f"the hand has moved by {metres} m, and the tip {scale} times as far")
+    run_ticks(scenario, hand.client, 0.4)
+    assert distance(hand.tip[0], start) == pytest.approx(scale * (hand.pose[0][1] - y), abs=2e-3)
 
 
 @pytest.mark.long

@@ -27,6 +27,7 @@ from tests.e2e.session_process import (
     run_command,
     run_verify,
 )
+from tests.e2e.session_time import run_ticks, wait_until_recorded
 
 pytestmark = pytest.mark.e2e
 
@@ -73,7 +74,10 @@ def test_operators_finish_the_handover_although_the_authority_was_killed(
     """It is killed while the hammer is in the air; the same two emulated headsets, never restarted, hand it over."""
     watcher = scenario.join("watcher", "observer")
     headsets = emulate(
-        scenario.server.address, "name=ann,behaviour=giver,robot=left", "name=bob,behaviour=receiver,robot=right"
+        scenario.server.address,
+        "name=ann,behaviour=giver,robot=left",
+        "name=bob,behaviour=receiver,robot=right",
+        seconds=300.0,  # longer than all that is waited for
     )
 
     def get_hammer_height() -> float:
@@ -83,6 +87,7 @@ def test_operators_finish_the_handover_although_the_authority_was_killed(
     table = get_hammer_height()
     scenario.run_until(lambda: get_hammer_height() > table + 0.06, "ann lifts the hammer", 60.0)
     before = dict(watcher.mirror.leases)
+    wait_until_recorded(scenario, scenario.server.recording, watcher.session_now_ns())
     kill_authority(scenario.server)
     lifted = get_hammer_height()
     again = resume(scenario.server)
@@ -106,7 +111,8 @@ def test_resume_after_ctrl_c_keeps_participants_leases_estop_and_pause(
     ann = driving.client
     me, lease = ann.participant_id, ann.mirror.leases["left"]
     dora.estop("test")
-    scenario.run_for(0.5)  # an arm paused while it brakes would move by a millimetre afterwards
+    scenario.run_until(lambda: ann.mirror.estop, "e-stop")
+    run_ticks(scenario, dora, 0.5)  # an arm paused while it brakes would move by a millimetre afterwards
     dora.control("pause")
     scenario.run_until(lambda: ann.mirror.estop and ann.mirror.paused, "e-stop and pause")
     session_id, tip = get_session_id(ann), driving.tip
@@ -125,7 +131,7 @@ def test_resume_after_ctrl_c_keeps_participants_leases_estop_and_pause(
     dora.clear_estop()
     dora.control("resume")
     scenario.run_until(lambda: not ann.mirror.paused, "the session continues")
-    scenario.run_for(0.3)
+    run_ticks(scenario, ann, 0.3)
     assert distance(tip[0], driving.tip[0]) < 1e-3, "a closed clutch must not move the robot"
     scenario.engage(driving)
     report = again.finish()
@@ -151,7 +157,8 @@ def test_resume_after_a_power_cut_continues_at_the_last_readable_row(
     """All processes are killed at once and the file ends within a write; then the resumed session is killed, too."""
     ann = driving.client
     me = ann.participant_id
-    scenario.run_for(1.0)
+    engaged_ns = ann.session_now_ns()
+    wait_until_recorded(scenario, scenario.server.recording, engaged_ns + 1_000_000_000)  # more than is cut off
     for process in [*list_descendants(scenario.server.process.pid), psutil.Process(scenario.server.process.pid)]:
         process.kill()
     scenario.server.process.wait()
@@ -161,6 +168,7 @@ def test_resume_after_a_power_cut_continues_at_the_last_readable_row(
     assert ann.participant_id == me
     assert ann.mirror.leases["left"].holder == me
     scenario.engage(driving)
+    wait_until_recorded(scenario, again.recording, ann.session_now_ns())
     kill_authority(again)
     third = resume(scenario.server, number=3)
     wait_reconnected(scenario, third, ann)
@@ -208,6 +216,7 @@ def test_encrypted_session_resumes_encrypted_with_the_same_keys(
         ann.acquire(["left"])
         scenario.engage(hand)
         me = ann.participant_id
+        wait_until_recorded(scenario, scenario.server.recording, ann.session_now_ns())
         kill_authority(scenario.server)
         again = resume(scenario.server)
         wait_reconnected(scenario, again, ann)

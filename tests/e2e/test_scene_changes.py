@@ -7,7 +7,6 @@ import math
 import sys
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import msgspec
@@ -27,8 +26,9 @@ from iris_session.recording import Recording
 from tests.e2e import session_program
 from tests.e2e.publisher_program import make_cloth, make_grid
 from tests.e2e.scenario import Scenario
-from tests.e2e.session_process import COMMAND, SessionProcess, kill_all
+from tests.e2e.session_process import COMMAND, DEADLINE_S, SessionProcess, kill_all
 from tests.e2e.session_program import RED
+from tests.e2e.session_time import run_ticks, wait_until_recorded
 from tests.loopback import make_loopback_address
 from tests.recording.support import read
 
@@ -83,9 +83,9 @@ def test_operators_continue_in_another_scene_and_it_replays(scenario: Scenario) 
     assert "object3" in bob.mirror.body_index
     assert "hammer" not in bob.mirror.leases
     hand.velocity = (0.0, 0.0, 0.0)
-    scenario.run_for(0.3)
+    run_ticks(scenario, ann, 0.3)
     still = hand.tip[0]
-    scenario.run_for(0.3)
+    run_ticks(scenario, ann, 0.3)
     assert distance(hand.tip[0], still) < 1e-3, "a closed clutch must not move the robot"
 
     def has_moved() -> bool:
@@ -114,7 +114,9 @@ def test_operators_continue_in_another_scene_and_it_replays(scenario: Scenario) 
     welcome = late.connection.welcome
     assert welcome is not None
     assert welcome.tick_period_ns == 4_000_000
-    scenario.run_until(lambda: late.status().tick_period_ns == 4_000_000, "the status reports it within a second")
+    scenario.run_until(
+        lambda: late.status(DEADLINE_S).tick_period_ns == 4_000_000, "the status reports it within a second"
+    )
     scenario.run_until(lambda: len({c.mirror.event_seq for c in scenario.clients}) == 1, "all have the same events")
     assert len({c.mirror.mirror_hash() for c in scenario.clients}) == 1
     assert not ann.mirror.leases["arm1"].holder
@@ -148,27 +150,12 @@ def test_session_killed_in_its_second_scene_resumes_in_it(scenario: Scenario, tm
     command_scene(scenario, "three")
     wait_for_epoch(scenario, 2)
     ann.acquire(["arm3"])
-    scenario.run_until(lambda: ann.status().recorder.bytes_written, "the recorder has begun its file")
+    scenario.run_until(lambda: ann.status(DEADLINE_S).recorder.bytes_written, "the recorder has begun its file")
     scenario.server.children()["recording.process"].kill()  # the next rows are in a part of their own
     hand = scenario.add_hand(ann, "arm3")
     scenario.engage(hand)
     scenario.run_until((scenario.server.folder / "session.part2.rrd").exists, "the next part of the recording")
-    engaged_ns = ann.session_now_ns()
-
-    def read_newest_row() -> int:
-        try:
-            with Recording.open(scenario.server.recording, warn=False) as recording:
-                return max((row.now_ns for row in recording.rows()), default=0)
-        except RuntimeError:  # of Rerun: a message was partly written
-            return 0
-
-    def is_recorded() -> bool:
-        with ThreadPoolExecutor(1) as reader:  # on a busy machine it takes longer than the heartbeat timeout
-            newest = reader.submit(read_newest_row)
-            scenario.run_until(newest.done, "the recording is read")
-        return newest.result() > engaged_ns
-
-    scenario.run_until(is_recorded, "the engagement is in the file")
+    wait_until_recorded(scenario, scenario.server.recording, ann.session_now_ns())
     scenario.server.kill()
     resumed_file = scenario.server.folder / "session.resume2.rrd"
     resumed = SessionProcess(
@@ -216,6 +203,7 @@ def test_patch_is_the_same_for_present_and_late_clients_and_after_resume(scenari
     assert list(after.visuals[:60]) == red[:60]
     assert after.visuals[60:-1] == before.visuals[60:]
 
+    wait_until_recorded(scenario, scenario.server.recording, ann.session_now_ns())
     scenario.server.kill()
     resumed_file = scenario.server.folder / "session.resume2.rrd"
     command = [*COMMAND, "serve", "--resume", str(scenario.server.folder / "session.rrd")]
@@ -237,7 +225,6 @@ def test_patch_is_the_same_for_present_and_late_clients_and_after_resume(scenari
 
 
 CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
-DEADLINE_S = 60.0
 HZ = 60.0
 #: States between two patches: 20 patches a second.
 PATCH_INTERVAL = 3

@@ -153,8 +153,9 @@ def test_device_pairs_with_a_single_use_code_and_joins_in_its_role(
     assert offer["addresses"] == [lab.server.address]
     assert png.read_bytes().startswith(b"\x89PNG")
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "tablet-home"))
-    with Client(lab.server.address, role="observer", name="Tab", join_code=offer["code"].lower()) as tablet:
-        assert tablet.wait_for(lambda c: c.scene.state is not None)
+    tablet = Client(lab.server.address, role="observer", name="Tab", join_code=offer["code"].lower())
+    with tablet.connect(DEADLINE_S):
+        assert tablet.wait_for(lambda c: c.scene.state is not None, DEADLINE_S)
     assert wait_for_end(process, offer)[0] == 0
     (entry,) = [key for key in lab.home.clients.read().values() if key.name == "tablet"]
     assert entry.roles == ("observer",)
@@ -227,7 +228,8 @@ def test_revoked_key_is_disconnected_at_once_and_others_are_not(lab: EncryptedSc
     # Half a second and one second on an idle machine; printed, because a busy one has no bound.
     print(f"out after {out_after:.3f} s, longest gap of the others {gap.longest:.3f} s")
     lab.engage(bob)  # on a busy machine a sample may be late
-    assert bob.client.lease_version("right") == version
+    # A machine that stood still for 2 s has disconnected bob, too, who has resumed his lease.
+    assert bob.client.lease_version("right") == version or gap.longest > 2.0
     now = bob.client.scene.tip_pose("left")
     assert resting is not None
     assert now is not None

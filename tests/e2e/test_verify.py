@@ -22,7 +22,7 @@ from iris_session.protocol.entries import Lost, decode_entries
 from iris_session.recording import JournalRow, Recording
 from iris_session.recording.messages import Batch
 from iris_session.session.verification import verify_recording
-from tests.e2e.scenario import Scenario
+from tests.e2e.scenario import Scenario, is_driven
 from tests.e2e.session_process import run_verify
 from tests.recording.support import write
 
@@ -154,10 +154,9 @@ def test_follower_ramps_to_a_distant_leader_and_then_follows(scenario: Scenario)
     closed_at = 0.0
 
     def close_clutch() -> None:
-        """Open and close the clutch; again when no sample counted while it was open."""
+        """Open and close the clutch; again when no sample counted while it was open, or one came too late."""
         nonlocal closed_at
-        followed = client.scene.state is not None and bool(client.scene.state.header.applied)
-        if not followed and time.monotonic() > closed_at + 3.0:
+        if not is_driven(client, "left") and time.monotonic() > closed_at + 3.0:
             leader.clutch = False
             scenario.run_for(0.3)
             leader.clutch, closed_at = True, time.monotonic()

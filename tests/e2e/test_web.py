@@ -24,9 +24,15 @@ from numpy.typing import NDArray
 from iris_session.bench.chromium import BUILT_PAGE, WEB_CLIENT
 from iris_session.demo.named_scenes import scene_by_name
 from iris_session.protocol.client_messages import Acquire
-from iris_session.protocol.server_messages import Reply
+from iris_session.protocol.server_messages import (
+    Event,
+    Gap,
+    ParticipantChanged,
+    ParticipantJoined,
+    Reply,
+)
 from tests.e2e.browser import Browser, Page, join_as, printed_address
-from tests.e2e.scenario import Scenario
+from tests.e2e.scenario import Hand, Scenario
 from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess
 from tests.scene.pictures import ModelRenderer, graphics, silhouette_iou
 from tests.web.browser import WebBrowser, open_http
@@ -136,9 +142,8 @@ def test_a_cloth_that_is_folded_moves_in_the_page(
     assert page.evaluate(highest) < 0.02
     folders = [f"name={side},behaviour=folder,object=cloth,robot={side}" for side in ("left", "right")]
     emulate(server.address, *folders, seconds=4 * DEADLINE_S)
-    page.wait(f"{highest} > 0.05", 4 * DEADLINE_S)
-    drawn = page.evaluate("[...irisSession.view.shown.vertices.values()][0].filter((_, i) => i % 3 === 2)")
-    assert max(drawn if isinstance(drawn, list) else drawn.values()) > 0.03
+    drawn = "Math.max(...[...irisSession.view.shown.vertices.values()][0].filter((_, i) => i % 3 === 2))"
+    page.wait(f"{highest} > 0.05 && {drawn} > 0.03", 4 * DEADLINE_S)
     assert page.errors == []
 
 
@@ -175,16 +180,29 @@ def test_markup_in_names_is_text(scenario: Scenario, open_page: Callable[..., Pa
     assert page.errors == []
 
 
+def measure_drift(scenario: Scenario, hand: Hand, seconds: float) -> float:
+    """Return how far the tip gets from where it is now within so much simulated time [m]."""
+    client = hand.client
+
+    def has_state(session_ns: float, sim_s: float) -> bool:
+        state = client.scene.state
+        return state is not None and state.header.session_time >= session_ns and state.header.sim_time >= sim_s
+
+    now_ns = client.session_now_ns()
+    scenario.run_until(lambda: has_state(now_ns, 0.0), "a state that is not older than the event")
+    assert client.scene.state is not None
+    stopped, until_s = hand.tip, client.scene.state.header.sim_time + seconds
+    scenario.run_until(lambda: has_state(now_ns, until_s), f"{seconds} s")
+    return float(np.linalg.norm(np.subtract(hand.tip[0], stopped[0])))
+
+
 def test_estop_holds_all_robots(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     page = open_page(scenario.server, "stopper")
     hand = scenario.drive("cat", "left", (0.0, 0.05, 0.0))
     page.evaluate("document.activeElement.blur()")
     page.press("Space")
     scenario.run_until(lambda: hand.client.mirror.estop, "the e-stop is in force")
-    stopped = hand.tip
-    until = time.monotonic() + 1.0
-    scenario.run_until(lambda: time.monotonic() > until, "a second")
-    assert np.linalg.norm(np.subtract(hand.tip[0], stopped[0])) < 0.01
+    assert measure_drift(scenario, hand, 1.0) < 0.01
     page.wait("!document.querySelector('.stopped').hidden && document.title.startsWith('STOPPED')")
     page.click("button", "Clear")
     scenario.run_until(lambda: not hand.client.mirror.estop, "the e-stop is cleared")
@@ -212,10 +230,7 @@ def test_the_estop_button_stops_robots(scenario: Scenario, open_page: Callable[.
         click = thread.submit(page.click, "button", "E-STOP Space")
         scenario.run_until(lambda: note_stop() and click.done(), "the e-stop is in force")
         click.result()
-    stopped = hand.tip
-    until = time.monotonic() + 0.5
-    scenario.run_until(lambda: time.monotonic() > until, "half a second")
-    drift = float(np.linalg.norm(np.subtract(hand.tip[0], stopped[0])))
+    drift = measure_drift(scenario, hand, 0.5)
     delay_ms = 1e3 * stopped_at[0] - page.evaluate("window.clicked")
     print(f"e-stop by the button: at another client after {delay_ms:.0f} ms, then {1e3 * drift:.1f} mm of motion")
     assert 0.0 < delay_ms < 5_000.0
@@ -303,7 +318,7 @@ def test_a_browser_pairs_by_the_printed_link(
         guest.wait_until_ready()
         assert guest.evaluate("irisSession.state.role") == "observer"
         assert guest.evaluate("[...document.querySelectorAll('[data-robot] button')].every((one) => one.hidden)")
-        assert pairing.wait(30) == 0
+        assert pairing.wait(DEADLINE_S) == 0
         offered = guest.evaluate("[...document.querySelector('#self-role').options].map((one) => one.value)")
         assert offered == ["observer"]
         chosen = json.dumps({"name": "Web", "role": "director", "roles": []})  # of a session that allowed it
@@ -368,6 +383,13 @@ def test_a_reload_resumes_with_the_lease(scenario: Scenario, open_page: Callable
 BACKGROUND_S: Final = float(os.environ.get("IRIS_BACKGROUND_S", "6"))
 
 
+def is_of_the_machine(event: Event, watcher: str) -> bool:
+    """Return whether an event says that a busy machine stood still, or that the watcher itself was lost and is back."""
+    body = event.body
+    joined = isinstance(body, ParticipantJoined | ParticipantChanged) and body.participant.name == watcher
+    return isinstance(body, Gap) or joined
+
+
 @pytest.mark.long
 def test_a_tab_in_the_background_keeps_its_robot(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     """Browsers run timers and frames of such a tab rarely or not at all. Its worker keeps the connection."""
@@ -377,14 +399,14 @@ def test_a_tab_in_the_background_keeps_its_robot(scenario: Scenario, open_page: 
     page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
     drawn = page.evaluate("irisSession.view.drawn")
     watcher = scenario.join("watcher")
-    scenario.run_for(0.5)
-    known = len(scenario.events["watcher"])
     dan = page.evaluate("irisSession.state.self.id")
+    scenario.run_until(lambda: watcher.mirror.leases["left"].holder == dan, "the watcher sees who has the robot")
+    known = len(scenario.events["watcher"])
     with ThreadPoolExecutor(1) as thread:
         still = thread.submit(page.stand_still, BACKGROUND_S)
         scenario.run_until(still.done, "the tab is in front again", BACKGROUND_S + DEADLINE_S)
         still.result()
-    assert [type(event.body).__name__ for event in scenario.events["watcher"][known:]] == []
+    assert [one for one in scenario.events["watcher"][known:] if not is_of_the_machine(one, watcher.name)] == []
     assert watcher.mirror.leases["left"].holder == dan
     page.wait(f"irisSession.view.drawn > {drawn} && irisSession.state.phase.phase === 'ready'")
     assert page.evaluate("irisSession.state.self.id") == dan

@@ -6,6 +6,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from iris_session.demo.scenes import scene_path
+from iris_session.protocol.names import HoldReason
+from iris_session.protocol.server_messages import EngagementChanged, LeaseChanged
 from tests.e2e.browser import Page, decode_picture, join_as
 from tests.e2e.scenario import Scenario, assert_only_late
 from tests.e2e.session_process import SessionProcess
@@ -26,6 +29,8 @@ VIEW = {"lookat": [0, 0, 0.2], "azimuth": 90, "elevation": -25, "distance": 2.0}
 SPEED = 0.1  # of the tip by default [m/s]
 #: A robot that stops has this long [s]; its tip is at rest within this of where it stays [m].
 STOP_S, REST_M = 0.2, 0.001
+#: Why a robot holds when the machine was late; duration of a drag [s].
+LATE, DRAG_S = {HoldReason.STALE, HoldReason.REJECTED, HoldReason.GAP}, 2.5
 #: Another camera: half a metre before the tip of the left robot, whose picture is 17 cm high there.
 CLOSE = '<camera name="close" pos="-0.2 -0.5 0.28" xyaxes="1 0 0 0 0 1" fovy="20"/>'
 
@@ -67,6 +72,12 @@ class Tip:
         assert tip is not None
         return np.array(tip[0])
 
+    @property
+    def sim_time(self) -> float:
+        state = self.client.scene.state
+        assert state is not None
+        return float(state.header.sim_time)
+
     def note(self) -> None:
         state = self.client.scene.state
         if state is not None and (not self.times or state.header.session_time * 1e-6 > self.times[-1]):
@@ -83,8 +94,9 @@ class Tip:
         self.scenario.run_until(is_done, what)
 
     def watch_for(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        self.watch(lambda: time.monotonic() > end, f"{seconds} s")
+        """Watch until so much time has passed in the simulation, too: a busy machine may stand still meanwhile."""
+        end, end_sim = time.monotonic() + seconds, self.sim_time + seconds
+        self.watch(lambda: time.monotonic() > end and self.sim_time > end_sim, f"{seconds} s")
 
     def measure_stop(self, since_ms: float) -> float:
         """Watch a second; return how long after a moment of the session the tip was at rest [s]."""
@@ -116,26 +128,50 @@ def words(page: Page) -> str:
     return text
 
 
-def drive_forward(page: Page, tip: Tip, distance: float) -> NDArray[np.float64]:
-    """Hold left Shift and W until the tip has moved by `distance` [m]; return where it began.
+def wait_for_samples(tip: Tip, page: Page) -> None:
+    """Wait until samples have seen what is pressed now. Nothing counts for 0.2 s after the focus came back."""
+    page.evaluate("new Promise((done) => setTimeout(() => done(null), 300))")  # samples are due before, however late
+    tip.watch_for(0.1)
 
-    On a busy machine a sample may come too late and be rejected: then, and only then, the keys are pressed anew.
+
+def drive_until(
+    page: Page, tip: Tip, is_there: Callable[[], bool], hold: Callable[[], object], let_go: Callable[[], object]
+) -> None:
+    """Hold something until the tip is where it should be. `let_go` is called only before it is held anew.
+
+    On a busy machine a sample may come too late and be rejected: then, and only then, it is held anew.
     """
     for _ in range(10):
-        begin, until = tip.place, time.monotonic() + 5.0
+        until = time.monotonic() + 5.0
         rejected = page.evaluate(FEEDBACK)["rejected"]
+        hold()
+        while not is_there() and time.monotonic() < until:
+            tip.watch_for(0.002)
+        if is_there():
+            return
+        feedback = page.evaluate(FEEDBACK)
+        assert_only_late(rejected, feedback["rejected"], filter(None, [feedback["hold_reason"]]))
+        let_go()
+        wait_for_samples(tip, page)
+    raise AssertionError(f"the tip does not get there: {words(page)}")
+
+
+def drive_forward(page: Page, tip: Tip, distance: float) -> NDArray[np.float64]:
+    """Hold left Shift and W until the tip has moved by `distance` [m]; return where it began."""
+    begin = tip.place
+
+    def hold() -> None:
+        nonlocal begin
+        begin = tip.place
         page.hold("Shift")
         page.hold("w")
-        while np.linalg.norm(tip.place - begin) <= distance and time.monotonic() < until:
-            tip.watch_for(0.002)
-        if np.linalg.norm(tip.place - begin) > distance:
-            return begin
-        feedback = page.evaluate(FEEDBACK)
-        assert_only_late(rejected, feedback["rejected"], [feedback["hold_reason"]])
+
+    def let_go() -> None:
         page.let_go("w")
         page.let_go("Shift")
-        tip.watch_for(0.3)  # a sample must have seen the key let go
-    raise AssertionError(f"the tip does not move by {distance} m: {words(page)}")
+
+    drive_until(page, tip, lambda: bool(np.linalg.norm(tip.place - begin) > distance), hold, let_go)
+    return begin
 
 
 def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
@@ -156,7 +192,7 @@ def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
     expected = SPEED * (at["keyup KeyW"] - at["keydown KeyW"]) * 1e-3
     print(f"moved {1e3 * moved} mm, {1e3 * expected:.1f} mm by time; at rest after {1e3 * stopped_s:.0f} ms")
     assert abs(moved[1] - expected) < 0.015
-    assert 0.09 < moved[1] < 0.16
+    assert moved[1] > 0.09
     assert np.linalg.norm(moved[[0, 2]]) < 0.005
     assert stopped_s < STOP_S
     driver.let_go("Shift")
@@ -176,18 +212,24 @@ def test_a_window_without_focus_stops_the_robot(scenario: Scenario, driver: Page
     assert words(driver).startswith("Held: the window lost the focus.")
     driver.let_go("w")
     driver.let_go("Shift")
-    tip.watch_for(0.3)  # nothing counts for 0.2 s after the focus came back
+    wait_for_samples(tip, driver)
     drive_forward(driver, tip, 0.01)
     driver.let_go("Shift")
+
+
+def list_freed_ms(scenario: Scenario) -> list[float]:
+    """Return when the left robot became free after it was held, in session time [ms]."""
+    changes = [(e.body, e.session_time) for e in scenario.events["watcher"]]
+    return [1e-6 * at for b, at in changes if isinstance(b, LeaseChanged) and b.previous_holder and not b.lease.holder]
 
 
 @pytest.mark.long
 def test_a_lost_lease_ends_driving(scenario: Scenario, driver: Page) -> None:
     tip = Tip(scenario)
     drive_forward(driver, tip, 0.03)
-    freed_ms = tip.times[-1]
     tip.client.assign(["left"])
-    stopped_s = tip.measure_stop(freed_ms)
+    tip.watch(lambda: list_freed_ms(scenario), "the lease is lost")
+    stopped_s = tip.measure_stop(list_freed_ms(scenario)[0])
     print(f"at rest {1e3 * stopped_s:.0f} ms after the lease was lost")
     assert stopped_s < STOP_S
     driver.wait("document.querySelector('.drive').hidden")
@@ -212,7 +254,7 @@ def test_the_estop_key_is_the_same_while_driving(scenario: Scenario, driver: Pag
     assert np.linalg.norm(tip.place - stopped) < REST_M  # the keys are still pressed
     driver.let_go("w")
     driver.let_go("Shift")
-    tip.watch_for(0.3)  # as a finger: a sample must have seen the key let go
+    wait_for_samples(tip, driver)  # as a finger: a sample must have seen the key let go
     drive_forward(driver, tip, 0.01)
     driver.let_go("Shift")
 
@@ -240,15 +282,32 @@ def test_the_estop_key_presses_no_button_while_driving(driver: Page) -> None:
 
 @pytest.mark.long
 def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> None:
-    """Half a millimetre for a pixel: to the right along +X, and no farther when the button is let go."""
+    """Half a millimetre for a pixel: to the right along +X, and no farther when the button is let go.
+
+    A page that draws slowly misses a part of the way, and so does one whose samples come too late; then, and only then,
+    it is dragged on.
+    """
     tip = Tip(scenario)
-    begin = tip.place
-    driver.drag(".drive .handle", 100, 0, seconds=2.5)  # what is dragged before the session engages does not count
-    tip.watch_for(0.7)
-    moved = tip.place - begin
-    print(f"moved {1e3 * moved} mm")
-    assert 0.02 < moved[0] < 0.055  # a page that draws slowly misses a part of the way, and adds nothing
-    assert np.linalg.norm(moved[1:]) < 0.005
+    first = tip.place
+    for _ in range(20):
+        begin, seen = tip.place, len(scenario.events["watcher"])
+        drawn, rejected = driver.evaluate("irisSession.view.drawn"), driver.evaluate(FEEDBACK)["rejected"]
+        with ThreadPoolExecutor(1) as thread:  # what is dragged before the session engages does not count
+            drag = thread.submit(driver.drag, ".drive .handle", 100, 0, seconds=DRAG_S)
+            tip.watch(drag.done, "the drag ends")
+            drag.result()
+        tip.watch_for(0.7)
+        moved = tip.place - begin
+        print(f"moved {1e3 * moved} mm")
+        assert moved[0] < 0.055
+        assert np.linalg.norm(moved[1:]) < 0.005
+        if moved[0] > 0.02 or tip.place[0] - first[0] > 0.02:
+            break
+        bodies = [event.body for event in scenario.events["watcher"][seen:]]
+        held = {b.reason for b in bodies if isinstance(b, EngagementChanged) and not b.engaged}
+        is_late = bool(held & LATE) or driver.evaluate(FEEDBACK)["rejected"] != rejected
+        assert is_late or driver.evaluate("irisSession.view.drawn") - drawn < 10 * DRAG_S, held
+    assert tip.place[0] - first[0] > 0.02
     assert words(driver).startswith("Held. Hold left Shift")
 
 
@@ -258,10 +317,20 @@ def test_a_gamepad_drives_until_it_is_unplugged_and_again_once_let_go(scenario: 
     tip = Tip(scenario)
     begin = tip.place
     driver.evaluate(PAD)
-    tip.watch_for(0.3)
+    wait_for_samples(tip, driver)
     assert np.linalg.norm(tip.place - begin) < REST_M  # the shoulder button is not held
-    driver.evaluate("void (window.shoulder = true)")
-    tip.watch(lambda: tip.place[1] - begin[1] > 0.03, "the gamepad moves the tip")
+    shoulder = "void (window.shoulder = {})"
+
+    def drive(distance: float) -> None:
+        drive_until(
+            driver,
+            tip,
+            lambda: bool(tip.place[1] - begin[1] > distance),
+            lambda: driver.evaluate(shoulder.format("true")),
+            lambda: driver.evaluate(shoulder.format("false")),
+        )
+
+    drive(0.03)
     unplugged_ms = driver.evaluate("irisSession.view.sessionTime()")
     driver.evaluate(UNPLUG)
     stopped_s = tip.measure_stop(unplugged_ms)
@@ -273,10 +342,9 @@ def test_a_gamepad_drives_until_it_is_unplugged_and_again_once_let_go(scenario: 
     begin = tip.place
     tip.watch_for(1.0)
     assert np.linalg.norm(tip.place - begin) < REST_M  # the shoulder button was held when the gamepad came
-    driver.evaluate("void (window.shoulder = false)")
-    tip.watch_for(0.3)
-    driver.evaluate("void (window.shoulder = true)")
-    tip.watch(lambda: tip.place[1] - begin[1] > 0.02, "the gamepad moves the tip again")
+    driver.evaluate(shoulder.format("false"))
+    wait_for_samples(tip, driver)
+    drive(0.02)
 
 
 # --- recording cameras ------------------------------------------------------------------------------------------------
@@ -340,20 +408,31 @@ def test_a_gripper_that_leaves_a_picture_is_warned_of(close_scenario: Scenario, 
     tip = Tip(close_scenario)
     middle = float(tip.place[2])
 
-    def drive_to(key: str, condition: Callable[[float], bool]) -> None:
+    def hold(key: str) -> None:
+        page.hold("Shift")
         page.hold(key)
-        tip.watch(lambda: condition(float(tip.place[2]) - middle), f"{key} moves the gripper there")
-        page.let_go(key)
-        tip.watch_for(1.0)
 
-    page.hold("Shift")
+    def let_go(key: str) -> None:
+        page.let_go(key)
+        page.let_go("Shift")
+
+    def drive_to(key: str, condition: Callable[[float], bool]) -> None:
+        def is_there() -> bool:
+            return condition(float(tip.place[2]) - middle)
+
+        drive_until(page, tip, is_there, lambda: hold(key), lambda: let_go(key))
+        let_go(key)
+        tip.watch_for(1.0)
+        wait_for_samples(tip, page)
+
     drive_to("r", lambda height: height > 0.045)
+    while tip.place[2] - middle > 0.08:  # the key was let go late
+        drive_to("f", lambda height: height < 0.07)
     assert page.evaluate(outside) == ""
     drive_to("r", lambda height: height > 0.09)  # the edge is 88 mm above the middle, the margin 4 mm
     page.wait(f"{outside} === 'Outside this picture: the gripper of left'")
     drive_to("f", lambda height: height < 0.06)
     page.wait(f"{outside} === ''")
-    page.let_go("Shift")
     page.reload()
     page.wait_until_ready()
     page.wait("document.querySelector('[data-camera=close]')")  # remembered

@@ -314,9 +314,7 @@ def test_a_reader_that_stops_gets_the_newest_afterwards(page: str) -> None:
             begin_ns = time.monotonic_ns()
             resume()
             await slow.wait(lambda: slow.states[-1][1] > begin_ns, "state comes")
-            await asyncio.sleep(0.3)
-            newest = [header for header, at_ns in slow.states if at_ns > begin_ns][-1]
-            assert newest.state_seq >= ann.states[-20][0].state_seq, "fresh again at once"
+            await slow.wait(lambda: slow.states[-1][0].state_seq >= ann.states[-20][0].state_seq, "fresh again")
             assert slow.close_code is None, "a pause of seconds is no reason to close"
 
     run(work())
@@ -399,7 +397,7 @@ def test_all_browsers_of_a_killed_gateway_resume_and_nothing_leaks(serve: Serve)
             print(f"eight browsers are back after {took_s:.2f} s")
             assert all(welcome.resumed for welcome in again)
             assert [w.participant_id for w in again] == [w.participant_id for w in welcomes if w]
-            assert took_s < 10.0
+            assert took_s < DEADLINE_S
             people = [p for p in (await tabs[0].snapshot()).participants if p.connected]
             assert sorted(p.name for p in people) == sorted([*names, "web"]), "no one is there twice"
             for tab in tabs:

@@ -212,8 +212,9 @@ def test_marks_align_and_a_touch_confirms_the_kept_place_after_a_reload(quest: M
     assert 0.0 < aligned.error_at_robot_m < 0.05
     quest.engage("left")
     quest.press("squeeze", 0.0)
-    quest.press("a-button", 1.0)
-    quest.run_until(lambda: host.mirror.episode is not None and host.mirror.episode.state == "running", "an episode")
+    quest.press_until(
+        "a-button", lambda: host.mirror.episode is not None and host.mirror.episode.state == "running", "an episode"
+    )
     quest.press("a-button", 0.0)
 
     quest.begin_another_frame()

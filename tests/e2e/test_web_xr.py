@@ -60,8 +60,7 @@ def test_a_robot_is_driven_in_ar(quest: EmulatedQuest) -> None:
     quest.run_until(lambda: arrives("controller/right", pose, 0.15), "the controller is near the origin of its ray")
 
     quest.wait(f"{HEADSET}.pointed.right === 'left'")
-    quest.press("trigger", 1.0)
-    quest.run_until(lambda: holder(host, "left") == person, "the robot is leased by pointing at it")
+    quest.press_until("trigger", lambda: holder(host, "left") == person, "the robot is leased by pointing at it")
     quest.press("trigger", 0.0)
     quest.wait(f"{HEADSET}.hands.driven.get('right') === 'left'")
 
@@ -75,8 +74,7 @@ def test_a_robot_is_driven_in_ar(quest: EmulatedQuest) -> None:
     assert now
     quest.place("quest.controllers.right", aim_at(now[0], 0.6))
     quest.wait(f"{HEADSET}.pointed.right === 'left'")
-    quest.press("trigger", 1.0)
-    quest.run_until(lambda: holder(host, "left") == "", "the robot is released by holding the trigger")
+    quest.press_until("trigger", lambda: holder(host, "left") == "", "the robot is released by holding the trigger")
     quest.press("trigger", 0.0)
 
     quest.press("thumbstick", 1.0)
@@ -97,8 +95,7 @@ def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     quest.enter("Enter VR")
     quest.wait(f"{HEADSET}.showsScene && {HEADSET}.props.urgent.shown.includes('To stay here')")
     assert quest.person.alignment is None  # a measurement may still align it
-    quest.tap_at_nothing()
-    quest.run_until(lambda: quest.is_aligned(AlignmentKind.PLACED), "a director is placed by its own word")
+    quest.tap_until(lambda: quest.is_aligned(AlignmentKind.PLACED), "a director is placed by its own word")
     assert (quest.person.id, holder(host, "left")) == (person, person)
 
     quest.engage("left")  # the robot that was leased before
@@ -117,8 +114,7 @@ def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     quest.evaluate("quest.recenter()")
     quest.run_until(lambda: quest.person.alignment is None, "another tracking frame is not aligned")
     quest.wait(f"{HEADSET}.props.urgent.shown.includes('To stay here')")
-    quest.tap_at_nothing()
-    quest.run_until(
+    quest.tap_until(
         lambda: (
             quest.is_aligned(AlignmentKind.PLACED)
             and quest.person.alignment is not None
@@ -153,14 +149,13 @@ def test_a_request_for_the_robot_is_answered_in_the_headset(quest: EmulatedQuest
         found: Any = quest.evaluate(f"{HEADSET}.consent.answers.{answer}")
         quest.place("quest.controllers.right", aim_at(apply(T_WORLD_TRACKING, tuple(found)), 0.4))
         quest.wait(f"{HEADSET}.aimed.right === '{answer}'")
-        quest.press("trigger", 1.0)
         replies: list[Reply] = []
 
         def has_reply() -> bool:
             replies.extend(filter(None, [ben.answer(request)]))
             return bool(replies)
 
-        quest.run_until(has_reply, f"Ben's request is answered: {answer}")
+        quest.press_until("trigger", has_reply, f"Ben's request is answered: {answer}")
         quest.press("trigger", 0.0)
         quest.wait(f"{HEADSET}.consent.answers === null")
         return replies[0]
@@ -176,8 +171,8 @@ def test_a_request_for_the_robot_is_answered_in_the_headset(quest: EmulatedQuest
     assert tip
     quest.place("quest.controllers.right", aim_at(tip[0], 0.6))
     quest.wait(f"{HEADSET}.pointed.right === 'left'")
-    quest.press("trigger", 1.0)
-    quest.wait(f'{HEADSET}.consent.question.shown.includes("waiting for ben\'s consent to left")')
+    asks = f'{HEADSET}.consent.question.shown.includes("waiting for ben\'s consent to left")'
+    quest.press_until("trigger", lambda: quest.evaluate(asks), "the headset asks Ben")
     quest.press("trigger", 0.0)
     asked = [e.body for e in quest.scenario.events["ben"] if isinstance(e.body, ConsentRequested)][-1]
     ben.consent(asked.consent_id, grant=True)
