@@ -20,7 +20,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from iris_session.bench.report import BenchError
+from iris_session.bench.report import BenchError, compute_percentile
 from iris_session.system.priority import freeze_garbage_collector, tick_priority
 from iris_session.system.process import child_environment, module_command
 
@@ -65,10 +65,10 @@ def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, floa
                 process.communicate()
     late = np.array(lateness) * 1e-6
     return {
-        "bare_age_ms_p50": round(float(np.percentile(ages, 50)), 3),
-        "bare_age_ms_p99": round(float(np.percentile(ages, 99)), 3),
+        "bare_age_ms_p50": compute_percentile(ages, 50),
+        "bare_age_ms_p99": compute_percentile(ages, 99),
         "bare_late_tick_share": round(float((late > PERIOD_NS * 1e-6).mean()), 6),
-        "bare_lateness_ms_p99": round(float(np.percentile(late, 99)), 3),
+        "bare_lateness_ms_p99": compute_percentile(late, 99),
     }
 
 

@@ -25,7 +25,7 @@ from iris_session.bench.cloud_clients import UNCHECKED, CloudStreamJob
 from iris_session.bench.cloud_clients import CloudColumn as Column
 from iris_session.bench.cloud_source import STREAM, MovingCloud, SourceJob
 from iris_session.bench.harness import Action, BenchRun, Log, Measurement, measure
-from iris_session.bench.report import Bar, BenchError, BenchReport, make_bar
+from iris_session.bench.report import Bar, BenchError, BenchReport, compute_percentile, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.netsim.process import make_link_address
 from iris_session.streams.cloud import decode_cloud, read_header
@@ -161,12 +161,12 @@ def summarize(
         "bytes_per_point": round(
             (whole[:, Column.SIZE].mean() + heads / len(clouds)) / whole[:, Column.POINTS].mean(), 4
         ),
-        "age_ms_p50": _percentile((rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * MS, 50),
-        "age_ms_p99": _percentile((rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * MS, 99),
-        "encode_ms_p50": _percentile(encode_ms, 50),
-        "encode_ms_p99": _percentile(encode_ms, 99),
-        "decode_ms_p50": _percentile(whole[:, Column.DECODED] * MS, 50),
-        "decode_ms_p99": _percentile(whole[:, Column.DECODED] * MS, 99),
+        "age_ms_p50": compute_percentile((rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * MS, 50),
+        "age_ms_p99": compute_percentile((rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * MS, 99),
+        "encode_ms_p50": compute_percentile(encode_ms, 50),
+        "encode_ms_p99": compute_percentile(encode_ms, 99),
+        "decode_ms_p50": compute_percentile(whole[:, Column.DECODED] * MS, 50),
+        "decode_ms_p99": compute_percentile(whole[:, Column.DECODED] * MS, 99),
         "max_error_mm": round(errors_m * 1e3, 5),
         "stated_error_mm": round(stated_m * 1e3, 5),
         "mbit_per_s": round(float(whole[:, Column.SIZE].mean()) * 8e-6 * hz, 1),
@@ -278,7 +278,3 @@ def _compare(clouds: NDArray[Any], runs: Sequence[dict[str, Any]], cloud: Moving
         worst_m = max(worst_m, float(np.linalg.norm(decoded - cloud.sort(number / hz), axis=1).max()))
         stated_m = min(stated_m, read_header(whole).quantum_error_m)
     return worst_m, stated_m
-
-
-def _percentile(values: NDArray[Any], q: float) -> float:
-    return round(float(np.percentile(values, q)), 3) if len(values) else float("inf")

@@ -18,7 +18,7 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloth_motion import HZ, ClothMotion, load_cloth_motion
 from iris_session.bench.deformable_clients import DeformableJob
 from iris_session.bench.harness import Log, Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import NO_BARS, BenchError, BenchReport, make_bar
+from iris_session.bench.report import NO_BARS, BenchError, BenchReport, compute_percentile, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.names import BudgetClass
 from iris_session.session.session import Session
@@ -144,16 +144,16 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
     superseded, dropped, malformed, overflow, heads = np.sum([log["counts"] for log in logs], axis=0).tolist()
     sent = sizes.sum() + np.count_nonzero(sizes) * heads / len(ages)
     return {
-        "encode_ms_p50": _percentile(spent[:, 0], 50),
-        "encode_ms_p99": _percentile(spent[:, 0], 99),
+        "encode_ms_p50": compute_percentile(spent[:, 0], 50),
+        "encode_ms_p99": compute_percentile(spent[:, 0], 99),
         "mbit_per_s": round(float(sent) * 8e-6 / got.seconds, 3),
         "max_error_mm": round(_compute_max_error_m(got.logs, source) * 1e3, 5),
         "delivered_hz_min": round(min(len(log["handed_ns"]) for log in logs) / got.seconds, 2),
-        "encode_cpu_ms_p50": _percentile(spent[:, 1], 50),
-        "encode_cpu_ms_p99": _percentile(spent[:, 1], 99),
-        "decode_cpu_ms_p50": _percentile(decode, 50),
-        "age_ms_p50": _percentile(ages, 50),
-        "age_ms_p99": _percentile(ages, 99),
+        "encode_cpu_ms_p50": compute_percentile(spent[:, 1], 50),
+        "encode_cpu_ms_p99": compute_percentile(spent[:, 1], 99),
+        "decode_cpu_ms_p50": compute_percentile(decode, 50),
+        "age_ms_p50": compute_percentile(ages, 50),
+        "age_ms_p99": compute_percentile(ages, 99),
         "bytes_per_frame": round(float(sizes[sizes > 0].mean()), 1),
         "frames_encoded": len(spent),
         "frames_refused": source.refused,
@@ -210,8 +210,8 @@ def _measure_offline(motion: ClothMotion, topology: DeformableTopology) -> dict[
     pairs = range(0, len(motion.nodes) - 1, _SAMPLE)
     steps = np.stack([motion.vertices(index + 1) - motion.vertices(index) for index in pairs])
     speeds = np.linalg.norm(steps, axis=2) * HZ
-    found["vertex_speed_m_per_s_p50"] = _percentile(speeds, 50)
-    found["vertex_speed_m_per_s_p99"] = _percentile(speeds, 99)
+    found["vertex_speed_m_per_s_p50"] = compute_percentile(speeds, 50)
+    found["vertex_speed_m_per_s_p99"] = compute_percentile(speeds, 99)
     return found
 
 
@@ -227,9 +227,5 @@ def _measure_reference(motion: ClothMotion) -> dict[str, float]:
     return {
         "float32_mbit_per_s": round(12 * motion.n_vertices * HZ * 8e-6, 3),
         "float32_zstd_mbit_per_s": round(float(np.mean(sizes)) * HZ * 8e-6, 3),
-        "float32_zstd_encode_ms_p50": _percentile(np.array(spent_ns) * 1e-6, 50),
+        "float32_zstd_encode_ms_p50": compute_percentile(np.array(spent_ns) * 1e-6, 50),
     }
-
-
-def _percentile(values: np.ndarray[Any, Any], q: float) -> float:
-    return round(float(np.percentile(values, q)), 3)

@@ -10,7 +10,7 @@ import numpy as np
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import NO_BARS, BenchReport, make_bar
+from iris_session.bench.report import NO_BARS, BenchReport, compute_percentile, make_bar
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.protocol.names import Device
@@ -56,8 +56,8 @@ def run_input(
     tick_ms = model.opt.timestep * 1e3
     received = sum(map(len, got.received.values()))
     results: dict[str, Any] = {
-        "response_ms_p50": round(float(np.percentile(responses, 50)), 3) if len(responses) else float("inf"),
-        "response_ms_p99": round(float(np.percentile(responses, 99)), 3) if len(responses) else float("inf"),
+        "response_ms_p50": compute_percentile(responses, 50),
+        "response_ms_p99": compute_percentile(responses, 99),
         "samples_followed": len(responses),
         "late_tick_share": round(got.stats.late_share, 6),
         "lateness_ms_p99": round(got.stats.p99_ns * 1e-6, 3),

@@ -12,7 +12,9 @@ from importlib.metadata import version
 from typing import Any, Final
 
 import msgspec
+import numpy as np
 import psutil
+from numpy.typing import NDArray
 
 VERSION: Final = 1
 #: Parameter `bars` of a benchmark over an impaired link.
@@ -143,6 +145,11 @@ def flatten(results: dict[str, Any]) -> dict[str, Any]:
         else:
             out[key] = value
     return out
+
+
+def compute_percentile(values: NDArray[Any], q: float) -> float:
+    """Return a percentile of values, to three decimals; infinite, so null in a report, where there are none."""
+    return round(float(np.percentile(values, q)), 3) if len(values) else math.inf
 
 
 def _replace_infinite(value: Any) -> Any:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import CLIENTS_PER_PROCESS, Action, BenchRun, Log, assign_links, group_clients, measure
-from iris_session.bench.report import NO_BARS, BenchReport, make_bar
+from iris_session.bench.report import NO_BARS, BenchReport, compute_percentile, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.netsim.process import make_link_address
 
@@ -131,7 +131,7 @@ def measure_others_p99(logs: dict[str, Log], names: list[str], begin_ns: int, in
         (log["handed_ns"] - log["state_ns"])[_select_between(log, begin_ns, interval.stall_s, interval.end_s)]
         for log in (logs[name] for name in names)
     ]
-    return float(np.percentile(np.concatenate(ages), 99)) * 1e-6
+    return compute_percentile(np.concatenate(ages) * 1e-6, 99)
 
 
 def _select_between(log: Log, begin_ns: int, from_s: float, to_s: float) -> NDArray[np.bool_]:

@@ -10,7 +10,7 @@ import numpy as np
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import NO_BARS, BenchReport, make_bar
+from iris_session.bench.report import NO_BARS, BenchError, BenchReport, compute_percentile, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 
 #: The bar applies under input: this many of the clients send 3 devices x 72 Hz of samples.
@@ -51,16 +51,18 @@ def run_state(
     progress("comparing every delivered frame with the state at its tick")
     ages = np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
     inside = np.concatenate([(log["published_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
+    if not len(ages):
+        raise BenchError("no client received state: increase --seconds")
     position_mm, rotation_deg = compute_errors(got)
     messages = sum(int(log["counts"][3]) for log in got.logs.values())
     total = sum(int(log["counts"][4]) for log in got.logs.values())
     results: dict[str, Any] = {
         "delivered_hz_min": round(min(len(log["ticks"]) for log in got.logs.values()) / got.seconds, 2),
-        "age_ms_p50": round(float(np.percentile(ages, 50)), 3),
-        "age_ms_p95": round(float(np.percentile(ages, 95)), 3),
-        "age_ms_p99": round(float(np.percentile(ages, 99)), 3),
-        "age_at_publish_ms_p50": round(float(np.percentile(inside, 50)), 3),
-        "age_at_publish_ms_p99": round(float(np.percentile(inside, 99)), 3),
+        "age_ms_p50": compute_percentile(ages, 50),
+        "age_ms_p95": compute_percentile(ages, 95),
+        "age_ms_p99": compute_percentile(ages, 99),
+        "age_at_publish_ms_p50": compute_percentile(inside, 50),
+        "age_at_publish_ms_p99": compute_percentile(inside, 99),
         "bytes_per_frame": round(total / messages, 1),
         "bytes_per_body": round(total / messages / bodies, 2),
         "max_position_error_mm": round(position_mm, 5),

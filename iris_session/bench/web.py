@@ -19,7 +19,7 @@ import psutil
 from iris_session.bench.chromium import MissingToolError, find_tools
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import Action, BenchRun, Log, Measurement, group_clients, measure
-from iris_session.bench.report import Bar, BenchError, BenchReport, make_bar
+from iris_session.bench.report import Bar, BenchError, BenchReport, compute_percentile, make_bar
 from iris_session.bench.slow_client import (
     BASELINE,
     SHORTEST_S,
@@ -187,7 +187,7 @@ def compute_rate(log: Log, seconds: float) -> float:
 def summarize_ages(logs: Sequence[Log]) -> dict[str, float]:
     """Return percentiles of the ages at all clients of `logs` [ms]."""
     ages = np.concatenate([compute_ages(log) for log in logs])
-    return {f"age_ms_p{p}": _percentile(ages, p) for p in (50, 95, 99)}
+    return {f"age_ms_p{p}": compute_percentile(ages, p) for p in (50, 95, 99)}
 
 
 def summarize_browsers(
@@ -246,19 +246,19 @@ def summarize_tab(log: Log, stops: Sequence[tuple[int, int]]) -> dict[str, Any]:
     return {
         "tab_state_hz": round(float(log["hz"][0]), 2),
         "tab_drawn_hz": round(float(log["hz"][1]), 2),
-        "tab_age_ms_p50": _percentile(log["ages_ms"], 50),
-        "tab_age_ms_p99": _percentile(log["ages_ms"], 99),
-        "js_ms_per_frame_p50": _percentile(log["js_ms"], 50),
-        "js_ms_per_frame_p99": _percentile(log["js_ms"], 99),
-        "render_ms_per_frame_p50": _percentile(log["render_ms"], 50),
+        "tab_age_ms_p50": compute_percentile(log["ages_ms"], 50),
+        "tab_age_ms_p99": compute_percentile(log["ages_ms"], 99),
+        "js_ms_per_frame_p50": compute_percentile(log["js_ms"], 50),
+        "js_ms_per_frame_p99": compute_percentile(log["js_ms"], 99),
+        "render_ms_per_frame_p50": compute_percentile(log["render_ms"], 50),
         "heap_mib": {f"{at_s:.0f} s": round(float(heap), 2) for at_s, heap, _ in memory},
         "heap_growth_mib": round(float(memory[-1, 1] - memory[min(1, len(memory) - 2), 1]), 2),
         "tab_memory_mib": {f"{at_s:.0f} s": round(float(resident), 1) for at_s, _, resident in memory},
         "estops": len(pairs),
-        "estop_ms_p50": _percentile(total, 50),
-        "estop_ms_max": _percentile(total, 100),
-        "estop_click_to_front_ms_p50": _percentile(sending, 50),
-        "estop_front_to_hold_ms_p50": _percentile(holding, 50),
+        "estop_ms_p50": compute_percentile(total, 50),
+        "estop_ms_max": compute_percentile(total, 100),
+        "estop_click_to_front_ms_p50": compute_percentile(sending, 50),
+        "estop_front_to_hold_ms_p50": compute_percentile(holding, 50),
         "tab_renderer": str(log["renderer"][0]),
     }
 
@@ -277,10 +277,6 @@ def _summarize_session(got: Measurement) -> dict[str, Any]:
         "scheduling": got.scheduling,
         "drops": got.drops,
     }
-
-
-def _percentile(values: np.ndarray[Any, Any], q: float) -> float:
-    return round(float(np.percentile(values, q)), 3) if len(values) else math.inf
 
 
 # --- actions ----------------------------------------------------------------------------------------------------------

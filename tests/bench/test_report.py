@@ -101,11 +101,15 @@ def test_benchmarks_over_an_impaired_link(tmp_path: Path, arguments: tuple[str, 
     folder = tmp_path / "empty"
     folder.mkdir()
     people = ("--clients", "1") if arguments[0] == "state" else ("--observers", "0")
-    result = _bench(folder, *arguments, *people, "--seconds", SECONDS, "--profile", str(slow))
+    key = "age_ms_p50" if arguments[0] == "state" else "response_ms_p50"
+    for _ in range(3):
+        result = _bench(folder, *arguments, *people, "--seconds", SECONDS, "--profile", str(slow))
+        if result["results"][key] is not None:  # null: a busy machine has disconnected the operator
+            break
+    assert result["results"][key] > 50.0
     assert result["bars"] == []
     assert result["params"]["profile"] == str(slow)
     assert "include the link" in result["params"]["bars"]
-    assert result["results"]["age_ms_p50" if arguments[0] == "state" else "response_ms_p50"] > 50.0
 
 
 def test_unknown_profile_is_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
