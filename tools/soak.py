@@ -438,14 +438,19 @@ def check_log(name: str, records: list[tuple[Any, ...]], recorded: dict[int, int
 
 
 def check_memory(rss: dict[str, list[tuple[float, float]]]) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Return resident memory per process over the second half of the run [MiB]: start, end, slope per hour."""
+    """Return resident memory per process over the second half of the run [MiB]: start, end, growth per hour.
+
+    Growth is that of the lowest value, from the third quarter to the last. Above it memory comes and goes with the
+    load, by 10 MiB in the recorder, and is highest at the end, when all operators drive.
+    """
     figures: dict[str, dict[str, float]] = {}
     problems: list[str] = []
     for name, series in rss.items():
         half = np.array(series[len(series) // 2 :])
         if len(half) < 4:
             continue
-        slope = float(np.polyfit(half[:, 0] - half[0, 0], half[:, 1], 1)[0])
+        third, last = half[: len(half) // 2], half[len(half) // 2 :]
+        slope = float((last[:, 1].min() - third[:, 1].min()) / (last[0, 0] - third[0, 0]))
         growth = slope * float(half[-1, 0] - half[0, 0])
         figures[name] = {
             "mib": round(float(half[-1, 1]), 1),

@@ -54,7 +54,10 @@ def test_event_check_finds_gaps_repeats_and_changes() -> None:
 def test_memory_check_finds_only_a_leak() -> None:
     flat = [(float(t), 100.0 + t % 3) for t in range(60)]
     warming = [(float(t), 100.0 + min(t, 20)) for t in range(60)]
+    busy = [(float(t), 100.0 + 5.0 * (t % 7) + 20.0 * (t > 50)) for t in range(60)]
     leaking = [(float(t), 100.0 + 0.3 * t) for t in range(60)]
-    figures, problems = check_memory({"front": flat, "recorder": warming, "authority": leaking})
-    assert [p.split()[2] for p in problems] == ["authority"]
+    busy_and_leaking = [(t, a + b) for (t, a), (_, b) in zip(busy, leaking, strict=True)]
+    series = {"front": flat, "recorder": warming, "gateway": busy, "authority": leaking, "camera": busy_and_leaking}
+    figures, problems = check_memory(series)
+    assert [p.split()[2] for p in problems] == ["authority", "camera"]
     assert figures["authority"]["mib_per_hour"] == pytest.approx(1080.0)
