@@ -52,7 +52,7 @@ class Decided(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Handback(msgspec.Struct, frozen=True, array_like=True):
-    """What the next front gets. `state`: opaque bytes. `step`: of the newest `Decided` that they are after."""
+    """State of the front for its successor. `state`: opaque bytes. `step`: that of the newest `Decided` before it."""
 
     step: int
     state: bytes
