@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from iris_session.client import Client
-from iris_session.client import client as client_module
-from tests.client.harness import PATIENCE_NS, LiveSession
+from tests.client.harness import PATIENCE_NS, LiveSession, let_clients_wait
 from tests.loopback import make_loopback_address
 
 #: Default of the client's waits in these tests: a busy machine may stop a process for seconds.
@@ -17,9 +16,7 @@ DEADLINE_S = 30.0
 
 @pytest.fixture(autouse=True)
 def _wait_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client_module, "DEFAULT_TIMEOUT_S", DEADLINE_S)
-    for waiting in (Client.connect, Client.wait_for, Client.status, Client.request):
-        monkeypatch.setattr(waiting, "__defaults__", (DEADLINE_S,))
+    let_clients_wait(monkeypatch, DEADLINE_S)
 
 
 @pytest.fixture

@@ -11,8 +11,11 @@ from collections import deque
 
 import msgspec
 import numpy as np
+import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
+from iris_session.client import Client
+from iris_session.client import client as client_module
 from iris_session.link import FrontConfig, FrontProcess, SceneInfo
 from iris_session.protocol.client_messages import Control, Sample
 from iris_session.protocol.common import IDENTITY, Pose
@@ -36,6 +39,13 @@ def scene() -> SceneInfo:
     poses = np.zeros((len(BODIES), 7))
     poses[:, 3] = 1.0
     return SceneInfo("hash", robots, bodies, poses.tobytes())
+
+
+def let_clients_wait(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    """Let clients wait so long by default: a busy machine may stop a process for seconds."""
+    monkeypatch.setattr(client_module, "DEFAULT_TIMEOUT_S", seconds)
+    for waiting in (Client.connect, Client.wait_for, Client.status, Client.request):
+        monkeypatch.setattr(waiting, "__defaults__", (seconds,))
 
 
 class LiveSession:

@@ -56,7 +56,7 @@ def store(tmp_path: Path) -> Store:
 
 @pytest.fixture
 def live(store: Store) -> Iterator[LiveSession]:
-    host = make_loopback_address()  # whose ports nobody takes while the front is replaced
+    host = make_loopback_address()  # no other test takes its ports while the front is replaced
     live = LiveSession(host=host, asset_root=str(store.root), assets=(*store.addresses, "0" * 64))
     yield live
     live.close()

@@ -37,7 +37,7 @@ class Lab:
         self.mine = KeyHome(folder / "mine")
         self.name = f"lab-{secrets.token_hex(4)}"
         self.session = LiveSession(
-            host=make_loopback_address(),  # whose ports nobody takes between two sessions
+            host=make_loopback_address(),  # no other test takes its ports between two sessions
             curve=True,
             key_home=str(folder / "server"),
             session_name=self.name,

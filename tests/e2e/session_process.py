@@ -165,9 +165,11 @@ class SessionProcess:
 
     def count_recorded_rows(self) -> int:
         """Return how many steps are in the file so far; on a busy machine none for seconds."""
-        with contextlib.suppress(NotARecordingError), Recording.open(self.recording, warn=False) as recording:
-            return recording.count_rows()
-        return 0
+        try:
+            with Recording.open(self.recording, warn=False) as recording:
+                return recording.count_rows()
+        except (NotARecordingError, RuntimeError):  # not begun; of Rerun: a message was partly written
+            return 0
 
     def verify(self) -> dict[str, Any]:
         """Verify the recording, which must be identical. Return the report of `iris-session verify --json`."""

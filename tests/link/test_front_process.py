@@ -129,7 +129,7 @@ def test_unusable_keys_are_named(tmp_path: Path, secret_file: str, folder: str, 
 
 
 def test_restarted_front_is_waited_for() -> None:
-    config = FrontConfig(host=make_loopback_address(), control_port=0, state_port=0)  # whose ports nobody takes
+    config = FrontConfig(host=make_loopback_address(), control_port=0, state_port=0)  # no other test takes its ports
     process = FrontProcess(config, scene())
     ports = process.start()
     os.kill(process.pid, signal.SIGKILL)

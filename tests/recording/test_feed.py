@@ -472,7 +472,7 @@ def test_unread_vertices_are_dropped_and_counted_and_the_journal_continues(
     square: bytes,
 ) -> None:
     recorder, endpoint = played
-    feed = RecorderFeed(endpoint, vertices_endpoint=f"ipc://{tmp_path}/nobody")
+    feed = RecorderFeed(endpoint, vertices_endpoint=f"ipc://{tmp_path}/unread")
     feed.send_header(make_header())
     for i in range(VERTEX_FRAMES + 7):
         feed.send_vertices("flex-0", square, i * 50_000_000)

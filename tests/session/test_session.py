@@ -302,7 +302,7 @@ def test_incomplete_recording_is_reported(tmp_path: Path, monkeypatch: pytest.Mo
         monkeypatch.setattr(processes, waiting, 60.0)
     before = time.monotonic()
     assert not session.close()
-    assert time.monotonic() - before < 50.0, "nobody waits for a recorder that is gone"
+    assert time.monotonic() - before < 50.0, "the end does not wait for a recorder that is gone"
     assert "killed by signal 9" in session.recording_fault
 
 
