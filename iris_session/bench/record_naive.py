@@ -1,7 +1,7 @@
-"""Reference of `bench record`: what Rerun's own calls make of the same values, without a journal and raw messages.
+"""References of `bench record`: what Rerun's own calls make of the same values, without a journal and raw messages.
 
-One entity per body, device and series, one row per state, on the four timelines of a recording; `rerun.send_columns`
-in batches, which is the smallest of the usual ways to log. The geometry of the scene is in the file once.
+One entity per body, device and series, one row per state, on the four timelines of a recording. The geometry of the
+scene is in the file once. The length of the batches decides about the size, since a short chunk is mostly its schema.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from iris_session.recording.record_batches import read_index
 from iris_session.recording.rrd_file import read_chunks
 from iris_session.recording.timelines import Moment, to_time_columns
 
-#: Length of a batch. Rerun's own batches are much shorter, and a chunk is mostly its schema.
-BATCH_S: Final = 8.0
+#: Session time of a batch: of `rerun.log`, whose batcher writes after 0.2 s (`ChunkBatcherConfig.flush_tick`), and of
+#: a program that collects columns as long as a recorder does.
+LOG_BATCH_S: Final = 0.2
+COLUMNS_BATCH_S: Final = 8.0
 _SCALARS: Final = "Scalars:scalars"
 _TIMELINES: Final = (paths.STEP, paths.SIM_TIME, paths.SESSION_TIME, paths.WALL_TIME)
 _Rows = dict[str, list[tuple[Moment, list[float]]]]
 
 
-def write_naive_log(recording: Recording, output: Path) -> int:
-    """Log the values of a recording to `output`. Return its size [bytes]."""
+def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
+    """Log the values of a recording to `output`, in batches of so much session time. Return its size [bytes]."""
     log = rr.RecordingStream("naive", recording_id="naive")
     log.set_log_time_enabled(False)
     log.save(output)
@@ -39,12 +41,12 @@ def write_naive_log(recording: Recording, output: Path) -> int:
         picture = ScenePicture(log)
         picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
         picture.draw(first)
-    for rows in _split(_list_poses(states, recording.header.origin_utc_ns)):
+    for rows in _split(_list_poses(states, recording.header.origin_utc_ns), batch_s):
         for entity, taken in rows.items():
             poses = np.array([pose for _, pose in taken], np.float32)
             columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]])
             _send(log, entity, [moment for moment, _ in taken], columns)
-    for rows in _split(sorted(_list_scalars(recording), key=lambda row: row[1].session_ns)):
+    for rows in _split(sorted(_list_scalars(recording), key=lambda row: row[1].session_ns), batch_s):
         for entity, taken in rows.items():
             values = np.array([row for _, row in taken], np.float64)
             columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
@@ -79,12 +81,12 @@ def _list_scalars(recording: Recording) -> Iterator[tuple[str, Moment, list[floa
                 yield str(chunk.entity_path), Moment(*moment), values
 
 
-def _split(rows: Iterable[tuple[str, Moment, list[float]]]) -> Iterator[_Rows]:
-    """Collect rows in order of time by entity, in batches of `BATCH_S`."""
+def _split(rows: Iterable[tuple[str, Moment, list[float]]], batch_s: float) -> Iterator[_Rows]:
+    """Collect rows in order of time by entity, in batches."""
     begin_ns: int | None = None
     batch: _Rows = {}
     for entity, moment, values in rows:
-        if begin_ns is None or not 0 <= moment.session_ns - begin_ns < BATCH_S * 1e9:
+        if begin_ns is None or not 0 <= moment.session_ns - begin_ns < batch_s * 1e9:
             if batch:
                 yield batch
             begin_ns, batch = moment.session_ns, {}

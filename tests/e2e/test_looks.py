@@ -1,4 +1,4 @@
-"""Recordings of real sessions in Rerun's viewer, checked by `tools/look_at_recordings.py`."""
+"""Recordings of real sessions in Rerun's viewer, checked by `tools/look_at_recordings.py`, and in its dataframes."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from tests.e2e.session_process import (
 )
 from tests.loopback import make_loopback_address
 from tests.models import robot_models
+from tests.recording.dataframes import compare_dataframes
 from tools.look_at_recordings import MissingViewerError, check_file, look_at
 
 __all__ = ["robot_models"]
@@ -126,6 +127,12 @@ def test_eventful_session_is_seen_without_errors(sessions: Sessions) -> None:
     assert_looks_right(sessions.eventful)
 
 
+def test_dataframes_of_rerun_have_every_row_of_an_eventful_session(sessions: Sessions) -> None:
+    n, problems = compare_dataframes(sessions.eventful)
+    assert not problems
+    assert n > 10_000
+
+
 def test_killed_session_is_seen_without_errors(sessions: Sessions, tmp_path: Path) -> None:
     """Both parts, without the recording that continues it."""
     for name in ("session.rrd", "session.part2.rrd"):
@@ -150,5 +157,7 @@ def test_session_that_was_cut_in_a_message_is_seen_without_errors(sessions: Sess
 def test_demos_are_seen_without_errors(demo: str, tmp_path: Path) -> None:
     done = run_command("demo", demo, *DEMO_OPTIONS, cwd=tmp_path, timeout_s=DEMO_S)
     assert done.stdout, done.stderr[-3000:]
-    recording = json.loads(done.stdout)["recording"]  # whether its operators succeeded does not matter here
-    assert_looks_right(Path(tmp_path, recording))
+    # Whether its operators succeeded does not matter here.
+    recording = Path(tmp_path, json.loads(done.stdout)["recording"])
+    assert_looks_right(recording)
+    assert not compare_dataframes(recording)[1]
