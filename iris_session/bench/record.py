@@ -27,7 +27,7 @@ import psutil
 
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.harness import ClientProcess, Measurement, group_clients, measure
-from iris_session.bench.record_naive import COLUMNS_BATCH_S, LOG_BATCH_S, write_naive_log
+from iris_session.bench.record_naive import LOG_BATCH_S, LONG_BATCH_S, write_naive_log
 from iris_session.bench.record_session import BODIES, OPERATORS, BenchSession, SessionJob, make_record_scene
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.demo.scenes.generators import arm_names
@@ -71,11 +71,14 @@ class Kill(NamedTuple):
 
 
 class FileSize(NamedTuple):
-    """Size of a recording, of a naive log and of columns with its values [bytes], and their session time [s]."""
+    """Size of a recording and of naive logs of its values [bytes], and their session time [s].
+
+    `naive`: in long batches; `live`: in those of `rerun.log`.
+    """
 
     recorded: int
     naive: int
-    columns: int
+    live: int
     duration_s: float
 
 
@@ -109,7 +112,7 @@ def run_record(
             drops |= got.drops if recorded else {}
             if recorded:
                 _wait_for_index(path)
-        progress("writing the same values as a naive log, and as columns")
+        progress("writing the same values as naive logs")
         sizes = [measure_size(folder / f"round{i}.rrd", folder) for i in range(2 * rounds) if i % 4 in (0, 3)]
         losses, missing = _kill_sessions(folder, kills, seed, progress)
     results = summarize_rounds(measured) | summarize_sizes(sizes) | summarize_kills(losses)
@@ -142,14 +145,14 @@ def _wait_for_index(path: Path) -> None:
 
 
 def measure_size(path: Path, folder: Path) -> FileSize:
-    """Compare the size of a recording with those of logs of its values, which are written into `folder`."""
+    """Compare the size of a recording with those of naive logs of its values, which are written into `folder`."""
     with Recording.open(path) as recording:
         times = [row.now_ns for row in recording.rows()]
         if len(times) < 2:
             raise BenchError("a recording has no rows")
-        naive = write_naive_log(recording, folder / "naive.rrd", LOG_BATCH_S)
-        columns = write_naive_log(recording, folder / "columns.rrd", COLUMNS_BATCH_S)
-        return FileSize(path.stat().st_size, naive, columns, (times[-1] - times[0]) * 1e-9)
+        naive = write_naive_log(recording, folder / "naive.rrd", LONG_BATCH_S)
+        live = write_naive_log(recording, folder / "live.rrd", LOG_BATCH_S)
+        return FileSize(path.stat().st_size, naive, live, (times[-1] - times[0]) * 1e-9)
 
 
 def summarize_rounds(rounds: Sequence[Round]) -> dict[str, Any]:
@@ -172,14 +175,14 @@ def summarize_rounds(rounds: Sequence[Round]) -> dict[str, Any]:
 
 
 def summarize_sizes(sizes: Sequence[FileSize]) -> dict[str, Any]:
-    """Return the size of recordings per minute, beside those of naive logs and of columns."""
-    recorded, naive, columns, duration_s = (sum(values) for values in zip(*sizes, strict=True))
+    """Return the size of recordings per minute, beside those of naive logs."""
+    recorded, naive, live, duration_s = (sum(values) for values in zip(*sizes, strict=True))
     return {
         "mb_per_min": round(recorded * 60e-6 / duration_s, 2),
         "naive_mb_per_min": round(naive * 60e-6 / duration_s, 2),
-        "columns_mb_per_min": round(columns * 60e-6 / duration_s, 2),
+        "live_log_mb_per_min": round(live * 60e-6 / duration_s, 2),
         "size_ratio": round(recorded / naive, 3),
-        "columns_size_ratio": round(recorded / columns, 3),
+        "live_log_size_ratio": round(recorded / live, 3),
     }
 
 

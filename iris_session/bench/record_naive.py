@@ -21,10 +21,10 @@ from iris_session.recording.record_batches import read_index
 from iris_session.recording.rrd_file import read_chunks
 from iris_session.recording.timelines import Moment, to_time_columns
 
-#: Session time of a batch: of `rerun.log`, whose batcher writes after 0.2 s (`ChunkBatcherConfig.flush_tick`), and of
-#: a program that collects columns as long as a recorder does.
+#: Session time of a batch: of a program that collects for `rerun.send_columns` as long as a recorder does, and of one
+#: that calls `rerun.log`, whose batcher writes after 0.2 s (`ChunkBatcherConfig.flush_tick`).
+LONG_BATCH_S: Final = 8.0
 LOG_BATCH_S: Final = 0.2
-COLUMNS_BATCH_S: Final = 8.0
 _SCALARS: Final = "Scalars:scalars"
 _TIMELINES: Final = (paths.STEP, paths.SIM_TIME, paths.SESSION_TIME, paths.WALL_TIME)
 _Rows = dict[str, list[tuple[Moment, list[float]]]]
