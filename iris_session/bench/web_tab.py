@@ -81,12 +81,12 @@ _PROBE: Final = """
       listener.call(this, event);
     }));
   } });
-  for (const name of ["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"]) {
-    const draw = WebGL2RenderingContext.prototype[name];
-    WebGL2RenderingContext.prototype[name] = function (...given) {
-      if (!bench.skipsDraws) draw.apply(this, given);
-    };
-  }
+  bench.skipDraws = () => {
+    bench.skipsDraws = true;
+    for (const name of ["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"]) {
+      WebGL2RenderingContext.prototype[name] = () => undefined;
+    }
+  };
   window.addEventListener("click", (event) => {
     if (event.target.closest("#estop")) clicks.push(performance.timeOrigin + event.timeStamp);
   }, { capture: true });
@@ -134,7 +134,7 @@ class BenchTab:
             self._call("press", key="Enter")
         self._wait(_READY)
         self._call("evaluate", script="irisSession.view.scene.complete.then(() => null)")
-        self._call("evaluate", script=f"void (irisBench.skipsDraws = {_IS_SOFTWARE})")
+        self._call("evaluate", script=f"{_IS_SOFTWARE} && irisBench.skipDraws()")
 
     def measure(self, begin_ns: int, end_ns: int) -> None:
         """Measure a window of session time [ns], the last seconds of which are for e-stops."""

@@ -54,6 +54,6 @@ test("a cloud or a picture that came is taken, so that the worker passes on the 
   const client = new WorkerClient(port);
   client.on("picture", () => undefined);
   port.say({ type: "picture", stream: "front", bitmap: {} as ImageBitmap, capture_ms: 1, received_ms: 1 });
-  port.say({ type: "deformable", stream: "cloth", vertices: new Float32Array(), session_ms: 1, scene_epoch: 1, seq: 1, bound_m: 0 });
+  port.say({ type: "deformable", stream: "cloth", vertices: new Float32Array(), surface: null, session_ms: 1, scene_epoch: 1, seq: 1, bound_m: 0 });
   expect(port.posted).toEqual([{ type: "taken", stream: "front" }]);
 });

@@ -5,6 +5,7 @@ import { beforeEach, describe, expect, test } from "vitest";
 import type { FromWorker, ToWorker } from "../src/core/api.ts";
 import { ClientWorker } from "../src/core/client_worker.ts";
 import { decodeClient, encodeStruct } from "../src/core/codec.ts";
+import { decodeTopology } from "../src/core/deformable.ts";
 import { decodeValue, encodeValue } from "../src/core/msgpack.ts";
 import { hashSecret, makeProof, stretchCode } from "../src/core/pairing.ts";
 import type { SocketLike } from "../src/core/pairing_client.ts";
@@ -516,14 +517,19 @@ describe("assets and media", () => {
   };
 
   /** A scene with a cloth, and its asset. */
-  const addCloth = (): string => {
+  const addCloth = (elements = Uint32Array.from(decodeTopology(fromHex(cloth.topology)).faces)): string => {
     const plan = fromHex(cloth.topology);
-    const info = { name: "plan", dtype: "u1", shape: [plan.length], bytes: plan.length };
-    const header = encodeStruct("ArrayHeader", { kind: "deformable", arrays: [info] });
+    const infos = [
+      { name: "plan", dtype: "u1", shape: [plan.length], bytes: plan.length },
+      { name: "elements", dtype: "u4", shape: [elements.length / 3, 3], bytes: elements.byteLength },
+      { name: "uv", dtype: "f4", shape: [elements.length / 3, 3, 2], bytes: 2 * elements.byteLength },
+    ];
+    const uv = new Uint8Array(2 * elements.byteLength);
+    const header = encodeStruct("ArrayHeader", { kind: "deformable", arrays: infos });
     const prefix = new Uint8Array(8);
     prefix.set(new TextEncoder().encode("IRA1"));
     new DataView(prefix.buffer).setUint32(4, header.length, true);
-    const asset = new Uint8Array(Buffer.concat([prefix, header, plan]));
+    const asset = new Uint8Array(Buffer.concat([prefix, header, plan, new Uint8Array(elements.buffer), uv]));
     const look = { name: "cloth", dim: 2, group: 0, vertices: 30, elements: 40, radius: 0.001, flat: false, material: -1, rgba: [1, 1, 1, 1] };
     const address = addAsset(asset);
     return addAsset(encodeStruct("SceneSpec", { deformables: [{ ...look, stream: "cloth", address, bytes: asset.length }] }));
@@ -600,6 +606,10 @@ describe("assets and media", () => {
     media.deliver(3, new TextEncoder().encode("media/1/cloth/full"), header, fromHex((cloth.frames[0] as { hex: string }).hex));
     expect(bench.last("deformable")).toMatchObject({ stream: "cloth", seq: 7, scene_epoch: 1 });
     expect(bench.last("deformable").vertices).toHaveLength(90);
+    const { position, normal } = bench.last("deformable").surface!;
+    expect(position.length).toBe(normal.length);
+    expect(position.length).toBeGreaterThan(2 * 90); // both sides, and the rim
+    expect([...position, ...normal].every(Number.isFinite)).toBe(true);
     media.deliver(3, new Uint8Array(), encodeStruct("MediaHeader", ["cloud", "full", 1, 7, 1, 2]), new Uint8Array([1, 2]));
     expect(bench.last("media").bytes).toEqual(new Uint8Array([1, 2]));
     media.deliver(3, new Uint8Array(), header, new Uint8Array([1, 2]));
@@ -613,6 +623,35 @@ describe("assets and media", () => {
     expect(bench.sockets).toHaveLength(4);
     bench.post({ type: "want_streams", streams: [] });
     expect(bench.socket.readyState).toBe(3);
+  });
+
+  test("a deformable whose triangles have no vertices is refused in words", async () => {
+    await bench.join(addCloth(Uint32Array.of(0, 1, 30)));
+    bench.socket.deliver(5, ticket("t1"));
+    await bench.until(() => bench.of("notice").length > 0);
+    expect(bench.last("notice").text).toContain("the deformable cloth cannot be shown");
+  });
+
+  test("a page that stands still gets no more frames of a deformable than it gives back", async () => {
+    await bench.join(addCloth());
+    bench.socket.deliver(5, ticket("t1"));
+    await bench.until(() => bench.of("scene").length > 0);
+    bench.post({ type: "want_streams", streams: ["cloth"] });
+    bench.say({ type: "delivery_budget", budget_class: "full" });
+    const media = bench.socket;
+    media.open();
+    const send = (): void => {
+      const header = encodeStruct("MediaHeader", ["cloth", "full", 1, 7, bench.now, bench.now, "deformable", 0]);
+      media.deliver(3, new Uint8Array(), header, fromHex((cloth.frames[0] as { hex: string }).hex));
+    };
+    for (let i = 0; i < 100; i++) send();
+    const held = bench.of("deformable").length;
+    expect(held).toBeLessThan(100);
+    const { surface } = bench.last("deformable");
+    bench.post({ type: "recycle_surface", stream: "cloth", surface });
+    send();
+    send();
+    expect(bench.of("deformable")).toHaveLength(held + 1);
   });
 
   describe("a ticket", () => {

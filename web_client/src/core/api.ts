@@ -8,6 +8,7 @@
 // Poses are world-frame, right-handed, Z up: rows of seven numbers `x y z qw qx qy qz`.
 
 import type { CloudFrame } from "./cloud.ts";
+import type { Surface } from "./sheet.ts";
 import type * as wire from "../protocol/messages.g.ts";
 
 /** A value of the wire with all defaults filled in: what the worker posts has every field. */
@@ -107,7 +108,8 @@ export type ToWorker =
   /** Frames drawn since the last such message: `display_hz` of the client's report. */
   | { type: "drawn"; frames: number }
   /** A buffer of `frame` that the page has done with. */
-  | { type: "recycle"; poses: Float32Array };
+  | { type: "recycle"; poses: Float32Array }
+  | { type: "recycle_surface"; stream: string; surface: Surface | null };
 
 export interface AssetWish {
   address: string;
@@ -274,11 +276,15 @@ export interface StatusUpdate {
   status: StatusReport;
 }
 
-/** The vertices of a deformable stream: 3 numbers each, world frame, transferred. */
+/**
+ * The vertices of a deformable stream: 3 numbers each, world frame, transferred. Give it back with `recycleSurface`.
+ * `surface`: what is drawn of them, null for ropes.
+ */
 export interface DeformableUpdate {
   type: "deformable";
   stream: string;
   vertices: Float32Array;
+  surface: Surface | null;
   /** Session time of the vertices [ms]. */
   session_ms: number;
   scene_epoch: number;

@@ -159,6 +159,9 @@ export class ClientWorker {
       case "recycle":
         this.recycle(command.poses);
         break;
+      case "recycle_surface":
+        this.media.recycleSurface(command.stream, command.surface);
+        break;
     }
   }
 

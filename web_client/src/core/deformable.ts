@@ -7,7 +7,7 @@ const TOPOLOGY_BYTES = 24;
 const FRAME_BYTES = 32;
 const ESCAPE_BYTES = 16;
 const MAX_VERTICES = 2 ** 18;
-const MAX_FACES = 2 ** 20;
+export const MAX_FACES = 2 ** 20;
 const PLAN_TREE = 1;
 /** Exponents of the lattice for bounds from 10 um to 4 m. */
 const MIN_EXPONENT = -17;

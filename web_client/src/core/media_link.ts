@@ -1,7 +1,7 @@
 // The WebSocket for media: opened while streams are wanted, with the ticket of the session. Deformables, clouds and pictures
 // are decoded here.
 
-import type { FromWorker, MediaCounters } from "./api.ts";
+import type { DeformableUpdate, FromWorker, MediaCounters } from "./api.ts";
 import type { ArrivalMeter } from "./arrival_meter.ts";
 import { decodeCloud } from "./cloud.ts";
 import { decodeMediaHeader } from "./codec.ts";
@@ -9,7 +9,8 @@ import { MalformedError, WireError } from "./errors.ts";
 import { readJpegSize } from "./jpeg.ts";
 import { NewestFrames } from "./newest_frames.ts";
 import type { SocketLike } from "./pairing_client.ts";
-import type { SceneAssets } from "./scene_assets.ts";
+import type { DeformableStream, SceneAssets } from "./scene_assets.ts";
+import type { Surface } from "./sheet.ts";
 import { Channel, CloseCode, encodeTicket, encodeWishes, SUBPROTOCOL, unpackMessage } from "./wire.ts";
 
 /** What of the environment is needed. */
@@ -19,6 +20,12 @@ export interface MediaEnvironment {
   setTimer(ms: number, callback: () => void): () => void;
   /** Decode a JPEG image to this width [pixels]; rejects for one that is damaged. */
   decodeImage(bytes: Uint8Array, width: number): Promise<ImageBitmap>;
+}
+
+/** Frames of a deformable that the page has, and surfaces that it has given back. */
+interface Lent {
+  frames: number;
+  used: Surface[];
 }
 
 /** A cloud or a picture, not decoded yet. */
@@ -40,6 +47,8 @@ const MAX_STREAMS = 16;
  * headset several frames on its way to the graphics card.
  */
 const MAX_SHOWN = 1024;
+/** Frames of a deformable that the page has at most: more than it keeps to interpolate (`FrameBuffer`). */
+const MAX_LENT = 40;
 const FIRST_PAUSE_MS = 200;
 const LONGEST_PAUSE_MS = 5_000;
 
@@ -49,6 +58,7 @@ export class MediaLink {
   /** By stream: of clouds and pictures that are wanted now. */
   readonly counters = new Map<string, MediaCounters>();
   private readonly frames = new NewestFrames<Frame>((stream, frame) => this.begin(stream, frame));
+  private readonly lent = new Map<string, Lent>();
   private wishes: string[] = [];
   private url = "";
   private ticket = "";
@@ -91,6 +101,14 @@ export class MediaLink {
   /** Note that the page has taken the newest cloud or picture of a stream: another one may come. */
   onTaken(stream: string): void {
     this.frames.finish(stream);
+  }
+
+  /** Take the surface of a frame of a deformable that the page does not need any more, null where it had none. */
+  recycleSurface(stream: string, surface: Surface | null): void {
+    const lent = this.lent.get(stream);
+    if (lent === undefined) return;
+    lent.frames -= 1;
+    if (surface !== null && lent.used.length < 2) lent.used.push(surface);
   }
 
   /** Close the socket and forget the ticket: they belong to a connection that is gone. */
@@ -160,11 +178,8 @@ export class MediaLink {
     const [stream, , scene_epoch, seq, captureNs, , encoding, , , receivedNs] = header;
     this.meter.recordMedia(head.length + bytes.length, Math.max(0, this.getSessionNs() - captureNs));
     if (encoding === "deformable") {
-      const decoder = this.assets.findDecoder(stream);
-      if (decoder === undefined) return;
-      const vertices = decoder.decode(bytes);
-      const session_ms = captureNs / MS_NS;
-      this.environment.post({ type: "deformable", stream, vertices, session_ms, scene_epoch, seq, bound_m: decoder.boundM }, [vertices.buffer]);
+      const deformable = this.assets.findDeformable(stream);
+      if (deformable !== undefined) this.postDeformable(deformable, bytes, { stream, session_ms: captureNs / MS_NS, scene_epoch, seq });
       return;
     }
     if (encoding === "cloud" || encoding === "jpeg") {
@@ -174,6 +189,22 @@ export class MediaLink {
     }
     const copy = bytes.slice();
     this.environment.post({ type: "media", header, bytes: copy }, [copy.buffer]);
+  }
+
+  private postDeformable(
+    deformable: DeformableStream,
+    bytes: Uint8Array,
+    head: Pick<DeformableUpdate, "stream" | "session_ms" | "scene_epoch" | "seq">,
+  ): void {
+    const lent = this.lent.get(head.stream) ?? { frames: 0, used: [] };
+    this.lent.set(head.stream, lent);
+    if (lent.frames >= MAX_LENT) return; // the page stands still
+    const vertices = deformable.decoder.decode(bytes);
+    const surface = deformable.buildSurface(vertices, lent.used.pop());
+    lent.frames += 1;
+    const buffers = surface === null ? [] : [surface.position.buffer, surface.normal.buffer];
+    const { boundM } = deformable.decoder;
+    this.environment.post({ type: "deformable", ...head, vertices, surface, bound_m: boundM }, [vertices.buffer, ...buffers]);
   }
 
   /** Take a cloud or a picture: a page that stands still gets the newest one when it runs again, not all of them. */

@@ -1,6 +1,7 @@
 // The page's end of the worker: requests as promises, updates to listeners by type. Decodes nothing.
 
 import type { FromWorker, Reply, RequestMessage, ToWorker } from "./api.ts";
+import type { Surface } from "./sheet.ts";
 
 type UpdateOf<K extends FromWorker["type"]> = Extract<FromWorker, { type: K }>;
 type Listener<K extends FromWorker["type"]> = (update: UpdateOf<K>) => void;
@@ -51,6 +52,12 @@ export class WorkerClient {
   /** Give the buffer of a frame back. */
   recycle(poses: Float32Array): void {
     this.post({ type: "recycle", poses }, [poses.buffer as ArrayBuffer]);
+  }
+
+  /** Give the surface of a frame of a deformable back, null for one without. */
+  recycleSurface(stream: string, surface: Surface | null): void {
+    const buffers = surface === null ? [] : [surface.position.buffer, surface.normal.buffer];
+    this.post({ type: "recycle_surface", stream, surface }, buffers);
   }
 
   private dispatch(update: FromWorker): void {

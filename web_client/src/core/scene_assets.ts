@@ -4,10 +4,11 @@
 import type { AssetWish, FromWorker, SceneSpec } from "./api.ts";
 import { decodeArrays, requireArray } from "./arrays.ts";
 import { AssetFetcher, type FetchEnvironment } from "./asset_fetcher.ts";
-import { DeformableDecoder, decodeTopology } from "./deformable.ts";
-import { WireError } from "./errors.ts";
+import { DeformableDecoder, decodeTopology, MAX_FACES } from "./deformable.ts";
+import { MalformedError, WireError } from "./errors.ts";
 import type { SessionMirror } from "./mirror.ts";
 import { decodeScene } from "./scene.ts";
+import { type SheetArrays, SheetBuilder, type SheetLook, type Surface } from "./sheet.ts";
 import type { Store } from "./storage.ts";
 
 /** What of the environment is needed. */
@@ -24,13 +25,47 @@ const MAX_DECODED_BYTES = 512 << 20;
 /** Time until a specification that could not be fetched is requested again. */
 const RETRY_MS = 1_000;
 
+/** Decodes the frames of one deformable and builds what is drawn of them. Throws `WireError` for a malformed asset. */
+export class DeformableStream {
+  readonly decoder: DeformableDecoder;
+  private readonly arrays: SheetArrays;
+  private readonly vertices: number;
+  private look: SheetLook = { dim: 1, radius: 0, flat: false };
+  private builder: SheetBuilder | null = null;
+
+  constructor(readonly address: string, asset: Uint8Array<ArrayBuffer>, look: SheetLook) {
+    const { arrays } = decodeArrays(asset, MAX_DECODED_BYTES);
+    const topology = decodeTopology(requireArray(arrays, "plan", [Uint8Array], [null]).data);
+    this.decoder = new DeformableDecoder(topology);
+    this.vertices = topology.vertexCount;
+    const elements = requireArray<Uint16Array | Uint32Array>(arrays, "elements", [Uint16Array, Uint32Array], [null, null]).data;
+    if (elements.length > 3 * MAX_FACES || elements.some((vertex) => vertex >= this.vertices)) {
+      throw new MalformedError(`${elements.length} corners of triangles, or one of them at no vertex`);
+    }
+    this.arrays = { elements, uv: arrays.uv && requireArray(arrays, "uv", [Float32Array], [null, null, 2]).data };
+    this.setLook(look);
+  }
+
+  /** The scene has changed: the deformable may be drawn otherwise. */
+  setLook(look: SheetLook): void {
+    if (look.dim === this.look.dim && look.radius === this.look.radius && look.flat === this.look.flat) return;
+    this.look = { dim: look.dim, radius: look.radius, flat: look.flat };
+    this.builder = look.dim > 1 ? new SheetBuilder(look, this.vertices, this.arrays) : null;
+  }
+
+  /** Return the surface of vertices, null for a rope. `used`: as in `SheetBuilder.build`. */
+  buildSurface(vertices: Float32Array, used?: Surface): Surface | null {
+    return this.builder?.build(vertices, used) ?? null;
+  }
+}
+
 /** Fetches, decodes and posts assets. */
 export class SceneAssets {
   private readonly fetcher: AssetFetcher;
   private readonly wishes = new Map<string, AssetWish>();
   private readonly uses = new Map<string, Use[]>();
-  /** Decoders by stream, with the address of their topology. */
-  private readonly decoders = new Map<string, { address: string; decoder: DeformableDecoder }>();
+  /** By stream. */
+  private readonly deformables = new Map<string, DeformableStream>();
   private sceneHash = "";
   private shown = "";
   private progress = { wanted: 0, done: 0, bytes: 0, bytes_done: 0 };
@@ -49,7 +84,7 @@ export class SceneAssets {
       this.fetcher.reset();
       this.wishes.clear();
       this.uses.clear();
-      this.decoders.clear();
+      this.deformables.clear();
       this.sceneHash = this.shown = "";
       this.progress = { wanted: 0, done: 0, bytes: 0, bytes_done: 0 };
     } else this.fetcher.setLink(baseUrl, ticket);
@@ -84,9 +119,9 @@ export class SceneAssets {
     this.fetchScene(sceneHash, sceneEpoch, sceneRevision);
   }
 
-  /** Return the decoder of a stream, undefined while its topology is not there. */
-  findDecoder(stream: string): DeformableDecoder | undefined {
-    return this.decoders.get(stream)?.decoder;
+  /** Return what decodes a stream, undefined while its topology is not there. */
+  findDeformable(stream: string): DeformableStream | undefined {
+    return this.deformables.get(stream);
   }
 
   private fetchScene(address: string, sceneEpoch: number, sceneRevision: number): void {
@@ -105,14 +140,17 @@ export class SceneAssets {
 
   private fetchTopologies(spec: SceneSpec): void {
     const addresses = new Map(spec.deformables.map(({ stream, address }) => [stream, address]));
-    for (const [stream, { address }] of this.decoders) if (addresses.get(stream) !== address) this.decoders.delete(stream);
-    for (const { stream, address, bytes, name } of spec.deformables) {
-      if (this.decoders.has(stream)) continue;
+    for (const [stream, { address }] of this.deformables) if (addresses.get(stream) !== address) this.deformables.delete(stream);
+    for (const part of spec.deformables) {
+      const { stream, address, bytes, name } = part;
+      const known = this.deformables.get(stream);
+      if (known !== undefined) {
+        known.setLook(part);
+        continue;
+      }
       this.use(address, bytes, (asset) => {
         try {
-          const { arrays } = decodeArrays(asset, MAX_DECODED_BYTES);
-          const plan = requireArray(arrays, "plan", [Uint8Array], [null]);
-          this.decoders.set(stream, { address, decoder: new DeformableDecoder(decodeTopology(plan.data)) });
+          this.deformables.set(stream, new DeformableStream(address, asset, part));
         } catch (error) {
           this.notify(`the deformable ${name} cannot be shown: ${describeWireError(error)}`);
         }

@@ -1,4 +1,5 @@
-// Cloths, soft bodies and ropes: vertices that come with every frame of a stream, interpolated like bodies.
+// Cloths, soft bodies and ropes: vertices that come with every frame of a stream, interpolated like bodies. The surface
+// of cloths and soft bodies is computed in the worker, and interpolated by the graphics card.
 
 import {
   BufferAttribute,
@@ -12,244 +13,161 @@ import {
   Vector3,
 } from "three";
 
+import { SheetBuilder, type Surface } from "../core/sheet.ts";
 import type { DeformableArrays } from "./arrays.ts";
+import { type Between, interpolateValues, type TimedFrame } from "./interpolation.ts";
 import { pieceBetween } from "./scene_view.ts";
 import { buildPrimitive } from "./shapes.ts";
 import type { Deformable } from "./spec.ts";
 
-/** One deformable. `setVertices` takes the vertices of the whole, in the session's world. */
-export class DeformableView {
+/**
+ * A frame of a deformable. `values`: its vertices, in the session's world; `surface`: what is drawn of them, null for
+ * ropes; `content`: another number for each that differs from the frame before.
+ */
+export interface DeformableFrame extends TimedFrame {
+  surface: Surface | null;
+  content: number;
+}
+
+/** One deformable. */
+export interface DeformableView {
   readonly object: Object3D;
   readonly stream: string;
-  readonly vertices: number;
-  private readonly geometry: BufferGeometry;
-  private readonly write: (vertices: Float32Array) => void;
+  /** Show what lies between two frames. Those of another topology are ignored. Returns whether the picture has changed. */
+  show(found: Between<DeformableFrame>): boolean;
+  dispose(): void;
+}
+
+/** Make a deformable as it lies at first. `material`: of `makeSurface`, where it is no rope with `isInterpolated`. */
+export function makeDeformable(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial): DeformableView {
+  const view = part.dim === 1 ? new RopeView(part, arrays, material) : new SheetView(part, arrays, material);
+  view.object.name = part.name;
+  view.object.frustumCulled = false;
+  view.object.castShadow = true;
+  view.object.receiveShadow = true;
+  return view;
+}
+
+/** Points and normals of one frame on the graphics card, and which it is. */
+interface Uploaded {
+  position: BufferAttribute;
+  normal: BufferAttribute;
+  content: number;
+}
+
+/** A cloth or soft body: the frames before and after are on the graphics card, and a uniform says what is between. */
+class SheetView implements DeformableView {
+  readonly object: Mesh;
+  readonly stream: string;
+  private readonly geometry = new BufferGeometry();
+  private before: Uploaded;
+  private after: Uploaded;
+  private share = 0;
 
   constructor(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial) {
     this.stream = part.stream;
-    this.vertices = part.vertices;
-    if (part.dim === 1) {
-      [this.object, this.geometry, this.write] = makeRope(part, arrays, material);
-    } else {
-      [this.object, this.geometry, this.write] = makeSheet(part, arrays, material);
-    }
-    this.object.name = part.name;
-    this.object.frustumCulled = false;
-    this.object.castShadow = true;
-    this.object.receiveShadow = true;
-    this.write(arrays.position);
+    const { position } = arrays;
+    const builder = new SheetBuilder(part, position.length / 3, arrays);
+    const rest = builder.build(position)!;
+    this.before = upload(rest);
+    this.after = upload(rest);
+    this.geometry.setIndex(new BufferAttribute(builder.index, 1));
+    if (builder.uv) this.geometry.setAttribute("uv", new BufferAttribute(builder.uv, 2));
+    this.setAttributes();
+    this.object = new Mesh(this.geometry, material);
+    this.object.onBeforeRender = (_renderer, _scene, _camera, _geometry, used) => {
+      const { uniforms } = used as ShaderMaterial;
+      if (!uniforms?.share) return; // of shadows and masks, which show the frame before
+      uniforms.share.value = this.share;
+      (used as ShaderMaterial).uniformsNeedUpdate = true;
+    };
   }
 
-  /** Move the vertices. Frames of another topology are ignored. */
-  setVertices(vertices: Float32Array): void {
-    if (vertices.length === 3 * this.vertices) this.write(vertices);
+  show({ before, after, share }: Between<DeformableFrame>): boolean {
+    if (!this.fits(before) || !this.fits(after)) return false;
+    let isChanged = before.content !== this.before.content;
+    if (isChanged) {
+      if (before.content === this.after.content) [this.before, this.after] = [this.after, this.before];
+      else replace(this.before, before);
+      this.setAttributes();
+    }
+    const shareNow = after.content === before.content ? 0 : share;
+    if (shareNow > 0 && after.content !== this.after.content) replace(this.after, after);
+    isChanged ||= shareNow !== this.share;
+    this.share = shareNow;
+    return isChanged;
   }
 
   dispose(): void {
     this.geometry.dispose();
   }
+
+  private fits(frame: DeformableFrame): boolean {
+    return frame.surface?.position.length === this.before.position.array.length;
+  }
+
+  private setAttributes(): void {
+    this.geometry.setAttribute("position", this.before.position);
+    this.geometry.setAttribute("normal", this.before.normal);
+    this.geometry.setAttribute("nextPosition", this.after.position);
+    this.geometry.setAttribute("nextNormal", this.after.normal);
+  }
 }
 
-type Made = [Object3D, BufferGeometry, (vertices: Float32Array) => void];
+/** Return attributes of their own, since surfaces are given back to the worker. */
+function upload(surface: Surface): Uploaded {
+  const make = (values: Float32Array): BufferAttribute => new BufferAttribute(values.slice(), 3).setUsage(DynamicDrawUsage);
+  return { position: make(surface.position), normal: make(surface.normal), content: -1 };
+}
 
-function makeRope(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial): Made {
-  const shape = buildPrimitive({ kind: "cylinder", size: [1, 1, 0.5], mesh: -1, hfield: -1 });
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(shape.position, 3));
-  geometry.setAttribute("normal", new BufferAttribute(shape.normal, 3));
-  geometry.setIndex(new BufferAttribute(shape.index, 1));
-  const { elements } = arrays;
-  const pieces = new InstancedMesh(geometry, material, elements.length / 2);
-  const [a, b, matrix] = [new Vector3(), new Vector3(), new Matrix4()];
-  const write = (vertices: Float32Array): void => {
-    for (let i = 0; i < elements.length / 2; i++) {
-      a.fromArray(vertices, 3 * elements[2 * i]!);
-      b.fromArray(vertices, 3 * elements[2 * i + 1]!);
-      pieces.setMatrixAt(i, pieceBetween(a, b, Math.max(part.radius, 0.001), matrix));
+function replace(uploaded: Uploaded, { surface, content }: DeformableFrame): void {
+  if (!surface) return;
+  (uploaded.position.array as Float32Array).set(surface.position);
+  (uploaded.normal.array as Float32Array).set(surface.normal);
+  uploaded.position.needsUpdate = uploaded.normal.needsUpdate = true;
+  uploaded.content = content;
+}
+
+/** A rope: a cylinder for each piece. */
+class RopeView implements DeformableView {
+  readonly object: InstancedMesh;
+  readonly stream: string;
+  private readonly geometry = new BufferGeometry();
+  private readonly elements: Uint16Array | Uint32Array;
+  private readonly radius: number;
+  private readonly vertices: Float32Array;
+
+  constructor(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial) {
+    this.stream = part.stream;
+    this.elements = arrays.elements;
+    this.radius = Math.max(part.radius, 0.001);
+    this.vertices = arrays.position.slice();
+    const shape = buildPrimitive({ kind: "cylinder", size: [1, 1, 0.5], mesh: -1, hfield: -1 });
+    this.geometry.setAttribute("position", new BufferAttribute(shape.position, 3));
+    this.geometry.setAttribute("normal", new BufferAttribute(shape.normal, 3));
+    this.geometry.setIndex(new BufferAttribute(shape.index, 1));
+    this.object = new InstancedMesh(this.geometry, material, this.elements.length / 2);
+    this.place();
+  }
+
+  show({ before, after, share }: Between<DeformableFrame>): boolean {
+    if (before.values.length !== this.vertices.length || after.values.length !== this.vertices.length) return false;
+    const isChanged = interpolateValues(before.values, after.values, share, this.vertices);
+    if (isChanged) this.place();
+    return isChanged;
+  }
+
+  dispose(): void {
+    this.geometry.dispose();
+  }
+
+  private place(): void {
+    const [a, b, matrix] = [new Vector3(), new Vector3(), new Matrix4()];
+    for (let i = 0; i < this.elements.length / 2; i++) {
+      a.fromArray(this.vertices, 3 * this.elements[2 * i]!);
+      b.fromArray(this.vertices, 3 * this.elements[2 * i + 1]!);
+      this.object.setMatrixAt(i, pieceBetween(a, b, this.radius, matrix));
     }
-    pieces.instanceMatrix.needsUpdate = true;
-  };
-  return [pieces, geometry, write];
-}
-
-/**
- * Triangles with normals computed here: per vertex, or per triangle where `flat`. A cloth has its thickness as MuJoCo
- * draws it: both sides are `radius` away from the vertices, with a rim between them.
- */
-function makeSheet(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial): Made {
-  const { elements, uv } = arrays;
-  const isThick = part.dim === 2 && part.radius > 0;
-  const rim = isThick ? findRim(elements) : [];
-  // Drawn points of one side: the vertices, once for each of their places in a texture, or every corner where it is flat.
-  const vertex: number[] = [];
-  const coordinate: number[] = [];
-  const index: number[] = [];
-  const known = new Map<string, number>();
-  for (let c = 0; c < elements.length; c++) {
-    const at = uv ? [uv[2 * c]!, uv[2 * c + 1]!] : [];
-    const key = `${elements[c]!} ${at.join(" ")}`;
-    const before = part.flat ? undefined : known.get(key);
-    index.push(before ?? vertex.length);
-    if (before !== undefined) continue;
-    known.set(key, vertex.length);
-    vertex.push(elements[c]!);
-    coordinate.push(...at);
-  }
-  const upper = vertex.length;
-  if (isThick) {
-    for (let c = 0; c < elements.length; c += 3) for (const k of [0, 2, 1]) index.push(upper + index[c + k]!);
-    for (let i = 0, n = coordinate.length; i < n; i++) coordinate.push(coordinate[i]!);
-  }
-  // Then the points of the rim, which share nothing: vertices and distances from them.
-  const rimStart = isThick ? 2 * upper : upper;
-  const offset: number[] = [];
-  for (const [a, b, ca, cb] of rim) {
-    for (const [v, sign, c] of [[a, 1, ca], [a, -1, ca], [b, -1, cb], [a, 1, ca], [b, -1, cb], [b, 1, cb]] as const) {
-      index.push(rimStart + offset.length);
-      vertex.push(v);
-      offset.push(sign * part.radius);
-      if (uv) coordinate.push(uv[2 * c]!, uv[2 * c + 1]!);
-    }
-  }
-  const count = rimStart + offset.length;
-  const position = new Float32Array(3 * count);
-  const normal = new Float32Array(3 * count);
-  const smooth = new Float32Array(3 * part.vertices);
-  const geometry = new BufferGeometry();
-  const positions = new BufferAttribute(position, 3).setUsage(DynamicDrawUsage);
-  const normals = new BufferAttribute(normal, 3).setUsage(DynamicDrawUsage);
-  geometry.setAttribute("position", positions);
-  geometry.setAttribute("normal", normals);
-  if (uv) geometry.setAttribute("uv", new BufferAttribute(new Float32Array(coordinate), 2));
-  geometry.setIndex(new BufferAttribute(new Uint32Array(index), 1));
-  const corners = Uint32Array.from(elements, (v) => 3 * v);
-  const from = Uint32Array.from(vertex, (v) => 3 * v);
-  const write = (p: Float32Array): void => {
-    addUpNormals(p, corners, smooth);
-    placeSides(p, smooth, from.subarray(0, upper), isThick ? part.radius : 0, position, normal);
-    for (let i = 0, at = 3 * rimStart; i < offset.length; i++) {
-      const v = from[upper + i]!;
-      for (let k = 0; k < 3; k++) position[at++] = p[v + k]! + offset[i]! * smooth[v + k]!;
-    }
-    for (let i = part.flat ? 0 : rimStart; i < count; i += 3) {
-      setFlatNormal(position, normal, i, i >= upper && i < rimStart ? -1 : 1);
-    }
-    positions.needsUpdate = normals.needsUpdate = true;
-  };
-  return [new Mesh(geometry, material), geometry, write];
-}
-
-/** Return the edges of one triangle only, as (vertex, vertex, corner, corner), in its winding. */
-function findRim(elements: Uint16Array | Uint32Array): [number, number, number, number][] {
-  const edges = new Map<string, [number, number, number, number] | null>();
-  for (let c = 0; c < elements.length; c += 3) {
-    for (const [i, j] of [[0, 1], [1, 2], [2, 0]] as const) {
-      const [a, b] = [elements[c + i]!, elements[c + j]!];
-      const key = a < b ? `${a} ${b}` : `${b} ${a}`;
-      edges.set(key, edges.has(key) ? null : [a, b, c + i, c + j]);
-    }
-  }
-  return [...edges.values()].filter((edge) => edge !== null);
-}
-
-/**
- * Write the unit normals of vertices to `out`: the sum over their triangles, weighed by area. `corners`: where each corner
- * of the triangles begins in `p`. For every frame: written out, since arrays in between take V8 four times as long.
- */
-function addUpNormals(p: Float32Array, corners: Uint32Array, out: Float32Array): void {
-  out.fill(0);
-  for (let c = 0; c < corners.length; c += 3) {
-    const a = corners[c]!;
-    const b = corners[c + 1]!;
-    const d = corners[c + 2]!;
-    const px = p[a]!;
-    const py = p[a + 1]!;
-    const pz = p[a + 2]!;
-    const ux = p[b]! - px;
-    const uy = p[b + 1]! - py;
-    const uz = p[b + 2]! - pz;
-    const vx = p[d]! - px;
-    const vy = p[d + 1]! - py;
-    const vz = p[d + 2]! - pz;
-    const x = uy * vz - uz * vy;
-    const y = uz * vx - ux * vz;
-    const z = ux * vy - uy * vx;
-    out[a]! += x;
-    out[a + 1]! += y;
-    out[a + 2]! += z;
-    out[b]! += x;
-    out[b + 1]! += y;
-    out[b + 2]! += z;
-    out[d]! += x;
-    out[d + 1]! += y;
-    out[d + 2]! += z;
-  }
-  for (let i = 0; i < out.length; i += 3) {
-    const length = measure(out[i]!, out[i + 1]!, out[i + 2]!);
-    out[i]! /= length;
-    out[i + 1]! /= length;
-    out[i + 2]! /= length;
-  }
-}
-
-/**
- * Write points and normals of the upper side, and after them those of the lower side where there is a radius. `from`:
- * where the vertex of each point begins in `p`.
- */
-function placeSides(
-  p: Float32Array,
-  smooth: Float32Array,
-  from: Uint32Array,
-  radius: number,
-  position: Float32Array,
-  normal: Float32Array,
-): void {
-  const size = 3 * from.length;
-  for (let i = 0, at = 0; i < from.length; i++, at += 3) {
-    const v = from[i]!;
-    const nx = smooth[v]!;
-    const ny = smooth[v + 1]!;
-    const nz = smooth[v + 2]!;
-    const x = p[v]!;
-    const y = p[v + 1]!;
-    const z = p[v + 2]!;
-    position[at] = x + radius * nx;
-    position[at + 1] = y + radius * ny;
-    position[at + 2] = z + radius * nz;
-    normal[at] = nx;
-    normal[at + 1] = ny;
-    normal[at + 2] = nz;
-    if (radius === 0) continue;
-    position[size + at] = x - radius * nx;
-    position[size + at + 1] = y - radius * ny;
-    position[size + at + 2] = z - radius * nz;
-    normal[size + at] = -nx;
-    normal[size + at + 1] = -ny;
-    normal[size + at + 2] = -nz;
-  }
-}
-
-/** Return the length of a vector, 1 of none. `Math.hypot` takes ten times as long. */
-function measure(x: number, y: number, z: number): number {
-  return Math.sqrt(x * x + y * y + z * z) || 1;
-}
-
-/** Write the normal of the triangle of three points. `sign`: -1 where it is drawn in the other order. */
-function setFlatNormal(p: Float32Array, normal: Float32Array, corner: number, sign: number): void {
-  const a = 3 * corner;
-  const ux = p[a + 3]! - p[a]!;
-  const uy = p[a + 4]! - p[a + 1]!;
-  const uz = p[a + 5]! - p[a + 2]!;
-  const vx = p[a + 6]! - p[a]!;
-  const vy = p[a + 7]! - p[a + 1]!;
-  const vz = p[a + 8]! - p[a + 2]!;
-  const x = uy * vz - uz * vy;
-  const y = uz * vx - ux * vz;
-  const z = ux * vy - uy * vx;
-  const length = sign * measure(x, y, z);
-  for (let at = a; at < a + 9; at += 3) {
-    normal[at] = x / length;
-    normal[at + 1] = y / length;
-    normal[at + 2] = z / length;
+    this.object.instanceMatrix.needsUpdate = true;
   }
 }

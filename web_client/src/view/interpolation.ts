@@ -15,19 +15,26 @@ export interface TimedFrame {
   values: Float32Array;
 }
 
+/** Two frames, and the share of the later one. */
+export interface Between<T> {
+  before: T;
+  after: T;
+  share: number;
+}
+
 /** The newest frames of one stream, oldest first. */
-export class FrameBuffer {
-  private frames: TimedFrame[] = [];
+export class FrameBuffer<T extends TimedFrame = TimedFrame> {
+  private frames: T[] = [];
 
-  /** `onRelease` gets the values of frames that are not needed any more. */
-  constructor(private readonly onRelease: (values: Float32Array) => void = () => undefined) {}
+  /** `onRelease` gets frames that are not needed any more. */
+  constructor(private readonly onRelease: (frame: T) => void = () => undefined) {}
 
-  get newest(): TimedFrame | undefined {
+  get newest(): T | undefined {
     return this.frames.at(-1);
   }
 
   /** Add a frame. One of another length, or from before the newest, replaces all. */
-  push(frame: TimedFrame): void {
+  push(frame: T): void {
     const { newest } = this;
     if (newest && (newest.values.length !== frame.values.length || frame.session_ms < newest.session_ms)) this.clear();
     else if (newest && frame.session_ms === newest.session_ms) this.release(this.frames.pop()!);
@@ -44,7 +51,7 @@ export class FrameBuffer {
    * Return the two frames around a session time and the share of the later one; frames before them are released. Before
    * the first frame it is the first alone, after the last one the last alone.
    */
-  around(session_ms: number): { before: TimedFrame; after: TimedFrame; share: number } | null {
+  around(session_ms: number): Between<T> | null {
     while (this.frames.length >= 2 && this.frames[1]!.session_ms <= session_ms) this.release(this.frames.shift()!);
     const [before, after] = [this.frames[0], this.frames[1]];
     if (!before) return null;
@@ -52,8 +59,8 @@ export class FrameBuffer {
     return { before, after, share: (session_ms - before.session_ms) / (after.session_ms - before.session_ms) };
   }
 
-  private release(frame: TimedFrame): void {
-    this.onRelease(frame.values);
+  private release(frame: T): void {
+    this.onRelease(frame);
   }
 }
 

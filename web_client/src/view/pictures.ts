@@ -97,9 +97,10 @@ export class CameraPictures {
 
   /** Copy the pictures onto the canvas. */
   show(): void {
+    if (this.pictures.length === 0) return;
     const { renderer } = this;
     const canvas = renderer.domElement.getBoundingClientRect();
-    if (this.pictures.length === 0 || canvas.width === 0) return;
+    if (canvas.width === 0) return;
     renderer.autoClear = false;
     renderer.setScissorTest(true);
     for (const { element, target, drawn_ms } of this.pictures) {

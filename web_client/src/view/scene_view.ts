@@ -21,7 +21,7 @@ import {
 import type { AssetSource, MeshArrays } from "./arrays.ts";
 import { makeWorldRoot, setPose } from "./axes.ts";
 import { type Budget, chooseLevels, type LevelChoice } from "./budget.ts";
-import { DeformableView } from "./deformables.ts";
+import { type DeformableView, makeDeformable } from "./deformables.ts";
 import { Lighting } from "./lighting.ts";
 import { mergeMeshes } from "./merging.ts";
 import { addTextureCoordinates, buildHeightField, buildPrimitive, cubeDirections, ENDLESS_M } from "./shapes.ts";
@@ -112,10 +112,10 @@ export class SceneView {
           const wish = { address: part.address, bytes: part.bytes, encoding: part.encoding };
           const [arrays, material] = await Promise.all([
             this.assets.loadDeformable(wish),
-            this.makeMaterial(part.material, part.rgba, { isDoubleSided: part.dim === 2 }),
+            this.makeMaterial(part.material, part.rgba, { isDoubleSided: part.dim === 2, isInterpolated: part.dim > 1 }),
           ]);
           if (this.isDisposed) return;
-          const view = new DeformableView(part, arrays, material);
+          const view = makeDeformable(part, arrays, material);
           this.owned.add(view);
           this.deformables.push(view);
           this.world.add(view.object);
@@ -271,7 +271,7 @@ export class SceneView {
   private async makeMaterial(
     index: number,
     rgba: Rgba,
-    use: { geometry?: Geometry; isDoubleSided?: boolean; isBack?: boolean; fadeAt?: number },
+    use: { geometry?: Geometry; isDoubleSided?: boolean; isInterpolated?: boolean; isBack?: boolean; fadeAt?: number },
   ): Promise<ShaderMaterial> {
     const material = this.spec.materials[index];
     const source = this.findColorTexture(material);
@@ -281,7 +281,7 @@ export class SceneView {
     const isDrawn = source >= 0 && (kind === "2d" || (use.geometry !== undefined && !(mesh?.textured ?? false)));
     const texture = isDrawn ? await this.loadTexture(source) : null;
     const hasVertexColors = mesh ? await this.hasVertexColors(use.geometry!) : false;
-    const key = JSON.stringify([index, rgba, isDrawn, hasVertexColors, use.isDoubleSided, use.isBack, use.fadeAt]);
+    const key = JSON.stringify([index, rgba, isDrawn, hasVertexColors, use.isDoubleSided, use.isInterpolated, use.isBack, use.fadeAt]);
     let made = this.materials.get(key);
     if (!made) {
       made = makeSurface(
@@ -293,6 +293,7 @@ export class SceneView {
           isBlended: hasVertexColors || (texture !== null && this.spec.textures[source]!.channels === 4),
           hasVertexColors,
           side: use.isDoubleSided ? DoubleSide : use.isBack ? BackSide : FrontSide,
+          isInterpolated: use.isInterpolated ?? false,
           fadeAt: use.fadeAt ?? 0,
         },
         this.lighting,

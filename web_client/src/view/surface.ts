@@ -16,6 +16,8 @@ export interface Look {
   isBlended: boolean;
   hasVertexColors: boolean;
   side: Side;
+  /** Attributes `nextPosition` and `nextNormal` are those of the next frame; the uniform `share` says how much of it. */
+  isInterpolated: boolean;
   /** Fades out at a distance: a plane without end [m], 0 for no fading. */
   fadeAt: number;
 }
@@ -35,24 +37,37 @@ varying vec3 vNormal;
   attribute vec3 cubeDirection;
   varying vec3 vCube;
 #endif
+#ifdef IS_INTERPOLATED
+  attribute vec3 nextPosition;
+  attribute vec3 nextNormal;
+  uniform float share;
+#endif
 #ifdef HAS_VERTEX_COLORS
   attribute vec4 vertexColor;
   varying vec4 vVertexColor;
 #endif
 void main() {
   #include <beginnormal_vertex>
-  #include <defaultnormal_vertex>
   #include <begin_vertex>
-  #include <project_vertex>
+  #ifdef IS_INTERPOLATED
+    objectNormal = mix(objectNormal, nextNormal, share);
+    transformed = mix(transformed, nextPosition, share);
+  #endif
   #include <worldpos_vertex>
-  #include <shadowmap_vertex>
+  // Uniforms that are used are set for every object: matrices of the view only where a shadow needs them.
+  #if defined(USE_SHADOWMAP) || NUM_SPOT_LIGHT_COORDS > 0
+    #include <defaultnormal_vertex>
+    #include <shadowmap_vertex>
+  #endif
   vec4 local = vec4(transformed, 1.0);
   vec3 localNormal = objectNormal;
   #ifdef USE_INSTANCING
     local = instanceMatrix * local;
     localNormal = mat3(instanceMatrix) * localNormal;
   #endif
-  vPosition = (modelMatrix * local).xyz;
+  vec4 world = modelMatrix * local;
+  vPosition = world.xyz;
+  gl_Position = projectionMatrix * (viewMatrix * world);
   vNormal = mat3(modelMatrix) * localNormal;
   #ifdef HAS_MAP
     vMapUv = uv;
@@ -166,6 +181,7 @@ export function makeSurface(look: Look, lighting: Lighting): ShaderMaterial {
   if (look.cube) defines.HAS_CUBE = "";
   if (look.hasVertexColors) defines.HAS_VERTEX_COLORS = "";
   if (look.side === DoubleSide) defines.DOUBLE_SIDED = "";
+  if (look.isInterpolated) defines.IS_INTERPOLATED = "";
   if (look.fadeAt > 0) defines.FADE_AT = look.fadeAt.toFixed(3);
   const material = new ShaderMaterial({
     defines,
@@ -181,6 +197,7 @@ export function makeSurface(look: Look, lighting: Lighting): ShaderMaterial {
       shininess: { value: 128 * Math.min(Math.max(roughness >= 0 ? 1 - roughness : shininess, 0), 1) },
       map: { value: look.map },
       cube: { value: look.cube },
+      ...(look.isInterpolated ? { share: { value: 0 } } : {}),
     },
     vertexShader: VERTEX,
     fragmentShader: `${FRAGMENT_HEAD}${writeLights(lighting)}${FRAGMENT_TAIL}`,

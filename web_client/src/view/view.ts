@@ -13,7 +13,7 @@ import {
   WebGLRenderer,
 } from "three";
 
-import { type FrameUpdate, nowMs, type SceneSpec } from "../core/api.ts";
+import { type DeformableUpdate, type FrameUpdate, nowMs, type SceneSpec } from "../core/api.ts";
 import type { WorkerClient } from "../core/page_client.ts";
 import { AnchorOverlay } from "./anchors.ts";
 import { WorkerAssets } from "./assets.ts";
@@ -23,8 +23,8 @@ import { type Budget, DESKTOP, HEADSET, SOFTWARE } from "./budget.ts";
 import { Viewpoint } from "./camera.ts";
 import { CloudViews } from "./clouds.ts";
 import { CameraPictures } from "./pictures.ts";
-import type { DeformableView } from "./deformables.ts";
-import { DelayEstimator, FrameBuffer, interpolatePoses, interpolateValues, POSE_FLOATS } from "./interpolation.ts";
+import type { DeformableFrame } from "./deformables.ts";
+import { type Between, DelayEstimator, FrameBuffer, interpolatePoses, interpolateValues, POSE_FLOATS } from "./interpolation.ts";
 import { SceneView } from "./scene_view.ts";
 
 // Colours are blended as they are (docs/scene.md).
@@ -72,11 +72,10 @@ export interface HeadsetStage {
   onReset(): void;
 }
 
+/** A stream of a deformable. `found`: what is drawn of it. */
 interface Stream {
-  buffer: FrameBuffer;
-  values: Float32Array;
-  /** What shows the values. */
-  part: DeformableView | null;
+  buffer: FrameBuffer<DeformableFrame>;
+  found: Between<DeformableFrame> | null;
 }
 
 /** Draws the session on a canvas. Throws `Error` with advice when the browser has no WebGL. */
@@ -114,6 +113,8 @@ export class View {
   private lastFrame_ms = 0;
   private drawnSinceReport = 0;
   private sceneCount = 0;
+  /** Frames of deformables that differed from those before. */
+  private contents = 0;
   /** A changed scene that is not in the picture yet. */
   private next: SceneView | null = null;
   private headset: HeadsetStage | null = null;
@@ -136,7 +137,7 @@ export class View {
     this.root.add(this.overlay, this.clouds.group);
     this.assets = new WorkerAssets(client);
     this.viewpoint = new Viewpoint(canvas);
-    this.frames = new FrameBuffer((values) => client.recycle(values));
+    this.frames = new FrameBuffer(({ values }) => client.recycle(values));
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
     this.listen();
@@ -169,7 +170,13 @@ export class View {
 
   /** What is drawn now: poses, 7 numbers per body of `bodies`, and vertices of deformables by stream. */
   get shown(): { bodies: number[]; poses: Float32Array; vertices: Map<string, Float32Array> } {
-    const vertices = new Map([...this.streams].map(([name, stream]) => [name, stream.values] as const));
+    const vertices = new Map<string, Float32Array>();
+    for (const [name, { found }] of this.streams) {
+      if (!found) continue;
+      const values = new Float32Array(found.before.values.length);
+      interpolateValues(found.before.values, found.after.values, found.share, values);
+      vertices.set(name, values);
+    }
     return { bodies: this.bodyIds, poses: this.drawnPoses, vertices };
   }
 
@@ -225,12 +232,7 @@ export class View {
     client.on("cloud", ({ stream, cloud }) => this.clouds.show(stream, cloud));
     client.on("frame", (frame) => this.takeFrame(frame));
     client.on("presence", ({ items }) => this.avatars.setPresence(items, this.sessionTime()));
-    client.on("deformable", ({ stream, vertices, session_ms }) => {
-      const known = this.streams.get(stream);
-      const target = known ?? { buffer: new FrameBuffer(), values: new Float32Array(0), part: null };
-      this.streams.set(stream, target);
-      target.buffer.push({ session_ms, values: vertices });
-    });
+    client.on("deformable", (update) => this.takeDeformable(update));
   }
 
   private setScene(spec: SceneSpec): void {
@@ -280,6 +282,16 @@ export class View {
     this.lastFrame_ms = frame.session_ms;
     if (period > 0 && period < 500) this.delay.add(frame.age_ms, period, nowMs());
     this.frames.push({ session_ms: frame.session_ms, values: frame.poses });
+  }
+
+  private takeDeformable({ stream, vertices, surface, session_ms }: DeformableUpdate): void {
+    const release = (frame: DeformableFrame): void => this.client.recycleSurface(stream, frame.surface);
+    const target = this.streams.get(stream) ?? { buffer: new FrameBuffer<DeformableFrame>(release), found: null };
+    this.streams.set(stream, target);
+    const { newest } = target.buffer;
+    const isSame = newest !== undefined && isEqual(newest.values, vertices);
+    const content = isSame ? newest.content : ++this.contents;
+    target.buffer.push({ session_ms, values: vertices, surface, content });
   }
 
   private sessionTime(): number {
@@ -347,14 +359,8 @@ export class View {
       const stream = this.streams.get(part.stream);
       const found = stream?.buffer.around(session_ms);
       if (!stream || !found) continue;
-      const { length } = found.before.values;
-      const isNew = stream.part !== part; // also where a changed scene replaced it: it would lie as it did at first
-      stream.part = part;
-      if (stream.values.length !== length) stream.values = new Float32Array(length);
-      const isChanged = interpolateValues(found.before.values, found.after.values, found.share, stream.values);
-      if (!isChanged && !isNew) continue;
-      part.setVertices(stream.values);
-      isMoved = true;
+      stream.found = found;
+      if (part.show(found)) isMoved = true;
     }
     return isMoved;
   }
@@ -423,6 +429,10 @@ function inspectDevice(renderer: WebGLRenderer): Device {
     pixelRatio: isSoftware ? 1 : Math.min(devicePixelRatio, 2),
     renderer: name,
   };
+}
+
+function isEqual(a: Float32Array, b: Float32Array): boolean {
+  return a.length === b.length && a.every((value, i) => value === b[i]);
 }
 
 function listAddresses(spec: SceneSpec): Set<string> {

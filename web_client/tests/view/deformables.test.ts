@@ -3,7 +3,8 @@
 import type { BufferAttribute, Mesh, ShaderMaterial } from "three";
 import { expect, test } from "vitest";
 
-import { DeformableView } from "../../src/view/deformables.ts";
+import { SheetBuilder } from "../../src/core/sheet.ts";
+import { type DeformableFrame, type DeformableView, makeDeformable } from "../../src/view/deformables.ts";
 import type { Deformable } from "../../src/view/spec.ts";
 
 const SIDE = 3;
@@ -16,12 +17,43 @@ const ELEMENTS = Uint16Array.from(
 const FACES = ELEMENTS.length / 3;
 const RIM = 4 * (SIDE - 1);
 
+/** A cloth, and its frames at heights [m]. */
+class Cloth {
+  private readonly part: Deformable;
+  readonly view: DeformableView;
+  private readonly builder: SheetBuilder;
+
+  constructor(part: Partial<Deformable>, uv?: Float32Array) {
+    this.part = { name: "cloth", stream: "flex-0", vertices: SIDE * SIDE, dim: 2, radius: RADIUS, flat: false, ...part } as Deformable;
+    this.view = makeDeformable(this.part, { position: POSITION, elements: ELEMENTS, uv }, {} as ShaderMaterial);
+    this.builder = new SheetBuilder(this.part, SIDE * SIDE, { elements: ELEMENTS, uv });
+  }
+
+  makeFrame(height: number, content: number): DeformableFrame {
+    const values = POSITION.map((value, i) => (i % 3 === 2 ? height : value));
+    return { session_ms: 0, values, surface: this.builder.build(values), content };
+  }
+
+  get(name: string): BufferAttribute {
+    const { geometry } = this.view.object as Mesh;
+    return (name === "index" ? geometry.index! : geometry.getAttribute(name)) as BufferAttribute;
+  }
+
+  /** Heights of the first point in the frame before and after, and the uniform, as the graphics card gets them. */
+  get drawn(): number[] {
+    const material = { uniforms: { share: { value: -1 } } };
+    const { object } = this.view;
+    object.onBeforeRender(null!, null!, null!, null!, material as unknown as ShaderMaterial, null!);
+    const heights = ["position", "nextPosition"].map((name) => Math.round(100 * (this.get(name).getZ(0) - RADIUS)) / 100 + 0); // -0 is 0
+    return [...heights, material.uniforms.share.value];
+  }
+}
+
 function draw(part: Partial<Deformable>, uv?: Float32Array): (name: string) => BufferAttribute {
-  const given = { name: "cloth", stream: "flex-0", vertices: SIDE * SIDE, dim: 2, radius: RADIUS, flat: false, ...part } as Deformable;
-  const view = new DeformableView(given, { position: POSITION, elements: ELEMENTS, uv }, {} as ShaderMaterial);
-  view.setVertices(POSITION.map((value, i) => (i % 3 === 2 ? 0.5 : value)));
-  const { geometry } = view.object as Mesh;
-  return (name) => (name === "index" ? geometry.index! : geometry.getAttribute(name)) as BufferAttribute;
+  const cloth = new Cloth(part, uv);
+  const frame = cloth.makeFrame(0.5, 1);
+  expect(cloth.view.show({ before: frame, after: frame, share: 0 })).toBe(true);
+  return (name) => cloth.get(name);
 }
 
 test.each([false, true])("both sides of a thick sheet follow its vertices, flat: %s", (flat) => {
@@ -43,4 +75,30 @@ test("triangles share their vertices, unless they are flat or the texture has a 
   const uv = Float32Array.from({ length: 2 * ELEMENTS.length }, (_, i) => Math.floor(i / 6)); // each triangle elsewhere
   expect(draw({}, uv)("position").count).toBe(2 * 3 * FACES + 6 * RIM);
   expect(draw({ radius: 0 })("position").count).toBe(SIDE * SIDE);
+});
+
+test("the graphics card gets every frame once, and what is between two by a number", () => {
+  const cloth = new Cloth({});
+  const [first, second, third] = [cloth.makeFrame(1, 1), cloth.makeFrame(2, 2), cloth.makeFrame(3, 3)];
+  expect(cloth.view.show({ before: first, after: second, share: 0.25 })).toBe(true);
+  expect(cloth.drawn).toEqual([1, 2, 0.25]);
+  const versions = (): number[] => ["position", "nextPosition"].map((name) => cloth.get(name).version);
+  const before = versions();
+  expect(cloth.view.show({ before: first, after: second, share: 0.75 })).toBe(true);
+  expect(cloth.drawn).toEqual([1, 2, 0.75]);
+  expect(versions()).toEqual(before);
+  expect(cloth.view.show({ before: second, after: third, share: 0.5 })).toBe(true);
+  expect(cloth.drawn).toEqual([2, 3, 0.5]);
+  expect(cloth.get("position").version).toBe(before[1]); // it was there already
+});
+
+test("a sheet that lies still changes nothing, and frames of another one are ignored", () => {
+  const cloth = new Cloth({});
+  const rest = cloth.makeFrame(1, 1);
+  expect(cloth.view.show({ before: rest, after: { ...rest, session_ms: 1000 }, share: 0.3 })).toBe(true);
+  expect(cloth.view.show({ before: rest, after: { ...rest, session_ms: 1000 }, share: 0.6 })).toBe(false);
+  expect(cloth.view.show({ before: { ...rest, session_ms: 1000 }, after: { ...rest, session_ms: 2000 }, share: 0.1 })).toBe(false);
+  const other = new Cloth({ flat: true }).makeFrame(2, 2);
+  expect(cloth.view.show({ before: other, after: other, share: 0 })).toBe(false);
+  expect(cloth.drawn).toEqual([1, 0, 0]);
 });

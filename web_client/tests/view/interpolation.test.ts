@@ -7,7 +7,7 @@ const pose = (x: number, q: [number, number, number, number] = [1, 0, 0, 0]): Fl
 
 test("a frame between two others is found with its share, and older ones are given back", () => {
   const released: Float32Array[] = [];
-  const buffer = new FrameBuffer((values) => released.push(values));
+  const buffer = new FrameBuffer(({ values }) => released.push(values));
   const first = pose(0);
   buffer.push({ session_ms: 100, values: first });
   buffer.push({ session_ms: 110, values: pose(1) });

@@ -7,6 +7,7 @@ import type { FromWorker, SceneSpec, ToWorker } from "../../src/core/api.ts";
 import { encodeStruct } from "../../src/core/codec.ts";
 import { WorkerClient, type WorkerPort } from "../../src/core/page_client.ts";
 import { decodeScene } from "../../src/core/scene.ts";
+import { SheetBuilder } from "../../src/core/sheet.ts";
 import { WorkerAssets } from "../../src/view/assets.ts";
 import { DESKTOP } from "../../src/view/budget.ts";
 import { FrameBuffer } from "../../src/view/interpolation.ts";
@@ -14,6 +15,9 @@ import { View } from "../../src/view/view.ts";
 
 const REST = [[0, 0, 0], [1, 0, 0, 0]];
 const LOOK = { group: 0, material: -1, rgba: [1, 1, 1, 1] };
+
+/** The cloth of the scenes, as the worker builds it. */
+const SHEET = new SheetBuilder({ dim: 2, radius: 0, flat: true }, 3, { elements: Uint16Array.of(0, 1, 2) });
 
 const addressOf = (kind: string, look: string): string => kind + look.repeat(63);
 
@@ -48,6 +52,7 @@ class Stage {
     overlay: new Group(),
     frames: new FrameBuffer(),
     streams: new Map(),
+    contents: 0,
     scene: null,
     next: null,
     headset: null,
@@ -92,7 +97,8 @@ class Stage {
     this.session_ms += 10;
     const { session_ms } = this;
     this.say({ type: "frame", bodies_version: 1, session_ms, age_ms: 0, poses: Float32Array.of(x, 0, 0, 1, 0, 0, 0) });
-    this.say({ type: "deformable", stream: "cloth", session_ms, vertices: new Float32Array(9).fill(x) });
+    const vertices = new Float32Array(9).fill(x);
+    this.say({ type: "deformable", stream: "cloth", session_ms, vertices, surface: SHEET.build(vertices) });
     (this.view as unknown as { draw(): void }).draw();
   }
 
