@@ -158,7 +158,7 @@ def decode_cloud(payload: bytes | memoryview) -> CloudFrame:
     blocks = values.reshape(-1, _BLOCK)
     blocks += np.tile(np.array([*header.origin, 0], np.float32), _BLOCK // 4)
     blocks *= np.float32(2.0**header.exponent)
-    packed = (np.frombuffer(payload, "<i8", header.n_points, HEADER_BYTES) >> 48) & 0xFFFF
+    packed = (np.frombuffer(payload, "<u8", header.n_points, HEADER_BYTES) >> np.uint64(48)).view(np.int64)
     positions = values[:n].reshape(-1, 4)[:, :3]
     return CloudFrame(positions, unpack_colors(packed), header.error_m, header.voxel_m)
 
