@@ -17,7 +17,7 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from anchors.pose import PoseTuple, Vec3, quat_from_rotvec, quat_from_yaw, quat_mul
 from tests.e2e.browser import Browser, join_as, printed_address
@@ -58,6 +58,26 @@ def look_at(p_world: Vec3, target_world: Vec3) -> PoseTuple:
     x, y, z = (b - a for a, b in zip(p_world, target_world, strict=True))
     pitch = quat_from_rotvec((0.0, math.atan2(-z, math.hypot(x, y)), 0.0))
     return p_world, quat_mul(quat_from_yaw(math.atan2(y, x)), pitch)
+
+
+def shoot_demo(browser: Browser, scratch: Path, picture: Path, **size: Any) -> None:
+    """Write a picture of the page while the operators of a demo are at work. Raises `SystemExit` if they had ended."""
+    output = scratch / f"{picture.stem}.out"
+    command = [*COMMAND, "demo", "handover", "--timeout", "240", "--record", str(scratch / f"{picture.stem}.rrd")]
+    with output.open("wb") as out:
+        process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
+    try:
+        page = browser.open(picture.stem, wait_for_address(output, process), **size)
+        page.wait_until_ready()
+        page.wait(BOTH_HELD, 200.0)  # they try again where a busy machine has made them fail
+        time.sleep(SETTLE_S)
+        page.screenshot(picture)
+        if not page.evaluate(f"irisSession.state.phase.phase === 'ready' && {BOTH_HELD}"):
+            raise SystemExit(f"{picture}: the demo ended before the picture was made; do nothing else on this machine")
+        page.close()
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def shoot_ar(browser: Browser, scratch: Path, picture: Path) -> None:
@@ -101,31 +121,13 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="where to write the pictures")
     folder = parser.parse_args().folder.resolve()
     with tempfile.TemporaryDirectory() as scratch:
-        output = Path(scratch) / "demo.out"
-        command = [*COMMAND, "demo", "handover", "--timeout", "240", "--record", str(Path(scratch) / "session.rrd")]
-        with output.open("wb") as out:
-            process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
         browser = Browser()
         try:
-            address = wait_for_address(output, process)
-            page = browser.open("desktop", address, width=1280, height=800)
-            page.wait_until_ready()
-            page.wait(BOTH_HELD, 200.0)  # they try again where a busy machine has made them fail
-            time.sleep(SETTLE_S)
-            page.screenshot(folder / "dashboard.png")
-            page.close()
-            phone = browser.open("phone", address, width=390, height=844, phone=True)
-            phone.wait_until_ready()
-            time.sleep(3.0)
-            phone.screenshot(folder / "dashboard-phone.png")
-            phone.close()
-            process.terminate()
-            process.wait()
+            shoot_demo(browser, Path(scratch), folder / "dashboard.png", width=1280, height=800)
+            shoot_demo(browser, Path(scratch), folder / "dashboard-phone.png", width=390, height=844, phone=True)
             shoot_ar(browser, Path(scratch), folder / "ar.png")
         finally:
             browser.close()
-            process.terminate()
-            process.wait()
 
 
 if __name__ == "__main__":
