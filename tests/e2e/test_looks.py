@@ -160,4 +160,6 @@ def test_demos_are_seen_without_errors(demo: str, tmp_path: Path) -> None:
     # Whether its operators succeeded does not matter here.
     recording = Path(tmp_path, json.loads(done.stdout)["recording"])
     assert_looks_right(recording)
-    assert not compare_dataframes(recording)[1]
+    n, problems = compare_dataframes(recording)
+    assert not problems
+    assert n > 10_000

@@ -1,7 +1,7 @@
 """Compare what Rerun's dataframes have of a recording with the rows of the file, one by one.
 
-To Rerun, an empty list is no value, and clearing an entity is none either: both are left out. A row that is written
-twice, as the last one of a closed file, counts once.
+To Rerun, an empty list is no value, and clearing an entity is none either: both are left out. Equal values at one time
+count once: the last mark of a closed file is written twice.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def compare_dataframes(path: Path) -> tuple[int, list[str]]:
                 shown = set(_list_values(frame, f"{entity}:{component}", timeline))
                 n += len(written)
                 if shown != written:
-                    lost = len(written - shown)
-                    problems.append(f"{entity}, {component}: {lost} of {len(written)} values are not in the dataframe")
+                    text = f"of {len(written)} values {len(written - shown)} are missing, {len(shown - written)} differ"
+                    problems.append(f"{entity}, {component}: {text}")
     return n, problems
 
 

@@ -644,6 +644,10 @@ describe("assets and media", () => {
       const header = encodeStruct("MediaHeader", ["cloth", "full", 1, 7, bench.now, bench.now, "deformable", 0]);
       media.deliver(3, new Uint8Array(), header, fromHex((cloth.frames[0] as { hex: string }).hex));
     };
+    bench.post({ type: "drawn", frames: 1 });
+    send();
+    expect(bench.last("deformable")).toMatchObject({ surface: null }); // it builds the few itself
+    bench.post({ type: "drawn", frames: 60 });
     for (let i = 0; i < 100; i++) send();
     const held = bench.of("deformable").length;
     expect(held).toBeLessThan(100);

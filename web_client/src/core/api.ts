@@ -109,6 +109,7 @@ export type ToWorker =
   | { type: "drawn"; frames: number }
   /** A buffer of `frame` that the page has done with. */
   | { type: "recycle"; poses: Float32Array }
+  /** The surface of a frame of `deformable` that the page has done with, null for a frame without. */
   | { type: "recycle_surface"; stream: string; surface: Surface | null };
 
 export interface AssetWish {
@@ -276,9 +277,12 @@ export interface StatusUpdate {
   status: StatusReport;
 }
 
+/** Frames of a stream that the page keeps to interpolate: enough for the longest delay at 120 Hz. */
+export const MAX_KEPT_FRAMES = 32;
+
 /**
- * The vertices of a deformable stream: 3 numbers each, world frame, transferred. Give it back with `recycleSurface`.
- * `surface`: what is drawn of them, null for ropes.
+ * The vertices of a deformable stream: 3 numbers each, world frame, transferred. `surface`: what is drawn of them, null
+ * for ropes, and for a page that draws little, which builds it itself. Give it back with `recycleSurface`, also null.
  */
 export interface DeformableUpdate {
   type: "deformable";

@@ -155,6 +155,7 @@ export class ClientWorker {
         break;
       case "drawn":
         this.meter.recordDrawn(command.frames);
+        this.media.onDrawn(command.frames);
         break;
       case "recycle":
         this.recycle(command.poses);

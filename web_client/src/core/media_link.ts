@@ -1,7 +1,7 @@
 // The WebSocket for media: opened while streams are wanted, with the ticket of the session. Deformables, clouds and pictures
 // are decoded here.
 
-import type { DeformableUpdate, FromWorker, MediaCounters } from "./api.ts";
+import { type DeformableUpdate, type FromWorker, MAX_KEPT_FRAMES, type MediaCounters } from "./api.ts";
 import type { ArrivalMeter } from "./arrival_meter.ts";
 import { decodeCloud } from "./cloud.ts";
 import { decodeMediaHeader } from "./codec.ts";
@@ -22,10 +22,10 @@ export interface MediaEnvironment {
   decodeImage(bytes: Uint8Array, width: number): Promise<ImageBitmap>;
 }
 
-/** Frames of a deformable that the page has, and surfaces that it has given back. */
-interface Lent {
+/** `frames`: those of a deformable that the page has. `spare`: surfaces that it has given back. */
+interface LentFrames {
   frames: number;
-  used: Surface[];
+  spare: Surface[];
 }
 
 /** A cloud or a picture, not decoded yet. */
@@ -47,8 +47,10 @@ const MAX_STREAMS = 16;
  * headset several frames on its way to the graphics card.
  */
 const MAX_SHOWN = 1024;
-/** Frames of a deformable that the page has at most: more than it keeps to interpolate (`FrameBuffer`). */
-const MAX_LENT = 40;
+/** Frames of a deformable that the page has at most: those that it keeps, and some on their way. */
+const MAX_LENT = 2 * MAX_KEPT_FRAMES;
+/** Pictures per second below which the page itself builds the few surfaces that it draws. */
+const LEAST_DRAWN_HZ = 10;
 const FIRST_PAUSE_MS = 200;
 const LONGEST_PAUSE_MS = 5_000;
 
@@ -58,11 +60,13 @@ export class MediaLink {
   /** By stream: of clouds and pictures that are wanted now. */
   readonly counters = new Map<string, MediaCounters>();
   private readonly frames = new NewestFrames<Frame>((stream, frame) => this.begin(stream, frame));
-  private readonly lent = new Map<string, Lent>();
+  private readonly lent = new Map<string, LentFrames>();
   private wishes: string[] = [];
   private url = "";
   private ticket = "";
   private epoch = 0;
+  /** Pictures that the page drew in the last second. */
+  private drawnHz = LEAST_DRAWN_HZ;
   private socket: SocketLike | null = null;
   private cancelTimer: (() => void) | null = null;
   private pauseMs = FIRST_PAUSE_MS;
@@ -103,12 +107,17 @@ export class MediaLink {
     this.frames.finish(stream);
   }
 
+  /** Note how many pictures the page drew in the last second. */
+  onDrawn(pictures: number): void {
+    this.drawnHz = pictures;
+  }
+
   /** Take the surface of a frame of a deformable that the page does not need any more, null where it had none. */
   recycleSurface(stream: string, surface: Surface | null): void {
     const lent = this.lent.get(stream);
     if (lent === undefined) return;
     lent.frames -= 1;
-    if (surface !== null && lent.used.length < 2) lent.used.push(surface);
+    if (surface !== null && lent.spare.length < 2) lent.spare.push(surface);
   }
 
   /** Close the socket and forget the ticket: they belong to a connection that is gone. */
@@ -196,11 +205,11 @@ export class MediaLink {
     bytes: Uint8Array,
     head: Pick<DeformableUpdate, "stream" | "session_ms" | "scene_epoch" | "seq">,
   ): void {
-    const lent = this.lent.get(head.stream) ?? { frames: 0, used: [] };
+    const lent = this.lent.get(head.stream) ?? { frames: 0, spare: [] };
     this.lent.set(head.stream, lent);
-    if (lent.frames >= MAX_LENT) return; // the page stands still
+    if (lent.frames >= MAX_LENT) return; // the page does not keep up
     const vertices = deformable.decoder.decode(bytes);
-    const surface = deformable.buildSurface(vertices, lent.used.pop());
+    const surface = this.drawnHz >= LEAST_DRAWN_HZ ? deformable.buildSurface(vertices, lent.spare.pop()) : null;
     lent.frames += 1;
     const buffers = surface === null ? [] : [surface.position.buffer, surface.normal.buffer];
     const { boundM } = deformable.decoder;

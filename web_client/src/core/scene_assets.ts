@@ -29,7 +29,7 @@ const RETRY_MS = 1_000;
 export class DeformableStream {
   readonly decoder: DeformableDecoder;
   private readonly arrays: SheetArrays;
-  private readonly vertices: number;
+  private readonly vertexCount: number;
   private look: SheetLook = { dim: 1, radius: 0, flat: false };
   private builder: SheetBuilder | null = null;
 
@@ -37,12 +37,15 @@ export class DeformableStream {
     const { arrays } = decodeArrays(asset, MAX_DECODED_BYTES);
     const topology = decodeTopology(requireArray(arrays, "plan", [Uint8Array], [null]).data);
     this.decoder = new DeformableDecoder(topology);
-    this.vertices = topology.vertexCount;
-    const elements = requireArray<Uint16Array | Uint32Array>(arrays, "elements", [Uint16Array, Uint32Array], [null, null]).data;
-    if (elements.length > 3 * MAX_FACES || elements.some((vertex) => vertex >= this.vertices)) {
-      throw new MalformedError(`${elements.length} corners of triangles, or one of them at no vertex`);
-    }
-    this.arrays = { elements, uv: arrays.uv && requireArray(arrays, "uv", [Float32Array], [null, null, 2]).data };
+    this.vertexCount = topology.vertexCount;
+    const corners = look.dim === 1 ? 2 : 3;
+    const elements = requireArray<Uint16Array | Uint32Array>(arrays, "elements", [Uint16Array, Uint32Array], [null, corners]);
+    const count = elements.shape[0] as number;
+    if (count > MAX_FACES) throw new MalformedError(`${count} elements, at most ${MAX_FACES} are possible`);
+    const beyond = elements.data.find((vertex) => vertex >= this.vertexCount);
+    if (beyond !== undefined) throw new MalformedError(`an element names vertex ${beyond} of ${this.vertexCount}`);
+    const uv = arrays.uv && requireArray(arrays, "uv", [Float32Array], [count, corners, 2]).data;
+    this.arrays = { elements: elements.data, uv };
     this.setLook(look);
   }
 
@@ -50,12 +53,12 @@ export class DeformableStream {
   setLook(look: SheetLook): void {
     if (look.dim === this.look.dim && look.radius === this.look.radius && look.flat === this.look.flat) return;
     this.look = { dim: look.dim, radius: look.radius, flat: look.flat };
-    this.builder = look.dim > 1 ? new SheetBuilder(look, this.vertices, this.arrays) : null;
+    this.builder = look.dim > 1 ? new SheetBuilder(look, this.vertexCount, this.arrays) : null;
   }
 
-  /** Return the surface of vertices, null for a rope. `used`: as in `SheetBuilder.build`. */
-  buildSurface(vertices: Float32Array, used?: Surface): Surface | null {
-    return this.builder?.build(vertices, used) ?? null;
+  /** Return the surface of vertices, null for a rope. `spare`: as in `SheetBuilder.build`. */
+  buildSurface(vertices: Float32Array, spare?: Surface): Surface | null {
+    return this.builder?.build(vertices, spare) ?? null;
   }
 }
 

@@ -36,7 +36,7 @@ export class SheetBuilder {
   /** Drawn points of one side, and where the rim begins. */
   private readonly upper: number;
   private readonly rimStart: number;
-  /** Where each corner of the triangles, and the vertex of each drawn point of one side and of the rim begins. */
+  /** Places in the array of vertices: of the corners of the triangles, of the points of one side, of those of the rim. */
   private readonly corners: Uint32Array;
   private readonly from: Uint32Array;
   private readonly rimFrom: Uint32Array;
@@ -44,8 +44,7 @@ export class SheetBuilder {
   private readonly offset: Float32Array;
   private readonly smooth: Float32Array;
 
-  /** `vertices`: their number. */
-  constructor(look: SheetLook, private readonly vertices: number, { elements, uv }: SheetArrays) {
+  constructor(look: SheetLook, private readonly vertexCount: number, { elements, uv }: SheetArrays) {
     const isThick = look.dim === 2 && look.radius > 0;
     this.radius = isThick ? look.radius : 0;
     this.isFlat = look.flat;
@@ -73,7 +72,7 @@ export class SheetBuilder {
     this.rimStart = isThick ? 2 * this.upper : this.upper;
     const rim: number[] = [];
     const offset: number[] = [];
-    for (const [a, b, ca, cb] of isThick ? findRim(elements, vertices) : []) {
+    for (const [a, b, ca, cb] of isThick ? findRim(elements, vertexCount) : []) {
       for (const [v, sign, c] of [[a, 1, ca], [a, -1, ca], [b, -1, cb], [a, 1, ca], [b, -1, cb], [b, 1, cb]] as const) {
         index.push(this.rimStart + offset.length);
         rim.push(v);
@@ -88,18 +87,18 @@ export class SheetBuilder {
     this.from = Uint32Array.from(vertex, (v) => 3 * v);
     this.rimFrom = Uint32Array.from(rim, (v) => 3 * v);
     this.offset = new Float32Array(offset);
-    this.smooth = new Float32Array(3 * vertices);
+    this.smooth = new Float32Array(3 * vertexCount);
   }
 
   /**
-   * Return the surface of vertices, null if they are of another sheet. It is in `used` if that fits: a surface that is not
-   * needed any more.
+   * Return the surface of vertices, null if they are of another sheet. It is written into `spare`, a surface that is not
+   * needed any more, if that has as many points.
    */
-  build(vertices: Float32Array, used?: Surface): Surface | null {
-    if (vertices.length !== 3 * this.vertices) return null;
+  build(vertices: Float32Array, spare?: Surface): Surface | null {
+    if (vertices.length !== 3 * this.vertexCount) return null;
     const { count, rimStart, smooth, offset, rimFrom } = this;
-    const isFit = used?.position.length === 3 * count;
-    const { position, normal } = isFit ? used : { position: new Float32Array(3 * count), normal: new Float32Array(3 * count) };
+    const isSpare = spare?.position.length === 3 * count;
+    const { position, normal } = isSpare ? spare : { position: new Float32Array(3 * count), normal: new Float32Array(3 * count) };
     addUpNormals(vertices, this.corners, smooth);
     placeSides(vertices, smooth, this.from, this.radius, position, normal);
     for (let i = 0, at = 3 * rimStart; i < offset.length; i++) {
@@ -114,12 +113,12 @@ export class SheetBuilder {
 }
 
 /** Return the edges of one triangle only, as (vertex, vertex, corner, corner), in its winding. */
-function findRim(elements: Uint16Array | Uint32Array, vertices: number): [number, number, number, number][] {
+function findRim(elements: Uint16Array | Uint32Array, vertexCount: number): [number, number, number, number][] {
   const edges = new Map<number, [number, number, number, number] | null>();
   for (let c = 0; c < elements.length; c += 3) {
     for (const [i, j] of [[0, 1], [1, 2], [2, 0]] as const) {
       const [a, b] = [elements[c + i]!, elements[c + j]!];
-      const key = a < b ? a * vertices + b : b * vertices + a;
+      const key = a < b ? a * vertexCount + b : b * vertexCount + a;
       edges.set(key, edges.has(key) ? null : [a, b, c + i, c + j]);
     }
   }

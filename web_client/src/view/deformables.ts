@@ -8,6 +8,7 @@ import {
   InstancedMesh,
   Matrix4,
   Mesh,
+  MeshDepthMaterial,
   type Object3D,
   type ShaderMaterial,
   Vector3,
@@ -21,8 +22,8 @@ import { buildPrimitive } from "./shapes.ts";
 import type { Deformable } from "./spec.ts";
 
 /**
- * A frame of a deformable. `values`: its vertices, in the session's world; `surface`: what is drawn of them, null for
- * ropes; `content`: another number for each that differs from the frame before.
+ * A frame of a deformable. `values`: its vertices, in the session's world. `surface`: what is drawn of them, as in
+ * `DeformableUpdate`. `content`: frames with the same number have the same vertices.
  */
 export interface DeformableFrame extends TimedFrame {
   surface: Surface | null;
@@ -33,7 +34,7 @@ export interface DeformableFrame extends TimedFrame {
 export interface DeformableView {
   readonly object: Object3D;
   readonly stream: string;
-  /** Show what lies between two frames. Those of another topology are ignored. Returns whether the picture has changed. */
+  /** Show what lies between two frames, unless they are of another topology. Returns whether the picture has changed. */
   show(found: Between<DeformableFrame>): boolean;
   dispose(): void;
 }
@@ -48,8 +49,8 @@ export function makeDeformable(part: Deformable, arrays: DeformableArrays, mater
   return view;
 }
 
-/** Points and normals of one frame on the graphics card, and which it is. */
-interface Uploaded {
+/** Points and normals of one frame on the graphics card. `content`: of the frame, -1 for the sheet as it lies at first. */
+interface UploadedFrame {
   position: BufferAttribute;
   normal: BufferAttribute;
   content: number;
@@ -60,50 +61,67 @@ class SheetView implements DeformableView {
   readonly object: Mesh;
   readonly stream: string;
   private readonly geometry = new BufferGeometry();
-  private before: Uploaded;
-  private after: Uploaded;
-  private share = 0;
+  private readonly builder: SheetBuilder;
+  private readonly vertexValues: number;
+  private readonly depthMaterial: MeshDepthMaterial;
+  private readonly share = { value: 0 };
+  private before: UploadedFrame;
+  private after: UploadedFrame;
 
   constructor(part: Deformable, arrays: DeformableArrays, material: ShaderMaterial) {
     this.stream = part.stream;
     const { position } = arrays;
-    const builder = new SheetBuilder(part, position.length / 3, arrays);
-    const rest = builder.build(position)!;
-    this.before = upload(rest);
-    this.after = upload(rest);
-    this.geometry.setIndex(new BufferAttribute(builder.index, 1));
-    if (builder.uv) this.geometry.setAttribute("uv", new BufferAttribute(builder.uv, 2));
+    this.vertexValues = position.length;
+    this.builder = new SheetBuilder(part, position.length / 3, arrays);
+    const rest = this.builder.build(position)!;
+    this.before = makeAttributes(rest);
+    this.after = makeAttributes(rest);
+    this.geometry.setIndex(new BufferAttribute(this.builder.index, 1));
+    if (this.builder.uv) this.geometry.setAttribute("uv", new BufferAttribute(this.builder.uv, 2));
     this.setAttributes();
     this.object = new Mesh(this.geometry, material);
-    this.object.onBeforeRender = (_renderer, _scene, _camera, _geometry, used) => {
-      const { uniforms } = used as ShaderMaterial;
-      if (!uniforms?.share) return; // of shadows and masks, which show the frame before
-      uniforms.share.value = this.share;
-      (used as ShaderMaterial).uniformsNeedUpdate = true;
+    // Sheets that look alike share their material, so the uniform is set for each. Masks have a material without it.
+    this.object.onBeforeRender = (_renderer, _scene, _camera, _geometry, drawnWith) => {
+      const { uniforms } = drawnWith as ShaderMaterial;
+      if (!uniforms?.share) return;
+      uniforms.share.value = this.share.value;
+      (drawnWith as ShaderMaterial).uniformsNeedUpdate = true;
     };
+    this.depthMaterial = makeDepthMaterial(this.share);
+    this.object.customDepthMaterial = this.depthMaterial;
   }
 
   show({ before, after, share }: Between<DeformableFrame>): boolean {
-    if (!this.fits(before) || !this.fits(after)) return false;
+    if (before.values.length !== this.vertexValues || after.values.length !== this.vertexValues) return false;
     let isChanged = before.content !== this.before.content;
     if (isChanged) {
       if (before.content === this.after.content) [this.before, this.after] = [this.after, this.before];
-      else replace(this.before, before);
+      else this.upload(this.before, before);
       this.setAttributes();
     }
     const shareNow = after.content === before.content ? 0 : share;
-    if (shareNow > 0 && after.content !== this.after.content) replace(this.after, after);
-    isChanged ||= shareNow !== this.share;
-    this.share = shareNow;
+    if (shareNow > 0 && after.content !== this.after.content) {
+      this.upload(this.after, after);
+      isChanged = true;
+    }
+    isChanged ||= shareNow !== this.share.value;
+    this.share.value = shareNow;
     return isChanged;
   }
 
   dispose(): void {
     this.geometry.dispose();
+    this.depthMaterial.dispose();
   }
 
-  private fits(frame: DeformableFrame): boolean {
-    return frame.surface?.position.length === this.before.position.array.length;
+  /** Copy a surface, since it is given back. That of a frame from before the scene was changed may not be of this sheet. */
+  private upload(target: UploadedFrame, { surface, values, content }: DeformableFrame): void {
+    const isMine = surface?.position.length === target.position.array.length;
+    const { position, normal } = isMine ? surface : this.builder.build(values)!;
+    (target.position.array as Float32Array).set(position);
+    (target.normal.array as Float32Array).set(normal);
+    target.position.needsUpdate = target.normal.needsUpdate = true;
+    target.content = content;
   }
 
   private setAttributes(): void {
@@ -114,18 +132,21 @@ class SheetView implements DeformableView {
   }
 }
 
-/** Return attributes of their own, since surfaces are given back to the worker. */
-function upload(surface: Surface): Uploaded {
+function makeAttributes(surface: Surface): UploadedFrame {
   const make = (values: Float32Array): BufferAttribute => new BufferAttribute(values.slice(), 3).setUsage(DynamicDrawUsage);
   return { position: make(surface.position), normal: make(surface.normal), content: -1 };
 }
 
-function replace(uploaded: Uploaded, { surface, content }: DeformableFrame): void {
-  if (!surface) return;
-  (uploaded.position.array as Float32Array).set(surface.position);
-  (uploaded.normal.array as Float32Array).set(surface.normal);
-  uploaded.position.needsUpdate = uploaded.normal.needsUpdate = true;
-  uploaded.content = content;
+/** Return the material of shadow maps: points lie where `surface.ts` draws them, or a sheet in motion would shade itself. */
+function makeDepthMaterial(share: { value: number }): MeshDepthMaterial {
+  const material = new MeshDepthMaterial();
+  material.onBeforeCompile = (shader) => {
+    shader.uniforms.share = share;
+    shader.vertexShader = shader.vertexShader
+      .replace("#include <common>", "#include <common>\nattribute vec3 nextPosition;\nuniform float share;")
+      .replace("#include <begin_vertex>", "#include <begin_vertex>\nif (share > 0.0) transformed = mix(transformed, nextPosition, share);");
+  };
+  return material;
 }
 
 /** A rope: a cylinder for each piece. */

@@ -1,9 +1,9 @@
 // Interpolation on the shared clock: what is drawn lies between two received frames, a delay behind session time. Pure.
 
+import { MAX_KEPT_FRAMES } from "../core/api.ts";
+
 /** Rows of a pose: x y z qw qx qy qz. */
 export const POSE_FLOATS = 7;
-/** Frames kept: enough for the longest delay at 120 Hz. */
-const MAX_FRAMES = 32;
 const MIN_DELAY_MS = 10;
 const MAX_DELAY_MS = 300;
 /** The delay shrinks by at most this much per second [ms]: motion looks 2 % slower for a while, not jerky. */
@@ -39,7 +39,7 @@ export class FrameBuffer<T extends TimedFrame = TimedFrame> {
     if (newest && (newest.values.length !== frame.values.length || frame.session_ms < newest.session_ms)) this.clear();
     else if (newest && frame.session_ms === newest.session_ms) this.release(this.frames.pop()!);
     this.frames.push(frame);
-    while (this.frames.length > MAX_FRAMES) this.release(this.frames.shift()!);
+    while (this.frames.length > MAX_KEPT_FRAMES) this.release(this.frames.shift()!);
   }
 
   clear(): void {

@@ -50,11 +50,13 @@ void main() {
   #include <beginnormal_vertex>
   #include <begin_vertex>
   #ifdef IS_INTERPOLATED
-    objectNormal = mix(objectNormal, nextNormal, share);
-    transformed = mix(transformed, nextPosition, share);
+    if (share > 0.0) { // else the next frame may be one of long ago
+      objectNormal = mix(objectNormal, nextNormal, share);
+      transformed = mix(transformed, nextPosition, share);
+    }
   #endif
   #include <worldpos_vertex>
-  // Uniforms that are used are set for every object: matrices of the view only where a shadow needs them.
+  // Setting a matrix for every object takes time: normalMatrix is used for shadows only, and modelViewMatrix nowhere.
   #if defined(USE_SHADOWMAP) || NUM_SPOT_LIGHT_COORDS > 0
     #include <defaultnormal_vertex>
     #include <shadowmap_vertex>

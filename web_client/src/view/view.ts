@@ -72,10 +72,11 @@ export interface HeadsetStage {
   onReset(): void;
 }
 
-/** A stream of a deformable. `found`: what is drawn of it. */
+/** A stream of a deformable. `found`: what is drawn of it; `scene`: number of the scene of its newest frame. */
 interface Stream {
   buffer: FrameBuffer<DeformableFrame>;
   found: Between<DeformableFrame> | null;
+  scene: number;
 }
 
 /** Draws the session on a canvas. Throws `Error` with advice when the browser has no WebGL. */
@@ -113,8 +114,8 @@ export class View {
   private lastFrame_ms = 0;
   private drawnSinceReport = 0;
   private sceneCount = 0;
-  /** Frames of deformables that differed from those before. */
-  private contents = 0;
+  /** Newest number of `DeformableFrame.content`. */
+  private contentCount = 0;
   /** A changed scene that is not in the picture yet. */
   private next: SceneView | null = null;
   private headset: HeadsetStage | null = null;
@@ -182,7 +183,7 @@ export class View {
 
   /**
    * Draw the scene once in another size, without people, anchors, clouds and shadows, and return the picture as a data URL.
-   * `silhouette`: white on black, without planes and sky. For tests and for masks.
+   * `silhouette`: white on black, without planes and sky; deformables in motion as in the frame before. For tests and for masks.
    */
   capture(width: number, height: number, silhouette: boolean): string {
     const { scene, root } = this;
@@ -267,6 +268,7 @@ export class View {
     this.scene?.dispose();
     this.scene = scene;
     this.next = null;
+    this.keepStreams(new Set(scene.spec.deformables.map((part) => part.stream)));
     this.poses = new Float32Array(0); // its bodies lie as they did at first, until they are moved
     this.root.add(scene.world);
     this.touch();
@@ -285,13 +287,28 @@ export class View {
   }
 
   private takeDeformable({ stream, vertices, surface, session_ms }: DeformableUpdate): void {
-    const release = (frame: DeformableFrame): void => this.client.recycleSurface(stream, frame.surface);
-    const target = this.streams.get(stream) ?? { buffer: new FrameBuffer<DeformableFrame>(release), found: null };
-    this.streams.set(stream, target);
+    const target = this.streams.get(stream) ?? this.addStream(stream);
     const { newest } = target.buffer;
-    const isSame = newest !== undefined && isEqual(newest.values, vertices);
-    const content = isSame ? newest.content : ++this.contents;
+    const isSame = newest !== undefined && target.scene === this.sceneCount && isEqual(newest.values, vertices);
+    target.scene = this.sceneCount;
+    const content = isSame ? newest.content : ++this.contentCount;
     target.buffer.push({ session_ms, values: vertices, surface, content });
+  }
+
+  private addStream(name: string): Stream {
+    const release = (frame: DeformableFrame): void => this.client.recycleSurface(name, frame.surface);
+    const stream: Stream = { buffer: new FrameBuffer(release), found: null, scene: this.sceneCount };
+    this.streams.set(name, stream);
+    return stream;
+  }
+
+  /** Forget the frames of deformables that are in no scene any more. */
+  private keepStreams(names: ReadonlySet<string>): void {
+    for (const [name, stream] of this.streams) {
+      if (names.has(name)) continue;
+      stream.buffer.clear();
+      this.streams.delete(name);
+    }
   }
 
   private sessionTime(): number {

@@ -92,13 +92,35 @@ test("the graphics card gets every frame once, and what is between two by a numb
   expect(cloth.get("position").version).toBe(before[1]); // it was there already
 });
 
-test("a sheet that lies still changes nothing, and frames of another one are ignored", () => {
+test("a sheet that lies still changes nothing", () => {
   const cloth = new Cloth({});
   const rest = cloth.makeFrame(1, 1);
   expect(cloth.view.show({ before: rest, after: { ...rest, session_ms: 1000 }, share: 0.3 })).toBe(true);
   expect(cloth.view.show({ before: rest, after: { ...rest, session_ms: 1000 }, share: 0.6 })).toBe(false);
   expect(cloth.view.show({ before: { ...rest, session_ms: 1000 }, after: { ...rest, session_ms: 2000 }, share: 0.1 })).toBe(false);
-  const other = new Cloth({ flat: true }).makeFrame(2, 2);
-  expect(cloth.view.show({ before: other, after: other, share: 0 })).toBe(false);
   expect(cloth.drawn).toEqual([1, 0, 0]);
+});
+
+test("a surface that is missing, or of a sheet that is drawn otherwise, is built of the vertices", () => {
+  const cloth = new Cloth({});
+  const frames = [{ ...cloth.makeFrame(2, 1), surface: null }, { ...new Cloth({ flat: true }).makeFrame(3, 2) }] as const;
+  expect(cloth.view.show({ before: frames[0], after: frames[1], share: 0.5 })).toBe(true);
+  expect(cloth.drawn).toEqual([2, 3, 0.5]);
+});
+
+test("frames of another topology are ignored", () => {
+  const cloth = new Cloth({});
+  const other: DeformableFrame = { session_ms: 0, values: new Float32Array(3), surface: null, content: 1 };
+  expect(cloth.view.show({ before: other, after: other, share: 0 })).toBe(false);
+  expect(cloth.drawn).toEqual([0, 0, 0]);
+});
+
+test("a surface is written into one that is not needed any more, if that has as many points", () => {
+  const [thick, flat] = [new SheetBuilder({ dim: 2, radius: RADIUS, flat: false }, SIDE * SIDE, { elements: ELEMENTS }), new SheetBuilder({ dim: 2, radius: RADIUS, flat: true }, SIDE * SIDE, { elements: ELEMENTS })];
+  const spare = thick.build(POSITION)!;
+  const expected = thick.build(POSITION.map((value) => value + 1))!;
+  const surface = thick.build(POSITION.map((value) => value + 1), spare)!;
+  expect(surface.position).toBe(spare.position);
+  expect([surface.position, surface.normal]).toEqual([expected.position, expected.normal]);
+  expect(flat.build(POSITION, spare)!.position).not.toBe(spare.position);
 });

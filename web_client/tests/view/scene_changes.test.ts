@@ -42,17 +42,21 @@ class Stage {
   problems: string[] = [];
   root = new Scene();
   session_ms = 0;
-  private readonly port: WorkerPort = { postMessage: (message) => this.posted.push(message), onmessage: null };
+  private readonly port: WorkerPort = {
+    postMessage: (message, transfer) => this.posted.push(structuredClone(message, { transfer })),
+    onmessage: null,
+  };
   private readonly client = new WorkerClient(this.port);
   readonly view = Object.assign(Object.create(View.prototype) as View, {
     client: this.client,
     assets: new WorkerAssets(this.client),
-    events: { onScene: (spec: SceneSpec) => this.shownSpecs.push(spec.visuals[0]!.name), onProblem: (text: string) => this.problems.push(text) },
+    events: { onScene: (spec: SceneSpec) => this.shownSpecs.push(spec.visuals[0]?.name ?? ""), onProblem: (text: string) => this.problems.push(text) },
     root: this.root,
     overlay: new Group(),
     frames: new FrameBuffer(),
     streams: new Map(),
-    contents: 0,
+    contentCount: 0,
+    sceneCount: 0,
     scene: null,
     next: null,
     headset: null,
@@ -161,4 +165,23 @@ test("a scene of another room appears at once, and a change of the room before i
   await stage.load("c");
   stage.move(1);
   expect(stage.see()).toEqual([["c", 1, 1]]);
+});
+
+test("every surface is given back when its frame is over, and those of a scene that is gone", async () => {
+  const back = (): number => stage.posted.filter((message) => message.type === "recycle_surface").length;
+  for (let x = 1; x <= 10; x++) stage.move(x);
+  expect(back()).toBe(9); // one is drawn
+  expect(stage.see()).toEqual([["a", 10, 10]]);
+  stage.setScene(decodeScene(encodeStruct("SceneSpec", { name: "an empty room" })));
+  await settle();
+  expect(back()).toBe(10);
+});
+
+test("a cloth at rest is drawn anew when it is drawn otherwise", async () => {
+  stage.move(1);
+  stage.setScene(makeSpec("b"));
+  await settle();
+  await stage.load("b");
+  stage.move(1);
+  expect(stage.see()).toEqual([["b", 1, 1]]);
 });
