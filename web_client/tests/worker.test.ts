@@ -656,6 +656,9 @@ describe("assets and media", () => {
     send();
     send();
     expect(bench.of("deformable")).toHaveLength(held + 1);
+    bench.pass(1100);
+    await bench.until(() => bench.of("stats").length > 0);
+    expect(bench.last("stats").counters["media not taken"]).toBe(103 - held - 1);
   });
 
   describe("a ticket", () => {

@@ -587,7 +587,12 @@ export class ClientWorker {
         media_bytes_per_s: arrivals.mediaBytesPerS,
         missed: arrivals.missed,
         reconnects: counters.reconnects,
-        counters: { ...numbers, ...Object.fromEntries([...state, ...byCode]), "media malformed": this.media.malformed },
+        counters: {
+          ...numbers,
+          ...Object.fromEntries([...state, ...byCode]),
+          "media malformed": this.media.malformed,
+          "media not taken": this.media.notTaken,
+        },
         media: Object.fromEntries([...this.media.counters].map(([stream, counts]) => [stream, { ...counts }])),
       },
       [],

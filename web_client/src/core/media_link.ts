@@ -57,6 +57,8 @@ const LONGEST_PAUSE_MS = 5_000;
 /** Streams of media for the page. */
 export class MediaLink {
   malformed = 0;
+  /** Frames of deformables that a page that does not keep up was not sent. */
+  notTaken = 0;
   /** By stream: of clouds and pictures that are wanted now. */
   readonly counters = new Map<string, MediaCounters>();
   private readonly frames = new NewestFrames<Frame>((stream, frame) => this.begin(stream, frame));
@@ -207,7 +209,10 @@ export class MediaLink {
   ): void {
     const lent = this.lent.get(head.stream) ?? { frames: 0, spare: [] };
     this.lent.set(head.stream, lent);
-    if (lent.frames >= MAX_LENT) return; // the page does not keep up
+    if (lent.frames >= MAX_LENT) {
+      this.notTaken += 1;
+      return;
+    }
     const vertices = deformable.decoder.decode(bytes);
     const surface = this.drawnHz >= LEAST_DRAWN_HZ ? deformable.buildSurface(vertices, lent.spare.pop()) : null;
     lent.frames += 1;

@@ -1,6 +1,6 @@
 // Cloths: what is drawn of a sheet of vertices.
 
-import type { BufferAttribute, Mesh, ShaderMaterial } from "three";
+import { type BufferAttribute, type Mesh, ShaderLib, type ShaderMaterial, type WebGLRenderer } from "three";
 import { expect, test } from "vitest";
 
 import { SheetBuilder } from "../../src/core/sheet.ts";
@@ -123,4 +123,15 @@ test("a surface is written into one that is not needed any more, if that has as 
   expect(surface.position).toBe(spare.position);
   expect([surface.position, surface.normal]).toEqual([expected.position, expected.normal]);
   expect(flat.build(POSITION, spare)!.position).not.toBe(spare.position);
+});
+
+test("shadow maps show a sheet where it is drawn: between two frames", () => {
+  const cloth = new Cloth({});
+  const shader = { ...ShaderLib.depth, uniforms: {} as Record<string, { value: number }> };
+  const material = (cloth.view.object as Mesh).customDepthMaterial!;
+  material.onBeforeCompile(shader as unknown as Parameters<typeof material.onBeforeCompile>[0], {} as WebGLRenderer);
+  expect(shader.vertexShader).toContain("attribute vec3 nextPosition;");
+  expect(shader.vertexShader).toContain("mix(transformed, nextPosition, share)");
+  cloth.view.show({ before: cloth.makeFrame(1, 1), after: cloth.makeFrame(2, 2), share: 0.25 });
+  expect(shader.uniforms.share!.value).toBe(0.25);
 });
