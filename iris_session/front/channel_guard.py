@@ -21,7 +21,7 @@ from iris_session.front.connection_guard import (
 from iris_session.front.connections import TrafficCounter
 from iris_session.front.memory_guard import PendingConnection
 from iris_session.link.config import MEBIBYTE, MILLISECOND, FrontLimits
-from iris_session.link.sockets import close_tcp
+from iris_session.link.sockets import close_tcp, pace_tcp
 from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES
 
 #: Counted messages of one connection to a channel before it is closed: repeated subscriptions, as many as a client can
@@ -202,6 +202,12 @@ class ChannelGuard:
             has_key = bool(key_id) or unread > STRANGER_BYTES
             self._floods.append(ChannelFlood(address, key_id, connection.opened_ns, has_key))
         return counted
+
+    def pace(self, descriptor: int, bytes_per_s: float) -> None:
+        """Limit the rate at which the system sends to a connection, 0 for no limit."""
+        connection = self._tcp.find(descriptor)
+        if connection is not None:
+            pace_tcp(descriptor, connection.address, bytes_per_s)
 
     def pop_floods(self) -> list[ChannelFlood]:
         """Return and forget the connections that were closed for a flood since the last call."""

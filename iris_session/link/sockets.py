@@ -6,6 +6,7 @@ import contextlib
 import resource
 import socket
 import struct
+import sys
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
@@ -50,6 +51,9 @@ _EVENTS = int(zmq.EVENTS)
 _POLLIN = int(zmq.POLLIN)
 #: Linux, `struct tcp_info`: `tcpi_bytes_acked`, and `tcpi_bytes_received` after it.
 _COUNTS_AT: Final = 120
+#: Linux, `asm-generic/socket.h`: TCP sends packets no faster than so many bytes per second (socket(7)). Of a slow link.
+_SO_MAX_PACING_RATE: Final = 47
+_UNPACED: Final = 0xFFFF_FFFF
 #: The kernel closes the connection of a peer that acknowledges no queued data for so long, because it vanished or
 #: sleeps. Else the connection and its queue would stay for a quarter of an hour, or for ever.
 STUCK_MS: Final = 30_000
@@ -214,6 +218,23 @@ def close_tcp(descriptor: int, peer: tuple[str, int], *, discard: bool = False) 
     except OSError:
         return False
     return True
+
+
+def pace_tcp(descriptor: int, peer: tuple[str, int], bytes_per_s: float) -> None:
+    """Have the system send on one TCP connection no faster than this, 0 for no limit: on a slow link a large message
+    that is sent at once delays all that is sent after it. Only Linux can; elsewhere nothing changes.
+
+    Args:
+        descriptor: File descriptor of the connection.
+        peer: Address and port of its peer. A connection with another one, which has got the descriptor since, is left.
+        bytes_per_s: The limit.
+    """
+    if sys.platform != "linux":
+        return
+    rate = min(_UNPACED, round(bytes_per_s)) or _UNPACED
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+        if connection.getpeername()[:2] == peer:
+            connection.setsockopt(socket.SOL_SOCKET, _SO_MAX_PACING_RATE, struct.pack("=I", rate))
 
 
 def peer_of(descriptor: int) -> tuple[str, int]:

@@ -98,6 +98,34 @@ def test_cloud_on_a_link_that_becomes_slow_is_coarser_or_rarer_but_goes_on(mbit:
     assert NONE_LEVEL not in held
 
 
+def test_frames_are_paced_below_what_a_slow_link_carries() -> None:
+    link = Link(1000)
+    assert link.play(5).pace == 0.0, "no limit on a link that is fast enough"
+    link.capacity = 8 * MBIT
+    link.play(15)
+    lowered = next(i for i, (_, grant) in enumerate(link.grants) if grant.levels["cloud"])
+    drains, later = link.grants[lowered][1].pace, link.grants[-1][1].pace
+    assert compute_cost(CLOUD, link.grants[-1][1].levels) < later < 8 * MBIT
+    assert 0 < drains < later, "what fills the link drains first"
+    link.capacity = 1000 * MBIT
+    assert link.play(120).pace == 0.0
+
+
+def test_measured_rate_of_a_full_link_bounds_what_is_sent_and_tried() -> None:
+    controller, rates = BudgetController(), {"cloud": tuple(192 * MBIT / 2**n for n in range(6))}
+    grants = []
+    for i in range(40):
+        share = (1.0, 0.2, 0.13)[max(0, min(2, i - 7))] if i < 10 else 1.0  # of frames: buffers take some
+        measure = LinkMeasure(None, round(15 * share), 15, bytes_per_s=18 * MBIT)
+        grants.append(controller.update(1, measure, rates, i * STEP_NS))
+    costs = [compute_cost(rates, grant.levels) / MBIT for grant in grants]
+    assert costs[:8] == [192.0] * 8
+    assert max(costs[9:30]) == 12.0, "24 Mbit/s is not tried soon: the link carried 18"
+    for i in range(40, 200):
+        controller.update(1, LinkMeasure(None, 15, 15, bytes_per_s=12 * MBIT), rates, i * STEP_NS)
+    assert controller.update(1, LinkMeasure(None, 15, 15), rates, 200 * STEP_NS).levels["cloud"] == 0, "but later"
+
+
 def find_lowered(delivered: list[int]) -> int | None:
     """Return the measure after which the level is lowered. `delivered`: of 15 due frames, each quarter of a second."""
     controller = BudgetController()

@@ -619,3 +619,25 @@ def test_topics() -> None:
     assert parse_topic(make_topic(12, "cloud.1")) == (12, "cloud.1")
     for bad in (b"", b"media/", b"media/0/x/", b"media/1/x", b"media/1/a/b/", b"media/1//", b"media/-1/x/", b"\xff"):
         assert parse_topic(bad) is None
+
+
+def test_pace_of_a_connection_is_told_once_for_each_of_its_readers() -> None:
+    wire = Wire()
+
+    def allow(pace: float) -> None:
+        wire.hub.set_subscribers({ANN: MediaSubscriber("a", {}, 0, pace), BOB: MediaSubscriber("b", {})}, SECOND)
+
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
+    assert wire.hub.pop_paces() == {}
+    allow(5e6)
+    assert wire.hub.pop_paces() == {1: 5e6}
+    assert wire.hub.pop_paces() == {}
+    wire.hub.subscribe(ANN, "camera", "a", 3, SECOND)
+    assert wire.hub.pop_paces() == {3: 5e6}
+    wire.hub.remove_reader(3)
+    wire.hub.subscribe(ANN, "camera", "a", 3, SECOND)  # another connection with this descriptor
+    assert wire.hub.pop_paces() == {3: 5e6}
+    allow(0.0)
+    assert wire.hub.pop_paces() == {1: 0.0, 3: 0.0}
+    assert wire.hub.pop_paces() == {}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import sys
+import threading
 import time
 from contextlib import ExitStack
 
@@ -11,7 +13,7 @@ import zmq
 
 from iris_session.link import sockets
 from iris_session.link.config import FrontConfig, FrontLimits
-from iris_session.link.sockets import FILE_DESCRIPTORS, RESERVED_DESCRIPTORS, close_tcp, fit_limits
+from iris_session.link.sockets import FILE_DESCRIPTORS, RESERVED_DESCRIPTORS, close_tcp, fit_limits, pace_tcp
 
 
 def test_stalled_subscriber_is_cut_off_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,3 +75,24 @@ def test_what_is_unread_of_a_connection_that_is_closed_is_discarded_on_request(d
         assert len(ours.recv(1000, socket.MSG_PEEK | socket.MSG_WAITALL)) == 1000
         assert close_tcp(ours.fileno(), peer, discard=discard)
         assert len(ours.recv(1000)) == (0 if discard else 1000)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has SO_MAX_PACING_RATE")
+def test_paced_connection_sends_no_faster_until_the_limit_is_lifted() -> None:
+    n_bytes = 1_000_000
+    with ExitStack() as stack:
+        listening = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        near = stack.enter_context(socket.create_connection(listening.getsockname()))
+        far = stack.enter_context(listening.accept()[0])
+        pace_tcp(near.fileno(), ("127.0.0.1", 1), 1.0)  # of a descriptor that is another's now
+        for pace, shortest_s in ((1_000_000, 0.25), (0, 0.0)):  # the system sends ten segments of 64 KiB at once
+            pace_tcp(near.fileno(), near.getpeername(), pace)
+            sender = threading.Thread(target=near.sendall, args=(bytes(n_bytes),))
+            began = time.monotonic()
+            sender.start()
+            left = n_bytes
+            while left:
+                left -= len(far.recv(left))
+            assert time.monotonic() - began >= shortest_s
+            sender.join()
+        assert near.getsockopt(socket.SOL_SOCKET, 47) == -1, "SO_MAX_PACING_RATE, as it was"

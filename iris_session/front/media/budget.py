@@ -40,6 +40,8 @@ BLOCKED: Final = 0.15
 BLOCKED_EACH: Final = 0.1
 #: After a change, frames that are under way still have to arrive.
 SETTLE_NS: Final = 500 * MILLISECOND
+#: After a level was lowered, frames of the level before are in the way of those that are due for so long.
+FLUSH_NS: Final = SECOND
 #: Reports do not count for so long after a level was lowered: queues on the way have to drain, beside the media that
 #: are left, and a report covers the second before it.
 DRAIN_NS: Final = 2600 * MILLISECOND
@@ -50,7 +52,13 @@ LOWER_TO: Final = 0.7
 #: limit.
 SLACK: Final = 1.5
 LIMIT_SLACK: Final = 1.15
-#: Time between steps up. To a level that has failed it doubles each time, until the level works.
+#: Frames for a slow link are sent at so many times the rate that they are given: a frame that was sent at once would
+#: fill it, and delay the state behind it. `LOWER_TO` times this is less than what came through.
+PACE: Final = 1.1
+#: The same just after a level was lowered: what fills the link has to drain.
+DRAIN_PACE: Final = 0.6
+#: Time between steps up. To a level that has failed, after a step up or because the link did not take it, it doubles
+#: each time, until the level works.
 RAISE_NS: Final = 3 * SECOND
 RAISE_MAX_NS: Final = 48 * SECOND
 #: Rates are measured and vary: levels that cost this share of those that failed are the same ones.
@@ -80,6 +88,7 @@ class LinkMeasure(NamedTuple):
         due: Media frames that were due.
         limit: Bytes per second that the client wants at most, 0 for no limit.
         newest: Bytes of the newest frame by stream.
+        bytes_per_s: Rate at which its connection was acknowledged what was sent since then, 0 if that is not known.
     """
 
     report: StateReport | None
@@ -87,14 +96,17 @@ class LinkMeasure(NamedTuple):
     due: int = 0
     limit: float = 0.0
     newest: Mapping[str, int] = MappingProxyType({})
+    bytes_per_s: float = 0.0
 
 
 class BudgetGrant(NamedTuple):
-    """Levels of one client. `levels`: index into `LEVELS` by stream. `bytes_per_s`: bound of all, 0 for none."""
+    """Levels of one client. `levels`: index into `LEVELS` by stream. `bytes_per_s`: bound of all, 0 for none. `pace`:
+    bytes per second at which their frames are to be sent, 0 for as fast as the connection takes them."""
 
     levels: dict[str, int]
     bytes_per_s: float = 0.0
     reason: str = ""
+    pace: float = 0.0
 
 
 def compute_cost(rates: Rates, levels: Mapping[str, int]) -> float:
@@ -173,7 +185,11 @@ class BudgetController:
             state.congested_ns = now_ns
         if reason and present > 0.0:
             state.blameless_since_ns = -1
-            self._lower_levels(state, rates, LOWER_TO * present * state.delivered_share, reason, now_ns)
+            passed = present * state.delivered_share
+            if state.is_blocked and measure.bytes_per_s:
+                passed = min(passed, measure.bytes_per_s)  # of frames, buffers take some first
+                state.failed = min(state.failed, measure.bytes_per_s / SAME_COST)
+            self._lower_levels(state, rates, LOWER_TO * passed, reason, now_ns)
         elif reason:
             if now_ns >= state.single_until_ns:
                 self._relearn_best(state, now_ns)
@@ -187,7 +203,10 @@ class BudgetController:
         if not reason:
             self._give_singles(state, resting, measure.newest, allowed, now_ns)
         bound = 0.0 if math.isinf(allowed) else allowed
-        return BudgetGrant(dict(state.levels), bound, state.reason if bound or any(state.levels.values()) else "")
+        reason = state.reason if bound or any(state.levels.values()) else ""
+        drains = now_ns - state.lowered_ns < SETTLE_NS
+        pace = (DRAIN_PACE if drains else PACE) * max(bound, compute_cost(rates, state.levels)) if bound else 0.0
+        return BudgetGrant(dict(state.levels), bound, reason, pace)
 
     # --- congestion --------------------------------------------------------------------------------------------------
 
@@ -197,8 +216,9 @@ class BudgetController:
             self._judge_report(state, measure.report, now_ns)
         if measure.due:
             share = measure.delivered / measure.due
-            state.delivered_share = (state.delivered_share + share) / 2  # buffers take some first
-            before, state.missing = state.missing, 1.0 - share
+            state.delivered_share = (state.delivered_share + share) / 2
+            flushes = now_ns - state.lowered_ns < FLUSH_NS
+            before, state.missing = state.missing, 0.0 if flushes else 1.0 - share
             state.is_blocked = min(before, state.missing) > BLOCKED_EACH and before + state.missing > 2 * BLOCKED
         if state.reported_ns >= 0 and now_ns - state.reported_ns > SILENT_NS:
             state.delivered_share = 0.0
@@ -249,7 +269,7 @@ class BudgetController:
                 state.single_until_ns = now_ns + round(newest.get(stream, 0) / bytes_per_s * SECOND)
 
     def _lower_levels(self, state: _ClientBudget, rates: Rates, bytes_per_s: float, reason: str, now_ns: int) -> None:
-        if now_ns - state.raised_ns <= PROBE_NS:
+        if state.is_blocked or now_ns - state.raised_ns <= PROBE_NS:
             state.failed = min(state.failed, compute_cost(rates, state.levels))
             state.raise_after_ns = min(2 * state.raise_after_ns, RAISE_MAX_NS)
         levels = select_levels(rates, bytes_per_s)

@@ -161,6 +161,8 @@ class MediaProxy:
             with self.lock:
                 closed += [self._subscriber_guard.evict(fd, "media_memory") for fd in self.scheduler.pop_stuck()]
                 self._count_reasons(closed)
+                for descriptor, bytes_per_s in self.scheduler.pop_paces().items():
+                    self._subscriber_guard.pace(descriptor, bytes_per_s)
                 waits = self.scheduler.flush(self._send, self._now_ns())
                 if self._recorder is not None:
                     self._recorder.tick(self.scheduler, self._now_ns())

@@ -60,11 +60,13 @@ class MediaSubscriber(NamedTuple):
         user_id: Key that its subscriptions must come with.
         levels: Index into `LEVELS` by stream.
         default_level: Level of other streams.
+        bytes_per_s: Rate at which frames are to be sent, 0 for as fast as the connection takes them.
     """
 
     user_id: str
     levels: Mapping[str, int]
     default_level: int = 0
+    bytes_per_s: float = 0.0
 
 
 class DeliveryCounters(NamedTuple):
@@ -190,6 +192,7 @@ class MediaScheduler:
         self._refused: dict[tuple[int, str], tuple[int, int]] = {}  # by sender and stream: since when, and when last
         self._left: deque[int] = deque(maxlen=MAX_LEFT)
         self._stuck: set[int] = set()
+        self._paces: dict[int, float] = {}  # bytes per second by descriptor, where there is a limit
         self.drops: dict[str, int] = {}
         self.superseded: dict[int, int] = {}
 
@@ -250,6 +253,7 @@ class MediaScheduler:
 
     def remove_reader(self, reader: int) -> None:
         """Remove a TCP connection that has ended, with its subscriptions."""
+        self._paces.pop(reader, None)  # the next connection may have its descriptor
         for number, stream in sorted(self._by_reader.pop(reader, ())):
             self.unsubscribe(number, stream, reader)
 
@@ -257,12 +261,28 @@ class MediaScheduler:
         """Return the streams that a connection subscribed to."""
         return sorted(self._by_number.get(number, ()))
 
+    def list_readers(self, number: int) -> set[int]:
+        """Return the descriptors by which a connection gets media."""
+        streams = self._by_number.get(number, ())
+        return {reader for stream in streams for reader in self._subscriptions[number, stream].readers}
+
     def read_counters(self, number: int) -> DeliveryCounters:
         """Return the counters of all subscriptions of a connection."""
         total = self._ended_counters.get(number, DeliveryCounters())
         for stream in self._by_number.get(number, ()):
             total = total.combine(self._subscriptions[number, stream].counters)
         return total
+
+    def pop_paces(self) -> dict[int, float]:
+        """Return the readers whose rate has changed since the last call, with bytes per second, 0 for no limit."""
+        wanted: dict[int, float] = {}
+        for number, one in self._subscribers.items():
+            if one.bytes_per_s:
+                wanted |= dict.fromkeys(self.list_readers(number), one.bytes_per_s)
+        ended = self._paces.keys() - wanted.keys()
+        changed = {reader: pace for reader, pace in wanted.items() if self._paces.get(reader) != pace}
+        self._paces = wanted
+        return changed | dict.fromkeys(ended & self._by_reader.keys(), 0.0)
 
     # --- frames ------------------------------------------------------------------------------------------------------
 

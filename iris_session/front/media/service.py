@@ -5,6 +5,7 @@ The front's side of the media proxy: it decides which keys may hand in frames, a
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Final
 
 import msgspec
@@ -25,6 +26,7 @@ from iris_session.front.media.budget import (
 )
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import LOCAL, DeliveryCounters, MediaSubscriber, StreamStats
+from iris_session.link.sockets import tcp_counts
 from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import BudgetClass
@@ -56,6 +58,8 @@ class _ClientState:
         self.grant = BudgetGrant({})
         self.streams: list[str] = []
         self.bytes_per_s = 0.0
+        self.acknowledged: dict[int, int] = {}  # bytes by descriptor
+        self.measured_ns = 0
         self.drops = 0
         self.budget: tuple[Any, ...] | None = None
 
@@ -181,6 +185,7 @@ class MediaService:
             reasons, superseded = proxy.scheduler.pop_drops()
             wanted = {number: proxy.scheduler.list_subscriptions(number) for number in self._states}
             tallies = {number: proxy.scheduler.read_counters(number) for number in self._states}
+            readers = {number: proxy.scheduler.list_readers(number) for number in self._states}
         self._decide_sources(again=True)
         self._note_senders()
         for reason, count in reasons.items():
@@ -191,7 +196,8 @@ class MediaService:
                 self._states[number].drops += count
         for number, state in self._states.items():
             state.streams = wanted[number]
-            self._update_client(number, state, tallies[number], now_ns)
+            link_bytes_per_s = _measure_link(state, readers[number], now_ns)
+            self._update_client(number, state, tallies[number], link_bytes_per_s, now_ns)
         self._describe_streams(now_ns)
         self._publish_levels()
 
@@ -222,7 +228,9 @@ class MediaService:
         shown = {name: self._described.get(name, one) for name, one in found.items()}
         self._described = found if shown == found or self._description_bucket.take(now_ns) else shown
 
-    def _update_client(self, number: int, state: _ClientState, tally: DeliveryCounters, now_ns: int) -> None:
+    def _update_client(
+        self, number: int, state: _ClientState, tally: DeliveryCounters, link_bytes_per_s: float, now_ns: int
+    ) -> None:
         before, state.counters = state.counters, tally
         state.bytes_per_s = (tally.bytes - before.bytes) * 1e9 / PERIOD_NS
         report, fresh = self._connections.by_number[number].recent_report(now_ns), None
@@ -232,7 +240,9 @@ class MediaService:
         limit = max(0.0, state.report.media_limit_mbit_per_s) * MBIT if state.report is not None else 0.0
         streams = {stream: self._stats[stream] for stream in state.streams if stream in self._stats}
         newest = {stream: facts.frame_bytes or 0 for stream, facts in streams.items()}
-        measure = LinkMeasure(fresh, tally.delivered - before.delivered, tally.due - before.due, limit, newest)
+        measure = LinkMeasure(
+            fresh, tally.delivered - before.delivered, tally.due - before.due, limit, newest, link_bytes_per_s
+        )
         rates = {stream: facts.rates for stream, facts in streams.items()}
         if self._controller is not None:
             state.grant = self._controller.update(number, measure, rates, now_ns)
@@ -250,7 +260,9 @@ class MediaService:
         subscribers = {}
         for number, state in self._states.items():
             key = self._context.find_channel_key(self._connections.by_number[number])
-            subscribers[number] = MediaSubscriber(key, state.grant.levels, _initial_level(state.grant))
+            subscribers[number] = MediaSubscriber(
+                key, state.grant.levels, _initial_level(state.grant), state.grant.pace
+            )
         with self._proxy.lock:
             self._proxy.scheduler.set_subscribers(subscribers, self._context.now_ns())
 
@@ -338,6 +350,16 @@ def _describe_stream(name: str, facts: StreamStats, now_ns: int) -> StreamBudget
         detail=info.detail,
         stale=facts.is_stale(now_ns),
     )
+
+
+def _measure_link(state: _ClientState, readers: Iterable[int], now_ns: int) -> float:
+    """Return the rate at which what was sent to the connections of one client was acknowledged since the last call, 0
+    if that is not known."""
+    counts = {reader: counts.acknowledged for reader in readers if (counts := tcp_counts(reader)) is not None}
+    before, state.acknowledged = state.acknowledged, counts
+    seconds, state.measured_ns = (now_ns - state.measured_ns) * 1e-9, now_ns
+    n_bytes = sum(count - before[reader] for reader, count in counts.items() if count >= before.get(reader, count + 1))
+    return n_bytes / seconds if seconds > 0.0 else 0.0
 
 
 def _initial_level(grant: BudgetGrant) -> int:
