@@ -126,6 +126,15 @@ def test_measured_rate_of_a_full_link_bounds_what_is_sent_and_tried() -> None:
     assert controller.update(1, LinkMeasure(None, 15, 15), rates, 200 * STEP_NS).levels["cloud"] == 0, "but later"
 
 
+def test_short_halt_of_a_link_does_not_end_its_media() -> None:
+    controller, rates = BudgetController(), {"cloud": tuple(192 * MBIT / 2**n for n in range(6))}
+    measures = [LinkMeasure(None, 15, 15, bytes_per_s=192 * MBIT)] * 8
+    measures += [LinkMeasure(None, 8, 15, bytes_per_s=90 * MBIT), LinkMeasure(None, 0, 15, bytes_per_s=0.01 * MBIT)]
+    grants = [controller.update(1, one, rates, i * STEP_NS) for i, one in enumerate(measures)]
+    assert grants[-2].levels["cloud"] == 0
+    assert 0 < grants[-1].levels["cloud"] < NONE_LEVEL
+
+
 def find_lowered(delivered: list[int]) -> int | None:
     """Return the measure after which the level is lowered. `delivered`: of 15 due frames, each quarter of a second."""
     controller = BudgetController()

@@ -48,6 +48,9 @@ DRAIN_NS: Final = 2600 * MILLISECOND
 SILENT_NS: Final = 3 * SECOND
 #: Levels are lowered to this share of the rate that came through.
 LOWER_TO: Final = 0.7
+#: The rate at which a connection took its media counts down to one part in so many of what its frames say: a link that
+#: comes to a halt for half a second is not slow.
+MAX_FALL: Final = 8.0
 #: Rates are measured and vary: levels stay until they cost so much more than the budget, or than the client's own
 #: limit.
 SLACK: Final = 1.5
@@ -186,9 +189,9 @@ class BudgetController:
         if reason and present > 0.0:
             state.blameless_since_ns = -1
             passed = present * state.delivered_share
-            if state.is_blocked and measure.bytes_per_s:
-                passed = min(passed, measure.bytes_per_s)  # of frames, buffers take some first
-                state.failed = min(state.failed, measure.bytes_per_s / SAME_COST)
+            if state.is_blocked and measure.bytes_per_s:  # of frames, buffers take some first
+                passed = min(passed, max(measure.bytes_per_s, passed / MAX_FALL))
+                state.failed = min(state.failed, passed / SAME_COST)
             self._lower_levels(state, rates, LOWER_TO * passed, reason, now_ns)
         elif reason:
             if now_ns >= state.single_until_ns:
