@@ -567,12 +567,11 @@ class RrdWriter:
             changes += [(event.step, event.session_time, change) for change in one.changes]
             if one.participant:
                 self._plot_person(event, one)
-                self._anchors.set_error(one.worst_at_anchor_m, self._find_moment(event.step, event.session_time))
+                self._anchors.set_error(one.worst_at_anchor_m, self._find_anchor_moment(event))
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._people.remove(event.body.participant, self._find_moment(event.step, event.session_time))
             elif isinstance(event.body, AnchorMoved):
-                moment = self._find_moment(event.step, event.session_time)
-                self._anchors.move(event.body.anchor_id, event.body.T_world_anchor, moment)
+                self._anchors.move(event.body.anchor_id, event.body.T_world_anchor, self._find_anchor_moment(event))
             elif isinstance(event.body, SceneChanged) and event.body.cause == "new_scene":
                 self._people.label_robots({}, self._find_moment(event.step, event.session_time))
         text = rr.TextLog.columns(text=[one.line.text for one in told], level=[one.line.level for one in told])
@@ -580,6 +579,12 @@ class RrdWriter:
         times = self._to_times(paths.EVENTS, [e.step for e in events], [e.session_time for e in events])
         self._send_columns(paths.EVENTS, times, columns)
         self._add_lanes(changes)
+
+    def _find_anchor_moment(self, event: Event) -> Moment:
+        """Return the moment of an event that may change anchors; no two are equal."""
+        moment = self._find_moment(event.step, event.session_time)
+        (shown_ns,) = self._times.spread(paths.ANCHORS, [moment.session_ns])
+        return self._make_moment(moment.step, moment.sim_ns, shown_ns)
 
     def _tell(self, event: Event) -> _Told:
         line, changes = self._story.add(event)

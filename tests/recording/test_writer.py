@@ -716,6 +716,19 @@ def test_anchors_have_axes_and_the_worst_stated_error(tmp_path: Path) -> None:
     assert [size[0][0] for size in sizes] == pytest.approx([0.0, 0.002, 0.005, 0.002])
 
 
+def test_errors_at_anchors_that_change_at_one_time_are_rows_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    sheet = Pose((1.0, 2.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, anchors={"sheet": sheet}))
+    alignments = [Alignment(i, "measured", sheet, 0, (), i * 1e-3, 0.1) for i in (1, 2, 3)]
+    events = [Event(i, 1, 100, AlignmentChanged("p1", one)) for i, one in enumerate(alignments, 1)]
+    writer.add(Batch(events=events, states=[frame(0, np.zeros((0, 7)))]))
+    writer.close()
+    times = column(select(read(path)["/anchors/sheet/error"], "Ellipsoids3D:half_sizes"), "session_time")
+    assert len(set(times)) == len(times) == 4
+
+
 def test_result_is_in_properties_and_text(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     header, batch = journal(3)
