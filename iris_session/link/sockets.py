@@ -227,7 +227,8 @@ def pace_tcp(descriptor: int, peer: tuple[str, int], bytes_per_s: float) -> None
     Args:
         descriptor: File descriptor of the connection.
         peer: Address and port of its peer. A connection with another one, which has got the descriptor since, is left.
-        bytes_per_s: The limit.
+        bytes_per_s: The limit. A segment that was sent delays the next one by the limit at its time, also when that is
+            lifted: a low one may stop the connection for long.
     """
     if sys.platform != "linux":
         return

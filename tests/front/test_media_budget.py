@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.front.media.budget import (
+    MIN_PACE,
     NONE_LEVEL,
     RAISE_NS,
     BudgetController,
@@ -109,6 +110,37 @@ def test_frames_are_paced_below_what_a_slow_link_carries() -> None:
     assert 0 < drains < later, "what fills the link drains first"
     link.capacity = 1000 * MBIT
     assert link.play(120).pace == 0.0
+
+
+def test_stream_that_hardly_moves_is_not_paced_by_what_it_costs() -> None:
+    """A segment would hold back what comes after it for minutes, when the stream moves again."""
+    link, slow, moving = Link(100), {"cloth": (400.0, 200.0, 100.0, 50.0, 25.0, 12.5)}, CLOUD["cloud"]
+    link.play(5, slow)
+    link.age_ms = 300.0
+    link.play(10, slow)
+    grant = link.grants[-1][1]
+    assert 0.0 < grant.bytes_per_s < 400.0, "the machine is slow, the session takes it for the link"
+    assert grant.pace >= MIN_PACE
+    link.age_ms = 10.0
+    link.play(60, {"cloth": moving})
+    assert link.grants[-1][1] == BudgetGrant({"cloth": 0})
+
+
+def test_frames_that_wait_for_their_own_pace_are_no_congestion() -> None:
+    controller, rates = BudgetController(), {"cloud": tuple(16 * MBIT / 2**n for n in range(6))}
+    for share in (1.0, 1.0, 1.0, 1.0, 0.5, 0.5):
+        measure = LinkMeasure(None, round(16 * share), 16, bytes_per_s=8 * MBIT * share)
+        before = controller.update(1, measure, rates, SECOND)
+    now_ns, grown = 6 * SECOND, {"cloud": tuple(2 * rate for rate in rates["cloud"])}
+    # Large segments leave rarely: none in one measure, two in the next.
+    for taken in (2.0 * before.pace, 0.0, 2.0 * before.pace, 0.0):
+        paced = controller.update(1, LinkMeasure(None, 8, 16, bytes_per_s=taken), grown, now_ns)
+        now_ns += STEP_NS
+        assert paced.bytes_per_s >= before.bytes_per_s, paced
+    for _ in range(4):
+        full = controller.update(1, LinkMeasure(None, 8, 16, bytes_per_s=0.5 * before.pace), grown, now_ns)
+        now_ns += STEP_NS
+    assert full.bytes_per_s < before.bytes_per_s
 
 
 def test_measured_rate_of_a_full_link_bounds_what_is_sent_and_tried() -> None:

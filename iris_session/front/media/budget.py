@@ -60,6 +60,12 @@ LIMIT_SLACK: Final = 1.15
 PACE: Final = 1.1
 #: The same just after a level was lowered: what fills the link has to drain.
 DRAIN_PACE: Final = 0.6
+#: Lowest pace [bytes/s]. TCP plans when the next segment may leave by the pace of the last one, and keeps to that when
+#: the pace is raised. Between two processes of one computer a segment has up to 64 KiB: a quarter of a second at this
+#: pace, but eleven minutes at 100 bytes per second, which a stream that hardly moves may cost.
+MIN_PACE: Final = 262_144.0
+#: A connection that took this share of its pace is held back by the pace, not by the link: its rates have grown.
+PACED: Final = 0.8
 #: Time between steps up. To a level that has failed, after a step up or because the link did not take it, it doubles
 #: each time, until the level works.
 RAISE_NS: Final = 3 * SECOND
@@ -156,6 +162,8 @@ class _ClientBudget:
         self.complaint = ""  # what the newest report complains about
         self.missing = 0.0  # share of due frames that were not delivered, in the newest measure
         self.is_blocked = False
+        self.pace = 0.0
+        self.taken = 0.0  # bytes per second that the connection was acknowledged, in the newest measure
         self.delivered_share = 1.0  # smoothed share of due frames that were delivered
         self.changed_ns = self.lowered_ns = self.raised_ns = self.congested_ns = -SILENT_NS
         self.raise_after_ns = RAISE_NS
@@ -208,8 +216,9 @@ class BudgetController:
         bound = 0.0 if math.isinf(allowed) else allowed
         reason = state.reason if bound or any(state.levels.values()) else ""
         drains = now_ns - state.lowered_ns < SETTLE_NS
-        pace = (DRAIN_PACE if drains else PACE) * max(bound, compute_cost(rates, state.levels)) if bound else 0.0
-        return BudgetGrant(dict(state.levels), bound, reason, pace)
+        pace = (DRAIN_PACE if drains else PACE) * max(bound, compute_cost(rates, state.levels))
+        state.pace = max(pace, MIN_PACE) if bound else 0.0
+        return BudgetGrant(dict(state.levels), bound, reason, state.pace)
 
     # --- congestion --------------------------------------------------------------------------------------------------
 
@@ -223,6 +232,8 @@ class BudgetController:
             flushes = now_ns - state.lowered_ns < FLUSH_NS
             before, state.missing = state.missing, 0.0 if flushes else 1.0 - share
             state.is_blocked = min(before, state.missing) > BLOCKED_EACH and before + state.missing > 2 * BLOCKED
+            state.is_blocked = state.is_blocked and not self._is_paced(state, measure)
+        state.taken = measure.bytes_per_s
         if state.reported_ns >= 0 and now_ns - state.reported_ns > SILENT_NS:
             state.delivered_share = 0.0
             return "the client has not reported for 3 s"
@@ -231,6 +242,11 @@ class BudgetController:
         if state.is_blocked:
             return "the link does not take all media"
         return state.complaint
+
+    @staticmethod
+    def _is_paced(state: _ClientBudget, measure: LinkMeasure) -> bool:
+        """Return whether frames are missing because of the pace: over two measures, as large segments are rare."""
+        return 0.0 < PACED * state.pace <= (state.taken + measure.bytes_per_s) / 2
 
     def _judge_report(self, state: _ClientBudget, report: StateReport, now_ns: int) -> None:
         state.reported_ns = now_ns
