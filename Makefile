@@ -106,7 +106,7 @@ test-unit: install-dev
 	@rm -f .coverage
 	$(UNIT) $(T)
 
-# Emulated people need their share of the cores in time, or they drop what they hold: not beside all the others.
+# Emulated people need their share of the cores in time, or they drop what they hold: one demo at a time.
 DEMOS := tests/e2e/test_demo_scenes.py tests/e2e/test_demo_handover.py
 # A browser that draws in software takes both cores, drawn cameras one; the doctor finds fault with a busy machine; four
 # emulated headsets that see drift and bumps, or the many sessions of the docs tests, take what others need in time:
@@ -115,7 +115,7 @@ ALONE := tests/test_docs.py tests/e2e/test_alignment.py tests/e2e/test_doctor.py
   tests/e2e/test_clouds.py tests/e2e/test_demo_cloud.py tests/e2e/test_looks.py tests/bench/test_web.py
 test-e2e: install-dev $(PAGE)
 ifeq ($(T),tests)
-	$(E2E) --dist load $(DEMOS)
+	$(E2E) -n 1 $(DEMOS)
 	$(E2E) $(addprefix --ignore=,$(DEMOS) $(ALONE)) $(T)
 	$(E2E) -n 1 $(ALONE)
 else

@@ -33,10 +33,10 @@ DEADLINE_S: Final = 60.0
 START_S: Final = 90.0
 #: Commands that end by themselves; and a whole demo, which takes a minute on an idle machine [s].
 COMMAND_S: Final = 120.0
-DEMO_S: Final = 600.0
+DEMO_S: Final = 900.0
 #: Options of a demo that must succeed on a busy machine, too: it may be begun twice more, and verifying what it has
 #: recorded takes as long again.
-DEMO_OPTIONS: Final = ("--json", "--timeout", "240")
+DEMO_OPTIONS: Final = ("--json", "--timeout", "360")
 COMMAND: Final = [sys.executable, "-m", "iris_session.cli.main"]
 #: Options of `serve` that bind free ports.
 FREE_PORTS: Final = ("--control-port", "0", "--state-port", "0")

@@ -76,7 +76,7 @@ def test_failed_operators_begin_again_from_a_reset_scene(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(run._EmulatorGroup, "list_failures", fail_once_at_work)
     config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd")
-    result = run.run_demo(make_demo("handover"), config, timeout_s=270.0)
+    result = run.run_demo(make_demo("handover"), config, timeout_s=360.0)
     assert (result.ok, result.verified) == (True, True), result.problems
     assert 2 <= result.takes <= 3  # on a busy machine an operator may fail by itself, too
     assert "dropped it" in "".join(result.notes)
