@@ -199,8 +199,6 @@ class SessionRobots:
             shapes = scene.spec, scene.meshes, tuple(mirror.robots.values()), mirror.bodies
             points = RobotPoints(*shapes) if self._removes else None
             surface = RobotSurface(*shapes)
-            if points is not None:
-                points.warm_up()  # in the loop that reports it might look as if the process hangs
         except Exception as error:  # of a connection, or of a scene: the cloud goes on with the points on robots
             if self._surface is None:
                 self._warn(str(error))

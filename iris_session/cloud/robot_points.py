@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from anchors.camera import pose_to_matrix
-from anchors.pose import PoseTuple
 from iris_session.cloud.pipeline import BodyPose
 from iris_session.cloud.voxels import Positions, load_kernels
 from iris_session.protocol.names import GeometryKind
@@ -35,7 +34,6 @@ _MAX_CELLS: Final = 4_000_000
 _FAR: Final = 255
 #: Pieces that the longest edge of a triangle is cut into, at most: 2.5 m of a robot.
 _MAX_PIECES: Final = 512
-_ORIGIN: Final[PoseTuple] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 Distances = npt.NDArray[np.uint8]
 
 
@@ -98,11 +96,6 @@ class RobotPoints:
         self.n_bodies = self._robots.n
         self.n_unknown = 0
 
-    def warm_up(self) -> None:
-        """Let numba compile what `find` needs: the first time takes seconds."""
-        for shapes in (self._robots, self._things):
-            shapes.measure(np.zeros((1, 3), np.float32), lambda name, at_ns: _ORIGIN, 0)
-
     def find(self, positions: Positions, body_pose: BodyPose, capture_ns: int) -> npt.NDArray[np.bool_]:
         """Return which points lie on a robot.
 
@@ -121,6 +114,17 @@ class RobotPoints:
             to_things, _ = self._things.measure(positions[rows], body_pose, capture_ns)
             found[rows] = distances[rows] <= to_things
         return found
+
+
+def warm_up_removal() -> None:
+    """Let numba compile what `RobotPoints.find` needs, or load it: the first time takes seconds."""
+    kernels = load_kernels()
+    if kernels is not None:
+        points, turns = np.zeros((1, 3), np.float32), np.zeros((1, 3, 4), np.float32)
+        shapes, found = np.ones((1, 3), np.int32), np.zeros(1, np.uint8)
+        kernels.measure_distances(
+            points, np.zeros((1, 4), np.float32), turns, np.zeros(1, np.uint8), np.zeros(1, np.int64), shapes, found
+        )
 
 
 class _Shapes:
@@ -166,8 +170,8 @@ class _Shapes:
         measure = _measure if self._kernels is None else self._kernels.measure_distances
         measure(
             np.ascontiguousarray(positions, np.float32),
-            spheres.astype(np.float32),
-            to_cells.astype(np.float32),
+            np.ascontiguousarray(spheres, np.float32),
+            np.ascontiguousarray(to_cells, np.float32),
             self._flat,
             self._starts[present],
             self._shapes[present],

@@ -32,6 +32,7 @@ from iris_session.cloud.pipeline import (
     PointRemover,
 )
 from iris_session.cloud.reader import NewFrame, SourceReader
+from iris_session.cloud.robot_points import warm_up_removal
 from iris_session.cloud.sources.playback import DEFAULT_HZ
 from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, choose_max_cells
 from iris_session.protocol.common import MAX_TEXT
@@ -446,9 +447,12 @@ def make_pipeline_camera(settings: CloudSettings, camera: CameraSettings) -> Pip
 
 
 def make_warm_filter(settings: CloudSettings) -> VoxelFilter:
-    """Return a filter that is compiled: the first picture would take seconds, in which nothing is reported."""
+    """Return a filter that is compiled, and compile what removes points on robots: the first picture would take
+    seconds, in which nothing is reported."""
     voxels = VoxelFilter(settings.voxel_m, max_cells=choose_max_cells(settings.points))
     voxels.warm_up()
+    if settings.remove_robots:
+        warm_up_removal()
     return voxels
 
 

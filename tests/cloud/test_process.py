@@ -110,13 +110,8 @@ class FakeRobotPoints:
 
     def __init__(self, *_: object) -> None:
         self.n_unknown = 0
-        self.is_warm = False
-
-    def warm_up(self) -> None:
-        self.is_warm = True
 
     def find(self, positions: Any, body_pose: object, capture_ns: int) -> Any:
-        assert self.is_warm
         return positions[:, 0] > 0.0
 
 

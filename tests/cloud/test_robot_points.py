@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from anchors.camera import CameraModel
 from anchors.pose import PoseTuple
-from iris_session.cloud.robot_points import RobotPoints, find_robot_bodies
+from iris_session.cloud import robot_points
+from iris_session.cloud.robot_points import RobotPoints, find_robot_bodies, warm_up_removal
 from iris_session.physics import find_robots
 from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
@@ -121,7 +122,7 @@ def test_bodies_without_a_pose_are_counted_and_keep_their_points(
 
 
 def test_what_is_compiled_at_the_beginning_is_what_is_called(
-    robot_models: Path, tmp_path_factory: pytest.TempPathFactory
+    robot_models: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
     called: list[tuple[Any, ...]] = []
@@ -130,9 +131,9 @@ def test_what_is_compiled_at_the_beginning_is_what_is_called(
         def measure_distances(self, *arrays: NDArray[Any]) -> None:
             called.append(tuple((one.dtype, one.ndim, one.flags.c_contiguous) for one in arrays))
 
+    monkeypatch.setattr(robot_points, "load_kernels", lambda use_numba=None: Kernels())
+    warm_up_removal()
     found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed)
-    found._robots._kernels = Kernels()
-    found.warm_up()
     assert len(called) == 1
     found.find(holding.points, holding.body_pose, 7)
     assert called[0] == called[1]

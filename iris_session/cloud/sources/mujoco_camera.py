@@ -22,6 +22,7 @@ from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple
 from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
+from iris_session.cloud.robot_points import warm_up_removal
 from iris_session.cloud.sources.playback import DEFAULT_HZ, SECOND
 from iris_session.cloud.voxels import VoxelFilter
 
@@ -228,9 +229,9 @@ def _to_rotations(quaternions: Floats) -> Floats:
 def main() -> int:
     """Open the drawn cameras of a camera file and close them again: in a process that has nothing else to lose.
 
-    Then let the filter of their points be compiled: beside a session, at low priority, that takes much longer. The file
-    is on standard input, as `CloudSettings` in MessagePack. Why a camera cannot be drawn goes to standard output, on
-    one line, with exit status 1.
+    Then let the filters of their points be compiled: beside a session, at low priority, that takes much longer. The
+    file is on standard input, as `CloudSettings` in MessagePack. Why a camera cannot be drawn goes to standard output,
+    on one line, with exit status 1.
     """
     settings = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=CloudSettings)
     try:
@@ -238,6 +239,8 @@ def main() -> int:
             if camera.source == "mujoco":
                 MujocoCamera(camera, time.monotonic_ns).close()
         VoxelFilter(settings.voxel_m).warm_up()
+        if settings.remove_robots:
+            warm_up_removal()
     except SourceError as error:
         print(error)
         return 1
