@@ -462,9 +462,11 @@ def test_a_camera_by_hand_ends_by_ctrl_c_and_waits_for_its_session(
 
     wait_until(are_shown, "the ages are shown")
     server.children()["front.main"].kill()
+    # Frames of before are still to be read.
+    assert ann.wait_for(lambda _: ann.connection.counters.reconnects > 0 and ann.ready, DEADLINE_S), "a new front"
     wait_for_frames(ann, "room", 2)
     again = run_command("cloud", "run", str(camera_file), "--address", server.address, cwd=tmp_path)
-    assert again.returncode == 1
+    assert again.returncode == 1, again.stderr
     assert again.stderr == (
         "iris-session: the stream 'room' has another source already, camera 'room' at 127.0.0.1: write another "
         "`stream =` into the camera file, or end that source\n"
