@@ -22,7 +22,7 @@ from iris_session.client.endpoint_resolver import SessionJoiner
 from iris_session.client.errors import ClientError, NotConnectedError
 from iris_session.client.media import ClientMedia
 from iris_session.client.scene import ClientScene
-from iris_session.client.sockets import ClientSockets, to_milliseconds
+from iris_session.client.sockets import ClientSockets
 from iris_session.protocol.common import Denial
 from iris_session.protocol.server_messages import Event, Feedback, Reply
 from iris_session.protocol.session_mirror import MissedEvents
@@ -82,7 +82,8 @@ class ClientLoop:
             now = time.monotonic_ns()
             if progressed or now >= deadline:
                 break
-            self._wait(min(deadline, self._connection.next_deadline_ns(now)) - now)
+            wait_ns = min(deadline, self._connection.next_deadline_ns(now)) - now
+            self._sockets.wait(wait_ns, sending=self._connection.peek_outgoing() is not None)
         self._raise_failure()
         return progressed
 
@@ -250,13 +251,6 @@ class ClientLoop:
             client.on_feedback(message)
         elif isinstance(message, Reply) and client.on_denial is not None and message.denial is not None:
             client.on_denial(message.denial)
-
-    def _wait(self, timeout_ns: int) -> None:
-        poller = zmq.Poller()
-        self.register(poller)
-        self._sockets.register_wake(poller)
-        poller.poll(to_milliseconds(timeout_ns))
-        self._sockets.clear_wake()
 
     def _raise_failure(self) -> None:
         if self._connection.failure is not None:

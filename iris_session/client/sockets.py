@@ -314,6 +314,19 @@ class ClientSockets:
             self.register_wake(poller)
         return self._state
 
+    def wait(self, timeout_ns: int, *, sending: bool) -> None:
+        """Wait until a socket has something, `wake` is called, or the time is over.
+
+        Args:
+            timeout_ns: Time to wait at most [ns].
+            sending: Also end when the control socket has room.
+        """
+        poller = zmq.Poller()
+        self.register(poller, sending=sending)
+        self.register_wake(poller)
+        poller.poll(to_milliseconds(timeout_ns))
+        self.clear_wake()
+
     def register_wake(self, poller: zmq.Poller) -> None:
         """Add the socket of `wake` to `poller`."""
         poller.register(self._wake_in.fileno(), zmq.POLLIN)

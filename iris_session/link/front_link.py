@@ -85,12 +85,16 @@ class FrontLink:
         self._silence_ns = 0
         self._backlog.clear()
         self._taken = 0
-        self._socket = self._context.socket(zmq.PAIR)
-        self._socket.setsockopt(zmq.SNDHWM, _SEND_QUEUE)
-        self._socket.setsockopt(zmq.RCVHWM, 0)  # bounded by the front's credits
         endpoint = f"ipc://{path}"
-        self._socket.bind(endpoint)
+        self._socket = self._listen(endpoint)
         return endpoint
+
+    def _listen(self, endpoint: str) -> zmq.Socket[bytes]:
+        socket = self._context.socket(zmq.PAIR)
+        socket.setsockopt(zmq.SNDHWM, _SEND_QUEUE)
+        socket.setsockopt(zmq.RCVHWM, 0)  # bounded by the front's credits
+        socket.bind(endpoint)
+        return socket
 
     @property
     def silence_ns(self) -> int:

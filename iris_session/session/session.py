@@ -203,15 +203,19 @@ class Session(Owner):
                 now_ns = self.clock()
                 if (end_ns is not None and now_ns >= end_ns) or (until is not None and until()):
                     break
-                times.lap(LateCause.OWNER)
-                if stepper.paused:
-                    self._take_paused_step(stepper, pacer, times)
-                    times.restart_chain()
-                else:
-                    self._take_tick(stepper, pacer, times)
-                self._require_started().supervise(stepper)
-                times.lap(LateCause.SUPERVISION)
+                self._take_step(stepper, pacer, times)
         pacer.pause(self.clock())  # no tick is late after the end of the run
+
+    def _take_step(self, stepper: Stepper, pacer: Pacer, times: TickTimes) -> None:
+        """Wait until the next step is due, take it, and look after the processes."""
+        times.lap(LateCause.OWNER)
+        if stepper.paused:
+            self._take_paused_step(stepper, pacer, times)
+            times.restart_chain()
+        else:
+            self._take_tick(stepper, pacer, times)
+        self._require_started().supervise(stepper)
+        times.lap(LateCause.SUPERVISION)
 
     def _measure_ticks(self, stepper: Stepper, pacer: Pacer) -> TickTimes:
         """Measure the parts of every tick from here on, for status reports."""

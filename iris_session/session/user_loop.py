@@ -386,14 +386,18 @@ class UserLoop:
             self._left = {}
             self._stepper.post_own(ExternalReset())
 
+    def _step_if_idle(self) -> None:
+        """Take a step without ticks if the user's loop is silent."""
+        if self._stepper.clock() - self._last_tick_ns <= IDLE_AFTER_NS:
+            return
+        with self.lock:
+            if self._stepper.clock() - self._last_tick_ns > IDLE_AFTER_NS and not self._closed.is_set():
+                self._stepper.step(0, self._plant)
+                self._processes.supervise(self._stepper)
+
     def _run_helper(self) -> None:
         try:
             while not self._closed.wait(IDLE_PERIOD_S):
-                if self._stepper.clock() - self._last_tick_ns <= IDLE_AFTER_NS:
-                    continue
-                with self.lock:
-                    if self._stepper.clock() - self._last_tick_ns > IDLE_AFTER_NS and not self._closed.is_set():
-                        self._stepper.step(0, self._plant)
-                        self._processes.supervise(self._stepper)
+                self._step_if_idle()
         except BaseException as error:  # raised at the user's next tick, where it is seen
             self._helper_error, self._helper_traceback = error, error.__traceback__
