@@ -57,6 +57,8 @@ class Journal:
         Args:
             first_keyframe: Begin at this keyframe instead of at the begin of the session.
         """
+        if not self.keyframes:
+            return 0  # the session ended before its first step
         core = SessionCore(decode_model(self._model), self._config, lambda name: decode_model(self._models[name]))
         keyframe = self.keyframes[first_keyframe]
         core.restore(CoreState(keyframe.plant, keyframe.authority, keyframe.controller, keyframe.status))

@@ -6,6 +6,7 @@ has room for a few messages: what does not fit is refused to the sender, as Zero
 
 from __future__ import annotations
 
+import errno
 import struct
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -195,6 +196,12 @@ class Network:
             front.is_listening = False
             for connection in list(front.connections.values()):
                 self.close(connection)
+
+    def try_port(self, *_: object) -> Inbox:
+        """Open and forget a TCP connection, as commands do to see whether anything listens."""
+        if self.front is None:
+            raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+        return Inbox()
 
     def connect(self, sockets: RigClientSockets) -> Connection | None:
         """Open a TCP connection to the present front; `None` while there is none."""

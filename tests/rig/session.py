@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, Self
@@ -10,6 +13,9 @@ import mujoco
 import pytest
 
 from anchors.pose import PoseTuple
+from iris_session.cli import control as _control  # noqa: F401  (commands import their modules late: simulated too)
+from iris_session.cli import status as _status  # noqa: F401
+from iris_session.cli.main import main
 from iris_session.client import Client, ClientError, endpoint_resolver
 from iris_session.client import client as client_module
 from iris_session.client.core.status import ConnectionPhase
@@ -137,6 +143,7 @@ class Rig:
         patch.setattr(processes, "FrontProcess", self._make_front)
         patch.setattr(client_module, "ClientSockets", self._make_sockets)
         patch.setattr(endpoint_resolver, "request_introduction", _refuse_introduction)
+        patch.setattr(socket, "create_connection", self._network.try_port)
         try:
             self.session = self._make_session()
             self.session.start()
@@ -261,6 +268,13 @@ class Rig:
         client.open()
         _Poller(self, client)
         return client
+
+    def run_command(self, *arguments: str) -> tuple[int, str, str]:
+        """Run an `iris-session` command beside the session. Return its exit status, output and errors."""
+        out, errors = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
+            status = main(list(arguments))
+        return status, out.getvalue(), errors.getvalue()
 
     def connect_raw(self) -> RigClientSockets:
         """Open a control connection without a client behind it: send any bytes by `send_control`."""

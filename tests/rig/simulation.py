@@ -59,13 +59,18 @@ class SimulatedTime:
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
+        self._asked_ns = self._asked = 0
         self.sleep = simulation.sleep
 
     def monotonic_ns(self) -> int:
         return self._simulation.now_ns
 
     def monotonic(self) -> float:
-        return self._simulation.now_ns / SECOND
+        # A nanosecond later at every call: a loop that waits for less than one would never end.
+        now_ns = self._simulation.now_ns
+        self._asked = self._asked + 1 if now_ns == self._asked_ns else 0
+        self._asked_ns = now_ns
+        return (now_ns + self._asked) / SECOND
 
     perf_counter_ns, perf_counter = monotonic_ns, monotonic
 
