@@ -57,19 +57,3 @@ def test_two_operators_stow_two_soft_bodies(tmp_path: Path) -> None:
 def test_two_operators_fold_a_cloth(tmp_path: Path) -> None:
     goals = run_demo(tmp_path, "cloth", max_takes=3)["goals"]  # on a busy machine, one fold in some ten fails
     assert [(goal["deformable"], goal["goal"]) for goal in goals] == [("cloth", "folded")]
-
-
-def test_invalid_number_of_operators_is_one_line(tmp_path: Path) -> None:
-    done = run_command("demo", "aloha", "--operators", "4", cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("iris-session: demo aloha")
-    assert "2 operators" in done.stderr
-
-
-def test_missing_robot_models_name_the_variable_and_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("IRIS_DATA", raising=False)
-    done = run_command("demo", "iiwa", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "IRIS_DATA" in done.stderr
-    assert "models/kuka_iiwa_14/iiwa14.xml" in done.stderr
-    assert done.stderr.count("\n") == 1

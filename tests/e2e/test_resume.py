@@ -24,7 +24,6 @@ from tests.e2e.session_process import (
     assert_all_end,
     kill_all,
     list_descendants,
-    run_command,
     run_verify,
 )
 from tests.e2e.session_time import run_ticks, wait_until_recorded
@@ -150,7 +149,6 @@ def get_session_id(client: Client) -> str:
     return client.connection.welcome.session_id
 
 
-@pytest.mark.long
 def test_resume_after_a_power_cut_continues_at_the_last_readable_row(
     scenario: Scenario, driving: Hand, resume: Resume
 ) -> None:
@@ -178,22 +176,6 @@ def test_resume_after_a_power_cut_continues_at_the_last_readable_row(
     assert report["continues"].startswith("session.resume2.rrd ")
     assert again.verify()["continues"].startswith("session.rrd ")
     assert run_verify(scenario.server.recording)["cuts"]
-
-
-@pytest.mark.long
-def test_invalid_resume_is_one_line(scenario: Scenario) -> None:
-    folder = scenario.server.folder
-    cases: tuple[tuple[list[str], str], ...] = (
-        (["--resume", str(folder)], str(scenario.server.process.pid)),
-        (["--resume", str(folder / "nothing.rrd")], "nothing.rrd"),
-        (["--resume", str(folder), "--mode", "takeover"], "--mode"),
-        ([], "scene"),
-    )
-    for arguments, expected in cases:
-        done = run_command("serve", *arguments, cwd=folder)
-        assert done.returncode == 2, (done.stdout, done.stderr)
-        (line,) = done.stderr.strip().splitlines()
-        assert expected in line
 
 
 @pytest.mark.long

@@ -92,15 +92,6 @@ def test_ctrl_c_while_one_client_joins_and_another_drives(
     assert scenario.server.verify()["finished"]
 
 
-def test_ctrl_c_while_paused(scenario: Scenario) -> None:
-    director = scenario.join("dora", "director")
-    director.control("pause")
-    scenario.run_until(lambda: director.mirror.paused, "the session is paused")
-    interrupt(scenario.server)
-    assert scenario.server.process.returncode == 0
-    assert scenario.server.verify()["finished"]
-
-
 @pytest.mark.long
 def test_ctrl_c_while_the_recorder_hangs(scenario: Scenario, driving: Hand) -> None:
     """Rows that the recorder did not receive are lost, which is reported; the rest verifies."""

@@ -1,0 +1,75 @@
+"""`iris-session estop`, `clear-estop`, `pause`, `assign`, ...: a running session controlled from another terminal."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import termios
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.session_process import DEADLINE_S, make_serve_command, wait_until
+
+pytestmark = pytest.mark.e2e
+
+
+def test_keys_of_the_terminal_stop_and_clear(tmp_path: Path) -> None:
+    """Space stops; after Ctrl-C the terminal is as it was before."""
+    parent, terminal = pty.openpty()
+    before = termios.tcgetattr(terminal)
+    screen = b""
+
+    def read_screen() -> bytes:
+        nonlocal screen
+        while True:
+            try:
+                screen += os.read(parent, 65536)
+            except BlockingIOError:
+                return screen
+
+    os.set_blocking(parent, False)
+    command = make_serve_command("handover", tmp_path / "session.rrd", "--no-beacon")
+    process = subprocess.Popen(
+        ["setsid", "--ctty", *command], stdin=terminal, stdout=terminal, stderr=terminal, cwd=tmp_path
+    )
+    try:
+        wait_until(lambda: b"space e-stop" in read_screen(), "the footer is shown")
+        os.write(parent, b" ")
+        wait_until(lambda: b"E-STOP" in read_screen(), "the e-stop is shown")
+        os.write(parent, b"c")
+        wait_until(lambda: b"running" in read_screen().rpartition(b"E-STOP")[2], "it is cleared")
+        termios.tcsetattr(terminal, termios.TCSANOW, before)  # as a shell does after Ctrl-Z
+        wait_until(lambda: not termios.tcgetattr(terminal)[3] & termios.ICANON, "keys count without Enter again")
+        os.write(parent, b" ")
+        wait_until(lambda: b"E-STOP" in read_screen().rpartition(b"running")[2], "the e-stop is shown again")
+        os.write(parent, b"\x03")
+        wait_until(lambda: read_screen() is not None and process.poll() is not None, "the session ends")
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 0, read_screen().decode(errors="replace")
+    assert termios.tcgetattr(terminal) == before
+    os.close(parent)
+    os.close(terminal)
+
+
+@pytest.mark.long
+def test_background_session_does_not_read_the_terminal(tmp_path: Path) -> None:
+    """A process of a background group that reads its terminal would be stopped by the system."""
+    parent, terminal = pty.openpty()
+    script = 'set -m; "$@" & wait'  # -m: a process group of its own, so not in the foreground
+    command = make_serve_command("handover", tmp_path / "session.rrd", "--no-beacon", "--seconds", "1")
+    process = subprocess.Popen(
+        ["setsid", "--ctty", "bash", "-c", script, "bash", *command],
+        stdin=terminal, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=tmp_path,
+    )  # fmt: skip
+    try:
+        assert process.wait(DEADLINE_S) == 0
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        os.close(parent)
+        os.close(terminal)
