@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from iris_session.codegen.arrays_golden import build_golden, render_golden
 from iris_session.scene import AssetDecodeError, decode_arrays
+from tools.codegen.arrays_golden import build_golden, render_golden
 
 FILE = Path(__file__).parents[2] / "docs" / "protocol" / "arrays.json"
 CONTENT = json.loads(FILE.read_text())

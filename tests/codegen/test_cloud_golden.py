@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from iris_session.codegen.cloud_golden import render_golden
 from iris_session.streams.cloud import decode_cloud
+from tools.codegen.cloud_golden import render_golden
 
 FILE = Path(__file__).parents[2] / "docs" / "protocol" / "cloud.json"
 FRAMES: list[dict[str, Any]] = json.loads(FILE.read_text())["frames"]

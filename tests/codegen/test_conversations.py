@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from iris_session.client.core import connection
-from iris_session.codegen.conversations import AssetPlayer, ConversationPlayer
+from tools.codegen.conversations import AssetPlayer, ConversationPlayer
 
 FILE = Path(__file__).parents[2] / "docs" / "protocol" / "conversations.json"
 CONVERSATIONS: list[dict[str, Any]] = json.loads(FILE.read_text())["conversations"]

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import zstandard
 
-from iris_session.codegen.deformable_golden import build_golden, render_golden
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder, read_header
 from iris_session.streams.deformable_topology import DeformableTopology
+from tools.codegen.deformable_golden import build_golden, render_golden
 
 FILE = Path(__file__).parents[2] / "docs" / "protocol" / "deformable.json"
 MESHES: list[dict[str, Any]] = json.loads(FILE.read_text())["meshes"]

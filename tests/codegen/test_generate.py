@@ -10,9 +10,9 @@ from typing import get_args
 import msgspec
 import pytest
 
-from iris_session.codegen import __main__ as generate
-from iris_session.codegen import csharp, schema, tables, typescript
 from iris_session.protocol import assets, client_messages, codec, names, scene, server_messages
+from tools.codegen import __main__ as generate
+from tools.codegen import csharp, schema, tables, typescript
 
 ROOT = Path(__file__).parents[2]
 
@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.parametrize("target", [name for name in generate.TARGETS if name not in ("arrays", "deformable")])
 def test_generated_files_are_current(target: str) -> None:
     outdated = [str(path.relative_to(ROOT)) for path, _ in generate.find_outdated(ROOT, [target])]
-    assert outdated == [], f"run: python -m iris_session.codegen {target}"
+    assert outdated == [], f"run: python -m tools.codegen {target}"
 
 
 def checkout(tmp_path: Path) -> Path:

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 
 from anchors.pose import Quat, Vec3, quat_normalize, quat_rotate
-from iris_session.codegen import rigid_reference
-from iris_session.codegen.conversions import from_three, from_unity, to_three, to_unity
 from iris_session.protocol import codec
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import ClientEnvelope
@@ -23,6 +21,8 @@ from iris_session.protocol.media import MediaHeader, MediaPush
 from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
 from tests.streams.poses import random_poses
+from tools.codegen import rigid_reference
+from tools.codegen.conversions import from_three, from_unity, to_three, to_unity
 
 GOLDEN = json.loads((Path(__file__).parents[2] / "docs" / "protocol" / "golden.json").read_text())
 

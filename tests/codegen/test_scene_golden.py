@@ -11,7 +11,6 @@ import msgpack  # type: ignore[import-untyped]
 import msgspec
 import pytest
 
-from iris_session.codegen import schema
 from iris_session.protocol import names
 from iris_session.protocol.scene import (
     MAX_SCENE_BYTES,
@@ -26,6 +25,7 @@ from iris_session.protocol.scene import (
     encode_scene,
 )
 from tests.codegen.test_interop import is_same_value, reverse_keys, unpack
+from tools.codegen import schema
 
 GOLDEN = json.loads((Path(__file__).parents[2] / "docs" / "protocol" / "scene.json").read_text())
 KINDS = {kind.__name__: kind for group in ("scene", "arrays", "patch") for kind in schema.GROUPS[group]}

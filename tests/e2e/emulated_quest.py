@@ -26,12 +26,12 @@ from anchors.pose import (
 )
 from iris_session.bench.chromium import WEB_CLIENT
 from iris_session.client import Client
-from iris_session.codegen.conversions import to_three
 from iris_session.protocol.names import HoldReason
 from iris_session.protocol.server_messages import EngagementChanged, ParticipantInfo
 from tests.e2e.browser import Page
 from tests.e2e.scenario import Scenario, assert_only_late, is_driven
 from tests.e2e.session_process import DEADLINE_S
+from tools.codegen.conversions import to_three
 
 IWER: Final = WEB_CLIENT / "node_modules" / "iwer" / "build" / "iwer.min.js"
 #: Makes the emulated headset `quest`; `glide` moves its right controller in page frames, `tap` presses its trigger.

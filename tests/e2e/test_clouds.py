@@ -21,7 +21,6 @@ import pytest
 from PIL import Image
 
 from iris_session import Client, CurveKeys, Recording, StreamCamera, StreamInfo, encode_cloud
-from iris_session.codegen.conversions import from_three, to_three
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.protocol.names import BudgetClass
 from iris_session.security import KeyHome, KeyPair
@@ -30,6 +29,7 @@ from tests.e2e.emulated_quest import HEADSET, INSTALL, IWER, aim_at
 from tests.e2e.scenario import Scenario
 from tests.e2e.session_process import COMMAND, END_WITH_PARENT, SessionProcess, run_command, wait_until
 from tests.e2e.test_cameras import find_stream, folder_camera, write_file, write_pictures
+from tools.codegen.conversions import from_three, to_three
 
 pytestmark = pytest.mark.e2e
 

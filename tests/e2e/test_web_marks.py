@@ -17,12 +17,12 @@ import pytest
 
 from anchors.lie import Array, quat_exp, quat_to_matrix
 from anchors.pose import PoseTuple, Quat, Vec3, apply, compose, distance, inverse, quat_from_rotvec, quat_from_yaw
-from iris_session.codegen.conversions import to_three
 from iris_session.protocol.common import Alignment
 from iris_session.protocol.names import AlignmentKind
 from tests.e2e.browser import Page, join_as
 from tests.e2e.emulated_quest import HEADSET, INSTALL, IWER, EmulatedQuest, holder
 from tests.e2e.scenario import Scenario, is_driven
+from tools.codegen.conversions import to_three
 
 pytestmark = pytest.mark.e2e
 

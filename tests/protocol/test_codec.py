@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.codegen.examples import make_extreme, make_full, make_least
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import Acquire, Bye, ClientEnvelope, Hello, Sample, wrap_message
 from iris_session.protocol.common import Pose, Target
@@ -33,6 +32,7 @@ from iris_session.protocol.limits import (
 )
 from iris_session.protocol.media import StreamCamera, StreamInfo
 from iris_session.protocol.server_messages import Event, Presence, ProtocolFault, ServerEnvelope, StateHeader
+from tools.codegen.examples import make_extreme, make_full, make_least
 
 pack = msgspec.msgpack.encode
 MAKES = (make_full, make_least, make_extreme)

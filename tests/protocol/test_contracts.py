@@ -7,7 +7,6 @@ from typing import get_args
 import msgspec
 import pytest
 
-from iris_session.codegen.examples import make_extreme, make_full, make_least
 from iris_session.protocol import entries, specs, steps
 from iris_session.protocol.client_messages import Bye, ClientMessage, Hello, Sample
 from iris_session.protocol.codec import decode_server, encode_server
@@ -16,6 +15,7 @@ from iris_session.protocol.entries import Entry, decode_entries, decode_entry, e
 from iris_session.protocol.scene import RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import Event, Feedback, Notice, PresenceItem, Reply, ServerEnvelope
 from iris_session.protocol.specs import RobotSpec
+from tools.codegen.examples import make_extreme, make_full, make_least
 
 WIRE = set(get_args(ClientMessage))
 INTERNAL = [kind for kind in get_args(entries.EntryMessage) if kind not in WIRE]

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from anchors.pose import distance
-from iris_session.codegen.examples import make_full
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import ModelUnsupportedError, SimulationDivergedError, load_model
 from iris_session.protocol.client_messages import Control
@@ -22,6 +21,7 @@ from iris_session.protocol.server_messages import Event, EventBody, Notice, Scen
 from iris_session.protocol.steps import Decision, OutgoingMessage
 from iris_session.session.core import CROWDED_ENTRIES, SessionCore, encode_for_digest, read_plant_state
 from tests.session.play import TICK_NS, entries, host, make_core, play
+from tools.codegen.examples import make_full
 
 
 def test_same_journal_gives_the_same_digests() -> None:

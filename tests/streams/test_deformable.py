@@ -12,7 +12,6 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.codegen.deformable_golden import make_cloth, make_rope, make_shell
 from iris_session.protocol.names import BudgetClass
 from iris_session.streams.deformable import (
     COARSER,
@@ -25,6 +24,7 @@ from iris_session.streams.deformable import (
 )
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
+from tools.codegen.deformable_golden import make_cloth, make_rope, make_shell
 
 Floats = npt.NDArray[np.float64]
 HEADER = 32

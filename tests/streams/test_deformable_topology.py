@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.codegen.deformable_golden import make_cloth, make_rope, make_shell
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
 from iris_session.streams.deformable_topology import (
     MAX_LEVELS,
@@ -22,6 +21,7 @@ from iris_session.streams.deformable_topology import (
     used_vertices,
 )
 from iris_session.streams.errors import StreamError
+from tools.codegen.deformable_golden import make_cloth, make_rope, make_shell
 
 SCENE = """
 <mujoco>

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iris_session.codegen.web_golden import build_golden, render_golden
 from iris_session.protocol.client_messages import Bye, Heartbeat, wrap_message
 from iris_session.protocol.codec import decode_client, encode_client, encode_server
 from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, TooLargeError
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, ServerEnvelope
 from iris_session.web import wire
+from tools.codegen.web_golden import build_golden, render_golden
 
 FILE = Path(__file__).parents[2] / "docs" / "protocol" / "web.json"
 GOLDEN: dict[str, Any] = json.loads(FILE.read_text())

@@ -1,4 +1,4 @@
-// Messages of the iris-session protocol. Written by `python -m iris_session.codegen typescript`: do not edit.
+// Messages of the iris-session protocol. Written by `python -m tools.codegen typescript`: do not edit.
 //
 // Fields with a `?` may be missing in what is received: their value is then that of `DEFAULTS`. Values of open
 // enumerations may be others than those listed.

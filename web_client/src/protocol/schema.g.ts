@@ -1,4 +1,4 @@
-// Tables of the iris-session protocol. Written by `python -m iris_session.codegen typescript-schema`: do not edit.
+// Tables of the iris-session protocol. Written by `python -m tools.codegen typescript-schema`: do not edit.
 //
 // Types of fields; ["null", type] is that type or null.
 //   ["bool"], ["float"], ["int", lowest, highest] (null: no bound within int64), ["str", characters, pattern],

@@ -7,7 +7,6 @@ returns what the core did; the generator records it, and the test compares it.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -57,6 +56,7 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.protocol.session_mirror import MissedEvents
 from iris_session.streams.rigid import RigidEncoder
+from tools.codegen.vectors import render_vectors
 
 Step = dict[str, Any]
 
@@ -547,23 +547,15 @@ def _asset_steps() -> list[Step]:
 
 
 def render_conversations() -> str:
-    """Return the text of conversations.json: every step with its outcome, one step per line."""
-    conversations: list[tuple[dict[str, Any], list[Step]]] = []
+    """Return the text of conversations.json: every step with its outcome."""
+    conversations: list[Step] = []
     for name, (about, make) in CONVERSATIONS.items():
         token = b"token-0".hex() if name == "used token" else ""
         player = ConversationPlayer(SECRET.hex(), token)
         head = {"name": name, "core": "connection", "about": about, "secret": SECRET.hex(), "resume_token": token}
-        conversations.append((head, [step | player.play_step(step) for step in make()]))
+        conversations.append({**head, "steps": [step | player.play_step(step) for step in make()]})
     loader = AssetPlayer()
-    head = {
-        "name": "assets",
-        "core": "asset loader",
-        "about": "chunks, bytes of another asset once and twice, a lost link",
-    }
-    conversations.append((head, [step | loader.play_step(step) for step in _asset_steps()]))
-    blocks = []
-    for head, steps in conversations:
-        lines = ",\n".join("      " + json.dumps(step) for step in steps)
-        blocks.append(f'    {json.dumps(head)[:-1]}, "steps": [\n{lines}\n    ]}}')
-    body = ",\n".join(blocks)
-    return f'{{\n  "protocol_version": {PROTOCOL_VERSION},\n  "conversations": [\n{body}\n  ]\n}}\n'
+    about = "chunks, bytes of another asset once and twice, a lost link"
+    steps = [step | loader.play_step(step) for step in _asset_steps()]
+    conversations.append({"name": "assets", "core": "asset loader", "about": about, "steps": steps})
+    return render_vectors({"protocol_version": PROTOCOL_VERSION, "conversations": conversations}, "steps")

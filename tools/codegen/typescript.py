@@ -12,14 +12,10 @@ from typing import Any, Final
 
 import msgspec
 
-from iris_session.codegen import rigid_reference
-from iris_session.codegen.schema import UNIONS, Field, Struct, Type, find_enum_doc, list_all_structs, list_enums
-from iris_session.protocol import assets, server_messages
-from iris_session.protocol.names import PROTOCOL_VERSION, SCENE_VERSION
-from iris_session.protocol.scene import MAX_SCENE_BYTES
+from tools.codegen.schema import CONSTANTS, UNIONS, Field, Struct, Type, find_enum_doc, list_all_structs, list_enums
 
 HEAD: Final = """\
-// Messages of the iris-session protocol. Written by `python -m iris_session.codegen typescript`: do not edit.
+// Messages of the iris-session protocol. Written by `python -m tools.codegen typescript`: do not edit.
 //
 // Fields with a `?` may be missing in what is received: their value is then that of `DEFAULTS`. Values of open
 // enumerations may be others than those listed.
@@ -41,21 +37,9 @@ def render_typescript() -> str:
 
 
 def _render_constants() -> str:
-    return "\n".join(
-        [
-            f"export const PROTOCOL_VERSION = {PROTOCOL_VERSION};",
-            f'export const TOPIC_RIGID = "{server_messages.TOPIC_RIGID.decode()}";',
-            f'export const TOPIC_PRESENCE = "{server_messages.TOPIC_PRESENCE.decode()}";',
-            f"export const RIGID_FORMAT = {rigid_reference.FORMAT};",
-            "/** Edge of the position lattice [m]. */",
-            f"export const RIGID_LATTICE_M = {rigid_reference.LATTICE_M!r};",
-            f"export const RIGID_POSITION_BITS = {rigid_reference.POSITION_BITS};",
-            f"export const RIGID_ROTATION_CENTRE = {rigid_reference.ROTATION_CENTRE};",
-            f"export const SCENE_VERSION = {SCENE_VERSION};",
-            f"export const MAX_SCENE_BYTES = {MAX_SCENE_BYTES};",
-            f'export const ARRAYS_MAGIC = "{assets.ARRAYS_MAGIC.decode()}";',
-        ]
-    )
+    rows = [f"export const {name} = {json.dumps(value)};" for name, value in CONSTANTS.items()]
+    rows.insert(list(CONSTANTS).index("RIGID_LATTICE_M"), "/** Edge of the position lattice [m]. */")
+    return "\n".join(rows)
 
 
 def _render_enums() -> Iterator[str]:

@@ -8,44 +8,16 @@ from __future__ import annotations
 
 import base64
 import json
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
-from iris_session.codegen.schema import UNIONS, Field, Struct, Type, list_all_structs
 from iris_session.protocol import assets, limits
 from iris_session.protocol.codec import get_tag
+from tools.codegen.schema import UNIONS, Field, Struct, Type, list_all_structs
 
-HEAD: Final = """\
-// Tables of the iris-session protocol. Written by `python -m iris_session.codegen typescript-schema`: do not edit.
-//
-// Types of fields; ["null", type] is that type or null.
-//   ["bool"], ["float"], ["int", lowest, highest] (null: no bound within int64), ["str", characters, pattern],
-//   ["bytes", bytes], ["array", item, length, longest], ["map", item], ["struct", name], ["union", name].
-// 0 or "" as a bound stands for none. `length` of an array: exactly so many items.
-
-export type FieldType =
-  | readonly ["bool" | "float"]
-  | readonly ["int", number | null, number | null]
-  | readonly ["str", number, string]
-  | readonly ["bytes", number]
-  | readonly ["array", FieldType, number, number]
-  | readonly ["map", FieldType]
-  | readonly ["struct", string]
-  | readonly ["union", string]
-  | readonly ["null", FieldType];
-
-/** One field: name, type, and the default in a list of its own; an empty list where the field is required. */
-export type FieldRow = readonly [name: string, type: FieldType, fallback: readonly unknown[]];
-
-/** One struct. `array`: a MessagePack array, else a map. `tag`: its tag field and tag, in a union. */
-export interface StructTable {
-  readonly array: boolean;
-  readonly tag: readonly [field: string, tag: string] | null;
-  readonly fields: readonly FieldRow[];
-}
-"""
-
+_TEMPLATE: Final = Path(__file__).parent / "schema.ts"
 #: Integers that a JavaScript number holds exactly; wider bounds are those of int64.
 _EXACT: Final = 2**53 - 1
 
@@ -55,9 +27,10 @@ def render_schema() -> str:
     structs = "\n".join(_render_struct(struct) for struct in list_all_structs())
     members = {name: ", ".join(json.dumps(kind.__name__) for kind in kinds) for name, kinds in UNIONS.items()}
     unions = "\n".join(f"  {name}: [{names}]," for name, names in members.items())
+    _, _, head = _TEMPLATE.read_text(encoding="utf-8").partition("\n")
     return "\n".join(
         [
-            HEAD,
+            head,
             "const EMPTY_BYTES = new Uint8Array();",
             "",
             f"export const STRUCTS: Readonly<Record<string, StructTable>> = {{\n{structs}\n}};",

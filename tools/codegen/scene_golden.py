@@ -6,15 +6,12 @@ Written to docs/protocol/scene.json. Values are written as in golden.json. Addre
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Iterator
 from typing import Any, Final
 
 import msgspec
 
-from iris_session.codegen.examples import iterate_examples
-from iris_session.codegen.schema import GROUPS
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.names import (
     SCENE_VERSION,
@@ -57,6 +54,9 @@ from iris_session.protocol.scene import (
     check_scene,
     encode_scene,
 )
+from tools.codegen.examples import iterate_examples
+from tools.codegen.schema import GROUPS
+from tools.codegen.vectors import render_vectors
 
 _pack = msgspec.msgpack.encode
 _HALF: Final = math.sqrt(0.5)
@@ -67,18 +67,15 @@ _GREY: Final = (0.5, 0.5, 0.5, 1.0)
 
 
 def render_scene_golden() -> str:
-    """Return the text of scene.json: one vector a line."""
+    """Return the text of scene.json."""
     content = {
+        "scene_version": SCENE_VERSION,
         "structs": list(_iterate_structs()),
         "scenes": list(_iterate_scenes()),
         "patches": list(_iterate_patches()),
         "malformed": list(_iterate_malformed()),
     }
-    blocks = []
-    for name, rows in content.items():
-        lines = ",\n".join("    " + json.dumps(row, allow_nan=False) for row in rows)
-        blocks.append(f'  "{name}": [\n{lines}\n  ]')
-    return f'{{\n  "scene_version": {SCENE_VERSION},\n' + ",\n".join(blocks) + "\n}\n"
+    return render_vectors(content)
 
 
 def _make_address(data: bytes) -> str:

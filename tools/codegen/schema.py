@@ -24,6 +24,7 @@ from iris_session.protocol import (
     server_messages,
     status,
 )
+from tools.codegen import rigid_reference
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,20 @@ class Struct:
     fields: tuple[Field, ...]
     cls: type[msgspec.Struct]
 
+
+#: Numbers and texts of the protocol that are no messages.
+CONSTANTS: Final[dict[str, int | float | str]] = {
+    "PROTOCOL_VERSION": names.PROTOCOL_VERSION,
+    "TOPIC_RIGID": server_messages.TOPIC_RIGID.decode(),
+    "TOPIC_PRESENCE": server_messages.TOPIC_PRESENCE.decode(),
+    "RIGID_FORMAT": rigid_reference.FORMAT,
+    "RIGID_LATTICE_M": rigid_reference.LATTICE_M,
+    "RIGID_POSITION_BITS": rigid_reference.POSITION_BITS,
+    "RIGID_ROTATION_CENTRE": rigid_reference.ROTATION_CENTRE,
+    "SCENE_VERSION": names.SCENE_VERSION,
+    "MAX_SCENE_BYTES": scene.MAX_SCENE_BYTES,
+    "ARRAYS_MAGIC": assets.ARRAYS_MAGIC.decode(),
+}
 
 #: Closed unions of tagged structs, by the name used in generated code.
 UNIONS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import msgspec
 
-from iris_session.codegen.schema import UNIONS, Field, Struct, Type, list_all_structs, list_enums
+from tools.codegen.schema import UNIONS, Field, Struct, Type, list_all_structs, list_enums
 
 _STRUCTS: Final[dict[str, Struct]] = {struct.name: struct for struct in list_all_structs()}
 _ENUMS: Final = list_enums()

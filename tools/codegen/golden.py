@@ -7,15 +7,12 @@ unknown), but they must decode to the value. `malformed` vectors must be rejecte
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import msgspec
 
-from iris_session.codegen import conversions, rigid_reference
-from iris_session.codegen.examples import iterate_examples, make_full
 from iris_session.protocol import codec
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Pair, Sample, wrap_message
@@ -30,6 +27,9 @@ from iris_session.protocol.server_messages import (
     StateHeader,
 )
 from iris_session.protocol.status import DeliveryBudget, MediaStreamReport, StatusReport
+from tools.codegen import conversions, rigid_reference
+from tools.codegen.examples import iterate_examples, make_full
+from tools.codegen.vectors import render_vectors
 
 _pack = msgspec.msgpack.encode
 #: Fields that messages got after their first vectors were written: a message without them must decode, too.
@@ -69,19 +69,7 @@ def render_golden() -> str:
         "conversions": list(_iterate_conversions()),
         "rigid": list(_iterate_rigid()),
     }
-    lines = ["{"]
-    for key, value in content.items():
-        comma = "" if key == "rigid" else ","
-        if isinstance(value, list):
-            rows = ",\n".join("    " + _dump_json(row) for row in value)
-            lines.append(f"  {json.dumps(key)}: [\n{rows}\n  ]{comma}")
-        else:
-            lines.append(f"  {json.dumps(key)}: {_dump_json(value)}{comma}")
-    return "\n".join([*lines, "}", ""])
-
-
-def _dump_json(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=True, allow_nan=False)
+    return render_vectors(content)
 
 
 def _describe_vector(name: str, data: bytes, value: Any, **more: Any) -> dict[str, Any]:

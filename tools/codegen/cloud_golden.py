@@ -1,17 +1,17 @@
 """Golden vectors of point cloud frames, for tests of this and every other decoder.
 
-docs/protocol/cloud.json, written by `python -m iris_session.codegen cloud`: frames with the points that they decode to.
+docs/protocol/cloud.json, written by `python -m tools.codegen cloud`: frames with the points that they decode to.
 """
 
 from __future__ import annotations
 
-import json
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from iris_session.streams.cloud import SHARES, decode_cloud, encode_cloud
+from tools.codegen.vectors import render_vectors, scatter_numbers, to_json_numbers
 
 Floats = npt.NDArray[np.float64]
 Colors = npt.NDArray[np.uint8]
@@ -27,8 +27,7 @@ _CLOUDS: Final = (
 
 def make_cloud(n: int, extent_m: float, centre: tuple[float, float, float]) -> tuple[Floats, Colors]:
     """Return `n` scattered points (n, 3) [m] and their colours, the same on every machine."""
-    turns = np.arange(3 * n) * ((5.0**0.5 - 1.0) / 2.0) % 1.0  # multiples of the golden ratio: no visible order
-    positions = (turns.reshape(n, 3) - 0.5) * extent_m + np.array(centre)
+    positions = (scatter_numbers(3 * n).reshape(n, 3) - 0.5) * extent_m + np.array(centre)
     colors = (np.arange(3 * n) * 37 % 256).astype(np.uint8).reshape(n, 3)
     return positions, colors
 
@@ -46,7 +45,7 @@ def build_golden() -> dict[str, Any]:
                     "hex": payload.hex(),
                     "error_m": decoded.error_m if np.isfinite(decoded.error_m) else None,
                     "voxel_m": decoded.voxel_m,
-                    "positions": decoded.positions.astype(np.float64).tolist(),
+                    "positions": to_json_numbers(decoded.positions),
                     "colors": decoded.colors[:, :3].tolist(),
                 }
             )
@@ -54,6 +53,5 @@ def build_golden() -> dict[str, Any]:
 
 
 def render_golden() -> str:
-    """Return the text of the file, a frame a line."""
-    frames = ",\n".join("    " + json.dumps(frame, allow_nan=False) for frame in build_golden()["frames"])
-    return f'{{\n  "format": 1,\n  "frames": [\n{frames}\n  ]\n}}\n'
+    """Return the text of the file."""
+    return render_vectors(build_golden())

@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from iris_session.codegen.schema import GROUPS, Field, Struct, Type, find_enum_doc, list_enums, list_structs
 from iris_session.protocol import assets, limits
+from tools.codegen.schema import GROUPS, Field, Struct, Type, find_enum_doc, list_enums, list_structs
 
 
 def render_sections() -> dict[str, str]:

@@ -1,12 +1,11 @@
 """Golden vectors of the web channel, for tests of gateways and of clients without ZeroMQ.
 
-docs/protocol/web.json, written by `python -m iris_session.codegen web`: WebSocket messages with their frames, messages
+docs/protocol/web.json, written by `python -m tools.codegen web`: WebSocket messages with their frames, messages
 that must be refused, the messages of a gateway, and what a gateway makes of a client's envelope.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -42,6 +41,7 @@ from iris_session.web.wire import (
     encode_frames,
     splice_name,
 )
+from tools.codegen.vectors import render_vectors
 
 _encode = msgspec.msgpack.Encoder().encode
 _NAME: Final = "web-00112233aabb"
@@ -152,11 +152,5 @@ def build_golden() -> dict[str, Any]:
 
 
 def render_golden() -> str:
-    """Return the text of the file, a vector a line."""
-    golden = build_golden()
-    blocks = [f'  "format": {golden["format"]},\n  "subprotocol": {json.dumps(golden["subprotocol"])}']
-    for section, rows in golden.items():
-        if isinstance(rows, list):
-            lines = ",\n".join("    " + json.dumps(row) for row in rows)
-            blocks.append(f"  {json.dumps(section)}: [\n{lines}\n  ]")
-    return "{\n" + ",\n".join(blocks) + "\n}\n"
+    """Return the text of the file."""
+    return render_vectors(build_golden())

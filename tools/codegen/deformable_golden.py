@@ -1,6 +1,6 @@
 """Golden vectors of the deformable stream, for tests of this and every other decoder.
 
-docs/protocol/deformable.json, written by `python -m iris_session.codegen deformable`: per mesh its topology, and frames
+docs/protocol/deformable.json, written by `python -m tools.codegen deformable`: per mesh its topology, and frames
 with the vertices that they decode to. Packed planes are those of the zstd that is installed: another version may pack
 them otherwise, which decodes to the same.
 """
@@ -8,7 +8,6 @@ them otherwise, which decodes to the same.
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,6 +17,7 @@ import numpy.typing as npt
 from iris_session.protocol.names import BudgetClass
 from iris_session.streams.deformable import COARSER, DeformableDecoder, DeformableEncoder, read_header
 from iris_session.streams.deformable_topology import DeformableTopology, used_vertices
+from tools.codegen.vectors import render_vectors, scatter_numbers, to_json_numbers
 
 Floats = npt.NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def make_shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, 
             a, b, c, d = (number[tuple(np.insert(np.array(place), axis, end).tolist())] for place in corners)
             faces += [(a, b, c), (a, c, d)]
     used, table = used_vertices(len(grid), faces)
-    shuffled = np.argsort(_scatter_numbers(len(used)))
+    shuffled = np.argsort(scatter_numbers(len(used)))
     places = np.empty((len(used), 3))
     places[shuffled] = grid[used] * spacing_m
     height = places[:, 2:] / (side * spacing_m)
@@ -54,16 +54,11 @@ def make_shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, 
 
 def make_rope(n: int, spacing_m: float = 0.015) -> tuple[DeformableTopology, Floats]:
     """Return a hanging rope whose vertices are numbered without order."""
-    shuffled = np.argsort(_scatter_numbers(n))
+    shuffled = np.argsort(scatter_numbers(n))
     x = (np.arange(n) - n / 2) * spacing_m
     vertices = np.empty((n, 3))
     vertices[shuffled] = np.stack([x, 0.1 * x, 1.0 + 2.0 * x**2], axis=1)
     return DeformableTopology(n, edges=np.stack([shuffled[:-1], shuffled[1:]], axis=1)), vertices
-
-
-def _scatter_numbers(n: int) -> Floats:
-    """Return (n,) different numbers in [0, 1) without visible order: multiples of the golden ratio."""
-    return np.asarray(np.arange(n) * ((5.0**0.5 - 1.0) / 2.0) % 1.0)
 
 
 def iterate_meshes() -> Iterator[tuple[str, DeformableTopology, dict[str, Floats]]]:
@@ -71,7 +66,7 @@ def iterate_meshes() -> Iterator[tuple[str, DeformableTopology, dict[str, Floats
     topology, vertices = make_cloth(6, 5)
     broken = vertices.copy()
     broken[3], broken[17] = (np.nan, 0.0, np.inf), (0.25, -5e6, 1.0)
-    noise = 2.0 * _scatter_numbers(vertices.size).reshape(vertices.shape) - 1.0
+    noise = 2.0 * scatter_numbers(vertices.size).reshape(vertices.shape) - 1.0
     crumpled, scattered = vertices + 0.2 * noise, 4000.0 * noise
     yield (
         "cloth",
@@ -102,23 +97,13 @@ def build_golden() -> dict[str, Any]:
                         "name": f"{frame}/{budget_class}",
                         "bound_m": read_header(payload).bound_m,
                         "hex": payload.hex(),
-                        "vertices": _to_json_numbers(DeformableDecoder(topology).decode(payload)),
+                        "vertices": to_json_numbers(DeformableDecoder(topology).decode(payload)),
                     }
                 )
         content.append({"name": name, "topology": topology.to_bytes().hex(), "frames": rows})
     return {"format": 1, "meshes": content}
 
 
-def _to_json_numbers(positions: npt.NDArray[np.float32]) -> list[list[float | None]]:
-    return [[v if np.isfinite(v) else None for v in row] for row in positions.astype(np.float64).tolist()]
-
-
 def render_golden() -> str:
-    """Return the text of the file, a frame a line."""
-    meshes_of = build_golden()["meshes"]
-    blocks = []
-    for mesh in meshes_of:
-        frames = ",\n".join("      " + json.dumps(frame, allow_nan=False) for frame in mesh["frames"])
-        head = f'"name": {json.dumps(mesh["name"])}, "topology": "{mesh["topology"]}"'
-        blocks.append(f'    {{{head}, "frames": [\n{frames}\n    ]}}')
-    return '{\n  "format": 1,\n  "meshes": [\n' + ",\n".join(blocks) + "\n  ]\n}\n"
+    """Return the text of the file."""
+    return render_vectors(build_golden(), "frames")

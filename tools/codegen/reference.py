@@ -46,7 +46,7 @@ def render_reference() -> str:
     lines = [
         "# Reference",
         "",
-        "Every public name of `iris_session`, from its docstring: `python -m iris_session.codegen reference`.",
+        "Every public name of `iris_session`, from its docstring: `python -m tools.codegen reference`.",
         "Metres, radians, quaternions `(w, x, y, z)`; times in seconds unless a name ends in `_ns`.",
         "",
     ]

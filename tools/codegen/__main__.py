@@ -1,6 +1,6 @@
 """Write the generated files of a checkout, or check that they are current.
 
-python -m iris_session.codegen all [--check]        or one of: csharp, typescript, golden, docs, reference, ...
+python -m tools.codegen all [--check]        or one of: csharp, typescript, golden, docs, reference, ...
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from iris_session.codegen import (
+from tools.codegen import (
     arrays_golden,
     cloud_golden,
     conversations,
@@ -72,7 +72,7 @@ def find_outdated(root: Path, names: list[str]) -> list[tuple[Path, str]]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line. Exit status 1 with `--check` when a file is not current."""
-    parser = argparse.ArgumentParser(prog="python -m iris_session.codegen", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.codegen", description=__doc__)
     parser.add_argument("what", choices=[*TARGETS, "all"])
     parser.add_argument("--check", action="store_true", help="write nothing; fail when a file is not current")
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[2], help="the checkout")

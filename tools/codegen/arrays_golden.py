@@ -1,12 +1,11 @@
 """Golden vectors of the container of arrays, for tests of this and every other reader.
 
-docs/protocol/arrays.json, written by `python -m iris_session.codegen arrays`: assets, and the arrays that they decode
+docs/protocol/arrays.json, written by `python -m tools.codegen arrays`: assets, and the arrays that they decode
 to. Frames are those of the zstd that is installed: another version may pack them otherwise, which decodes to the same.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Final
@@ -19,6 +18,7 @@ from iris_session.protocol.assets import ARRAYS_MAGIC, ArrayHeader, ArrayInfo
 from iris_session.protocol.names import ArrayCodec, ArrayFilter, ArrayKind
 from iris_session.scene.arrays import StoredArray, decode_arrays, encode_arrays
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
+from tools.codegen.vectors import render_vectors, to_json_numbers
 
 #: Values of the arrays of every dtype.
 _NUMBERS: Final = np.array([[0, 1, 255], [7, 7, 7], [200, 3, 129], [128, 127, 0]])
@@ -81,7 +81,7 @@ def iterate_malformed() -> Iterator[tuple[str, bytes]]:
     yield "two arrays of one name", _pack_asset(ArrayHeader(ArrayKind.MESH, (twice, twice)), b"ab")
 
 
-def build_golden() -> dict[str, list[dict[str, Any]]]:
+def build_golden() -> dict[str, Any]:
     """Return the content of the file. Values are flat, in C order: integers, or floats with the value of the float32,
     null where they are not finite."""
     assets = []
@@ -90,21 +90,18 @@ def build_golden() -> dict[str, list[dict[str, Any]]]:
             array_name: {
                 "dtype": values.dtype.str.lstrip("<|"),
                 "shape": list(values.shape),
-                "values": _to_json_numbers(values),
+                "values": to_json_numbers(values.ravel()),
             }
             for array_name, values in decode_arrays(data, kind).items()
         }
         assets.append({"name": name, "kind": kind, "hex": data.hex(), "arrays": arrays})
-    return {"assets": assets, "malformed": [{"name": name, "hex": data.hex()} for name, data in iterate_malformed()]}
+    malformed = [{"name": name, "hex": data.hex()} for name, data in iterate_malformed()]
+    return {"format": 1, "assets": assets, "malformed": malformed}
 
 
 def render_golden() -> str:
-    """Return the text of the file, a vector a line."""
-    blocks = []
-    for name, rows in build_golden().items():
-        lines = ",\n".join("    " + json.dumps(row, allow_nan=False) for row in rows)
-        blocks.append(f'  "{name}": [\n{lines}\n  ]')
-    return '{\n  "format": 1,\n' + ",\n".join(blocks) + "\n}\n"
+    """Return the text of the file."""
+    return render_vectors(build_golden())
 
 
 def _make_every_dtype() -> dict[str, NDArray[Any]]:
@@ -140,10 +137,3 @@ def _make_colors(corners: int) -> NDArray[np.uint8]:
 def _pack_asset(header: ArrayHeader, body: bytes) -> bytes:
     head = msgspec.msgpack.encode(header)
     return ARRAYS_MAGIC + len(head).to_bytes(4, "little") + head + body
-
-
-def _to_json_numbers(values: NDArray[Any]) -> list[Any]:
-    if values.dtype.kind != "f":
-        plain: list[Any] = values.ravel().tolist()
-        return plain
-    return [v if np.isfinite(v) else None for v in values.astype(np.float64).ravel().tolist()]

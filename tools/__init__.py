@@ -1,0 +1,1 @@
+"""Tools of a checkout: generators, fuzzers, measurements. No part of the installed package."""
