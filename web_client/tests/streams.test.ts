@@ -295,6 +295,7 @@ describe("Zstandard", () => {
     ["two frames", new Uint8Array([...frame, ...frame]), text.length],
     ["no stated size", new Uint8Array(zstdCompressSync(text)).map((byte, i) => (i === 4 ? byte & 0x1f : byte)), text.length],
     ["a size that no block holds", fromHex("28b52ffd" + "a0" + "00000040" + "0100" + "00"), 2 ** 30],
+    ["98,047 sequences of the longest matches, in 23 bytes", fromHex("28b52ffd" + "a0" + "00000200" + "5d0000" + "00ffffff" + "54230334" + "ffff80"), 131_072],
   ])("refuses %s", (_name, bytes, size) => {
     expect(() => decompressFrame(bytes, size)).toThrow(MalformedError);
   });

@@ -1,6 +1,8 @@
 // Fetches assets over HTTPS, in the order and window of `AssetLoader`, into the store of the browser. Every asset is
 // hashed: bytes that do not have their address are fetched once more, then given up.
 
+import { bytesToHex } from "@noble/hashes/utils.js";
+
 import { AssetRefusal } from "../protocol/messages.g.ts";
 import { AssetLoader, type ChunkRequest } from "./asset_loader.ts";
 import type { Store } from "./storage.ts";
@@ -205,7 +207,7 @@ function readRange(response: Response, bytes: Uint8Array<ArrayBuffer>): Answer {
 
 async function hasAddress(bytes: Uint8Array<ArrayBuffer>, address: string): Promise<boolean> {
   const digest = new Uint8Array(await crypto.subtle.digest("SHA-256", bytes));
-  return [...digest].map((byte) => byte.toString(16).padStart(2, "0")).join("") === address;
+  return bytesToHex(digest) === address;
 }
 
 function join(parts: readonly Uint8Array[]): Uint8Array<ArrayBuffer> {

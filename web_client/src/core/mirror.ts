@@ -3,9 +3,11 @@
 // `SessionMirror` never guesses: after a gap in `event_seq` it is not `synced`, and until a new snapshot comes it keeps
 // the newer events aside (bounded). Two mirrors with equal `eventSeq` have equal `hash()`, whenever they started.
 
+import { blake2b } from "@noble/hashes/blake2.js";
+import { bytesToHex } from "@noble/hashes/utils.js";
+
 import type * as wire from "../protocol/messages.g.ts";
 import type { BodyInfo, Filled, Lease, ParticipantInfo, RobotInfo } from "./api.ts";
-import { blake2b } from "./blake2b.ts";
 import { writeStruct } from "./codec.ts";
 import { Writer } from "./msgpack.ts";
 
@@ -161,7 +163,7 @@ export class SessionMirror {
     writeList(writer, "RobotInfo", sortedValues(this.robots));
     writeList(writer, "BodyInfo", this.bodies);
     if (hasAnchors) writeAnchorPoses(writer, sortedValues(this.anchors));
-    return [...blake2b(writer.finish(), 16)].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+    return bytesToHex(blake2b(writer.finish(), { dkLen: 16 }));
   }
 
   private takeBodies(snapshot: Snapshot): void {

@@ -1,5 +1,7 @@
 // The worker of the page: gives `ClientWorker` sockets, clocks and the database of the browser.
 
+import { bytesToHex } from "@noble/hashes/utils.js";
+
 import type { ToWorker } from "./api.ts";
 import { ClientWorker } from "./client_worker.ts";
 import { takeSlot } from "./identity.ts";
@@ -27,7 +29,7 @@ async function start(): Promise<void> {
     decodeImage: (bytes, resizeWidth) => createImageBitmap(new Blob([bytes as Uint8Array<ArrayBuffer>], { type: "image/jpeg" }), { resizeWidth }),
     store,
     slot,
-    run: [...run].map((byte) => byte.toString(16).padStart(2, "0")).join(""),
+    run: bytesToHex(run),
   });
   self.onmessage = (event: MessageEvent<ToWorker>) => worker.receive(event.data);
   for (const command of queued) worker.receive(command);

@@ -10,6 +10,7 @@ import {
   Mesh,
   MeshDepthMaterial,
   type Object3D,
+  Quaternion,
   type ShaderMaterial,
   Vector3,
 } from "three";
@@ -17,7 +18,6 @@ import {
 import { SheetBuilder, type Surface } from "../core/sheet.ts";
 import type { DeformableArrays } from "./arrays.ts";
 import { type Between, interpolateValues, type TimedFrame } from "./interpolation.ts";
-import { pieceBetween } from "./scene_view.ts";
 import { buildPrimitive } from "./shapes.ts";
 import type { Deformable } from "./spec.ts";
 
@@ -187,8 +187,18 @@ class RopeView implements DeformableView {
     for (let i = 0; i < this.elements.length / 2; i++) {
       a.fromArray(this.vertices, 3 * this.elements[2 * i]!);
       b.fromArray(this.vertices, 3 * this.elements[2 * i + 1]!);
-      this.object.setMatrixAt(i, pieceBetween(a, b, this.radius, matrix));
+      this.object.setMatrixAt(i, spanPiece(a, b, this.radius, matrix));
     }
     this.object.instanceMatrix.needsUpdate = true;
   }
+}
+
+const Z = new Vector3(0, 0, 1);
+
+/** Return the matrix that lays a cylinder of radius 1 and height 1 between two points: a piece of a rope or tendon. */
+export function spanPiece(a: Vector3, b: Vector3, radius: number, out = new Matrix4()): Matrix4 {
+  const along = new Vector3().subVectors(b, a);
+  const length = along.length();
+  const turn = new Quaternion().setFromUnitVectors(Z, length > 0 ? along.divideScalar(length) : Z);
+  return out.compose(new Vector3().addVectors(a, b).multiplyScalar(0.5), turn, new Vector3(radius, radius, length));
 }

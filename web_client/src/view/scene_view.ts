@@ -12,7 +12,6 @@ import {
   InstancedMesh,
   Matrix4,
   Mesh,
-  Quaternion,
   type ShaderMaterial,
   type Texture,
   Vector3,
@@ -21,7 +20,7 @@ import {
 import type { AssetSource, MeshArrays } from "./arrays.ts";
 import { makeWorldRoot, setPose } from "./axes.ts";
 import { type Budget, chooseLevels, type LevelChoice } from "./budget.ts";
-import { type DeformableView, makeDeformable } from "./deformables.ts";
+import { type DeformableView, makeDeformable, spanPiece } from "./deformables.ts";
 import { Lighting } from "./lighting.ts";
 import { mergeMeshes } from "./merging.ts";
 import { addTextureCoordinates, buildHeightField, buildPrimitive, cubeDirections, ENDLESS_M } from "./shapes.ts";
@@ -253,7 +252,7 @@ export class SceneView {
             return body ? end.applyQuaternion(body.quaternion).add(body.position) : end;
           });
           for (let i = 0; i + 1 < ends.length; i++) {
-            pieces.setMatrixAt(i, pieceBetween(ends[i]!, ends[i + 1]!, tendon.width));
+            pieces.setMatrixAt(i, spanPiece(ends[i]!, ends[i + 1]!, tendon.width));
           }
           pieces.instanceMatrix.needsUpdate = true;
         };
@@ -352,14 +351,4 @@ function toBufferGeometry(
   if (mesh.color) made.setAttribute("vertexColor", new BufferAttribute(mesh.color, 4, true));
   made.setIndex(new BufferAttribute(mesh.index, 1));
   return made;
-}
-
-const Z = new Vector3(0, 0, 1);
-
-/** Return the matrix that lays a cylinder of radius 1 and height 1 between two points. */
-export function pieceBetween(a: Vector3, b: Vector3, radius: number, out = new Matrix4()): Matrix4 {
-  const along = new Vector3().subVectors(b, a);
-  const length = along.length();
-  const turn = new Quaternion().setFromUnitVectors(Z, length > 0 ? along.divideScalar(length) : Z);
-  return out.compose(new Vector3().addVectors(a, b).multiplyScalar(0.5), turn, new Vector3(radius, radius, length));
 }
