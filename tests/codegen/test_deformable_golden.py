@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import zstandard
 
-from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder, read_header
+from iris_session.streams.deformable import DeformableDecoder, read_header
 from iris_session.streams.deformable_topology import DeformableTopology
-from tools.codegen.deformable_golden import build_golden, render_golden
+from tools.codegen.deformable_golden import render_golden
 
 FILE = Path(__file__).parents[2] / "docs" / "protocol" / "deformable.json"
 MESHES: list[dict[str, Any]] = json.loads(FILE.read_text())["meshes"]
@@ -44,18 +44,6 @@ def test_literal_reader_agrees_with_the_vector(mesh: dict[str, Any], frame: dict
         assert [v if math.isfinite(v) else None for v in row] == true
 
 
-@frames
-def test_encoder_reproduces_the_planes(mesh: dict[str, Any], frame: dict[str, Any]) -> None:
-    """Another version of zstd may compress differently, so packed bytes are not compared."""
-    payload = bytes.fromhex(frame["hex"])
-    header = read_header(payload)
-    topology = DeformableTopology.from_bytes(bytes.fromhex(mesh["topology"]))
-    again = DeformableEncoder(topology, header.bound_m).encode(DeformableDecoder(topology).decode(payload))
-    assert again is not None
-    assert read_header(again["full"]) == header
-    assert planes(again["full"]) == planes(payload)
-
-
 def test_vectors_cover_every_part_of_the_format() -> None:
     headers = [read_header(bytes.fromhex(frame["hex"])) for _, frame in FRAMES]
     assert {h.packed for h in headers} == {True, False}
@@ -66,16 +54,22 @@ def test_vectors_cover_every_part_of_the_format() -> None:
     assert {(t.plan, t.order is None) for t in topologies} == {(0, True), (0, False), (1, False)}
 
 
-def test_file_is_current_and_written_as_generated() -> None:
-    names = [(m["name"], m["topology"], [f["name"] for f in m["frames"]]) for m in build_golden()["meshes"]]
-    assert names == [(m["name"], m["topology"], [f["name"] for f in m["frames"]]) for m in MESHES]
-    assert json.loads(render_golden()).keys() == {"format", "meshes"}
+def test_file_is_current() -> None:
+    """With planes unpacked: another version of zstd may compress differently."""
+
+    def unpack(meshes: list[dict[str, Any]]) -> list[Any]:
+        return [
+            {**mesh, "frames": [{**frame, "hex": unpack_planes(frame)} for frame in mesh["frames"]]} for mesh in meshes
+        ]
+
+    assert unpack(json.loads(render_golden())["meshes"]) == unpack(MESHES)
 
 
-def planes(payload: bytes) -> bytes:
+def unpack_planes(frame: dict[str, Any]) -> bytes:
+    payload = bytes.fromhex(frame["hex"])
     header = read_header(payload)
-    packed = payload[32 + 16 * header.n_escaped :]
-    return zstandard.decompress(packed) if header.packed else packed
+    at = 32 + 16 * header.n_escaped
+    return payload[:at] + (zstandard.decompress(payload[at:]) if header.packed else payload[at:])
 
 
 # --- docs/deformables.md, in the order of its steps, one number at a time -------------------------------------------

@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
-from typing import get_args
 
 import msgspec
 import pytest
 
-from iris_session.protocol import assets, client_messages, codec, names, scene, server_messages
+from iris_session.protocol import assets, client_messages, names, scene, server_messages
 from tools.codegen import __main__ as generate
-from tools.codegen import csharp, schema, tables, typescript
+from tools.codegen import csharp, schema, typescript
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,36 +23,33 @@ def test_generated_files_are_current(target: str) -> None:
     assert outdated == [], f"run: python -m tools.codegen {target}"
 
 
-def checkout(tmp_path: Path) -> Path:
-    for relative, _ in generate.TARGETS.values():
-        (tmp_path / relative).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / relative, tmp_path / relative)
-    return tmp_path
-
-
 def test_check_fails_for_a_stale_file_and_writing_repairs_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root = checkout(tmp_path)
-    (root / "docs/protocol/golden.json").unlink()
-    text = root / "docs/protocol.md"
+    for relative, _ in generate.TARGETS.values():
+        (tmp_path / relative).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / relative, tmp_path / relative)
+    (tmp_path / "docs/protocol/golden.json").unlink()
+    text = tmp_path / "docs/protocol.md"
     text.write_text(text.read_text().replace("| `clutch` |", "| `clasp` |"))
-    assert generate.main(["all", "--check", "--root", str(root)]) == 1
-    assert capsys.readouterr().out.splitlines() == [
-        "not current: docs/protocol/golden.json",
-        "not current: docs/protocol.md",
+    root = ["--root", str(tmp_path)]
+    assert generate.main(["docs", "--check", *root]) == 1
+    assert generate.main(["typescript", "--check", *root]) == 0
+    assert generate.main(["all", *root]) == 0
+    assert [line.split(": ")[1] for line in capsys.readouterr().out.splitlines()] == [
+        "docs/protocol.md",
+        "docs/protocol/golden.json",
+        "docs/protocol.md",
     ]
-    assert generate.main(["typescript", "--check", "--root", str(root)]) == 0
-    assert generate.main(["all", "--root", str(root)]) == 0
-    assert generate.main(["all", "--check", "--root", str(root)]) == 0
+    assert generate.main(["docs", "--check", *root]) == 0
     assert text.read_text() == (ROOT / "docs/protocol.md").read_text()
 
 
 def test_generator_needs_a_checkout_and_its_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         generate.main(["all", "--root", str(tmp_path)])
-    assert "checkout" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="must hold <!-- generated:values -->"):
+    assert str(tmp_path) in capsys.readouterr().err
+    with pytest.raises(ValueError, match="<!-- generated:values -->"):
         generate.update_document("# Protocol\n")
 
 
@@ -74,14 +70,6 @@ def test_descriptions_of_open_enumerations_are_complete() -> None:
         kind = getattr(names, name)
         assert doc.split() == (kind.__doc__ or "").split()
         assert not doc or doc.endswith("."), name
-    document = (ROOT / "docs/protocol.md").read_text()
-    alarms = " ".join(document.split("#### AlarmKind\n")[1].split("\n#### ")[0].split())
-    for text in (
-        "`changed`: an anchor is",
-        "`differs`: and elsewhere",
-        "`jump`: the tracking frame moved at once",
-    ):
-        assert text in alarms
 
 
 def test_schema_follows_the_definitions() -> None:
@@ -117,22 +105,25 @@ def test_enumerations_of_fields_exist() -> None:
 
 @pytest.mark.parametrize("kind", [list[int], set[str], int | str, tuple[int, str] | None])
 def test_unsupported_types_are_rejected(kind: object) -> None:
-    with pytest.raises(TypeError, match=r"no form|none of"):
+    with pytest.raises(TypeError):
         schema._describe_type(msgspec.inspect.type_info(kind))
 
 
-def test_csharp_has_every_message_field_and_tag() -> None:
-    text = csharp.render_csharp()
+def test_every_struct_has_its_fields_and_tag_in_csharp_and_typescript() -> None:
+    cs, ts = csharp.render_csharp(), typescript.render_typescript()
     for struct in schema.list_all_structs():
-        body = re.search(rf"public sealed class {struct.name} : \w+\n    \{{\n(.*?)\n    \}}\n", text, re.DOTALL)
-        assert body, struct.name
-        assert (f'TagName = "{struct.tag}"' in body[1]) == bool(struct.tag)
+        form = rf"type {struct.name} = \[" if struct.array_like else rf"interface {struct.name} \{{"
+        in_cs = re.search(rf"public sealed class {struct.name} : \w+\n    \{{\n(.*?)\n    \}}\n", cs, re.DOTALL)
+        in_ts = re.search(rf"export {form}\n(.*?)\n[\]}}]", ts, re.DOTALL)
+        assert in_cs, struct.name
+        assert in_ts, struct.name
+        assert (f'TagName = "{struct.tag}"' in in_cs[1]) == bool(struct.tag)
         for field in struct.fields:
-            assert re.search(rf"public \S+(, long>)? {csharp.to_pascal_case(field.name, struct.name)} = ", body[1]), (
-                field.name
-            )
+            name = csharp.to_pascal_case(field.name, struct.name)
+            assert re.search(rf"public \S+(, long>)? {name} = ", in_cs[1]), name
+            assert re.search(rf"^  {field.name}{'' if field.required else '[?]'}: ", in_ts[1], re.MULTILINE), field.name
     for value in (value for values in schema.list_enums().values() for value in values.values()):
-        assert f'= "{value}";' in text
+        assert f'= "{value}";' in cs
 
 
 def test_csharp_checks_the_bounds_of_the_schema() -> None:
@@ -153,40 +144,11 @@ def test_csharp_checks_the_bounds_of_the_schema() -> None:
         assert line in text, line
 
 
-def test_typescript_has_defaults_of_untagged_maps() -> None:
-    text = typescript.render_typescript().split("export const VALUE_DEFAULTS")[1]
-    light = text.split("  Light: {\n")[1].split("  },")[0]
-    assert '    follow: "fixed",\n' in light
-    assert "    attenuation: [1.0, 0.0, 0.0],\n" in light
-    assert '    headlight: {"active": true, ' in text
-
-
 def test_csharp_names() -> None:
     assert csharp.to_pascal_case("request_id", "Acquire") == "RequestId"
     assert csharp.to_pascal_case("T_world_tracking", "Alignment") == "T_world_tracking"
     assert csharp.to_pascal_case("tracking_epoch", "TrackingEpoch") == "TrackingEpochValue"
     assert csharp.to_pascal_case("CONTROLLER_LEFT") == "ControllerLeft"
-
-
-def test_typescript_has_every_message_field_and_union() -> None:
-    text = typescript.render_typescript()
-    for struct in schema.list_all_structs():
-        form = rf"type {struct.name} = \[" if struct.array_like else rf"interface {struct.name} \{{"
-        body = re.search(rf"export {form}\n(.*?)\n[\]}}]", text, re.DOTALL)
-        assert body, struct.name
-        for field in struct.fields:
-            assert re.search(rf"^  {field.name}{'' if field.required else '[?]'}: ", body[1], re.MULTILINE), field.name
-    for name, members in schema.UNIONS.items():
-        assert f"export type {name} =\n" + "\n".join(f"  | {member.__name__}" for member in members) + ";" in text
-
-
-def test_tables_have_every_type_and_limit() -> None:
-    sections = tables.render_sections()
-    for tag in (*codec.CLIENT_TYPES, *codec.SERVER_TYPES):
-        assert f"| `{tag}` |" in sections["limits"]
-        assert f'`type` = `"{tag}"`' in sections["client"] + sections["server"]
-    for kind in get_args(server_messages.EventKind):
-        assert f"#### {kind.__name__}\n" in sections["events"]
 
 
 def test_links_of_the_document_resolve() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -118,10 +119,9 @@ def test_reference_and_encoder_agree_on_escapes() -> None:
 
 
 def test_reference_rejects_levels_outside_the_unit_ball() -> None:
-    with pytest.raises(ValueError, match="no rotation"):
-        rigid_reference.decode_rotation((16383, 8191, 8191))
-    with pytest.raises(ValueError, match="no rotation"):
-        rigid_reference.decode_rotation((0, 0, 0))
+    for levels in ((16383, 8191, 8191), (0, 0, 0)):
+        with pytest.raises(ValueError, match=re.escape(str(levels))):
+            rigid_reference.decode_rotation(levels)
 
 
 def test_conversions_transform_vectors_like_poses() -> None:
@@ -143,9 +143,3 @@ def test_axes_of_the_engines() -> None:
     forward, left, up = ((*axis, 1.0, 0.0, 0.0, 0.0) for axis in np.eye(3).tolist())
     assert [to_unity(axis)[:3] for axis in (forward, left, up)] == [(0, 0, 1), (-1, 0, 0), (0, 1, 0)]
     assert [to_three(axis)[:3] for axis in (forward, left, up)] == [(0, 0, -1), (-1, 0, 0), (0, 1, 0)]
-
-
-def test_conversion_vectors_agree_with_the_functions() -> None:
-    for vector in GOLDEN["conversions"]:
-        assert list(to_unity(vector["world"])) == vector["unity"]
-        assert list(to_three(vector["world"])) == vector["three"]

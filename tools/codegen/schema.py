@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final, get_args
 
 import msgspec
@@ -252,6 +253,7 @@ def list_structs(group: str) -> tuple[Struct, ...]:
     return tuple(_describe_struct(cls) for cls in GROUPS[group])
 
 
+@cache
 def list_all_structs() -> tuple[Struct, ...]:
     """Return every struct of the wire, each once."""
     return tuple(struct for group in GROUPS for struct in list_structs(group))
