@@ -2,7 +2,7 @@
 
 import { describe, expect, test } from "vitest";
 import { AssetLoader } from "../src/core/asset_loader.ts";
-import { decodeAssetChunk, encodeStruct } from "../src/core/codec.ts";
+import { decodeStruct, encodeStruct } from "../src/core/codec.ts";
 import { ClientConnection, type InboxMessage } from "../src/core/connection.ts";
 import { SampleBuilder } from "../src/core/samples.ts";
 import type { SceneState } from "../src/core/state_stream.ts";
@@ -165,7 +165,7 @@ class AssetPlayer {
   }
 
   private async processChunk(head: Uint8Array, data: Uint8Array<ArrayBuffer>, nowNs: number): Promise<string> {
-    const [, requestId, address, offset, total] = decodeAssetChunk(head, data.length);
+    const [, requestId, address, offset, total] = decodeStruct("AssetChunk", head) as [number, number, string, number, number];
     const accepted = this.loader.processChunk(requestId, address, offset, total, data.length, nowNs);
     if (typeof accepted === "object") return `failed: ${accepted.reason}`;
     if (accepted !== "store") return accepted;

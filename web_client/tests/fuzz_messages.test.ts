@@ -18,9 +18,6 @@ describe("hostile bytes", () => {
   test("state header", () => fuzz(codec.decodeStateHeader, seedsOf("state_header")));
   test("presence", () => fuzz(codec.decodePresence, seedsOf("presence")));
   test("media header", () => fuzz(codec.decodeMediaHeader, seedsOf("media_header")));
-  test("asset request", () => fuzz(codec.decodeAssetRequest, seedsOf("asset_request")));
-  test("asset chunk", () => fuzz((bytes) => codec.decodeAssetChunk(bytes, 2), seedsOf("asset_chunk")));
-  test("asset refusal", () => fuzz(codec.decodeAssetRefused, seedsOf("asset_refused")));
   test("values without a schema", () => fuzz(decodeValue, [...seedsOf("client"), ...seedsOf("presence")]));
   test("web messages", () => fuzz(unpackMessage, seedsOf("state_header").map((frame) => packMessage(2, [frame, frame.subarray(3)]))));
   test("messages of the gateway", () => {

@@ -22,8 +22,6 @@ const AT_ONCE = 32;
 /** Pauses after a temporary refusal and after a disconnect; doubled each time, until a chunk comes. */
 const FIRST_PAUSE_NS = 50_000_000;
 const LONGEST_PAUSE_NS = 2_000_000_000;
-/** Time without any answer after which the connection is replaced. */
-const PATIENCE_NS = 15_000_000_000;
 const PASSING: readonly string[] = [AssetRefusal.TOO_MANY, AssetRefusal.NOT_ALLOWED, AssetRefusal.RATE, AssetRefusal.BUSY];
 
 /** One request to be sent. */
@@ -83,7 +81,6 @@ export class AssetLoader {
   private nextId = 0;
   private pauseNs = 0;
   private pausedUntilNs = 0;
-  private progressNs = 0;
 
   /** `mostRequests`: how many may wait for their answers. */
   constructor(private readonly mostRequests = MAX_ASSET_REQUESTS / 2) {}
@@ -150,7 +147,6 @@ export class AssetLoader {
       while (item.open) {
         const length = item.nextBytes(this.chunkBytes);
         if (this.asked.size >= this.mostRequests || this.outstanding + length > WINDOW_BYTES) return requests;
-        if (this.asked.size === 0) this.progressNs = nowNs;
         this.nextId += 1;
         const ask = { requestId: this.nextId, address: item.address, offset: item.asked, length };
         this.asked.set(this.nextId, [ask, nowNs]);
@@ -173,7 +169,6 @@ export class AssetLoader {
     this.asked.delete(requestId);
     if (ask === null || ask.offset !== offset || ask.address !== address) return "unasked";
     this.restoreLostRequests(ask.requestId);
-    this.progressNs = nowNs;
     this.pauseNs = 0;
     this.refusal = "";
     this.adaptChunkSize(ask, size, nowNs - askedNs);
@@ -237,7 +232,6 @@ export class AssetLoader {
     this.asked.delete(requestId);
     if (ask === null) return null;
     this.restoreLostRequests(ask.requestId);
-    this.progressNs = nowNs;
     const item = this.items.get(ask.address);
     if (item === undefined) return null;
     if (PASSING.includes(reason)) {
@@ -282,10 +276,5 @@ export class AssetLoader {
     this.asked.clear();
     this.pauseNs = this.pausedUntilNs = 0;
     for (const item of this.items.values()) item.asked = item.got;
-  }
-
-  /** Return whether answers have not come for too long. */
-  isOverdue(nowNs: number): boolean {
-    return this.asked.size > 0 && nowNs - this.progressNs > PATIENCE_NS;
   }
 }

@@ -45,12 +45,3 @@ export function decodeCloud(frame: Uint8Array): CloudFrame {
   new Uint8Array(points.buffer).set(frame.subarray(HEADER_BYTES));
   return { points, origin, step_m: 2 ** exponent, error_m, voxel_m };
 }
-
-/** Return red, green and blue of a colour of 16 bits, 0 to 255. */
-export function unpackColor(packed: number): [number, number, number] {
-  return [
-    Math.round(((packed >> 11) * 255) / 31),
-    Math.round((((packed >> 5) & 63) * 255) / 63),
-    Math.round(((packed & 31) * 255) / 31),
-  ];
-}

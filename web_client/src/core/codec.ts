@@ -11,9 +11,6 @@ import { PROTOCOL_VERSION } from "../protocol/messages.g.ts";
 import {
   CLIENT_LIMITS,
   type FieldType,
-  MAX_ASSET_CHUNK_BYTES,
-  MAX_ASSET_HEADER_BYTES,
-  MAX_ASSET_REQUEST_BYTES,
   MAX_CLIENT_BYTES,
   MAX_MEDIA_HEADER_BYTES,
   MAX_PRESENCE_BYTES,
@@ -35,8 +32,6 @@ export type ServerMessage = Filled<wire.ServerMessage>;
 export type StateHeader = Filled<wire.StateHeader>;
 export type Presence = Filled<wire.Presence>;
 export type MediaHeader = Filled<wire.MediaHeader>;
-export type AssetChunk = Filled<wire.AssetChunk>;
-export type AssetRefused = Filled<wire.AssetRefused>;
 
 type Decode = (reader: Reader) => unknown;
 type Encode = (writer: Writer, value: unknown) => void;
@@ -115,13 +110,8 @@ class Decoders {
   }
 
   private compileUnion(name: string): Decode {
-    const members = new Map<string, Decode>();
-    let tagField = "";
-    for (const member of findUnion(name)) {
-      const [field, tag] = findStruct(member).tag as [string, string];
-      tagField = field;
-      members.set(tag, this.struct(member));
-    }
+    const { tagField, structs } = findUnion(name);
+    const members = new Map(structs.map(([tag, struct]) => [tag, this.struct(struct)]));
     return (reader) => {
       const tag = peekTag(reader, tagField);
       const decode = members.get(tag);
@@ -256,10 +246,12 @@ function findStruct(name: string): StructTable {
   return table;
 }
 
-function findUnion(name: string): readonly string[] {
+/** Return the tag field of a union, and the tag and name of each of its structs. */
+function findUnion(name: string): { tagField: string; structs: [tag: string, struct: string][] } {
   const members = UNIONS[name];
   if (members === undefined) throw new Error(`no union ${name} in the tables`);
-  return members;
+  const tags = members.map((member) => findStruct(member).tag as readonly [string, string]);
+  return { tagField: tags[0]?.[0] ?? "", structs: members.map((member, i) => [tags[i]?.[1] ?? "", member]) };
 }
 
 const rounded = new Decoders(false);
@@ -393,13 +385,8 @@ function encodeDictionary(item: FieldType): Encode {
 }
 
 function encodeUnion(name: string): Encode {
-  const members = new Map<unknown, Encode>();
-  let tagField = "";
-  for (const member of findUnion(name)) {
-    const [field, tag] = findStruct(member).tag as [string, string];
-    tagField = field;
-    members.set(tag, structEncoder(member));
-  }
+  const { tagField, structs } = findUnion(name);
+  const members = new Map<unknown, Encode>(structs.map(([tag, struct]) => [tag, structEncoder(struct)]));
   return (writer, value) => {
     const tag = typeof value === "object" && value !== null ? (value as Record<string, unknown>)[tagField] : undefined;
     const encode = members.get(tag);
@@ -425,23 +412,6 @@ export function decodeStruct(name: string, bytes: Uint8Array, exact = false): un
   const value = (exact ? exactly : rounded).struct(name)(reader);
   reader.expectEnd();
   return value;
-}
-
-/** Decode an array of members of a union, such as the operations of a patch. */
-export function decodeUnionList(name: string, bytes: Uint8Array, exact = false): unknown[] {
-  const decoders = exact ? exactly : rounded;
-  const members = new Map(findUnion(name).map((member) => [findStruct(member).tag?.[1], decoders.struct(member)]));
-  const tagField = findStruct(findUnion(name)[0] as string).tag?.[0] as string;
-  const reader = new Reader(bytes);
-  const items: unknown[] = [];
-  for (let left = reader.readArrayHead(); left > 0; left--) {
-    const tag = peekTag(reader, tagField);
-    const decode = members.get(tag);
-    if (decode === undefined) throw new MalformedError(`unknown ${tagField} ${describe(tag)}`);
-    items.push(decode(reader));
-  }
-  reader.expectEnd();
-  return items;
 }
 
 /** Write the value of any struct. Throws `MalformedError` for one that does not fit. */
@@ -514,29 +484,4 @@ export function decodePresence(bytes: Uint8Array, exact = false): Presence {
 
 export function decodeMediaHeader(bytes: Uint8Array, exact = false): MediaHeader {
   return decodeSized("MediaHeader", "media header", bytes, MAX_MEDIA_HEADER_BYTES, exact);
-}
-
-function decodeAsset<T>(name: string, what: string, bytes: Uint8Array, limit: number, exact: boolean): T {
-  checkSize(what, bytes.length, limit);
-  checkVersion(bytes);
-  return decodeStruct(name, bytes, exact) as T;
-}
-
-export function decodeAssetRequest(bytes: Uint8Array, exact = false): Filled<wire.AssetRequest> {
-  return decodeAsset("AssetRequest", "asset request", bytes, MAX_ASSET_REQUEST_BYTES, exact);
-}
-
-/** Decode the first of the two frames of a chunk, whose second has `payload` bytes. */
-export function decodeAssetChunk(bytes: Uint8Array, payload: number, exact = false): AssetChunk {
-  const chunk = decodeAsset<AssetChunk>("AssetChunk", "asset chunk", bytes, MAX_ASSET_HEADER_BYTES, exact);
-  checkSize("asset chunk", payload, MAX_ASSET_CHUNK_BYTES);
-  const [, , , offset, total] = chunk;
-  if (BigInt(offset) + BigInt(payload) > BigInt(total)) {
-    throw new MalformedError(`${payload} bytes from ${offset} of an asset of ${total}`);
-  }
-  return chunk;
-}
-
-export function decodeAssetRefused(bytes: Uint8Array, exact = false): AssetRefused {
-  return decodeAsset("AssetRefused", "asset refusal", bytes, MAX_ASSET_HEADER_BYTES, exact);
 }

@@ -21,7 +21,6 @@ export interface LevelChoice {
   textureBytes: number;
 }
 
-export const NO_LIMIT: Budget = { triangles: 0, textureBytes: 0, objects: 0, points: Number.POSITIVE_INFINITY };
 /** Where a Quest 3 begins to struggle; good for phones too. */
 export const HEADSET: Budget = { triangles: 750_000, textureBytes: 700 * 2 ** 20, objects: 200, points: 100_000 };
 /** A desktop with a graphics card. */

@@ -1,8 +1,9 @@
 import { expect, test } from "vitest";
 
-import { chooseLevels, NO_LIMIT } from "../../src/view/budget.ts";
+import { type Budget, chooseLevels } from "../../src/view/budget.ts";
 import type { SceneSpec } from "../../src/view/spec.ts";
 
+const NO_LIMIT: Budget = { triangles: 0, textureBytes: 0, objects: 0, points: Number.POSITIVE_INFINITY };
 const level = (triangles: number, max_error_m: number) => ({
   address: "",
   bytes: 0,
