@@ -102,7 +102,6 @@ def _render_class(struct: Struct, base: str) -> str:
             f'    public const string TagName = "{struct.tag}";',
             "    public override string Tag { get { return TagName; } }",
         ]
-    read = _render_read_array(struct) if struct.array_like else _render_read_map(struct)
     return "\n".join(
         [
             *_render_doc(struct.doc),
@@ -111,7 +110,7 @@ def _render_class(struct: Struct, base: str) -> str:
             *tag,
             *fields,
             "",
-            *(f"    {line}".rstrip() for line in [*read, "", *_render_write(struct)]),
+            *(f"    {line}".rstrip() for line in [*_render_read(struct), "", *_render_write(struct)]),
             "}",
         ]
     )
@@ -201,28 +200,32 @@ def _render_assignment(field: Field, struct: Struct) -> str:
     return f"{target} = {_render_read_value(field.type)};"
 
 
-def _render_read_array(struct: Struct) -> list[str]:
-    required = sum(field.required for field in struct.fields)
-    lines = [
+def _render_read(struct: Struct) -> list[str]:
+    return [
         f"public static {struct.name} Read(WireReader reader)",
         "{",
         f"    {struct.name} value = new {struct.name}();",
+        *(_render_read_array(struct) if struct.array_like else _render_read_map(struct)),
+        "    return value;",
+        "}",
+    ]
+
+
+def _render_read_array(struct: Struct) -> list[str]:
+    required = sum(field.required for field in struct.fields)
+    lines = [
         "    int n = reader.ReadArrayHeader();",
         f'    if (n < {required}) throw new WireException("{struct.name} of " + n + " elements, expected {required}");',
     ]
     for k, field in enumerate(struct.fields):
         condition = "" if field.required else f"if (n > {k}) "
         lines.append(f"    {condition}{_render_assignment(field, struct)}")
-    lines.append(f"    for (int i = {len(struct.fields)}; i < n; i++) reader.Skip();")
-    return [*lines, "    return value;", "}"]
+    return [*lines, f"    for (int i = {len(struct.fields)}; i < n; i++) reader.Skip();"]
 
 
 def _render_read_map(struct: Struct) -> list[str]:
     wanted = sum(1 << k for k, field in enumerate(struct.fields) if field.required)
     lines = [
-        f"public static {struct.name} Read(WireReader reader)",
-        "{",
-        f"    {struct.name} value = new {struct.name}();",
         *(["    uint seen = 0;"] if wanted else []),
         "    for (int n = reader.ReadMapHeader(); n > 0; n--)",
         "    {",
@@ -241,7 +244,7 @@ def _render_read_map(struct: Struct) -> list[str]:
         lines.append(
             f'    if ((seen & {wanted}u) != {wanted}u) throw new WireException("missing field of {struct.name}");'
         )
-    return [*lines, "    return value;", "}"]
+    return lines
 
 
 def _render_write(struct: Struct) -> list[str]:

@@ -22,6 +22,11 @@ _FLOATS: Final = (1.7976931348623157e308, 5e-324, -0.0, 0.1 + 0.2)
 _TEXT: Final = 'Zoë 机器人 🤖 "\\'
 
 
+def make_address(data: bytes) -> str:
+    """Return the address of the asset that consists of `data`."""
+    return hashlib.sha256(data).hexdigest()
+
+
 def make_full(cls: type[msgspec.Struct]) -> Any:
     """Return an instance of `cls` with a different value in every field."""
     return cls(**{field.name: _make_value(field, n) for n, field in enumerate(_STRUCTS[cls.__name__].fields, start=1)})
@@ -63,7 +68,7 @@ def _make_ordinary_value(kind: Type, name: str, n: int) -> Any:
         case "float":
             return n + 0.25
         case "str":
-            return _make_address(name) if kind.pattern else name
+            return make_address(name.encode()) if kind.pattern else name
         case "bytes":
             return bytes(range(16))
         case "array":
@@ -89,7 +94,7 @@ def _make_extreme_value(kind: Type, field: Field) -> Any:
         case "float":
             return _FLOATS[0]
         case "str":
-            return _make_address(field.name) if kind.pattern else (_TEXT * 40)[: kind.max_length]
+            return make_address(field.name.encode()) if kind.pattern else (_TEXT * 40)[: kind.max_length]
         case "bytes":
             return bytes(range(192, 256))
         case "array":
@@ -104,8 +109,3 @@ def _make_extreme_value(kind: Type, field: Field) -> Any:
             return make_extreme(_STRUCTS[kind.name].cls)
         case _:
             return make_extreme(UNIONS[kind.name][-1])
-
-
-def _make_address(name: str) -> str:
-    """Return the address of the asset that holds `name`: the only pattern of a field."""
-    return hashlib.sha256(name.encode()).hexdigest()

@@ -5,7 +5,6 @@ Written to docs/protocol/scene.json. Values are written as in golden.json. Addre
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator
 from typing import Any, Final
@@ -54,7 +53,7 @@ from iris_session.protocol.scene import (
     check_scene,
     encode_scene,
 )
-from tools.codegen.examples import iterate_examples
+from tools.codegen.examples import iterate_examples, make_address
 from tools.codegen.schema import GROUPS
 from tools.codegen.vectors import render_vectors
 
@@ -76,10 +75,6 @@ def render_scene_golden() -> str:
         "malformed": list(_iterate_malformed()),
     }
     return render_vectors(content)
-
-
-def _make_address(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
 
 
 def _iterate_structs() -> Iterator[dict[str, Any]]:
@@ -118,7 +113,7 @@ _LIGHT: Final = {
 
 
 def _describe_scene(name: str, data: bytes, spec: SceneSpec, canonical: bool = False) -> dict[str, Any]:
-    row = {"name": name, "canonical": canonical, "address": _make_address(data), "hex": data.hex()}
+    row = {"name": name, "canonical": canonical, "address": make_address(data), "hex": data.hex()}
     return {**row, "value": msgspec.to_builtins(spec)}
 
 
@@ -142,7 +137,7 @@ def _iterate_patches() -> Iterator[dict[str, Any]]:
         ),
     }
     for name, ops in cases.items():
-        after = _make_address(encode_scene(apply_patch(before, ops)))
+        after = make_address(encode_scene(apply_patch(before, ops)))
         row = {"name": name, "before": "every kind of thing", "after": after, "hex": _pack(ops).hex()}
         yield {**row, "value": msgspec.to_builtins(ops)}
 
@@ -205,13 +200,13 @@ _CHECKED: Final = {
 
 
 def _make_mesh_level(what: str, triangles: int, max_error_m: float = 0.0) -> MeshLevel:
-    return MeshLevel(_make_address(what.encode()), 1_000, AssetEncoding.ARRAYS, 3 * triangles, triangles, max_error_m)
+    return MeshLevel(make_address(what.encode()), 1_000, AssetEncoding.ARRAYS, 3 * triangles, triangles, max_error_m)
 
 
 def _make_texture(name: str, kind: str, side: int, encoding: str, colorspace: str = ColorSpace.AUTO) -> Texture:
     sizes = (side, side // 2)
     levels = tuple(
-        TextureLevel(_make_address(f"{name}{size}".encode()), 500, encoding, size, size, index)
+        TextureLevel(make_address(f"{name}{size}".encode()), 500, encoding, size, size, index)
         for index, size in enumerate(sizes)
     )
     return Texture(name, kind, side, side, 3, colorspace, levels)
@@ -248,7 +243,7 @@ def make_full_scene() -> SceneSpec:
         materials=materials,
         textures=textures,
         meshes=(Mesh("hammer", (-0.1, -0.1, -0.2), (0.1, 0.1, 0.2), True, levels),),
-        hfields=(HeightField("hills", 20, 30, (2.0, 3.0, 0.5, 0.1), _make_address(b"hills"), 2_000),),
+        hfields=(HeightField("hills", 20, 30, (2.0, 3.0, 0.5, 0.1), make_address(b"hills"), 2_000),),
         lights=tuple(_iterate_lights()),
         cameras=tuple(_iterate_cameras()),
         sites=(
@@ -258,7 +253,7 @@ def make_full_scene() -> SceneSpec:
         tendons=(Tendon("rope", 0, 0.003, (0, 1), 0, _RED),),
         deformables=tuple(
             Deformable(f"dim{dim}", dim, 0, 100, 180, 0.005, dim == 3, 1, _GREY, f"deform-{dim}", address, 4_000)
-            for dim, address in ((n, _make_address(f"dim{n}".encode())) for n in (1, 2, 3))
+            for dim, address in ((n, make_address(f"dim{n}".encode())) for n in (1, 2, 3))
         ),
         environment=Environment(Headlight(False, (0.2, 0.2, 0.2)), 2, _RED, 0.4, _GREY, 5.0, 9.0, 0.02, 60.0, 2.5),
         groups_shown=(0, 2),
