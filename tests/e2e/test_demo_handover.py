@@ -33,34 +33,18 @@ CHILDREN = 5
 
 
 def test_hammer_is_handed_over_and_the_recording_verifies(tmp_path: Path) -> None:
+    """How well emulated people do it is tested in simulated time, in `tests/rig/test_demos.py`."""
     done = run_command("demo", "handover", *DEMO_OPTIONS, cwd=tmp_path, timeout_s=DEMO_S)
     assert done.returncode == 0, (done.stdout, done.stderr[-3000:])
     result = json.loads(done.stdout)  # exactly one object
-    assert result["ok"] is True
-    assert set(result) >= {
-        *("ok", "seconds", "participants", "handovers", "recording", "alignment_mm", "late_tick_share"),
-        *("verified", "problems"),
-    }
+    assert (result["ok"], result["verified"], result["problems"]) == (True, True, [])
+    assert {"seconds", "recording", "alignment_mm", "late_tick_share"} <= set(result)
     assert result["participants"] == ["ann", "bob"]
-    assert result["problems"] == []
-    assert result["verified"] is True
-    assert result["takes"] <= 2  # on a busy machine an operator may drop it
     (handover,) = result["handovers"]
     assert set(handover) == {"object", "giver", "receiver", "at_s", "duration_s"}
-    assert handover["object"] == "hammer"
-    assert handover["giver"] != handover["receiver"]
-    assert 0.0 < handover["at_s"] < result["seconds"]
-    assert handover["duration_s"] > 0.1
-    for error in result["alignment_mm"].values():
-        assert 0.0 < error["at_sheet"] < 2.0 * error["stated_p95"]
-    assert 0.0 <= result["late_tick_share"] <= 1.0
-    recording = Path(result["recording"])
-    assert recording.parts[0] == "sessions"
-    assert recording.name == "session.rrd"
-    assert "handover" in done.stderr  # of the display
-    report = run_verify(tmp_path / recording)
-    assert report["recording_class"] == "closed"
-    assert report["finished"]
+    assert (handover["object"], handover["giver"], handover["receiver"]) == ("hammer", "left", "right")
+    report = run_verify(tmp_path / result["recording"])
+    assert (report["recording_class"], report["finished"]) == ("closed", True)
 
 
 @pytest.mark.long

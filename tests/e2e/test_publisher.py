@@ -98,7 +98,6 @@ def check_more(scenario: Scenario, observers: list[CheckingObserver], more: int 
     scenario.run_until(enough, "all observers receive the moving world")
 
 
-@pytest.mark.long
 def test_observers_receive_poses_and_vertices_of_a_world_without_mujoco(scenario: Scenario, tmp_path: Path) -> None:
     composed = publisher_program.build_scene(tmp_path).build(AssetStore(tmp_path / "store"))
     stream = composed.deformables["cloth"].stream
@@ -138,6 +137,7 @@ def test_observers_receive_poses_and_vertices_of_a_world_without_mujoco(scenario
     assert "open" in refused.stderr
 
 
+@pytest.mark.long
 def test_served_mesh_file_is_shown_without_moving_bodies(tmp_path: Path, serve: Callable[..., SessionProcess]) -> None:
     publisher_program.build_scene(tmp_path)
     server = serve(str(tmp_path / "corner.off"), "--name", "shelf")

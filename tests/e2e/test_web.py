@@ -101,6 +101,7 @@ class Reference:
         return picture, (number >= 0) & ~is_plane
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scene", "distances"), [("handover", 1.35), ("cloth", 1.35), pytest.param("aloha", 0.9, marks=pytest.mark.long)]
 )
@@ -172,6 +173,7 @@ def test_two_browsers_share_robots(scenario: Scenario, open_page: Callable[..., 
     assert second.errors == []
 
 
+@pytest.mark.long
 def test_markup_in_names_is_text(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     page = open_page(scenario.server, "reader")
     scenario.join("<img src=x onerror=alert(1)>")
@@ -271,6 +273,7 @@ def test_the_keyboard_alone_is_enough(scenario: Scenario, open_page: Callable[..
     assert page.evaluate("irisSession.view.viewpoint.camera.position.toArray()") != before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("phone", [False, True])
 def test_axe_finds_nothing_serious(scenario: Scenario, open_page: Callable[..., Page], phone: bool) -> None:
     width, height = (390, 844) if phone else (1280, 800)
@@ -296,6 +299,7 @@ def make_link(role: str) -> tuple[subprocess.Popen[str], str]:
     raise AssertionError("pair has printed no link")
 
 
+@pytest.mark.long
 def test_a_browser_pairs_by_the_printed_link(
     serve: Callable[..., SessionProcess], browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -355,6 +359,7 @@ class NewerGateway(http.server.SimpleHTTPRequestHandler):
         """Log nothing."""
 
 
+@pytest.mark.long
 def test_a_page_of_an_older_version_says_to_reload(browser: Browser) -> None:
     handler = functools.partial(NewerGateway, directory=str(BUILT_PAGE.parent))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:

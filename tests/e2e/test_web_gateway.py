@@ -64,6 +64,7 @@ def page(shared_session: SessionProcess) -> str:
     return page_of(shared_session)
 
 
+@pytest.mark.long
 def test_page_and_information_without_a_ticket(page: str) -> None:
     async def work() -> None:
         async with open_http() as http:
@@ -86,6 +87,7 @@ def test_page_and_information_without_a_ticket(page: str) -> None:
     run(work())
 
 
+@pytest.mark.long
 def test_browsers_join_and_get_state_like_zeromq_clients(page: str, shared_session: SessionProcess) -> None:
     async def work() -> None:
         async with browsers(page, "ann", "bob") as (ann, bob):
@@ -129,6 +131,7 @@ def test_an_operator_behind_the_gateway_drives_and_stops(page: str) -> None:
     run(work())
 
 
+@pytest.mark.long
 def test_assets_are_fetched_with_ranges_and_a_ticket(page: str) -> None:
     async def work() -> None:
         async with browsers(page, "ann", "bob") as (ann, bob):
@@ -161,6 +164,7 @@ def test_assets_are_fetched_with_ranges_and_a_ticket(page: str) -> None:
     run(work())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("headers", "status"),
     [
@@ -183,6 +187,7 @@ def test_other_sites_are_refused(page: str, headers: dict[str, str], status: int
     run(work())
 
 
+@pytest.mark.long
 def test_another_version_is_refused_in_words(page: str) -> None:
     async def work() -> None:
         async with open_http() as http:
@@ -242,6 +247,7 @@ def test_hostile_messages_close_their_sender_only(page: str) -> None:
     run(work())
 
 
+@pytest.mark.long
 def test_media_need_a_ticket(page: str) -> None:
     async def work() -> None:
         async with browsers(page, "ann") as (ann,):
@@ -305,6 +311,7 @@ def test_a_thousand_silent_sockets_harm_no_one(page: str) -> None:
     run(work())
 
 
+@pytest.mark.long
 def test_a_reader_that_stops_gets_the_newest_afterwards(page: str) -> None:
     async def work() -> None:
         async with browsers(page, "ann", "slow") as (ann, slow):
@@ -342,7 +349,6 @@ def test_a_reader_that_never_reads_is_closed(page: str) -> None:
     run(work())
 
 
-@pytest.mark.long
 def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
     server = serve()
     page = page_of(server)
@@ -411,6 +417,7 @@ def test_all_browsers_of_a_killed_gateway_resume_and_nothing_leaks(serve: Serve)
     server.finish()
 
 
+@pytest.mark.long
 def test_session_end_is_said(serve: Serve) -> None:
     server = serve()
     page = page_of(server)
@@ -424,6 +431,7 @@ def test_session_end_is_said(serve: Serve) -> None:
     assert server.process.wait(DEADLINE_S) == 0
 
 
+@pytest.mark.long
 def test_unpaired_browsers_of_an_encrypted_session(
     serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -540,6 +548,7 @@ def test_a_gateway_by_hand_fetches_an_asset_once_for_all(
         out.close()
 
 
+@pytest.mark.long
 def test_without_a_page_there_is_no_port(serve: Serve) -> None:
     server = serve("handover", "--no-web")
     assert "in a browser" not in server.output

@@ -178,6 +178,7 @@ def lab(serve: Callable[..., SessionProcess], tmp_path: Path, monkeypatch: pytes
     lab.close()
 
 
+@pytest.mark.long
 def test_person_behind_gateways(lab: Lab) -> None:
     first, second = lab.gateways
     secret = os.urandom(32)

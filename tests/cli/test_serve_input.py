@@ -11,8 +11,6 @@ import pytest
 
 from tests.e2e.session_process import FREE_PORTS, run_command, run_in_process, wait_until
 
-pytestmark = pytest.mark.e2e
-
 #: An arm with two sites that may be its end effector.
 AMBIGUOUS = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
 <body name="arm"><joint name="j1" axis="0 0 1"/><geom size=".05"/>
@@ -81,6 +79,7 @@ def test_invalid_input_is_one_line_that_names_the_value(
     assert_no_process_in(folder)
 
 
+@pytest.mark.e2e
 def test_ambiguous_model_prints_a_robot_file_to_edit(folder: Path) -> None:
     done = run_command("serve", "ambiguous.xml", "--no-record", cwd=folder)
     assert done.returncode == 2, (done.stdout, done.stderr)
@@ -97,11 +96,11 @@ def test_ambiguous_model_prints_a_robot_file_to_edit(folder: Path) -> None:
     assert_no_process_in(folder)
 
 
-@pytest.mark.parametrize("option", ["--control-port", "--state-port"])
-def test_port_in_use_is_one_line_that_names_the_port(folder: Path, option: str) -> None:
+@pytest.mark.e2e
+def test_port_in_use_is_one_line_that_names_the_port(folder: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        ports = [*FREE_PORTS, option, port]
+        ports = [*FREE_PORTS, "--state-port", port]
         done = run_command("serve", "handover", "--record", "new.rrd", *ports, cwd=folder)
     assert done.returncode == 2, (done.stdout, done.stderr)
     (line,) = done.stderr.strip().splitlines()
