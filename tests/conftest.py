@@ -9,14 +9,19 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from pathlib import Path
 
 import psutil
 import pytest
 from hypothesis import HealthCheck, settings
+
+from tests.models import DATA, MENAGERIE
+from tools.system_packages import OPENGL, find_missing
 
 # A run in the background inherits that Ctrl-C is ignored, and so would every process that a test starts and interrupts.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -33,6 +38,21 @@ settings.load_profile(os.environ.get("HYPOTHESIS", "same"))
 RUN_VARIABLE = "IRIS_TEST_RUN"
 #: Time for processes that end by themselves after the last test, on a busy machine [s].
 ENDING_S = 120.0
+
+
+#: Missing packages of the system without which nothing can be drawn.
+NO_OPENGL = sorted({*OPENGL} & {*find_missing()})
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Skip tests that fail to draw on a machine without OpenGL; in CI they fail."""
+    report = yield
+    if NO_OPENGL and report.failed and not os.environ.get("CI") and re.search("OpenGL|EGL", report.longreprtext):
+        report.outcome = "skipped"
+        path, line, _ = item.location
+        report.longrepr = (path, line or 0, f"needs OpenGL: apt-get install {' '.join(NO_OPENGL)}")
+    return report
 
 
 def _find_test_processes() -> list[psutil.Process]:
@@ -62,8 +82,13 @@ def _check_processes_end() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _isolate_keys_and_assets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep the keys and cached assets of the user from the tests and from the processes that they start."""
+    """Keep the keys, cached assets and robot models of the user from the tests and the processes that they start.
+
+    So the robots are the same everywhere, and none is downloaded.
+    """
     with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("IRIS_DATA", raising=False)
+        patch.setenv("MENAGERIE_ROOT", str(MENAGERIE))
         patch.setenv("IRIS_HOME", str(tmp_path_factory.mktemp("keys") / "home"))
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))  # shared by the tests of one run
         yield
@@ -75,6 +100,18 @@ def _check_priority_is_kept() -> Iterator[None]:
     before = os.getpriority(os.PRIO_PROCESS, 0)
     yield
     assert os.getpriority(os.PRIO_PROCESS, 0) == before
+
+
+@pytest.fixture(scope="session")
+def rgbd() -> Path:
+    """The folder of real RGB-D frames. Without it a test is not run; in CI with `IRIS_DATA`, that is a failure."""
+    folder = Path(DATA, "rgbd").resolve()
+    if not (DATA and folder.is_dir()):
+        reason = f"needs real RGB-D frames: a folder rgbd/ in IRIS_DATA={DATA}"
+        if os.environ.get("CI") and DATA:
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return folder
 
 
 @pytest.fixture

@@ -1,21 +1,25 @@
-"""Models of real robots that some tests need: in the folder `IRIS_DATA`, else beside the checkout."""
+"""Models of real robots for tests, from a package, and real pictures, where `IRIS_DATA` has them."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Final
 
-import pytest
-
-BESIDE = Path(__file__).parents[2] / "shared"
+from iris_session.demo.scenes.models import WHEEL, find_wheel_folder
 
 
-@pytest.fixture
-def robot_models(monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of models, visible to child processes too. Its absence is a failure, not a skip."""
-    folder = Path(os.environ.get("IRIS_DATA") or BESIDE)
-    for name in ("aloha/scene.xml", "kuka_iiwa_14/iiwa14.xml"):
-        if not (folder / "models" / name).is_file():
-            pytest.fail(f"models/{name} is not in {folder}: set IRIS_DATA to the folder with the test data")
-    monkeypatch.setenv("IRIS_DATA", str(folder.resolve()))
+def _find_menagerie() -> Path:
+    folder = find_wheel_folder()
+    if folder is None:
+        raise FileNotFoundError(f"{WHEEL} has the robots of these tests: pip install -e '.[all,dev]'")
     return folder
+
+
+#: Folder of robots of MuJoCo Menagerie.
+MENAGERIE: Final = _find_menagerie()
+#: Two arms on a table; an arm without a hand, whose flange has a site.
+ALOHA: Final = MENAGERIE / "aloha" / "scene.xml"
+PANDA: Final = MENAGERIE / "franka_emika_panda" / "panda_nohand.xml"
+#: `IRIS_DATA` of the person who runs the tests; empty without. Tests themselves do not have it in their environment.
+DATA: Final = os.environ.get("IRIS_DATA", "")

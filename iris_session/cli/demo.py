@@ -26,19 +26,19 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         description="Run a whole session with emulated operators in other processes. Exit status 0 only if every "
         "object changed hands by contact alone (or was folded, or stowed) and the recording verifies bit for bit.\n\n"
         "  handover   arms made of primitives hand over a hammer; needs no data\n"
-        "  iiwa       the same with KUKA iiwa 14 arms\n"
+        "  panda      the same with Franka Panda arms\n"
         "  aloha      two ALOHA stations: two operators with two arms each exchange a red and a blue board\n"
         "  cloth      two operators fold a cloth: each takes a corner\n"
         "  soft       two operators stow a soft body each in one box\n"
         "  cloud      handover before two depth cameras; an observer watches their point cloud and pictures. The\n"
         "             cameras are drawn: needs OpenGL without a display (Debian: libegl1 libgl1-mesa-dri)\n\n"
-        "The models of iiwa and aloha are read from the folder in IRIS_DATA.",
+        "The models of panda and aloha come from IRIS_DATA or the package mujoco-menagerie.",
         epilog="examples:\n  iris-session demo handover\n  iris-session demo handover --seed 7 --json\n"
         "  iris-session demo handover --operators 8 --observers 8\n  iris-session demo aloha --profile busy-wifi\n"
-        "  iris-session demo iiwa --latency 40\n  iris-session demo cloud --record cloud.rrd",
+        "  iris-session demo panda --latency 40\n  iris-session demo cloud --record cloud.rrd",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("demo", choices=("handover", "iiwa", "aloha", "cloth", "soft", "cloud"))
+    parser.add_argument("demo", choices=("handover", "panda", "aloha", "cloth", "soft", "cloud"))
     parser.add_argument(
         "--operators", type=int, default=2, metavar="N", help="operators, in pairs; 2 to 8 (default: 2)"
     )

@@ -38,7 +38,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="share a MuJoCo scene, or show a file",
         description="Share a MuJoCo scene in real time until Ctrl-C. Robots are found in the model, or given by name. "
         "Other files (GLB, STL, OBJ, ...) are shown as they are, a URDF in its zero configuration.",
-        epilog=f"named scenes (iiwa and aloha need the folder in IRIS_DATA):\n{format_scene_names()}\n\n"
+        epilog=f"named scenes (panda and aloha need the package mujoco-menagerie):\n{format_scene_names()}\n\n"
         "examples:\n"
         "  iris-session serve scene.xml\n"
         "  iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request\n"

@@ -1,7 +1,7 @@
 """The demos: for each its scene, the pose of its sheet, and its cast of emulated operators. Nothing runs here.
 
 `handover`: two arms drawn from primitives and a hammer, or up to eight around a round table; needs no data.
-`iiwa`: the same with KUKA iiwa 14 arms. `aloha`: two ALOHA stations, two operators with two arms each. `cloth`: two
+`panda`: the same with Franka Panda arms. `aloha`: two ALOHA stations, two operators with two arms each. `cloth`: two
 operators fold a cloth. `soft`: two operators stow a soft body each. `cloud`: `handover` before two depth cameras, whose
 cloud and pictures observers watch.
 """
@@ -26,13 +26,13 @@ from iris_session.demo.named_scenes import (
     make_aloha,
     make_arms,
     make_cloth,
-    make_iiwa,
+    make_panda,
     make_soft,
     scene_by_name,
 )
 from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, RADIUS
 from iris_session.demo.scenes.generators import arm_names, compute_bearing, compute_circle_radius
-from iris_session.demo.scenes.iiwa import compute_iiwa_radius
+from iris_session.demo.scenes.panda import compute_panda_radius
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID
 from iris_session.emulator.specs import HandTask, HeadsetSpec
 from iris_session.protocol.names import Device
@@ -99,13 +99,13 @@ def _make_handover(operators: int, seed: int) -> Demo:
     return _cast_around_table(play, operators, compute_circle_radius(operators), "arm", seed)
 
 
-def _make_iiwa(operators: int, seed: int) -> Demo:
-    _check_operators("iiwa", operators)
+def _make_panda(operators: int, seed: int) -> Demo:
+    _check_operators("panda", operators)
     return _cast_around_table(
-        _make_without_cast("iiwa", make_iiwa(operators), _list_objects(operators)),
+        _make_without_cast("panda", make_panda(operators), _list_objects(operators)),
         operators,
-        compute_iiwa_radius(operators),
-        "iiwa",
+        compute_panda_radius(operators),
+        "panda",
         seed,
     )
 
@@ -261,7 +261,7 @@ def _cast_at_table(
 
 DEMOS: Final[dict[str, Callable[[int, int], Demo]]] = {
     "handover": _make_handover,
-    "iiwa": _make_iiwa,
+    "panda": _make_panda,
     "aloha": _make_aloha,
     "cloth": _make_cloth,
     "soft": _make_soft,

@@ -1,4 +1,4 @@
-"""Scenes by name: drawn from primitives, or built around models of real robots (from `IRIS_DATA`).
+"""Scenes by name: drawn from primitives, or built around models of real robots of MuJoCo Menagerie.
 
 Each comes with the pose of its alignment sheet. Names like `arms4` say how many arms there are.
 """
@@ -19,7 +19,7 @@ from iris_session.demo.scene_names import SCENE_NAMES
 from iris_session.demo.scenes import free_bodies_scene, n_arms_scene, scene_path
 from iris_session.demo.scenes.aloha import SHEET_Z, aloha_scene
 from iris_session.demo.scenes.deformables import cloth_scene, soft_scene
-from iris_session.demo.scenes.iiwa import iiwa_scene
+from iris_session.demo.scenes.panda import panda_scene
 from iris_session.demo.scenes.parts import add_sheet, get_sheet_position
 from iris_session.physics import load_model
 from iris_session.session.config import DEFAULT_ANCHORS, DEFAULT_SHEET_M
@@ -55,9 +55,9 @@ def make_arms(n: int) -> NamedScene:
     return NamedScene(spec.compile(), _place_sheet(get_sheet_position(n)))
 
 
-def make_iiwa(n: int) -> NamedScene:
-    """Return `n` KUKA iiwa 14 arms around a round table."""
-    return NamedScene(iiwa_scene(n).compile(), _place_sheet(get_sheet_position(n)))
+def make_panda(n: int) -> NamedScene:
+    """Return `n` Franka Panda arms around a round table."""
+    return NamedScene(panda_scene(n).compile(), _place_sheet(get_sheet_position(n)))
 
 
 def make_aloha() -> NamedScene:
@@ -96,14 +96,14 @@ SCENES: Final[dict[str, Callable[[], NamedScene]]] = {
     "handover": lambda: load_packaged("handover"),
     "arm": lambda: load_packaged("arm"),
     "arms": lambda: make_arms(8),
-    "iiwa": lambda: make_iiwa(2),
+    "panda": lambda: make_panda(2),
     "aloha": make_aloha,
     "cloth": make_cloth,
     "soft": make_soft,
     "cloud": make_cloud,
     "bodies": lambda: NamedScene(free_bodies_scene().compile()),
 }
-NUMBERED: Final[dict[str, Callable[[int], NamedScene]]] = {"arms": make_arms, "iiwa": make_iiwa}
+NUMBERED: Final[dict[str, Callable[[int], NamedScene]]] = {"arms": make_arms, "panda": make_panda}
 
 
 def scene_by_name(name: str) -> NamedScene:

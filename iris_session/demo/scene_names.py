@@ -8,7 +8,7 @@ SCENE_NAMES: Final = {
     "handover": "two arms, a hammer, a board",
     "arm": "one arm",
     "arms": "eight arms around a table; arms1 to arms12 for another number",
-    "iiwa": "two KUKA iiwa 14 around a table; iiwa1 to iiwa8 for another number",
+    "panda": "two Franka Panda arms around a table; panda1 to panda8 for another number",
     "aloha": "two ALOHA stations face to face, four arms",
     "cloth": "two arms and a cloth",
     "soft": "two arms, two soft bodies, an open box",

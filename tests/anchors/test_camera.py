@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import cv2
@@ -18,7 +17,6 @@ from anchors.camera import (
     pose_to_matrix,
     to_rvec_tvec,
 )
-from tests.models import BESIDE
 
 CAMERA = CameraModel(640, 480, 585.0, 584.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.01))
 
@@ -49,9 +47,8 @@ def test_scaled_intrinsics_project_to_the_same_image_position() -> None:
     assert np.allclose(double.project(points), 2.0 * (CAMERA.project(points) + 0.5) - 0.5)
 
 
-def test_intrinsics_of_a_real_camera_are_read() -> None:
-    folder = Path(os.environ.get("IRIS_DATA") or BESIDE) / "rgbd"
-    camera = parse_camera((folder / "camera-intrinsics.txt").read_text(), 640, 480)
+def test_intrinsics_of_a_real_camera_are_read(rgbd: Path) -> None:
+    camera = parse_camera((rgbd / "camera-intrinsics.txt").read_text(), 640, 480)
     assert (camera.fx, camera.cx, camera.width) == (585.0, 320.0, 640)
 
 

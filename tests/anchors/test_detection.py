@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from anchors.detection import DetectionError, SheetDetection, SheetDetector, det
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_to_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
-from tests.models import BESIDE
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
@@ -27,7 +25,6 @@ TABLE, DOOR = Sheet("table", 0.160), Sheet("door", 0.120)
 #: Intrinsics of a real depth camera, with the distortion of an ordinary lens.
 CAMERA = CameraModel(640, 480, 585.0, 585.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.0))
 CONDITIONS = Conditions(rays=2)
-RGBD = Path(os.environ.get("IRIS_DATA") or BESIDE) / "rgbd"
 
 
 @pytest.fixture(scope="module")
@@ -113,17 +110,17 @@ def test_two_sheets_are_identified_with_a_covered_marker(pages: dict[str, Page])
     assert _errors(second, door)[0] < 1.0
 
 
-def test_image_without_sheets_has_no_detections() -> None:
+def test_image_without_sheets_has_no_detections(rgbd: Path) -> None:
     camera = CameraModel(640, 480, 585.0, 585.0, 320.0, 240.0)
     sheets = [Sheet(f"sheet-{k}", 0.160) for k in range(8)]
-    frames = sorted(RGBD.glob("*.color.jpg"))[::12]
+    frames = sorted(rgbd.glob("*.color.jpg"))[::12]
     assert frames
     for path in frames:
         assert SheetDetector(sheets, camera).detect(cv2.imread(str(path))) == []
 
 
-def test_sheet_in_a_real_room_is_detected(pages: dict[str, Page]) -> None:
-    room = cv2.imread(str(RGBD / "frame-000000.color.jpg"), cv2.IMREAD_GRAYSCALE)
+def test_sheet_in_a_real_room_is_detected(pages: dict[str, Page], rgbd: Path) -> None:
+    room = cv2.imread(str(rgbd / "frame-000000.color.jpg"), cv2.IMREAD_GRAYSCALE)
     true = _facing((0.1, 0.1, 1.2), 35.0, -60.0)
     picture = photograph([(pages["table"], true)], CAMERA, CONDITIONS, np.random.default_rng(4), background=room)
     (seen,) = SheetDetector([TABLE], CAMERA).detect(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))

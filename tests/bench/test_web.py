@@ -13,9 +13,6 @@ from iris_session.bench.web import FROZEN, LOADING, make_web_bars, plan_web_inte
 from iris_session.bench.web_tab import STOPS, STOPS_S
 from tests.bench.test_report import _bench, _check
 from tests.e2e.browser import require_browser
-from tests.models import robot_models
-
-__all__ = ["robot_models"]
 
 MS = 1_000_000
 KEYS = {
@@ -80,7 +77,7 @@ def test_bars_follow_the_baseline_and_the_length() -> None:
 
 @pytest.mark.long
 @pytest.mark.e2e
-def test_web(tmp_path: Path, robot_models: Path) -> None:
+def test_web(tmp_path: Path) -> None:
     """A tab, a browser that is disturbed, another one, and a client beside them, encrypted."""
     require_browser()
     options = ("--clients", "3", "--vertices", "100", "--seconds", "27", "--curve")

@@ -102,8 +102,8 @@ def test_robots_json_is_one_object(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["robots", "nothing.xml"], "nothing.xml"),
         (["verify", "nothing.rrd"], "nothing.rrd"),
-        (["serve", "nothing"], "expected one of handover, arm, arms, iiwa, aloha"),
-        (["robots", "nothing"], "expected one of handover, arm, arms, iiwa, aloha"),
+        (["serve", "nothing"], "expected one of handover, arm, arms, panda, aloha"),
+        (["robots", "nothing"], "expected one of handover, arm, arms, panda, aloha"),
         (["serve", "arms13"], "1 to 12 arms, not 13"),
         (["serve", "handover", "--assign", "ann"], "NAME=ROBOT[,ROBOT]"),
         (["serve", "handover", "--unaligned", "ann"], "key:FINGERPRINT"),

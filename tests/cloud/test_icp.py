@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from functools import cache
 from pathlib import Path
 
@@ -49,9 +48,9 @@ def move(T: Floats, points: Floats) -> Floats:
 
 
 @cache
-def see_real_room(number: int) -> tuple[Floats, Floats]:
+def see_real_room(rgbd: Path, number: int) -> tuple[Floats, Floats]:
     """Return points and position of the camera of a real picture, by its pose."""
-    path = Path(os.environ["IRIS_DATA"]) / "rgbd" / f"frame-{number:06d}"
+    path = rgbd / f"frame-{number:06d}"
     depth = cv2.imread(f"{path}.depth.png", cv2.IMREAD_UNCHANGED)
     color = cv2.imread(f"{path}.color.jpg")
     assert depth is not None
@@ -80,9 +79,9 @@ def see_table(camera: int) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_extrinsics_off_by_2_cm_and_1_degree_are_mended_on_real_frames(seed: int) -> None:
-    reference, _ = see_real_room(0)
-    points, p_camera = see_real_room(20)
+def test_extrinsics_off_by_2_cm_and_1_degree_are_mended_on_real_frames(seed: int, rgbd: Path) -> None:
+    reference, _ = see_real_room(rgbd, 0)
+    points, p_camera = see_real_room(rgbd, 20)
     error = bump(p_camera, seed)
     found = refine_pose(move(error, points), reference)
     left_m, left_deg = measure_error(found, error, p_camera)
@@ -103,8 +102,8 @@ def test_extrinsics_of_two_cameras_at_a_table_are_mended(seed: int) -> None:
     assert left_deg < 0.3
 
 
-def test_exact_extrinsics_stay() -> None:
-    reference, _ = see_real_room(0)
+def test_exact_extrinsics_stay(rgbd: Path) -> None:
+    reference, _ = see_real_room(rgbd, 0)
     found = refine_pose(reference, reference)
     assert found.shift_m < 1e-3
     assert found.turn_rad < 1e-3

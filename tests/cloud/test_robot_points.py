@@ -23,9 +23,6 @@ from iris_session.protocol.server_messages import BodyInfo, RobotInfo
 from iris_session.scene import MeshArrays
 from tests.cloud.rays import cast_picture, look_at
 from tests.cloud.robot_scene import load_robots
-from tests.models import robot_models
-
-__all__ = ["robot_models"]
 
 EYES = ((1.3, -1.2, 0.9), (-1.2, -1.3, 0.8), (0.1, 1.6, 0.7))
 CAMERA = CameraModel(320, 240, 280.0, 280.0, 159.5, 119.5)
@@ -79,9 +76,9 @@ def hold_object(scene: str, folder: Path) -> Holding:
 
 
 @backends
-@pytest.mark.parametrize("scene", ["iiwa", "handover"])
+@pytest.mark.parametrize("scene", ["panda", "handover"])
 def test_robots_are_gone_and_the_object_in_the_gripper_is_not(
-    scene: str, use_numba: bool, robot_models: Path, tmp_path_factory: pytest.TempPathFactory
+    scene: str, use_numba: bool, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     holding = hold_object(scene, tmp_path_factory.getbasetemp() / scene)
     on_robot = holding.find(use_numba=use_numba)
@@ -95,7 +92,7 @@ def test_robots_are_gone_and_the_object_in_the_gripper_is_not(
 
 
 def test_of_an_object_that_the_session_does_not_know_what_touches_the_fingers_goes(
-    robot_models: Path, tmp_path_factory: pytest.TempPathFactory
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
     of_thing = holding.bodies == holding.thing
@@ -106,9 +103,7 @@ def test_of_an_object_that_the_session_does_not_know_what_touches_the_fingers_go
     assert wider > unknown
 
 
-def test_bodies_without_a_pose_are_counted_and_keep_their_points(
-    robot_models: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_bodies_without_a_pose_are_counted_and_keep_their_points(tmp_path_factory: pytest.TempPathFactory) -> None:
     holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
     found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed)
     assert not found.find(holding.points, holding.body_pose, 8).any()
@@ -122,7 +117,7 @@ def test_bodies_without_a_pose_are_counted_and_keep_their_points(
 
 
 def test_what_is_compiled_at_the_beginning_is_what_is_called(
-    robot_models: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
     called: list[tuple[Any, ...]] = []
@@ -141,7 +136,7 @@ def test_what_is_compiled_at_the_beginning_is_what_is_called(
 
 @backends
 def test_clouds_without_points_and_scenes_without_robots_have_none(
-    use_numba: bool, robot_models: Path, tmp_path_factory: pytest.TempPathFactory
+    use_numba: bool, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
     found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed, use_numba=use_numba)

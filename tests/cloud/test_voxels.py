@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections import defaultdict
@@ -190,19 +189,18 @@ def test_pictures_without_measurements_have_no_points(use_numba: bool, depth: in
     assert found.counts.sum() == points
 
 
-def test_real_frames_make_one_room() -> None:
+def test_real_frames_make_one_room(rgbd: Path) -> None:
     """Views of a moving camera, merged by their poses: surfaces of one view lie on those of the others."""
-    folder = Path(os.environ["IRIS_DATA"]) / "rgbd"
-    matrix = np.loadtxt(folder / "camera-intrinsics.txt")
+    matrix = np.loadtxt(rgbd / "camera-intrinsics.txt")
     camera = CameraModel(640, 480, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     rays, limits = make_rays(camera), DepthLimits(farthest_m=3.5)
     views = []
     for number in (0, 10, 20):
-        depth = cv2.imread(str(folder / f"frame-{number:06d}.depth.png"), cv2.IMREAD_UNCHANGED)
-        color = cv2.imread(str(folder / f"frame-{number:06d}.color.jpg"))
+        depth = cv2.imread(str(rgbd / f"frame-{number:06d}.depth.png"), cv2.IMREAD_UNCHANGED)
+        color = cv2.imread(str(rgbd / f"frame-{number:06d}.color.jpg"))
         assert depth is not None
         assert color is not None
-        pose = np.loadtxt(folder / f"frame-{number:06d}.pose.txt")
+        pose = np.loadtxt(rgbd / f"frame-{number:06d}.pose.txt")
         one = VoxelFilter(0.01)
         one.add_depth(depth.astype(np.uint16), color.astype(np.uint8), rays, pose, limits=limits)
         views.append(one.collect(min_points=2, min_around=4).positions)

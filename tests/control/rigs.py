@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-from pathlib import Path
 
 import msgspec
 import mujoco
@@ -16,23 +14,12 @@ from iris_session.control.arm_model import read_site_pose
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, CommandSource, Decision, FixedView, ObjectCommand
+from tests.models import ALOHA, PANDA
 
-ROOT = Path(__file__).resolve().parents[2]
 STEP_NS = 2_000_000
 IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
-IIWA_HOME = (0.0, 0.3, 0.0, -1.6, 0.0, 1.2, 0.0)
-
-
-def data_folder() -> Path:
-    """The folder of real models: `IRIS_DATA` (relative to the repository), else `shared` beside the repository."""
-    folder = (ROOT / os.environ.get("IRIS_DATA", "../shared")).resolve()
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder} does not exist: set IRIS_DATA to the folder that holds models/")
-    return folder
-
-
-def iiwa_path() -> str:
-    return str(data_folder() / "models" / "kuka_iiwa_14" / "iiwa14.xml")
+#: The flange points down, 0.50 m in front of the base and 0.45 m above it.
+PANDA_HOME = (0.0, -0.16, 0.0, -2.19, 0.0, 2.03, math.pi / 4)
 
 
 def set_actuators(spec: mujoco.MjSpec, kind: str) -> None:
@@ -47,19 +34,19 @@ def set_actuators(spec: mujoco.MjSpec, kind: str) -> None:
             actuator.set_to_motor()
 
 
-def iiwa_spec(prefix: str = "", kind: str = "position") -> RobotSpec:
+def panda_spec(prefix: str = "", kind: str = "position") -> RobotSpec:
     return RobotSpec(
-        prefix.rstrip("/") or "iiwa",
+        prefix.rstrip("/") or "panda",
         tuple(f"{prefix}joint{i}" for i in range(1, 8)),
         tuple(f"{prefix}actuator{i}" for i in range(1, 8)),
         f"{prefix}attachment_site",
-        f"{prefix}base",
+        f"{prefix}link0",
         hold="gravity_pd" if kind == "torque" else "",
     )
 
 
-def iiwa_model(kind: str = "position", timestep: float = 0.002) -> mujoco.MjModel:
-    spec = mujoco.MjSpec.from_file(iiwa_path())
+def panda_model(kind: str = "position", timestep: float = 0.002) -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_file(str(PANDA))
     spec.option.timestep = timestep
     for key in list(spec.keys):
         spec.delete(key)
@@ -68,27 +55,29 @@ def iiwa_model(kind: str = "position", timestep: float = 0.002) -> mujoco.MjMode
     return spec.compile()
 
 
-def iiwa_arms(places: list[Vec3], yaws: list[float] | None = None) -> tuple[mujoco.MjModel, list[RobotSpec]]:
-    """Several position-controlled iiwa arms in one scene, at `places` turned by `yaws` [rad]."""
+def panda_arms(places: list[Vec3], yaws: list[float] | None = None) -> tuple[mujoco.MjModel, list[RobotSpec]]:
+    """Several position-controlled panda arms in one scene, at `places` turned by `yaws` [rad]."""
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.002
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10  # as of the arm
     robots = []
     for i, place in enumerate(places):
-        arm = mujoco.MjSpec.from_file(iiwa_path())
+        arm = mujoco.MjSpec.from_file(str(PANDA))
         for key in list(arm.keys):
             arm.delete(key)
         for mesh in arm.meshes:
-            mesh.file = str(Path(iiwa_path()).parent / "assets" / mesh.file)
+            mesh.file = str(PANDA.parent / "assets" / mesh.file)
         yaw = yaws[i] if yaws else 0.0
         frame = spec.worldbody.add_frame(pos=place, quat=[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)])
         spec.attach(arm, prefix=f"r{i}/", frame=frame)
-        robots.append(iiwa_spec(f"r{i}/"))
+        robots.append(panda_spec(f"r{i}/"))
     return spec.compile(), robots
 
 
 def aloha_model() -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_path(str(data_folder() / "models" / "aloha" / "scene.xml"))
+    return mujoco.MjModel.from_xml_path(str(ALOHA))
 
 
 def aloha_robots() -> list[RobotSpec]:

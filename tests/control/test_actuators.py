@@ -144,6 +144,8 @@ def aloha() -> tuple[Grippers, mujoco.MjData, int, int]:
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     robots = aloha_robots()
+    for robot in robots:
+        data.actuator(robot.gripper_actuator).ctrl[:] = robot.gripper_open
     plain = msgspec.structs.replace(robots[0], name="plain", gripper_actuator="")
     grippers = Grippers(model, [robots[0], plain, robots[1]], ControlConfig(gripper_speed=4.0), 0.002)
     grippers.reset(data)

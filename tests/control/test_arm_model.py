@@ -11,7 +11,7 @@ from anchors.pose import compose
 from iris_session.control import ControlError
 from iris_session.control.arm_model import ArmModel, has_moving_base, read_site_pose
 from iris_session.protocol.specs import RobotSpec
-from tests.control.rigs import aloha_model, aloha_robots, apart, iiwa_arms, iiwa_model, iiwa_spec
+from tests.control.rigs import aloha_model, aloha_robots, apart, panda_arms, panda_model, panda_spec
 
 
 def check_fk(model: mujoco.MjModel, robot: RobotSpec) -> None:
@@ -34,15 +34,15 @@ def test_fk_equals_the_scene_for_aloha(side: int) -> None:
     check_fk(aloha_model(), aloha_robots()[side])
 
 
-def test_fk_equals_the_scene_for_turned_iiwas() -> None:
-    model, robots = iiwa_arms([(0.0, 0.0, 0.3), (0.5, -1.0, 0.0)], [0.7, -2.0])
+def test_fk_equals_the_scene_for_turned_arms() -> None:
+    model, robots = panda_arms([(0.0, 0.0, 0.3), (0.5, -1.0, 0.0)], [0.7, -2.0])
     for robot in robots:
         check_fk(model, robot)
 
 
 def test_joint_order_of_the_robot_need_not_be_the_chains() -> None:
-    robot = iiwa_spec()
-    check_fk(iiwa_model(), msgspec.structs.replace(robot, joints=robot.joints[::-1], actuators=robot.actuators[::-1]))
+    robot = panda_spec()
+    check_fk(panda_model(), msgspec.structs.replace(robot, joints=robot.joints[::-1], actuators=robot.actuators[::-1]))
 
 
 SLIDER = """<mujoco><worldbody><body name="base">{base}

@@ -11,7 +11,7 @@ from anchors.pose import PoseTuple, quat_angle, quat_from_rotvec, quat_mul
 from iris_session.control import ControlConfig, ControlError, clutch
 from iris_session.protocol.common import Pose
 from iris_session.protocol.steps import Command, CommandSource
-from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_model, iiwa_spec
+from tests.control.rigs import PANDA_HOME, Rig, decision, panda_model, panda_spec
 
 BASE: PoseTuple = ((0.5, 0.1, 0.8), quat_from_rotvec((0.3, -1.0, 0.2)))
 TURN = quat_from_rotvec((0.0, 0.0, 0.4))
@@ -143,11 +143,11 @@ def test_scales_are_kept_within_limits() -> None:
 # --- leader robots ---
 
 
-HOME = np.array(IIWA_HOME)
+HOME = np.array(PANDA_HOME)
 
 
 def rig() -> Rig:
-    made = Rig(iiwa_model(), [iiwa_spec()], home=IIWA_HOME)
+    made = Rig(panda_model(), [panda_spec()], home=PANDA_HOME)
     made.hold(5)
     return made
 
@@ -156,7 +156,7 @@ def lead(made: Rig, q: np.ndarray, qd: np.ndarray | None = None, **more: object)
     source = made.source(
         (0.0, 0.0, 0.0), pose_world=None, q=tuple(q), qd=() if qd is None else tuple(qd), device="joints", **more
     )
-    return Command("iiwa", "joints", sources=(source,))
+    return Command("panda", "joints", sources=(source,))
 
 
 def test_the_first_engaged_step_changes_nothing_then_the_follower_arrives_exactly() -> None:
@@ -210,7 +210,7 @@ def test_several_leaders_are_blended_without_a_jump() -> None:
     def both(a: float, b: float) -> Command:
         one = lead(made, HOME + a, participant="a", weight=0.75).sources[0]
         two = lead(made, HOME + b, participant="b", weight=0.25).sources[0]
-        return Command("iiwa", "joints", sources=(one, two))
+        return Command("panda", "joints", sources=(one, two))
 
     made.step(decision([both(0.0, 0.5)]))
     for _ in range(100):
@@ -244,7 +244,7 @@ def test_the_ramp_has_hysteresis() -> None:
 def test_a_leader_does_not_take_the_follower_out_of_its_workspace() -> None:
     tip = rig().target()[0]
     box = ((-2.0, -2.0, tip[2] - 0.02), (2.0, 2.0, 2.0))
-    made = Rig(iiwa_model(), [iiwa_spec()], ControlConfig(workspaces={"iiwa": box}), home=IIWA_HOME)
+    made = Rig(panda_model(), [panda_spec()], ControlConfig(workspaces={"panda": box}), home=PANDA_HOME)
     low = HOME + np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0])  # the shoulder leans forward: the tip sinks
     lowest = tip[2]
     for k in range(400):

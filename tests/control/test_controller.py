@@ -17,37 +17,38 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, FixedView, ObjectCommand
 from tests.control.rigs import (
-    IIWA_HOME,
+    PANDA_HOME,
     Rig,
     aloha_model,
     aloha_robots,
     apart,
     decision,
     hold_command,
-    iiwa_model,
-    iiwa_spec,
     old,
+    panda_model,
+    panda_spec,
     pose_command,
 )
+from tests.models import PANDA
 
 #: No environment moves the arm here, so that the target may lead it by any distance; see `test_hold` for the bound.
 TARGETS = ControlConfig(output="targets", target_lead_m=9.0, target_lead_rad=9.0)
 
 
-def iiwa(config: ControlConfig | None = None) -> Rig:
-    made = Rig(iiwa_model(), [iiwa_spec()], config, home=IIWA_HOME)
+def panda(config: ControlConfig | None = None) -> Rig:
+    made = Rig(panda_model(), [panda_spec()], config, home=PANDA_HOME)
     made.hold(3)
     return made
 
 
 def drive(made: Rig, *sources: object, steps: int = 1, **more: object) -> None:
     for _ in range(steps):
-        made.step(decision([pose_command("iiwa", *sources, **more)]))  # type: ignore[arg-type]
+        made.step(decision([pose_command("panda", *sources, **more)]))  # type: ignore[arg-type]
         sources = tuple(old(s) for s in sources)  # type: ignore[arg-type]
 
 
 def twist(made: Rig, v: tuple[float, ...], **more: object) -> Command:
-    return Command("iiwa", "twist", sources=(made.source((0.0,) * 3, pose_world=None, twist_world=v, **more),))
+    return Command("panda", "twist", sources=(made.source((0.0,) * 3, pose_world=None, twist_world=v, **more),))
 
 
 def test_targets_after_reset_are_where_the_robots_stand() -> None:
@@ -59,9 +60,9 @@ def test_targets_after_reset_are_where_the_robots_stand() -> None:
 
 
 def test_control_must_be_told_where_the_robots_stand() -> None:
-    model = iiwa_model()
+    model = panda_model()
     with pytest.raises(ControlError, match=r"call reset\(data\) or restore\(bytes\) first"):
-        Controller(model, [iiwa_spec()]).tick(mujoco.MjData(model))
+        Controller(model, [panda_spec()]).tick(mujoco.MjData(model))
 
 
 def test_only_the_ctrl_of_its_own_robots_is_written() -> None:
@@ -75,40 +76,40 @@ def test_only_the_ctrl_of_its_own_robots_is_written() -> None:
 
 
 def test_a_robot_without_a_command_or_sources_holds_and_unknown_robots_are_refused() -> None:
-    rig = iiwa()
+    rig = panda()
     drive(rig, rig.source((0.0, 0.0, 0.0)), steps=2)
     drive(rig, rig.source((0.1, 0.0, 0.0)), steps=20)
     assert rig.controller._joints.moving
     rig.step(decision([]))
     assert rig.controller._states[0].latch is None
     drive(rig, rig.source((0.0, 0.0, 0.0), engagement=2), steps=2)
-    rig.step(decision([Command("iiwa", "pose")]))
+    rig.step(decision([Command("panda", "pose")]))
     assert rig.controller._states[0].latch is None
-    with pytest.raises(ControlError, match=r"robot 'ur5' is not known. Available robots: iiwa"):
+    with pytest.raises(ControlError, match=r"robot 'ur5' is not known. Available robots: panda"):
         rig.step(decision([hold_command("ur5")]))
 
 
 def test_steps_without_ticks_take_samples_but_move_nothing() -> None:
-    rig = iiwa()
+    rig = panda()
     drive(rig, rig.source((0.0, 0.0, 0.0)))
     ctrl, applied = rig.data.ctrl.copy(), rig.controller.get_status()[0].applied
     last = rig.source((0.05, 0.0, 0.0))
     for source in (rig.source((0.02, 0.0, 0.0)), last, old(last)):
-        rig.step(decision([pose_command("iiwa", source)]), n_ticks=0)
+        rig.step(decision([pose_command("panda", source)]), n_ticks=0)
     assert (rig.data.ctrl == ctrl).all()
     assert rig.controller.get_status()[0].applied is applied
-    rig.step(decision([pose_command("iiwa", old(last))]), n_ticks=3)
+    rig.step(decision([pose_command("panda", old(last))]), n_ticks=3)
     now = rig.controller.get_status()[0].applied
     assert now is not None
     assert (now.seq, now.step_ns) == (last.seq, rig.steps * 2_000_000)
 
 
 def test_an_engagement_during_a_pause_is_applied_with_the_first_tick() -> None:
-    rig = iiwa()
+    rig = panda()
     source = rig.source((0.0, 0.0, 0.0))
-    rig.step(decision([pose_command("iiwa", source)]), n_ticks=0)
+    rig.step(decision([pose_command("panda", source)]), n_ticks=0)
     assert rig.controller.get_status()[0].applied is None
-    rig.step(decision([pose_command("iiwa", old(source))]))
+    rig.step(decision([pose_command("panda", old(source))]))
     applied = rig.controller.get_status()[0].applied
     assert applied is not None
     assert applied.seq == source.seq
@@ -133,7 +134,7 @@ def test_the_gripper_follows_and_stays_in_hold() -> None:
 
 
 def test_a_twist_moves_at_its_speed_and_stops_with_hold() -> None:
-    rig = iiwa()
+    rig = panda()
     start = rig.target()
     command = twist(rig, (0.0, 0.1, 0.0, 0.0, 0.0, 0.2))
     before = rig.data.ctrl.copy()
@@ -151,7 +152,7 @@ def test_a_twist_moves_at_its_speed_and_stops_with_hold() -> None:
 
 
 def test_a_twist_target_does_not_run_away_from_an_arm_that_cannot_follow() -> None:
-    rig = iiwa()
+    rig = panda()
     command = twist(rig, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     for _ in range(3000):
         rig.step(decision([command]))
@@ -167,7 +168,7 @@ def test_a_twist_target_does_not_run_away_from_an_arm_that_cannot_follow() -> No
 
 
 def test_an_absolute_target_is_reached_at_bounded_speed_from_one_sample() -> None:
-    rig = iiwa(ControlConfig(tip_speed=0.25))
+    rig = panda(ControlConfig(tip_speed=0.25))
     start = rig.target()
     goal = ((start[0][0], start[0][1] + 0.2, start[0][2]), start[1])
     before = rig.data.ctrl.copy()
@@ -180,7 +181,7 @@ def test_an_absolute_target_is_reached_at_bounded_speed_from_one_sample() -> Non
 
 
 def test_sharing_blends_and_nobody_joining_or_leaving_moves_the_robot() -> None:
-    rig = iiwa()
+    rig = panda()
     start = rig.target()
     alone = rig.source((0.0, 0.0, 0.0), participant="a")
     drive(rig, alone, steps=5)
@@ -202,17 +203,17 @@ def test_sharing_blends_and_nobody_joining_or_leaving_moves_the_robot() -> None:
 
 
 def test_shared_twists_are_weighted() -> None:
-    rig = iiwa()
+    rig = panda()
     start = rig.target()
     one = rig.source((0.0,) * 3, participant="a", pose_world=None, twist_world=(0.1, 0, 0, 0, 0, 0), weight=0.5)
     two = rig.source((0.0,) * 3, participant="b", pose_world=None, twist_world=(0, -0.1, 0, 0, 0, 0), weight=0.5)
     for _ in range(501):
-        rig.step(decision([Command("iiwa", "twist", sources=(one, two))]))
+        rig.step(decision([Command("panda", "twist", sources=(one, two))]))
     assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.05, -0.05, 0.0), abs=2e-3)
 
 
 def test_changing_the_scale_while_engaged_does_not_jump() -> None:
-    rig = iiwa()
+    rig = panda()
     start = rig.target()
     drive(rig, rig.source((0.0, 0.0, 0.0)))
     for _ in range(40):
@@ -227,30 +228,30 @@ def test_changing_the_scale_while_engaged_does_not_jump() -> None:
 
 @pytest.mark.parametrize("successor", [{"participant": "b"}, {"engagement": 2}, {"device": "hand/left"}])
 def test_a_successor_without_a_hold_between_does_not_inherit_the_motion(successor: dict[str, object]) -> None:
-    rig = iiwa()
+    rig = panda()
     drive(rig, rig.source((0.0, 0.0, 0.0)))
     drive(rig, rig.source((0.0, 0.5, 0.0)), steps=30)  # still far from there, and moving fast
     assert np.abs(rig.controller._joints.v).max() > 0.5
     goal = rig.controller._joints.q + rig.controller._joints.v**2 / 80 * np.sign(rig.controller._joints.v)
     for _ in range(40):
         drive(rig, rig.source((3.0, 3.0, 3.0), **successor), steps=7)
-    assert rig.data.ctrl == pytest.approx(goal, abs=0.01)
+    assert rig.data.ctrl == pytest.approx(goal, abs=0.015)
     assert np.abs(rig.controller._joints.v).max() < 0.02  # no more than the elbow on its way to the rest posture
 
 
 def test_changing_the_kind_while_engaged_does_not_jump() -> None:
-    rig = iiwa()
+    rig = panda()
     for _ in range(60):
         drive(rig, rig.source((0.05, 0.0, 0.0)), steps=7)
     before = rig.data.ctrl.copy()
-    rig.step(decision([Command("iiwa", "joints", sources=(rig.source((0.0,) * 3, pose_world=None, q=IIWA_HOME),))]))
+    rig.step(decision([Command("panda", "joints", sources=(rig.source((0.0,) * 3, pose_world=None, q=PANDA_HOME),))]))
     assert np.abs(rig.data.ctrl - before).max() < 1e-6
 
 
 def test_the_workspace_is_kept_and_reported() -> None:
-    tip = iiwa().target()[0]
+    tip = panda().target()[0]
     box = ((-2.0, -2.0, tip[2] - 0.02), (2.0, 2.0, 2.0))
-    rig = iiwa(ControlConfig(workspaces={"iiwa": box}))
+    rig = panda(ControlConfig(workspaces={"panda": box}))
     drive(rig, rig.source((0.0, 0.0, 0.0)))
     for _ in range(60):
         drive(rig, rig.source((0.0, 0.0, -0.3)), steps=7)
@@ -259,7 +260,7 @@ def test_the_workspace_is_kept_and_reported() -> None:
 
 
 def test_a_robot_that_cannot_get_where_it_is_commanded_is_reported() -> None:
-    rig = iiwa()
+    rig = panda()
     drive(rig, rig.source((0.0, 0.0, 0.0)))
     rig.data.qpos[:] += 0.4  # as if something held it
     mujoco.mj_forward(rig.model, rig.data)
@@ -273,40 +274,40 @@ def test_a_robot_that_cannot_get_where_it_is_commanded_is_reported() -> None:
 def test_reset_forgets_everything() -> None:
     box = """<body name="box" pos="3 0 1"><freejoint/><geom size=".1"/></body>"""
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
-    arm = mujoco.MjSpec.from_file(str(__import__("tests.control.rigs", fromlist=["x"]).iiwa_path()))
+    arm = mujoco.MjSpec.from_file(str(PANDA))
     body = arm.worldbody.add_body(name="box", pos=spec.body("box").pos)
     body.add_freejoint()
     body.add_geom(size=[0.1, 0, 0])
     for key in list(arm.keys):
         arm.delete(key)
-    rig = Rig(arm.compile(), [iiwa_spec()], objects=[ObjectSpec("box", "box")], home=IIWA_HOME)
+    rig = Rig(arm.compile(), [panda_spec()], objects=[ObjectSpec("box", "box")], home=PANDA_HOME)
     grasp = (ObjectCommand("box", 1, Pose((3.0, 0.0, 1.5), (1.0, 0.0, 0.0, 0.0))),)
     for k in range(60):
         source = rig.source((0.002 * k, 0.0, 0.0))
-        rig.step(decision([pose_command("iiwa", source)], grasp))
+        rig.step(decision([pose_command("panda", source)], grasp))
     assert rig.data.body("box").xfrc_applied.any()
     assert rig.data.body("box").xpos[2] > 1.02
     mujoco.mj_resetData(rig.model, rig.data)
     mujoco.mj_forward(rig.model, rig.data)
     rig.controller.reset(rig.data)
-    fresh = Rig(rig.model, [iiwa_spec()], objects=[ObjectSpec("box", "box")])
+    fresh = Rig(rig.model, [panda_spec()], objects=[ObjectSpec("box", "box")])
     assert rig.controller.snapshot() == fresh.controller.snapshot()
     assert rig.controller.get_status()[0].applied is None
 
 
 def test_a_robot_on_a_moving_base_reaches_world_targets() -> None:
-    arm = mujoco.MjSpec.from_file(str(__import__("tests.control.rigs", fromlist=["x"]).iiwa_path()))
+    arm = mujoco.MjSpec.from_file(str(PANDA))
     for key in list(arm.keys):
         arm.delete(key)
-    base = arm.body("base")
+    base = arm.body("link0")
     base.add_joint(name="rail", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
-    rig = Rig(arm.compile(), [iiwa_spec()], home=IIWA_HOME)
+    rig = Rig(arm.compile(), [panda_spec()], home=PANDA_HOME)
     goal = rig.target()
     for k in range(700):
         rig.data.joint("rail").qpos[:] = 0.0002 * k
         rig.data.joint("rail").qvel[:] = 0.1
         mujoco.mj_forward(rig.model, rig.data)
-        rig.step(decision([pose_command("iiwa", rig.source(*goal, absolute=True, new=k % 7 == 0))]))
+        rig.step(decision([pose_command("panda", rig.source(*goal, absolute=True, new=k % 7 == 0))]))
     state = rig.controller._states[0]
     assert state.T_world_root[0][0] == pytest.approx(0.139, abs=2e-3)
     assert apart(rig.controller._ik.compute_tip(0, state), goal)[0] < 5e-3  # follows at 0.1 m/s
@@ -315,9 +316,9 @@ def test_a_robot_on_a_moving_base_reaches_world_targets() -> None:
 def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mink", None)
     with pytest.raises(ImportError, match=r"iris-session\[control\]"):
-        Controller(iiwa_model(), [iiwa_spec()])
-    rig = iiwa(TARGETS)
-    rig.data.ctrl[:] = IIWA_HOME
+        Controller(panda_model(), [panda_spec()])
+    rig = panda(TARGETS)
+    rig.data.ctrl[:] = PANDA_HOME
     rig.hold(500)
     start, ctrl = rig.target(), rig.data.ctrl.copy()
     drive(rig, rig.source((0.0, 0.0, 0.0)))
@@ -336,9 +337,9 @@ def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: 
     for _ in range(251):
         rig.step(decision([twist(rig, (0.0, 0.0, -0.2, 0.0, 0.0, 0.0), engagement=2)]))
     assert rig.target()[0][2] - held[0][2] == pytest.approx(-0.1, abs=1e-3)
-    q = np.add(IIWA_HOME, 0.02)
+    q = np.add(PANDA_HOME, 0.02)
     rig.hold(1)
-    joints = Command("iiwa", "joints", sources=(rig.source((0.0,) * 3, pose_world=None, q=tuple(q), engagement=3),))
+    joints = Command("panda", "joints", sources=(rig.source((0.0,) * 3, pose_world=None, q=tuple(q), engagement=3),))
     for _ in range(400):
         rig.step(decision([joints]))
     data = mujoco.MjData(rig.model)
@@ -349,11 +350,11 @@ def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: 
 
 
 def test_targets_need_no_actuators_that_control_could_drive() -> None:
-    bare = RobotSpec("iiwa", iiwa_spec().joints, (), "attachment_site", "base", gripper_actuator="none")
-    rig = Rig(iiwa_model("torque"), [bare], TARGETS, home=IIWA_HOME)
+    bare = RobotSpec("panda", panda_spec().joints, (), "attachment_site", "link0", gripper_actuator="none")
+    rig = Rig(panda_model("torque"), [bare], TARGETS, home=PANDA_HOME)
     joints = {"pose_world": None, "q": (9.0,) * 7}
     for _ in range(2000):
-        rig.step(decision([Command("iiwa", "joints", sources=(rig.source((0.0,) * 3, **joints),), gripper=1.0)]))
+        rig.step(decision([Command("panda", "joints", sources=(rig.source((0.0,) * 3, **joints),), gripper=1.0)]))
     assert rig.controller._joints.goal == pytest.approx(rig.model.jnt_range[:, 1])
     assert not rig.data.ctrl.any()
 
@@ -379,6 +380,6 @@ def test_no_robots_at_all() -> None:
 
 
 def test_a_robot_that_control_cannot_drive_is_refused_at_construction() -> None:
-    bare = RobotSpec("iiwa", iiwa_spec().joints, iiwa_spec().actuators, "attachment_site", "base")
+    bare = RobotSpec("panda", panda_spec().joints, panda_spec().actuators, "attachment_site", "link0")
     with pytest.raises(ControlError, match="declare hold = 'gravity_pd'"):
-        Controller(iiwa_model("torque"), [bare])
+        Controller(panda_model("torque"), [bare])

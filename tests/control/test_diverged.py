@@ -13,15 +13,16 @@ from iris_session.control.grasp import Grasps
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.protocol.steps import Command, FixedView, ObjectCommand
-from tests.control.rigs import IIWA_HOME, Rig, decision, hold_command, iiwa_path, iiwa_spec, pose_command
+from tests.control.rigs import PANDA_HOME, Rig, decision, hold_command, panda_spec, pose_command
+from tests.models import PANDA
 
 
 def on_a_rail(config: ControlConfig | None = None) -> Rig:
-    arm = mujoco.MjSpec.from_file(iiwa_path())
+    arm = mujoco.MjSpec.from_file(str(PANDA))
     for key in list(arm.keys):
         arm.delete(key)
-    arm.body("base").add_joint(name="rail", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
-    return Rig(arm.compile(), [iiwa_spec()], config, home=IIWA_HOME)
+    arm.body("link0").add_joint(name="rail", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
+    return Rig(arm.compile(), [panda_spec()], config, home=PANDA_HOME)
 
 
 def tick(rig: Rig, command: Command) -> None:
@@ -39,12 +40,12 @@ def test_a_base_that_stands_nowhere_is_held_where_it_was() -> None:
     for config in (None, ControlConfig(output="targets")):
         rig = on_a_rail(config)
         for k in range(20):
-            rig.step(decision([pose_command("iiwa", rig.source((0.001 * k, 0.0, 0.0)))]))
+            rig.step(decision([pose_command("panda", rig.source((0.001 * k, 0.0, 0.0)))]))
         rig.data.joint("rail").qpos[:] = math.nan
         mujoco.mj_kinematics(rig.model, rig.data)
         before = rig.target()
-        tick(rig, pose_command("iiwa", rig.source((0.3, 0.0, 0.0))))
-        tick(rig, hold_command("iiwa"))
+        tick(rig, pose_command("panda", rig.source((0.3, 0.0, 0.0))))
+        tick(rig, hold_command("panda"))
         assert finite(rig.target())
         assert np.linalg.norm(np.subtract(rig.target()[0], before[0])) < 0.02
         assert np.isfinite(rig.data.ctrl).all()
@@ -57,7 +58,7 @@ def test_a_reset_on_numbers_that_are_none_keeps_what_was_commanded() -> None:
         rig.data.qpos[:] = math.nan
         mujoco.mj_kinematics(rig.model, rig.data)
         rig.controller.reset(rig.data)
-        tick(rig, hold_command("iiwa"))
+        tick(rig, hold_command("panda"))
         assert np.allclose(rig.target()[0], before[0], atol=1e-9)
         assert config is not None or np.isfinite(rig.data.ctrl).all()
         assert config is None or (rig.data.ctrl == ctrl).all()

@@ -9,22 +9,22 @@ import pytest
 
 from anchors.pose import PoseTuple, quat_from_rotvec
 from tests.control.rigs import (
-    IIWA_HOME,
+    PANDA_HOME,
     Rig,
     aloha_model,
     aloha_robots,
     apart,
     decision,
-    iiwa_model,
-    iiwa_spec,
+    panda_model,
+    panda_spec,
     pose_command,
 )
 
 KINDS = ["position", "velocity", "torque"]
 
 
-def iiwa(kind: str) -> Rig:
-    rig = Rig(iiwa_model(kind), [iiwa_spec(kind=kind)], home=IIWA_HOME)
+def panda(kind: str) -> Rig:
+    rig = Rig(panda_model(kind), [panda_spec(kind=kind)], home=PANDA_HOME)
     rig.hold(1000)  # physics settles under gravity
     return rig
 
@@ -69,26 +69,26 @@ def engage_jump(rig: Rig, engagement: int) -> tuple[float, float]:
 
 @pytest.mark.parametrize("kind", ["position", "velocity"])
 def test_the_first_engaged_step_leaves_ctrl_bitwise_unchanged(kind: str) -> None:
-    rig = iiwa(kind)
+    rig = panda(kind)
     rig.hold(6000 if kind == "velocity" else 0)
     if kind == "velocity":  # its law reads the measured joint: take a state in which that has come to rest
         rig.data.qvel[:] = 0.0
     before = rig.data.ctrl.tobytes()
-    twin = iiwa_after_one_more_hold(rig)
-    rig.step(decision([pose_command("iiwa", rig.source((4.0, 5.0, 6.0), quat_from_rotvec((1.0, 1.0, 1.0))))]))
+    twin = panda_after_one_more_hold(rig)
+    rig.step(decision([pose_command("panda", rig.source((4.0, 5.0, 6.0), quat_from_rotvec((1.0, 1.0, 1.0))))]))
     assert rig.data.ctrl.tobytes() == twin
     if kind == "position":
         assert rig.data.ctrl.tobytes() == before
 
 
-def iiwa_after_one_more_hold(rig: Rig) -> bytes:
+def panda_after_one_more_hold(rig: Rig) -> bytes:
     """`ctrl` that the same state gets from one more step of hold; the rig itself is left as it was."""
     snapshot, ctrl = rig.controller.snapshot(), rig.data.ctrl.copy()
     held = rig.data.ctrl.copy()
     from iris_session.protocol.steps import FixedView
     from tests.control.rigs import hold_command
 
-    rig.controller.begin(0, 1, decision([hold_command("iiwa")]), FixedView())
+    rig.controller.begin(0, 1, decision([hold_command("panda")]), FixedView())
     rig.controller.tick(rig.data)
     held[:] = rig.data.ctrl
     rig.controller.restore(snapshot)
@@ -108,7 +108,7 @@ def test_the_first_engaged_step_leaves_ctrl_unchanged_on_aloha_gripper_included(
 
 @pytest.mark.parametrize("make", [*KINDS, "aloha"])
 def test_no_jump_on_engage_nor_after_three_seconds_without_tracking(make: str) -> None:
-    rig = aloha() if make == "aloha" else iiwa(make)
+    rig = aloha() if make == "aloha" else panda(make)
     for engagement, pause in ((1, 1500), (3, 1500), (5, 200)):
         rig.hold(pause)  # 1500 steps: 3 s
         distance, angle = engage_jump(rig, engagement)
@@ -120,7 +120,7 @@ def test_no_jump_on_engage_nor_after_three_seconds_without_tracking(make: str) -
 
 @pytest.mark.parametrize("make", [*KINDS, "aloha"])
 def test_no_sag_on_repeated_engage(make: str) -> None:
-    rig = aloha() if make == "aloha" else iiwa(make)
+    rig = aloha() if make == "aloha" else panda(make)
     targets = [rig.target(i) for i in range(len(rig.robots))]
     start = [rig.tip(i) for i in range(len(rig.robots))]
     for engagement in range(1, 31):
@@ -135,7 +135,7 @@ def test_no_sag_on_repeated_engage(make: str) -> None:
 
 @pytest.mark.parametrize(("make", "bound"), [("position", 1e-6), ("velocity", 1e-4), ("torque", 1e-6), ("aloha", 1e-3)])
 def test_no_drift_in_hold_after_a_drag(make: str, bound: float) -> None:
-    rig = aloha() if make == "aloha" else iiwa(make)
+    rig = aloha() if make == "aloha" else panda(make)
     drag(rig, 700, 1)
     rig.hold(2000)
     start, ctrl = [rig.tip(i) for i in range(len(rig.robots))], rig.data.ctrl.copy()
@@ -148,15 +148,15 @@ def test_no_drift_in_hold_after_a_drag(make: str, bound: float) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_hold_stops_a_fast_drag_within_the_limits(kind: str) -> None:
-    """The measured joints: 40 rad/s^2, and what servos add when it begins and ends. Never back by more than 10 mrad."""
-    rig = iiwa(kind)
+    """The measured joints: 40 rad/s^2, and what servos add to a light wrist. Never back by more than 10 mrad."""
+    rig = panda(kind)
     drag(rig, 400, 1, speed=0.8)
     q, v = rig.data.qpos.copy(), rig.data.qvel.copy()
     assert np.abs(v).max() > 0.5
     way, farthest, last = np.zeros(7), np.zeros(7), v.copy()
     for _ in range(150):
         rig.hold(1)
-        assert (np.abs(rig.data.qvel - last) <= 100.0 * 0.002).all()
+        assert (np.abs(rig.data.qvel - last) <= 125.0 * 0.002).all()
         last = rig.data.qvel.copy()
         way = np.sign(v) * (rig.data.qpos - q)
         farthest = np.maximum(farthest, way)
@@ -167,13 +167,13 @@ def test_hold_stops_a_fast_drag_within_the_limits(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_tip_follows_the_hand(kind: str) -> None:
-    rig = iiwa(kind)
+    rig = panda(kind)
     start = rig.tip()
-    rig.step(decision([pose_command("iiwa", rig.source((0.0, 0.0, 0.0)))]))
+    rig.step(decision([pose_command("panda", rig.source((0.0, 0.0, 0.0)))]))
     turn = quat_from_rotvec((0.0, 0.0, 0.5))
     for _ in range(200):
         for k in range(7):
-            rig.step(decision([pose_command("iiwa", rig.source((-0.1, 0.15, 0.1), turn, new=k == 0))]))
+            rig.step(decision([pose_command("panda", rig.source((-0.1, 0.15, 0.1), turn, new=k == 0))]))
     moved = np.subtract(rig.tip()[0], start[0])
     assert moved == pytest.approx((-0.1, 0.15, 0.1), abs={"position": 4e-3, "velocity": 2e-3, "torque": 1e-4}[kind])
     expected = apart(((0.0, 0.0, 0.0), start[1]), ((0.0, 0.0, 0.0), rig.tip()[1]))[1]

@@ -14,17 +14,17 @@ from iris_session.control import ControlConfig
 from iris_session.control.arm_model import ArmModel
 from iris_session.control.ik import IkSolver, require_solver
 from tests.control.rigs import (
-    IIWA_HOME,
+    PANDA_HOME,
     Rig,
     aloha_model,
     aloha_robots,
     apart,
     decision,
     hold_command,
-    iiwa_arms,
-    iiwa_model,
-    iiwa_spec,
     old,
+    panda_arms,
+    panda_model,
+    panda_spec,
     pose_command,
 )
 
@@ -32,8 +32,8 @@ FREE = np.full(7, 0.1)
 
 
 def test_reachable_poses_converge_to_within_a_hair() -> None:
-    arm = ArmModel(iiwa_model(), iiwa_spec())
-    solver, rng, rest = IkSolver(arm, ControlConfig()), np.random.default_rng(3), np.array(IIWA_HOME)
+    arm = ArmModel(panda_model(), panda_spec())
+    solver, rng, rest = IkSolver(arm, ControlConfig()), np.random.default_rng(3), np.array(PANDA_HOME)
     for _ in range(20):
         goal = arm.forward_kinematics(rest + rng.uniform(-0.3, 0.3, 7))
         q = rest.copy()
@@ -45,10 +45,10 @@ def test_reachable_poses_converge_to_within_a_hair() -> None:
 
 
 def test_joints_in_another_order_than_the_chains_give_the_same_motion() -> None:
-    robot = iiwa_spec()
+    robot = panda_spec()
     turned = msgspec.structs.replace(robot, joints=robot.joints[3:] + robot.joints[:3])
-    arm, other = ArmModel(iiwa_model(), robot), ArmModel(iiwa_model(), turned)
-    home = np.array(IIWA_HOME)
+    arm, other = ArmModel(panda_model(), robot), ArmModel(panda_model(), turned)
+    home = np.array(PANDA_HOME)
     q, rest, goal = home + 0.1, home - 0.05, arm.forward_kinematics(home + np.linspace(-0.1, 0.2, 7))
     lower, upper = np.linspace(-0.01, -0.07, 7), np.linspace(0.08, 0.02, 7)
     direct = IkSolver(arm, ControlConfig()).step(q, rest, goal, lower, upper).q
@@ -70,7 +70,7 @@ def test_bounds_hold_in_every_joint_and_order() -> None:
 
 
 def test_result_depends_on_the_arguments_alone() -> None:
-    arm, home = ArmModel(iiwa_model(), iiwa_spec()), np.array(IIWA_HOME)
+    arm, home = ArmModel(panda_model(), panda_spec()), np.array(PANDA_HOME)
     used, fresh = IkSolver(arm, ControlConfig()), IkSolver(arm, ControlConfig())
     goal = arm.forward_kinematics(home + 0.2)
     for k in range(10):
@@ -80,15 +80,15 @@ def test_result_depends_on_the_arguments_alone() -> None:
 
 
 def test_a_stretched_arm_is_reported_as_singular() -> None:
-    arm = ArmModel(iiwa_model(), iiwa_spec())
-    solver, home = IkSolver(arm, ControlConfig()), np.array(IIWA_HOME)
+    arm = ArmModel(panda_model(), panda_spec())
+    solver, home = IkSolver(arm, ControlConfig()), np.array(PANDA_HOME)
     straight = np.zeros(7)
     assert solver.step(straight, straight, arm.forward_kinematics(straight), -FREE, FREE).singular
     assert not solver.step(home, home, arm.forward_kinematics(home), -FREE, FREE).singular
 
 
 def test_a_program_without_solution_leaves_the_joints() -> None:
-    arm, home = ArmModel(iiwa_model(), iiwa_spec()), np.array(IIWA_HOME)
+    arm, home = ArmModel(panda_model(), panda_spec()), np.array(PANDA_HOME)
     step = IkSolver(arm, ControlConfig()).step(home, home, arm.forward_kinematics(home + 0.1), FREE, -FREE)
     assert (step.q == home).all()
     assert step.singular
@@ -112,7 +112,7 @@ def test_the_missing_extra_is_named_in_one_line(monkeypatch: pytest.MonkeyPatch)
 
 
 def rig(config: ControlConfig | None = None) -> Rig:
-    made = Rig(iiwa_model(), [iiwa_spec()], config, home=IIWA_HOME)
+    made = Rig(panda_model(), [panda_spec()], config, home=PANDA_HOME)
     made.hold(5)
     return made
 
@@ -134,11 +134,11 @@ def test_one_far_sample_converges_over_several_solves_at_bounded_speed() -> None
     made = rig()
     start = made.target()
     first, far = made.source((0.0, 0.0, 0.0)), made.source((0.05, 0.25, -0.1))
-    made.step(decision([pose_command("iiwa", first)]))
+    made.step(decision([pose_command("panda", first)]))
     solves = count_solves(made)
     previous, fastest = made.data.ctrl.copy(), 0.0
     for k in range(600):
-        made.step(decision([pose_command("iiwa", far if k == 0 else old(far))]))
+        made.step(decision([pose_command("panda", far if k == 0 else old(far))]))
         fastest = max(fastest, float(np.abs(made.data.ctrl - previous).max()) / 0.002)
         previous = made.data.ctrl.copy()
     goal = ((start[0][0] + 0.05, start[0][1] + 0.25, start[0][2] - 0.1), start[1])
@@ -151,8 +151,8 @@ def test_one_far_sample_converges_over_several_solves_at_bounded_speed() -> None
 
 
 def test_solves_are_at_most_100_hz_per_robot_and_two_a_tick_and_all_robots_get_theirs() -> None:
-    model, robots = iiwa_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(8)])
-    made = Rig(model, robots, home=IIWA_HOME)
+    model, robots = panda_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(8)])
+    made = Rig(model, robots, home=PANDA_HOME)
     solves = count_solves(made)
     for k in range(400):  # a new sample of everybody in every step: five times as many as may be solved
         x = 0.1 * np.sin(0.01 * k)
@@ -168,8 +168,8 @@ def test_solves_are_at_most_100_hz_per_robot_and_two_a_tick_and_all_robots_get_t
 
 
 def test_crowded_steps_solve_less_and_starve_nobody_if_all_of_them_are() -> None:
-    model, robots = iiwa_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(8)])
-    made = Rig(model, robots, home=IIWA_HOME)
+    model, robots = panda_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(8)])
+    made = Rig(model, robots, home=PANDA_HOME)
     solves = count_solves(made)
     tick = made.controller.tick
     made.controller.tick = lambda data: tick(data, crowded=True)  # type: ignore[method-assign,assignment,misc]
@@ -184,9 +184,9 @@ def test_crowded_steps_solve_less_and_starve_nobody_if_all_of_them_are() -> None
 @pytest.mark.parametrize(("n", "tick_s", "interval_ticks"), [(3, 0.01, 1), (4, 0.005, 2), (12, 0.002, 5)])
 def test_long_ticks_and_many_robots_starve_nobody(n: int, tick_s: float, interval_ticks: int) -> None:
     """A robot that is solved less often than its device sends moves slower than its hand."""
-    model, robots = iiwa_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(n)])
+    model, robots = panda_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(n)])
     model.opt.timestep = tick_s
-    made = Rig(model, robots, home=IIWA_HOME)
+    made = Rig(model, robots, home=PANDA_HOME)
     solves = count_solves(made)
     for k in range(40):
         made.step(decision(pose_command(r.name, made.source((0.001 * k, 0.0, 0.0))) for r in robots))
@@ -199,38 +199,38 @@ def test_long_ticks_and_many_robots_starve_nobody(n: int, tick_s: float, interva
 
 def test_a_new_sample_is_solved_in_its_own_tick() -> None:
     made = rig()
-    made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.0)))]))
+    made.step(decision([pose_command("panda", made.source((0.0, 0.0, 0.0)))]))
     for k in range(1, 100):
         source = made.source((0.001 * k, 0.0, 0.0), new=True)
-        made.step(decision([pose_command("iiwa", source)]))
+        made.step(decision([pose_command("panda", source)]))
         applied = made.controller.get_status()[0].applied
         assert applied is not None
         assert (applied.seq, applied.step_ns) == (source.seq, made.steps * 2_000_000)
-        assert (applied.robot, applied.participant, applied.device) == ("iiwa", "p1", "controller/right")
+        assert (applied.robot, applied.participant, applied.device) == ("panda", "p1", "controller/right")
         for _ in range(6):
-            made.step(decision([pose_command("iiwa", old(source))]))
+            made.step(decision([pose_command("panda", old(source))]))
         assert made.controller.get_status()[0].applied is applied
 
 
 def test_out_of_reach_is_reported_and_solving_ends_until_the_hand_comes_back() -> None:
     made = rig()
     far = [made.source((0.0, 0.0, 0.0)), made.source((3.0, 0.0, 0.0))]
-    made.step(decision([pose_command("iiwa", far[0])]))
-    made.step(decision([pose_command("iiwa", far[1])]))
+    made.step(decision([pose_command("panda", far[0])]))
+    made.step(decision([pose_command("panda", far[1])]))
     for _ in range(1500):
-        made.step(decision([pose_command("iiwa", old(far[1]))]))
+        made.step(decision([pose_command("panda", old(far[1]))]))
     limits = made.controller.get_status()[0].limits
     assert "reach" in limits
     solves = count_solves(made)
     for _ in range(100):
-        made.step(decision([pose_command("iiwa", old(far[1]))]))
+        made.step(decision([pose_command("panda", old(far[1]))]))
     assert solves == []
     back = made.source((0.0, 0.0, 0.0))
-    made.step(decision([pose_command("iiwa", back)]))
+    made.step(decision([pose_command("panda", back)]))
     for _ in range(1500):
-        made.step(decision([pose_command("iiwa", old(back))]))
+        made.step(decision([pose_command("panda", old(back))]))
     assert "reach" not in made.controller.get_status()[0].limits
-    made.step(decision([hold_command("iiwa")]))
+    made.step(decision([hold_command("panda")]))
     assert made.controller.get_status()[0].limits == ()
 
 
@@ -238,28 +238,28 @@ def test_out_of_reach_is_reported_while_samples_flow_and_a_fast_hand_is_not() ->
     made = rig()
     for k in range(1500):
         x = 0.1 * np.sin(0.012 * k)  # up to 0.6 m/s
-        made.step(decision([pose_command("iiwa", made.source((x, 0.0, 0.0), new=k % 7 == 0))]))
+        made.step(decision([pose_command("panda", made.source((x, 0.0, 0.0), new=k % 7 == 0))]))
         assert "reach" not in made.controller.get_status()[0].limits
     for k in range(1000):
         x = min(0.002 * k, 1.5)
-        made.step(decision([pose_command("iiwa", made.source((x, 0.0, 0.0), new=k % 7 == 0))]))
+        made.step(decision([pose_command("panda", made.source((x, 0.0, 0.0), new=k % 7 == 0))]))
     assert "reach" in made.controller.get_status()[0].limits
 
 
 @pytest.mark.parametrize(
     ("aim", "turn", "expected"),
     [
-        ((-0.3, 0.0, -0.9), (0.0, 0.0, 3.0), {"joint2", "joint4"}),
-        ((-0.5, 0.0, 0.1), (0.0, 2.0, 0.0), {"joint4", "joint6"}),
-        ((-0.9, -0.4, 0.3), (0.0, 0.0, 0.0), {"joint6"}),
+        ((-0.3, 0.0, -0.9), (0.0, 0.0, 3.0), {"joint2"}),
+        ((-0.5, 0.0, -0.3), (0.0, 0.0, 0.0), {"joint4"}),
+        ((0.0, 0.0, 0.0), (0.0, 2.0, 0.0), {"joint6"}),
     ],
 )
 def test_joint_limits_hold_and_are_named(aim: Vec3, turn: Vec3, expected: set[str]) -> None:
     made = rig()
-    made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.0)))]))
+    made.step(decision([pose_command("panda", made.source((0.0, 0.0, 0.0)))]))
     far, named = made.source(aim, quat_from_rotvec(turn)), set()
     for k in range(1000):
-        made.step(decision([pose_command("iiwa", far if k == 0 else old(far))]))
+        made.step(decision([pose_command("panda", far if k == 0 else old(far))]))
         named |= {name for name in made.controller.get_status()[0].limits if name.startswith("joint")}
         q = made.controller._joints.q
         assert (q >= made.model.jnt_range[:, 0] - 1e-9).all()
@@ -271,27 +271,27 @@ def test_while_samples_flow_there_is_one_solve_for_each() -> None:
     made = rig()
     solves = count_solves(made)
     for k in range(700):
-        made.step(decision([pose_command("iiwa", made.source((0.0, 0.001 * (k // 7), 0.0), new=k % 7 == 0))]))
+        made.step(decision([pose_command("panda", made.source((0.0, 0.001 * (k // 7), 0.0), new=k % 7 == 0))]))
     assert len(solves) == 99  # the first of 100 samples latches
 
 
 def test_a_robot_that_starts_outside_its_range_is_not_thrown_back() -> None:
-    made = Rig(iiwa_model(), [iiwa_spec()], home=(0.0, 0.3, 0.0, -2.2, 0.0, 1.2, 0.0))  # joint4 ends at -2.0944
+    made = Rig(panda_model(), [panda_spec()], home=(0.0, -0.16, 0.0, -3.15, 0.0, 2.99, 0.785))  # joint4 ends at -3.0718
     made.hold(3)
     source = made.source((0.0, 0.0, 0.0))
-    made.step(decision([pose_command("iiwa", source)]))
+    made.step(decision([pose_command("panda", source)]))
     before = made.data.ctrl.copy()
-    made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.001)))]))
+    made.step(decision([pose_command("panda", made.source((0.0, 0.0, 0.001)))]))
     assert np.abs(made.data.ctrl - before).max() < 2.5 * 0.002
     assert "joint4" in made.controller.get_status()[0].limits
 
 
 @pytest.mark.parametrize("timestep", [0.001, 0.005, 0.02])
 def test_other_timesteps_track_too(timestep: float) -> None:
-    made = Rig(iiwa_model(timestep=timestep), [iiwa_spec()], home=IIWA_HOME)
-    made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.0)))]))
+    made = Rig(panda_model(timestep=timestep), [panda_spec()], home=PANDA_HOME)
+    made.step(decision([pose_command("panda", made.source((0.0, 0.0, 0.0)))]))
     start = made.target()
     for _ in range(round(2.0 / timestep)):
-        made.step(decision([pose_command("iiwa", made.source((0.0, 0.1, 0.0)))]))
+        made.step(decision([pose_command("panda", made.source((0.0, 0.1, 0.0)))]))
     assert np.subtract(made.target()[0], start[0]) == pytest.approx((0.0, 0.1, 0.0), abs=1e-9)
     assert apart(made.controller._ik.compute_tip(0, made.controller._states[0]), made.target())[0] < 5e-5

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from iris_session.control import ControlConfig, ControlError
 from iris_session.control.arm_model import ArmModel
 from iris_session.control.interpolate import JointInterpolator, read_speed_limits
-from tests.control.rigs import iiwa_model, iiwa_spec
+from tests.control.rigs import panda_model, panda_spec
 
 DT = 0.002
 ALL = slice(0, 3)
@@ -97,7 +97,7 @@ def test_a_stop_while_standing_or_moving_away_stays_near() -> None:
 
 
 def test_speed_limits_by_name_and_by_kind() -> None:
-    model, robot = iiwa_model(), iiwa_spec()
+    model, robot = panda_model(), panda_spec()
     config = ControlConfig(velocity_limits={"joint2": 0.7}, acceleration_limits={"joint7": 9.0})
     velocity, acceleration = read_speed_limits(model, [robot], [ArmModel(model, robot)], config)
     assert velocity.tolist() == [2.5, 0.7, 2.5, 2.5, 2.5, 2.5, 2.5]

@@ -13,7 +13,7 @@ from iris_session.control import ControlConfig, Controller
 from iris_session.control.proximity import ProximityLimiter, compute_box_bounds
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Command
-from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_arms, pose_command
+from tests.control.rigs import PANDA_HOME, Rig, decision, panda_arms, pose_command
 
 FACING = ([(0.0, 0.0, 0.0), (1.3, 0.0, 0.0)], [0.0, math.pi])
 
@@ -37,10 +37,10 @@ def push(rig: Rig, towards: float, steps: int) -> list[tuple[tuple[str, ...], ..
 
 
 def test_closing_robots_are_slowed_and_stop_apart_and_retreat_freely() -> None:
-    model, robots = iiwa_arms(*FACING)
+    model, robots = panda_arms(*FACING)
     config = ControlConfig()
     proximity = ProximityLimiter(model, robots, config)
-    rig = Rig(model, robots, config, home=IIWA_HOME)
+    rig = Rig(model, robots, config, home=PANDA_HOME)
     rig.hold(200)
     smallest = 1.0
     for _ in range(8):
@@ -62,7 +62,7 @@ def lean(rig: Rig, steps: int) -> float:
     """Leader robots that send at 500 Hz lean both arms towards each other at 1 rad/s; returns the smallest gap."""
     proximity, smallest = ProximityLimiter(rig.model, rig.robots, ControlConfig()), 1.0
     for k in range(steps):
-        q = np.add(IIWA_HOME, (0.0, min(0.002 * k, 0.7), 0.0, min(0.002 * k, 0.7), 0.0, 0.0, 0.0))
+        q = np.add(PANDA_HOME, (0.0, min(0.002 * k, 0.7), 0.0, min(0.002 * k, 0.7), 0.0, 0.0, 0.0))
         rows = [rig.source((0.0, 0.0, 0.0), pose_world=None, q=tuple(q.tolist()), device="joints") for _ in range(2)]
         rig.step(decision(Command(f"r{i}", "joints", sources=(row,)) for i, row in enumerate(rows)))
         if k % 5 == 0:
@@ -71,19 +71,19 @@ def lean(rig: Rig, steps: int) -> float:
 
 
 def test_leaders_that_send_at_every_step_do_not_lift_the_bound() -> None:
-    model, robots = iiwa_arms(*FACING)
-    rig = Rig(model, robots, home=IIWA_HOME)
+    model, robots = panda_arms(*FACING)
+    rig = Rig(model, robots, home=PANDA_HOME)
     rig.hold(200)
     assert 0.005 < lean(rig, 700) < 0.04
     assert all("proximity" in status.limits for status in rig.controller.get_status())
-    free = Rig(model, robots, ControlConfig(proximity_margin=0.0), home=IIWA_HOME)
+    free = Rig(model, robots, ControlConfig(proximity_margin=0.0), home=PANDA_HOME)
     free.hold(200)
     assert lean(free, 700) < 0.0, "without the bound they would have collided"
 
 
 def test_the_bound_survives_a_restart_of_control() -> None:
-    model, robots = iiwa_arms(*FACING)
-    rig = Rig(model, robots, home=IIWA_HOME)
+    model, robots = panda_arms(*FACING)
+    rig = Rig(model, robots, home=PANDA_HOME)
     rig.hold(200)
     lean(rig, 403)  # between two checks
     assert (rig.controller._joints.near < rig.controller._joints.velocity).any()
@@ -99,16 +99,16 @@ def test_the_bound_survives_a_restart_of_control() -> None:
 
 def test_without_the_margin_they_collide() -> None:
     """The test above can fail: the same push with the check off ends in contact."""
-    model, robots = iiwa_arms(*FACING)
-    rig = Rig(model, robots, ControlConfig(proximity_margin=0.0), home=IIWA_HOME)
+    model, robots = panda_arms(*FACING)
+    rig = Rig(model, robots, ControlConfig(proximity_margin=0.0), home=PANDA_HOME)
     rig.hold(200)
     push(rig, 0.2, 600)
     assert gap(rig, ProximityLimiter(model, robots, ControlConfig())) < 0.005
 
 
 def test_a_blocked_robots_solution_does_not_run_away_from_its_joints() -> None:
-    model, robots = iiwa_arms(*FACING)
-    rig = Rig(model, robots, ControlConfig(lead_s=0.02), home=IIWA_HOME)
+    model, robots = panda_arms(*FACING)
+    rig = Rig(model, robots, ControlConfig(lead_s=0.02), home=PANDA_HOME)
     rig.hold(200)
     push(rig, 0.6, 800)
     ahead = np.abs(rig.controller._joints.goal - rig.controller._joints.q)

@@ -13,7 +13,8 @@ from iris_session.control import ControlConfig, Controller
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, Decision, ObjectCommand
-from tests.control.rigs import Rig, aloha_robots, data_folder, hold_command, pose_command
+from tests.control.rigs import Rig, aloha_robots, hold_command, pose_command
+from tests.models import ALOHA
 
 ONE_A_TICK = ControlConfig(max_solves_per_tick=1)  # so that whose turn it is matters
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -22,7 +23,7 @@ STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
     """Aloha with a free box to take."""
-    spec = mujoco.MjSpec.from_file(str(data_folder() / "models" / "aloha" / "scene.xml"))
+    spec = mujoco.MjSpec.from_file(str(ALOHA))
     for key in list(spec.keys):
         spec.delete(key)
     box = spec.worldbody.add_body(name="box", pos=[0.0, 0.0, 0.1])

@@ -9,7 +9,7 @@ import pytest
 from anchors.pose import IDENTITY_QUAT
 from iris_session.control import ControlConfig
 from iris_session.protocol.steps import Command
-from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_model, iiwa_spec, pose_command
+from tests.control.rigs import PANDA_HOME, Rig, decision, panda_model, panda_spec, pose_command
 from tests.control.test_diverged import on_a_rail
 
 #: Nothing recomputes the tip here, so that the target may lead it by any distance; see `test_hold` for the bound.
@@ -21,7 +21,7 @@ def lead(rig: Rig, q: np.ndarray, steps: int, engagement: int = 1) -> list[tuple
     limits, now = [], rig.data.qpos.copy()
     for _ in range(steps):
         source = rig.source((0.0,) * 3, pose_world=None, q=tuple(q.tolist()), device="joints", engagement=engagement)
-        rig.step(decision([Command("iiwa", "joints", sources=(source,))]))
+        rig.step(decision([Command("panda", "joints", sources=(source,))]))
         now += np.clip(q - now, -0.002, 0.002)
         rig.data.qpos[:] = now
         rig.data.qvel[:] = 0.0
@@ -30,22 +30,22 @@ def lead(rig: Rig, q: np.ndarray, steps: int, engagement: int = 1) -> list[tuple
 
 
 def test_a_leader_is_apart_until_the_environment_has_caught_up() -> None:
-    rig = Rig(iiwa_model(), [iiwa_spec()], TARGETS, home=IIWA_HOME)
-    limits = lead(rig, np.add(IIWA_HOME, 0.5), 400)
+    rig = Rig(panda_model(), [panda_spec()], TARGETS, home=PANDA_HOME)
+    limits = lead(rig, np.add(PANDA_HOME, 0.5), 400)
     assert limits[10] == ("leader_apart",)
     assert limits[-1] == ()
 
 
 def test_the_workspace_of_a_leader_starts_where_the_arm_was_taken_by_others() -> None:
     """What a hand has moved through the environment in between is no detour for the leader that comes next."""
-    rig = Rig(iiwa_model(), [iiwa_spec()], TARGETS, home=IIWA_HOME)
-    there = np.add(IIWA_HOME, 0.3)
+    rig = Rig(panda_model(), [panda_spec()], TARGETS, home=PANDA_HOME)
+    there = np.add(PANDA_HOME, 0.3)
     lead(rig, there, 300)
-    rig.step(decision([pose_command("iiwa", rig.source((0.0, 0.0, 0.0), engagement=2))]))
-    rig.data.qpos[:] = IIWA_HOME
+    rig.step(decision([pose_command("panda", rig.source((0.0, 0.0, 0.0), engagement=2))]))
+    rig.data.qpos[:] = PANDA_HOME
     rig.hold(1)
-    assert rig.controller._joints.goal == pytest.approx(IIWA_HOME)
-    lead(rig, np.add(IIWA_HOME, 0.05), 3, engagement=3)
+    assert rig.controller._joints.goal == pytest.approx(PANDA_HOME)
+    lead(rig, np.add(PANDA_HOME, 0.05), 3, engagement=3)
     assert rig.controller.get_status()[0].limits == ()
 
 

@@ -15,17 +15,13 @@ from iris_session.emulator.behaviours.stower import BOX, BOX_INSIDE
 from iris_session.physics import World, find_objects, find_robots
 from iris_session.protocol.names import Device
 from iris_session.session.errors import ConfigError
-from tests.models import robot_models
-
-__all__ = ["robot_models"]
-pytestmark = pytest.mark.usefixtures("robot_models")
 
 CASTS = [
     ("handover", 2),
     ("handover", 5),
     ("handover", 8),
-    ("iiwa", 2),
-    ("iiwa", 8),
+    ("panda", 2),
+    ("panda", 8),
     ("aloha", 2),
     ("cloth", 2),
     ("soft", 2),
@@ -137,13 +133,13 @@ def test_every_observer_of_the_cloud_watches_all_its_streams(observers: int, nam
     ("demo", "operators", "observers", "why"),
     [
         ("handover", 1, 0, "2 to 8 operators, not 1"),
-        ("iiwa", 9, 0, "2 to 8 operators, not 9"),
+        ("panda", 9, 0, "2 to 8 operators, not 9"),
         ("aloha", 4, 0, "2 operators, not 4"),
         ("handover", 2, 17, "--observers 17 .*0 to 16"),
         ("cloth", 3, 0, "2 operators, not 3"),
         ("soft", 8, 0, "2 operators, not 8"),
         ("cloud", 3, 0, "2 operators, not 3.*--observers"),
-        ("juggle", 2, 0, "'juggle': handover, iiwa, aloha, cloth, soft, cloud"),
+        ("juggle", 2, 0, "'juggle': handover, panda, aloha, cloth, soft, cloud"),
     ],
 )
 def test_unsuitable_casts_are_rejected_with_reason(demo: str, operators: int, observers: int, why: str) -> None:

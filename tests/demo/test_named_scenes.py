@@ -9,7 +9,7 @@ from iris_session.cloud.camera_file import load_camera_file
 from iris_session.demo.named_scenes import SCENES, scene_by_name
 from iris_session.demo.scene_names import SCENE_NAMES
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_SHEET_M
-from iris_session.physics import ModelNotFoundError, find_robots
+from iris_session.physics import find_robots
 from iris_session.session.errors import ConfigError
 
 
@@ -19,7 +19,7 @@ def test_names_in_the_help_are_available() -> None:
 
 @pytest.mark.parametrize(
     ("name", "robots"),
-    [("handover", 2), ("arm", 1), ("arms", 8), ("arms3", 3), ("iiwa", 2), ("iiwa1", 1), ("aloha", 4), ("bodies", 0)],
+    [("handover", 2), ("arm", 1), ("arms", 8), ("arms3", 3), ("panda", 2), ("panda1", 1), ("aloha", 4), ("bodies", 0)],
 )
 def test_scene_has_its_robots_and_a_sheet_of_known_size(name: str, robots: int) -> None:
     scene = scene_by_name(name)
@@ -47,18 +47,12 @@ def test_cameras_of_the_cloud_draw_every_body_of_the_session_and_more() -> None:
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("alohas", "handover, arm, arms, iiwa, aloha, cloth, soft, cloud, bodies"),
+        ("alohas", "handover, arm, arms, panda, aloha, cloth, soft, cloud, bodies"),
         ("handover2", "one of handover"),
         ("arms0", "scene 'arms0': .* 1 to 12"),
-        ("iiwa9", "1 to 8"),
+        ("panda9", "1 to 8"),
     ],
 )
 def test_unknown_name_lists_the_known(name: str, text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         scene_by_name(name)
-
-
-def test_missing_models_are_reported_with_their_location(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("IRIS_DATA", raising=False)
-    with pytest.raises(ModelNotFoundError, match="set IRIS_DATA"):
-        scene_by_name("aloha")

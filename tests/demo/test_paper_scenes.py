@@ -1,9 +1,8 @@
-"""The scenes with real robots: ALOHA stations and KUKA arms, built from the models in `IRIS_DATA`."""
+"""The scenes with real robots: ALOHA stations and Panda arms, built from models of MuJoCo Menagerie."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -11,12 +10,8 @@ import numpy as np
 import pytest
 
 from iris_session.demo.scenes.aloha import BOARD_SIZE, aloha_scene
-from iris_session.demo.scenes.iiwa import compute_iiwa_radius, iiwa_scene
-from iris_session.physics import ModelNotFoundError, find_objects, find_robots
-from tests.models import robot_models
-
-__all__ = ["robot_models"]
-pytestmark = pytest.mark.usefixtures("robot_models")
+from iris_session.demo.scenes.panda import compute_panda_radius, panda_scene
+from iris_session.physics import find_objects, find_robots
 
 
 def _settled(model: mujoco.MjModel, steps: int = 500) -> mujoco.MjData:
@@ -75,8 +70,8 @@ def test_aloha_shares_the_meshes_of_its_stations(aloha: mujoco.MjModel) -> None:
 
 
 @pytest.mark.parametrize("n", [2, 8])
-def test_iiwa_arms_stand_around_a_table_and_hold_still(n: int) -> None:
-    model = iiwa_scene(n).compile()
+def test_panda_arms_stand_around_a_table_and_hold_still(n: int) -> None:
+    model = panda_scene(n).compile()
     robots = find_robots(model)
     assert len(robots) == n
     assert [o.name for o in find_objects(model)] == [f"object{k + 1}" for k in range(n // 2)]
@@ -85,8 +80,8 @@ def test_iiwa_arms_stand_around_a_table_and_hold_still(n: int) -> None:
     for robot in robots:
         base, tip = data.body(robot.base_body), data.site(robot.site)
         assert len(robot.joints) == 7
-        assert robot.gripper_actuator == f"{robot.name}/gripper"
-        assert np.hypot(*base.xpos[:2]) == pytest.approx(compute_iiwa_radius(n))
+        assert robot.gripper_actuator == f"{robot.name}/actuator8"
+        assert np.hypot(*base.xpos[:2]) == pytest.approx(compute_panda_radius(n))
         inward = base.xmat.reshape(3, 3).T @ (tip.xpos - base.xpos)
         np.testing.assert_allclose(inward, (0.5, 0.0, 0.35), atol=5e-3)  # gravity is compensated
         assert tip.xmat.reshape(3, 3)[2, 2] == pytest.approx(-1.0, abs=1e-3)
@@ -101,20 +96,11 @@ def _rests_on_table_only(model: Any, data: Any, name: str) -> bool:
 
 
 @pytest.mark.parametrize("n", [0, 9])
-def test_iiwa_has_room_for_eight(n: int) -> None:
+def test_panda_has_room_for_eight(n: int) -> None:
     with pytest.raises(ValueError, match=f"1 to 8 arms, not {n}"):
-        iiwa_scene(n)
+        panda_scene(n)
 
 
 def test_same_arguments_give_the_same_scene() -> None:
-    assert iiwa_scene(3).to_xml() == iiwa_scene(3).to_xml()
+    assert panda_scene(3).to_xml() == panda_scene(3).to_xml()
     assert aloha_scene().to_xml() == aloha_scene().to_xml()
-
-
-def test_missing_models_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("IRIS_DATA", str(tmp_path))
-    with pytest.raises(ModelNotFoundError, match=r"models/aloha/scene\.xml.*Menagerie"):
-        aloha_scene()
-    monkeypatch.delenv("IRIS_DATA")
-    with pytest.raises(ModelNotFoundError, match=r"IRIS_DATA .*models/kuka_iiwa_14/iiwa14\.xml"):
-        iiwa_scene()

@@ -42,7 +42,6 @@ from tests.e2e.session_process import (
 
 pytestmark = pytest.mark.e2e
 
-RGBD = Path(os.environ.get("IRIS_DATA", "")) / "rgbd"
 WIDTH, HEIGHT = 160, 120
 INTRINSICS = f"{{width = {WIDTH}, height = {HEIGHT}, fx = 146.0, fy = 146.0, cx = 79.5, cy = 59.5}}"
 POSE = "{position_m = [0.0, 0.0, 1.0], quaternion_wxyz = [0.5, -0.5, 0.5, -0.5]}"
@@ -160,13 +159,12 @@ def wait_for_fault(client: Client, stream: str, fault: str) -> StreamBudget:
     return found[-1]
 
 
-@pytest.mark.skipif(not RGBD.is_dir(), reason="needs the test data")
 def test_clouds_of_two_processes_reach_who_joins_late(
-    serve: Callable[..., SessionProcess], watch: Callable[..., Client], tmp_path: Path
+    serve: Callable[..., SessionProcess], watch: Callable[..., Client], rgbd: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "scene.xml").write_text(ROOM)
     intrinsics = "{width = 640, height = 480, fx = 585.0, fy = 585.0, cx = 319.5, cy = 239.5}"
-    real = f'name = "hand"\nsource = "folder"\npath = "{RGBD}"\nhz = {HZ}\nintrinsics = {intrinsics}\n'
+    real = f'name = "hand"\nsource = "folder"\npath = "{rgbd}"\nhz = {HZ}\nintrinsics = {intrinsics}\n'
     rendered = 'name = "front"\nsource = "mujoco"\nmodel = "scene.xml"\ncamera = "front"\n'
     rendered += f"width = {WIDTH}\nheight = {HEIGHT}\nhz = {HZ}\n"
     files = (

@@ -9,9 +9,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.session_process import DEMO_OPTIONS, DEMO_S, run_command
-from tests.models import robot_models
 
-__all__ = ["robot_models"]
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 60.0)]
 
 
@@ -28,7 +26,6 @@ def run_demo(folder: Path, *arguments: str, max_takes: int = 2) -> dict[str, Any
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("robot_models")
 def test_aloha_operators_exchange_boards(tmp_path: Path) -> None:
     result = run_demo(tmp_path, "aloha", max_takes=3)  # a board is dropped in about one of twelve, by physics alone
     found = {h["object"]: (h["giver"], h["receiver"]) for h in result["handovers"]}
@@ -41,9 +38,8 @@ def test_aloha_operators_exchange_boards(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("robot_models")
-def test_iiwa_operators_hand_over_a_hammer(tmp_path: Path) -> None:
-    result = run_demo(tmp_path, "iiwa")
+def test_panda_operators_hand_over_a_hammer(tmp_path: Path) -> None:
+    result = run_demo(tmp_path, "panda")
     assert [(h["object"], h["giver"], h["receiver"]) for h in result["handovers"]] == [("object1", "left", "right")]
 
 

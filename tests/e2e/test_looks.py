@@ -25,11 +25,9 @@ from tests.e2e.session_process import (
     wait_until,
 )
 from tests.loopback import make_loopback_address
-from tests.models import robot_models
 from tests.recording.dataframes import compare_dataframes
 from tools.look_at_recordings import MissingViewerError, check_file, look_at
 
-__all__ = ["robot_models"]
 pytestmark = [pytest.mark.e2e, pytest.mark.long, pytest.mark.timeout(DEMO_S + 120.0)]
 
 
@@ -152,8 +150,7 @@ def test_session_that_was_cut_in_a_message_is_seen_without_errors(sessions: Sess
     assert_looks_right(path)
 
 
-@pytest.mark.usefixtures("robot_models")
-@pytest.mark.parametrize("demo", ["handover", "aloha", "iiwa", "soft", "cloth"])
+@pytest.mark.parametrize("demo", ["handover", "aloha", "panda", "soft", "cloth"])
 def test_demos_are_seen_without_errors(demo: str, tmp_path: Path) -> None:
     done = run_command("demo", demo, *DEMO_OPTIONS, cwd=tmp_path, timeout_s=DEMO_S)
     assert done.stdout, done.stderr[-3000:]

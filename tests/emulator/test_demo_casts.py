@@ -9,16 +9,13 @@ import pytest
 from iris_session.demo.demos import make_demo
 from iris_session.emulator.behaviours import CombinedBehaviour, HandInput, OperatorView
 from tests.emulator.handover_rig import LateView, demo, demo_verdict, over
-from tests.models import robot_models
-
-__all__ = ["robot_models"]
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("robot_models", "untraced")
+@pytest.mark.usefixtures("untraced")
 def test_every_object_is_handed_over() -> None:
-    """By friction, in mid-air, onto a table. Two iiwa, and ALOHA: `tests/e2e/test_demo_scenes.py`."""
-    rig = demo(make_demo("iiwa", 4), seed=0)
+    """By friction, in mid-air, onto a table. Two panda, and ALOHA: `tests/e2e/test_demo_scenes.py`."""
+    rig = demo(make_demo("panda", 4), seed=0)
     rig.run(60.0, until=over)
     assert demo_verdict(rig) == ""
     assert rig.fastest_hand < 0.5

@@ -30,14 +30,14 @@ def test_aloha_has_two_arms(aloha: mujoco.MjModel) -> None:
     )
 
 
-def test_iiwa_has_one_arm(iiwa: mujoco.MjModel) -> None:
-    assert find_robots(iiwa) == (
+def test_panda_has_one_arm(panda: mujoco.MjModel) -> None:
+    assert find_robots(panda) == (
         RobotSpec(
-            name="iiwa14",
+            name="panda",
             joints=tuple(f"joint{i}" for i in range(1, 8)),
             actuators=tuple(f"actuator{i}" for i in range(1, 8)),
             site="attachment_site",
-            base_body="base",
+            base_body="link0",
         ),
     )
 
@@ -228,9 +228,9 @@ def test_jaw_opens_away_from_the_fixed_jaw(sign: int) -> None:
 # --- objects are the named free bodies without actuators ---
 
 
-def test_objects_of_real_scenes(handover: mujoco.MjModel, aloha: mujoco.MjModel, iiwa: mujoco.MjModel) -> None:
+def test_objects_of_real_scenes(handover: mujoco.MjModel, aloha: mujoco.MjModel, panda: mujoco.MjModel) -> None:
     assert find_objects(handover) == (ObjectSpec("hammer", "hammer"), ObjectSpec("board", "board"))
-    assert find_objects(aloha) == find_objects(iiwa) == ()
+    assert find_objects(aloha) == find_objects(panda) == ()
 
 
 def test_robots_fixed_and_unnamed_bodies_are_no_objects() -> None:

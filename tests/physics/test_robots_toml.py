@@ -11,7 +11,7 @@ from iris_session.physics import PhysicsError, RobotsFileError, dump_robots_toml
 from tests.physics.models import arm, scene
 
 
-@pytest.mark.parametrize("name", ["aloha", "iiwa", "handover"])
+@pytest.mark.parametrize("name", ["aloha", "panda", "handover"])
 def test_detected_robots_round_trip(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     m = request.getfixturevalue(name)
     robots = find_robots(m)
@@ -21,15 +21,15 @@ def test_detected_robots_round_trip(name: str, request: pytest.FixtureRequest, t
     assert load_robots_toml(tmp_path / "robots.toml", m) == load_robots_toml(str(tmp_path / "robots.toml"), m) == robots
 
 
-def test_three_keys_are_enough(iiwa: mujoco.MjModel) -> None:
+def test_three_keys_are_enough(panda: mujoco.MjModel) -> None:
     joints = ", ".join(f'"joint{i}"' for i in range(1, 8))
     text = f'[[robot]]\nname = "k"\njoints = [{joints}]\nsite = "attachment_site"\nhold = "gravity_pd"\n'
-    (robot,) = load_robots_toml(text, iiwa)
+    (robot,) = load_robots_toml(text, panda)
     assert robot.actuators == tuple(f"actuator{i}" for i in range(1, 8))
     assert robot.base_body == "link1"
     assert robot.mode == "exclusive"
     assert robot.hold == "gravity_pd"
-    assert load_robots_toml("\n", iiwa) == ()
+    assert load_robots_toml("\n", panda) == ()
 
 
 GOOD = {

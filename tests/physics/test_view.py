@@ -173,22 +173,22 @@ def test_contacts_match_a_simple_loop_in_the_handover_scene(handover: mujoco.MjM
     assert ("board", "table") in seen
 
 
-def test_poses_and_joints(iiwa: mujoco.MjModel) -> None:
-    world = World(iiwa, find_robots(iiwa), ())
+def test_poses_and_joints(panda: mujoco.MjModel) -> None:
+    world = World(panda, find_robots(panda), ())
     view = world.view()
     assert view.tick == 0
     for _ in range(20):
         world.tick()
     assert (view.tick, view.sim_time) == (20, float(world.data.time))
     site = world.data.site("attachment_site")
-    pose = view.tip_pose("iiwa14")
+    pose = view.tip_pose("panda")
     assert pose.p == tuple(site.xpos.tolist())
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, np.array(pose.q))
     assert np.allclose(matrix, site.xmat, atol=1e-12)
-    assert view.joints("iiwa14") == tuple(world.data.qpos.tolist())
+    assert view.joints("panda") == tuple(world.data.qpos.tolist())
     world.tick()
-    assert view.tip_pose("iiwa14") != pose
+    assert view.tip_pose("panda") != pose
 
 
 def test_unknown_names_are_rejected_with_known_ones(handover: mujoco.MjModel) -> None:

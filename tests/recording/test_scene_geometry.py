@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import msgspec
@@ -20,10 +19,9 @@ from iris_session.recording.picture import build_components
 from iris_session.scene import AssetMissingError, AssetStore, EncodeOptions
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
+from tests.models import ALOHA, PANDA
 from tests.recording.support import XML, make_header
 from tests.scene.models import LOOKS, SHAPES, every_shape
-
-DATA = Path(os.environ.get("IRIS_DATA", Path(__file__).parents[3] / "shared"))
 
 
 def infos(model: mujoco.MjModel) -> list[BodyInfo]:
@@ -122,10 +120,10 @@ def test_tall_texture_is_reduced_like_a_wide_one(tmp_path: Path) -> None:
     assert [max(one.shape) for one in found if one is not None] == [scene.TEXTURE_SIDE] * 3
 
 
-@pytest.mark.parametrize("path", ["aloha/scene.xml", "kuka_iiwa_14/scene.xml"])
-def test_every_geom_of_real_robots_is_placed_as_in_mujoco(path: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("path", [ALOHA, PANDA], ids=["aloha", "panda"])
+def test_every_geom_of_real_robots_is_placed_as_in_mujoco(path: Path, tmp_path: Path) -> None:
     """In another configuration than that of the specification."""
-    model, store = mujoco.MjModel.from_xml_path(str(DATA / "models" / path)), AssetStore(tmp_path)
+    model, store = mujoco.MjModel.from_xml_path(str(path)), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, infos(model))
     data = mujoco.MjData(model)

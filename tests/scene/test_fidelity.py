@@ -11,12 +11,10 @@ import pytest
 from iris_session.protocol.scene import encode_scene
 from iris_session.scene import AssetStore, EncodeOptions
 from iris_session.scene.mujoco_scene import parse_mujoco
-from tests.models import robot_models
+from tests.models import MENAGERIE
 from tests.scene.models import every_shape
 from tests.scene.pictures import ModelRenderer, cameras, graphics, silhouette_iou
 from tests.scene.rebuild import rebuild
-
-__all__ = ["robot_models"]
 
 #: Of 255. Edges of textures may fall onto the adjacent pixel, so a few may differ by more than `VISIBLE`.
 MEAN_DIFFERENCE, VISIBLE, VISIBLE_SHARE = 0.5, 24, 0.002
@@ -45,10 +43,10 @@ def check(model: mujoco.MjModel, store: AssetStore, views: slice) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "views"), [pytest.param("aloha", slice(2, 5), marks=pytest.mark.long), ("kuka_iiwa_14", slice(0, 3))]
+    ("name", "views"), [pytest.param("aloha", slice(2, 5), marks=pytest.mark.long), ("franka_emika_panda", slice(0, 3))]
 )
-def test_real_robots_look_the_same(robot_models: Path, tmp_path: Path, name: str, views: slice) -> None:
-    model = mujoco.MjModel.from_xml_path(str(robot_models / "models" / name / "scene.xml"))
+def test_real_robots_look_the_same(tmp_path: Path, name: str, views: slice) -> None:
+    model = mujoco.MjModel.from_xml_path(str(MENAGERIE / name / "scene.xml"))
     check(model, AssetStore(tmp_path), views)
 
 

@@ -1,4 +1,4 @@
-"""Two ALOHA stations face to face: the scene of `iris-session demo aloha`. Models: MuJoCo Menagerie, from `IRIS_DATA`.
+"""Two ALOHA stations face to face: the scene of `iris-session demo aloha`.
 
 World: Z up, table tops at z = 0, room floor at z = -0.75. The stations touch at y = 0; `south` is worked from -y,
 `north` from +y, and left and right are those of the operator who sits there. Robots: `south/left`, `south/right`,
@@ -29,6 +29,11 @@ ARM_HOME: Final = (0.9, -0.3768, 0.0629, 0.0, 1.5357, 0.0)
 FINGER_OPEN: Final = 0.037  # m, of one finger along its rail
 #: Where the fingers hold best, a centimetre behind their tips, in the frame of the gripper link [m].
 P_LINK_TCP: Final = (0.134, 0.0, 0.0)
+#: Capsules of the fingers in newer versions of the model: radius and half length [m], position [m], quaternion.
+_FINGERS: Final = {
+    "left_finger_link": ((0.01373, 0.04606), (0.01415, -0.0347, 0.0119), (0.544446, 0.455511, 0.456118, -0.536698)),
+    "right_finger_link": ((0.01373, 0.04606), (0.01417, 0.0347, 0.01176), (0.538959, -0.458738, -0.452903, -0.542183)),
+}
 #: Where the boards lie, seen by their owner: in front of the right arm, the long side pointing at it.
 _BOARD_FROM_BASE: Final = (0.47, math.radians(165.0))  # m from the right base, bearing
 
@@ -80,6 +85,8 @@ def _station(path: Any) -> Any:
     for texture in [t for t in spec.textures if int(t.type) == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)]:
         spec.delete(texture)
     for side in ("left", "right"):
+        _fit_capsules(spec.body(f"{side}/base_link"))
+    for side in ("left", "right"):
         spec.body(f"{side}/gripper_link").add_site(
             name=f"{side}/tcp",  # z along the fingers, y the closing direction
             pos=list(P_LINK_TCP),
@@ -88,6 +95,22 @@ def _station(path: Any) -> Any:
             group=4,
         )
     return spec
+
+
+def _fit_capsules(arm: Any) -> None:
+    """Let an arm collide with capsules, as in newer versions of the model; older ones have the hulls of its meshes,
+    between which a board slips."""
+    import mujoco
+
+    for body in (arm, *arm.find_all("body")):
+        for geom in body.geoms:
+            if geom.classname.name != "collision" or int(geom.type) != int(mujoco.mjtGeom.mjGEOM_MESH):
+                continue
+            geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE  # by default fitted to the mesh
+            for finger, (size, pos, quat) in _FINGERS.items():
+                if body.name.endswith(finger):
+                    geom.meshname = ""
+                    geom.size, geom.pos, geom.quat = [*size, 0.0], pos, quat
 
 
 def _board_place(index: int) -> tuple[float, float, float]:

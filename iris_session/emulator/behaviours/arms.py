@@ -39,8 +39,17 @@ class ArmKind:
 
 #: The arm of `arm.xml`, in the handover demo.
 ARM: Final = ArmKind()
-#: KUKA iiwa 14 with the same gripper.
-IIWA: Final = ArmKind(exchange_height=0.30, exchange_inward=0.35, lean=math.radians(20.0), reach=0.62, speed=0.33)
+#: Franka Emika Panda with its own hand.
+PANDA: Final = ArmKind(
+    base="link0",
+    fingers=("left_finger", "right_finger"),
+    pads=((0.0, 0.0, 0.0445), (0.0, 0.0, 0.0445)),
+    exchange_height=0.30,
+    exchange_inward=0.35,
+    lean=math.radians(20.0),
+    reach=0.62,
+    speed=0.33,
+)
 #: ViperX 300 of an ALOHA station. The camera above its gripper is in the way of a partner's unless both lean; leaning
 #: farther, its wrist would be stretched (singular) at the table. Its light servos are compliant and lag: it is moved
 #: slowly.
@@ -57,7 +66,7 @@ VIPERX: Final = ArmKind(
     near_m=0.004,
     near_rad=0.04,
 )
-ARM_KINDS: Final[dict[str, ArmKind]] = {"arm": ARM, "iiwa": IIWA, "viperx": VIPERX}
+ARM_KINDS: Final[dict[str, ArmKind]] = {"arm": ARM, "panda": PANDA, "viperx": VIPERX}
 
 
 def get_arm_kind(name: str) -> ArmKind:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from pathlib import Path
 
 import cv2
@@ -106,12 +105,11 @@ def test_what_is_missing_or_damaged_is_named(tmp_path: Path, how: str) -> None:
 
 
 @pytest.mark.long
-def test_the_real_frames_make_one_room() -> None:
+def test_the_real_frames_make_one_room(rgbd: Path) -> None:
     """Views of a moving camera: surfaces of each lie on those of the view before."""
-    folder = Path(os.environ["IRIS_DATA"]) / "rgbd"
-    matrix = np.loadtxt(folder / "camera-intrinsics.txt")
+    matrix = np.loadtxt(rgbd / "camera-intrinsics.txt")
     camera = CameraModel(640, 480, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    frames = read_all(make_settings(folder, camera))
+    frames = read_all(make_settings(rgbd, camera))
     assert len(frames) == 60
     rays, limits = make_rays(camera), DepthLimits(farthest_m=3.5)
     views: list[NDArray[np.float32]] = []
