@@ -71,14 +71,31 @@ FORBIDDEN = {
     "doctor": {"zmq", "mujoco", "rerun"},
     "codegen": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
 }
-#: Imports between rooms that remain to be removed.
-TRANSITIONAL: set[tuple[str, str]] = set()
 #: Rooms whose result depends only on arguments: no set order, no addresses, no hash seed.
 PURE = ("anchors", "protocol", "authority", "control", "streams")
 #: The feed and the process of the recorder use sockets; the rest of `recording` reads and writes files.
 RECORDING_SOCKETS = {"feed.py", "process.py"}
 #: Packages that only the sources of depth frames import. Clocks: they and the process; the client: the process.
 CLOUD_SOURCES = {"mujoco", "rerun", "mcap", "pyrealsense2", "pyorbbecsdk"}
+
+#: Calls that read the wall clock, which jumps (daylight saving, NTP, users), by the last two names of the dotted call.
+WALL_CLOCK = {
+    *("time.time", "time.time_ns", "time.localtime", "time.gmtime", "time.ctime", "time.strftime"),
+    *("datetime.now", "datetime.utcnow", "datetime.today", "date.today"),
+}
+#: Where it may be read: it stamps something for people, or measures what must survive a reboot.
+WALL_CLOCK_READERS = {
+    "iris_session/security/allow_list.py": "when a key was added or last seen, for people",
+    "iris_session/security/join_codes.py": "when a join code ends: shared by processes, outlives a reboot",
+    "iris_session/front/pairing.py": "whether a join code is open",
+    "iris_session/cli/pair.py": "how long a join code is shown",
+    "iris_session/assets/store.py": "which files were used longest ago, as the file system stamps them",
+    "iris_session/web/certificate.py": "when a certificate begins and ends, which is wall time by definition",
+    "iris_session/bench/web_tab.py": "when a browser, which has no other clock in common, has seen a click",
+    "iris_session/cli/view.py": "when a recording was written last, as the file system stamps it, for people",
+    "iris_session/session/config.py": "name of a default folder",
+    "iris_session/session/processes.py": "when a recording was made, for people",
+}
 
 
 @cache
@@ -156,8 +173,7 @@ def test_rooms_import_what_the_table_allows() -> None:
             continue
         name, allowed = path.relative_to(ROOT), table()[room]
         if allowed is not None:
-            transitional = {to for source, to in TRANSITIONAL if source == room}
-            wrong = rooms_imported(path) - allowed - {room, *transitional}
+            wrong = rooms_imported(path) - allowed - {room}
             offenders += [f"{name}: {room} may not import {other}" for other in sorted(wrong)]
         outside = {dotted.split(".")[0] for dotted in imports(path)}
         never = FORBIDDEN.get(room, set()) | (set() if room == "codegen" else {"tools"})
@@ -204,6 +220,23 @@ def test_impurities_are_detected() -> None:
     assert [line.split(":")[0] for line in sorted(impurities(ast.parse(source)))] == [
         f"line {n}" for n in (1, 3, 4, 5, 6)
     ]
+
+
+def calls(path: Path) -> Iterator[str]:
+    """Yield the last two names of every dotted call of a module, such as `time.sleep`."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Call):
+            yield ".".join(ast.unparse(node.func).split(".")[-2:])
+
+
+def test_the_wall_clock_is_read_in_few_places_only() -> None:
+    found = {str(path.relative_to(ROOT)) for path in modules() if WALL_CLOCK & {*calls(path)}}
+    assert found == set(WALL_CLOCK_READERS), "session time is time.monotonic_ns; or say here what the wall clock is for"
+
+
+def test_nothing_uses_select() -> None:
+    """A session with many clients has descriptors above 1023, which `select.select` rejects."""
+    assert not [path for path in modules() if "select.select" in {*calls(path), *imports(path)}]
 
 
 def test_modules_have_docstrings() -> None:

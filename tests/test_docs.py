@@ -27,7 +27,6 @@ from iris_session.cli.main import build_parser
 from iris_session.demo.run import DemoResult
 from iris_session.demo.scenes import scene_path
 from iris_session.protocol import names
-from tests.models import BESIDE
 
 ROOT = Path(__file__).parents[1]
 #: `docs/protocol.md` has its own tests (tests/protocol); only its links are checked here.
@@ -82,7 +81,7 @@ BLOCKS = tuple(block for page in PAGES for block in blocks(page))
 #: A block with a lab address needs keys, and is run by `test_key_files_of_the_network_page_work`.
 LAB_ADDRESS = "192.168.0.10"
 PYTHON = tuple(block for block in BLOCKS if block.language == "python" and LAB_ADDRESS not in block.text)
-#: Pages whose blocks run always; those of the others, with `make test FULL=1`.
+#: Pages whose blocks run in `make test`, those of each in one test; those of the others run in `make test-long`.
 FIRST_PAGES = ("README.md", "tutorial.md")
 SHELL = tuple(block for block in BLOCKS if block.language == "bash")
 
@@ -152,12 +151,20 @@ def run_python(tmp_path: Path) -> Callable[..., str]:
 
 
 @pytest.mark.e2e
+@pytest.mark.parametrize("page", FIRST_PAGES)
+def test_first_page_works(page: str, serve: str, run_python: Callable[..., str]) -> None:
+    """Its blocks of Python, beside the session that it starts."""
+    assert any(block.page.name == page and "iris-session serve handover" in block.text for block in SHELL)
+    texts = [block.text for block in PYTHON if block.page.name == page]
+    assert len(texts) == 2
+    for text in texts:
+        run_python(text.replace(ADDRESS, serve))
+
+
+@pytest.mark.long
+@pytest.mark.e2e
 @pytest.mark.parametrize(
-    "block",
-    [
-        pytest.param(block, id=block.name, marks=[] if block.name.startswith(FIRST_PAGES) else pytest.mark.long)
-        for block in PYTHON
-    ],
+    "block", [pytest.param(block, id=block.name) for block in PYTHON if block.page.name not in FIRST_PAGES]
 )
 def test_python_block_runs(block: Block, run_python: Callable[..., str], request: pytest.FixtureRequest) -> None:
     text, has_deformables = block.text, "Deformables(client)" in block.text
@@ -252,6 +259,7 @@ def test_example_of_a_user_loop_is_joined_until_it_ends(name: str, tmp_path: Pat
         assert "ann (agent) drives left" in output.read_text()
 
 
+@pytest.mark.long
 @pytest.mark.e2e
 def test_policy_example_moves_its_robot(serve: str, run_python: Callable[..., str]) -> None:
     output = run_python((ROOT / "examples" / "policy.py").read_text(encoding="utf-8"), serve, "6")
@@ -410,7 +418,7 @@ FILE = re.compile(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|md|xml|toml|json|png))`")
 def test_named_files_exist(page: Path) -> None:
     for name in FILE.findall(prose(page)):
         # Modules are named from the root or, in short, from the package.
-        folders = (ROOT, ROOT / "iris_session", Path(os.environ.get("IRIS_DATA") or BESIDE))
+        folders = (ROOT, ROOT / "iris_session")
         assert any((folder / name).is_file() for folder in folders), f"{page.name}: {name}"
 
 
@@ -461,3 +469,19 @@ def test_roles_modes_and_policies_are_in_the_guide() -> None:
     wanted = names.Role.ALL | names.LeaseMode.ALL | names.AssignmentPolicy.ALL | names.Device.ALL
     missing = sorted(value for value in wanted | names.EpisodeAction.ALL if not re.search(rf'[`"]{value}["`]', guide))
     assert not missing
+
+
+# --- failures ---
+
+
+def test_every_failure_has_a_test() -> None:
+    """The page of recovery names tests that exist, for every row of its table."""
+    page = (ROOT / "docs" / "recovery.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (?!what fails).+", page.split("## What fails", 1)[1], re.MULTILINE)
+    texts = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")]
+    there = {name for text in texts for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE)}
+    assert len(rows) > 15
+    for row in rows:
+        named = set(re.findall(r"`(test_\w+)`", row))
+        assert named, f"no test is named: {row}"
+        assert not named - there, f"no such test: {named - there}"
