@@ -2,21 +2,19 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-export IRIS_DATA ?= $(abspath ../shared)
 # Some environments forbid compiled files: then each process that a test starts compiles all our modules anew.
 unexport PYTHONDONTWRITEBYTECODE
+.NOTPARALLEL:
 
-.PHONY: install install-dev demo screenshots test check test-unit test-e2e test-web test-random coverage bench web clean help
+.PHONY: install install-dev demo screenshots test test-long check test-web test-random bench web clean help
 
 help:
 	@echo "make demo     two emulated operators hand a hammer over, recorded and verified"
 	@echo "make web      builds the page for browsers, web_client, into iris_session/web/page"
-	@echo "make test     lint, strict types and tests: the four below"
-	@echo "  make check      lint, format, strict types"
-	@echo "  make test-unit  tests in one process;  make test-unit T=tests/control  those of one room"
-	@echo "  make test-e2e   tests that start real processes;  make test-e2e T=tests/e2e/test_operators.py"
-	@echo "  make test-web   strict types and tests of web_client"
-	@echo "make test FULL=1  also tests marked long, and the bounds of coverage: what continuous integration runs"
+	@echo "make test     all that decides: lint, strict types, tests, coverage of the rooms that decide"
+	@echo "make test-long   the rest: demos, benchmarks, browsers at length, hostile clients, fuzzing, a soak"
+	@echo "make check    only lint, format, strict types"
+	@echo "make test-web    only strict types and tests of web_client"
 	@echo "make test-random  the unit tests with other random examples than the usual ones"
 	@echo "make bench    the benchmarks of docs/benchmarks.md"
 	@echo "make screenshots  records the demo anew and makes the pictures of README and docs"
@@ -56,7 +54,7 @@ web: $(PAGE)
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
 
-demo: install $(PAGE)
+demo: install
 	@$(BIN)/iris-session demo handover
 
 # OpenGL and Vulkan without a display (Debian: libegl1 libgl1-mesa-dri mesa-vulkan-drivers), a browser (chromium).
@@ -72,66 +70,27 @@ screenshots: install-dev $(PAGE)
 	@PYTHONPATH=. $(BIN)/python tools/page_screenshots.py docs/img
 
 check: install-dev
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	@$(BIN)/python tools/run_tests.py --only lint,format,types
 
-# What decides; the rest talks to sockets, disks and people.
-CORE := iris_session/authority/*,iris_session/protocol/*,iris_session/control/*
+# All that decides. One room: .venv/bin/python -m pytest tests/control
+test:
+	@echo "Python packages go to $(VENV), packages of npm to web_client/node_modules; nothing is installed elsewhere"
+	@$(PYTHON) tools/system_packages.py
+	@$(MAKE) --no-print-directory install-dev web
+	@$(BIN)/python tools/run_tests.py
 
-# Tests start some hundreds of short processes, each of which would compile the package again.
-export PYTHONDONTWRITEBYTECODE :=
-
-# Tests at once, and which. Two leave a third of two cores unused, since tests wait for processes; sessions in real time
-# need that third.
-JOBS ?= 3
-JOBS_E2E ?= 2
-T ?= tests
-
-# Without FULL=1, tests that take more than some seconds are left out: a run on two cores is short enough to be made
-# before every commit. Continuous integration runs all, and traces for coverage, which takes half as long again.
-FULL ?=
-KINDS := $(if $(FULL),,and not long)
-UNIT = $(BIN)/python -m pytest -q -m "not e2e $(KINDS)" -n $(JOBS) --dist worksteal $(if $(FULL),--cov --cov-report=)
-# A file stays on one worker, because its tests share sessions; the longest begin first (tests/e2e/conftest.py).
-E2E = $(BIN)/python -m pytest -q -m "e2e $(KINDS)" -n $(JOBS_E2E) --dist loadfile --no-loadscope-reorder
-
-test: check
-	$(MAKE) --no-print-directory test-unit
-	$(MAKE) --no-print-directory test-e2e
-	$(MAKE) --no-print-directory test-web
-	$(if $(FULL),$(MAKE) --no-print-directory coverage)
-
-test-unit: install-dev
-	@rm -f .coverage
-	$(UNIT) $(T)
-
-# Emulated people need their share of the cores in time, or they drop what they hold: one demo at a time.
-DEMOS := tests/e2e/test_demo_scenes.py tests/e2e/test_demo_handover.py
-# A browser that draws in software takes both cores, drawn cameras one; the doctor finds fault with a busy machine; four
-# emulated headsets that see drift and bumps, or the many sessions of the docs tests, take what others need in time:
-# these run one by one, after those with real time.
-ALONE := tests/test_docs.py tests/e2e/test_alignment.py tests/e2e/test_doctor.py tests/e2e/test_web.py tests/e2e/test_web_xr.py tests/e2e/test_web_marks.py tests/e2e/test_web_desktop.py \
-  tests/e2e/test_clouds.py tests/e2e/test_demo_cloud.py tests/e2e/test_looks.py tests/bench/test_web.py
-test-e2e: install-dev $(PAGE)
-ifeq ($(T),tests)
-	$(E2E) -n 1 $(DEMOS)
-	$(E2E) $(addprefix --ignore=,$(DEMOS) $(ALONE)) $(T)
-	$(E2E) -n 1 $(ALONE)
-else
-	$(E2E) $(T)
-endif
+# The rest: tests marked long, one at a time, coverage of everything, hostile clients, fuzzing and a soak.
+test-long:
+	@$(PYTHON) tools/system_packages.py
+	@$(MAKE) --no-print-directory install-dev web
+	@$(BIN)/python tools/run_tests.py --long
 
 test-web: web_client/node_modules/.installed
 	@$(NPM) run --silent check
 	@$(NPM) run --silent test
 
 test-random: install-dev
-	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) $(T)
-
-coverage: install-dev
-	$(BIN)/python -m coverage report --include="$(CORE)" --fail-under=95
-	$(BIN)/python -m coverage report --omit="$(CORE)" --fail-under=90
+	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n 3
 
 # Every benchmark runs, whatever the one before says; the status is that of the worst.
 bench: install

@@ -32,6 +32,7 @@ pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 60.0)]
 CHILDREN = 5
 
 
+@pytest.mark.long
 def test_hammer_is_handed_over_and_the_recording_verifies(tmp_path: Path) -> None:
     """How well emulated people do it is tested in simulated time, in `tests/rig/test_demos.py`."""
     done = run_command("demo", "handover", *DEMO_OPTIONS, cwd=tmp_path, timeout_s=DEMO_S)
@@ -95,6 +96,7 @@ def test_timeout_fails_and_lists_the_problems(tmp_path: Path) -> None:
     assert result["verified"] is True, "the recording of a failed demo verifies, too"
 
 
+@pytest.mark.long
 def test_ctrl_c_leaves_no_process_and_a_finished_recording(demo: subprocess.Popen[bytes], tmp_path: Path) -> None:
     children = list_descendants(demo.pid)
     assert len(children) == CHILDREN

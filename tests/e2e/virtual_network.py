@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -163,6 +164,6 @@ class Network:
 
 
 def require_namespaces() -> None:
-    """Skip without root, which creating network namespaces requires."""
-    if sys.platform != "linux" or os.geteuid() != 0:
-        skip_unless_ci("network namespaces need Linux and root")
+    """Skip without root and `ip`, which creating network namespaces requires."""
+    if sys.platform != "linux" or os.geteuid() != 0 or shutil.which("ip") is None:
+        skip_unless_ci("network namespaces need Linux, root, and ip (Debian: iproute2)")
