@@ -44,6 +44,14 @@ ENDING_S = 120.0
 NO_OPENGL = sorted({*OPENGL} & {*find_missing()})
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests in a browser: one that draws in software takes all cores, so these run one by one."""
+    for item in items:
+        if "browser" in getattr(item, "fixturenames", ()):
+            item.add_marker("browser")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Skip tests that fail to draw on a machine without OpenGL; in CI they fail."""

@@ -5,7 +5,8 @@
     python tools/run_tests.py --only unit,processes
 
 A stage is a command; all run, whatever the one before found. Markers of tests: none: in one process; `e2e`: starts
-processes; `long`: not in `make test`. The last line is like that of pytest; exit status 0 if no stage failed.
+processes; `browser`: one that opens pages; `long`: not in `make test`. The last line is like that of pytest; exit
+status 0 if no stage failed.
 """
 
 from __future__ import annotations
@@ -82,10 +83,11 @@ def make_stages() -> tuple[Stage, ...]:
         # A file stays on one worker: its tests share sessions. The longest begin first (tests/e2e/conftest.py).
         make_pytest(
             "processes",
-            "e2e and not long",
+            "e2e and not long and not browser",
             *("-n", str(PROCESS_JOBS), "--dist", "loadfile", "--no-loadscope-reorder", "tests"),
         ),
-        Stage("web", ("make", "--no-print-directory", "test-web")),
+        make_pytest("browsers", "e2e and not long and browser", "-p", "no:xdist", "tests/e2e"),
+        Stage("web client", ("make", "--no-print-directory", "test-web")),
     )
 
 
