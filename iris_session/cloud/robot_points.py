@@ -20,8 +20,8 @@ from iris_session.cloud.voxels import Positions, load_kernels
 from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import Body, SceneSpec, Visual
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
-from iris_session.scene.elements import to_matrix
 from iris_session.scene.meshes import MeshArrays
+from iris_session.scene.nodes import to_matrix
 from iris_session.scene.shapes import build_primitive
 
 Floats = npt.NDArray[np.float64]

@@ -23,8 +23,8 @@ from iris_session.cloud.robot_points import find_robot_bodies, sample_bodies
 from iris_session.cloud.voxels import make_rays
 from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
-from iris_session.scene.elements import to_matrix
 from iris_session.scene.meshes import MeshArrays
+from iris_session.scene.nodes import to_matrix
 
 Floats = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]

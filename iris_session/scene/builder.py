@@ -20,14 +20,14 @@ from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.names import GeometryKind, LightKind, TextureKind
 from iris_session.protocol.scene import Camera, Environment, Light, Rgb
 from iris_session.scene.arrays import to_array
-from iris_session.scene.assembly import ComposedBody, ComposedDeformable, SceneContent, assemble_scene
 from iris_session.scene.asset_builder import EncodeOptions
-from iris_session.scene.composed import ComposedScene
-from iris_session.scene.elements import GREY, Appearance, DrawnItem, Matrix, TextureImage, to_matrix, truncate_name
+from iris_session.scene.build import ComposedBody, ComposedDeformable, SceneContent, build_scene
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.files import load_file
 from iris_session.scene.importers.units import file_question, measure_side
 from iris_session.scene.importers.urdf import read_urdf
+from iris_session.scene.nodes import GREY, Appearance, DrawnItem, Matrix, TextureImage, to_matrix, truncate_name
+from iris_session.scene.result import ComposedScene
 from iris_session.scene.validation import (
     check_mesh,
     check_number,
@@ -681,7 +681,7 @@ class SceneBuilder:
             SceneBuildError: The scene is too large, or something in it cannot be drawn.
             OSError: The store cannot be written.
         """
-        return assemble_scene(self._content, self.environment, store, options, threads)
+        return build_scene(self._content, self.environment, store, options, threads)
 
     # --- internal -----------------------------------------------------------------------------------------------------
 

@@ -17,8 +17,8 @@ from iris_session.protocol.common import Vec3
 from iris_session.protocol.names import ArrayKind, GeometryKind
 from iris_session.protocol.scene import Geometry, SceneSpec, Visual
 from iris_session.scene.arrays import decode_arrays
-from iris_session.scene.elements import to_matrix, to_vec3
 from iris_session.scene.meshes import decode_mesh
+from iris_session.scene.nodes import to_matrix, to_vec3
 
 #: Larger than any part or robot and most rooms [m]; a part of a centimetre with a file in millimetres is larger.
 LARGEST_M: Final = 10.0

@@ -27,11 +27,11 @@ from iris_session.protocol.names import ArrayKind, AssetEncoding, Follow, LightK
 from iris_session.protocol.scene import Body, Camera, Light, SceneSpec, Visual
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.cube_maps import CUBE_SIDE, CubeMap, CubeMapReader, bake_cube_map, direction_scale
-from iris_session.scene.elements import compose_poses, to_vec3
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.mesh_processing import normalise
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
+from iris_session.scene.nodes import compose_poses, to_vec3
 from iris_session.scene.shapes import (
     add_texture_coordinates,
     build_height_field,

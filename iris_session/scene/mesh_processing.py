@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Rgba
-from iris_session.scene.elements import Matrix
 from iris_session.scene.meshes import MeshArrays, find_unique_rows, index_corners
+from iris_session.scene.nodes import Matrix
 
 #: A corner whose smooth normal is farther than this (cosine) from the face's gets the face's: MuJoCo's rule for meshes.
 CREASE: Final = 0.8

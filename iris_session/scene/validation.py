@@ -20,12 +20,12 @@ from iris_session.protocol.common import IDENTITY, Pose, Quat, Vec3
 from iris_session.protocol.names import TextureRole
 from iris_session.protocol.scene import Rgba
 from iris_session.scene.arrays import to_array
-from iris_session.scene.elements import GREY, MAX_TRIANGLES, Appearance, TextureImage
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import check_pixels, read_pixels
 from iris_session.scene.importers.references import read_bounded
 from iris_session.scene.mesh_processing import compute_creased_normals, normalise
 from iris_session.scene.meshes import MeshArrays, index_corners
+from iris_session.scene.nodes import GREY, MAX_TRIANGLES, Appearance, TextureImage
 
 
 def parse_appearance(

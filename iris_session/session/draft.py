@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from iris_session.protocol.common import Pose
 from iris_session.scene import SceneBuildError
-from iris_session.scene.composed import ComposedScene, Joint
+from iris_session.scene.result import ComposedScene, Joint
 from iris_session.session.errors import PublishError, short_repr
 
 #: Farthest coordinate [m]. Beyond it units are wrong, and the stream's error bound does not hold.

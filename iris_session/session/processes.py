@@ -38,7 +38,7 @@ from iris_session.recording import (
 from iris_session.recording.environment import describe_environment, read_boot_id
 from iris_session.recording.feed import SILENCE_S
 from iris_session.recording.folders import check_new_recording
-from iris_session.scene.composed import ComposedScene
+from iris_session.scene.result import ComposedScene
 from iris_session.session.cameras import SessionCameras
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import SessionCore

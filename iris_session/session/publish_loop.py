@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from iris_session.physics.carrier import Carrier
 from iris_session.protocol.entries import ExternalReset
 from iris_session.protocol.status import NOT_PUBLISHED
-from iris_session.scene.composed import ComposedScene
+from iris_session.scene.result import ComposedScene
 from iris_session.session.deformables import DeformableSourceMesh
 from iris_session.session.draft import Frame
 from iris_session.session.errors import OwnershipError

@@ -28,7 +28,7 @@ from iris_session.physics.carrier import Carrier
 from iris_session.protocol.entries import EntryMessage
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.composed import ComposedScene
+from iris_session.scene.result import ComposedScene
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import make_session_core
 from iris_session.session.draft import SceneDraft

@@ -28,8 +28,8 @@ from iris_session.protocol.scene import (
     merge_patches,
 )
 from iris_session.scene import AssetStore, Hold, SceneBuildError
-from iris_session.scene.composed import ComposedScene
 from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene.result import ComposedScene
 
 #: Specifications of patches that are kept: more than can be pending for the loop, and as long as a slow disk may need
 #: to read them for the recording. A session that is patched ten times a second must not fill the disk.

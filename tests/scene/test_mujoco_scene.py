@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from iris_session.physics import World
 from iris_session.protocol.scene import SceneError, SceneSpec, decode_scene, encode_scene, list_assets
 from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
-from iris_session.scene.elements import to_matrix
 from iris_session.scene.mujoco_scene import ParsedScene, parse_mujoco
+from iris_session.scene.nodes import to_matrix
 from tests.scene.models import every_shape, flexes
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import Body, SceneSpec
-from iris_session.scene.composed import ArticulatedBody, Articulation, ComposedScene, DeformableSource, Joint
+from iris_session.scene.result import ArticulatedBody, Articulation, ComposedScene, DeformableSource, Joint
 from iris_session.streams.deformable_topology import DeformableTopology
 
 UNIT = (1.0, 0.0, 0.0, 0.0)

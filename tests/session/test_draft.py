@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.scene.composed import ArticulatedBody, Articulation, Joint
+from iris_session.scene.result import ArticulatedBody, Articulation, Joint
 from iris_session.session.draft import MAX_WARNINGS, SceneDraft
 from iris_session.session.errors import PublishError
 from tests.session.published import CLOTH, MOVING, UNIT, composed

@@ -2,5 +2,5 @@
 
 `files.load_file` reads any mesh file into nodes, `urdf.read_urdf` a robot into an articulation and drawn items. Both
 check sizes, counts and paths before a library sees untrusted bytes. Not here: MuJoCo models (`mujoco_scene`), and how
-nodes become a scene (`builder`, `assembly`).
+nodes become a scene (`builder`, `build`).
 """

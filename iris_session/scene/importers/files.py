@@ -11,9 +11,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from iris_session.scene.elements import LoadedFile
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.references import References
+from iris_session.scene.nodes import LoadedFile
 
 #: Suffixes that `load_file` reads; the others of trimesh are point clouds, general archives, or very rare.
 _GLTF: Final = ("glb", "gltf")

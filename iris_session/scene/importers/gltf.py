@@ -23,7 +23,12 @@ from numpy.typing import NDArray
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.names import ColorSpace, LightKind, TextureRole
 from iris_session.protocol.scene import Camera, Light, Rgb, Rgba
-from iris_session.scene.elements import (
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.images import PixelBudget, Pixels, drop_alpha, read_pixels
+from iris_session.scene.importers.references import References, read_bounded
+from iris_session.scene.mesh_processing import add_back_sides, merge_vertex_color, normalise
+from iris_session.scene.meshes import MeshArrays, index_corners
+from iris_session.scene.nodes import (
     MAX_FILE_BYTES,
     MAX_NODES,
     MAX_TRIANGLES,
@@ -35,11 +40,6 @@ from iris_session.scene.elements import (
     TextureImage,
     truncate_name,
 )
-from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.images import PixelBudget, Pixels, drop_alpha, read_pixels
-from iris_session.scene.importers.references import References, read_bounded
-from iris_session.scene.mesh_processing import add_back_sides, merge_vertex_color, normalise
-from iris_session.scene.meshes import MeshArrays, index_corners
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _LIGHTS: Final = {

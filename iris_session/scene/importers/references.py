@@ -21,8 +21,8 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Final
 
-from iris_session.scene.elements import MAX_FILE_BYTES
 from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.nodes import MAX_FILE_BYTES
 
 #: Number of parent folders that are searched for a package.
 _UP: Final = 8

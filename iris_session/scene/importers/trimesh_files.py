@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.names import TextureRole
 from iris_session.protocol.scene import Rgba
-from iris_session.scene.elements import (
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.images import PixelBudget, to_pixels
+from iris_session.scene.importers.mesh_validation import CHECKS, absolute_corners
+from iris_session.scene.importers.references import References, read_bounded
+from iris_session.scene.importers.xml_files import check_3mf, check_dae
+from iris_session.scene.mesh_processing import compute_creased_normals, merge_vertex_color, normalise
+from iris_session.scene.meshes import find_unique_rows, index_corners
+from iris_session.scene.nodes import (
     GREY,
     MAX_NODES,
     MAX_TRIANGLES,
@@ -28,13 +35,6 @@ from iris_session.scene.elements import (
     TextureImage,
     truncate_name,
 )
-from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.images import PixelBudget, to_pixels
-from iris_session.scene.importers.mesh_validation import CHECKS, absolute_corners
-from iris_session.scene.importers.references import References, read_bounded
-from iris_session.scene.importers.xml_files import check_3mf, check_dae
-from iris_session.scene.mesh_processing import compute_creased_normals, merge_vertex_color, normalise
-from iris_session.scene.meshes import find_unique_rows, index_corners
 
 _UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
 _USED: Final = re.compile(rb"^[ \t]*usemtl[ \t]+(\S[^\r\n]*)", re.MULTILINE)

@@ -13,10 +13,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.scene.composed import Joint
-from iris_session.scene.elements import Matrix
 from iris_session.scene.extent import LARGEST_M, SMALLEST_M, find_unit_mistake, format_length
 from iris_session.scene.meshes import MeshArrays
+from iris_session.scene.nodes import Matrix
+from iris_session.scene.result import Joint
 
 #: Limits of a joint that are hardly radians: more than three turns one way [rad], and at most 2.5 turns in degrees.
 #: Larger values are a common way to write "no limit".

@@ -20,8 +20,6 @@ import numpy as np
 from iris_session.protocol.common import Pose, Vec3
 from iris_session.protocol.names import GeometryKind, TextureRole
 from iris_session.protocol.scene import Rgba
-from iris_session.scene.composed import ArticulatedBody, Articulation, Joint
-from iris_session.scene.elements import Appearance, DrawnItem, LoadedFile, Matrix, TextureImage, to_pose, truncate_name
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, read_pixels
 from iris_session.scene.importers.files import (
@@ -43,6 +41,8 @@ from iris_session.scene.importers.units import (
     robot_question,
 )
 from iris_session.scene.importers.xml_files import no_xml
+from iris_session.scene.nodes import Appearance, DrawnItem, LoadedFile, Matrix, TextureImage, to_pose, truncate_name
+from iris_session.scene.result import ArticulatedBody, Articulation, Joint
 
 #: Joints with several degrees of freedom: their links are moved as bodies, not by joint positions.
 _LOOSE: Final = frozenset({"floating", "planar"})

@@ -11,8 +11,8 @@ import zipfile
 from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
-from iris_session.scene.elements import MAX_FILE_BYTES, MAX_NODES, MAX_TRIANGLES
 from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.nodes import MAX_FILE_BYTES, MAX_NODES, MAX_TRIANGLES
 
 #: Encodings in which the text that is searched for here has the bytes of ASCII.
 _PLAIN: Final = frozenset(

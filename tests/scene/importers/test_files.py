@@ -14,10 +14,10 @@ from PIL import Image
 
 from iris_session.scene import AssetStore, SceneBuildError, decode_image, decode_mesh
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.composed import ComposedScene
-from iris_session.scene.elements import MAX_FILE_BYTES, to_matrix
 from iris_session.scene.importers.files import load_file
 from iris_session.scene.importers.references import References
+from iris_session.scene.nodes import MAX_FILE_BYTES, to_matrix
+from iris_session.scene.result import ComposedScene
 
 PIXELS = np.random.default_rng(2).integers(0, 255, (4, 8, 3), dtype=np.uint8)
 OBJ = """mtllib parts.mtl

@@ -16,8 +16,8 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import SceneSpec
 from iris_session.scene import AssetStore, SceneBuildError, decode_image, decode_mesh
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.elements import to_matrix
 from iris_session.scene.glb import write_glb
+from iris_session.scene.nodes import to_matrix
 from tests.scene.documents import SQUARE, SQUARE_UV, Document
 
 RNG = np.random.default_rng(3)

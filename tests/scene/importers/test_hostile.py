@@ -88,7 +88,7 @@ def test_accessors_without_bytes_are_bounded(tmp_path: Path) -> None:
 
 
 def test_copies_in_many_scales_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("iris_session.scene.assembly.MAX_TRIANGLES", 10)
+    monkeypatch.setattr("iris_session.scene.build.MAX_TRIANGLES", 10)
     for alike in (True, False):
         document = Document()
         document.square()

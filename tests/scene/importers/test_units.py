@@ -9,8 +9,8 @@ import trimesh
 
 from iris_session.scene import AssetStore
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.composed import Joint
 from iris_session.scene.importers.units import Drawn, colour_question, degrees_question, file_question, robot_question
+from iris_session.scene.result import Joint
 
 MM = "in millimetres where metres are meant?"
 OFTEN = "divided by 1,000 once too often?"

@@ -1,4 +1,4 @@
-"""Assembly of scenes: the content that a `SceneBuilder` has collected (`SceneContent`), and `assemble_scene`, which
+"""Assembly of scenes: the content that a `SceneBuilder` has collected (`SceneContent`), and `build_scene`, which
 makes the specification.
 
 Every body, mesh, texture and material gets a number; equal ones share it. Assets go to the store. The order of all
@@ -40,8 +40,12 @@ from iris_session.protocol.scene import (
 )
 from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions, MeshNote, Work
 from iris_session.scene.budget import add_totals
-from iris_session.scene.composed import Articulation, ComposedScene, DeformableSource
-from iris_session.scene.elements import (
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.extent import compute_box_extent
+from iris_session.scene.importers.urdf import Robot
+from iris_session.scene.mesh_processing import scale_mesh
+from iris_session.scene.meshes import MeshArrays, encode_deformable
+from iris_session.scene.nodes import (
     MAX_TRIANGLES,
     Appearance,
     DrawnItem,
@@ -55,11 +59,7 @@ from iris_session.scene.elements import (
     to_pose,
     to_vec3,
 )
-from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.extent import compute_box_extent
-from iris_session.scene.importers.urdf import Robot
-from iris_session.scene.mesh_processing import scale_mesh
-from iris_session.scene.meshes import MeshArrays, encode_deformable
+from iris_session.scene.result import Articulation, ComposedScene, DeformableSource
 from iris_session.streams.deformable_topology import DeformableTopology
 
 #: Minimum viewing distance [m], and viewing distance in extents of the scene.
@@ -70,7 +70,7 @@ _FACES: Final = 6
 MAX_COORDINATE_M: Final = 1e6
 
 
-def assemble_scene(
+def build_scene(
     world: SceneContent, environment: Environment | None, store: AssetStore, options: EncodeOptions | None, threads: int
 ) -> ComposedScene:
     """Build the specification and its assets. Raises `SceneBuildError`."""
