@@ -41,7 +41,7 @@ from iris_session.protocol.scene import (
 from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions, MeshNote, Work
 from iris_session.scene.budget import add_totals
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.extent import compute_box_extent
+from iris_session.scene.extent import compute_box_extent, format_unit_hint, largest_mesh_side
 from iris_session.scene.importers.urdf import Robot
 from iris_session.scene.mesh_processing import scale_mesh
 from iris_session.scene.meshes import MeshArrays, encode_deformable
@@ -66,6 +66,7 @@ from iris_session.streams.deformable_topology import DeformableTopology
 _FAR: Final = 50.0
 _FAR_EXTENTS: Final = 10.0
 _FACES: Final = 6
+_SCALE_ADVICE: Final = "scale={factor} (--scale {factor}), times the present one,"
 #: Maximum coordinate of a vertex in its own frame [m]. Larger ones are a mistake of units, and too large for float32.
 MAX_COORDINATE_M: Final = 1e6
 
@@ -112,6 +113,7 @@ def build_scene(
     if skybox >= 0:
         surroundings = msgspec.structs.replace(surroundings, skybox=skybox)
     spec = msgspec.structs.replace(spec, environment=surroundings)
+    unit_hint = format_unit_hint(largest_mesh_side(spec), _SCALE_ADVICE)
     return ComposedScene(
         spec=spec,
         scene_hash=store.put(_encode_checked(spec)),
@@ -120,7 +122,7 @@ def build_scene(
         articulations=dict(world.articulations),
         deformables={source.name: source for source in sources},
         skipped=tuple(world.skipped),
-        notes=tuple(world.notes),
+        notes=(f"the largest mesh is {unit_hint}",) if unit_hint else (),
         built=builder.built,
         recalled=builder.recalled,
     )
@@ -374,12 +376,11 @@ class SceneContent:
     skybox: TextureImage | None = None
     names: set[str] = field(default_factory=set)
     skipped: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
 
     @contextmanager
     def atomic(self) -> Iterator[None]:
         """Undo everything that was added in this context when it raises."""
-        lists: tuple[list[Any], ...] = (self.bodies, self.items, self.lights, self.cameras, self.skipped, self.notes)
+        lists: tuple[list[Any], ...] = (self.bodies, self.items, self.lights, self.cameras, self.skipped)
         lengths, names = [len(one) for one in lists], self.names.copy()
         try:
             yield
@@ -393,10 +394,6 @@ class SceneContent:
         """Add lines on what clients will not see, each once."""
         self.skipped += dict.fromkeys(text for text in texts if text not in self.skipped)
 
-    def add_notes(self, texts: tuple[str, ...]) -> None:
-        """Add lines on likely mistakes, each once."""
-        self.notes += dict.fromkeys(text for text in texts if text not in self.notes)
-
     def add_robot(self, robot: Robot) -> None:
         """Add an articulation with its bodies, joints at rest."""
         articulation = robot.articulation
@@ -407,7 +404,6 @@ class SceneContent:
         self.articulations[articulation.name] = articulation
         self.names.update((articulation.name, *articulation.bodies))
         self.add_skipped(robot.skipped)
-        self.add_notes(robot.notes)
 
     def add_nodes(
         self, loaded: LoadedFile, body: int, T_body_file: Matrix, look: Appearance | None, *, flat: bool

@@ -9,10 +9,9 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Sequence
 from os import PathLike
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import IDENTITY, Vec3
@@ -24,11 +23,13 @@ from iris_session.scene.asset_builder import EncodeOptions
 from iris_session.scene.build import ComposedBody, ComposedDeformable, SceneContent, build_scene
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.files import load_file
-from iris_session.scene.importers.units import file_question, measure_side
 from iris_session.scene.importers.urdf import read_urdf
 from iris_session.scene.nodes import GREY, Appearance, DrawnItem, Matrix, TextureImage, to_matrix, truncate_name
 from iris_session.scene.result import ComposedScene
 from iris_session.scene.validation import (
+    AppearanceOptions,
+    DrawingOptions,
+    Placement,
     check_mesh,
     check_number,
     check_numbers,
@@ -38,6 +39,7 @@ from iris_session.scene.validation import (
     check_triangles,
     check_vertices,
     parse_appearance,
+    parse_options,
 )
 from iris_session.streams.deformable_topology import MAX_VERTICES
 
@@ -56,14 +58,14 @@ class SceneBuilder:
     content may have any name or none. A wrong argument raises `SceneBuildError`, whose message says what would be
     right, and adds nothing.
 
-    Placement, arguments of methods that add shapes, meshes and files:
+    Placement of shapes, meshes and files, as keyword arguments:
 
         position: Position [m] in the world, or in the frame of `on`.
         quaternion: Orientation `(w, x, y, z)`, likewise.
         movable: Publish its pose under its name; otherwise it is static.
         on: Name of a movable body or of a body of an articulation to fix it to.
 
-    Appearance, arguments of the same methods and of `add_deformable`, as in `protocol.scene.Material`:
+    Appearance of the same and of deformables, as keyword arguments, as in `protocol.scene.Material`:
 
         rgba: Colour, 3 or 4 numbers from 0 to 1.
         texture: Path of an image, or pixels (height, width, 1, 3 or 4) uint8, first row on top; multiplied with
@@ -106,115 +108,60 @@ class SceneBuilder:
         name: str = "",
         *,
         half_size: Sequence[float],
-        position: Sequence[float] = IDENTITY.p,
-        quaternion: Sequence[float] = IDENTITY.q,
-        movable: bool = False,
-        on: str = "",
-        rgba: Sequence[float] | None = None,
-        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
-        metallic: float | None = None,
-        roughness: float | None = None,
-        emission: float | None = None,
-        specular: float | None = None,
-        shininess: float | None = None,
-        repeat: Sequence[float] = (1.0, 1.0),
-        uniform: bool = False,
+        **options: Unpack[DrawingOptions],
     ) -> str:
         """Add a box centred on its frame.
 
         Args:
             name: Name; a movable body needs a unique one.
             half_size: Half lengths along x, y, z [m].
-            position, quaternion, movable, on: Placement; see the class.
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
-                class.
+            **options: Placement and appearance; see the class.
 
         Raises:
-            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+            SceneBuildError: An argument is wrong. Nothing is added.
         """
         size = check_numbers("half_size", half_size, 3, above=0.0)
-        appearance = parse_appearance(
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
-        )
-        return self._add_shape(GeometryKind.BOX, name, size, appearance, position, quaternion, movable=movable, on=on)
+        return self._add_shape(GeometryKind.BOX, name, size, options)
 
     def add_sphere(
         self,
         name: str = "",
         *,
         radius: float,
-        position: Sequence[float] = IDENTITY.p,
-        quaternion: Sequence[float] = IDENTITY.q,
-        movable: bool = False,
-        on: str = "",
-        rgba: Sequence[float] | None = None,
-        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
-        metallic: float | None = None,
-        roughness: float | None = None,
-        emission: float | None = None,
-        specular: float | None = None,
-        shininess: float | None = None,
-        repeat: Sequence[float] = (1.0, 1.0),
-        uniform: bool = False,
+        **options: Unpack[DrawingOptions],
     ) -> str:
         """Add a sphere.
 
         Args:
             name: Name; a movable body needs a unique one.
             radius: Radius [m].
-            position, quaternion, movable, on: Placement; see the class.
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
-                class.
+            **options: Placement and appearance; see the class.
 
         Raises:
-            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+            SceneBuildError: An argument is wrong. Nothing is added.
         """
         size = check_number("radius", radius, above=0.0) * 3
-        appearance = parse_appearance(
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
-        )
-        return self._add_shape(
-            GeometryKind.SPHERE, name, size, appearance, position, quaternion, movable=movable, on=on
-        )
+        return self._add_shape(GeometryKind.SPHERE, name, size, options)
 
     def add_ellipsoid(
         self,
         name: str = "",
         *,
         half_size: Sequence[float],
-        position: Sequence[float] = IDENTITY.p,
-        quaternion: Sequence[float] = IDENTITY.q,
-        movable: bool = False,
-        on: str = "",
-        rgba: Sequence[float] | None = None,
-        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
-        metallic: float | None = None,
-        roughness: float | None = None,
-        emission: float | None = None,
-        specular: float | None = None,
-        shininess: float | None = None,
-        repeat: Sequence[float] = (1.0, 1.0),
-        uniform: bool = False,
+        **options: Unpack[DrawingOptions],
     ) -> str:
         """Add an ellipsoid.
 
         Args:
             name: Name; a movable body needs a unique one.
             half_size: Half axes along x, y, z [m].
-            position, quaternion, movable, on: Placement; see the class.
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
-                class.
+            **options: Placement and appearance; see the class.
 
         Raises:
-            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+            SceneBuildError: An argument is wrong. Nothing is added.
         """
         size = check_numbers("half_size", half_size, 3, above=0.0)
-        appearance = parse_appearance(
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
-        )
-        return self._add_shape(
-            GeometryKind.ELLIPSOID, name, size, appearance, position, quaternion, movable=movable, on=on
-        )
+        return self._add_shape(GeometryKind.ELLIPSOID, name, size, options)
 
     def add_capsule(
         self,
@@ -222,19 +169,7 @@ class SceneBuilder:
         *,
         radius: float,
         half_length: float,
-        position: Sequence[float] = IDENTITY.p,
-        quaternion: Sequence[float] = IDENTITY.q,
-        movable: bool = False,
-        on: str = "",
-        rgba: Sequence[float] | None = None,
-        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
-        metallic: float | None = None,
-        roughness: float | None = None,
-        emission: float | None = None,
-        specular: float | None = None,
-        shininess: float | None = None,
-        repeat: Sequence[float] = (1.0, 1.0),
-        uniform: bool = False,
+        **options: Unpack[DrawingOptions],
     ) -> str:
         """Add a capsule along z: a cylinder with half spheres beyond its ends.
 
@@ -242,20 +177,13 @@ class SceneBuilder:
             name: Name; a movable body needs a unique one.
             radius: Radius [m].
             half_length: Half length of the cylinder [m].
-            position, quaternion, movable, on: Placement; see the class.
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
-                class.
+            **options: Placement and appearance; see the class.
 
         Raises:
-            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+            SceneBuildError: An argument is wrong. Nothing is added.
         """
         size = check_numbers("radius and half_length", [radius, radius, half_length], 3, above=0.0)
-        appearance = parse_appearance(
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
-        )
-        return self._add_shape(
-            GeometryKind.CAPSULE, name, size, appearance, position, quaternion, movable=movable, on=on
-        )
+        return self._add_shape(GeometryKind.CAPSULE, name, size, options)
 
     def add_cylinder(
         self,
@@ -263,19 +191,7 @@ class SceneBuilder:
         *,
         radius: float,
         half_length: float,
-        position: Sequence[float] = IDENTITY.p,
-        quaternion: Sequence[float] = IDENTITY.q,
-        movable: bool = False,
-        on: str = "",
-        rgba: Sequence[float] | None = None,
-        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
-        metallic: float | None = None,
-        roughness: float | None = None,
-        emission: float | None = None,
-        specular: float | None = None,
-        shininess: float | None = None,
-        repeat: Sequence[float] = (1.0, 1.0),
-        uniform: bool = False,
+        **options: Unpack[DrawingOptions],
     ) -> str:
         """Add a cylinder along z.
 
@@ -283,60 +199,36 @@ class SceneBuilder:
             name: Name; a movable body needs a unique one.
             radius: Radius [m].
             half_length: Half length [m].
-            position, quaternion, movable, on: Placement; see the class.
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
-                class.
+            **options: Placement and appearance; see the class.
 
         Raises:
-            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+            SceneBuildError: An argument is wrong. Nothing is added.
         """
         size = check_numbers("radius and half_length", [radius, radius, half_length], 3, above=0.0)
-        appearance = parse_appearance(
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
-        )
-        return self._add_shape(
-            GeometryKind.CYLINDER, name, size, appearance, position, quaternion, movable=movable, on=on
-        )
+        return self._add_shape(GeometryKind.CYLINDER, name, size, options)
 
     def add_plane(
         self,
         name: str = "",
         *,
         half_size: Sequence[float] = (0.0, 0.0),
-        position: Sequence[float] = IDENTITY.p,
-        quaternion: Sequence[float] = IDENTITY.q,
-        movable: bool = False,
-        on: str = "",
-        rgba: Sequence[float] | None = None,
-        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
-        metallic: float | None = None,
-        roughness: float | None = None,
-        emission: float | None = None,
-        specular: float | None = None,
-        shininess: float | None = None,
-        repeat: Sequence[float] = (1.0, 1.0),
-        uniform: bool = False,
+        **options: Unpack[DrawingOptions],
     ) -> str:
         """Add a rectangle in the plane z = 0, visible from +z.
 
         Args:
             name: Name; a movable body needs a unique one.
             half_size: Half lengths along x, y [m]; 0 is endless.
-            position, quaternion, movable, on: Placement; see the class.
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
-                class.
+            **options: Placement and appearance; see the class.
 
         Raises:
-            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+            SceneBuildError: An argument is wrong. Nothing is added.
         """
         x, y = check_numbers("half_size", half_size, 2)
         if x < 0 or y < 0:
             raise SceneBuildError(f"half_size of a plane is {tuple(half_size)}: expected lengths, or 0 for endless")
         size = (x, y, 1.0)
-        appearance = parse_appearance(
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
-        )
-        return self._add_shape(GeometryKind.PLANE, name, size, appearance, position, quaternion, movable=movable, on=on)
+        return self._add_shape(GeometryKind.PLANE, name, size, options)
 
     def add_mesh(
         self,
@@ -347,19 +239,7 @@ class SceneBuilder:
         normals: Any = None,
         uvs: Any = None,
         colors: Any = None,
-        position: Sequence[float] = IDENTITY.p,
-        quaternion: Sequence[float] = IDENTITY.q,
-        movable: bool = False,
-        on: str = "",
-        rgba: Sequence[float] | None = None,
-        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
-        metallic: float | None = None,
-        roughness: float | None = None,
-        emission: float | None = None,
-        specular: float | None = None,
-        shininess: float | None = None,
-        repeat: Sequence[float] = (1.0, 1.0),
-        uniform: bool = False,
+        **options: Unpack[DrawingOptions],
     ) -> str:
         """Add a mesh given as arrays.
 
@@ -370,18 +250,16 @@ class SceneBuilder:
             normals: Shape (n, 3); computed by default.
             uvs: Texture coordinates, shape (n, 2), v down.
             colors: Vertex colours, shape (n, 3 or 4), uint8.
-            position, quaternion, movable, on: Placement; see the class.
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
-                class.
+            **options: Placement and appearance; see the class.
 
         Raises:
-            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+            SceneBuildError: An argument is wrong. Nothing is added.
         """
         mesh = check_mesh(f"mesh {reprlib.repr(name)}", vertices, triangles, normals, uvs, colors)
-        appearance = parse_appearance(
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
-        ) or Appearance(rgba=(1.0, 1.0, 1.0, 1.0) if colors is not None else GREY)
-        body, matrix = self._place(name, position, quaternion, movable=movable, on=on)
+        placement, appearance = parse_options(options)
+        if appearance is None:
+            appearance = Appearance(rgba=(1.0, 1.0, 1.0, 1.0) if colors is not None else GREY)
+        body, matrix = self._place(name, placement)
         self._content.items.append(DrawnItem(body, truncate_name(name), matrix, appearance, mesh))
         return name
 
@@ -395,21 +273,9 @@ class SceneBuilder:
         up: str | None = None,
         package_dirs: Sequence[str | PathLike[str]] = (),
         name: str = "",
-        position: Sequence[float] = IDENTITY.p,
-        quaternion: Sequence[float] = IDENTITY.q,
-        movable: bool = False,
-        on: str = "",
-        rgba: Sequence[float] | None = None,
-        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
-        metallic: float | None = None,
-        roughness: float | None = None,
-        emission: float | None = None,
-        specular: float | None = None,
-        shininess: float | None = None,
-        repeat: Sequence[float] = (1.0, 1.0),
-        uniform: bool = False,
+        **options: Unpack[DrawingOptions],
     ) -> str:
-        """Add a glTF, GLB, OBJ, STL, PLY, OFF, DAE or 3MF file.
+        """Add a glTF, GLB, OBJ, STL, PLY, OFF or DAE file.
 
         Nodes of a static file become bodies of the scene; a movable file is one body. If any argument of appearance is
         given, it replaces all materials of the file.
@@ -421,9 +287,7 @@ class SceneBuilder:
                 unless the file says otherwise.
             package_dirs: Folders that the file may refer into.
             name: Name; by default the stem of the file name.
-            position, quaternion, movable, on: Placement; see the class.
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
-                class.
+            **options: Placement and appearance; see the class.
 
         Returns:
             The name.
@@ -448,14 +312,10 @@ class SceneBuilder:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
         T_up_file = _FROM_Y_UP if up_axis == "y" else np.eye(4)
         T_body_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ T_up_file
-        appearance = parse_appearance(
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
-        )
+        placement, appearance = parse_options(options)
         with self._content.atomic(), np.errstate(all="ignore"):  # poses that are not finite are refused
-            body, T_parent_body = self._place(name, position, quaternion, movable=movable, on=on, named=True)
+            body, T_parent_body = self._place(name, placement, named=True)
             self._content.add_nodes(loaded, body, T_parent_body @ T_body_file, appearance, flat=self._is_moving(body))
-            placed = [(surface.mesh, T_body_file @ node.matrix) for node in loaded.nodes for surface in node.surfaces]
-            self._content.add_notes(file_question(where.name, measure_side(placed), factors))
         return name
 
     def add_urdf(
@@ -509,15 +369,7 @@ class SceneBuilder:
         uvs: Any = None,
         radius: float = 0.005,
         flat: bool = False,
-        rgba: Sequence[float] | None = None,
-        texture: str | PathLike[str] | NDArray[np.uint8] | None = None,
-        metallic: float | None = None,
-        roughness: float | None = None,
-        emission: float | None = None,
-        specular: float | None = None,
-        shininess: float | None = None,
-        repeat: Sequence[float] = (1.0, 1.0),
-        uniform: bool = False,
+        **appearance: Unpack[AppearanceOptions],
     ) -> str:
         """Add a mesh whose vertices are published: a surface of triangles, or ropes of edges.
 
@@ -529,11 +381,10 @@ class SceneBuilder:
             uvs: Texture coordinates, shape (n, 2), v down.
             radius: Radius of ropes [m].
             flat: Draw one normal per face.
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform: Appearance; see the
-                class.
+            **appearance: Appearance; see the class.
 
         Raises:
-            SceneBuildError: An argument is wrong; the message names it and says what would be right. Nothing is added.
+            SceneBuildError: An argument is wrong. Nothing is added.
         """
         self._check_new_name(name)
         if len(self._content.deformables) >= MAX_STREAMS:
@@ -551,12 +402,10 @@ class SceneBuilder:
         what, given, width = ("triangles", triangles, 3) if edges is None else ("edges", edges, 2)
         elements = check_triangles(f"{what} of {whose}", given, len(points), width)
         (half,) = check_number("radius", radius, above=0.0)
-        appearance = parse_appearance(
-            rgba, texture, metallic, roughness, emission, specular, shininess, repeat, uniform=uniform
-        )
+        look = parse_appearance(appearance)
         uv = None if uvs is None else check_vertices(f"uvs of {whose}", uvs, 2, len(points))
         self._content.deformables.append(
-            ComposedDeformable(name, points, elements, uv, half, flat, appearance or Appearance())
+            ComposedDeformable(name, points, elements, uv, half, flat, look or Appearance())
         )
         self._content.names.add(name)
         return name
@@ -685,57 +534,32 @@ class SceneBuilder:
 
     # --- internal -----------------------------------------------------------------------------------------------------
 
-    def _add_shape(
-        self,
-        kind: str,
-        name: str,
-        size: tuple[float, ...],
-        appearance: Appearance | None,
-        position: Sequence[float],
-        quaternion: Sequence[float],
-        *,
-        movable: bool,
-        on: str,
-    ) -> str:
-        body, matrix = self._place(name, position, quaternion, movable=movable, on=on)
-        item = DrawnItem(
-            body,
-            truncate_name(name),
-            matrix,
-            appearance or Appearance(),
-            kind=kind,
-            size=(size[0], size[1], size[2]),
+    def _add_shape(self, kind: str, name: str, size: tuple[float, ...], options: DrawingOptions) -> str:
+        placement, appearance = parse_options(options)
+        body, matrix = self._place(name, placement)
+        x, y, z = size
+        self._content.items.append(
+            DrawnItem(body, truncate_name(name), matrix, appearance or Appearance(), kind=kind, size=(x, y, z))
         )
-        self._content.items.append(item)
         return name
 
-    def _place(
-        self,
-        name: str,
-        position: Sequence[float],
-        quaternion: Sequence[float],
-        *,
-        movable: bool,
-        on: str,
-        named: bool = False,
-    ) -> tuple[int, Matrix]:
+    def _place(self, name: str, placement: Placement, *, named: bool = False) -> tuple[int, Matrix]:
         """Return the index of the body to add to (-1: the world), created if movable or `named`, and T_body_item."""
         if not isinstance(name, str):
             raise SceneBuildError(f"name is {name!r}: text is expected, '' for no name")
-        T = check_pose(position, quaternion)
-        if on and movable:
-            raise SceneBuildError(f"{name!r} is to be movable and on {on!r}: one of both")
-        if on:
-            return self._find_movable(on), to_matrix(T)
-        if movable:
+        if placement.on and placement.movable:
+            raise SceneBuildError(f"{name!r} is to be movable and on {placement.on!r}: one of both")
+        if placement.on:
+            return self._find_movable(placement.on), to_matrix(placement.pose)
+        if placement.movable:
             self._check_new_name(name)
             if name == _WORLD:
                 raise SceneBuildError(f"name is {name!r}: that is the frame that all is in, give name= another one")
             self._content.names.add(name)
-        if movable or named:
-            self._content.bodies.append(ComposedBody(truncate_name(name), -1, T, movable))
+        if placement.movable or named:
+            self._content.bodies.append(ComposedBody(truncate_name(name), -1, placement.pose, placement.movable))
             return len(self._content.bodies) - 1, np.eye(4)
-        return -1, to_matrix(T)
+        return -1, to_matrix(placement.pose)
 
     def _is_moving(self, body: int) -> bool:
         return body >= 0 and self._content.bodies[body].moving

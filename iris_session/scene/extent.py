@@ -21,9 +21,9 @@ from iris_session.scene.meshes import decode_mesh
 from iris_session.scene.nodes import to_matrix, to_vec3
 
 #: Larger than any part or robot and most rooms [m]; a part of a centimetre with a file in millimetres is larger.
-LARGEST_M: Final = 10.0
+_LARGEST_M: Final = 10.0
 #: Too small to be seen or grasped [m]; a part of two metres that was divided by 1,000 once too often is smaller.
-SMALLEST_M: Final = 0.002
+_SMALLEST_M: Final = 0.002
 Points = NDArray[Any]
 
 
@@ -97,26 +97,17 @@ def largest_mesh_side(spec: SceneSpec) -> float:
     return max((b - a for box in boxes for a, b in zip(box.low, box.high, strict=True)), default=0.0)
 
 
-def find_unit_mistake(side_m: float) -> tuple[float, str] | None:
-    """Return the likely mistake of units behind a longest side: the factor that corrects it, and a description.
-
-    `None` where the side is plausible.
-    """
-    if side_m > LARGEST_M:
-        return 1e-3, "in millimetres where metres are meant?"
-    if 0.0 < side_m < SMALLEST_M:
-        return 1e3, "divided by 1,000 once too often?"
-    return None
-
-
 def format_unit_hint(side_m: float, remedy: str) -> str:
-    """Return the likely mistake of units as a line, empty without one. `remedy`: correction, with `{factor}` for the
-    factor.
+    """Return the likely mistake of units behind a longest side as a line, empty where the side is plausible.
+
+    `remedy`: correction, with `{factor}` for the factor.
     """
-    mistake = find_unit_mistake(side_m)
-    if mistake is None:
+    if side_m > _LARGEST_M:
+        factor, what = 1e-3, "in millimetres where metres are meant?"
+    elif 0.0 < side_m < _SMALLEST_M:
+        factor, what = 1e3, "divided by 1,000 once too often?"
+    else:
         return ""
-    factor, what = mistake
     remedied = remedy.format(factor=f"{factor:g}")
     return f"{format_length(side_m)} large: {what} {remedied} makes it {format_length(side_m * factor)}"
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from anchors.lie import quat_from_matrix, quat_to_matrix
 from anchors.pose import compose
 from iris_session.protocol.common import MAX_TEXT, Pose, Vec3
-from iris_session.protocol.names import ColorSpace, GeometryKind, TextureKind
+from iris_session.protocol.names import ColorSpace, GeometryKind, TextureKind, TextureRole
 from iris_session.protocol.scene import Camera, Light, Rgba, Vec2
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import Pixels
@@ -44,6 +44,11 @@ class TextureImage:
     name: str = ""
     kind: str = TextureKind.IMAGE
     colorspace: str = ColorSpace.AUTO
+
+
+def color_images(image: TextureImage) -> tuple[tuple[str, TextureImage], ...]:
+    """Return an image as the colour of an appearance."""
+    return ((TextureRole.RGBA if image.pixels.shape[2] == 4 else TextureRole.RGB, image),)
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,7 +52,7 @@ class ComposedScene:
         articulations: Articulations by name.
         deformables: Deformables by name.
         skipped: Content that clients will not see, one line each.
-        notes: Likely mistakes of units, one line each, with the correction.
+        notes: A likely mistake of units, with the correction, or nothing.
         built: Number of pieces of work that were done.
         recalled: Number of those whose result the store already had.
     """

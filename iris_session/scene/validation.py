@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple, TypedDict, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import IDENTITY, Pose, Quat, Vec3
-from iris_session.protocol.names import TextureRole
 from iris_session.protocol.scene import Rgba
 from iris_session.scene.arrays import to_array
 from iris_session.scene.errors import SceneBuildError
@@ -25,48 +24,84 @@ from iris_session.scene.images import check_pixels, read_pixels
 from iris_session.scene.importers.references import read_bounded
 from iris_session.scene.mesh_processing import compute_creased_normals, normalise
 from iris_session.scene.meshes import MeshArrays, index_corners
-from iris_session.scene.nodes import GREY, MAX_TRIANGLES, Appearance, TextureImage
+from iris_session.scene.nodes import GREY, MAX_TRIANGLES, Appearance, TextureImage, color_images
+
+_STRENGTHS: Final = ("emission", "specular", "shininess", "metallic", "roughness")
 
 
-def parse_appearance(
-    rgba: Sequence[float] | None,
-    texture: str | PathLike[str] | NDArray[np.uint8] | None,
-    metallic: float | None,
-    roughness: float | None,
-    emission: float | None,
-    specular: float | None,
-    shininess: float | None,
-    repeat: Sequence[float],
-    *,
-    uniform: bool,
-) -> Appearance | None:
-    """Return the appearance that arguments of `SceneBuilder` describe, `None` when all are left out.
+class PlacementOptions(TypedDict, total=False):
+    """Arguments of `SceneBuilder` that place something; see there."""
+
+    position: Sequence[float]
+    quaternion: Sequence[float]
+    movable: bool
+    on: str
+
+
+class AppearanceOptions(TypedDict, total=False):
+    """Arguments of `SceneBuilder` that say how something looks; see there. `None` is the default."""
+
+    rgba: Sequence[float] | None
+    texture: str | PathLike[str] | NDArray[np.uint8] | None
+    metallic: float | None
+    roughness: float | None
+    emission: float | None
+    specular: float | None
+    shininess: float | None
+    repeat: Sequence[float]
+    uniform: bool
+
+
+class DrawingOptions(PlacementOptions, AppearanceOptions, total=False):
+    """Arguments of `SceneBuilder` for what is drawn at a place."""
+
+
+class Placement(NamedTuple):
+    """Place of something: its pose in the world, or in the frame of the body `on`; `movable`: a body of its own."""
+
+    pose: Pose
+    movable: bool
+    on: str
+
+
+def parse_options(options: DrawingOptions) -> tuple[Placement, Appearance | None]:
+    """Return placement and appearance, `None` when no argument of appearance is given. Raises `SceneBuildError`."""
+    _reject_unknown(options, DrawingOptions)
+    pose = check_pose(options.get("position", IDENTITY.p), options.get("quaternion", IDENTITY.q))
+    look = {name: value for name, value in options.items() if name in AppearanceOptions.__annotations__}
+    appearance = parse_appearance(cast("AppearanceOptions", look))
+    return Placement(pose, bool(options.get("movable", False)), options.get("on", "")), appearance
+
+
+def parse_appearance(options: AppearanceOptions) -> Appearance | None:
+    """Return the appearance that arguments describe, `None` when all are defaults.
 
     Raises:
         SceneBuildError: A value is out of its range, or the texture cannot be read.
     """
-    across, down = check_numbers("repeat", repeat, 2)
-    given = {
-        "emission": emission,
-        "specular": specular,
-        "shininess": shininess,
-        "metallic": metallic,
-        "roughness": roughness,
+    _reject_unknown(options, AppearanceOptions)
+    rgba, texture = options.get("rgba"), options.get("texture")
+    across, down = check_numbers("repeat", options.get("repeat", (1.0, 1.0)), 2)
+    uniform = bool(options.get("uniform", False))
+    values: dict[str, Any] = {
+        name: check_number(name, value)[0] for name in _STRENGTHS if (value := options.get(name)) is not None
     }
-    values: dict[str, Any] = {name: check_number(name, value)[0] for name, value in given.items() if value is not None}
     if rgba is None and texture is None and not values and (across, down) == (1.0, 1.0) and not uniform:
         return None
     color = (GREY if texture is None else (1.0, 1.0, 1.0, 1.0)) if rgba is None else _check_rgba(rgba)
-    images: tuple[tuple[str, TextureImage], ...] = ()
-    if texture is not None:
-        pixels = check_texture(texture, "texture")
-        images = ((TextureRole.RGBA if pixels.shape[2] == 4 else TextureRole.RGB, TextureImage(pixels)),)
+    images = () if texture is None else color_images(TextureImage(check_texture(texture, "texture")))
     for name, value in values.items():
         if value < 0.0 or (value > 1.0 and name != "emission"):
             raise SceneBuildError(f"{name} is {value:g}: {'0 or more' if name == 'emission' else 'from 0 to 1'}")
     if "roughness" in values and "shininess" not in values:  # for clients that do not draw by roughness
         values["shininess"] = min(max(1.0 - values["roughness"], 0.0), 1.0)
-    return replace(Appearance(rgba=color, images=images, repeat=(across, down), uniform=bool(uniform)), **values)
+    return replace(Appearance(rgba=color, images=images, repeat=(across, down), uniform=uniform), **values)
+
+
+def _reject_unknown(options: Mapping[str, Any], known: type) -> None:
+    names = known.__annotations__
+    if unknown := [name for name in options if name not in names]:
+        raise TypeError(f"unexpected argument {unknown[0]!r}: these are known: {', '.join(names)}")
 
 
 def _check_rgba(rgba: Any) -> Rgba:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 import re
-import traceback
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -15,15 +15,15 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.references import References
 from iris_session.scene.nodes import LoadedFile
 
+_logger = logging.getLogger("iris_session.scene")
 #: Suffixes that `load_file` reads; the others of trimesh are point clouds, general archives, or very rare.
 _GLTF: Final = ("glb", "gltf")
-MESHES: Final = ("3mf", "dae", "obj", "off", "ply", "stl")
+MESHES: Final = ("dae", "obj", "off", "ply", "stl")
 ROBOTS: Final = ("urdf",)
 #: Suffixes of files that MuJoCo reads.
 MODELS: Final = ("mjb", "mjcf", "xml")
 ENDINGS: Final = tuple(sorted((*_GLTF, *MESHES, *ROBOTS, *MODELS)))
 _ADDRESS: Final = re.compile(r"(https?|ftp):[/\\]")
-_ROOM: Final = Path(__file__).parents[1]
 #: Maximum number of files that an error message lists.
 _LISTED: Final = 8
 #: Errors whose messages are about code, not about the file.
@@ -82,24 +82,15 @@ def read_guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
         raise SceneBuildError(f"{path} does not fit into memory: make it smaller") from None
     except (IndexError, KeyError) as error:
         raise SceneBuildError(f"{path} names something that it does not have ({error}): export it again") from error
-    except _OF_CODE as error:  # a library did not find what it needs; the message is about its code
+    except _OF_CODE as error:  # a reader did not find what it needs; the message is about its code
+        _logger.debug("%s cannot be read", path, exc_info=True)
         raise SceneBuildError(
             f"{path} is damaged, or no {kind.upper()}: something in it is missing or of another kind; "
-            f"export or download it again{_of_ours(error)}"
+            "export or download it again"
         ) from error
     except Exception as error:
         text = " ".join(str(error).split())[:200]  # one line
         raise SceneBuildError(f"{path} is damaged, or no {kind.upper()}: {type(error).__name__}: {text}") from error
-
-
-def _of_ours(error: BaseException) -> str:
-    """Return, for error messages, where our own code failed, if it did: then that may be wrong, not the file."""
-    *_, last = traceback.extract_tb(error.__traceback__)
-    place = Path(last.filename)
-    if _ROOM not in place.parents:
-        return ""
-    said = " ".join(str(error).split())[:200]  # one line
-    return f" (if other programs open it, please report: {type(error).__name__}: {said}, {place.name}:{last.lineno})"
 
 
 def get_ending(path: Path) -> str:

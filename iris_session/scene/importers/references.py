@@ -147,10 +147,10 @@ class References:
             tried.append(root)
             found = (root / inside).resolve()
             if found.is_relative_to(root.resolve()) and found.is_file():
-                if self._may_draw_in(root, found):
+                if self._is_trusted_root(root, found):
                     return found
                 closed = closed or root
-        lost = [(root / inside).resolve() for root in tried if root.is_dir() and self._may_draw_in(root, root)]
+        lost = [(root / inside).resolve() for root in tried if root.is_dir() and self._is_trusted_root(root, root)]
         within = [path for path in lost if any(path.is_relative_to(root.resolve()) for root in tried)]
         if closed is None and within:
             raise SceneBuildError(
@@ -164,7 +164,7 @@ class References:
             f"{self.path.name} refers to {reference}: {hint}; name the package's folder in package_dirs"
         )
 
-    def _may_draw_in(self, root: Path, found: Path) -> bool:
+    def _is_trusted_root(self, root: Path, found: Path) -> bool:
         """Return whether `found`, below the folder `root` that was found by name, belongs to the file."""
         named = root in self.given or root.parent in self.given
         return named or (root / _PACKAGE).is_file() or any(found.is_relative_to(own) for own in self._roots)

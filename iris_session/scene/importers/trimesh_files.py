@@ -1,4 +1,4 @@
-"""Reader of mesh files by way of trimesh: OBJ with MTL, STL, PLY with colours, OFF, DAE, 3MF. Not glTF: see `gltf`.
+"""Reader of mesh files by way of trimesh: OBJ with MTL, STL, PLY with colours, OFF, DAE. Not glTF: see `gltf`.
 
 Colours are taken unchanged. Missing normals are computed with creases, as MuJoCo does.
 """
@@ -15,13 +15,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.names import TextureRole
 from iris_session.protocol.scene import Rgba
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, to_pixels
-from iris_session.scene.importers.mesh_validation import CHECKS, absolute_corners
+from iris_session.scene.importers.mesh_validation import CHECKS
 from iris_session.scene.importers.references import References, read_bounded
-from iris_session.scene.importers.xml_files import check_3mf, check_dae
+from iris_session.scene.importers.xml_files import check_dae
 from iris_session.scene.mesh_processing import compute_creased_normals, merge_vertex_color, normalise
 from iris_session.scene.meshes import find_unique_rows, index_corners
 from iris_session.scene.nodes import (
@@ -33,6 +32,7 @@ from iris_session.scene.nodes import (
     Node,
     Surface,
     TextureImage,
+    color_images,
     truncate_name,
 )
 
@@ -54,14 +54,9 @@ def read_with_trimesh(path: Path, references: References, name: str) -> LoadedFi
     trimesh, kind = _trimesh(), path.suffix.lower().lstrip(".")
     data = _checked(path.name, kind, read_bounded(path))
     resolver = _resolver(trimesh, references)
-    try:
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
-        reader = _Reader(trimesh, path.name, name)
-        nodes = reader.nodes(scene)
-    except IndexError:
-        if kind == "obj":
-            absolute_corners(path.name, data)  # raises with the line
-        raise
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+    reader = _Reader(trimesh, path.name, name)
+    nodes = reader.nodes(scene)
     lost = _lost_materials(path.name, data, resolver) if kind == "obj" else ()
     return LoadedFile(
         nodes, _find_up_axis(kind, data), _find_unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped)
@@ -74,9 +69,7 @@ def _checked(name: str, kind: str, data: bytes) -> bytes:
             import collada  # noqa: F401
         except ImportError:
             raise SceneBuildError(f"{name}: DAE files need pycollada: pip install 'iris-session[files]'") from None
-        check_dae(name, data)
-    if kind == "3mf":
-        check_3mf(name, data)
+        return check_dae(name, data)
     return CHECKS[kind](name, data) if kind in CHECKS else data
 
 
@@ -234,7 +227,7 @@ class _Reader:
             pixels = to_pixels(image, f"a picture of {self._name}")
             self._pictures[id(image)] = TextureImage(self._budget.spend(pixels))
         picture = self._pictures[id(image)]
-        return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
+        return color_images(picture)
 
 
 def _rgba(color: Any) -> Rgba:

@@ -1,24 +1,25 @@
-"""Reader of URDF robots as articulations: the document, its joints, and its links as drawn items.
+"""Reader of URDF robots as articulations: joints, which must form one tree, and links as drawn items.
 
-The document is checked for everything that yourdfpy needs and does not check, with the line in the message; elements
-that yourdfpy does not know are removed and reported. The joints determine the root link, the joints that are set, and
-those that mimic others; together they must form one tree.
+Messages name the line of the element that is wrong. Elements that are not drawn, such as inertias, transmissions and
+extensions of simulators, are not read.
 """
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from anchors.lie import quat_to_matrix
+from anchors.pose import quat_from_rotvec, quat_mul
 from iris_session.protocol.common import Pose, Vec3
-from iris_session.protocol.names import GeometryKind, TextureRole
+from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import Rgba
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, read_pixels
@@ -32,64 +33,37 @@ from iris_session.scene.importers.files import (
     xacro_advice,
 )
 from iris_session.scene.importers.references import References, read_bounded
-from iris_session.scene.importers.units import (
-    Drawn,
-    colour_question,
-    degrees_question,
-    measure_reach,
-    measure_side,
-    robot_question,
+from iris_session.scene.importers.xml_files import line_of, parse_xml
+from iris_session.scene.nodes import (
+    Appearance,
+    DrawnItem,
+    LoadedFile,
+    Matrix,
+    TextureImage,
+    color_images,
+    to_pose,
+    truncate_name,
 )
-from iris_session.scene.importers.xml_files import no_xml
-from iris_session.scene.nodes import Appearance, DrawnItem, LoadedFile, Matrix, TextureImage, to_pose, truncate_name
 from iris_session.scene.result import ArticulatedBody, Articulation, Joint
 
+_FIXED: Final = "fixed"
 #: Joints with several degrees of freedom: their links are moved as bodies, not by joint positions.
 _LOOSE: Final = frozenset({"floating", "planar"})
 _MOVING: Final = frozenset({"revolute", "continuous", "prismatic"})
+_KINDS: Final = _MOVING | _LOOSE | {_FIXED}
 _TREE: Final = "a URDF is a tree, leave one of them out (closed chains: in MJCF, one joint as an equality constraint)"
-_KNOWN: Final = _MOVING | {"fixed", "floating", "planar"}
-_SHAPES: Final = frozenset({"box", "cylinder", "sphere", "mesh"})
-#: Required attributes by element and, where that matters, its parent element.
-_NEEDED: Final = {
-    "link": ("name",),
-    "joint": ("name", "type"),
-    "joint/parent": ("link",),
-    "joint/child": ("link",),
-    "joint/mimic": ("joint",),
-    "geometry/mesh": ("filename",),
-    "geometry/box": ("size",),
-    "geometry/cylinder": ("radius", "length"),
-    "geometry/sphere": ("radius",),
-}
-#: Required elements of a joint.
-_ENDS: Final = ("parent", "child")
-#: Numeric attributes, and how many numbers each has.
-_NUMBERS: Final[Mapping[str, Mapping[str, int | tuple[int, ...]]]] = {
-    "origin": {"xyz": 3, "rpy": 3},
-    "axis": {"xyz": 3},
-    "box": {"size": 3},
-    "cylinder": {"radius": 1, "length": 1},
-    "sphere": {"radius": 1},
-    "mesh": {"scale": (1, 3)},
-    "limit": {"lower": 1, "upper": 1},
-    "mimic": {"multiplier": 1, "offset": 1},
-    "color": {"rgba": 4},
-}
 
 
 @dataclass(frozen=True)
 class Robot:
     """Result of reading a URDF.
 
-    `items` belong to `articulation.parts`, by index. `skipped`: a line for each thing left out; `notes`: a line for
-    each likely mistake.
+    `items` belong to `articulation.parts`, by index. `skipped`: a line for each thing left out.
     """
 
     articulation: Articulation
     items: tuple[DrawnItem, ...]
     skipped: tuple[str, ...]
-    notes: tuple[str, ...] = ()
 
 
 def read_urdf(
@@ -101,10 +75,18 @@ def read_urdf(
     collisions: bool = False,
     scale: float = 1.0,
 ) -> Robot:
-    """Return the robot of a URDF file. Raises `SceneBuildError`.
+    """Read a URDF file.
 
-    Its bodies are called `name/link`. `collisions`: draw collision geometry instead of visuals. `scale`: size factor of
-    the drawing; joints keep their positions, also sliding ones.
+    Args:
+        path: The file.
+        name: Name of the articulation; its bodies are called `name/link`.
+        T_world_root: Pose of the root link.
+        package_dirs: Folders of packages that it refers to.
+        collisions: Draw collision geometry instead of visuals.
+        scale: Size factor of the drawing; joints keep their positions, also sliding ones.
+
+    Raises:
+        SceneBuildError: The file is missing or damaged, or its joints are no tree.
     """
     check_present(path)
     if get_ending(path) == "xacro":
@@ -113,467 +95,345 @@ def read_urdf(
         raise SceneBuildError(
             f"{path.name} is no URDF: files that end in .{get_ending(path)} go with add_file, or Session"
         )
-    references = References(path, package_dirs)
-    data = read_bounded(path)
-
-    def read() -> Robot:  # yourdfpy raises any kind of error for missing attributes
-        robot, skipped = parse_urdf(path, data)
-        return _Reader(path, name, robot, references, package_dirs, skipped, collisions).robot(T_world_root, scale)
-
-    found: Robot = read_guarded(path, "urdf", read)
-    return found if scale == 1.0 else _scale_robot(found, scale)
+    robot: Robot = read_guarded(
+        path, "urdf", lambda: _Reader(path, name, package_dirs, collisions, scale).read(T_world_root)
+    )
+    return robot
 
 
-def _scale_robot(robot: Robot, scale: float) -> Robot:
-    """Return the robot in another size."""
+class _Mimic(NamedTuple):
+    """Joint that is followed: its position times `multiplier` plus `offset`."""
 
-    def at(pose: Pose) -> Pose:
-        x, y, z = pose.p
-        return Pose((scale * x, scale * y, scale * z), pose.q)
+    joint: str
+    multiplier: float
+    offset: float
 
-    parts = []
-    for part in robot.articulation.parts:
-        slide = scale if part.sliding else 1.0
-        parts.append(
-            part._replace(
-                T_parent_joint=at(part.T_parent_joint), multiplier=slide * part.multiplier, offset=slide * part.offset
-            )
-        )
-    items = []
-    for item in robot.items:
-        matrix = item.matrix.copy()
-        matrix[:3, 3] *= scale
-        if item.mesh is not None:
-            matrix[:3, :3] *= scale
-        x, y, z = (scale * side for side in item.size)
-        items.append(replace(item, matrix=matrix, size=(x, y, z)))
-    return replace(robot, articulation=replace(robot.articulation, parts=tuple(parts)), items=tuple(items))
+
+class _Joint(NamedTuple):
+    """A joint of the file. `axis`: unit vector in its frame. Limits are infinite without any."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    T_parent_joint: Matrix
+    axis: Vec3
+    low: float
+    high: float
+    mimic: _Mimic | None
 
 
 class _Reader:
     def __init__(
-        self,
-        path: Path,
-        name: str,
-        robot: Any,
-        references: References,
-        package_dirs: Sequence[str | PathLike[str]],
-        skipped: dict[str, None],
-        collisions: bool,
+        self, path: Path, name: str, package_dirs: Sequence[str | PathLike[str]], collisions: bool, scale: float
     ) -> None:
-        self._path, self._name, self._robot = path, name, robot
-        self._references, self._package_dirs = references, package_dirs
-        self._skipped = skipped
-        self._collisions = collisions
-        self._files: dict[Path, LoadedFile] = {}
-        self._notes: dict[str, None] = {}
-        self._sizes: list[Drawn] = []
-        self._measured: set[tuple[Path, tuple[float, float, float]]] = set()
-        self._appearances: dict[str, Appearance | None] = {}
-        self._pictures: dict[Path, TextureImage] = {}
+        self._path, self._name, self._scale = path, name, scale
+        self._file = path.name
+        self._references, self._package_dirs = References(path, package_dirs), package_dirs
+        self._shape_tag = "collision" if collisions else "visual"
+        self._skipped: dict[str, None] = {}
+        self._loaded: dict[Path, LoadedFile] = {}
+        self._textures: dict[Path, TextureImage] = {}
         self._budget = PixelBudget(path.name)
-        self._materials: dict[str, Any] = {}
-        worn = (visual.material for link in robot.links for visual in link.visuals)
-        for material in (*robot.materials, *worn):
-            if material is not None and material.name and (material.color is not None or material.texture is not None):
-                self._materials.setdefault(material.name, material)
+        self._root = self._parse()
+        self._links = {self._require(link, "name"): link for link in self._root.findall("link")}
+        self._materials: dict[str, Element] = {}
+        for material in self._root.iter("material"):
+            if _is_defined(material):
+                self._materials.setdefault(material.get("name", ""), material)
 
-    def robot(self, T_world_root: Pose, scale: float) -> Robot:
-        """Return the robot. `scale`: size factor by which it will be drawn."""
-        root = root_link(self._path.name, self._robot)
-        table = read_joints(self._path.name, self._robot)
-        below: dict[str, list[Any]] = {}
-        for joint in self._robot.joints:
+    def read(self, T_world_root: Pose) -> Robot:
+        """Return the robot."""
+        joints = [self._read_joint(element) for element in self._root.findall("joint")]
+        root = self._find_root(joints)
+        below: dict[str, list[_Joint]] = {}
+        for joint in joints:
             below.setdefault(joint.parent, []).append(joint)
-        links = {link.name: link for link in self._robot.links}
+        by_name = {joint.name: joint for joint in joints}
+        set_joints = [joint for joint in joints if joint.kind in _MOVING and joint.mimic is None]
+        places = {joint.name: place for place, joint in enumerate(set_joints)}
         parts = [ArticulatedBody(f"{self._name}/{root}")]
         items: list[DrawnItem] = []
         loose: dict[str, str] = {}
+        mimics: dict[str, str] = {}
         waiting: list[tuple[str, int, Matrix]] = [(root, 0, np.eye(4))]
         while waiting:
-            name, part, T_part_link = waiting.pop()
-            items += self._collect_drawn(links[name], part, T_part_link)
-            for joint in reversed(below.get(name, [])):
-                T_part_child = T_part_link @ _matrix(self._path.name, joint)
-                if joint.type == "fixed":
+            link, part, T_part_link = waiting.pop()
+            items += self._read_items(link, part, T_part_link)
+            for joint in reversed(below.get(link, [])):
+                T_part_child = T_part_link @ joint.T_parent_joint
+                if joint.kind == _FIXED:
                     waiting.append((joint.child, part, T_part_child))
                     continue
-                body = f"{self._name}/{joint.child}"
-                if joint.type in _LOOSE:
-                    at = to_pose(T_part_child[:3, :3], T_part_child[:3, 3])
-                    parts.append(ArticulatedBody(body, part, at))
-                    loose[joint.name] = body
-                    waiting.append((joint.child, len(parts) - 1, np.eye(4)))
-                    continue
-                drive = table.drives[joint.name]
-                parts.append(
-                    ArticulatedBody(
-                        body=body,
-                        parent=part,
-                        T_parent_joint=to_pose(T_part_child[:3, :3], T_part_child[:3, 3]),
-                        axis=drive.axis,
-                        sliding=joint.type == "prismatic",
-                        joint=drive.joint,
-                        multiplier=drive.multiplier,
-                        offset=drive.offset,
-                    )
+                body = ArticulatedBody(
+                    f"{self._name}/{joint.child}", part, to_pose(T_part_child[:3, :3], T_part_child[:3, 3])
                 )
+                if joint.kind in _LOOSE:
+                    loose[joint.name] = body.body
+                else:
+                    source = self._follow(joint, by_name)
+                    length = self._scale if joint.kind == "prismatic" else 1.0
+                    body = body._replace(
+                        axis=joint.axis,
+                        sliding=joint.kind == "prismatic",
+                        joint=places[source.joint],
+                        multiplier=length * source.multiplier,
+                        offset=length * source.offset,
+                    )
+                    if joint.mimic is not None:
+                        mimics[joint.name] = source.joint
+                parts.append(body)
                 waiting.append((joint.child, len(parts) - 1, np.eye(4)))
         if not items:
-            other = "visuals: leave out collisions=True" if self._collisions else "collisions: give collisions=True"
+            other = (
+                "visuals: leave out collisions=True"
+                if self._shape_tag == "collision"
+                else "collisions: give collisions=True"
+            )
             self._skip(f"nothing of it is drawn; what it may have are {other}")
-        articulation = Articulation(self._name, T_world_root, tuple(parts), table.joints, table.mimics, loose)
-        units = robot_question(self._path.name, measure_reach(self._robot.joints, root), self._sizes, scale)
-        notes = (*units, *degrees_question(self._path.name, table.joints), *self._notes)
-        return Robot(articulation, tuple(items), tuple(self._skipped), notes)
-
-    # --- what is drawn ------------------------------------------------------------------------------------------------
-
-    def _collect_drawn(self, link: Any, part: int, T_part_link: Matrix) -> list[DrawnItem]:
-        found: list[DrawnItem] = []
-        for shape in link.collisions if self._collisions else link.visuals:
-            matrix = T_part_link @ (np.eye(4) if shape.origin is None else shape.origin)
-            look = None if self._collisions else self._appearance(shape.material)
-            name = truncate_name(shape.name or link.name)
-            geometry = shape.geometry
-            if geometry.mesh is not None:
-                found += self._mesh(geometry.mesh, part, name, matrix, look)
-                continue
-            kind, size = _shape(self._path.name, geometry)
-            self._sizes.append(Drawn(f"shape, a {kind} of {truncate_name(link.name)},", 2.0 * max(size)))
-            found.append(DrawnItem(part, name, matrix, look or Appearance(), kind=kind, size=size))
-        return found
-
-    def _mesh(self, mesh: Any, part: int, name: str, matrix: Matrix, look: Appearance | None) -> list[DrawnItem]:
-        if not mesh.filename:
-            raise SceneBuildError(f"{self._path.name}: a mesh of {name} names no file")
-        path = self._references.find(mesh.filename)
-        if path not in self._files:
-            self._files[path] = load_file(path, (*self._package_dirs, *self._references.folders(path)))
-            for text in self._files[path].skipped:
-                self._skipped[text] = None
-            if any(node.lights or node.cameras for node in self._files[path].nodes):
-                self._skip(f"lights and cameras in {path.name}")
-        loaded = self._files[path]
-        x, y, z = (float(v) for v in np.broadcast_to(1.0 if mesh.scale is None else mesh.scale, 3))
-        scale = np.diag([loaded.unit * x, loaded.unit * y, loaded.unit * z, 1.0])
-        self._measure(path, loaded, (x, y, z), scale)
-        return [
-            DrawnItem(
-                part, name, matrix @ scale @ node.matrix, surface.appearance or look or Appearance(), surface.mesh
-            )
-            for node in loaded.nodes
-            for surface in node.surfaces
-        ]
-
-    def _measure(self, path: Path, loaded: LoadedFile, given: tuple[float, float, float], scale: Matrix) -> None:
-        """Record the size of a mesh, with the scale of its `<mesh>`; once for each scale."""
-        if (path, given) not in self._measured:
-            self._measured.add((path, given))
-            placed = [(surface.mesh, scale @ node.matrix) for node in loaded.nodes for surface in node.surfaces]
-            self._sizes.append(Drawn(f"mesh, {path.name},", measure_side(placed), given))
-
-    def _appearance(self, material: Any) -> Appearance | None:
-        """Return the appearance of a URDF material; one without colour refers to another one by name."""
-        if material is None:
-            return None
-        known = material
-        if material.color is None and material.texture is None:
-            known = self._materials.get(material.name or "")
-        if known is None:
-            self._skip(f"material {material.name!r}, which has neither colour nor texture anywhere")
-            return None
-        key = f"{known.name} {known.color} {known.texture}"
-        if key not in self._appearances:
-            rgba = self._rgba(known)
-            self._appearances[key] = Appearance(
-                rgba=rgba, name=truncate_name(known.name or ""), images=self._texture(known.texture)
-            )
-        return self._appearances[key]
-
-    def _rgba(self, material: Any) -> Rgba:
-        values = (1.0,) * 4 if material.color is None else tuple(float(v) for v in material.color.rgba)
-        if len(values) != 4 or not all(map(math.isfinite, values)):
-            raise SceneBuildError(f"{self._path.name}: material {material.name!r} needs rgba of four finite numbers")
-        self._notes |= dict.fromkeys(colour_question(self._path.name, truncate_name(material.name or ""), values))
-        red, green, blue, alpha = (min(max(v, 0.0), 1.0) for v in values)
-        return red, green, blue, alpha
-
-    def _texture(self, texture: Any) -> tuple[tuple[str, TextureImage], ...]:
-        if texture is None or not texture.filename:
-            return ()
-        path = self._references.find(texture.filename)
-        if path not in self._pictures:
-            pixels = self._budget.spend(read_pixels(read_bounded(path), str(path)))
-            self._pictures[path] = TextureImage(pixels, truncate_name(path.stem))
-        picture = self._pictures[path]
-        return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
-
-    def _skip(self, text: str) -> None:
-        self._skipped[f"{self._path.name}: {text}"] = None
-
-
-def _matrix(file: str, joint: Any) -> Matrix:
-    """Return T_parent_joint of the file."""
-    matrix = np.eye(4) if joint.origin is None else np.asarray(joint.origin, np.float64)
-    if not np.isfinite(matrix).all():
-        raise SceneBuildError(f"{file}: the origin of joint {joint.name} is not finite")
-    return matrix
-
-
-def _shape(file: str, geometry: Any) -> tuple[str, tuple[float, float, float]]:
-    """Return kind and size of a simple shape, as in `Geometry`."""
-    if geometry.box is not None:
-        kind, sizes = GeometryKind.BOX, [0.5 * float(v) for v in geometry.box.size]
-    elif geometry.cylinder is not None:
-        radius = float(geometry.cylinder.radius)
-        kind, sizes = GeometryKind.CYLINDER, [radius, radius, 0.5 * float(geometry.cylinder.length)]
-    else:
-        kind, sizes = GeometryKind.SPHERE, [float(geometry.sphere.radius)] * 3
-    if len(sizes) != 3 or not all(math.isfinite(v) and v > 0 for v in sizes):
-        raise SceneBuildError(f"{file}: a {kind} of size {sizes}: three positive lengths are needed")
-    return kind, (sizes[0], sizes[1], sizes[2])
-
-
-# --- joints -----------------------------------------------------------------------------------------------------------
-
-
-class Drive(NamedTuple):
-    """Drive of one joint: joint `joint` of the table, times `multiplier` plus `offset`, along or around `axis`."""
-
-    joint: int
-    multiplier: float
-    offset: float
-    axis: Vec3
-
-
-class JointTable(NamedTuple):
-    """Joints of a robot.
-
-    `joints`: those that are set, in the order of the file; `drives`: by the names of moving joints; `mimics`: those
-    that follow others.
-    """
-
-    joints: tuple[Joint, ...]
-    drives: Mapping[str, Drive]
-    mimics: Mapping[str, str]
-
-
-def root_link(file: str, robot: Any) -> str:
-    """Return the link that no joint moves. Raises `SceneBuildError` unless links and joints form one tree."""
-    names = [link.name for link in robot.links]
-    if len(set(names)) != len(names) or not names:
-        raise SceneBuildError(f"{file}: no link, or two of one name: {_repeated(names)}")
-    held: dict[str, str] = {}
-    known = set(names)
-    for joint in robot.joints:
-        for link in (joint.parent, joint.child):
-            if link not in known:
-                raise SceneBuildError(f"{file}: joint {joint.name} refers to link {link!r}, which is not there")
-        if joint.child in held:
-            raise SceneBuildError(
-                f"{file}: link {joint.child} hangs on two joints, {held[joint.child]} and {joint.name}: {_TREE}"
-            )
-        held[joint.child] = joint.name
-    roots = [name for name in names if name not in held]
-    if len(roots) > 1:
-        raise SceneBuildError(
-            f"{file}: {len(roots)} links hang on no joint ({', '.join(roots[:8])}): in a URDF one does, join the others"
+        listed = tuple(
+            Joint(joint.name, joint.kind, joint.low, joint.high, min(max(0.0, joint.low), joint.high))
+            for joint in set_joints
         )
-    below: dict[str, list[str]] = {}
-    for joint in robot.joints:
-        below.setdefault(joint.parent, []).append(joint.child)
-    reached, waiting = set(roots), roots.copy()
-    while waiting:
-        found = below.get(waiting.pop(), [])
-        reached.update(found)
-        waiting += found
-    if len(reached) != len(names):
-        joints = _loop(robot, next(name for name in names if name not in reached))
-        raise SceneBuildError(f"{file}: the joints {', '.join(joints[:8])} make a loop: {_TREE}")
-    return str(roots[0])
+        articulation = Articulation(self._name, T_world_root, tuple(parts), listed, mimics, loose)
+        return Robot(articulation, tuple(items), tuple(self._skipped))
 
+    # --- document -----------------------------------------------------------------------------------------------------
 
-def _loop(robot: Any, link: str) -> list[str]:
-    """Return the joints of the loop that contains a link or an ancestor of it, from link to link."""
-    above = {joint.child: (joint.parent, joint.name) for joint in robot.joints}
-    places: dict[str, int] = {}
-    joints: list[str] = []
-    while link not in places:
-        places[link] = len(joints)
-        link, name = above[link]
-        joints.append(name)
-    return joints[places[link] :][::-1]
+    def _parse(self) -> Element:
+        root = parse_xml(str(self._path), read_bounded(self._path), "robot")
+        if root.tag != "robot":
+            raise SceneBuildError(f"{self._path} is no URDF: it begins with <{root.tag}> where <robot> is needed")
+        if any(element.tag.startswith("xacro:") for element in root.iter()):
+            raise SceneBuildError(f"{self._path}: {xacro_advice(self._path)}")
+        names = [link.get("name", "") for link in root.findall("link")]
+        if len(set(names)) != len(names) or not names:
+            raise SceneBuildError(f"{self._file}: no link, or two of one name: {_repeated(names)}")
+        return root
 
+    def _require(self, element: Element, attribute: str) -> str:
+        """Return an attribute that must be there."""
+        value = element.get(attribute)
+        if not value:
+            raise SceneBuildError(f"{self._place(element)} has no {attribute}")
+        return value
 
-def read_joints(file: str, robot: Any) -> JointTable:
-    """Return the joints of a robot that is a tree. Raises `SceneBuildError`."""
-    by_name = {joint.name: joint for joint in robot.joints}
-    if len(by_name) != len(robot.joints):
-        raise SceneBuildError(f"{file}: two joints of one name: {_repeated([joint.name for joint in robot.joints])}")
-    for joint in robot.joints:
-        if joint.type not in _KNOWN:
-            raise SceneBuildError(
-                f"{file}: joint {joint.name} of type {joint.type!r}; types are {', '.join(sorted(_KNOWN))}"
-            )
-    moving = [joint for joint in robot.joints if joint.type in _MOVING]
-    free = [joint for joint in moving if joint.mimic is None]
-    places = {joint.name: place for place, joint in enumerate(free)}
-    drives, mimics = {}, {}
-    for joint in moving:
-        source, multiplier, offset = _followed(file, joint, by_name)
-        drives[joint.name] = Drive(places[source], multiplier, offset, _axis(file, joint))
-        if joint.mimic is not None:
-            mimics[joint.name] = source
-    return JointTable(tuple(_limits(file, joint) for joint in free), drives, mimics)
-
-
-def _followed(file: str, joint: Any, by_name: Mapping[str, Any]) -> tuple[str, float, float]:
-    """Return the joint that is set, with multiplier and offset of its position, along a chain of mimics."""
-    multiplier, offset, seen = 1.0, 0.0, {joint.name}
-    while joint.mimic is not None:
-        times = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
-        plus = 0.0 if joint.mimic.offset is None else float(joint.mimic.offset)
-        if not (math.isfinite(times) and math.isfinite(plus)):
-            raise SceneBuildError(f"{file}: joint {joint.name} follows by a number that is not finite")
-        multiplier, offset = multiplier * times, offset + multiplier * plus
-        followed = by_name.get(joint.mimic.joint)
-        if followed is None or followed.type not in _MOVING or followed.name in seen:
-            raise SceneBuildError(
-                f"{file}: joint {joint.name} follows {joint.mimic.joint!r}, which does not move, or follows it in turn"
-            )
-        seen.add(followed.name)
-        joint = followed
-    return joint.name, multiplier, offset
-
-
-def _axis(file: str, joint: Any) -> Vec3:
-    axis = np.asarray(joint.axis, np.float64).reshape(-1)
-    length = float(np.linalg.norm(axis)) if axis.shape == (3,) else 0.0
-    if not math.isfinite(length) or length < 1e-9:
-        raise SceneBuildError(f"{file}: the axis of joint {joint.name} is {joint.axis}: three numbers, not all 0")
-    x, y, z = (axis / length).tolist()
-    return x, y, z
-
-
-def _limits(file: str, joint: Any) -> Joint:
-    """Return a joint with its limits: a missing one counts as 0, as in URDF; without both there are none."""
-    low, high = -math.inf, math.inf
-    limit = joint.limit
-    if joint.type != "continuous" and limit is not None and (limit.lower is not None or limit.upper is not None):
-        low, high = float(limit.lower or 0.0), float(limit.upper or 0.0)
-    if math.isnan(low) or math.isnan(high) or low > high:
-        raise SceneBuildError(f"{file}: joint {joint.name} has limits from {low} to {high}")
-    return Joint(joint.name, joint.type, low, high, min(max(0.0, low), high))
-
-
-def _repeated(names: list[str]) -> str:
-    return ", ".join(sorted({name for name in names if names.count(name) > 1})) or "none"
-
-
-# --- document ---------------------------------------------------------------------------------------------------------
-
-
-def parse_urdf(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
-    """Return the robot of yourdfpy, and a line for each element that was removed. Raises `SceneBuildError`."""
-    try:
-        import yourdfpy
-        from lxml import etree
-    except ImportError:
-        raise SceneBuildError("URDF files need yourdfpy: pip install 'iris-session[files]'") from None
-    root = _document(etree, path, data)
-    if root.getroottree().docinfo.doctype:
-        raise SceneBuildError(f"{path} has a DOCTYPE: remove it")
-    if root.tag != "robot":
-        raise SceneBuildError(f"{path} is no URDF: it begins with <{root.tag}> where <robot> is needed")
-    if any("xacro" in str(space) for space in root.nsmap.values()) and b"<xacro:" in data:
-        raise SceneBuildError(f"{path}: {xacro_advice(path)}")
-    if not root.get("name"):
-        root.set("name", path.stem)  # yourdfpy needs a name; it is not used
-    skipped = _without_other_shapes(path, root)
-    _check(path, root)
-    made = yourdfpy.URDF.load(
-        io.BytesIO(etree.tostring(root)),
-        build_scene_graph=False,
-        build_collision_scene_graph=False,
-        load_meshes=False,
-        load_collision_meshes=False,
-    )
-    return made.robot, skipped
-
-
-def _document(etree: Any, path: Path, data: bytes) -> Any:
-    """Return the document without elements of undeclared prefixes: these are common extensions for one simulator."""
-    safe = {"resolve_entities": False, "no_network": True, "huge_tree": False}
-    parser = etree.XMLParser(**safe)
-    try:
-        return etree.fromstring(data, parser)
-    except etree.XMLSyntaxError as error:
-        if any(entry.domain_name != "NAMESPACE" for entry in parser.error_log):
-            raise SceneBuildError(no_xml(str(path), data, "robot", error.lineno, error.msg)) from None
-    root = etree.fromstring(data, etree.XMLParser(recover=True, **safe))
-    for element in list(root.iter(etree.Element)):
-        if element.prefix is None and ":" in element.tag and not element.tag.startswith("{"):
-            element.getparent().remove(element)
-            continue
-        for name in [name for name in element.attrib if ":" in name and not name.startswith("{")]:
-            del element.attrib[name]
-    return root
-
-
-def _without_other_shapes(path: Path, root: Any) -> dict[str, None]:
-    skipped: dict[str, None] = {}
-    for holder in [*root.iter("visual"), *root.iter("collision")]:
-        geometry = holder.find("geometry")
-        shape = (
-            next((child.tag for child in geometry if isinstance(child.tag, str)), "") if geometry is not None else ""
-        )
-        if shape not in _SHAPES:
-            link = holder.getparent().get("name", "")
-            skipped[f"{path.name}: {holder.tag} of link {link}: shape {shape or 'none'!r}"] = None
-            holder.getparent().remove(holder)
-    return skipped
-
-
-def _check(path: Path, root: Any) -> None:
-    """Raise `SceneBuildError` for missing attributes and invalid numbers.
-
-    Only elements that are drawn are checked: transmissions and sensors have joints and limits of their own, and
-    exporters write masses in several ways.
-    """
-    for part in root:
-        if part.tag in ("link", "joint", "material"):
-            for element in part.iter():
-                if isinstance(element.tag, str) and element.getparent().tag != "inertial":
-                    _check_element(path, element)
-        if part.tag == "joint":
-            for end in _ENDS:
-                if part.find(end) is None:
-                    raise SceneBuildError(f'{_format_place(path, part)} has no <{end} link="...">')
-
-
-def _check_element(path: Path, element: Any) -> None:
-    above = element.getparent().tag
-    needed = _NEEDED.get(f"{above}/{element.tag}", _NEEDED.get(element.tag, ()) if above == "robot" else ())
-    for name in needed:
-        if not element.get(name):
-            raise SceneBuildError(f"{_format_place(path, element)} has no {name}")
-    for name, count in _NUMBERS.get(element.tag, {}).items():
-        text = element.get(name)
-        if text is None:
-            continue
+    def _numbers(
+        self,
+        element: Element | None,
+        attribute: str,
+        default: Sequence[float],
+        counts: tuple[int, ...] = (),
+        *,
+        endless: bool = False,
+    ) -> list[float]:
+        """Return the numbers of an attribute: as many as `default` has, or one of `counts`; finite unless `endless`."""
+        text = None if element is None else element.get(attribute)
+        if element is None or text is None:
+            return list(default)
         try:
             values = [float(word) for word in text.split()]
         except ValueError:
             values = []
-        counts = count if isinstance(count, tuple) else (count,)
-        endless = element.tag == "limit" and not any(map(math.isnan, values))
-        if len(values) not in counts or not (endless or all(map(math.isfinite, values))):
+        counts = counts or (len(default),)
+        finite = all(not math.isnan(v) if endless else math.isfinite(v) for v in values)
+        if len(values) not in counts or not finite:
             wanted = "one finite number" if counts == (1,) else f"{' or '.join(map(str, counts))} finite numbers"
-            raise SceneBuildError(f"{_format_place(path, element)}: {name} is {text[:60]!r} where {wanted} must stand")
+            raise SceneBuildError(f"{self._place(element)}: {attribute} is {text[:60]!r} where {wanted} must stand")
+        return values
+
+    def _origin(self, element: Element) -> Matrix:
+        """Return the pose that the `<origin>` of an element states, in the size of the drawing."""
+        origin = element.find("origin")
+        roll, pitch, yaw = self._numbers(origin, "rpy", (0.0, 0.0, 0.0))
+        about_z, about_y, about_x = ((0.0, 0.0, yaw), (0.0, pitch, 0.0), (roll, 0.0, 0.0))
+        q = quat_mul(quat_mul(quat_from_rotvec(about_z), quat_from_rotvec(about_y)), quat_from_rotvec(about_x))
+        matrix = np.eye(4)
+        matrix[:3, :3] = quat_to_matrix(np.array(q))
+        matrix[:3, 3] = self._scale * np.array(self._numbers(origin, "xyz", (0.0, 0.0, 0.0)))
+        return matrix
+
+    def _place(self, element: Element) -> str:
+        """Return the position of an element, for messages."""
+        name = element.get("name") or ""
+        return f"{self._file}, line {line_of(element)}: <{element.tag}>{f' {name}' if name else ''}"
+
+    def _skip(self, text: str) -> None:
+        self._skipped[f"{self._file}: {text}"] = None
+
+    # --- joints -------------------------------------------------------------------------------------------------------
+
+    def _read_joint(self, element: Element) -> _Joint:
+        name, kind = self._require(element, "name"), self._require(element, "type")
+        if kind not in _KINDS:
+            raise SceneBuildError(f"{self._file}: joint {name} of type {kind!r}; types are {', '.join(sorted(_KINDS))}")
+        ends = []
+        for tag in ("parent", "child"):
+            end = element.find(tag)
+            if end is None:
+                raise SceneBuildError(f'{self._place(element)} has no <{tag} link="...">')
+            ends.append(self._require(end, "link"))
+        low, high = self._read_limits(element, name, kind)
+        mimic, followed = element.find("mimic"), None
+        if mimic is not None and kind in _MOVING:
+            (multiplier,) = self._numbers(mimic, "multiplier", [1.0])
+            (offset,) = self._numbers(mimic, "offset", [0.0])
+            followed = _Mimic(self._require(mimic, "joint"), multiplier, offset)
+        axis = np.array(self._numbers(element.find("axis"), "xyz", (1.0, 0.0, 0.0)))
+        length = float(np.linalg.norm(axis))
+        if kind in _MOVING and length < 1e-9:
+            raise SceneBuildError(f"{self._file}: the axis of joint {name} is {axis}: three numbers, not all 0")
+        x, y, z = (axis / max(length, 1e-9)).tolist()
+        return _Joint(name, kind, ends[0], ends[1], self._origin(element), (x, y, z), low, high, followed)
+
+    def _read_limits(self, element: Element, name: str, kind: str) -> tuple[float, float]:
+        """Return the limits of a joint: a missing one counts as 0, as in URDF; without both there are none."""
+        limit = element.find("limit")
+        if kind == "continuous" or limit is None or not {"lower", "upper"}.intersection(limit.keys()):
+            return -math.inf, math.inf
+        (low,) = self._numbers(limit, "lower", [0.0], endless=True)
+        (high,) = self._numbers(limit, "upper", [0.0], endless=True)
+        if low > high:
+            raise SceneBuildError(f"{self._file}: joint {name} has limits from {low} to {high}")
+        return low, high
+
+    def _find_root(self, joints: Sequence[_Joint]) -> str:
+        """Return the link that no joint moves. Raises `SceneBuildError` unless links and joints form one tree."""
+        if len({joint.name for joint in joints}) != len(joints):
+            raise SceneBuildError(
+                f"{self._file}: two joints of one name: {_repeated([joint.name for joint in joints])}"
+            )
+        above: dict[str, _Joint] = {}
+        for joint in joints:
+            for link in (joint.parent, joint.child):
+                if link not in self._links:
+                    raise SceneBuildError(
+                        f"{self._file}: joint {joint.name} refers to link {link!r}, which is not there"
+                    )
+            if joint.child in above:
+                raise SceneBuildError(
+                    f"{self._file}: link {joint.child} hangs on two joints, {above[joint.child].name} and "
+                    f"{joint.name}: {_TREE}"
+                )
+            above[joint.child] = joint
+        rooted: set[str] = set()
+        for start in self._links:
+            link, way = start, dict[str, str]()  # links above one another, each with its joint
+            while link in above and link not in rooted:
+                if link in way:
+                    loop = [*way.values()][[*way].index(link) :][::-1]
+                    raise SceneBuildError(f"{self._file}: the joints {', '.join(loop[:8])} make a loop: {_TREE}")
+                way[link] = above[link].name
+                link = above[link].parent
+            rooted.update(way)
+        roots = [link for link in self._links if link not in above]
+        if len(roots) > 1:
+            raise SceneBuildError(
+                f"{self._file}: {len(roots)} links hang on no joint ({', '.join(roots[:8])}): in a URDF one does, "
+                "join the others"
+            )
+        return roots[0]
+
+    def _follow(self, joint: _Joint, by_name: Mapping[str, _Joint]) -> _Mimic:
+        """Return the joint that is set to move this one, along a chain of mimics."""
+        multiplier, offset, at = 1.0, 0.0, joint
+        for _ in by_name:
+            if at.mimic is None:
+                return _Mimic(at.name, multiplier, offset)
+            multiplier, offset = multiplier * at.mimic.multiplier, offset + multiplier * at.mimic.offset
+            followed = by_name.get(at.mimic.joint)
+            if followed is None or followed.kind not in _MOVING:
+                break
+            at = followed
+        followed_name = joint.mimic.joint if joint.mimic is not None else ""
+        raise SceneBuildError(
+            f"{self._file}: joint {joint.name} follows {followed_name!r}, which does not move, or follows it in turn"
+        )
+
+    # --- what is drawn ------------------------------------------------------------------------------------------------
+
+    def _read_items(self, link: str, part: int, T_part_link: Matrix) -> list[DrawnItem]:
+        found: list[DrawnItem] = []
+        for shown in self._links[link].findall(self._shape_tag):
+            geometry = shown.find("geometry")
+            shape = next(iter(geometry), None) if geometry is not None else None
+            matrix = T_part_link @ self._origin(shown)
+            name = truncate_name(shown.get("name") or link)
+            material = shown.find("material") if self._shape_tag == "visual" else None
+            look = None if material is None else self._read_appearance(material)
+            if shape is not None and shape.tag == "mesh":
+                found += self._read_mesh(shape, part, name, matrix, look)
+                continue
+            size = None if shape is None else self._read_size(shape)
+            if size is None:
+                tag = "none" if shape is None else shape.tag
+                self._skip(f"{self._shape_tag} of link {link}: shape {tag!r}")
+                continue
+            found.append(DrawnItem(part, name, matrix, look or Appearance(), kind=shape.tag, size=size))
+        return found
+
+    def _read_size(self, shape: Element) -> Vec3 | None:
+        """Return the size of a simple shape, as in `Geometry`; `None` for other elements."""
+        if shape.tag == GeometryKind.BOX:
+            self._require(shape, "size")
+            x, y, z = (0.5 * v for v in self._numbers(shape, "size", (0.0, 0.0, 0.0)))
+        elif shape.tag == GeometryKind.CYLINDER:
+            (x,), (length,) = (self._numbers(shape, key, [math.nan]) for key in ("radius", "length"))
+            y, z = x, 0.5 * length
+        elif shape.tag == GeometryKind.SPHERE:
+            (x,) = self._numbers(shape, "radius", [math.nan])
+            y = z = x
+        else:
+            return None
+        if not min(x, y, z) > 0 or math.isnan(z):
+            raise SceneBuildError(f"{self._place(shape)} has the half sizes {[x, y, z]}: positive lengths are needed")
+        return self._scale * x, self._scale * y, self._scale * z
+
+    def _read_mesh(
+        self, mesh: Element, part: int, name: str, matrix: Matrix, look: Appearance | None
+    ) -> list[DrawnItem]:
+        path = self._references.find(self._require(mesh, "filename"))
+        if path not in self._loaded:
+            self._loaded[path] = load_file(path, (*self._package_dirs, *self._references.folders(path)))
+            self._skipped |= dict.fromkeys(self._loaded[path].skipped)
+            if any(node.lights or node.cameras for node in self._loaded[path].nodes):
+                self._skip(f"lights and cameras in {path.name}")
+        loaded = self._loaded[path]
+        factors = np.broadcast_to(self._numbers(mesh, "scale", (1.0,), (1, 3)), 3)
+        T_part_file = matrix @ np.diag([*(self._scale * loaded.unit * factors), 1.0])
+        return [
+            DrawnItem(part, name, T_part_file @ node.matrix, surface.appearance or look or Appearance(), surface.mesh)
+            for node in loaded.nodes
+            for surface in node.surfaces
+        ]
+
+    def _read_appearance(self, material: Element) -> Appearance | None:
+        """Return the appearance of a material; one without colour refers to another one by name."""
+        name = material.get("name", "")
+        known = material if _is_defined(material) else self._materials.get(name)
+        if known is None:
+            self._skip(f"material {name!r}, which has neither colour nor texture anywhere")
+            return None
+        red, green, blue, alpha = (
+            min(max(v, 0.0), 1.0) for v in self._numbers(known.find("color"), "rgba", (1.0, 1.0, 1.0, 1.0))
+        )
+        rgba: Rgba = (red, green, blue, alpha)
+        texture = known.find("texture")
+        file = "" if texture is None else texture.get("filename", "")
+        return Appearance(rgba=rgba, name=truncate_name(name), images=self._read_texture(file) if file else ())
+
+    def _read_texture(self, file: str) -> tuple[tuple[str, TextureImage], ...]:
+        path = self._references.find(file)
+        if path not in self._textures:
+            pixels = self._budget.spend(read_pixels(read_bounded(path), str(path)))
+            self._textures[path] = TextureImage(pixels, truncate_name(path.stem))
+        return color_images(self._textures[path])
 
 
-def _format_place(path: Path, element: Any) -> str:
-    """Return the position of an element, for messages."""
-    name = element.get("name") or ""
-    return f"{path.name}, line {element.sourceline}: <{element.tag}>{f' {name}' if name else ''}"
+def _is_defined(material: Element) -> bool:
+    """Return whether a material has a colour or a texture of its own."""
+    return material.find("color") is not None or material.find("texture") is not None
+
+
+def _repeated(names: Sequence[str]) -> str:
+    return ", ".join(sorted({name for name in names if names.count(name) > 1})) or "none"

