@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.lie import quat_from_matrix
-from anchors.pose import PoseTuple, apply, compose, inverse, quat_conj, quat_mul, quat_rotate
+from anchors.pose import apply, compose, inverse, quat_conj, quat_rotate
 from iris_session.assets.store import AssetStore
-from iris_session.protocol.common import Pose, Quat, Vec3
+from iris_session.protocol.common import IDENTITY, Pose, Quat, Vec3
 from iris_session.protocol.names import ArrayKind, AssetEncoding, Follow, LightKind, TextureKind, TextureRole
 from iris_session.protocol.scene import Body, Camera, Light, SceneSpec, Visual
 from iris_session.scene.arrays import decode_arrays
+from iris_session.scene.colors import to_linear
 from iris_session.scene.cube_maps import CUBE_SIDE, CubeMap, CubeMapReader, bake_cube_map, direction_scale
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import decode_image, encode_image
@@ -109,13 +110,41 @@ class _GlbWriter:
                     self._get_children(nodes[visual.body]).append(node)
         for index, deformable in enumerate(self._spec.deformables):
             if deformable.rgba[3] > 0 and deformable.group in self._spec.groups_shown:
-                node = self._add_node(
-                    deformable.name or f"deformable_{index}", Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-                )
+                node = self._add_node(deformable.name or f"deformable_{index}", IDENTITY)
                 self._json["nodes"][node]["mesh"] = self._add_deformable(index)
                 self._get_children(0).append(node)
-        add_viewpoints(self._json, self._spec, nodes)
+        self._add_viewpoints(nodes)
         return self._pack()
+
+    def _add_viewpoints(self, nodes: Mapping[int, int]) -> None:
+        """Add cameras, and lights that are on, below the nodes of their bodies. `nodes`: nodes by id of the body."""
+        spec = self._spec
+        for k, camera in enumerate(spec.cameras):
+            pose = camera.T_body_camera
+            node = self._add_node(camera.name or f"camera_{k}", pose)
+            entry: dict[str, Any] = self._json["nodes"][node]
+            entry["camera"] = self._add("cameras", _build_camera(camera))
+            ahead = _find_direction_to_target(camera, pose.p, spec)
+            if ahead is not None:  # upright
+                q_world_body = next(body.T_world_body.q for body in spec.bodies if body.id == camera.body)
+                up = np.array(quat_rotate(quat_conj(q_world_body), (0.0, 0.0, 1.0)))
+                entry["rotation"] = _orient(-ahead, up, pose.q)
+            self._get_children(nodes[camera.body]).append(node)
+        lights = [light for light in spec.lights if light.active and light.kind in _LIGHTS]
+        if lights:
+            self._json["extensionsUsed"] = [_EXTENSION]
+            self._json["extensions"] = {_EXTENSION: {"lights": [_build_light(light) for light in lights]}}
+        for k, light in enumerate(lights):
+            node = self._add_node(light.name or f"light_{k}", Pose(light.p_body, IDENTITY.q))
+            ahead = _find_direction_to_target(light, light.p_body, spec)
+            back = -np.array(light.direction_body if ahead is None else ahead, np.float64)
+            back /= np.linalg.norm(back) or 1.0
+            up = np.array([0.0, 1.0, 0.0] if abs(back[1]) < 0.9 else [1.0, 0.0, 0.0])
+            self._json["nodes"][node] |= {
+                "rotation": _orient(back, up, IDENTITY.q),
+                "extensions": {_EXTENSION: {"light": k}},
+            }
+            self._get_children(nodes[light.body]).append(node)
 
     def _pack(self) -> bytes:
         self._json["buffers"] = [{"byteLength": len(self._blob)}]
@@ -232,7 +261,8 @@ class _GlbWriter:
         if uv is not None:
             attributes["TEXCOORD_0"] = self._add_accessor(uv, "VEC2")
         if mesh.color is not None:
-            attributes["COLOR_0"] = self._add_accessor(_to_linear_colors(mesh.color), "VEC4")
+            linear = np.concatenate([to_linear(mesh.color[:, :3] / 255), mesh.color[:, 3:] / 255], axis=1)
+            attributes["COLOR_0"] = self._add_accessor(linear.astype(np.float32), "VEC4")
         return {"attributes": attributes, "indices": self._add_indices(mesh.index)}
 
     def _add_indices(self, index: NDArray[Any]) -> int:
@@ -319,10 +349,10 @@ class _GlbWriter:
                 if mapped and texture is not None:
                     where[key] = {"index": texture}
             if material.emission > 0:  # of the visible colour, including the texture
-                found["emissiveFactor"] = [_to_linear(material.emission * v) for v in colour]
+                found["emissiveFactor"] = to_linear(material.emission * np.array(colour)).tolist()
                 if "baseColorTexture" in look:
                     found.setdefault("emissiveTexture", look["baseColorTexture"])
-        look["baseColorFactor"] = [*map(_to_linear, colour), min(max(float(rgba[3]), 0.0), 1.0)]
+        look["baseColorFactor"] = [*to_linear(colour).tolist(), min(max(float(rgba[3]), 0.0), 1.0)]
         if rgba[3] < 1:
             found["alphaMode"] = "BLEND"
         return found
@@ -361,14 +391,6 @@ def _normalise(normal: NDArray[np.float32]) -> NDArray[np.float32]:
     return kept
 
 
-def _to_linear_colors(color: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Convert vertex colours from sRGB in bytes to linear ones; alpha stays unchanged."""
-    v = color.astype(np.float64) / 255
-    shone = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
-    shone[:, 3] = v[:, 3]
-    return shone.astype(np.float32)
-
-
 def _initial_pose(body: Body, T_world_parent: Pose | None) -> Pose:
     """Return the initial pose in the parent: joints need not be at zero then."""
     T_world_body = body.T_world_body
@@ -381,40 +403,7 @@ def _initial_pose(body: Body, T_world_parent: Pose | None) -> Pose:
     return Pose(*compose(T_parent_world, (T_world_body.p, T_world_body.q)))
 
 
-def _to_linear(value: float) -> float:
-    """Convert an sRGB colour to glTF's linear factor."""
-    v = min(max(float(value), 0.0), 1.0)
-    return v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4
-
-
 # --- cameras and lights -----------------------------------------------------------------------------------------------
-
-
-def add_viewpoints(document: dict[str, Any], spec: SceneSpec, nodes: Mapping[int, int]) -> None:
-    """Add cameras and lights below the nodes of their bodies. `nodes`: nodes by id of the body."""
-    for k, camera in enumerate(spec.cameras):
-        document["cameras"].append(_build_camera(camera))
-        p, (w, x, y, z) = camera.T_body_camera.p, _seeing(camera, spec)
-        node = {"name": camera.name or f"camera_{k}", "translation": list(p), "rotation": [x, y, z, w], "camera": k}
-        _add_child_node(document, nodes[camera.body], node)
-    lights = [light for light in spec.lights if light.active and light.kind in _LIGHTS]
-    if not lights:
-        return
-    document["extensionsUsed"] = [_EXTENSION]
-    document["extensions"] = {_EXTENSION: {"lights": [_build_light(light) for light in lights]}}
-    for k, light in enumerate(lights):
-        node = {
-            "name": light.name or f"light_{k}",
-            "translation": list(light.p_body),
-            "rotation": _look_at(light, spec),
-            "extensions": {_EXTENSION: {"light": k}},
-        }
-        _add_child_node(document, nodes[light.body], node)
-
-
-def _add_child_node(document: dict[str, Any], parent: int, node: dict[str, Any]) -> None:
-    document["nodes"].append(node)
-    document["nodes"][parent].setdefault("children", []).append(len(document["nodes"]) - 1)
 
 
 def _build_camera(camera: Camera) -> dict[str, Any]:
@@ -433,8 +422,11 @@ def _build_camera(camera: Camera) -> dict[str, Any]:
 
 def _build_light(light: Light) -> dict[str, Any]:
     """Return a light as bright as it is drawn: intensity 1 by default, and its sRGB colour converted to linear."""
-    color = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in np.clip(light.diffuse, 0, 1).tolist()]
-    lamp: dict[str, Any] = {"type": _LIGHTS[light.kind], "color": color, "intensity": light.intensity or 1.0}
+    lamp: dict[str, Any] = {
+        "type": _LIGHTS[light.kind],
+        "color": to_linear(light.diffuse).tolist(),
+        "intensity": light.intensity or 1.0,
+    }
     if light.range > 0 and light.kind != LightKind.DIRECTIONAL:
         lamp["range"] = light.range
     if light.kind == LightKind.SPOT:
@@ -442,40 +434,28 @@ def _build_light(light: Light) -> dict[str, Any]:
     return lamp
 
 
-def _seeing(camera: Camera, spec: SceneSpec) -> Quat:
-    """Return the rotation of T_body_camera at the beginning: a camera that tracks a body is turned to it, upright."""
-    T_world_body = _place(camera.body, spec)
-    back = -_to_target(camera, apply(T_world_body, camera.T_body_camera.p), spec)
-    across = np.cross([0.0, 0.0, 1.0], back)
-    if not across.any():  # it tracks no body, or looks straight up or down
-        return camera.T_body_camera.q
-    across /= np.linalg.norm(across)
-    w, x, y, z = quat_from_matrix(np.stack([across, np.cross(back, across), back], axis=1)).tolist()
-    return quat_mul(quat_conj(T_world_body[1]), (w, x, y, z))
+def _find_direction_to_target(watcher: Light | Camera, p_body: Vec3, spec: SceneSpec) -> NDArray[np.float64] | None:
+    """Return the unit vector from a light or camera to the body that it tracks, in the frame of its own body.
 
-
-def _to_target(watcher: Light | Camera, p_world: Vec3, spec: SceneSpec) -> NDArray[np.float64]:
-    """Return the unit vector from `p_world` to the tracked body, zero without one."""
+    At the beginning; `None` when it tracks no body.
+    """
     if watcher.follow not in _WATCHING or watcher.target < 0:
-        return np.zeros(3)
-    way = np.subtract(_place(watcher.target, spec)[0], p_world)
-    return np.asarray(way / (np.linalg.norm(way) or 1.0))
+        return None
+    poses = {body.id: body.T_world_body for body in spec.bodies}
+    own = poses[watcher.body]
+    way = np.subtract(poses[watcher.target].p, apply((own.p, own.q), p_body))
+    way = np.array(quat_rotate(quat_conj(own.q), to_vec3(way)))
+    return np.asarray(way / np.linalg.norm(way)) if way.any() else None
 
 
-def _place(body: int, spec: SceneSpec) -> PoseTuple:
-    """Return T_world_body at the beginning."""
-    pose = next(one.T_world_body for one in spec.bodies if one.id == body)
-    return pose.p, pose.q
+def _orient(back: NDArray[np.float64], up: NDArray[np.float64], default: Quat) -> list[float]:
+    """Return `[x, y, z, w]` of a frame whose z axis is `back`, with its y axis close to `up`.
 
-
-def _look_at(light: Light, spec: SceneSpec) -> list[float]:
-    """Return `[x, y, z, w]` of a frame whose -z is the direction of the light, in the frame of its body."""
-    T_world_body = _place(light.body, spec)
-    to_target = _to_target(light, apply(T_world_body, light.p_body), spec)
-    watched = quat_rotate(quat_conj(T_world_body[1]), to_vec3(to_target))
-    back = -np.array(watched if to_target.any() else light.direction_body, np.float64)
-    back /= np.linalg.norm(back) or 1.0
-    side = np.cross([0.0, 1.0, 0.0] if abs(back[1]) < 0.9 else [1.0, 0.0, 0.0], back)
-    side /= np.linalg.norm(side) or 1.0
-    w, x, y, z = quat_from_matrix(np.stack([side, np.cross(back, side), back], axis=1)).tolist()
+    `default`: orientation where these are parallel.
+    """
+    side = np.cross(up, back)
+    w, x, y, z = default
+    if np.linalg.norm(side) > 1e-9:
+        side /= np.linalg.norm(side)
+        w, x, y, z = quat_from_matrix(np.stack([side, np.cross(back, side), back], axis=1)).tolist()
     return [x, y, z, w]

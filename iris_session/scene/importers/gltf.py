@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.names import ColorSpace, LightKind, TextureRole
 from iris_session.protocol.scene import Camera, Light, Rgba
+from iris_session.scene.colors import to_srgb
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, Pixels, drop_alpha, read_pixels
 from iris_session.scene.importers.gltf_file import KNOWN_EXTENSIONS, GltfFile, get_extension
@@ -242,7 +243,7 @@ class _Reader:
         pbr, mode = entry.get("pbrMetallicRoughness", {}), entry.get("alphaMode", "OPAQUE")
         cutoff = float(entry.get("alphaCutoff", 0.5))
         *factors, alpha = pbr.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0))
-        red, green, blue = map(_to_srgb, factors)
+        red, green, blue = to_srgb(factors).tolist()
         rgba, emission = self._emission(entry, (red, green, blue, 1.0 if mode == "OPAQUE" else _clamp(alpha)))
         uses: _Uses = []
         if base := pbr.get("baseColorTexture"):
@@ -269,7 +270,7 @@ class _Reader:
         In the specification a material emits its own colour; a black material takes the emitted colour as its own.
         """
         strength = get_extension(entry, "KHR_materials_emissive_strength").get("emissiveStrength", 1.0)
-        glow = float(strength) * np.array([_to_srgb(v) for v in to_vec3(entry.get("emissiveFactor", (0, 0, 0)))])
+        glow = float(strength) * to_srgb(entry.get("emissiveFactor", (0.0, 0.0, 0.0)))
         if not glow.any():
             return rgba, 0.0
         own = np.array(rgba[:3])
@@ -283,19 +284,19 @@ class _Reader:
 
     def _read_other_textures(self, entry: dict[str, Any]) -> _Uses:
         """Return the textures other than colour."""
-        rough = entry.get("pbrMetallicRoughness", {}).get("metallicRoughnessTexture")
-        shade = entry.get("occlusionTexture")
-        packed = bool(rough and shade) and rough["index"] == shade["index"]
+        rough: dict[str, Any] = entry.get("pbrMetallicRoughness", {}).get("metallicRoughnessTexture", {})
+        shade: dict[str, Any] = entry.get("occlusionTexture", {})
+        packed = bool(rough) and rough["index"] == shade.get("index")
         found = []
         for use, role, change in (
             (rough, TextureRole.ORM, None if packed else _drop_occlusion),
-            (None if packed else shade, TextureRole.OCCLUSION, None),
+            ({} if packed else shade, TextureRole.OCCLUSION, None),
             (entry.get("normalTexture"), TextureRole.NORMAL, None),
             (entry.get("emissiveTexture"), TextureRole.EMISSIVE, None),
         ):
             space = ColorSpace.AUTO if role == TextureRole.EMISSIVE else ColorSpace.LINEAR
-            image = None if use is None else self._read_texture(use, role, change, space)
-            if use is not None and image is not None:
+            image = self._read_texture(use, role, change, space) if use else None
+            if use and image is not None:
                 found.append((use, role, image))
         return found
 
@@ -343,7 +344,7 @@ class _Reader:
 
 
 def _to_light(entry: dict[str, Any], name: str) -> Light:
-    red, green, blue = (_to_srgb(v) for v in to_vec3(entry.get("color", (1.0, 1.0, 1.0))))
+    red, green, blue = to_srgb(entry.get("color", (1.0, 1.0, 1.0))).tolist()
     kind = _LIGHTS.get(entry.get("type", ""), LightKind.POINT)
     return Light(
         name=name,
@@ -369,13 +370,10 @@ def _to_camera(entry: dict[str, Any], name: str) -> Camera:
 
 
 def _to_bytes(color: NDArray[Any]) -> NDArray[np.uint8]:
-    """Convert linear vertex colours (n, 3 or 4) to sRGB in bytes, as `_to_srgb`."""
-    values = np.clip(np.nan_to_num(color.astype(np.float64)), 0, 1)
-    shown = np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055)
-    if values.shape[1] == 4:
-        shown[:, 3] = values[:, 3]
-    else:
-        shown = np.concatenate([shown, np.ones((len(shown), 1))], axis=1)
+    """Convert linear vertex colours (n, 3 or 4) to sRGB in bytes; alpha stays as it is."""
+    values = np.nan_to_num(color.astype(np.float64))
+    alpha = values[:, 3:] if values.shape[1] == 4 else np.ones((len(values), 1))
+    shown = np.concatenate([to_srgb(values[:, :3]), np.clip(alpha, 0.0, 1.0)], axis=1)
     return np.asarray(np.rint(shown * 255), np.uint8)
 
 
@@ -394,14 +392,6 @@ def _drop_occlusion(pixels: Pixels) -> Pixels:
     packed = np.full((*pixels.shape[:2], 3), 255, np.uint8)
     packed[:, :, 1:] = pixels[:, :, 1:3] if pixels.shape[2] >= 3 else pixels[:, :, :1]
     return packed
-
-
-def _to_srgb(value: float) -> float:
-    """Convert a linear factor of glTF to sRGB."""
-    v = _clamp(value)
-    if v >= 1.0:
-        return 1.0  # the formula is off by one bit there
-    return v * 12.92 if v <= 0.0031308 else 1.055 * v ** (1 / 2.4) - 0.055
 
 
 def _clamp(value: float) -> float:

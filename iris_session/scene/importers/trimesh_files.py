@@ -37,13 +37,8 @@ from iris_session.scene.nodes import (
 )
 
 _UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
-_USED: Final = re.compile(rb"^[ \t]*usemtl[ \t]+(\S[^\r\n]*)", re.MULTILINE)
-_DEFINED: Final = re.compile(rb"^[ \t]*newmtl[ \t]+(\S[^\r\n]*)", re.MULTILINE | re.IGNORECASE)
-_LIBRARIES: Final = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
 #: Names that trimesh gives to geometries without a name in the file.
 _MADE_UP: Final = re.compile(r"geometry(_\d+)?")
-#: Maps of an MTL file other than colour; the image of `map_ka` is that of the colour.
-_MAPS: Final = frozenset({"bump", "norm", "disp", "decal", "refl"})
 
 
 def read_with_trimesh(path: Path, references: References, name: str) -> LoadedFile:
@@ -57,10 +52,8 @@ def read_with_trimesh(path: Path, references: References, name: str) -> LoadedFi
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
     reader = _Reader(trimesh, path.name, name)
     nodes = reader.nodes(scene)
-    lost = _lost_materials(path.name, data, resolver) if kind == "obj" else ()
-    return LoadedFile(
-        nodes, _find_up_axis(kind, data), _find_unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped)
-    )
+    unit = float(trimesh.units.unit_conversion(scene.units, "meters")) if scene.units else 1.0
+    return LoadedFile(nodes, _find_up_axis(kind, data), unit, (*resolver.missing, *reader.skipped))
 
 
 def _checked(name: str, kind: str, data: bytes) -> bytes:
@@ -73,29 +66,12 @@ def _checked(name: str, kind: str, data: bytes) -> bytes:
     return CHECKS[kind](name, data) if kind in CHECKS else data
 
 
-def _lost_materials(name: str, data: bytes, resolver: Any) -> tuple[str, ...]:
-    """Return materials that no MTL file defines, if there is an MTL file: without any, the viewer chooses the
-    appearance.
-    """
-    libraries = {found.strip() for found in _LIBRARIES.findall(data)}
-    several = (f"{name}: its MTL files but for the first of {len(libraries)}",) if len(libraries) > 1 else ()
-    if not resolver.materials:
-        return several
-    lost = sorted({found.strip() for found in _USED.findall(data)} - resolver.materials)
-    names = ", ".join(truncate_name(found.decode(errors="replace")) for found in lost[:5])
-    return (*several, *([f"{name}: materials that its MTL file does not have: {names}"] if lost else []))
-
-
 def _find_up_axis(kind: str, data: bytes) -> str:
     """Return the up axis: COLLADA states it, y by default; the other formats do not, and count as z up."""
     if kind != "dae":
         return "z"
     found = _UP.search(data)
     return found.group(1).decode().lower() if found else "y"
-
-
-def _find_unit(trimesh: Any, scene: Any) -> float:
-    return float(trimesh.units.unit_conversion(scene.units, "meters")) if scene.units else 1.0
 
 
 class _Reader:
@@ -193,8 +169,6 @@ class _Reader:
             rgba = _rgba(material.diffuse)
         alpha = _first(more.get("d"), 1.0 - _first(more.get("tr"), 0.0))
         pictures = self._picture(material.image)
-        if maps := ", ".join(sorted(key for key in more if _other_map(key))):
-            self.skipped.append(f"{self._name}: of material {truncate_name(material.name)} the pictures {maps}")
         specular, gloss = more.get("ks"), _first(more.get("ns"), 64.0)
         shine = 0.5 if specular is None else float(np.mean(specular))
         return Appearance(
@@ -238,11 +212,6 @@ def _rgba(color: Any) -> Rgba:
     return red, green, blue, alpha
 
 
-def _other_map(key: str) -> bool:
-    """Return whether a keyword of an MTL file denotes a map other than colour."""
-    return key in _MAPS or (key.startswith("map_") and key not in ("map_kd", "map_ka"))
-
-
 def _first(value: Any, default: float) -> float:
     """Return a finite number of an MTL file, which may be a list of texts."""
     try:
@@ -258,17 +227,13 @@ def _resolver(trimesh: Any, references: References) -> Any:
     class Resolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
         def __init__(self) -> None:
             self.missing: list[str] = []
-            self.materials: set[bytes] = set()  # names defined by MTL files
 
         def get(self, name: str) -> bytes:
             try:
-                data = read_bounded(references.find(str(name).strip()))
+                return read_bounded(references.find(str(name).strip()))
             except SceneBuildError as error:
                 self.missing.append(str(error))
                 raise
-            if str(name).strip().lower().endswith(".mtl"):
-                self.materials.update(found.strip() for found in _DEFINED.findall(data))
-            return data
 
         def write(self, name: str, data: Any) -> None:
             raise SceneBuildError("nothing is written where files are read")

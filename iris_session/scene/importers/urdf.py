@@ -363,13 +363,10 @@ class _Reader:
             look = None if material is None else self._read_appearance(material)
             if shape is not None and shape.tag == "mesh":
                 found += self._read_mesh(shape, part, name, matrix, look)
-                continue
-            size = None if shape is None else self._read_size(shape)
-            if size is None:
-                tag = "none" if shape is None else shape.tag
-                self._skip(f"{self._shape_tag} of link {link}: shape {tag!r}")
-                continue
-            found.append(DrawnItem(part, name, matrix, look or Appearance(), kind=shape.tag, size=size))
+            elif shape is not None and (size := self._read_size(shape)) is not None:
+                found.append(DrawnItem(part, name, matrix, look or Appearance(), kind=shape.tag, size=size))
+            else:
+                self._skip(f"{self._shape_tag} of link {link}: shape {'none' if shape is None else shape.tag!r}")
         return found
 
     def _read_size(self, shape: Element) -> Vec3 | None:
