@@ -140,7 +140,7 @@ class SceneBuilder:
         Raises:
             SceneBuildError: An argument is wrong. Nothing is added.
         """
-        size = check_number("radius", radius, above=0.0) * 3
+        size = (check_number("radius", radius, above=0.0),) * 3
         return self._add_shape(GeometryKind.SPHERE, name, size, options)
 
     def add_ellipsoid(
@@ -306,7 +306,7 @@ class SceneBuilder:
             raise SceneBuildError(f"{wrong}: give up='y' or up='z', or None for what the format means")
         uniform_scale = to_array(scale, "scale").ndim == 0
         if uniform_scale:
-            (factor,) = check_number("scale", scale, "a number, or three, is needed")
+            factor = check_number("scale", scale)
         factors = (factor,) * 3 if uniform_scale else check_numbers("scale", scale, 3)
         if 0.0 in factors:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
@@ -350,7 +350,7 @@ class SceneBuilder:
         name = name or where.stem[:_MAX_NAME]
         self._check_new_name(name)
         T_world_root = check_pose(position, quaternion)
-        (factor,) = check_number("scale", scale, above=0.0)
+        factor = check_number("scale", scale, above=0.0)
         robot = read_urdf(where, name, T_world_root, package_dirs, collisions=collisions, scale=factor)
         for body in robot.articulation.bodies:
             self._check_new_name(body)
@@ -401,7 +401,7 @@ class SceneBuilder:
             )
         what, given, width = ("triangles", triangles, 3) if edges is None else ("edges", edges, 2)
         elements = check_triangles(f"{what} of {whose}", given, len(points), width)
-        (half,) = check_number("radius", radius, above=0.0)
+        half = check_number("radius", radius, above=0.0)
         look = parse_appearance(appearance)
         uv = None if uvs is None else check_vertices(f"uvs of {whose}", uvs, 2, len(points))
         self._content.deformables.append(
@@ -459,7 +459,7 @@ class SceneBuilder:
             ambient=_three("ambient", ambient),
             diffuse=_three("diffuse", diffuse),
             specular=_three("specular", specular),
-            cutoff=check_numbers("cutoff", [cutoff], 1)[0],
+            cutoff=check_number("cutoff", cutoff),
             castshadow=castshadow,
         )
         self._content.lights.append((self._find_movable(on), light))
@@ -491,7 +491,7 @@ class SceneBuilder:
         Raises:
             SceneBuildError: An argument is wrong. Nothing is added.
         """
-        (angle,) = check_number("fovy", fovy, above=0.0)
+        angle = check_number("fovy", fovy, above=0.0)
         if angle >= 180.0:
             raise SceneBuildError(f"fovy is {fovy}: degrees below 180")
         camera = Camera(truncate_name(name), 0, check_pose(position, quaternion), angle, resolution=resolution)

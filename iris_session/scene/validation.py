@@ -84,7 +84,7 @@ def parse_appearance(options: AppearanceOptions) -> Appearance | None:
     across, down = check_numbers("repeat", options.get("repeat", (1.0, 1.0)), 2)
     uniform = bool(options.get("uniform", False))
     values: dict[str, Any] = {
-        name: check_number(name, value)[0] for name in _STRENGTHS if (value := options.get(name)) is not None
+        name: check_number(name, value) for name in _STRENGTHS if (value := options.get(name)) is not None
     }
     if rgba is None and texture is None and not values and (across, down) == (1.0, 1.0) and not uniform:
         return None
@@ -133,37 +133,32 @@ def check_path(path: Any) -> Path:
         raise SceneBuildError(f"path is {path!r}: the path of a file is needed, as text or a Path") from None
 
 
-def check_numbers(what: str, values: Any, count: int, *, above: float | None = None) -> tuple[float, ...]:
-    """Return `count` finite numbers, greater than `above`."""
-    try:
-        texts = isinstance(values, str | bytes)  # whose digits would be taken for numbers
-        found = tuple(float(_reject_text(v)) for v in ((None,) if texts else values))
+def check_numbers(
+    what: str, values: Any, count: int, needed: str = "", *, above: float | None = None
+) -> tuple[float, ...]:
+    """Return `count` finite numbers, greater than `above`. `needed`: what they are, for the message."""
+    try:  # texts are no numbers, although `float` takes their digits
+        found = [float(v) for v in values if not isinstance(v, str | bytes)] if not isinstance(values, str) else []
     except (TypeError, ValueError, OverflowError):
-        raise SceneBuildError(f"{what} is {values!r}: {count} numbers are needed") from None
+        found = []
     if len(found) != count or not np.isfinite(found).all():
-        raise SceneBuildError(f"{what} is {values!r}: {count} finite numbers are needed")
+        raise SceneBuildError(f"{what} is {values!r}: {count} finite numbers {needed} are needed".replace("  ", " "))
     if above is not None and min(found) <= above:
         raise SceneBuildError(f"{what} is {values!r}: numbers greater than {above:g} are needed")
-    return found
+    return tuple(found)
 
 
-def check_number(
-    what: str, value: Any, needed: str = "a number is needed", *, above: float | None = None
-) -> tuple[float]:
-    """Return one finite number, greater than `above`, as a tuple."""
+def check_number(what: str, value: Any, *, above: float | None = None) -> float:
+    """Return one finite number, greater than `above`."""
     try:
-        found = float(_reject_text(value))
+        found = math.nan if isinstance(value, str | bytes) else float(value)
     except (TypeError, ValueError, OverflowError):
-        raise SceneBuildError(f"{what} is {value!r}: {needed}") from None
-    if not np.isfinite(found):
+        found = math.nan
+    if not math.isfinite(found):
         raise SceneBuildError(f"{what} is {value!r}: a finite number is needed")
     if above is not None and found <= above:
         raise SceneBuildError(f"{what} is {value!r}: a number greater than {above:g} is needed")
-    return (found,)
-
-
-def _reject_text(value: Any) -> Any:
-    return None if isinstance(value, str | bytes) else value
+    return found
 
 
 def check_vertices(what: str, values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:
@@ -229,9 +224,9 @@ def check_mesh(whose: str, vertices: Any, triangles: Any, normals: Any, uvs: Any
 
 def check_pose(position: Any, quaternion: Any) -> Pose:
     """Return a pose with the quaternion normalised. Raises `SceneBuildError`."""
-    x, y, z = _check_finite("position", position, 3, "(x, y, z) [m]")
+    x, y, z = check_numbers("position", position, 3, "(x, y, z) [m]")
     p: Vec3 = (x, y, z)
-    q = _check_finite("quaternion", quaternion, 4, "(w, x, y, z)")
+    q = check_numbers("quaternion", quaternion, 4, "(w, x, y, z)")
     length = math.hypot(*q)
     if not 1e-9 <= length < math.inf:
         raise SceneBuildError(
@@ -239,13 +234,3 @@ def check_pose(position: Any, quaternion: Any) -> Pose:
         )
     unit: Quat = (q[0] / length, q[1] / length, q[2] / length, q[3] / length)
     return IDENTITY if (p, unit) == (IDENTITY.p, IDENTITY.q) else Pose(p, unit)
-
-
-def _check_finite(what: str, values: Any, count: int, names: str) -> list[float]:
-    try:
-        found = [float(v) for v in ([] if isinstance(values, str | bytes) else values)]  # digits are no numbers
-    except (TypeError, ValueError):
-        found = []
-    if len(found) != count or not np.isfinite(found).all():
-        raise SceneBuildError(f"{what} is {values!r}: {count} finite numbers {names} are needed")
-    return found
