@@ -90,7 +90,7 @@ def _place_sheet(p_world: tuple[float, float, float]) -> dict[str, PoseTuple]:
 
 
 #: Endings of files in place of a name, for the error text; `serve` shows those that MuJoCo does not simulate.
-FILES: Final = ".xml, .mjcf, .mjb; to be shown: .urdf, .glb, .gltf, .stl, .obj, .ply, .off, .dae, .3mf"
+FILES: Final = ".xml, .mjcf, .mjb; to be shown: .urdf, .glb, .gltf, .stl, .obj, .ply, .off, .dae"
 #: Constructors of the scenes of `SCENE_NAMES`.
 SCENES: Final[dict[str, Callable[[], NamedScene]]] = {
     "handover": lambda: load_packaged("handover"),

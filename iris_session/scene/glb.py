@@ -90,8 +90,6 @@ class _GlbWriter:
         self._textures: dict[str, int] = {}  # by the address of the asset
         self._cubes = CubeMapReader(spec, store, CUBE_SIDE)
         self._accessors: dict[tuple[object, ...], int] = {}
-        self._shared: dict[tuple[object, ...], dict[str, Any]] = {}
-        self._see_through: set[tuple[object, ...]] = set()  # of those, by the alpha of their vertices
 
     def encode(self) -> bytes:
         T_world = {body.id: body.T_world_body for body in self._spec.bodies}
@@ -192,39 +190,26 @@ class _GlbWriter:
         return self._meshes[key]
 
     def _build_primitive(self, visual: Visual) -> dict[str, Any] | None:
-        geometry = visual.geometry
-        cube = self._cubes.find(visual.material, geometry)
-        mapped = self._mapping_key(visual, cube)
-        key = (geometry, mapped)
-        if key not in self._shared:
-            arrays = self._read_arrays(visual)
-            if arrays is None or not arrays.triangles:
-                return None
-            if cube is not None and cube.atlas is not None:
-                scale = direction_scale(self._spec, geometry, visual.material)
-                arrays = bake_cube_map(arrays, geometry, scale, cube.atlas)
-            elif mapped is not None:
-                arrays = add_texture_coordinates(arrays, geometry, self._spec.materials[visual.material])
-            self._shared[key] = self._add_attributes(arrays, arrays.uv)
-            if arrays.color is not None and bool((arrays.color[:, 3] < 255).any()):
-                self._see_through.add(key)
-        uv = "TEXCOORD_0" in self._shared[key]["attributes"]
-        see_through = key in self._see_through
-        material = self._add_material(visual.material, visual.rgba, mapped=uv, blended=see_through, cube=cube)
-        return {**self._shared[key], "material": material}
-
-    def _mapping_key(self, visual: Visual, cube: CubeMap | None) -> tuple[object, ...] | None:
-        """Return what texture coordinates depend on; `None` without a texture, or with those of the mesh unchanged."""
-        if cube is not None:
-            scale = direction_scale(self._spec, visual.geometry, visual.material)
-            return None if cube.atlas is None else ("cube", scale, cube.atlas.side, cube.atlas.single_colors)
-        material = None if visual.material < 0 else self._spec.materials[visual.material]
-        worn = -1 if material is None else material.find_texture()
-        if material is None or worn < 0 or self._spec.textures[worn].kind != TextureKind.IMAGE:
+        arrays = self._read_arrays(visual)
+        if arrays is None or not arrays.triangles:
             return None
-        mesh = visual.geometry.mesh
-        as_it_is = mesh >= 0 and self._spec.meshes[mesh].textured and material.repeat == (1.0, 1.0)
-        return None if as_it_is and not material.uniform else (material.repeat, material.uniform)
+        cube = self._cubes.find(visual.material, visual.geometry)
+        if cube is not None and cube.atlas is not None:
+            scale = direction_scale(self._spec, visual.geometry, visual.material)
+            arrays = bake_cube_map(arrays, visual.geometry, scale, cube.atlas)
+        elif visual.material >= 0:
+            material = self._spec.materials[visual.material]
+            texture = material.find_texture()
+            if texture >= 0 and self._spec.textures[texture].kind == TextureKind.IMAGE:
+                arrays = add_texture_coordinates(arrays, visual.geometry, material)
+        look = self._add_material(
+            visual.material,
+            visual.rgba,
+            mapped=arrays.uv is not None,
+            blended=arrays.color is not None and bool((arrays.color[:, 3] < 255).any()),
+            cube=cube,
+        )
+        return {**self._add_attributes(arrays), "material": look}
 
     def _read_arrays(self, visual: Visual) -> MeshArrays | None:
         geometry = visual.geometry
@@ -251,15 +236,15 @@ class _GlbWriter:
         mesh = index_corners(
             corners, np.repeat(normal[:, None], 3, axis=1), repeat_texture_coordinates(arrays.get("uv"), worn)
         )
-        return self._add("meshes", {"primitives": [{**self._add_attributes(mesh, mesh.uv), "material": look}]})
+        return self._add("meshes", {"primitives": [{**self._add_attributes(mesh), "material": look}]})
 
-    def _add_attributes(self, mesh: MeshArrays, uv: NDArray[np.float32] | None) -> dict[str, Any]:
+    def _add_attributes(self, mesh: MeshArrays) -> dict[str, Any]:
         attributes = {
             "POSITION": self._add_accessor(mesh.position, "VEC3", bounds=True),
             "NORMAL": self._add_accessor(_normalise(mesh.normal), "VEC3"),
         }
-        if uv is not None:
-            attributes["TEXCOORD_0"] = self._add_accessor(uv, "VEC2")
+        if mesh.uv is not None:
+            attributes["TEXCOORD_0"] = self._add_accessor(mesh.uv, "VEC2")
         if mesh.color is not None:
             linear = np.concatenate([to_linear(mesh.color[:, :3] / 255), mesh.color[:, 3:] / 255], axis=1)
             attributes["COLOR_0"] = self._add_accessor(linear.astype(np.float32), "VEC4")

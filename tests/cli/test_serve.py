@@ -54,7 +54,7 @@ def test_scene_argument_is_a_file_a_model_or_a_name(
         ("folder.glb", "is a folder"),
         (
             "part.docx",
-            ".docx cannot be read; supported are 3mf, dae, glb, gltf, mjb, mjcf, obj,",
+            ".docx cannot be read; supported are dae, glb, gltf, mjb, mjcf, obj,",
         ),
         ("part", "without a suffix"),
         ("empty.glb", "is empty: 0 bytes"),

@@ -48,7 +48,6 @@ def _robot(fuse: str) -> str:
         shape = '<mesh filename="package://arm_description/meshes/link.stl" scale="1 0.8 1.2"/>'
         parts.append(_link(f"link{k}", shape, "orange", f"0.0{k} 0 0.1", f"0.{k} 0.2 0"))
         origin = f'<origin xyz="0.0{k} -0.03 0.15" rpy="0.{k} {0.2 - 0.1 * k} {0.3 * k}"/>'
-        # yourdfpy uses the axis of a slide unnormalised: this one has length 1
         axis = "0 0.6 0.8" if kind == "prismatic" else f"0.{k + 1} {1 - 0.3 * k} 0.5"
         parts.append(_joint(name, kind, before, f"link{k}", origin, axis, low, high))
         before = f"link{k}"

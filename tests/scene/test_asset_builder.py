@@ -10,9 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.scene import AssetBuilder, AssetStore, EncodeOptions, decode_image, decode_mesh, encode_mesh_quantised
-from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.mesh_processing import simplify_mesh
+from iris_session.scene import AssetBuilder, AssetStore, EncodeOptions, decode_image, decode_mesh
 from iris_session.scene.meshes import index_corners
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.scene.models import many_objects
@@ -38,7 +36,8 @@ def test_lost_assets_and_damaged_notes_are_rebuilt(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     first = parse_mujoco(model, store)
     store.path(first.spec.meshes[0].levels[0].address).unlink()
-    assert parse_mujoco(model, store).built == 1
+    store.path(first.spec.textures[0].levels[0].address).write_bytes(b"")
+    assert parse_mujoco(model, store).built == 2
     next(path for path in (tmp_path / "index").rglob("*") if path.is_file()).write_bytes(b"\xc1")
     again = parse_mujoco(model, store)
     assert again.built == 1
@@ -104,15 +103,6 @@ def test_cube_faces_are_halved_separately(tmp_path: Path) -> None:
     assert np.array_equal(half[255::256, 0, 0], np.arange(6) * 40)
 
 
-def test_textures_in_other_encodings_are_passed_on(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path)
-    builder = AssetBuilder(store)
-    blob = np.random.default_rng(0).integers(0, 255, (3, 100, 2), np.uint8)
-    (note,) = builder.run([builder.texture_work(blob, "2d")])
-    assert note.levels[0].encoding == "opaque"
-    assert store.get(note.levels[0].address) == blob.tobytes()
-
-
 def test_arrays_of_equal_bytes_and_different_shape_differ(tmp_path: Path) -> None:
     """Two flat height fields, or the same numbers as edges and as triangles."""
     builder = AssetBuilder(AssetStore(tmp_path))
@@ -120,17 +110,6 @@ def test_arrays_of_equal_bytes_and_different_shape_differ(tmp_path: Path) -> Non
     wide, tall, whole = builder.run([builder.blob_work([b"grid", grid], repr(grid).encode) for grid in grids])
     assert len({wide.address, tall.address, whole.address}) == 3
     assert builder.built == 3
-
-
-def test_truncated_assets_are_rebuilt(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path)
-    pixels = picture(64, 64)
-    (note,) = (builder := AssetBuilder(store)).run([builder.texture_work(pixels, "2d")])
-    store.path(note.levels[0].address).write_bytes(b"")
-    again = AssetBuilder(store)
-    assert again.run([again.texture_work(pixels, "2d")]) == [note]
-    assert (again.built, again.recalled) == (1, 0)
-    assert np.array_equal(decode_image(store.get(note.levels[0].address), "arrays"), pixels)
 
 
 #: A mesh and a flex, and one difference at a time.
@@ -162,16 +141,6 @@ def test_cached_parts_of_a_model_are_not_used_for_another(tmp_path: Path) -> Non
     assert len(hashes) == len(DIFFERENT)
 
 
-def test_cloths_with_other_texture_coordinates_differ(tmp_path: Path) -> None:
-    addresses = set()
-    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
-    for uvs in ([[0, 0], [1, 0], [0, 1]], [[0, 0], [2, 0], [0, 2]]):
-        scene = SceneBuilder()
-        scene.add_deformable("cloth", corners, [[0, 1, 2]], uvs=uvs, texture=np.zeros((4, 4, 3), np.uint8))
-        addresses.add(scene.build(AssetStore(tmp_path)).spec.deformables[0].address)
-    assert len(addresses) == 2
-
-
 def test_transparent_textures_are_not_jpeg(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     builder = AssetBuilder(store, EncodeOptions(texture_encoding="jpeg"))
@@ -179,14 +148,3 @@ def test_transparent_textures_are_not_jpeg(tmp_path: Path) -> None:
     (note,) = builder.run([builder.texture_work(pixels, "2d")])
     assert note.levels[0].encoding == "png"
     np.testing.assert_array_equal(decode_image(store.get(note.levels[0].address), "png"), pixels)
-
-
-def test_stated_error_of_a_level_covers_both_steps(tmp_path: Path) -> None:
-    mesh = ball(4)
-    builder = AssetBuilder(AssetStore(tmp_path))
-    (note,) = builder.run([builder.mesh_work([mesh.position, mesh.index], lambda: mesh)])
-    coarse = simplify_mesh(mesh, mesh.triangles // 4)
-    assert coarse is not None
-    rounding = encode_mesh_quantised(coarse[0])[1]
-    assert rounding > 0
-    assert note.levels[1].max_error_m == pytest.approx(coarse[1] + rounding, rel=1e-12)

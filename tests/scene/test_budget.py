@@ -10,7 +10,6 @@ import pytest
 from iris_session.protocol.scene import Deformable, SceneSpec
 from iris_session.scene import AssetStore
 from iris_session.scene.budget import Budget, add_totals, choose_levels
-from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.report import build_report, format_tree
 from tests.scene.models import many_objects
@@ -75,15 +74,6 @@ def test_smallest_visuals_are_left_out_first(spec: SceneSpec) -> None:
     sides = [max(b - a for a, b in zip(mesh.low, mesh.high, strict=True)) for mesh in spec.meshes]
     largest = sides.index(max(sides))
     assert not any(visual.geometry.mesh == largest for visual in spec.visuals if visual.id in choice.hidden)
-
-
-def test_capsule_length_includes_its_caps(tmp_path: Path) -> None:
-    scene = SceneBuilder()
-    scene.add_capsule("longer", radius=0.5, half_length=0.8)
-    scene.add_box("shorter", half_size=(1.0, 0.1, 0.1))
-    found = scene.build(AssetStore(tmp_path)).spec
-    (hidden,) = choose_levels(found, Budget(objects=1)).hidden
-    assert found.visuals[hidden].name == "shorter"
 
 
 def test_report_names_heavy_parts(spec: SceneSpec) -> None:

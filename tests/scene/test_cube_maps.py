@@ -16,7 +16,7 @@ from PIL import Image
 
 from iris_session.protocol.scene import Geometry, SceneSpec
 from iris_session.scene import AssetStore, EncodeOptions
-from iris_session.scene.cube_maps import CubeMap, CubeMapReader, _with_atlas, bake_cube_map
+from iris_session.scene.cube_maps import CubeMapReader, bake_cube_map
 from iris_session.scene.glb import write_glb
 from iris_session.scene.meshes import MeshArrays
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -198,26 +198,6 @@ def test_large_cubes_are_scaled_down_and_jpeg_is_kept(
     assert (picture.size, picture.format) == ((3 * 36, 2 * 36), "JPEG")
     (difference,) = list_glb_differences(spec)
     assert difference.startswith("1 cube textures of more than 32 pixels")
-
-
-def test_cube_at_the_size_limit_is_unchanged(store: AssetStore) -> None:
-    spec = parse_mujoco(painted(SHAPES["box"], "cube", side=512), store).spec
-    visual = spec.visuals[0]
-    sides = []
-    for most in (512, 511):
-        cube = CubeMapReader(spec, store, most).find(visual.material, visual.geometry)
-        assert cube is not None
-        assert cube.atlas is not None
-        sides.append(cube.atlas.side)
-    assert sides == [512, 256]
-
-
-@pytest.mark.parametrize(("alpha", "pictured"), [(128, True), (255, False)])
-def test_uniform_transparent_texture_needs_a_picture(alpha: int, *, pictured: bool) -> None:
-    faces = np.full((6, 8, 8, 4), (200, 100, 0, alpha), np.uint8)
-    found = _with_atlas(CubeMap("", "png"), faces, 64)
-    assert (found.atlas is not None) == pictured
-    assert (found.tint != (1.0, 1.0, 1.0)) != pictured
 
 
 def ball(store: AssetStore) -> tuple[SceneSpec, MeshArrays, MeshArrays]:

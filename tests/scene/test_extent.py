@@ -12,7 +12,7 @@ import trimesh
 
 from iris_session.scene import AssetStore
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.extent import compute_box_extent, compute_extent, format_length, format_unit_hint
+from iris_session.scene.extent import compute_box_extent, compute_extent, format_unit_hint
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.nodes import to_matrix
 from iris_session.scene.shapes import build_primitive
@@ -99,7 +99,3 @@ def test_empty_scene_has_no_extent(tmp_path: Path) -> None:
 )
 def test_unit_mistakes_are_suspected(side: float, expected: str) -> None:
     assert format_unit_hint(side, "--scale {factor}") == expected
-
-
-def test_lengths_are_readable() -> None:
-    assert [format_length(v) for v in (0.1, 0.0999, 12.3456, 12_345.6)] == ["0.1 m", "99.9 mm", "12.35 m", "12,346 m"]

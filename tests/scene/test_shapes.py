@@ -101,21 +101,6 @@ def test_deformables_in_a_glb_have_their_poses(tmp_path: Path) -> None:
     assert {node["name"] for node in document(tmp_path / "a.glb")["nodes"]} >= {"cloth", "soft", "box"}
 
 
-@pytest.mark.parametrize("json_too", [False, True])
-def test_inspect(tmp_path: Path, capsys: pytest.CaptureFixture[str], *, json_too: bool) -> None:
-    options = ["--assets", str(tmp_path), *(["--json"] if json_too else [])]
-    assert main(["scene", "inspect", "handover", *options]) == 0
-    shown = capsys.readouterr().out
-    if json_too:
-        found = json.loads(shown)
-        assert len(found["scene_hash"]) == 64
-        assert found["totals"]["objects"] > 50
-        assert found["struggles"] == []
-    else:
-        assert "hammer: 3 box, cylinder, 164 triangles" in shown
-        assert "headset: nothing" in shown
-
-
 def test_scene_is_exported_in_its_initial_state(tmp_path: Path) -> None:
     """In the keyframe `home`, where joints are not at zero."""
     model = tmp_path / "arm.xml"
@@ -146,16 +131,3 @@ def test_scene_that_clients_would_reject_is_reported(
     monkeypatch.setattr("iris_session.protocol.scene.MAX_SCENE_BYTES", 1_000)
     assert main(["scene", "inspect", "handover", "--assets", str(tmp_path)]) == 2
     assert "at most 1000" in capsys.readouterr().err
-
-
-def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "handover.glb"
-    assert main(["scene", "export", "handover", str(out), "--assets", str(tmp_path / "assets")]) == 0
-    assert document(out)["asset"]["version"] == "2.0"
-    assert main(["scene", "export", "handover", "handover.obj", "--assets", str(tmp_path / "assets")]) == 2
-    assert main(["scene", "export", "handover", "/nowhere/a.glb", "--assets", str(tmp_path / "assets")]) == 2
-    assert main(["scene", "inspect", "handover", "--assets", str(out)]) == 2
-    errors = capsys.readouterr().err
-    assert ".glb" in errors
-    assert "cannot be written" in errors
-    assert "choose another" in errors

@@ -44,17 +44,6 @@ def test_large_picture_is_rejected_in_every_reader(tmp_path: Path, monkeypatch: 
         SceneBuilder().add_box(half_size=(1, 1, 1), texture=tmp_path / "picture.png")
 
 
-def test_names_that_cannot_be_sent_are_replaced(tmp_path: Path) -> None:
-    """JSON may contain lone surrogates."""
-    document = Document()
-    document.square()
-    document.json["nodes"] = [{"mesh": 0, "name": "half \ud800"}, {"mesh": 0, "name": "table"}]
-    scene = SceneBuilder()
-    scene.add_file(document.write(tmp_path / "a.glb"))
-    names = [body.name for body in scene.build(AssetStore(tmp_path / "store")).spec.bodies]
-    assert names[-2:] == ["half ?", "table"]
-
-
 def test_pictures_of_all_files_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where many materials name one picture: an OBJ file opens it for each."""
     path = write_obj(tmp_path)
