@@ -76,7 +76,7 @@ def decode_arrays(
     if header.kind != kind:
         raise AssetDecodeError(f"an asset of kind {header.kind!r}, where {kind!r} is expected")
     total = sum(
-        _stated_bytes(info) * (_SCALED // _DTYPES[info.dtype].itemsize if info.scale else 1) for info in header.arrays
+        _count_bytes(info) * (_SCALED // _DTYPES[info.dtype].itemsize if info.scale else 1) for info in header.arrays
     )
     if total > max_bytes:
         raise AssetDecodeError(f"arrays of {total} bytes, at most {max_bytes} are read")
@@ -171,7 +171,7 @@ def _undo_filter(info: ArrayInfo, plain: bytes | memoryview) -> Array:
     return flat.reshape(info.shape)
 
 
-def _stated_bytes(info: ArrayInfo) -> int:
+def _count_bytes(info: ArrayInfo) -> int:
     if info.dtype not in _DTYPES:
         raise AssetDecodeError(f"unknown dtype {info.dtype!r}, known: {', '.join(_DTYPES)}")
     size = math.prod(info.shape)
@@ -187,7 +187,7 @@ def _decode_array(info: ArrayInfo, packed: memoryview) -> Array:
         raise AssetDecodeError(f"unknown filter {info.filter!r}")
     if info.filter == ArrayFilter.DELTA and info.dtype == "f4":
         raise AssetDecodeError("differences of float32 are not exact")
-    size = _stated_bytes(info)
+    size = _count_bytes(info)
     plain: bytes | memoryview
     if info.codec == ArrayCodec.ZSTD:
         plain = _decompress(packed, size)

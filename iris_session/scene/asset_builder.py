@@ -105,7 +105,7 @@ class AssetBuilder:
     def run(self, pieces: Sequence[Work[Note]]) -> list[Note]:
         """Return results in the order of `pieces`. Equal content is built once."""
         with ThreadPoolExecutor(self._threads) as pool:
-            keys = list(pool.map(self._index_key, pieces))
+            keys = list(pool.map(self._compute_key, pieces))
             first = dict(zip(keys, pieces, strict=True))
             done = dict(zip(first, pool.map(self._run_one, first.items()), strict=True))
         recalled = [was for _, was in done.values()].count(True)
@@ -139,7 +139,7 @@ class AssetBuilder:
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
-    def _index_key(self, piece: Work[Note]) -> str:
+    def _compute_key(self, piece: Work[Note]) -> str:
         digest = hashlib.sha256(self._salt + piece.kind.__name__.encode())
         for part in piece.raw:
             content = np.ascontiguousarray(part).data if isinstance(part, np.ndarray) else memoryview(part)

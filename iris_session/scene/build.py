@@ -78,9 +78,9 @@ def build_scene(
     builder = AssetBuilder(store, options, threads)
     ids, bodies = _build_bodies(world)
     placed = [split_rigid(item.matrix) for item in world.items]
-    meshes, worn_mesh = _build_meshes(world.items, [rest for _, rest in placed], builder)
+    meshes, item_meshes = _build_meshes(world.items, [rest for _, rest in placed], builder)
     looks = [*(item.appearance for item in world.items), *(flexible.look for flexible in world.deformables)]
-    textures, materials, worn_look, skybox = _build_materials(looks, world.skybox, builder)
+    textures, materials, item_materials, skybox = _build_materials(looks, world.skybox, builder)
     visuals = tuple(
         Visual(
             id=k,
@@ -88,13 +88,13 @@ def build_scene(
             name=item.name,
             T_body_visual=placed[k][0],
             group=0,
-            geometry=_build_geometry(item, worn_mesh[k], meshes),
-            material=worn_look[k],
+            geometry=_build_geometry(item, item_meshes[k], meshes),
+            material=item_materials[k],
             rgba=item.appearance.rgba,
         )
         for k, item in enumerate(world.items)
     )
-    deformables, sources = _build_deformables(world.deformables, worn_look[len(visuals) :], builder)
+    deformables, sources = _build_deformables(world.deformables, item_materials[len(visuals) :], builder)
     spec = add_totals(
         SceneSpec(
             name=world.name,
@@ -109,7 +109,7 @@ def build_scene(
             deformables=deformables,
         )
     )
-    surroundings = environment or _default_environment(spec, sources)
+    surroundings = environment or _build_environment(spec, sources)
     if skybox >= 0:
         surroundings = msgspec.structs.replace(surroundings, skybox=skybox)
     spec = msgspec.structs.replace(spec, environment=surroundings)
@@ -298,7 +298,9 @@ def _build_deformables(
         sources.append(DeformableSource(one.name, f"deformable-{k}", topology, one.vertices))
         uv = None if one.uv is None or one.elements.shape[1] == 2 else one.uv[one.elements]
         raw: list[bytes | NDArray[Any]] = [b"deformable", one.elements, one.vertices]
-        works.append(builder.blob_work([*raw, *([] if uv is None else [uv])], _deformable_encoder(one, uv, topology)))
+        works.append(
+            builder.blob_work([*raw, *([] if uv is None else [uv])], _make_deformable_encoder(one, uv, topology))
+        )
     notes = builder.run(works)
     listed = tuple(
         Deformable(
@@ -320,13 +322,13 @@ def _build_deformables(
     return listed, sources
 
 
-def _deformable_encoder(
+def _make_deformable_encoder(
     one: ComposedDeformable, uv: NDArray[np.float32] | None, topology: DeformableTopology
 ) -> Callable[[], bytes]:
     return lambda: encode_deformable(one.elements, uv, one.vertices, topology)
 
 
-def _default_environment(spec: SceneSpec, sources: Sequence[DeformableSource]) -> Environment:
+def _build_environment(spec: SceneSpec, sources: Sequence[DeformableSource]) -> Environment:
     """Return an environment with centre and extent of the initial content without planes; all of it is within view."""
     box = compute_box_extent(spec, (source.vertices for source in sources))
     if box is None:
@@ -417,7 +419,7 @@ class SceneContent:
         bare: dict[int, MeshArrays] = {}
         places = [body] * len(loaded.nodes)
         T_world_body = to_matrix(self.bodies[body].pose) if body >= 0 else np.eye(4)
-        used = _nodes_with_content(loaded)
+        used = _find_nodes_with_content(loaded)
         several = len(used) > 1
         for k, node in enumerate(loaded.nodes):
             matrix = T_body_file @ node.matrix
@@ -443,14 +445,14 @@ class SceneContent:
                 )
             self.lights += [(places[k], _place_light(matrix, light)) for light in node.lights]
             if node.cameras:
-                T = _camera_pose(matrix)
+                T = _compute_camera_pose(matrix)
                 self.cameras += [
                     (places[k], msgspec.structs.replace(camera, T_body_camera=compose_poses(T, camera.T_body_camera)))
                     for camera in node.cameras
                 ]
 
 
-def _nodes_with_content(loaded: LoadedFile) -> set[int]:
+def _find_nodes_with_content(loaded: LoadedFile) -> set[int]:
     """Return the indices of nodes with content on or below them."""
     used: set[int] = set()
     for k, node in enumerate(loaded.nodes):
@@ -469,7 +471,7 @@ def _place_light(matrix: Matrix, light: Light) -> Light:
     return msgspec.structs.replace(light, p_body=to_vec3(p), direction_body=to_vec3(along))
 
 
-def _camera_pose(matrix: Matrix) -> Pose:
+def _compute_camera_pose(matrix: Matrix) -> Pose:
     """Return T_body_camera for the matrix of its node: the camera looks along -z with y up, also for a mirrored one."""
     back, up = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]), matrix[:3, 1]
     up = up - (up @ back) * back

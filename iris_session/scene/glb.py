@@ -86,7 +86,7 @@ class _GlbWriter:
             "cameras": [],
         }
         self._meshes: dict[tuple[object, ...], int | None] = {}
-        self._materials: dict[tuple[object, ...], int] = {}
+        self._materials: dict[str, int] = {}  # by their text
         self._textures: dict[str, int] = {}  # by the address of the asset
         self._cubes = CubeMapReader(spec, store, CUBE_SIDE)
         self._accessors: dict[tuple[object, ...], int] = {}
@@ -295,18 +295,6 @@ class _GlbWriter:
         opaque, apart from its own colour and textures. `cube`: cube texture of the visual; without it that of the
         material is not drawn.
         """
-        key = (index, tuple(rgba), mapped, both_sides, blended, cube is not None)
-        if key not in self._materials:
-            look = self._build_material(index, rgba, mapped=mapped, cube=cube)
-            look["doubleSided"] = both_sides
-            if blended:
-                look["alphaMode"] = "BLEND"
-            self._materials[key] = self._add("materials", look)
-        return self._materials[key]
-
-    def _build_material(
-        self, index: int, rgba: Sequence[float], *, mapped: bool, cube: CubeMap | None
-    ) -> dict[str, Any]:
         tint = (1.0, 1.0, 1.0) if cube is None else cube.tint
         colour = [float(v) * part for v, part in zip(rgba, tint, strict=False)]
         look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
@@ -317,17 +305,14 @@ class _GlbWriter:
             shine = 1.0 - material.shininess if material.roughness < 0 else material.roughness
             look["roughnessFactor"] = min(max(shine, 0.05), 1.0)
             found["name"] = material.name or f"material_{index}"
-            worn = material.find_texture()
-            if mapped and worn >= 0 and self._spec.textures[worn].channels == 4:
-                found["alphaMode"] = "BLEND"
+            color_texture = material.find_texture()
+            blended = blended or (mapped and color_texture >= 0 and self._spec.textures[color_texture].channels == 4)
+            base = self._add_texture(color_texture) if cube is None else self._add_atlas(cube)
+            shade = material.find_texture(TextureRole.ORM, TextureRole.OCCLUSION)
             for where, key, texture in (
-                (look, "baseColorTexture", self._add_texture(worn) if cube is None else self._add_atlas(cube)),
+                (look, "baseColorTexture", base),
                 (look, "metallicRoughnessTexture", self._add_texture(material.find_texture(TextureRole.ORM))),
-                (
-                    found,
-                    "occlusionTexture",
-                    self._add_texture(material.find_texture(TextureRole.ORM, TextureRole.OCCLUSION)),
-                ),
+                (found, "occlusionTexture", self._add_texture(shade)),
                 (found, "normalTexture", self._add_texture(material.find_texture(TextureRole.NORMAL))),
                 (found, "emissiveTexture", self._add_texture(material.find_texture(TextureRole.EMISSIVE))),
             ):
@@ -338,9 +323,13 @@ class _GlbWriter:
                 if "baseColorTexture" in look:
                     found.setdefault("emissiveTexture", look["baseColorTexture"])
         look["baseColorFactor"] = [*to_linear(colour).tolist(), min(max(float(rgba[3]), 0.0), 1.0)]
-        if rgba[3] < 1:
+        if blended or rgba[3] < 1:
             found["alphaMode"] = "BLEND"
-        return found
+        found["doubleSided"] = both_sides
+        known = json.dumps(found)
+        if known not in self._materials:
+            self._materials[known] = self._add("materials", found)
+        return self._materials[known]
 
     def _add_texture(self, index: int) -> int | None:
         if index < 0 or self._spec.textures[index].kind != TextureKind.IMAGE:

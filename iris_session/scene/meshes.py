@@ -109,8 +109,8 @@ def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
 
     Returns the bytes, and the bound on the position error [m].
     """
-    low, step = _lattice(mesh.position)
-    error = float(np.linalg.norm(step)) / 2 + _rounding_error(mesh.position)
+    low, step = _compute_lattice(mesh.position)
+    error = float(np.linalg.norm(step)) / 2 + _compute_rounding_error(mesh.position)
     arrays = [
         StoredArray(ArrayName.INDEX, _narrow_index(mesh.index, mesh.vertices), ArrayFilter.DELTA),
         _quantise(ArrayName.POSITION, mesh.position, low, step),
@@ -123,7 +123,7 @@ def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
         ),
     ]
     if mesh.uv is not None:
-        arrays.append(_quantise(ArrayName.UV, mesh.uv, *_lattice(mesh.uv)))
+        arrays.append(_quantise(ArrayName.UV, mesh.uv, *_compute_lattice(mesh.uv)))
     if mesh.color is not None:
         arrays.append(StoredArray(ArrayName.COLOR, mesh.color))
     return encode_arrays(ArrayKind.MESH, arrays, error), error
@@ -148,7 +148,7 @@ def _narrow_index(index: NDArray[np.uint32], vertices: int) -> NDArray[np.uint32
     return index.astype(np.uint16) if vertices <= 1 << 16 else index
 
 
-def _lattice(values: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _compute_lattice(values: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the lowest value and the step of 16 bits, per column."""
     if not len(values):
         return np.zeros(values.shape[1]), np.ones(values.shape[1])
@@ -157,7 +157,7 @@ def _lattice(values: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return low, np.where(step > 0, step, 1e-12)
 
 
-def _rounding_error(values: Floats) -> float:
+def _compute_rounding_error(values: Floats) -> float:
     """Return the error that float32 arithmetic in the decoder may add, over three axes [m]."""
     return float(np.abs(values).max(initial=0.0)) * 2.0**-22
 

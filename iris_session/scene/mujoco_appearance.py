@@ -114,7 +114,7 @@ def _to_body_frame(at: Any, body: int, v_world: Any) -> Any:
     return v_body
 
 
-def _light_place(model: mujoco.MjModel, i: int, at: Any | None) -> tuple[Vec3, Vec3]:
+def _find_light_place(model: mujoco.MjModel, i: int, at: Any | None) -> tuple[Vec3, Vec3]:
     """Return position and direction in the frame of the body. `at`: result of `compute_tracked`."""
     rigid = to_vec3(model.light_pos[i]), to_vec3(model.light_dir[i])
     if at is None or int(model.light_mode[i]) not in _TRACKING:
@@ -125,7 +125,7 @@ def _light_place(model: mujoco.MjModel, i: int, at: Any | None) -> tuple[Vec3, V
     return rigid if np.allclose(rigid, found, rtol=0, atol=_SAME) else found
 
 
-def _camera_place(model: mujoco.MjModel, i: int, at: Any | None) -> Pose:
+def _find_camera_pose(model: mujoco.MjModel, i: int, at: Any | None) -> Pose:
     """Return T_body_camera. `at`: result of `compute_tracked`."""
     rigid = to_pose(model.cam_pos[i], model.cam_quat[i])
     if at is None or int(model.cam_mode[i]) not in _TRACKING:
@@ -141,11 +141,11 @@ def _camera_place(model: mujoco.MjModel, i: int, at: Any | None) -> Pose:
 
 def read_lights(model: mujoco.MjModel, at: Any | None = None) -> tuple[Light, ...]:
     """Return all lights, by id. `at`: result of `compute_tracked`."""
-    places = [_light_place(model, i, at) for i in range(model.nlight)]
+    places = [_find_light_place(model, i, at) for i in range(model.nlight)]
     return tuple(
         Light(
             name=read_name(model, "light", i),
-            kind=_light_kind(model, i),
+            kind=_read_light_kind(model, i),
             body=int(model.light_bodyid[i]),
             p_body=places[i][0],
             direction_body=places[i][1],
@@ -168,7 +168,7 @@ def read_lights(model: mujoco.MjModel, at: Any | None = None) -> tuple[Light, ..
     )
 
 
-def _light_kind(model: mujoco.MjModel, index: int) -> str:
+def _read_light_kind(model: mujoco.MjModel, index: int) -> str:
     if hasattr(model, "light_type"):
         return _LIGHTS.get(int(model.light_type[index]), LightKind.SPOT)
     return LightKind.DIRECTIONAL if model.light_directional[index] else LightKind.SPOT  # before MuJoCo 3.3.3
@@ -190,9 +190,9 @@ def read_cameras(model: mujoco.MjModel, at: Any | None = None) -> tuple[Camera, 
             Camera(
                 name=read_name(model, "camera", i),
                 body=int(model.cam_bodyid[i]),
-                T_body_camera=_camera_place(model, i, at),
+                T_body_camera=_find_camera_pose(model, i, at),
                 fovy=float(model.cam_fovy[i]),
-                orthographic=_projection(model, i) == _ORTHOGRAPHIC,
+                orthographic=_read_projection(model, i) == _ORTHOGRAPHIC,
                 focal=focal,
                 principal=principal,
                 resolution=(width, height),
@@ -203,7 +203,7 @@ def read_cameras(model: mujoco.MjModel, at: Any | None = None) -> tuple[Camera, 
     return tuple(found)
 
 
-def _projection(model: mujoco.MjModel, index: int) -> int:
+def _read_projection(model: mujoco.MjModel, index: int) -> int:
     if hasattr(model, "cam_projection"):
         return int(model.cam_projection[index])
     return int(model.cam_orthographic[index])

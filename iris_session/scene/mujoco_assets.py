@@ -89,14 +89,14 @@ def read_textures(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[Texture
             width=image.shape[1],
             height=image.shape[0] // (1 if kind == TextureKind.IMAGE else _FACES),
             channels=image.shape[2],
-            colorspace=_color_space(model, i),
+            colorspace=_read_color_space(model, i),
             levels=note.levels,
         )
         for i, (kind, image, note) in enumerate(zip(kinds, images, notes, strict=True))
     )
 
 
-def _color_space(model: mujoco.MjModel, index: int) -> str:
+def _read_color_space(model: mujoco.MjModel, index: int) -> str:
     if not hasattr(model, "tex_colorspace"):  # before MuJoCo 3.3.1
         return ColorSpace.AUTO
     return _SPACES.get(int(model.tex_colorspace[index]), ColorSpace.AUTO)
@@ -164,8 +164,8 @@ def read_deformables(model: mujoco.MjModel, data: Any, builder: AssetBuilder) ->
             elements=len(parts[i].elements),
             radius=float(model.flex_radius[i]),
             flat=bool(model.flex_flatskin[i]),
-            material=_flex_material(model, i),
-            rgba=resolve_rgba(model, model.flex_rgba[i], _flex_material(model, i)),
+            material=_find_flex_material(model, i),
+            rgba=resolve_rgba(model, model.flex_rgba[i], _find_flex_material(model, i)),
             stream=stream_name(i),
             address=note.address,
             bytes=note.bytes,
@@ -174,7 +174,7 @@ def read_deformables(model: mujoco.MjModel, data: Any, builder: AssetBuilder) ->
     )
 
 
-def _flex_material(model: mujoco.MjModel, index: int) -> int:
+def _find_flex_material(model: mujoco.MjModel, index: int) -> int:
     """Return the material of a flex. Since MuJoCo 4 every element has one; models give all the same, so the first is
     used.
     """
@@ -223,14 +223,14 @@ def read_flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:
     ends = {"edges": elements} if dim == 1 else {"faces": elements}
     return FlexMesh(
         np.ascontiguousarray(elements, np.uint32),
-        _texture_coordinates(model, index, start, corners),
+        _read_texture_coordinates(model, index, start, corners),
         int(model.flex_vertadr[index]) + used,
         used,
         DeformableTopology(len(used), **ends).without_faces(),
     )
 
 
-def _texture_coordinates(
+def _read_texture_coordinates(
     model: mujoco.MjModel, index: int, start: int, corners: NDArray[np.int32]
 ) -> NDArray[np.float32] | None:
     at, dim = int(model.flex_texcoordadr[index]), int(model.flex_dim[index])

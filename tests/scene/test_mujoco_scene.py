@@ -179,24 +179,14 @@ def test_sites_and_tendons_are_optional(tmp_path: Path) -> None:
     xml = """<mujoco><worldbody><body><joint/><geom size=".1"/><site name="a" size=".01"/></body>
     <site name="b" pos="1 0 0" type="box" size=".01 .02 .03"/><site name="c"/></worldbody>
     <tendon><spatial name="t" width=".02" rgba="1 0 0 1"><site site="a"/><site site="b"/></spatial></tendon></mujoco>"""
-    plain, tendons, both = (
-        parse(xml, tmp_path, **wanted).spec for wanted in ({}, {"tendons": True}, {"sites": True, "tendons": True})
-    )
+    left_out = parse(xml, tmp_path)
+    assert [text.partition(":")[0] for text in left_out.skipped] == ["3 sites", "1 tendons"]
+    tendons, both = (parse(xml, tmp_path, sites=sites, tendons=True).spec for sites in (False, True))
+    plain = left_out.spec
     assert (plain.sites, plain.tendons) == ((), ())
     assert [site.name for site in tendons.sites] == ["b", "a"]
     assert [site.name for site in both.sites] == ["b", "c", "a"]
     assert (tendons.tendons[0].width, len(tendons.tendons[0].sites)) == (0.02, 2)
-
-
-def test_visible_sites_and_tendons_are_reported_as_left_out(tmp_path: Path) -> None:
-    xml = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/><site name="a"/></body>
-    <site name="b" pos="1 0 0"/><site group="4"/><site rgba="0 0 0 0"/></worldbody>
-    <tendon>{}<fixed><joint joint="j" coef="1"/></fixed></tendon></mujoco>"""
-    cable = '<spatial {}><site site="a"/><site site="b"/></spatial>'
-    shown, hidden = (xml.format(cable.format(look)) for look in ("", 'group="5"'))
-    assert [text.partition(":")[0] for text in parse(shown, tmp_path).skipped] == ["2 sites", "1 tendons"]
-    assert [text.partition(":")[0] for text in parse(hidden, tmp_path).skipped] == ["2 sites"]
-    assert parse(shown, tmp_path, sites=True, tendons=True).skipped == ()
 
 
 def test_texture_in_its_own_encoding_is_passed_on(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ _ADDRESS: Final = re.compile(r"(https?|ftp):[/\\]")
 #: Maximum number of files that an error message lists.
 _LISTED: Final = 8
 #: Errors whose messages are about code, not about the file.
-_OF_CODE: Final = (AttributeError, TypeError, NameError, AssertionError, NotImplementedError, RecursionError)
+_CODE_ERRORS: Final = (AttributeError, TypeError, NameError, AssertionError, NotImplementedError, RecursionError)
 
 
 def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name: str = "") -> LoadedFile:
@@ -44,7 +44,7 @@ def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name
     kind = get_ending(path)
     check_present(path)
     if kind not in (*_GLTF, *MESHES):
-        raise SceneBuildError(f"{path.name}: {_other_reader(path, kind)}")
+        raise SceneBuildError(f"{path.name}: {_suggest_reader(path, kind)}")
     references = References(path, package_dirs)
     found: LoadedFile = read_guarded(path, kind, lambda: _read(path, kind, references, name or path.stem))
     if not any(node.surfaces or node.lights or node.cameras for node in found.nodes):
@@ -60,9 +60,11 @@ def check_present(path: Path) -> None:
         if _ADDRESS.match(str(path)):  # `Path` merges the two slashes of an address
             raise SceneBuildError(f"{path.name}: files are read, not addresses: download it first")
         if path.is_dir():
-            raise SceneBuildError(f"{path} is a folder: name a file{readable_in(path, 'in it')}")
+            raise SceneBuildError(f"{path} is a folder: name a file{list_readable_files(path, 'in it')}")
         if not path.is_file():
-            raise SceneBuildError(f"{path}: no such file{readable_in(path.parent, 'in its folder', get_ending(path))}")
+            raise SceneBuildError(
+                f"{path}: no such file{list_readable_files(path.parent, 'in its folder', get_ending(path))}"
+            )
         if not path.stat().st_size:
             raise SceneBuildError(f"{path} is empty: 0 bytes")
     except (OSError, ValueError) as error:  # not a possible file name
@@ -82,7 +84,7 @@ def read_guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
         raise SceneBuildError(f"{path} does not fit into memory: make it smaller") from None
     except (IndexError, KeyError) as error:
         raise SceneBuildError(f"{path} names something that it does not have ({error}): export it again") from error
-    except _OF_CODE as error:  # a reader did not find what it needs; the message is about its code
+    except _CODE_ERRORS as error:  # a reader did not find what it needs; the message is about its code
         _logger.debug("%s cannot be read", path, exc_info=True)
         raise SceneBuildError(
             f"{path} is damaged, or no {kind.upper()}: something in it is missing or of another kind; "
@@ -98,7 +100,7 @@ def get_ending(path: Path) -> str:
     return path.suffix.lower().lstrip(".")
 
 
-def readable_in(folder: Path, where: str, wanted: str = "") -> str:
+def list_readable_files(folder: Path, where: str, wanted: str = "") -> str:
     """Return, for error messages, the readable files of a folder, those with suffix `wanted` first."""
     try:
         found = [entry for entry in folder.iterdir() if get_ending(entry) in ENDINGS and entry.is_file()]
@@ -111,7 +113,7 @@ def readable_in(folder: Path, where: str, wanted: str = "") -> str:
     return f"; {where}: {', '.join(names[:_LISTED])}{more}"
 
 
-def _other_reader(path: Path, kind: str) -> str:
+def _suggest_reader(path: Path, kind: str) -> str:
     if kind in ROBOTS:
         return "a URDF is a robot: use add_urdf"
     if kind == "xacro":

@@ -46,17 +46,17 @@ def read_with_trimesh(path: Path, references: References, name: str) -> LoadedFi
 
     Raises `SceneBuildError`, and any error that trimesh raises for damaged files.
     """
-    trimesh, kind = _trimesh(), path.suffix.lower().lstrip(".")
-    data = _checked(path.name, kind, read_bounded(path))
-    resolver = _resolver(trimesh, references)
+    trimesh, kind = _import_trimesh(), path.suffix.lower().lstrip(".")
+    data = _check_file(path.name, kind, read_bounded(path))
+    resolver = _make_resolver(trimesh, references)
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
     reader = _Reader(trimesh, path.name, name)
-    nodes = reader.nodes(scene)
+    nodes = reader.read_nodes(scene)
     unit = float(trimesh.units.unit_conversion(scene.units, "meters")) if scene.units else 1.0
     return LoadedFile(nodes, _find_up_axis(kind, data), unit, (*resolver.missing, *reader.skipped))
 
 
-def _checked(name: str, kind: str, data: bytes) -> bytes:
+def _check_file(name: str, kind: str, data: bytes) -> bytes:
     if kind == "dae":
         try:
             import collada  # noqa: F401
@@ -80,19 +80,19 @@ class _Reader:
         self._name = name
         self._unnamed = unnamed
         self._appearances: dict[int, Appearance | None] = {}
-        self._pictures: dict[int, TextureImage] = {}
+        self._images: dict[int, TextureImage] = {}
         self._budget = PixelBudget(name)
         self.skipped: list[str] = []
 
-    def nodes(self, scene: Any) -> tuple[Node, ...]:
+    def read_nodes(self, scene: Any) -> tuple[Node, ...]:
         """Return the nodes, flat, in the order of the geometries in the file: trimesh keeps no other order."""
         surfaces: dict[str, Surface] = {}
-        names = self._names(list(scene.geometry))
+        names = self._name_parts(list(scene.geometry))
         for name, geometry in scene.geometry.items():
             if not isinstance(geometry, self._trimesh.Trimesh):
                 self.skipped.append(f"{self._name}: {name}, which is {type(geometry).__name__} and no triangles")
             elif len(geometry.faces):
-                surfaces[name] = self._surface(geometry, names[name])
+                surfaces[name] = self._read_surface(geometry, names[name])
         if sum(surface.mesh.triangles for surface in surfaces.values()) > MAX_TRIANGLES:
             raise SceneBuildError(f"{self._name} has more than {MAX_TRIANGLES:,} triangles: make it coarser")
         order = {name: place for place, name in enumerate(surfaces)}
@@ -107,14 +107,14 @@ class _Reader:
         listed = list(surfaces.values())
         return tuple(Node(listed[k].name, -1, matrix, [listed[k]]) for k, matrix in placed)
 
-    def _names(self, given: list[str]) -> dict[str, str]:
+    def _name_parts(self, given: list[str]) -> dict[str, str]:
         """Return the names of the geometries: those in the file, or its own name where trimesh invented them."""
         made_up = [name for name in given if _MADE_UP.fullmatch(name)]
         several = len(made_up) > 1
         ours = {name: f"{self._unnamed}_{k}" if several else self._unnamed for k, name in enumerate(made_up, start=1)}
         return {name: truncate_name(ours.get(name, name)) for name in given}
 
-    def _surface(self, geometry: Any, name: str) -> Surface:
+    def _read_surface(self, geometry: Any, name: str) -> Surface:
         points = np.ascontiguousarray(geometry.vertices, np.float64)
         faces = np.ascontiguousarray(geometry.faces, np.int64)
         if not np.isfinite(points).all():
@@ -127,7 +127,7 @@ class _Reader:
         color: NDArray[np.uint8] | None = None
         look: Appearance | None = None
         if visual.kind == "texture":
-            look = self._appearance(visual.material)
+            look = self._read_appearance(visual.material)
             if visual.uv is not None and len(visual.uv) == len(points):
                 downward = np.asarray(visual.uv, np.float64)[:, :2] * [1, -1] + [0, 1]  # v points up in trimesh
                 uv = np.ascontiguousarray(np.nan_to_num(downward)[faces], np.float32)
@@ -135,13 +135,15 @@ class _Reader:
             color = np.asarray(visual.vertex_colors, np.uint8)[faces]
         elif visual.kind == "face":
             color = np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None], 3, axis=1)
-        mesh = index_corners(points[faces].astype(np.float32), self._normals(geometry, points, faces), uv, color)
+        mesh = index_corners(points[faces].astype(np.float32), self._read_normals(geometry, points, faces), uv, color)
         if color is not None:
             mesh, rgba = merge_vertex_color(mesh, (1.0, 1.0, 1.0, 1.0))
             look = Appearance(rgba=rgba)
         return Surface(mesh, look, name)
 
-    def _normals(self, geometry: Any, points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float32]:
+    def _read_normals(
+        self, geometry: Any, points: NDArray[np.float64], faces: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
         """Return normals at the corners: those of the file, else computed from the triangles around each point."""
         given = geometry._cache.cache.get("vertex_normals")  # the property would compute normals
         if given is not None and len(given) == len(points):
@@ -149,13 +151,15 @@ class _Reader:
         first, same = find_unique_rows(np.ascontiguousarray(points.astype(np.float32) + np.float32(0.0)))
         return compute_creased_normals(points[first], same[faces]).astype(np.float32)
 
-    def _appearance(self, material: Any) -> Appearance | None:
+    def _read_appearance(self, material: Any) -> Appearance | None:
         if id(material) not in self._appearances:
             pbr = isinstance(material, self._trimesh.visual.material.PBRMaterial)
-            self._appearances[id(material)] = self._of_pbr(material) if pbr else self._of_mtl(material)
+            self._appearances[id(material)] = (
+                self._read_pbr_material(material) if pbr else self._read_mtl_material(material)
+            )
         return self._appearances[id(material)]
 
-    def _of_mtl(self, material: Any) -> Appearance | None:
+    def _read_mtl_material(self, material: Any) -> Appearance | None:
         """Return the appearance of an MTL material.
 
         It is read from `Kd`, `Ks`, `Ns`, `d` or `Tr`, and `map_Kd`, which multiplies the colour. `None` for the
@@ -167,9 +171,9 @@ class _Reader:
         rgba = (1.0, 1.0, 1.0, 1.0) if material.image is not None else GREY
         if "kd" in more:
             rgba = _rgba(material.diffuse)
-        alpha = _first(more.get("d"), 1.0 - _first(more.get("tr"), 0.0))
-        pictures = self._picture(material.image)
-        specular, gloss = more.get("ks"), _first(more.get("ns"), 64.0)
+        alpha = _to_number(more.get("d"), 1.0 - _to_number(more.get("tr"), 0.0))
+        pictures = self._read_image(material.image)
+        specular, gloss = more.get("ks"), _to_number(more.get("ns"), 64.0)
         shine = 0.5 if specular is None else float(np.mean(specular))
         return Appearance(
             rgba=(*rgba[:3], min(max(alpha, 0.0), 1.0)),
@@ -179,7 +183,7 @@ class _Reader:
             images=pictures,
         )
 
-    def _of_pbr(self, material: Any) -> Appearance:
+    def _read_pbr_material(self, material: Any) -> Appearance:
         rgba = (1.0, 1.0, 1.0, 1.0) if material.baseColorFactor is None else _rgba(material.baseColorFactor)
         glow = 0.0 if material.emissiveFactor is None else float(np.max(material.emissiveFactor))
         metallic = -1.0 if material.metallicFactor is None else float(material.metallicFactor)
@@ -191,16 +195,16 @@ class _Reader:
             shininess=0.5 if roughness < 0 else min(max(1.0 - roughness, 0.0), 1.0),
             metallic=metallic,
             roughness=roughness,
-            images=self._picture(material.baseColorTexture),
+            images=self._read_image(material.baseColorTexture),
         )
 
-    def _picture(self, image: Any) -> tuple[tuple[str, TextureImage], ...]:
+    def _read_image(self, image: Any) -> tuple[tuple[str, TextureImage], ...]:
         if image is None:
             return ()
-        if id(image) not in self._pictures:
+        if id(image) not in self._images:
             pixels = to_pixels(image, f"a picture of {self._name}")
-            self._pictures[id(image)] = TextureImage(self._budget.spend(pixels))
-        picture = self._pictures[id(image)]
+            self._images[id(image)] = TextureImage(self._budget.spend(pixels))
+        picture = self._images[id(image)]
         return color_images(picture)
 
 
@@ -212,7 +216,7 @@ def _rgba(color: Any) -> Rgba:
     return red, green, blue, alpha
 
 
-def _first(value: Any, default: float) -> float:
+def _to_number(value: Any, default: float) -> float:
     """Return a finite number of an MTL file, which may be a list of texts."""
     try:
         found = float(value[0] if isinstance(value, list | tuple) else value)
@@ -221,7 +225,7 @@ def _first(value: Any, default: float) -> float:
     return found if math.isfinite(found) else default
 
 
-def _resolver(trimesh: Any, references: References) -> Any:
+def _make_resolver(trimesh: Any, references: References) -> Any:
     """Return the resolver that trimesh asks for further files: `references` decides, and missing files are recorded."""
 
     class Resolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
@@ -247,7 +251,7 @@ def _resolver(trimesh: Any, references: References) -> Any:
     return Resolver()
 
 
-def _trimesh() -> Any:
+def _import_trimesh() -> Any:
     try:
         import trimesh
     except ImportError:

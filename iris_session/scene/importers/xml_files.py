@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 from xml.sax import ContentHandler, SAXParseException
 
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.nodes import MAX_TRIANGLES
+from iris_session.scene.nodes import MAX_NODES, MAX_TRIANGLES
 
 #: Maximum depth of instances within one another.
 _MAX_DEPTH: Final = 64
@@ -99,6 +99,7 @@ def check_dae(name: str, data: bytes) -> bytes:
     root = parse_xml(name, data, "COLLADA")
     links: dict[str, list[str]] = {"": []}  # what is placed in each element, repeated; nodes by serial numbers
     triangles: dict[str, float] = {}
+    nodes: set[str] = set()
     waiting = [(root, "")]
     while waiting:
         element, holder = waiting.pop()
@@ -108,6 +109,7 @@ def check_dae(name: str, data: bytes) -> bytes:
             links[own] = []
             if tag == "node":
                 links[holder].append(own)
+                nodes.add(own)
             if identity := element.get("id"):
                 links.setdefault(f"#{identity}", []).append(own)
             holder = own
@@ -117,25 +119,28 @@ def check_dae(name: str, data: bytes) -> bytes:
         elif tag == "p":
             triangles[holder] = triangles.get(holder, 1.0) + len(element.text or "") / _TRIANGLE_CHARACTERS
         waiting += [(child, holder) for child in element]
-    _check_instances(name, links, triangles)
+    _check_instances(name, links, triangles, nodes)
     checked: bytes = ElementTree.tostring(root, "utf-8")
     return checked
 
 
-def _check_instances(name: str, links: dict[str, list[str]], triangles: dict[str, float]) -> None:
+def _check_instances(name: str, links: dict[str, list[str]], triangles: dict[str, float], nodes: set[str]) -> None:
     """Count what the file draws, everything as often as it is placed. Raises `SceneBuildError` for too much."""
     try:
         order = [*graphlib.TopologicalSorter(links).static_order()]
     except graphlib.CycleError:
         raise SceneBuildError(f"{name} contains an instance of itself: remove it") from None
     drawn: dict[str, float] = {}
+    parts: dict[str, int] = {}
     depth: dict[str, int] = {}
     for thing in order:  # contained elements come first
         below = links.get(thing, ())
         drawn[thing] = triangles.get(thing, 0.0) + sum(drawn[one] for one in below)
+        parts[thing] = (thing in nodes) + sum(parts[one] for one in below)
         depth[thing] = 1 + max((depth[one] for one in below), default=0)
-    if drawn[""] > MAX_TRIANGLES or depth[""] > _MAX_DEPTH:
+    if drawn[""] > MAX_TRIANGLES or parts[""] > MAX_NODES or depth[""] > _MAX_DEPTH:
         raise SceneBuildError(
-            f"{name} places its parts so often within one another that it draws {drawn['']:,.0f} triangles in "
-            f"{depth['']} levels, at most {MAX_TRIANGLES:,} in {_MAX_DEPTH}: make it simpler"
+            f"{name} places its parts so often within one another that it draws {drawn['']:,.0f} triangles of "
+            f"{parts['']:,} parts in {depth['']} levels, at most {MAX_TRIANGLES:,}, {MAX_NODES:,} and {_MAX_DEPTH}: "
+            "make it simpler"
         )

@@ -87,6 +87,5 @@ def test_comments_in_off_files_are_ignored(tmp_path: Path) -> None:
 def test_reports_of_the_library_are_not_printed(tmp_path: Path) -> None:
     """Without a handler Python would print them although no logging was configured."""
     broken = FACET.replace("normal 0 0 1", "normal 0 zero 1")
-    with pytest.raises(SceneBuildError):
-        load_file(written(tmp_path, "a.stl", f"solid x\n{broken}{FACET}endsolid"))
+    load_file(written(tmp_path, "a.stl", f"solid x\n{broken}{FACET}endsolid"))
     assert logging.getLogger("trimesh").handlers

@@ -48,8 +48,12 @@ def test_few_instances_are_read(tmp_path: Path) -> None:
     assert len(load_file(tmp_path / "a.dae").nodes) == 8
 
 
-def test_exponential_nesting_is_rejected(tmp_path: Path) -> None:
-    (tmp_path / "a.dae").write_text(dae(doubling(40), '<node id="top"><instance_node url="#n0"/></node>'))
+@pytest.mark.parametrize("empty", [False, True])
+def test_exponential_nesting_is_rejected(tmp_path: Path, empty: bool) -> None:
+    """Also of nodes without anything in them: the reader follows them all the same."""
+    nodes = doubling(40)
+    nodes = nodes.replace('<instance_geometry url="#g"/>', "") if empty else nodes
+    (tmp_path / "a.dae").write_text(dae(nodes, '<node id="top"><instance_node url="#n0"/></node>'))
     with pytest.raises(SceneBuildError, match=r"that it draws"):
         load_file(tmp_path / "a.dae")
 
