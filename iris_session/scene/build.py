@@ -66,7 +66,7 @@ from iris_session.streams.deformable_topology import DeformableTopology
 _FAR: Final = 50.0
 _FAR_EXTENTS: Final = 10.0
 _FACES: Final = 6
-_SCALE_ADVICE: Final = "scale={factor} (--scale {factor}), times the present one,"
+_SCALE_ADVICE: Final = "scale={factor} of what it is now (--scale {factor})"
 #: Maximum coordinate of a vertex in its own frame [m]. Larger ones are a mistake of units, and too large for float32.
 MAX_COORDINATE_M: Final = 1e6
 

@@ -29,7 +29,7 @@ from iris_session.scene.result import ComposedScene
 from iris_session.scene.validation import (
     AppearanceOptions,
     DrawingOptions,
-    Placement,
+    ScenePlacement,
     check_mesh,
     check_number,
     check_numbers,
@@ -543,7 +543,7 @@ class SceneBuilder:
         )
         return name
 
-    def _place(self, name: str, placement: Placement, *, named: bool = False) -> tuple[int, Matrix]:
+    def _place(self, name: str, placement: ScenePlacement, *, named: bool = False) -> tuple[int, Matrix]:
         """Return the index of the body to add to (-1: the world), created if movable or `named`, and T_body_item."""
         if not isinstance(name, str):
             raise SceneBuildError(f"name is {name!r}: text is expected, '' for no name")

@@ -56,7 +56,7 @@ class DrawingOptions(PlacementOptions, AppearanceOptions, total=False):
     """Arguments of `SceneBuilder` for what is drawn at a place."""
 
 
-class Placement(NamedTuple):
+class ScenePlacement(NamedTuple):
     """Place of something: its pose in the world, or in the frame of the body `on`; `movable`: a body of its own."""
 
     pose: Pose
@@ -64,13 +64,13 @@ class Placement(NamedTuple):
     on: str
 
 
-def parse_options(options: DrawingOptions) -> tuple[Placement, Appearance | None]:
+def parse_options(options: DrawingOptions) -> tuple[ScenePlacement, Appearance | None]:
     """Return placement and appearance, `None` when no argument of appearance is given. Raises `SceneBuildError`."""
     _reject_unknown(options, DrawingOptions)
     pose = check_pose(options.get("position", IDENTITY.p), options.get("quaternion", IDENTITY.q))
     look = {name: value for name, value in options.items() if name in AppearanceOptions.__annotations__}
     appearance = parse_appearance(cast("AppearanceOptions", look))
-    return Placement(pose, bool(options.get("movable", False)), options.get("on", "")), appearance
+    return ScenePlacement(pose, bool(options.get("movable", False)), options.get("on", "")), appearance
 
 
 def parse_appearance(options: AppearanceOptions) -> Appearance | None:

@@ -88,7 +88,7 @@ def test_inspect_prints_the_extent(tmp_path: Path, capsys: pytest.CaptureFixture
     assert run("scene", "inspect", box, *assets) == 0
     shown = capsys.readouterr().out
     assert "(-15, -10, 0) to (15, 10, 10), planes" in shown
-    assert "scale=0.001 (--scale 0.001)" in shown
+    assert "(--scale 0.001)" in shown
     assert run("scene", "inspect", box, *assets, "--scale", "0.001", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["extent"]["size"] == pytest.approx([0.03, 0.02, 0.01])
