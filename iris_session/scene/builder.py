@@ -103,13 +103,7 @@ class SceneBuilder:
 
     # --- shapes -------------------------------------------------------------------------------------------------------
 
-    def add_box(
-        self,
-        name: str = "",
-        *,
-        half_size: Sequence[float],
-        **options: Unpack[DrawingOptions],
-    ) -> str:
+    def add_box(self, name: str = "", *, half_size: Sequence[float], **options: Unpack[DrawingOptions]) -> str:
         """Add a box centred on its frame.
 
         Args:
@@ -123,13 +117,7 @@ class SceneBuilder:
         size = check_numbers("half_size", half_size, 3, above=0.0)
         return self._add_shape(GeometryKind.BOX, name, size, options)
 
-    def add_sphere(
-        self,
-        name: str = "",
-        *,
-        radius: float,
-        **options: Unpack[DrawingOptions],
-    ) -> str:
+    def add_sphere(self, name: str = "", *, radius: float, **options: Unpack[DrawingOptions]) -> str:
         """Add a sphere.
 
         Args:
@@ -143,13 +131,7 @@ class SceneBuilder:
         size = (check_number("radius", radius, above=0.0),) * 3
         return self._add_shape(GeometryKind.SPHERE, name, size, options)
 
-    def add_ellipsoid(
-        self,
-        name: str = "",
-        *,
-        half_size: Sequence[float],
-        **options: Unpack[DrawingOptions],
-    ) -> str:
+    def add_ellipsoid(self, name: str = "", *, half_size: Sequence[float], **options: Unpack[DrawingOptions]) -> str:
         """Add an ellipsoid.
 
         Args:
@@ -164,12 +146,7 @@ class SceneBuilder:
         return self._add_shape(GeometryKind.ELLIPSOID, name, size, options)
 
     def add_capsule(
-        self,
-        name: str = "",
-        *,
-        radius: float,
-        half_length: float,
-        **options: Unpack[DrawingOptions],
+        self, name: str = "", *, radius: float, half_length: float, **options: Unpack[DrawingOptions]
     ) -> str:
         """Add a capsule along z: a cylinder with half spheres beyond its ends.
 
@@ -186,12 +163,7 @@ class SceneBuilder:
         return self._add_shape(GeometryKind.CAPSULE, name, size, options)
 
     def add_cylinder(
-        self,
-        name: str = "",
-        *,
-        radius: float,
-        half_length: float,
-        **options: Unpack[DrawingOptions],
+        self, name: str = "", *, radius: float, half_length: float, **options: Unpack[DrawingOptions]
     ) -> str:
         """Add a cylinder along z.
 
@@ -208,11 +180,7 @@ class SceneBuilder:
         return self._add_shape(GeometryKind.CYLINDER, name, size, options)
 
     def add_plane(
-        self,
-        name: str = "",
-        *,
-        half_size: Sequence[float] = (0.0, 0.0),
-        **options: Unpack[DrawingOptions],
+        self, name: str = "", *, half_size: Sequence[float] = (0.0, 0.0), **options: Unpack[DrawingOptions]
     ) -> str:
         """Add a rectangle in the plane z = 0, visible from +z.
 
