@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.cli.cloud_calibrate import register_calibrate
-from iris_session.cli.cloud_scan import register_scan
 from iris_session.cli.common import (
     CommandError,
     add_address_options,
@@ -52,7 +51,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     """Add the command `cloud` with its actions."""
     parser = commands.add_parser(
         "cloud",
-        help="point clouds of depth cameras: run, example, inspect, calibrate, scan",
+        help="point clouds of depth cameras: run, example, inspect, calibrate",
         description="Show what depth cameras see as a point cloud in a session. `serve --camera FILE` does so by "
         "itself for cameras at its machine.",
         epilog="examples:\n"
@@ -65,7 +64,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    for register_action in (_register_run, _register_example, _register_inspect, register_calibrate, register_scan):
+    for register_action in (_register_run, _register_example, _register_inspect, register_calibrate):
         register_action(actions)
 
 

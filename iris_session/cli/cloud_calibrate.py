@@ -1,14 +1,16 @@
-"""`iris-session cloud calibrate`: poses of the cameras of a camera file, by sheets that they see, refined by ICP."""
+"""`iris-session cloud calibrate`: poses of the cameras of a camera file, by sheets that they see, refined by ICP.
+
+Or, with `--check`, whether they still fit. The mathematics is in `anchors`.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
-import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -36,10 +38,11 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from anchors.camera import CameraModel
+    from anchors.depth_calibration import PlacedCamera, PoseCheck
     from anchors.pose import PoseTuple
     from anchors.sheet import Sheet
     from iris_session.cloud.camera_file import CameraSettings, CloudSettings
-    from iris_session.cloud.frames import DepthFrame, DepthSource
+    from iris_session.cloud.frames import DepthFrame
 
     Floats = npt.NDArray[np.float64]
 
@@ -49,8 +52,8 @@ FRAMES_S: Final = 20.0
 ANCHORS_S: Final = 5.0
 #: Edge of the cells that ICP compares [m]: normals of smaller ones are noise.
 _ICP_VOXEL_M: Final = 0.02
-#: Points of a camera at which the stated error is computed.
-_ERROR_POINTS: Final = 200
+#: Error of a calibration that states none, 95 % [mm].
+_UNKNOWN_ERROR_MM: Final = 20.0
 
 
 class KnownSheets(NamedTuple):
@@ -78,14 +81,16 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
         help="calibrate the cameras of a camera file by sheets that they see",
         description="Take frames from the cameras of a camera file, detect sheets of known pose in them, and write the "
         "poses of the cameras with their stated errors. The poses of the sheets are those of a session, or given with "
-        "--at. With --icp the cameras are then fitted to each other by what they see. Nothing may move meanwhile.",
+        "--at. With --icp the cameras are then fitted to each other by what they see. Nothing may move meanwhile. With "
+        "--check nothing is written: the poses are compared with those of the camera file.",
         epilog="examples:\n"
         "  iris-session cloud calibrate camera.toml --out calibration.toml             sheets of the session here\n"
         "  iris-session cloud calibrate camera.toml --address 192.168.1.20 --icp --out calibration.toml\n"
-        "  iris-session cloud calibrate camera.toml --sheet table=160mm --at table=0,-0.45,0,1,0,0,0",
+        "  iris-session cloud calibrate camera.toml --sheet table=160mm --at table=0,-0.45,0,1,0,0,0\n"
+        "  iris-session cloud calibrate camera.toml --check                            do they still fit?",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("file", type=Path, help="camera file; the poses in it are not used")
+    parser.add_argument("file", type=Path, help="camera file; without --check the poses in it are not used")
     parser.add_argument(
         "--sheet",
         type=parse_named_length,
@@ -107,6 +112,7 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
         "--frames", type=parse_frame_count, default=10, metavar="N", help="frames per camera (default: %(default)s)"
     )
     parser.add_argument("--icp", action="store_true", help="then fit several cameras to each other")
+    parser.add_argument("--check", action="store_true", help="tell whether the poses of the camera file still fit")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the result as TOML, for the camera file")
     add_json_option(parser)
     parser.set_defaults(run=run_calibrate)
@@ -120,11 +126,16 @@ def parse_frame_count(text: str) -> int:
 
 
 def run_calibrate(arguments: argparse.Namespace) -> int:
-    """Calibrate, print the result, and write it to `--out`. Exit status 1 if the frames do not determine it."""
+    """Calibrate, print the result, and write it to `--out`. Or compare it with the camera file, for `--check`.
+
+    Exit status 1 if the frames do not determine it, or a camera is not where it was calibrated.
+    """
     from anchors.robot_world import CalibrationError
     from iris_session.cloud.camera_file import load_camera_file
 
-    settings = load_camera_file(arguments.file, calibrated=False)
+    settings = load_camera_file(arguments.file, calibrated=arguments.check)
+    if arguments.check and (arguments.icp or arguments.out is not None):
+        raise CommandError("--check writes no poses: leave out --icp and --out")
     if arguments.icp and len(settings.cameras) < 2:
         raise CommandError(f"--icp fits cameras to each other: {arguments.file} has one camera")
     for camera in settings.cameras:
@@ -133,12 +144,16 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
                 f"camera {camera.name!r} is on body {camera.body!r}: calibrate it with `iris-session anchors "
                 "calibrate-camera --camera-on-hand`"
             )
+        if arguments.check and camera.pose is None:
+            raise CommandError(f"camera {camera.name!r} has no calibration: its frames have poses of their own")
     known = _find_known_sheets(arguments)
     taken = [_take_frames(camera, arguments.frames) for camera in settings.cameras]
     try:
-        result = calibrate(settings, taken, known, icp=arguments.icp)
+        result, placed = calibrate(settings, taken, known, icp=arguments.icp)
     except CalibrationError as error:
         raise CommandError(str(error), status=1) from error
+    if arguments.check:
+        return _print_check(settings, placed, as_json=arguments.json)
     if arguments.out is not None:
         write_file(arguments.out, calibration_to_toml(result))
     if arguments.json:
@@ -155,6 +170,38 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
         name = json.dumps(arguments.out.name if is_beside else str(arguments.out.absolute()), ensure_ascii=False)
         print(f"{arguments.out}: name it in each camera of {arguments.file}: calibration = {name}")
     return 0
+
+
+def _print_check(settings: CloudSettings, placed: Mapping[str, PlacedCamera], *, as_json: bool) -> int:
+    """Print whether the poses of the camera file fit those that were measured. Return 1 if one does not."""
+    from anchors.depth_calibration import check_pose
+
+    checks: dict[str, PoseCheck] = {}
+    for camera in settings.cameras:
+        assert camera.pose is not None  # the camera file was checked
+        error_mm = _UNKNOWN_ERROR_MM if camera.error_mm is None else camera.error_mm
+        checks[camera.name] = check_pose(camera.pose.to_matrix(), 1e-3 * error_mm, placed[camera.name])
+    is_well = all(one.fits for one in checks.values())
+    cameras = {
+        name: {
+            "fits": one.fits,
+            "shift_mm": 1e3 * one.shift_m,
+            "turn_deg": math.degrees(one.turn_rad),
+            "off_mm": 1e3 * one.off_m,
+            "limit_mm": 1e3 * one.limit_m,
+        }
+        for name, one in checks.items()
+    }
+    if as_json:
+        print_json({"ok": is_well, "cameras": cameras})
+        return 0 if is_well else 1
+    for name, one in cameras.items():
+        advice = "fits" if one["fits"] else "was moved: put it back, or calibrate it again"
+        print(
+            f"{name} {advice}. Off by {one['shift_mm']:.1f} mm, {one['turn_deg']:.2f} deg, its points by "
+            f"{one['off_mm']:.1f} mm; stated errors explain {one['limit_mm']:.1f} mm"
+        )
+    return 0 if is_well else 1
 
 
 # --- input ------------------------------------------------------------------------------------------------------------
@@ -193,27 +240,14 @@ def _ask_session(arguments: argparse.Namespace, sheets: list[Sheet]) -> KnownShe
     )
 
 
-@contextmanager
-def open_camera(camera: CameraSettings) -> Iterator[DepthSource]:
-    """Open the source of a camera, and close it at the end."""
-    from iris_session.cloud.sources import open_source
-
-    source = open_source(camera, time.monotonic_ns)
-    try:
-        yield source
-    finally:
-        with suppress(Exception):  # of a device that is gone
-            source.close()
-
-
 def _take_frames(camera: CameraSettings, n: int) -> CameraFrames:
     """Take the next frames of a camera; of a recording that ends, as many as it has."""
     from iris_session.cloud.frames import SourceEndedError
-    from iris_session.cloud.sources import read_frame
+    from iris_session.cloud.sources import open_source, read_frame
 
     frames: list[DepthFrame] = []
     until = time.monotonic() + FRAMES_S
-    with open_camera(camera) as source:
+    with closing(open_source(camera, time.monotonic_ns)) as source:
         try:
             while len(frames) < n and time.monotonic() < until:
                 frame = read_frame(camera, source, 0.5)
@@ -234,14 +268,18 @@ def _take_frames(camera: CameraSettings, n: int) -> CameraFrames:
 
 def calibrate(
     settings: CloudSettings, taken: list[CameraFrames], known: KnownSheets, *, icp: bool = False
-) -> dict[str, Any]:
-    """Solve the poses of cameras by the sheets in their frames. Return the object that `--json` prints.
+) -> tuple[dict[str, Any], dict[str, PlacedCamera]]:
+    """Solve the poses of cameras by the sheets in their frames.
+
+    Returns:
+        The object that `--json` prints, and the cameras by name, before ICP.
 
     Raises:
         CommandError: The frames are not of the size of the intrinsics.
         CalibrationError: The frames do not determine the poses.
     """
     from anchors.camera import pose_to_matrix
+    from anchors.depth_calibration import PlacedCamera, compute_points_error
 
     pictures = [picture for one in taken for picture in _detect_sheets(one, known.sheets)]
     result, covariances = solve_from_known_sheets(pictures, known.poses, at_rest=True)
@@ -249,16 +287,17 @@ def calibrate(
     seen = {name: error_m for name, error_m in known.errors_m.items() if name in result["sheets"]}
     result["sheets_without_error"] = sorted(name for name, error_m in seen.items() if error_m == 0.0)
     sheet_m = max(seen.values(), default=0.0)
-    clouds = {}
+    placed = {}
     for one in taken:
-        part = cameras[one.settings.name]
-        T = pose_to_matrix(_read_pose(part["T_base_camera"]))
-        clouds[one.settings.name] = _make_cloud(settings, one, T)
-        error_m = _state_error(covariances[one.settings.name], T, clouds[one.settings.name])
-        part["error_mm_p95"] = 1e3 * math.hypot(error_m, sheet_m)
+        name = one.settings.name
+        T, covariance = pose_to_matrix(_read_pose(cameras[name]["T_base_camera"])), covariances[name]
+        points = _make_points(settings, one, T)
+        error_m = math.hypot(compute_points_error(covariance, T, points), sheet_m)
+        cameras[name]["error_mm_p95"] = 1e3 * error_m
+        placed[name] = PlacedCamera(T, covariance, points, error_m)
     if icp:
-        result["icp"] = _refine(cameras, clouds, covariances, sheet_m)
-    return result
+        result["icp"] = _fit_cameras(cameras, placed, sheet_m)
+    return result, placed
 
 
 def _detect_sheets(one: CameraFrames, sheets: list[Sheet]) -> Iterator[CalibrationPicture]:
@@ -273,7 +312,7 @@ def _detect_sheets(one: CameraFrames, sheets: list[Sheet]) -> Iterator[Calibrati
         yield CalibrationPicture(Path(one.settings.name, f"frame {number + 1}"), one.settings.name, one.camera, seen)
 
 
-def _make_cloud(settings: CloudSettings, one: CameraFrames, T_world_camera: Floats) -> Floats:
+def _make_points(settings: CloudSettings, one: CameraFrames, T_world_camera: Floats) -> Floats:
     """Return the points of a camera within the limits of the camera file, world frame."""
     import numpy as np
 
@@ -293,53 +332,21 @@ def _make_cloud(settings: CloudSettings, one: CameraFrames, T_world_camera: Floa
     return np.asarray(found.positions, np.float64)
 
 
-def _state_error(covariance: tuple[float, ...], T_world_camera: Floats, points: Floats) -> float:
-    """Return the error that 95 % of the camera's points keep, 95 % of the time [m]: rotation counts with distance.
+def _fit_cameras(cameras: dict[str, Any], placed: Mapping[str, PlacedCamera], sheet_m: float) -> dict[str, Any]:
+    """Fit cameras to each other. Change their poses and errors in the result."""
+    from anchors.camera import pose_from_matrix
+    from anchors.depth_calibration import CameraFit, fit_cameras
 
-    Without points: of a point on the camera's axis, 1.5 m away.
-    """
-    import numpy as np
-
-    from anchors.uncertainty import position_error_p95
-
-    x, y, z = T_world_camera[:3, 3].tolist()
-    chosen = points[:: max(1, len(points) // _ERROR_POINTS)] if len(points) else (T_world_camera @ (0, 0, 1.5, 1))[None]
-    bounds = [position_error_p95(covariance, (x, y, z), (p[0], p[1], p[2])) for p in chosen[:, :3].tolist()]
-    return float(np.quantile(bounds, 0.95))
-
-
-def _refine(
-    cameras: dict[str, Any], clouds: dict[str, Floats], covariances: Mapping[str, tuple[float, ...]], sheet_m: float
-) -> dict[str, Any]:
-    """Fit cameras one by one to those before them, in the order of their stated errors. Change their poses and errors.
-
-    A camera that was fitted has the error of the first one at its own points, and twice what its surfaces are apart
-    from those that it was fitted to, as these may be from the first one's.
-    """
-    import numpy as np
-
-    from anchors.camera import pose_from_matrix, pose_to_matrix
-    from iris_session.cloud.icp import RefinementRefusedError, refine_pose
-
-    first, *others = sorted(cameras, key=lambda name: float(cameras[name]["error_mm_p95"]))
-    reference = clouds[first]
-    T_first = pose_to_matrix(_read_pose(cameras[first]["T_base_camera"]))
-    errors_m = [sheet_m]
+    first, fits = fit_cameras(placed, sheet_m)
     found: dict[str, Any] = {}
-    for name in others:
-        try:
-            one = refine_pose(clouds[name], reference)
-        except RefinementRefusedError as error:
-            found[name] = {"refined": False, "reason": error.reason, "text": str(error)}
+    for name, fit in fits.items():
+        if not isinstance(fit, CameraFit):
+            found[name] = {"refined": False, "reason": fit.reason, "text": str(fit)}
             continue
-        T = one.T_world_world
-        pose = pose_from_matrix(T @ pose_to_matrix(_read_pose(cameras[name]["T_base_camera"])))
-        points = clouds[name] @ T[:3, :3].T + T[:3, 3]
-        reference = np.concatenate([reference, points])
-        errors_m.append(2.0 * one.rmse_after_m)
-        error_m = math.hypot(_state_error(covariances[first], T_first, points), *errors_m)
-        cameras[name] |= {"T_base_camera": pose_to_dict(pose), "error_mm_p95": 1e3 * error_m}
+        pose = pose_to_dict(pose_from_matrix(fit.camera.T_world_camera))
+        cameras[name] |= {"T_base_camera": pose, "error_mm_p95": 1e3 * fit.camera.error_m}
         del cameras[name]["sigma_deg"]  # of the pose by the sheets
+        one = fit.refinement
         found[name] = {
             "refined": True,
             "shift_mm": 1e3 * one.shift_m,
@@ -369,9 +376,3 @@ def _format_icp(result: dict[str, Any]) -> Iterator[str]:
             )
         else:
             yield f"{name}: not fitted: {one['text']}"
-
-
-def print_progress(text: str, *, as_json: bool) -> None:
-    """Write over the last line of a terminal on standard error; nowhere else."""
-    if not as_json and sys.stderr.isatty():
-        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)

@@ -30,7 +30,7 @@ from anchors.pose import quat_normalize
 from iris_session.protocol.common import Name, Quat, Text, Vec3
 from iris_session.protocol.media import MAX_IMAGE_SIZE, MAX_STREAMS, describe_bad_stream_name, is_stream_name
 
-SourceName = Literal["folder", "mujoco", "opencv", "rerun", "mcap", "realsense", "orbbec"]
+SourceName = Literal["folder", "mujoco", "rerun", "mcap", "realsense", "orbbec"]
 AudienceName = Literal["remote", "all"]
 #: Keys with a choice of values.
 _CHOICES: Final = {"source": get_args(SourceName), "audience": get_args(AudienceName)}
@@ -87,7 +87,7 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     Attributes:
         name: Name of the camera.
         source: Kind of the source.
-        path: Folder or file of a recording, or device: a serial number, for OpenCV a number; empty: the only one.
+        path: Folder or file of a recording, or serial number of a device; empty: the only one.
         model: Model file of a rendered camera.
         camera: Name of the rendered camera in that model.
         depth: Topic or entity of the depth pictures in a recording; empty: the only one.
@@ -297,7 +297,7 @@ class _Reader:
                 raise self._error("path", f"path is missing: source {camera.source!r} reads a file or folder", index)
             if not Path(camera.path).exists():
                 raise self._error("path", f"{camera.path!r} does not exist", index)
-        if camera.source in ("folder", "opencv") and camera.intrinsics is None:
+        if camera.source == "folder" and camera.intrinsics is None:
             wanted = "a file, or { width, height, fx, fy, cx, cy } in pixels"
             raise self._error("intrinsics", f"intrinsics are missing: {wanted}", index)
         has_poses = camera.source == "folder" and any(Path(camera.path).glob("*.pose.txt"))

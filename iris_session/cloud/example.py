@@ -46,13 +46,6 @@ camera = "front"           # camera of the model: field of view and pose are its
 # height = 480
 # hz = 30.0
 """,
-    "opencv": """\
-source = "opencv"          # a camera from which OpenCV reads depth
-path = "0"                 # number of the device
-# hz = 30.0                # frames per second
-"""
-    + _INTRINSICS
-    + _POSE,
     "rerun": """\
 source = "rerun"
 path = "recording.rrd"

@@ -33,9 +33,7 @@ from iris_session.client.fetched_scene import fetch_scene
 from iris_session.client.sockets import CurveKeys
 from iris_session.cloud.camera_file import CloudSettings
 from iris_session.cloud.config import CameraReport, CameraStart
-from iris_session.cloud.moved import MoveWatch, Sheets
 from iris_session.cloud.robot_points import RobotPoints
-from iris_session.cloud.robot_surface import PlacedSurface, RobotSurface
 from iris_session.cloud.sources import open_source
 from iris_session.cloud.voxels import PointSet
 from iris_session.cloud.worker import CloudWorker
@@ -45,7 +43,7 @@ from iris_session.protocol.names import Role
 from iris_session.protocol.status import DeliveryBudget
 from iris_session.scene.budget import Budget
 from iris_session.system.backoff import Backoff
-from iris_session.system.extras import MissingExtraError, require_package
+from iris_session.system.extras import MissingExtraError
 from iris_session.system.log import configure_logging, describe_error
 from iris_session.system.priority import lower_thread_priority
 from iris_session.system.process import die_with_parent, is_parent, take_stdout
@@ -126,7 +124,7 @@ class BodyHistory:
 
 
 class SessionRobots:
-    """The session's robots, by their shapes and the state at capture: which points lie on them, where they are seen.
+    """Removes the points on the session's robots, by their shapes and the state at capture.
 
     The shapes are fetched in a thread, again for another scene and while some are missing, and not for a session
     without robots. Until they are there all points stay.
@@ -134,29 +132,26 @@ class SessionRobots:
     Args:
         client: Client of the session.
         history: Poses of its bodies.
-        removes: Points are to be removed.
     """
 
-    def __init__(self, client: Client, history: BodyHistory, *, removes: bool) -> None:
+    def __init__(self, client: Client, history: BodyHistory) -> None:
         self._client = client
         self._history = history
-        self._removes = removes
         self._scene: tuple[str, str] | None = None
         self._backoff = Backoff(FETCH_AGAIN_NS)
         self._again_ns = self._delay_ns = 0
         self._thread: threading.Thread | None = None
         self._points: RobotPoints | None = None
-        self._surface: RobotSurface | None = None
-        self._n_missing = 0  # shapes that the points and the surface lack
-        self._said = ""
+        self._n_missing = 0  # shapes that `_points` lacks
+        self._fault = ""
 
     @property
     def warning(self) -> str:
         """One line for people about points on robots that stay; empty while all is well."""
         n = 0 if self._points is None else self._points.n_unknown
         unknown = f"the session sends no poses of {n} bodies of robots" if n else ""
-        why = "; ".join(filter(None, (self._said, unknown)))
-        return f"{_STAY}: {why}" if why and self._removes else ""
+        why = "; ".join(filter(None, (self._fault, unknown)))
+        return f"{_STAY}: {why}" if why else ""
 
     def is_ready(self, capture_ns: int) -> bool:
         """Return whether the state of that time is there; begin to fetch the shapes when they are needed."""
@@ -165,53 +160,42 @@ class SessionRobots:
         if version is not None and not is_fetching and self._client.mirror.robots:
             is_other = version[:2] != self._scene
             if is_other:
-                self._scene, self._n_missing = version[:2], 0
-                self._points = self._surface = None
+                self._scene, self._points, self._n_missing = version[:2], None, 0
                 self._backoff.reset()
-            lacks = self._surface is None or self._n_missing
             is_due = not 0 < self._again_ns - capture_ns <= self._delay_ns  # or session time went back
-            if is_other or (lacks and is_due):
+            if is_other or (is_due and (self._points is None or self._n_missing)):
                 self._delay_ns = self._backoff.next_delay()
                 self._again_ns = capture_ns + self._delay_ns
                 self._thread = threading.Thread(target=self._fetch, name="iris-robots", daemon=True)
                 self._thread.start()
-        return self._surface is None or self._history.covers(capture_ns)
+        return self._points is None or self._history.covers(capture_ns)
 
     def remove(self, points: PointSet, capture_ns: int) -> PointSet:
         """Return the points that do not lie on robots."""
-        found = self._points
-        if found is None:
+        robots = self._points
+        if robots is None:
             return points
-        kept = ~found.find(points.positions, self._history.find_pose, capture_ns)
+        kept = ~robots.find(points.positions, self._history.find_pose, capture_ns)
         return PointSet(points.positions[kept], points.colors[kept], points.counts[kept])
-
-    def place_surface(self, capture_ns: int, carrier: str) -> PlacedSurface | None:
-        """Place the surface of the robots, for a camera on a body; `None` until their shapes are there."""
-        found = self._surface
-        return None if found is None else found.place(self._history.find_pose, capture_ns, carrier)
 
     def _fetch(self) -> None:
         mirror = self._client.mirror
         try:
             scene = fetch_scene(self._client, COARSE_TEXTURES)
-            if self._surface is not None and len(scene.failed) >= self._n_missing:
+            if self._points is not None and len(scene.failed) >= self._n_missing:
                 return  # it is as it was
-            shapes = scene.spec, scene.meshes, tuple(mirror.robots.values()), mirror.bodies
-            points = RobotPoints(*shapes) if self._removes else None
-            surface = RobotSurface(*shapes)
+            points = RobotPoints(scene.spec, scene.meshes, tuple(mirror.robots.values()), mirror.bodies)
         except Exception as error:  # of a connection, or of a scene: the cloud goes on with the points on robots
-            if self._surface is None:
+            if self._points is None:
                 self._warn(str(error))
             return
-        # Both at once: `is_ready` waits for states, which removing points needs, as soon as there is a surface.
-        self._surface, self._points = surface, points
-        self._n_missing = len(scene.failed)
+        self._points, self._n_missing = points, len(scene.failed)
         self._warn(f"{self._n_missing} shapes are missing" if scene.failed else "")
 
-    def _warn(self, reason: str) -> None:
-        if reason and reason != self._said:
-            log.warning("%s: %s", _STAY if self._removes else "cameras are not compared with the robots", reason)
-        self._said = reason
+    def _warn(self, fault: str) -> None:
+        if fault and fault != self._fault:
+            log.warning("%s: %s", _STAY, fault)
+        self._fault = fault
 
 
 class SessionOutlet:
@@ -256,7 +240,7 @@ def run_cameras(
         Why it ended by itself: the session refuses it; empty otherwise.
     """
     history = BodyHistory(client)
-    robots = SessionRobots(client, history, removes=settings.remove_robots)
+    robots = SessionRobots(client, history) if settings.remove_robots else None
     client.on_state = history.on_state
     try:
         client.open()
@@ -267,13 +251,13 @@ def run_cameras(
             partial(open_source, body_poses=history.read_newest),
             time.perf_counter_ns,
             body_pose=history.find_pose,
-            remover=robots if settings.remove_robots else None,
-            watch=_make_watch(client, robots),
+            remover=robots,
         )
         on_report(CameraReport(settings.stream, starting=True))
 
         def report(one: CameraReport) -> None:
-            warning = "; ".join(filter(None, (one.warning, robots.warning)))
+            warnings = (one.warning, "" if robots is None else robots.warning)
+            warning = "; ".join(filter(None, warnings))
             on_report(msgspec.structs.replace(one, warning=warning, starting=worker.cloud is None))
 
         try:
@@ -325,22 +309,6 @@ def find_taken_stream(settings: CloudSettings, delivery: DeliveryBudget | None) 
                 "the camera file, or end that source"
             )
     return ""
-
-
-def _make_watch(client: Client, robots: SessionRobots) -> MoveWatch | None:
-    """Return what finds moved cameras by sheets and robots; `None` where packages for that are missing."""
-    try:
-        for package in ("cv2", "scipy"):
-            require_package(package, "finding moved cameras")
-    except MissingExtraError as error:
-        log.warning("%s", error)
-        return None
-
-    def find_sheets() -> Sheets:
-        anchors = tuple(client.mirror.anchors.values())
-        return {one.id: (one.size_m, (one.T_world_anchor.p, one.T_world_anchor.q)) for one in anchors if one.size_m}
-
-    return MoveWatch(find_sheets, robots)
 
 
 def make_client(start: CameraStart) -> Client:

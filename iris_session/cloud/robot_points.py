@@ -91,8 +91,8 @@ class RobotPoints:
         names = {body.id: body.name for body in known.values()}
         of_robots = find_robot_bodies(spec, robots)
         things = tuple(body for body in spec.bodies if body.id in known and known[body.id].object)
-        self._robots = _Shapes(sample_bodies(spec, meshes, of_robots), names, margin_m, kernels)
-        self._things = _Shapes(sample_bodies(spec, meshes, things), names, margin_m, kernels)
+        self._robots = _Shapes(_sample_bodies(spec, meshes, of_robots), names, margin_m, kernels)
+        self._things = _Shapes(_sample_bodies(spec, meshes, things), names, margin_m, kernels)
         self.n_bodies = self._robots.n
         self.n_unknown = 0
 
@@ -135,10 +135,10 @@ class _Shapes:
     """
 
     def __init__(
-        self, surfaces: Iterable[tuple[Body, Floats, Floats]], names: Mapping[int, str], margin_m: float, kernels: Any
+        self, surfaces: Iterable[tuple[Body, Floats]], names: Mapping[int, str], margin_m: float, kernels: Any
     ) -> None:
         grids, cells_m, lows, self._names, self._rest = [], [], [], [], []
-        for body, points, _ in surfaces:
+        for body, points in surfaces:
             grid, cell_m, low = _build_grid(points, margin_m)
             grids.append(grid)
             cells_m.append(cell_m)
@@ -222,46 +222,39 @@ def _build_grid(surface: Floats, margin_m: float) -> tuple[Distances, float, Flo
     return grid, cell_m, low
 
 
-def sample_bodies(
+def _sample_bodies(
     spec: SceneSpec, meshes: Mapping[int, MeshArrays], bodies: Iterable[Body]
-) -> Iterator[tuple[Body, Floats, Floats]]:
-    """Yield the bodies that have a surface, with points of it (n, 3) and their normals (n, 3), body frame.
-
-    Points are no further apart than a cell of `RobotPoints`. Normals have the sign of the triangles' order of corners.
-    """
+) -> Iterator[tuple[Body, Floats]]:
+    """Yield the bodies that have a surface, with points of it (n, 3), body frame, no further apart than a cell."""
     visuals: dict[int, list[Visual]] = {}
     for visual in spec.visuals:
         visuals.setdefault(visual.body, []).append(visual)
     for body in bodies:
         every = visuals.get(body.id, [])
         drawn = [one for one in every if one.rgba[3] > 0 and one.group in spec.groups_shown]
-        surface = [_sample_visual(one, meshes) for one in drawn or every]
-        if any(len(points) for points, _ in surface):
-            yield body, np.concatenate([one[0] for one in surface]), np.concatenate([one[1] for one in surface])
+        surface = [sample_visual(one, meshes) for one in drawn or every]
+        if any(map(len, surface)):
+            yield body, np.concatenate(surface)
 
 
-def _sample_visual(visual: Visual, meshes: Mapping[int, MeshArrays]) -> tuple[Floats, Floats]:
-    """Return points (n, 3) of the surface of a visual, and their normals (n, 3), body frame."""
+def sample_visual(visual: Visual, meshes: Mapping[int, MeshArrays]) -> Floats:
+    """Return points (n, 3) [m] of the surface of a visual, body frame; none of a plane."""
     mesh = meshes.get(visual.geometry.mesh) or build_primitive(visual.geometry)
     if mesh is None or visual.geometry.kind == GeometryKind.PLANE:
-        return np.empty((0, 3)), np.empty((0, 3))
-    points, normals = _sample_triangles(np.asarray(mesh.position, np.float64)[np.asarray(mesh.index, np.int64)])
+        return np.empty((0, 3))
+    points = _sample_triangles(np.asarray(mesh.position, np.float64)[np.asarray(mesh.index, np.int64)])
     T = to_matrix(visual.T_body_visual)
-    return points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
+    return points @ T[:3, :3].T + T[:3, 3]
 
 
-def _sample_triangles(corners: Floats) -> tuple[Floats, Floats]:
-    """Return points of triangles (n, 3, 3), and the normal of each: a triangle is cut along a lattice finer than a
-    cell, corners included."""
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+def _sample_triangles(corners: Floats) -> Floats:
+    """Return points of triangles (n, 3, 3): each is cut along a lattice finer than a cell, corners included."""
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     pieces = np.clip(np.ceil(longest / _CELL_M), 1, _MAX_PIECES).astype(int)
-    samples, normals = [np.empty((0, 3))], [np.empty((0, 3))]
+    samples = [np.empty((0, 3))]
     for n in np.unique(pieces):
         i, j = (steps.ravel() for steps in np.meshgrid(np.arange(n + 1), np.arange(n + 1)))
         chosen = i + j <= n
         weights = np.stack([i[chosen], j[chosen], n - i[chosen] - j[chosen]], axis=1) / n
         samples.append(np.einsum("wc,tcx->twx", weights, corners[pieces == n]).reshape(-1, 3))
-        normals.append(np.repeat(across[pieces == n], len(weights), axis=0))
-    return np.concatenate(samples), np.concatenate(normals)
+    return np.concatenate(samples)

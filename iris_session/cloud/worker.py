@@ -20,7 +20,6 @@ from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.config import CameraReport, SourceReport
 from iris_session.cloud.frames import DepthSource
 from iris_session.cloud.health import CameraHealth, Fault
-from iris_session.cloud.moved import UNKNOWN_ERROR_M, MoveWatch, WatchedFrame
 from iris_session.cloud.pipeline import (
     CLASSES,
     BodyPose,
@@ -28,7 +27,6 @@ from iris_session.cloud.pipeline import (
     CloudPipeline,
     PipelineCamera,
     PipelineSettings,
-    PlacedFrame,
     PointRemover,
 )
 from iris_session.cloud.reader import NewFrame, SourceReader
@@ -116,7 +114,6 @@ class CloudWorker:
         clock_ns: Clock by which stages are measured [ns].
         body_pose: Poses of bodies that carry cameras.
         remover: Removes points from every cloud.
-        watch: Looks for cameras that were moved.
 
     Attributes:
         cloud: The newest cloud, `None` before the first.
@@ -132,7 +129,6 @@ class CloudWorker:
         *,
         body_pose: BodyPose | None = None,
         remover: PointRemover | None = None,
-        watch: MoveWatch | None = None,
     ) -> None:
         if settings.picture_hz:
             require_package("cv2", "pictures of cameras (picture_hz)")
@@ -153,11 +149,10 @@ class CloudWorker:
             remover=remover,
             voxels=make_warm_filter(settings),
         )
-        self._watch = watch
         self._cameras = {one.name: one for one in settings.cameras}
         self._readers = {one.name: self._make_reader(one, open_source) for one in settings.cameras}
         self._openings: dict[str, int] = {}
-        self._models: dict[str, tuple[CameraModel, float]] = {}  # and the length of one unit of depth [m]
+        self._models: dict[str, CameraModel] = {}
         self._stream = _Stream(settings.stream, MediaEncoding.CLOUD)
         self._pictures = {
             one.name: _Stream(settings.name_picture_stream(one.name), MediaEncoding.JPEG)
@@ -196,8 +191,6 @@ class CloudWorker:
         self._polled_ns = self._reported_ns = self._refused_ns = None
         self._has_sent = False
         self.pipeline.clear()
-        if self._watch is not None:
-            self._watch.restart()
         for reader in self._readers.values():
             reader.restart_clock()
         for stream in (self._stream, *self._pictures.values()):
@@ -278,8 +271,6 @@ class CloudWorker:
         """End the threads. Return false when one is kept by its source."""
         for reader in self._readers.values():
             reader.stop()
-        if self._watch is not None:
-            self._watch.close()
         end_ns = self._clock_ns() + JOIN_NS  # of all together
         ended = [reader.join(max(0, end_ns - self._clock_ns()) / SECOND) for reader in self._readers.values()]
         return all(ended)
@@ -289,7 +280,7 @@ class CloudWorker:
     def _take_over(self, name: str, new: NewFrame, now_ns: int) -> None:
         if self._openings.get(name) != new.opening:
             self._openings[name] = new.opening
-            self._models[name] = new.model, new.depth_scale_m
+            self._models[name] = new.model
             self.pipeline.open_camera(name, new.model, new.depth_scale_m)
         self.pipeline.offer(name, new.frame, now_ns)
         picture = self._pictures.get(name)
@@ -317,7 +308,6 @@ class CloudWorker:
             return False
         self._failures.pop(self._stream.name, None)
         self.poses = {name: one.T_world_camera for name, one in frames.items()}
-        self._offer_to_watch(frames)
         self._note_stage("read", max(self._readers[name].read_ms for name in frames))
         for stage, duration_ms in cloud.stages_ms.items():
             self._note_stage(stage, duration_ms)
@@ -327,21 +317,6 @@ class CloudWorker:
         self._clouds += 1
         self._age_ms += (self._outlet.now_ns() - cloud.capture_ns) / MILLISECOND
         return True
-
-    def _offer_to_watch(self, frames: Mapping[str, PlacedFrame]) -> None:
-        if self._watch is None:
-            return
-        try:
-            for name, (frame, pose) in frames.items():
-                error_mm = self._cameras[name].error_mm
-                error_m = UNKNOWN_ERROR_M if error_mm is None else error_mm / 1000.0
-                model, scale_m = self._models[name]
-                body = self._cameras[name].body if frame.T_world_camera is None else ""
-                self._watch.offer(name, WatchedFrame(frame, model, scale_m, pose, error_m, body))
-        except Exception as error:  # of OpenCV that cannot be imported: the clouds go on
-            log.warning("cameras that are moved are not found: %s", describe_error(error))
-            self._watch.close()
-            self._watch = None
 
     def _note_failure(self, stream: _Stream, error: Exception) -> None:
         """Note that a frame could not be made: that ends neither this process nor the other streams."""
@@ -396,7 +371,7 @@ class CloudWorker:
         camera = self._cameras[name]
         if name not in self._models:
             return None
-        model, _ = self._models[name]
+        model = self._models[name]
         pose = None if camera.pose is None else camera.pose.to_matrix()
         if not camera.body:
             pose = self.poses.get(name, pose)
@@ -415,9 +390,6 @@ class CloudWorker:
             fault = Fault(StreamFault.POSE, NO_BODY.format(body) if body else NO_STATE)
         if fault is None and self.pipeline.is_left_out(name, now_ns):
             fault = Fault(StreamFault.CLOCK, LEFT_OUT)
-        move = None if self._watch is None else self._watch.find_move(name)
-        if move is not None and (fault is None or fault.fault == StreamFault.SLOW):
-            fault = Fault(StreamFault.MOVED, f"{move}: calibrate it again, `iris-session cloud calibrate`, and restart")
         return fault
 
     def _make_source_report(self, name: str, now_ns: int) -> SourceReport:

@@ -25,7 +25,6 @@ FAULTS: Final = {
         "its pictures have another size than its intrinsics, or depth another than colour",
         "set the size of the calibration, with depth registered to colour, or calibrate it in this size",
     ),
-    StreamFault.MOVED: ("the camera is not where it was calibrated", "put it back, or calibrate it again and restart"),
     StreamFault.POSE: (
         "the pose of the camera has values that are no numbers, or that of the body which carries it or of the robots "
         "to be removed is not known when it sees something",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import time
 from collections.abc import Callable
@@ -18,9 +17,7 @@ from iris_session.cli.main import main
 from iris_session.cloud.camera_file import load_camera_file
 from iris_session.cloud.config import CameraReport, SourceReport
 from iris_session.cloud.process import OnReport
-from iris_session.cloud.voxels import VoxelFilter
 from iris_session.protocol.names import StreamFault
-from iris_session.system.files import Replacement
 
 
 @pytest.fixture(autouse=True)
@@ -97,43 +94,11 @@ def test_a_file_that_cannot_be_used_is_one_line(
 
 def test_a_picture_that_cannot_be_read_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (camera_file.parent / "0.depth.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(4) + b"IHDR" + b"\xff" * 9)
-    assert main(["cloud", "scan", str(camera_file), "-o", str(camera_file.parent / "room.ply")]) == 2
+    assert main(["cloud", "calibrate", str(camera_file), "--sheet", "a=100mm", "--at", "a=0,0,0,1,0,0,0"]) == 2
     error = capsys.readouterr().err
     assert "camera 'front'" in error
     assert "0.depth.png" in error
     assert error.count("\n") == 1
-
-
-def test_a_scan_that_cannot_be_written_leaves_the_file_as_it_was(
-    camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(self: Replacement) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    out = camera_file.parent / "room.ply"
-    out.write_bytes(b"the scan of yesterday")
-    before = sorted(camera_file.parent.iterdir())
-    monkeypatch.setattr(Replacement, "finish", fail)
-    assert main(["cloud", "scan", str(camera_file), "--seconds", "0.3", "-o", str(out)]) == 2
-    assert "room.ply cannot be written: No space left on device" in capsys.readouterr().err
-    assert out.read_bytes() == b"the scan of yesterday"
-    assert sorted(camera_file.parent.iterdir()) == before
-
-
-def test_preparing_the_filter_is_not_part_of_a_scan(
-    camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    prepared: list[VoxelFilter] = []
-
-    def prepare(voxels: VoxelFilter) -> None:
-        prepared.append(voxels)
-        time.sleep(2.2)
-
-    monkeypatch.setattr(VoxelFilter, "warm_up", prepare)
-    out = camera_file.parent / "room.ply"
-    assert main(["cloud", "scan", str(camera_file), "--seconds", "2", "--json", "-o", str(out)]) == 0
-    assert len(prepared) == 1
-    assert json.loads(capsys.readouterr().out)["frames"]["front"] > 0
 
 
 def test_cameras_that_no_session_admitted_are_a_fault(

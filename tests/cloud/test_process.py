@@ -115,16 +115,6 @@ class FakeRobotPoints:
         return positions[:, 0] > 0.0
 
 
-class FakeRobotSurface:
-    """Placed as the arguments say."""
-
-    def __init__(self, *_: object) -> None:
-        pass
-
-    def place(self, body_pose: object, capture_ns: int, carrier: str) -> Any:
-        return capture_ns, carrier
-
-
 def make_points() -> PointSet:
     positions = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]], np.float32)
     return PointSet(positions, np.zeros((2, 3), np.uint8), np.ones(2, np.int64))
@@ -164,21 +154,14 @@ def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.Mon
         fetched.append(client)
         return SimpleNamespace(spec=None, meshes={}, failed={})
 
-    def make_surface(*_: object) -> FakeRobotSurface:
-        kept.append(len(robots.remove(make_points(), 0).positions))
-        return FakeRobotSurface()
-
-    kept: list[int] = []
     monkeypatch.setattr(process, "fetch_scene", fetch)
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
-    monkeypatch.setattr(process, "RobotSurface", make_surface)
     lab = Lab()
-    robots = SessionRobots(lab.client, lab.history, removes=True)
+    robots = SessionRobots(lab.client, lab.history)
     assert len(robots.remove(make_points(), 0).positions) == 2
     assert robots.is_ready(10 * MS), "frames do not wait for the shapes"
     is_there.set()
     wait_for_fetch(robots)
-    assert kept == [2], "no points go before frames wait for states"
     assert not robots.is_ready(10 * MS), "but for the state, from then on"
     for at in (0, 16):
         lab.add(at, 0.0)
@@ -187,8 +170,6 @@ def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.Mon
     assert left.positions.tolist() == [[-1.0, 0.0, 0.0]]
     assert (len(left.colors), len(left.counts)) == (1, 1)
     assert len(fetched) == 1
-    placed: Any = robots.place_surface(10 * MS, "hand")
-    assert placed == (10 * MS, "hand")
     lab.client.scene.version = ("session", "other", 2)
     robots.is_ready(10 * MS)
     wait_for_fetch(robots)
@@ -207,7 +188,7 @@ def test_without_shapes_all_points_stay_until_they_are_there(
 
     monkeypatch.setattr(process, "fetch_scene", fail)
     lab = Lab()
-    robots = SessionRobots(lab.client, lab.history, removes=True)
+    robots = SessionRobots(lab.client, lab.history)
     assert robots.is_ready(0)
     wait_for_fetch(robots)
     assert robots.is_ready(0)
@@ -215,7 +196,6 @@ def test_without_shapes_all_points_stay_until_they_are_there(
     assert f"points on robots stay in the cloud: {error}" in caplog.text
     assert robots.warning
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
-    monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
     monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
     robots.is_ready(FETCH_AGAIN_NS[0] - 1)
     assert robots.is_ready(FETCH_AGAIN_NS[0] - 1), "not tried again at once"
@@ -231,11 +211,10 @@ def test_without_shapes_all_points_stay_until_they_are_there(
 def test_shapes_that_are_missing_are_a_warning_and_fetched_again(monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[object] = []
     failed = {"a": "lost", "b": "lost"}
-    monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
-    monkeypatch.setattr(process, "RobotSurface", lambda *_: built.append(1) or FakeRobotSurface())
+    monkeypatch.setattr(process, "RobotPoints", lambda *_: built.append(1) or FakeRobotPoints())
     monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed=dict(failed)))
     lab = Lab()
-    robots = SessionRobots(lab.client, lab.history, removes=True)
+    robots = SessionRobots(lab.client, lab.history)
     at_ns = 0
 
     def fetch_again() -> str:
@@ -259,35 +238,25 @@ def test_shapes_that_are_missing_are_a_warning_and_fetched_again(monkeypatch: py
     assert robots._thread is thread, "all are there"
 
 
+def test_shapes_of_a_session_without_robots_are_not_fetched() -> None:
+    lab = Lab()
+    lab.client.mirror.robots = {}
+    robots = SessionRobots(lab.client, lab.history)
+    assert robots.is_ready(0)
+    assert robots._thread is None
+
+
 def test_bodies_without_poses_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
-    monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
     monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
     lab = Lab()
-    robots = SessionRobots(lab.client, lab.history, removes=True)
+    robots = SessionRobots(lab.client, lab.history)
     robots.is_ready(0)
     wait_for_fetch(robots)
     assert robots.warning == ""
     points: Any = robots._points
     points.n_unknown = 3
     assert robots.warning == "points on robots stay in the cloud: the session sends no poses of 3 bodies of robots"
-
-
-def test_shapes_are_not_fetched_in_vain(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={"a": "lost"}))
-    monkeypatch.setattr(process, "RobotSurface", FakeRobotSurface)
-    monkeypatch.delattr(process, "RobotPoints")
-    lab = Lab()
-    lab.client.mirror.robots = {}
-    robots = SessionRobots(lab.client, lab.history, removes=False)
-    assert robots.is_ready(0)
-    assert robots._thread is None, "a session without robots"
-    lab.client.mirror.robots = {"left": None}
-    robots.is_ready(0)
-    wait_for_fetch(robots)
-    assert robots.place_surface(0, "") is not None, "without points to remove"
-    assert "cameras are not compared with the robots: 1 shapes are missing" in caplog.text
-    assert robots.warning == "", "the cloud lacks nothing"
 
 
 def test_states_of_a_second_are_kept_at_any_rate() -> None:

@@ -259,22 +259,6 @@ def test_frames_that_cannot_be_made_end_nothing(
     assert (lab.fault(), lab.worker.make_report().warning) == (("", ""), "")
 
 
-def test_what_looks_for_moved_cameras_and_fails_ends_nothing(
-    open_timed_lab: Callable[..., TimedLab], caplog: pytest.LogCaptureFixture
-) -> None:
-    lab = open_timed_lab("front")
-
-    def fail(*_: object) -> Any:
-        raise ImportError("libGL.so.1: cannot open shared object file")
-
-    watch: Any = SimpleNamespace(offer=fail, find_move=lambda name: None, close=lambda: None)
-    lab.worker._watch = watch
-    for _ in range(3):
-        lab.step(40, "front")
-    assert len([one for one in lab.outlet.published if one[1]]) == 3
-    assert caplog.text.count("moved are not found: ImportError: libGL.so.1") == 1
-
-
 def test_a_camera_that_is_in_no_cloud_is_named(open_timed_lab: Callable[..., TimedLab]) -> None:
     lab = open_timed_lab("left", "right")
     for _ in range(50):

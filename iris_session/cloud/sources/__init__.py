@@ -95,10 +95,6 @@ def _open(settings: CameraSettings, now_ns: Callable[[], int], body_poses: BodyP
         from iris_session.cloud.sources.mujoco_camera import MujocoCamera
 
         return MujocoCamera(settings, now_ns, body_poses)
-    if settings.source == "opencv":
-        from iris_session.cloud.sources.opencv_capture import OpenCvCamera
-
-        return OpenCvCamera(settings, now_ns)
     if settings.source == "rerun":
         from iris_session.cloud.sources.rerun_recording import RerunSource
 

@@ -24,14 +24,17 @@ _MAX_POINTS: Final = 20_000
 #: Nearest points that make a plane; noise of depth averages out over them.
 _AROUND: Final = 24
 #: Pairs further apart than this are not made: at first, and in the end [m].
-REACH_M: Final = 0.10
+_REACH_M: Final = 0.10
 _LAST_REACH_M: Final = 0.03
 _ITERATIONS: Final = 60
 _SETTLED: Final = 2e-5  # [m] and [rad]
 #: Residuals are never weighted as if depth were better than this [m].
 _MIN_SCALE_M: Final = 0.002
 _MIN_PAIRS: Final = 500
-MIN_OVERLAP: Final = 0.25
+#: Largest correction in the middle of the overlap, and the largest rotation: a calibration is never off by more.
+_MAX_SHIFT_M: Final = 0.08
+_MAX_TURN_RAD: Final = math.radians(4.0)
+_MIN_OVERLAP: Final = 0.25
 #: Least eigenvalue of the normal equations per pair, rotations times the size of the overlap: about the share of the
 #: pairs that hold this direction. Planes have 0, and up to 0.003 by the noise of their normals; rooms 0.03 and more.
 _MIN_EIGENVALUE: Final = 0.006
@@ -50,11 +53,7 @@ class Refinement:
         overlap: Share of the camera's points that have a pair, 0 to 1.
         shift_m: How far the centre of the overlap moved.
         turn_rad: By how much it turned.
-        information: (6, 6) normal equations by (x, y, z [m], rx, ry, rz [rad]) about `center`, per pair and square
-            metre of residual: times the pairs that are independent, over the variance of one, it is an inverse
-            covariance.
-        center: Centre of the overlap [m].
-        condition: Largest over least eigenvalue of `information`, rotations times the size of the overlap.
+        condition: Largest over least eigenvalue of the normal equations, rotations times the size of the overlap.
     """
 
     T_world_world: Floats
@@ -63,8 +62,6 @@ class Refinement:
     overlap: float
     shift_m: float
     turn_rad: float
-    information: Floats
-    center: Floats
     condition: float
 
 
@@ -81,7 +78,7 @@ class RefinementRefusedError(Exception):
         self.reason: Reason = reason
 
 
-class Reference(NamedTuple):
+class _Reference(NamedTuple):
     """Points with a normal each, and a tree of them."""
 
     points: Floats
@@ -89,7 +86,7 @@ class Reference(NamedTuple):
     tree: Any
 
 
-class Pairs(NamedTuple):
+class _Pairs(NamedTuple):
     """Rows of the camera's points that have a pair, normals of their planes, and distances from these [m]."""
 
     rows: npt.NDArray[np.int64]
@@ -97,22 +94,12 @@ class Pairs(NamedTuple):
     residuals: Floats
 
 
-def refine_pose(
-    points: npt.NDArray[Any],
-    reference: npt.NDArray[Any],
-    *,
-    reach_m: float = REACH_M,
-    max_shift_m: float = 0.08,
-    max_turn_rad: float = math.radians(4.0),
-) -> Refinement:
+def refine_pose(points: npt.NDArray[Any], reference: npt.NDArray[Any]) -> Refinement:
     """Refine the pose of a camera.
 
     Args:
         points: (n, 3) [m], points of the camera in the world by its present calibration, voxels rather than pixels.
         reference: (m, 3) [m], points of other cameras or of a scan.
-        reach_m: Distance up to which points are paired at first: above the error of the calibration at the scene.
-        max_shift_m: Largest correction in the middle of the overlap.
-        max_turn_rad: Largest rotation of the correction.
 
     Returns:
         The correction, which fits better than the calibration.
@@ -123,17 +110,16 @@ def refine_pose(
     source = np.asarray(points, np.float64)
     source = source[:: max(1, math.ceil(len(source) / _MAX_POINTS))]
     target = _make_reference(np.asarray(reference, np.float64))
-    first = find_pairs(source, target, reach_m)
-    _check_overlap(first, source, reach_m)
-    moved, T, reach = source, np.eye(4), reach_m
+    first = _find_pairs(source, target, _REACH_M)
+    _check_overlap(first, source, _REACH_M)
+    moved, T, reach = source, np.eye(4), _REACH_M
     for _ in range(_ITERATIONS):
-        pairs = find_pairs(moved, target, reach)
+        pairs = _find_pairs(moved, target, reach)
         _check_overlap(pairs, source, reach)
-        information, gradient, center, size = make_normal_equations(moved, pairs)
+        information, gradient, center, size = _make_normal_equations(moved, pairs)
         values, vectors = np.linalg.eigh(information)
         step = -vectors @ ((vectors.T @ gradient) / (values + _DAMPING))
-        move = make_motion(step[:3], step[3:] / size, center)
-        T = move @ T
+        T = _make_motion(step[:3], step[3:] / size, center) @ T
         moved = source @ T[:3, :3].T + T[:3, 3]
         if reach == _LAST_REACH_M and np.abs(step).max() < _SETTLED:
             break
@@ -146,15 +132,13 @@ def refine_pose(
         len(pairs.rows) / len(source),
         float(np.linalg.norm(T[:3, :3] @ center + T[:3, 3] - center)),
         measure_turn(T[:3, :3]),
-        information * np.outer(scale := np.array([1.0] * 3 + [size] * 3), scale),
-        center,
         float(values[-1] / max(values[0], 1e-12)),
     )
-    _check_result(result, values[0], vectors[:, 0], max_shift_m, max_turn_rad)
+    _check_result(result, values[0], vectors[:, 0])
     return result
 
 
-def _make_reference(points: Floats) -> Reference:
+def _make_reference(points: Floats) -> _Reference:
     """Compute the normals of a cloud."""
     from scipy.spatial import cKDTree
 
@@ -165,18 +149,18 @@ def _make_reference(points: Floats) -> Reference:
     away = around - around.mean(axis=1, keepdims=True)
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))
     # The plane goes through the mean of the points around, not through the point with its own noise.
-    return Reference(around.mean(axis=1), vectors[:, :, 0], tree)
+    return _Reference(around.mean(axis=1), vectors[:, :, 0], tree)
 
 
-def find_pairs(points: Floats, target: Reference, reach_m: float) -> Pairs:
+def _find_pairs(points: Floats, target: _Reference, reach_m: float) -> _Pairs:
     """Pair points (n, 3) with the nearest ones of a reference within `reach_m` [m]."""
     distance, at = target.tree.query(points, distance_upper_bound=reach_m)
     rows = np.flatnonzero(np.isfinite(distance))
     normals = target.normals[at[rows]]
-    return Pairs(rows, normals, np.einsum("ij,ij->i", points[rows] - target.points[at[rows]], normals))
+    return _Pairs(rows, normals, np.einsum("ij,ij->i", points[rows] - target.points[at[rows]], normals))
 
 
-def make_normal_equations(points: Floats, pairs: Pairs) -> tuple[Floats, Floats, Floats, float]:
+def _make_normal_equations(points: Floats, pairs: _Pairs) -> tuple[Floats, Floats, Floats, float]:
     """Return matrix (6, 6) and gradient (6,) per pair, centre and size of the overlap [m]. Rotations are in units of
     its size, so that all six are lengths."""
     scale = max(_MIN_SCALE_M, 1.4826 * float(np.median(np.abs(pairs.residuals))))
@@ -190,17 +174,17 @@ def make_normal_equations(points: Floats, pairs: Pairs) -> tuple[Floats, Floats,
     return (J * weights[:, None]).T @ J, J.T @ (weights * pairs.residuals), center, size
 
 
-def _check_overlap(pairs: Pairs, source: Floats, reach_m: float) -> None:
+def _check_overlap(pairs: _Pairs, source: Floats, reach_m: float) -> None:
     n, share = len(pairs.rows), len(pairs.rows) / max(1, len(source))
-    if n < _MIN_PAIRS or share < MIN_OVERLAP:
+    if n < _MIN_PAIRS or share < _MIN_OVERLAP:
         raise RefinementRefusedError(
             "overlap",
             f"{n} points ({100.0 * share:.0f} %) lie within {100.0 * reach_m:.0f} cm of the reference: at least "
-            f"{_MIN_PAIRS} and {100.0 * MIN_OVERLAP:.0f} %; let both cameras see the same surfaces, or calibrate again",
+            f"{_MIN_PAIRS} and {100.0 * _MIN_OVERLAP:.0f} %; let both see the same surfaces, or calibrate again",
         )
 
 
-def _check_result(result: Refinement, least: float, free: Floats, max_shift_m: float, max_turn_rad: float) -> None:
+def _check_result(result: Refinement, least: float, free: Floats) -> None:
     if least < _MIN_EIGENVALUE:
         turns = np.linalg.norm(free[3:]) > np.linalg.norm(free[:3])
         way = free[3:] if turns else free[:3]
@@ -210,11 +194,11 @@ def _check_result(result: Refinement, least: float, free: Floats, max_shift_m: f
             f"what both see can {'turn about' if turns else 'slide along'} ({axis}) without a difference: let them see "
             "surfaces in three directions, as a table with things on it before a wall",
         )
-    if result.shift_m > max_shift_m or result.turn_rad > max_turn_rad:
+    if result.shift_m > _MAX_SHIFT_M or result.turn_rad > _MAX_TURN_RAD:
         raise RefinementRefusedError(
             "far",
             f"the clouds fit {1e3 * result.shift_m:.0f} mm and {math.degrees(result.turn_rad):.1f} deg away, more than "
-            f"{1e3 * max_shift_m:.0f} mm and {math.degrees(max_turn_rad):.1f} deg: calibrate the camera again",
+            f"{1e3 * _MAX_SHIFT_M:.0f} mm and {math.degrees(_MAX_TURN_RAD):.1f} deg: calibrate the camera again",
         )
     if result.rmse_after_m > 1.01 * result.rmse_before_m:
         raise RefinementRefusedError(
@@ -224,15 +208,15 @@ def _check_result(result: Refinement, least: float, free: Floats, max_shift_m: f
         )
 
 
-def _measure_rmse(points: Floats, target: Reference) -> float:
+def _measure_rmse(points: Floats, target: _Reference) -> float:
     """Return the rms distance from the planes [m]; what is further away than the last reach counts with that."""
-    pairs = find_pairs(points, target, _LAST_REACH_M)
+    pairs = _find_pairs(points, target, _LAST_REACH_M)
     squares = np.full(len(points), _LAST_REACH_M**2)
     squares[pairs.rows] = pairs.residuals**2
     return math.sqrt(float(squares.mean()))
 
 
-def make_motion(shift: Floats, turn: Floats, center: Floats) -> Floats:
+def _make_motion(shift: Floats, turn: Floats, center: Floats) -> Floats:
     """Return the motion (4, 4) that turns by a rotation vector about `center`, and shifts."""
     from scipy.spatial.transform import Rotation
 

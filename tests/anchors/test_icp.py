@@ -14,9 +14,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anchors import icp
 from anchors.camera import CameraModel
-from iris_session.cloud import icp
-from iris_session.cloud.icp import Refinement, RefinementRefusedError, refine_pose
+from anchors.icp import Refinement, RefinementRefusedError, refine_pose
 from iris_session.cloud.voxels import DepthLimits, VoxelFilter, make_rays
 from iris_session.demo.named_scenes import scene_by_name
 from tests.cloud.rays import cast_picture, look_at
@@ -78,7 +78,7 @@ def see_table(camera: int) -> tuple[Floats, Floats]:
     return make_cloud(depth, np.zeros((*depth.shape, 3), np.uint8), pose), pose[:3, 3]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_extrinsics_off_by_2_cm_and_1_degree_are_mended_on_real_frames(seed: int, rgbd: Path) -> None:
     reference, _ = see_real_room(rgbd, 0)
     points, p_camera = see_real_room(rgbd, 20)
@@ -92,7 +92,7 @@ def test_extrinsics_off_by_2_cm_and_1_degree_are_mended_on_real_frames(seed: int
     assert found.condition < 20.0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_extrinsics_of_two_cameras_at_a_table_are_mended(seed: int) -> None:
     reference, _ = see_table(0)
     points, p_camera = see_table(1)
@@ -151,14 +151,14 @@ def test_clouds_without_overlap_are_refused(points: Floats) -> None:
 
 def test_corrections_larger_than_allowed_are_refused() -> None:
     with pytest.raises(RefinementRefusedError, match="calibrate") as caught:
-        refine_pose(make_walls([X, Y, Z], 1) + 0.03, make_walls([X, Y, Z], 2), max_shift_m=0.04)
+        refine_pose(make_walls([X, Y, Z], 1) + 0.055, make_walls([X, Y, Z], 2))
     assert caught.value.reason == "far"
 
 
 def test_a_fit_that_is_worse_is_refused() -> None:
     found = refine_pose(make_walls([X, Y, Z], 1), make_walls([X, Y, Z], 2))
-    icp._check_result(found, 1.0, np.ones(6), 1.0, 1.0)
+    icp._check_result(found, 1.0, np.ones(6))
     worse = dataclasses.replace(found, rmse_after_m=1.02 * found.rmse_before_m)
     with pytest.raises(RefinementRefusedError, match="the calibration stays") as caught:
-        icp._check_result(worse, 1.0, np.ones(6), 1.0, 1.0)
+        icp._check_result(worse, 1.0, np.ones(6))
     assert caught.value.reason == "worse"
