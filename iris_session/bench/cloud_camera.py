@@ -27,14 +27,14 @@ from anchors.camera import CameraModel
 from iris_session.bench.cloud_room import WORKSPACE, RoomPicture, make_room_camera, make_room_pose, render_room
 from iris_session.bench.cloud_source import STREAM, publish
 from iris_session.client import Client
-from iris_session.cloud.frames import DepthFrame
-from iris_session.cloud.pipeline import Cloud, CloudPipeline, PipelineCamera, PipelineSettings, PlacedFrame
+from iris_session.cloud.camera_file import CameraSettings, CloudSettings
+from iris_session.cloud.frames import DepthFrame, SourceFrame
+from iris_session.cloud.pipeline import Cloud, CloudPipeline, PlacedFrame
 from iris_session.cloud.voxels import DepthLimits, pack_keys
 from iris_session.streams.cloud import encode_cloud
 from iris_session.system.priority import lower_thread_priority
 
 STAGES: Final = ("read", "voxels", "outliers", "budget", "encode", "send")
-MIN_POINTS, MIN_AROUND = 2, 4
 ERROR_M: Final = 0.01
 #: Pictures of each camera, shown again and again.
 CYCLE: Final = 4
@@ -122,13 +122,15 @@ class CloudCamera:
         self.case = case
         self.rig = make_rig(case, seed)
         names = [f"camera{i}" for i in range(case.cameras)]
-        cameras = [PipelineCamera(name, self.rig.limits, ERROR_M, None) for name in names]
-        settings = PipelineSettings(case.points, case.voxel_m, MIN_POINTS, MIN_AROUND)
-        self._pipeline = CloudPipeline(settings, cameras, time.perf_counter_ns)
+        low, high, nearest_m, farthest_m, _ = self.rig.limits
+        given = {"nearest_m": nearest_m, "farthest_m": farthest_m, "error_mm": 1e3 * ERROR_M}
+        cameras = tuple(CameraSettings(name=name, source="folder", **given) for name in names)
+        settings = CloudSettings(
+            stream=STREAM, points=case.points, voxel_m=case.voxel_m, low=low, high=high, cameras=cameras
+        )
+        self._pipeline = CloudPipeline(settings, time.perf_counter_ns)
         self._names = names
         self._next = 0
-        for name in names:
-            self._pipeline.open_camera(name, self.rig.model, 0.001)
         for _ in range(WARM_UP):
             self.make_cloud(0)
 
@@ -138,7 +140,8 @@ class CloudCamera:
         frames = {}
         for name, pictures in zip(self._names, self.rig.pictures, strict=True):
             depth, color, pose = pictures[self._next % len(pictures)]
-            frames[name] = PlacedFrame(DepthFrame(depth.copy(), color.copy(), now_ns), pose)
+            frame = DepthFrame(depth.copy(), color.copy(), now_ns)
+            frames[name] = PlacedFrame(SourceFrame(frame, self.rig.model, 0.001), pose)
         self._next += 1
         read_ms = (time.perf_counter_ns() - began_ns) * 1e-6
         return self._pipeline.make_cloud(frames), read_ms

@@ -283,7 +283,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     return _inspect_session(arguments)
 
 
-class _NoOutlet:
+class _NoSink:
     """Takes frames of a worker and sends them nowhere."""
 
     def now_ns(self) -> int:
@@ -308,7 +308,7 @@ def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
                 f"cloud run {path}`, then `iris-session cloud inspect ADDRESS`"
             )
     with _name_unexpected_error(settings):
-        worker = CloudWorker(settings, _NoOutlet(), open_source, time.perf_counter_ns)
+        worker = CloudWorker(settings, _NoSink(), open_source, time.perf_counter_ns)
         worker.start()
         try:
             _run_worker(worker, FIRST_FRAME_S, lambda: worker.cloud is not None)

@@ -243,21 +243,22 @@ def _ask_session(arguments: argparse.Namespace, sheets: list[Sheet]) -> KnownShe
 def _take_frames(camera: CameraSettings, n: int) -> CameraFrames:
     """Take the next frames of a camera; of a recording that ends, as many as it has."""
     from iris_session.cloud.frames import SourceEndedError
-    from iris_session.cloud.sources import open_source, read_frame
+    from iris_session.cloud.sources import name_camera, open_source
 
     frames: list[DepthFrame] = []
     until = time.monotonic() + FRAMES_S
     with closing(open_source(camera, time.monotonic_ns)) as source:
         try:
             while len(frames) < n and time.monotonic() < until:
-                frame = read_frame(camera, source, 0.5)
-                if frame is None:
-                    continue
-                if frame.T_world_camera is not None and camera.source != "mujoco":
-                    raise CommandError(f"camera {camera.name!r}: its frames have poses of their own, which count")
-                frames.append(frame)
+                frame = source.read(0.5)
+                if frame is not None:
+                    frames.append(frame)
         except SourceEndedError:
             pass
+        except Exception as error:  # also of a vendor's package
+            raise name_camera(camera, error) from error
+        if camera.source != "mujoco" and any(one.T_world_camera is not None for one in frames):
+            raise CommandError(f"camera {camera.name!r}: its frames have poses of their own, which count")
         if not frames:
             raise CommandError(f"camera {camera.name!r} gave no frame within {FRAMES_S:g} s", status=1)
         return CameraFrames(camera, source.camera, source.depth_scale_m, frames)
@@ -316,10 +317,11 @@ def _make_points(settings: CloudSettings, one: CameraFrames, T_world_camera: Flo
     """Return the points of a camera within the limits of the camera file, world frame."""
     import numpy as np
 
-    from iris_session.cloud.voxels import DepthLimits, VoxelFilter, make_rays
+    from iris_session.cloud.pipeline import make_limits
+    from iris_session.cloud.voxels import MIN_AROUND, MIN_POINTS, VoxelFilter, make_rays
 
     voxels = VoxelFilter(_ICP_VOXEL_M)
-    limits = DepthLimits(settings.low, settings.high, one.settings.nearest_m, one.settings.farthest_m)
+    limits = make_limits(settings, one.settings)
     rays = make_rays(one.camera)
     for frame in one.frames:
         try:
@@ -328,7 +330,7 @@ def _make_points(settings: CloudSettings, one: CameraFrames, T_world_camera: Flo
             )
         except ValueError as error:
             raise CommandError(f"camera {one.settings.name!r}: {error}") from error
-    found = voxels.collect(min_points=settings.min_points, min_around=settings.min_around)
+    found = voxels.collect(min_points=MIN_POINTS, min_around=MIN_AROUND)
     return np.asarray(found.positions, np.float64)
 
 

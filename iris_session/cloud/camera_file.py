@@ -12,20 +12,20 @@ Files that it names are read here, so that the settings can be passed on: intrin
 
 from __future__ import annotations
 
-import difflib
 import math
+import os
 import re
 import shlex
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from anchors.camera import CameraError, CameraModel, parse_camera, pose_to_matrix
+from anchors.camera import CameraModel, parse_camera, pose_to_matrix
 from anchors.pose import quat_normalize
 from iris_session.protocol.common import Name, Quat, Text, Vec3
 from iris_session.protocol.media import MAX_IMAGE_SIZE, MAX_STREAMS, describe_bad_stream_name, is_stream_name
@@ -34,6 +34,7 @@ SourceName = Literal["folder", "mujoco", "rerun", "mcap", "realsense", "orbbec"]
 AudienceName = Literal["remote", "all"]
 #: Keys with a choice of values.
 _CHOICES: Final = {"source": get_args(SourceName), "audience": get_args(AudienceName)}
+_ErrorMm = Annotated[float, Meta(gt=0.0, lt=1e6)]
 #: Points of a frame: below, a room cannot be recognised; above, a frame from another process is refused.
 _Budget = Annotated[int, Meta(ge=1_000, le=1_000_000)]
 _Rate = Annotated[float, Meta(ge=0.0, le=240.0)]
@@ -48,7 +49,6 @@ _MISSING: Final = {
     "calibration": "; `iris-session cloud calibrate` or `iris-session anchors calibrate-camera` writes it with --out, "
     "or give a pose",
 }
-_T = TypeVar("_T")
 
 
 class CameraFileError(ValueError):
@@ -120,7 +120,7 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     depth_scale_m: Annotated[float, Meta(gt=0.0, lt=1.0)] | None = None
     nearest_m: Annotated[float, Meta(ge=0.0)] = 0.3
     farthest_m: Annotated[float, Meta(gt=0.0, le=100.0)] = 3.5
-    error_mm: Annotated[float, Meta(gt=0.0)] | None = None
+    error_mm: _ErrorMm | None = None
     loop: bool = True
 
     def __post_init__(self) -> None:
@@ -138,13 +138,10 @@ class CloudSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         hz: Frames per second, at most.
         points: Points of a frame, at most.
         voxel_m: Smallest edge of a cell [m].
-        min_points: Points of a cell, at least.
-        min_around: Occupied cells around a cell, at least.
         low: Lowest corner of the crop box [m], world frame.
         high: Highest corner.
         remove_robots: Leave out points on the session's robots.
         picture_hz: Rate of the pictures, streams of their own; 0: none.
-        picture_quality: Quality of their JPEG, 1 to 100.
         cameras: Their frames are joined into one cloud.
     """
 
@@ -154,14 +151,15 @@ class CloudSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     hz: Annotated[float, Meta(gt=0.0, le=240.0)] = 30.0
     points: _Budget = 50_000
     voxel_m: Annotated[float, Meta(ge=0.001, le=10.0)] = 0.01
-    min_points: Annotated[int, Meta(ge=1)] = 2
-    min_around: Annotated[int, Meta(ge=0, le=26)] = 4
     low: Vec3 = (-2.0, -2.0, -0.1)
     high: Vec3 = (2.0, 2.0, 3.0)
     remove_robots: bool = False
     picture_hz: _Rate = 10.0
-    picture_quality: Annotated[int, Meta(ge=1, le=100)] = 80
     cameras: Annotated[tuple[CameraSettings, ...], Meta(min_length=1)]
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):  # also of NaN
+            raise ValueError(f"low {list(self.low)} must be below high {list(self.high)} in x, y and z")
 
     def name_picture_stream(self, camera: str) -> str:
         """Return the name of the stream of a camera's pictures."""
@@ -186,11 +184,7 @@ def load_camera_file(path: str | Path, *, calibrated: bool = True) -> CloudSetti
     Raises:
         CameraFileError: The file cannot be read, or a value in it cannot be used.
     """
-    try:
-        found = Path(path).expanduser().absolute()
-    except RuntimeError as error:  # the home of an unknown user
-        raise CameraFileError(f"camera file {path}: {error}") from error
-    return _Reader(found, calibrated).read()
+    return _Reader(Path(os.path.expanduser(path)).absolute(), calibrated).read()
 
 
 class _Reader:
@@ -207,15 +201,18 @@ class _Reader:
         except (ValueError, RecursionError) as error:  # also a number or a nesting that Python does not take
             line = re.search(r"line (\d+)", str(error))
             raise CameraFileError(f"{self._path}: {error}", line=int(line[1]) if line else 0) from error
-        self._check_finite(document)
-        given = document.get("cameras")
-        if not isinstance(given, list) or not given:
+        tables = document.get("cameras")
+        if not isinstance(tables, list) or not tables:
             raise self._error("cameras", "no camera: add a table [[cameras]] with name and source")
         document.setdefault("title", document.get("stream", ""))
         document["cameras"] = [
-            self._resolve(table, index) if isinstance(table, dict) else table for index, table in enumerate(given)
+            self._resolve(table, index) if isinstance(table, dict) else table for index, table in enumerate(tables)
         ]
-        settings = self._convert(document, CloudSettings)
+        try:
+            settings = msgspec.convert(document, CloudSettings)
+        except msgspec.ValidationError as error:
+            key, camera, text = _explain(error, document)
+            raise self._error(key, text, camera) from error
         self._check(settings)
         return settings
 
@@ -224,17 +221,17 @@ class _Reader:
     def _resolve(self, table: dict[str, Any], index: int) -> dict[str, Any]:
         """Return the table of a camera with the contents of the files that it names."""
         table = dict(table)
-        source = table.get("source")
-        if isinstance(table.get("path"), str) and source in _READ_FROM_DISK:
-            table["path"] = str(self._locate("path", table["path"], index))
-        if isinstance(table.get("model"), str):
-            table["model"] = str(self._locate("model", table["model"], index))
+        for key in ("path", "model") if table.get("source") in _READ_FROM_DISK else ("model",):
+            if isinstance(table.get(key), str):
+                table[key] = str(self._locate(table[key]))
         if isinstance(table.get("intrinsics"), str):
-            file = self._locate("intrinsics", table["intrinsics"], index)
+            file = self._locate(table["intrinsics"])
             try:
-                table["intrinsics"] = _to_table(parse_camera(_read_text(file, "intrinsics")))
+                camera = parse_camera(_read_text(file, "intrinsics"))
             except ValueError as error:
-                raise self._error("intrinsics", _name_file(file, error), index) from error
+                text = str(error) if isinstance(error, CameraFileError) else f"{file}: {error}"
+                raise self._error("intrinsics", text, index) from error
+            table["intrinsics"] = {name: getattr(camera, name) for name in CameraModel.__dataclass_fields__}
         if not self._calibrated:
             for key in ("calibration", "pose", "error_mm"):
                 table.pop(key, None)
@@ -244,9 +241,10 @@ class _Reader:
             raise self._error("pose", "pose and calibration are both given: one of them is enough", index)
         if not isinstance(calibration, str):
             raise self._error("calibration", f"{calibration!r} is not the path of a file", index)
-        file = self._locate("calibration", calibration, index)
         try:
-            pose, error_mm = read_calibration(file, str(table.get("name", "")), on_body=bool(table.get("body")))
+            pose, error_mm = read_calibration(
+                self._locate(calibration), str(table.get("name", "")), on_body=bool(table.get("body"))
+            )
         except CameraFileError as error:
             raise self._error("calibration", str(error), index) from error
         table["pose"] = pose
@@ -254,20 +252,15 @@ class _Reader:
             table.setdefault("error_mm", error_mm)
         return table
 
-    def _locate(self, key: str, given: str, index: int) -> Path:
+    def _locate(self, path: str) -> Path:
         """Return the path of a file that a camera names, relative to the camera file."""
-        try:
-            return self._path.parent / Path(given).expanduser()
-        except RuntimeError as error:  # the home of an unknown user
-            raise self._error(key, f"{given!r}: {error}", index) from error
+        return self._path.parent / os.path.expanduser(path)
 
     # --- checks ---
 
     def _check(self, settings: CloudSettings) -> None:
         if not is_stream_name(settings.stream):
             raise self._error("stream", describe_bad_stream_name(settings.stream))
-        if any(low >= high for low, high in zip(settings.low, settings.high, strict=True)):
-            raise self._error("low", f"low {list(settings.low)} must be below high {list(settings.high)} in x, y and z")
         names: set[str] = set()
         for index, camera in enumerate(settings.cameras):
             if camera.name in names:
@@ -276,84 +269,21 @@ class _Reader:
             stream = settings.name_picture_stream(camera.name)
             if not is_stream_name(stream):
                 raise self._error("name", describe_bad_stream_name(stream), index)
-            self._check_source(camera, index)
+            if problem := _find_source_problem(camera):
+                raise self._error(*problem, index)
+            has_poses = camera.source == "folder" and any(Path(camera.path).glob("*.pose.txt"))
+            if self._calibrated and camera.pose is None and camera.source != "mujoco" and not has_poses:
+                file, out = (shlex.quote(str(one)) for one in (self._path, self._path.with_name("calibration.toml")))
+                raise self._error(
+                    "calibration",
+                    f"no calibration: `iris-session cloud calibrate {file} --out {out}` writes one, "
+                    'then calibration = "calibration.toml"; or pose = { position_m, quaternion_wxyz }',
+                    index,
+                )
         if (n := len(settings.list_streams())) > MAX_STREAMS:
             raise self._error(
                 "cameras", f"{n} streams, one for each camera's pictures: at most {MAX_STREAMS}; picture_hz = 0: none"
             )
-
-    def _check_source(self, camera: CameraSettings, index: int) -> None:
-        model = camera.intrinsics
-        if model is not None and max(model.width, model.height) > MAX_IMAGE_SIZE:
-            wrong = f"intrinsics are of {model.width} x {model.height} pixels"
-            raise self._error("intrinsics", f"{wrong}: at most {MAX_IMAGE_SIZE} x {MAX_IMAGE_SIZE} are possible", index)
-        if camera.source == "mujoco":
-            for key in ("model", "camera"):
-                if not getattr(camera, key):
-                    raise self._error(key, f"{key} is missing: a rendered camera needs model and camera", index)
-            return
-        if camera.source in _READ_FROM_DISK:
-            if not camera.path:
-                raise self._error("path", f"path is missing: source {camera.source!r} reads a file or folder", index)
-            if not Path(camera.path).exists():
-                raise self._error("path", f"{camera.path!r} does not exist", index)
-        if camera.source == "folder" and camera.intrinsics is None:
-            wanted = "a file, or { width, height, fx, fy, cx, cy } in pixels"
-            raise self._error("intrinsics", f"intrinsics are missing: {wanted}", index)
-        has_poses = camera.source == "folder" and any(Path(camera.path).glob("*.pose.txt"))
-        if camera.pose is None and not has_poses and self._calibrated:
-            file, out = (shlex.quote(str(one)) for one in (self._path, self._path.with_name("calibration.toml")))
-            raise self._error(
-                "calibration",
-                f"no calibration: `iris-session cloud calibrate {file} --out {out}` writes one, "
-                'then calibration = "calibration.toml"; or pose = { position_m, quaternion_wxyz }',
-                index,
-            )
-
-    def _check_finite(self, value: Any, key: str = "", camera: int | None = None) -> None:
-        """Refuse inf and nan, which TOML has and JSON has not."""
-        if isinstance(value, dict):
-            for name, inner in value.items():
-                self._check_finite(inner, str(name), camera)
-        elif isinstance(value, list):
-            for index, inner in enumerate(value):
-                self._check_finite(inner, key, index if key == "cameras" else camera)
-        elif isinstance(value, float) and not math.isfinite(value):
-            raise self._error(key, f"{key} is {value}: a finite number is needed", camera)
-
-    # --- errors ---
-
-    def _convert(self, document: dict[str, Any], kind: type[_T]) -> _T:
-        try:
-            return msgspec.convert(document, kind)
-        except msgspec.ValidationError as error:
-            raise self._explain(str(error), document) from error
-
-    def _explain(self, said: str, document: dict[str, Any]) -> CameraFileError:
-        """Return msgspec's error with line, key and value."""
-        message, _, path = said.partition(" - at `$")
-        steps = re.findall(r"\.(\w+)|\[(\d+)\]", path)
-        value: Any = document
-        key, camera = "", None
-        for name, number in steps:
-            if number and key == "cameras":
-                camera = int(number)
-            key = name or key
-            value = value[name] if name else value[int(number)]
-        message = message.replace("`", "")
-        if found := re.fullmatch(r"Object contains unknown field (.+)", message):
-            known = _list_keys(key if isinstance(value, dict) else "")
-            near = difflib.get_close_matches(found[1], known, n=1)
-            right = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-            return self._error(found[1], f"unknown key {found[1]!r}: {right}", camera)
-        if found := re.fullmatch(r"Object missing required field (.+)", message):
-            return self._error(found[1], f"{found[1]} is missing", camera)
-        if key in _CHOICES and isinstance(value, str):
-            return self._error(key, f"{key} {value!r} is none of {', '.join(_CHOICES[key])}", camera)
-        if message.startswith("Expected"):
-            return self._error(key, f"{key} is {value!r}: e{message[1:]}", camera)
-        named = next((name for name in CameraSettings.__struct_fields__ if message.startswith(name)), key)
-        return self._error(named, message, camera)
 
     def _error(self, key: str, message: str, camera: int | None = None) -> CameraFileError:
         """Return the error of a key, of the file or of one of its cameras."""
@@ -361,6 +291,55 @@ class _Reader:
         where = f"{self._path}, line {line}" if line else f"{self._path}"
         which = f"camera {camera + 1}: " if camera is not None else ""
         return CameraFileError(f"{where}: {which}{message}", key, line)
+
+
+def _find_source_problem(camera: CameraSettings) -> tuple[str, str] | None:
+    """Return key and description of what the source of a camera cannot use, None where there is nothing."""
+    model = camera.intrinsics
+    if model is not None and max(model.width, model.height) > MAX_IMAGE_SIZE:
+        wrong = f"intrinsics are of {model.width} x {model.height} pixels"
+        return "intrinsics", f"{wrong}: at most {MAX_IMAGE_SIZE} x {MAX_IMAGE_SIZE} are possible"
+    if camera.source == "mujoco":
+        missing = next((key for key in ("model", "camera") if not getattr(camera, key)), "")
+        return (missing, f"{missing} is missing: a rendered camera needs model and camera") if missing else None
+    if camera.source in _READ_FROM_DISK:
+        if not camera.path:
+            return "path", f"path is missing: source {camera.source!r} reads a file or folder"
+        if not Path(camera.path).exists():
+            return "path", f"{camera.path!r} does not exist"
+    if camera.source == "folder" and model is None:
+        return "intrinsics", "intrinsics are missing: a file, or { width, height, fx, fy, cx, cy } in pixels"
+    return None
+
+
+def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> tuple[str, int | None, str]:
+    """Return the key of a value that msgspec refuses, the number of its camera, and one line with the value."""
+    message, _, path = str(error).replace("`", "").partition(" - at $")
+    value: Any = document
+    key, camera = "", None
+    for name, number in re.findall(r"\.(\w+)|\[(\d+)\]", path):
+        if number and key == "cameras":
+            camera = int(number)
+        key = name or key
+        value = value[name] if name else value[int(number)]
+    if found := re.fullmatch(r"Object contains unknown field (.+)", message):
+        return found[1], camera, f"unknown key {found[1]!r}: known are {', '.join(_list_keys(key))}"
+    if found := re.fullmatch(r"Object missing required field (.+)", message):
+        return found[1], camera, f"{found[1]} is missing"
+    if key in _CHOICES and isinstance(value, str):
+        return key, camera, f"{key} {value!r} is none of {', '.join(_CHOICES[key])}"
+    if message.startswith("Expected"):
+        return key, camera, f"{key} is {value!r}: e{message[1:]}"
+    fields = (*CloudSettings.__struct_fields__, *CameraSettings.__struct_fields__)
+    return next((name for name in fields if message.startswith(name)), key), camera, message
+
+
+class _Calibration(msgspec.Struct, frozen=True):
+    """What is read of the calibration of a camera."""
+
+    T_base_camera: CameraPose | None = None
+    T_ee_camera: CameraPose | None = None
+    error_mm_p95: _ErrorMm | None = None
 
 
 def read_calibration(path: Path, camera: str, *, on_body: bool) -> tuple[CameraPose, float | None]:
@@ -383,37 +362,22 @@ def read_calibration(path: Path, camera: str, *, on_body: bool) -> tuple[CameraP
     except (ValueError, RecursionError) as error:
         raise CameraFileError(f"{path}: {error}", "calibration") from error
     cameras = document.get("cameras")
-    part = document if not isinstance(cameras, dict) else cameras.get(camera)
+    part = cameras.get(camera) if isinstance(cameras, dict) else document
     if not isinstance(part, dict):
         raise CameraFileError(
             f"{path} has no camera {camera!r}: it has {', '.join(map(repr, cameras or ()))}", "calibration"
         )
-    if "T_ee_camera" in part and not on_body:
-        raise CameraFileError(
-            f"{path} is of a camera on the robot's hand: name the body of the scene that carries it, body",
-            "calibration",
-        )
-    table = "T_base_camera" if "T_base_camera" in part else "T_ee_camera"
-    if not isinstance(part.get(table), dict):
-        raise CameraFileError(
-            f"{path} has no [T_base_camera]: `iris-session cloud calibrate` or `iris-session anchors calibrate-camera` "
-            "writes one with --out",
-            "calibration",
-        )
     try:
-        pose = msgspec.convert(part[table], CameraPose)
+        found = msgspec.convert(part, _Calibration)
     except msgspec.ValidationError as error:
-        message = re.sub(r" - at `\$\.?(.*)`$", r" in \1", str(error)).replace("`", "")
-        raise CameraFileError(f"{path}, [{table}]: {message}", "calibration") from error
-    error_mm = part.get("error_mm_p95")
-    if error_mm is None:
-        return pose, None
-    if isinstance(error_mm, bool) or not isinstance(error_mm, int | float) or not 0.0 < error_mm < 1e6:
-        raise CameraFileError(
-            f"{path}: error_mm_p95 is {error_mm!r}: a number above 0 is needed; leave it out where it is not known",
-            "calibration",
-        )
-    return pose, float(error_mm)
+        raise CameraFileError(f"{path}: {_explain(error, part)[2]}", "calibration") from error
+    if found.T_base_camera is None and found.T_ee_camera is not None and not on_body:
+        text = "is of a camera on the robot's hand: name the body of the scene that carries it, body"
+        raise CameraFileError(f"{path} {text}", "calibration")
+    pose = found.T_base_camera or found.T_ee_camera
+    if pose is None:
+        raise CameraFileError(f"{path} has no [T_base_camera]{_MISSING['calibration']}", "calibration")
+    return pose, found.error_mm_p95
 
 
 def find_line(text: str, key: str, camera: int | None = None) -> int:
@@ -437,11 +401,16 @@ def find_line(text: str, key: str, camera: int | None = None) -> int:
     return at
 
 
-def _list_keys(key: str) -> list[str]:
-    """Return the keys of a table of the file, named by the key that holds it."""
-    if key == "cameras":
+def _list_keys(table: str) -> list[str]:
+    """Return the keys of a table, named by the key that holds it."""
+    if table == "cameras":
         return [*CameraSettings.__struct_fields__, "calibration"]
-    return list((CameraPose if key == "pose" else CloudSettings).__struct_fields__)
+    kinds: dict[str, type[msgspec.Struct]] = {
+        "pose": CameraPose,
+        "T_base_camera": CameraPose,
+        "T_ee_camera": CameraPose,
+    }
+    return list(kinds.get(table, CloudSettings).__struct_fields__)
 
 
 def _read_text(path: Path, kind: str) -> str:
@@ -451,14 +420,3 @@ def _read_text(path: Path, kind: str) -> str:
         said = getattr(error, "strerror", None) or str(error)
         hint = _MISSING.get(kind, "") if isinstance(error, FileNotFoundError) else ""
         raise CameraFileError(f"{kind} {path} cannot be read: {said}{hint}") from error
-
-
-def _name_file(path: Path, error: ValueError) -> str:
-    if not isinstance(error, CameraError):
-        return str(error)
-    hint = "; a matrix has no size of the pictures, write width, height, fx, fy, cx, cy" if "size" in str(error) else ""
-    return f"{path}: {error}{hint}"
-
-
-def _to_table(camera: CameraModel) -> dict[str, Any]:
-    return {name: getattr(camera, name) for name in CameraModel.__dataclass_fields__}

@@ -72,14 +72,11 @@ title = "Room"             # shown to people
 # hz = 30.0                # clouds per second at most
 # points = 50_000          # points of a cloud at most; cells grow until it is met
 # voxel_m = 0.01           # least edge of a cell
-# min_points = 2           # cells with fewer points are left out
-# min_around = 4           # cells with fewer occupied cells among the 26 around them are left out
 # What lies outside of this box is left out [m], world frame.
 low = [-2.0, -2.0, -0.1]
 high = [2.0, 2.0, 3.0]
 # remove_robots = false    # leave out points on the session's robots, which are drawn anyway
 # picture_hz = 10.0        # pictures per second, in streams named STREAM-CAMERA; 0: none
-# picture_quality = 80     # of their JPEG
 
 # One [[cameras]] for each camera: frames that are captured within 50 ms of each other become one cloud.
 [[cameras]]

@@ -5,7 +5,7 @@ The sources themselves are in `iris_session.cloud.sources`.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -38,16 +38,28 @@ class DepthFrame(NamedTuple):
     T_world_camera: npt.NDArray[np.float64] | None = None
 
 
+class SourceFrame(NamedTuple):
+    """A frame with what its source says of all of them: intrinsics, and the length of one unit of depth [m]."""
+
+    frame: DepthFrame
+    camera: CameraModel
+    depth_scale_m: float
+
+
 class DepthSource(Protocol):
     """A camera or a recording.
 
     Attributes:
         camera: Intrinsics of its frames.
         depth_scale_m: Length of one unit of `DepthFrame.depth` [m].
+        recorded_hz: Frames per second of a recording by their times, 0 while it is not known, and of cameras.
     """
 
     camera: CameraModel
     depth_scale_m: float
+
+    @property
+    def recorded_hz(self) -> float: ...
 
     def read(self, timeout_s: float) -> DepthFrame | None:
         """Return the next frame, or None if none came in time.
@@ -64,15 +76,3 @@ class DepthSource(Protocol):
     def close(self) -> None:
         """Release the device or file."""
         ...
-
-
-@runtime_checkable
-class RecordedSource(Protocol):
-    """A source whose frames have a rate of their own.
-
-    Attributes:
-        recorded_hz: Frames per second by their times, 0 while it is not known.
-    """
-
-    @property
-    def recorded_hz(self) -> float: ...

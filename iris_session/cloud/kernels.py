@@ -1,4 +1,4 @@
-"""Kernels of the voxel filter and of `robot_points`, compiled by numba; the machine code is kept for the next time.
+"""Kernels of the voxel filter, compiled by numba; the machine code is kept for the next time.
 
 Rows of a picture are first turned into keys of cells, in loops without branches that compile to vector instructions;
 then pixels side by side in one cell are added to it at once. Cells lie together in blocks of 4 x 4 x 4, and a hash
@@ -271,30 +271,3 @@ def _read(order: Any, keys: Any, sums: Any, min_points: Any, min_around: Any, vo
         counts[n] = np.int64(row[0])
         n += 1
     return positions[:n], colors[:n], counts[:n]
-
-
-@_jit
-def measure_distances(
-    positions: Any, spheres: Any, to_cells: Any, grids: Any, starts: Any, shapes: Any, found: Any
-) -> None:
-    """Lower `found` to the distances of points from bodies: see `robot_points`."""
-    n = spheres.shape[0]
-    low, high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
-    for b in range(n):
-        for axis in range(3):
-            low[axis] = min(low[axis], spheres[b, axis] - spheres[b, 3])
-            high[axis] = max(high[axis], spheres[b, axis] + spheres[b, 3])
-    for p in range(positions.shape[0]):
-        x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
-        if not (low[0] < x < high[0] and low[1] < y < high[1] and low[2] < z < high[2]):
-            continue
-        for b in range(n):
-            dx, dy, dz = x - spheres[b, 0], y - spheres[b, 1], z - spheres[b, 2]
-            if dx * dx + dy * dy + dz * dz >= spheres[b, 3] * spheres[b, 3]:
-                continue
-            T = to_cells[b]
-            i = np.int64(T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3])
-            j = np.int64(T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3])
-            k = np.int64(T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3])
-            if 0 <= i < shapes[b, 0] and 0 <= j < shapes[b, 1] and 0 <= k < shapes[b, 2]:
-                found[p] = min(found[p], grids[starts[b] + (i * shapes[b, 1] + j) * shapes[b, 2] + k])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from statistics import median
 from typing import Final, NamedTuple, Protocol
 
@@ -17,9 +17,12 @@ import numpy as np
 
 from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple
-from iris_session.cloud.frames import DepthFrame
+from iris_session.cloud.camera_file import CameraSettings, CloudSettings
+from iris_session.cloud.frames import DepthFrame, SourceFrame
 from iris_session.cloud.voxels import (
     FULL,
+    MIN_AROUND,
+    MIN_POINTS,
     DepthLimits,
     Floats,
     PointSet,
@@ -67,47 +70,16 @@ class PointRemover(Protocol):
         ...
 
 
-class PipelineCamera(NamedTuple):
-    """A camera of a pipeline.
-
-    Attributes:
-        name: Its name.
-        limits: Which of its pixels count.
-        error_m: Stated error of its points, 95 % [m].
-        T_body_camera: (4, 4), from its optical frame to the body, or to the world; `None`: each frame has its own.
-        body: Name of the body that carries it, empty for the world.
-    """
-
-    name: str
-    limits: DepthLimits
-    error_m: float
-    T_body_camera: Floats | None
-    body: str = ""
-
-
-class PipelineSettings(NamedTuple):
-    """Settings of a pipeline.
-
-    Attributes:
-        points: Points of a cloud at most.
-        voxel_m: Least edge of the cells [m].
-        min_points: Cells with fewer points are left out.
-        min_around: Cells with fewer occupied cells around them are left out.
-        classes: Classes that are encoded.
-    """
-
-    points: int
-    voxel_m: float
-    min_points: int = 1
-    min_around: int = 0
-    classes: tuple[str, ...] = CLASSES
-
-
 class PlacedFrame(NamedTuple):
-    """A frame and the pose of its camera when it was captured."""
+    """A frame of a source, and the pose (4, 4) of its camera when it was captured."""
 
-    frame: DepthFrame
+    source_frame: SourceFrame
     T_world_camera: Floats
+
+    @property
+    def capture_ns(self) -> int:
+        """Session time of the capture [ns]."""
+        return self.source_frame.frame.capture_ns
 
 
 class Cloud(NamedTuple):
@@ -135,17 +107,24 @@ class Cloud(NamedTuple):
 class _CameraState:
     """One camera: its frames that wait, the oldest first, with the time at which each arrived, and how they come."""
 
-    def __init__(self, camera: PipelineCamera) -> None:
+    def __init__(self, settings: CloudSettings, camera: CameraSettings) -> None:
         self.camera = camera
-        self.model: CameraModel | None = None
-        self.rays: Rays | None = None
-        self.depth_scale_m = 0.001
-        self.waiting: deque[tuple[DepthFrame, int]] = deque()
+        self.limits = make_limits(settings, camera)
+        self.error_m = math.inf if camera.error_mm is None else camera.error_mm / 1000.0
+        self.T_body_camera = None if camera.pose is None else camera.pose.to_matrix()
+        self.waiting: deque[tuple[SourceFrame, int]] = deque()
         self.lacks_pose = False
+        self._rays: tuple[CameraModel, Rays] | None = None
         self.restart()
 
+    def find_rays(self, model: CameraModel) -> Rays:
+        """Return the directions of the pixels, computed anew for other intrinsics."""
+        if self._rays is None or self._rays[0] != model:
+            self._rays = model, make_rays(model)
+        return self._rays[1]
+
     def restart(self) -> int:
-        """Forget the frames: those that come next are of another source or clock. Return how many waited."""
+        """Forget the frames: those that come next are of another clock. Return how many waited."""
         dropped = len(self.waiting)
         self.waiting.clear()
         self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # times of capture and arrival
@@ -153,15 +132,17 @@ class _CameraState:
         self._clouds_without = 0
         return dropped
 
-    def add(self, frame: DepthFrame, now_ns: int) -> None:
-        self.waiting.append((frame, now_ns))
-        self._recent.append((frame.capture_ns, now_ns))
+    def add(self, new: SourceFrame, now_ns: int) -> None:
+        """Take a frame. One from the future counts as captured now."""
+        capture_ns = min(new.frame.capture_ns, now_ns)
+        self.waiting.append((new._replace(frame=new.frame._replace(capture_ns=capture_ns)), now_ns))
+        self._recent.append((capture_ns, now_ns))
         if self._shown_ns is None:
             self._shown_ns = now_ns
 
-    def remove(self, frame: DepthFrame) -> int:
+    def remove(self, placed: PlacedFrame) -> int:
         """Remove a frame that waits, and those before it. Return how many those were."""
-        place = next(place for place, (one, _) in enumerate(self.waiting) if one is frame)
+        place = next(place for place, (one, _) in enumerate(self.waiting) if one is placed.source_frame)
         for _ in range(place + 1):
             self.waiting.popleft()
         return place
@@ -180,7 +161,7 @@ class _CameraState:
     @property
     def next_ns(self) -> float:
         """Capture of the next frame that it can give: one that waits for its pose, or the one to come."""
-        return self.waiting[0][0].capture_ns if self.waiting else self._recent[-1][0] + self.period_ns
+        return self.waiting[0][0].frame.capture_ns if self.waiting else self._recent[-1][0] + self.period_ns
 
     def is_delivering(self, now_ns: int) -> bool:
         return bool(self._recent) and now_ns - self._recent[-1][1] <= SILENCE_NS + self.period_ns
@@ -200,14 +181,12 @@ class _CameraState:
 class CloudPipeline:
     """Join frames, filter their points, and encode them.
 
-        pipeline.open_camera("front", source.camera, source.depth_scale_m)
-        pipeline.offer("front", frame, now_ns)
+        pipeline.offer("front", SourceFrame(frame, source.camera, source.depth_scale_m), now_ns)
         if frames := pipeline.take_frames(now_ns):
             cloud = pipeline.make_cloud(frames)
 
     Args:
-        settings: Settings of the cloud.
-        cameras: At least one.
+        settings: The camera file.
         clock_ns: Clock by which the stages are measured [ns].
         body_pose: Poses of bodies that carry cameras.
         remover: Removes points of the merged cloud.
@@ -219,8 +198,7 @@ class CloudPipeline:
 
     def __init__(
         self,
-        settings: PipelineSettings,
-        cameras: Sequence[PipelineCamera],
+        settings: CloudSettings,
         clock_ns: Callable[[], int],
         *,
         body_pose: BodyPose | None = None,
@@ -229,7 +207,7 @@ class CloudPipeline:
     ) -> None:
         self.drops: Counter[str] = Counter()
         self._settings = settings
-        self._states = {camera.name: _CameraState(camera) for camera in cameras}
+        self._states = {camera.name: _CameraState(settings, camera) for camera in settings.cameras}
         self._clock_ns = clock_ns
         self._body_pose = body_pose
         self._remover = remover
@@ -239,24 +217,16 @@ class CloudPipeline:
         self._taken_ns = 0
         self._waited_from_ns: int | None = None  # capture of the frame with which waiting for a camera began
 
-    def open_camera(self, name: str, model: CameraModel, depth_scale_m: float) -> None:
-        """Take the intrinsics of a camera whose source was opened. Frames that wait are dropped."""
-        state = self._states[name]
-        if model != state.model:
-            state.model, state.rays = model, make_rays(model)
-        state.depth_scale_m = depth_scale_m
-        self.drops["superseded"] += state.restart()
-
     def clear(self) -> None:
         """Drop all frames that wait: the clock by which they were captured is another."""
         self.drops["superseded"] += sum(state.restart() for state in self._states.values())
         self._captures.clear()
         self._waited_from_ns = None
 
-    def offer(self, name: str, frame: DepthFrame, now_ns: int) -> None:
+    def offer(self, name: str, new: SourceFrame, now_ns: int) -> None:
         """Take a frame of a camera. One from the future counts as captured now."""
         state = self._states[name]
-        state.add(frame._replace(capture_ns=min(frame.capture_ns, now_ns)), now_ns)
+        state.add(new, now_ns)
         if len(state.waiting) > MAX_WAITING:
             del state.waiting[-2]  # the oldest stays: its pose or partner is the next to come, or shows that none does
             self.drops["superseded"] += 1
@@ -278,12 +248,12 @@ class CloudPipeline:
         placed = {name: found for name, state in self._states.items() if (found := self._list_placed(state, now_ns))}
         joined, left_out = _join_frames(placed)
         for name, one in left_out:
-            self.drops["superseded"] += self._states[name].remove(one.frame)
+            self.drops["superseded"] += self._states[name].remove(one)
             self.drops["join"] += 1
         if not joined:
             self._waited_from_ns = None
             return {}
-        behind_ns = min(one.frame.capture_ns for one in joined.values())
+        behind_ns = min(one.capture_ns for one in joined.values())
         if self._waited_from_ns is None:
             self._waited_from_ns = behind_ns
         if any(
@@ -294,8 +264,8 @@ class CloudPipeline:
         for name, state in self._states.items():
             state.note_cloud(has_it=name in joined, now_ns=now_ns)
         for name, one in joined.items():
-            self.drops["superseded"] += self._states[name].remove(one.frame)
-            self._captures[name] = one.frame.capture_ns
+            self.drops["superseded"] += self._states[name].remove(one)
+            self._captures[name] = one.capture_ns
         return joined
 
     def make_cloud(self, frames: dict[str, PlacedFrame]) -> Cloud:
@@ -307,24 +277,22 @@ class CloudPipeline:
         settings, clock_ns = self._settings, self._clock_ns
         times = [clock_ns()]
         self._voxels.clear(self._next_voxel_m)
-        for name, (frame, T_world_camera) in frames.items():
+        for name, ((frame, model, depth_scale_m), T_world_camera) in frames.items():
             state = self._states[name]
-            if state.rays is None:
-                raise ValueError(f"the source of camera {name!r} was not opened: open_camera() comes first")
             self._voxels.add_depth(
                 frame.depth,
                 frame.color,
-                state.rays,
+                state.find_rays(model),
                 T_world_camera,
-                depth_scale_m=state.depth_scale_m,
-                limits=state.camera.limits,
+                depth_scale_m=depth_scale_m,
+                limits=state.limits,
             )
         self.drops["cells"] += self._voxels.overflow
         times.append(clock_ns())
-        points = self._voxels.collect(min_points=settings.min_points, min_around=settings.min_around)
-        capture_ns = min(one.frame.capture_ns for one in frames.values())
+        points = self._voxels.collect(min_points=MIN_POINTS, min_around=MIN_AROUND)
+        capture_ns = min(one.capture_ns for one in frames.values())
         if self._remover is not None:  # a robot that moves is where each of the cameras saw it
-            for at_ns in sorted({one.frame.capture_ns for one in frames.values()}):
+            for at_ns in sorted({one.capture_ns for one in frames.values()}):
                 points = self._remover.remove(points, at_ns)
         times.append(clock_ns())
         voxel_m, n = self._voxels.voxel_m, len(points.positions)
@@ -333,10 +301,8 @@ class CloudPipeline:
             self.drops["budget"] += n - settings.points
             points = _take_sample(points, settings.points, voxel_m)
         times.append(clock_ns())
-        error_m = max(self._states[name].camera.error_m for name in frames)
-        encoded = encode_cloud(
-            points.positions, points.colors, voxel_m=voxel_m, error_m=error_m, classes=settings.classes
-        )
+        error_m = max(self._states[name].error_m for name in frames)
+        encoded = encode_cloud(points.positions, points.colors, voxel_m=voxel_m, error_m=error_m, classes=CLASSES)
         times.append(clock_ns())
         durations = [(after - before) / MILLISECOND for before, after in itertools.pairwise(times)]
         stages_ms = dict(zip(("voxels", "outliers", "budget", "encode"), durations, strict=True))
@@ -363,14 +329,14 @@ class CloudPipeline:
         if now_ns - self._taken_ns <= SILENCE_NS:  # else times may have gone back
             others = (at_ns for name, at_ns in self._captures.items() if name != state.camera.name)
             first_ns = max(others, default=0) - JOIN_NS
-            while state.waiting and state.waiting[0][0].capture_ns < first_ns:
+            while state.waiting and state.waiting[0][0].frame.capture_ns < first_ns:
                 state.waiting.popleft()
                 self.drops["join"] += 1
         placed = []
-        for frame, _ in state.waiting:
-            pose = self._find_pose(state.camera, frame)
-            if pose is not None and (self._remover is None or self._remover.is_ready(frame.capture_ns)):
-                placed.append(PlacedFrame(frame, pose))
+        for new, _ in state.waiting:
+            pose = self._find_pose(state, new.frame)
+            if pose is not None and (self._remover is None or self._remover.is_ready(new.frame.capture_ns)):
+                placed.append(PlacedFrame(new, pose))
         if placed:
             state.lacks_pose = False
             return placed
@@ -380,14 +346,20 @@ class CloudPipeline:
             state.lacks_pose = True
         return placed
 
-    def _find_pose(self, camera: PipelineCamera, frame: DepthFrame) -> Floats | None:
+    def _find_pose(self, state: _CameraState, frame: DepthFrame) -> Floats | None:
         """Return `T_world_camera` at the capture of a frame."""
         if frame.T_world_camera is not None:
             return np.asarray(frame.T_world_camera, np.float64)
-        if camera.T_body_camera is None or not camera.body:
-            return camera.T_body_camera
-        T_world_body = None if self._body_pose is None else self._body_pose(camera.body, frame.capture_ns)
-        return None if T_world_body is None else pose_to_matrix(T_world_body) @ camera.T_body_camera
+        body = state.camera.body
+        if state.T_body_camera is None or not body:
+            return state.T_body_camera
+        T_world_body = None if self._body_pose is None else self._body_pose(body, frame.capture_ns)
+        return None if T_world_body is None else pose_to_matrix(T_world_body) @ state.T_body_camera
+
+
+def make_limits(settings: CloudSettings, camera: CameraSettings) -> DepthLimits:
+    """Return which pixels of a camera count."""
+    return DepthLimits(settings.low, settings.high, camera.nearest_m, camera.farthest_m)
 
 
 def _join_frames(
@@ -400,16 +372,14 @@ def _join_frames(
     left = {name: list(frames) for name, frames in placed.items()}
     too_old: list[tuple[str, PlacedFrame]] = []
     while left:
-        behind_ns = min(frames[-1].frame.capture_ns for frames in left.values())
-        found = {
-            name: min(frames, key=lambda one: abs(one.frame.capture_ns - behind_ns)) for name, frames in left.items()
-        }
-        oldest = min(found, key=lambda name: found[name].frame.capture_ns)
-        newest_ns = max(one.frame.capture_ns for one in found.values())
-        if newest_ns - found[oldest].frame.capture_ns <= JOIN_NS:
+        behind_ns = min(frames[-1].capture_ns for frames in left.values())
+        found = {name: min(frames, key=lambda one: abs(one.capture_ns - behind_ns)) for name, frames in left.items()}
+        oldest = min(found, key=lambda name: found[name].capture_ns)
+        newest_ns = max(one.capture_ns for one in found.values())
+        if newest_ns - found[oldest].capture_ns <= JOIN_NS:
             return found, too_old
         too_old.append((oldest, found[oldest]))
-        left[oldest] = [one for one in left[oldest] if one.frame.capture_ns > found[oldest].frame.capture_ns]
+        left[oldest] = [one for one in left[oldest] if one.capture_ns > found[oldest].capture_ns]
         if not left[oldest]:
             del left[oldest]
     return {}, too_old

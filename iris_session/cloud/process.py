@@ -42,7 +42,6 @@ from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.names import Role
 from iris_session.protocol.status import DeliveryBudget
 from iris_session.scene.budget import Budget
-from iris_session.system.backoff import Backoff
 from iris_session.system.extras import MissingExtraError
 from iris_session.system.log import configure_logging, describe_error
 from iris_session.system.priority import lower_thread_priority
@@ -56,8 +55,8 @@ CONNECT_S: Final = 0.1
 #: States are kept for so long, for the poses of bodies: longer than any camera is late. And so many at most.
 STATES_NS: Final = 1_000_000_000
 MAX_STATES: Final = 256
-#: After shapes of robots could not be fetched, the next attempts begin with a frame so much later.
-FETCH_AGAIN_NS: Final = tuple(seconds * 1_000_000_000 for seconds in (5, 10, 30, 60, 300))
+#: Shapes of robots that could not be fetched are fetched again with a frame so much later.
+FETCH_AGAIN_NS: Final = 15_000_000_000
 #: Of the scene only the shapes matter.
 COARSE_TEXTURES: Final = Budget(texture_bytes=1)
 #: A pose that was sent longer before or after a capture says nothing about it.
@@ -138,8 +137,7 @@ class SessionRobots:
         self._client = client
         self._history = history
         self._scene: tuple[str, str] | None = None
-        self._backoff = Backoff(FETCH_AGAIN_NS)
-        self._again_ns = self._delay_ns = 0
+        self._fetched_ns = 0
         self._thread: threading.Thread | None = None
         self._points: RobotPoints | None = None
         self._n_missing = 0  # shapes that `_points` lacks
@@ -161,11 +159,9 @@ class SessionRobots:
             is_other = version[:2] != self._scene
             if is_other:
                 self._scene, self._points, self._n_missing = version[:2], None, 0
-                self._backoff.reset()
-            is_due = not 0 < self._again_ns - capture_ns <= self._delay_ns  # or session time went back
+            is_due = not 0 <= capture_ns - self._fetched_ns < FETCH_AGAIN_NS  # or session time went back
             if is_other or (is_due and (self._points is None or self._n_missing)):
-                self._delay_ns = self._backoff.next_delay()
-                self._again_ns = capture_ns + self._delay_ns
+                self._fetched_ns = capture_ns
                 self._thread = threading.Thread(target=self._fetch, name="iris-robots", daemon=True)
                 self._thread.start()
         return self._points is None or self._history.covers(capture_ns)
@@ -198,7 +194,7 @@ class SessionRobots:
         self._fault = fault
 
 
-class SessionOutlet:
+class SessionSink:
     """Publishes what a worker makes in the session of a client."""
 
     def __init__(self, client: Client) -> None:
@@ -247,7 +243,7 @@ def run_cameras(
         client.start()  # it joins while the filter is compiled or loaded
         worker = CloudWorker(
             settings,
-            SessionOutlet(client),
+            SessionSink(client),
             partial(open_source, body_poses=history.read_newest),
             time.perf_counter_ns,
             body_pose=history.find_pose,

@@ -8,10 +8,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Final, NamedTuple
+from typing import Final
 
-from anchors.camera import CameraModel
-from iris_session.cloud.frames import DepthFrame, DepthSource, RecordedSource, SourceEndedError, SourceError
+from iris_session.cloud.frames import DepthSource, SourceEndedError, SourceError, SourceFrame
 from iris_session.cloud.health import CameraHealth, Fault
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.names import StreamFault
@@ -28,22 +27,6 @@ HEALTHY_FRAMES: Final = 30
 READ_S: Final = 0.2
 #: Weight of the newest frame in the mean time of reading.
 _SHARE: Final = 0.1
-
-
-class NewFrame(NamedTuple):
-    """A frame with what its source says of all of them.
-
-    Attributes:
-        frame: The frame.
-        model: Intrinsics.
-        depth_scale_m: Length of one unit of depth [m].
-        opening: Number of the opening of the source that it came from.
-    """
-
-    frame: DepthFrame
-    model: CameraModel
-    depth_scale_m: float
-    opening: int
 
 
 class SourceReader:
@@ -79,9 +62,8 @@ class SourceReader:
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._is_outdated = False  # the source was opened by the clock of another session
-        self._newest: NewFrame | None = None
+        self._newest: SourceFrame | None = None
         self._failure = ""
-        self._opening = 0
         self.superseded = self.refused = self.failures = 0
         self.read_ms = 0.0
         self._thread = threading.Thread(target=self._run, name=f"iris-camera-{name}"[:15], daemon=True)
@@ -91,7 +73,7 @@ class SourceReader:
         self._health.restart(self._now_ns())
         self._thread.start()
 
-    def take_frame(self) -> NewFrame | None:
+    def take_frame(self) -> SourceFrame | None:
         """Return the newest frame once: `None` until there is another."""
         with self._lock:
             newest, self._newest = self._newest, None
@@ -134,7 +116,6 @@ class SourceReader:
             try:
                 source = self._open_source()
                 try:
-                    self._opening += 1
                     with self._lock:
                         self._health.restart(self._now_ns())
                     self._read(source, backoff)
@@ -171,17 +152,16 @@ class SourceReader:
             frames += 1
             if frames == HEALTHY_FRAMES:
                 backoff.reset()
-            recorded_hz = source.recorded_hz if isinstance(source, RecordedSource) else 0.0
-            self._take_over(NewFrame(frame, source.camera, source.depth_scale_m, self._opening), recorded_hz)
+            self._take_over(SourceFrame(frame, source.camera, source.depth_scale_m), source.recorded_hz)
             self._on_frame()
 
-    def _take_over(self, new: NewFrame, recorded_hz: float) -> None:
+    def _take_over(self, new: SourceFrame, recorded_hz: float) -> None:
         with self._lock:
             if self._is_outdated:
                 return
             self._failure = ""
             self._health.limit_rate(recorded_hz)
-            if not self._health.check_frame(new.frame, new.model, self._now_ns()):
+            if not self._health.check_frame(new.frame, new.camera, self._now_ns()):
                 self.refused += 1
                 return
             self.superseded += self._newest is not None

@@ -8,15 +8,15 @@ every point that is nearer to it than to the robot, of another one all but what 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Final
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from anchors.camera import pose_to_matrix
 from iris_session.cloud.pipeline import BodyPose
-from iris_session.cloud.voxels import Positions, load_kernels
+from iris_session.cloud.voxels import Positions
 from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import Body, SceneSpec, Visual
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
@@ -25,6 +25,7 @@ from iris_session.scene.nodes import to_matrix
 from iris_session.scene.shapes import build_primitive
 
 Floats = npt.NDArray[np.float64]
+Distances = npt.NDArray[np.uint8]
 #: Depth, calibration and the time between a picture and the state together move a point by about this much [m].
 MARGIN_M: Final = 0.02
 #: Edge of a cell of a body's grid [m]; larger where a body would have more than `_MAX_CELLS`.
@@ -34,7 +35,6 @@ _MAX_CELLS: Final = 4_000_000
 _FAR: Final = 255
 #: Pieces that the longest edge of a triangle is cut into, at most: 2.5 m of a robot.
 _MAX_PIECES: Final = 512
-Distances = npt.NDArray[np.uint8]
 
 
 def find_robot_bodies(spec: SceneSpec, robots: Iterable[RobotInfo]) -> tuple[Body, ...]:
@@ -62,16 +62,10 @@ class RobotPoints:
         meshes: Meshes by their index in `spec.meshes`, as `FetchedScene.meshes`.
         robots: Robots of the session, as `client.mirror.robots.values()`.
         streamed: Bodies with poses in the state stream, as `client.mirror.bodies`.
-        margin_m: Distance from the visible surface of a robot up to which a point counts as lying on it [m].
-        use_numba: Use numba. By default where it is installed.
 
     Attributes:
         n_bodies: Number of bodies of robots with a surface.
         n_unknown: Those whose pose was not known in the last call: their points stayed.
-
-    Raises:
-        ValueError: `margin_m` is out of range.
-        MissingExtraError: `use_numba`, and numba is not installed.
     """
 
     def __init__(
@@ -80,20 +74,18 @@ class RobotPoints:
         meshes: Mapping[int, MeshArrays],
         robots: Iterable[RobotInfo],
         streamed: Iterable[BodyInfo],
-        *,
-        margin_m: float = MARGIN_M,
-        use_numba: bool | None = None,
     ) -> None:
-        if not _CELL_M <= margin_m <= 0.2:
-            raise ValueError(f"margin_m is {margin_m}: {_CELL_M:g} to 0.2 m are possible")
-        kernels = load_kernels(use_numba)
         known = {body.id: body for body in streamed}
-        names = {body.id: body.name for body in known.values()}
-        of_robots = find_robot_bodies(spec, robots)
-        things = tuple(body for body in spec.bodies if body.id in known and known[body.id].object)
-        self._robots = _Shapes(_sample_bodies(spec, meshes, of_robots), names, margin_m, kernels)
-        self._things = _Shapes(_sample_bodies(spec, meshes, things), names, margin_m, kernels)
-        self.n_bodies = self._robots.n
+
+        def make_shapes(bodies: Iterable[Body]) -> list[_BodyShape]:
+            return [
+                _make_shape(known[body.id].name if body.id in known else "", body, points)
+                for body, points in _sample_bodies(spec, meshes, bodies)
+            ]
+
+        self._robots = make_shapes(find_robot_bodies(spec, robots))
+        self._objects = make_shapes(body for body in spec.bodies if body.id in known and known[body.id].object)
+        self.n_bodies = len(self._robots)
         self.n_unknown = 0
 
     def find(self, positions: Positions, body_pose: BodyPose, capture_ns: int) -> npt.NDArray[np.bool_]:
@@ -107,106 +99,70 @@ class RobotPoints:
         Returns:
             (n,) true for the points on robots.
         """
-        distances, self.n_unknown = self._robots.measure(positions, body_pose, capture_ns)
+        distances, self.n_unknown = _measure(self._robots, positions, body_pose, capture_ns)
         found: npt.NDArray[np.bool_] = distances != _FAR
-        if self._things.n and found.any():
-            rows = np.flatnonzero(found)
-            to_things, _ = self._things.measure(positions[rows], body_pose, capture_ns)
-            found[rows] = distances[rows] <= to_things
+        rows = np.flatnonzero(found)
+        to_objects, _ = _measure(self._objects, positions[rows], body_pose, capture_ns)
+        found[rows] = distances[rows] <= to_objects
         return found
 
 
-def warm_up_removal() -> None:
-    """Let numba compile what `RobotPoints.find` needs, or load it: the first time takes seconds."""
-    kernels = load_kernels()
-    if kernels is not None:
-        points, turns = np.zeros((1, 3), np.float32), np.zeros((1, 3, 4), np.float32)
-        shapes, found = np.ones((1, 3), np.int32), np.zeros(1, np.uint8)
-        kernels.measure_distances(
-            points, np.zeros((1, 4), np.float32), turns, np.zeros(1, np.uint8), np.zeros(1, np.int64), shapes, found
-        )
+class _BodyShape(NamedTuple):
+    """Distances from the surface of a body in the cells of a grid.
 
-
-class _Shapes:
-    """Distance grids of bodies, one behind the other: `_starts[b]` is where that of body b begins.
-
-    The value at (i, j, k) is the distance from the surface [mm] of a cube of edge `_cells_m[b]` that begins at
-    `_lows[b]` + (i, j, k) edges, body frame; `_FAR` beyond the margin, and so in all the outermost cells.
+    Attributes:
+        name: Name of the body in the state stream, empty where it has no poses there.
+        T_world_rest: (4, 4), where the specification has it.
+        grid: Distance of each cell [mm]; `_FAR` beyond the margin, and so in all the outermost cells.
+        low: Lowest corner of the grid [m], body frame.
+        cell_m: Edge of a cell.
+        center, radius: Sphere around the grid [m], body frame.
     """
 
-    def __init__(
-        self, surfaces: Iterable[tuple[Body, Floats]], names: Mapping[int, str], margin_m: float, kernels: Any
-    ) -> None:
-        grids, cells_m, lows, self._names, self._rest = [], [], [], [], []
-        for body, points in surfaces:
-            grid, cell_m, low = _build_grid(points, margin_m)
-            grids.append(grid)
-            cells_m.append(cell_m)
-            lows.append(low)
-            self._names.append(names.get(body.id, ""))
-            self._rest.append(to_matrix(body.T_world_body))
-        self.n = len(grids)
-        self._kernels = kernels
-        self._cells_m, self._lows = np.array(cells_m), np.array(lows).reshape(-1, 3)
-        self._shapes = np.array([grid.shape for grid in grids], np.int32).reshape(-1, 3)
-        self._starts = np.concatenate([[0], np.cumsum([grid.size for grid in grids])]).astype(np.int64)
-        self._flat = np.concatenate([grid.reshape(-1) for grid in grids]) if grids else np.empty(0, np.uint8)
-        sizes = self._shapes * self._cells_m[:, None]
-        self._centers, self._radii = self._lows + 0.5 * sizes, 0.5 * np.linalg.norm(sizes, axis=1)
-
-    def measure(self, positions: Positions, body_pose: BodyPose, now_ns: int) -> tuple[Distances, int]:
-        """Return the distance of each point from the nearest body [mm], and of how many bodies no pose is known."""
-        poses = [body_pose(name, now_ns) if name else None for name in self._names]
-        present = [b for b, pose in enumerate(poses) if pose is not None or not self._names[b]]
-        found = np.full(len(positions), _FAR, np.uint8)
-        if not present or not len(positions):
-            return found, self.n - len(present)
-        T = np.array([self._rest[b] if (pose := poses[b]) is None else pose_to_matrix(pose) for b in present])
-        R, p, cells_m = T[:, :3, :3], T[:, :3, 3:], self._cells_m[present][:, None, None]
-        turn = R.transpose(0, 2, 1) / cells_m
-        to_cells = np.concatenate([turn, -turn @ p - self._lows[present][:, :, None] / cells_m], axis=2)
-        centers = R @ self._centers[present][:, :, None] + p
-        spheres = np.concatenate([centers[:, :, 0], self._radii[present][:, None]], axis=1)
-        measure = _measure if self._kernels is None else self._kernels.measure_distances
-        measure(
-            np.ascontiguousarray(positions, np.float32),
-            np.ascontiguousarray(spheres, np.float32),
-            np.ascontiguousarray(to_cells, np.float32),
-            self._flat,
-            self._starts[present],
-            self._shapes[present],
-            found,
-        )
-        return found, self.n - len(present)
+    name: str
+    T_world_rest: Floats
+    grid: Distances
+    low: Floats
+    cell_m: float
+    center: Floats
+    radius: float
 
 
 def _measure(
-    positions: Positions,
-    spheres: Positions,
-    to_cells: Positions,
-    grids: Distances,
-    starts: npt.NDArray[np.int64],
-    shapes: npt.NDArray[np.int32],
-    found: Distances,
-) -> None:
-    """Lower `found` to the distances of the points. In numba: `kernels.measure_distances`, in half the time."""
-    low, high = (spheres[:, :3] - spheres[:, 3:]).min(axis=0), (spheres[:, :3] + spheres[:, 3:]).max(axis=0)
+    shapes: Sequence[_BodyShape], positions: Positions, body_pose: BodyPose, now_ns: int
+) -> tuple[Distances, int]:
+    """Return the distance of each point from the nearest body [mm], and of how many bodies no pose is known."""
+    found = np.full(len(positions), _FAR, np.uint8)
+    poses = [body_pose(shape.name, now_ns) if shape.name else None for shape in shapes]
+    placed = [
+        (shape, shape.T_world_rest if pose is None else pose_to_matrix(pose))
+        for shape, pose in zip(shapes, poses, strict=True)
+        if pose is not None or not shape.name
+    ]
+    if not placed:
+        return found, len(shapes)
+    centers = np.array([T[:3, :3] @ shape.center + T[:3, 3] for shape, T in placed])
+    radii = np.array([[shape.radius] for shape, _ in placed])
+    low, high = (centers - radii).min(axis=0), (centers + radii).max(axis=0)
     near = np.flatnonzero(((positions > low) & (positions < high)).all(axis=1))
-    columns = np.ascontiguousarray(positions[near].T)  # so that each step runs through memory in order
-    for sphere, turn, start, shape in zip(spheres, to_cells, starts, shapes, strict=True):
-        away = columns - sphere[:3, None]
-        inside = np.flatnonzero(np.einsum("ij,ij->j", away, away) < sphere[3] ** 2)
-        cells = turn[:, :3] @ columns[:, inside] + turn[:, 3:]
-        i, j, k = (np.clip(cells[axis], 0, shape[axis] - 1).astype(np.int64) for axis in range(3))
+    columns = np.ascontiguousarray(positions[near].T, np.float32)  # so that each step runs through memory in order
+    for (shape, T), center in zip(placed, centers.astype(np.float32), strict=True):
+        away = columns - center[:, None]
+        inside = np.flatnonzero(np.einsum("ij,ij->j", away, away) < shape.radius**2)
+        turn = (T[:3, :3].T / shape.cell_m).astype(np.float32)
+        # Relative to the centre, where single precision is enough.
+        cells = turn @ away[:, inside] + ((shape.center - shape.low) / shape.cell_m).astype(np.float32)[:, None]
+        i, j, k = np.clip(cells.astype(np.int64), 0, np.array(shape.grid.shape)[:, None] - 1)
         rows = near[inside]
-        found[rows] = np.minimum(found[rows], grids[start + (i * shape[1] + j) * shape[2] + k])
+        found[rows] = np.minimum(found[rows], shape.grid[i, j, k])
+    return found, len(shapes) - len(placed)
 
 
-def _build_grid(surface: Floats, margin_m: float) -> tuple[Distances, float, Floats]:
-    """Return the distances [mm] from the samples (n, 3) of a surface, the edge of a cell, and the lowest corner."""
-    extent = surface.max(axis=0) - surface.min(axis=0) + 2.0 * margin_m
+def _make_shape(name: str, body: Body, surface: Floats) -> _BodyShape:
+    """Return the distances from the samples (n, 3) of a surface."""
+    extent = np.ptp(surface, axis=0) + 2.0 * MARGIN_M
     cell_m = max(_CELL_M, float(np.prod(extent) / _MAX_CELLS) ** (1 / 3))
-    reach = math.ceil(margin_m / cell_m) + 1  # the outermost cells stay beyond the margin
+    reach = math.ceil(MARGIN_M / cell_m) + 1  # the outermost cells stay beyond the margin
     low = surface.min(axis=0) - reach * cell_m
     shape = np.floor((surface.max(axis=0) - low) / cell_m).astype(int) + reach + 1
     grid = np.full(shape, _FAR, np.uint8)
@@ -216,10 +172,11 @@ def _build_grid(surface: Floats, margin_m: float) -> tuple[Distances, float, Flo
     around = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     distances = np.linalg.norm(around, axis=1) * cell_m
     for one in np.argsort(-distances, kind="stable"):  # nearer ones come last and remain
-        if distances[one] <= margin_m + 0.5 * cell_m:
+        if distances[one] <= MARGIN_M + 0.5 * cell_m:
             step = int(around[one] @ (grid.shape[1] * grid.shape[2], grid.shape[2], 1))
             flat[cells + step] = min(round(1e3 * float(distances[one])), _FAR - 1)
-    return grid, cell_m, low
+    half = 0.5 * cell_m * shape
+    return _BodyShape(name, to_matrix(body.T_world_body), grid, low, cell_m, low + half, float(np.linalg.norm(half)))
 
 
 def _sample_bodies(

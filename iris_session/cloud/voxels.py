@@ -38,6 +38,9 @@ MAX_CELLS: Final = 2**18
 #: Share of the cells above which a filter is too full: few remain for what moves into the picture.
 FULL: Final = 0.9
 MIN_VOXEL_M: Final = 0.001
+#: Cells of a depth camera with fewer points, or with fewer occupied cells around them, are outliers.
+MIN_POINTS: Final = 2
+MIN_AROUND: Final = 4
 #: Cells around a cell, itself left out.
 _AROUND: Final = tuple((i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) != (0, 0, 0))
 
@@ -80,16 +83,6 @@ class DepthLimits(NamedTuple):
     nearest_m: float = 0.1
     farthest_m: float = 10.0
     jump: float = 0.03
-
-
-def load_kernels(use_numba: bool | None = None) -> Any:
-    """Return the module of the loops in numba, or `None` for those in numpy.
-
-    Raises `MissingExtraError` for `use_numba` where it is not installed.
-    """
-    if use_numba and not _HAS_NUMBA:
-        raise MissingExtraError(describe_missing("numba", "use_numba=True"), name="numba")
-    return kernels if _HAS_NUMBA and use_numba is not False else None
 
 
 def make_rays(camera: CameraModel) -> Rays:
@@ -141,11 +134,14 @@ class VoxelFilter:
             raise ValueError(f"max_cells is {max_cells}: 1 to {2**24} are possible")
         if threads is not None and threads < 1:
             raise ValueError(f"threads is {threads}: at least 1")
+        if use_numba and not _HAS_NUMBA:
+            raise MissingExtraError(describe_missing("numba", "use_numba=True"), name="numba")
         if use_numba is None and not _HAS_NUMBA:
             log.warning("depth pictures are filtered by numpy, which takes longer: %s", describe_missing("numba"))
         n = max(1, min(4, os.cpu_count() or 1)) if threads is None else threads
         self.max_cells = max_cells
-        self._table = _NumpyTable(max_cells) if load_kernels(use_numba) is None else _NumbaTable(max_cells, n)
+        has_kernels = _HAS_NUMBA and use_numba is not False
+        self._table = _NumbaTable(max_cells, n) if has_kernels else _NumpyTable(max_cells)
         self.clear(voxel_m)
 
     def clear(self, voxel_m: float | None = None) -> None:

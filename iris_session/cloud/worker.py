@@ -1,7 +1,7 @@
 """The work of one camera process without its connection: sources, pipeline, pictures, faults, reports.
 
-It publishes through an `Outlet`: a session, or nothing at all where a camera file is inspected. No sockets: session
-time is that of the outlet, and the clock that measures stages is an argument.
+It publishes through an `FrameSink`: a session, or nothing at all where a camera file is inspected. No sockets: session
+time is that of the sink, and the clock that measures stages is an argument.
 """
 
 from __future__ import annotations
@@ -18,21 +18,12 @@ import msgspec
 from anchors.camera import CameraModel, pose_from_matrix
 from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.config import CameraReport, SourceReport
-from iris_session.cloud.frames import DepthSource
+from iris_session.cloud.frames import DepthSource, SourceFrame
 from iris_session.cloud.health import CameraHealth, Fault
-from iris_session.cloud.pipeline import (
-    CLASSES,
-    BodyPose,
-    Cloud,
-    CloudPipeline,
-    PipelineCamera,
-    PipelineSettings,
-    PointRemover,
-)
-from iris_session.cloud.reader import NewFrame, SourceReader
-from iris_session.cloud.robot_points import warm_up_removal
+from iris_session.cloud.pipeline import BodyPose, Cloud, CloudPipeline, PointRemover
+from iris_session.cloud.reader import SourceReader
 from iris_session.cloud.sources.playback import DEFAULT_HZ
-from iris_session.cloud.voxels import Colors, DepthLimits, Floats, VoxelFilter, choose_max_cells
+from iris_session.cloud.voxels import Colors, Floats, VoxelFilter, choose_max_cells
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.media import StreamCamera, StreamInfo, find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
@@ -43,6 +34,7 @@ MILLISECOND: Final = 1_000_000
 SECOND: Final = 1_000_000_000
 #: Period of the description of a stream.
 INFO_NS: Final = SECOND
+JPEG_QUALITY: Final = 80
 #: Sources whose pictures of a world at rest are all the same.
 RENDERED: Final = frozenset({"mujoco"})
 LEFT_OUT: Final = "its frames are in no cloud: they are captured, or dated, more than 50 ms before those of the others"
@@ -50,8 +42,6 @@ NO_BODY: Final = "the session has no body {!r}, or no state of it when a frame w
 NO_STATE: Final = "the session has no state of its robots when a frame was captured, which remove_robots needs"
 #: Session time that runs back by more than its slewing explains is that of another clock: the session was resumed.
 BACK_NS: Final = 50 * MILLISECOND
-#: Time in which a new connection takes nothing: what is not sent then is no drop.
-CONNECT_NS: Final = SECOND
 #: Time for the threads to leave their sources.
 JOIN_NS: Final = SECOND // 2
 
@@ -60,7 +50,7 @@ log = logging.getLogger(__name__)
 OpenSource = Callable[[CameraSettings, Callable[[], int]], DepthSource]
 
 
-class Outlet(Protocol):
+class FrameSink(Protocol):
     """The destination of frames."""
 
     def now_ns(self) -> int:
@@ -109,7 +99,7 @@ class CloudWorker:
 
     Args:
         settings: The camera file.
-        outlet: Destination of the frames.
+        sink: Destination of the frames.
         open_source: Opens a source.
         clock_ns: Clock by which stages are measured [ns].
         body_pose: Poses of bodies that carry cameras.
@@ -123,7 +113,7 @@ class CloudWorker:
     def __init__(
         self,
         settings: CloudSettings,
-        outlet: Outlet,
+        sink: FrameSink,
         open_source: OpenSource,
         clock_ns: Callable[[], int],
         *,
@@ -133,25 +123,16 @@ class CloudWorker:
         if settings.picture_hz:
             require_package("cv2", "pictures of cameras (picture_hz)")
         self._settings = settings
-        self._outlet = outlet
+        self._sink = sink
         self._clock_ns = clock_ns
         self._wake = threading.Event()
         self.cloud: Cloud | None = None
         self.poses: dict[str, Floats] = {}
-        pipeline = PipelineSettings(
-            settings.points, settings.voxel_m, settings.min_points, settings.min_around, CLASSES
-        )
-        self.pipeline = CloudPipeline(
-            pipeline,
-            [make_pipeline_camera(settings, one) for one in settings.cameras],
-            clock_ns,
-            body_pose=body_pose,
-            remover=remover,
-            voxels=make_warm_filter(settings),
-        )
+        voxels = VoxelFilter(settings.voxel_m, max_cells=choose_max_cells(settings.points))
+        voxels.warm_up()  # else the first picture would take seconds, in which nothing is reported
+        self.pipeline = CloudPipeline(settings, clock_ns, body_pose=body_pose, remover=remover, voxels=voxels)
         self._cameras = {one.name: one for one in settings.cameras}
         self._readers = {one.name: self._make_reader(one, open_source) for one in settings.cameras}
-        self._openings: dict[str, int] = {}
         self._models: dict[str, CameraModel] = {}
         self._stream = _Stream(settings.stream, MediaEncoding.CLOUD)
         self._pictures = {
@@ -160,7 +141,6 @@ class CloudWorker:
             if settings.picture_hz
         }
         self._drops: Counter[str] = Counter()
-        self._refused_ns: int | None = None  # time of the first frame that was not taken before any was
         self._has_sent = False
         self._failures: dict[str, str] = {}  # by stream: why its last frame could not be made
         self._polled_ns: int | None = None
@@ -171,7 +151,7 @@ class CloudWorker:
         self._stage_counts: Counter[str] = Counter()
 
     def _make_reader(self, camera: CameraSettings, open_source: OpenSource) -> SourceReader:
-        settings, now_ns = self._settings, self._outlet.now_ns
+        settings, now_ns = self._settings, self._sink.now_ns
         hz = min(settings.hz, camera.hz or DEFAULT_HZ)  # a recording with times of its own limits it further
         return SourceReader(
             camera.name,
@@ -188,7 +168,7 @@ class CloudWorker:
 
     def restart_clock(self) -> None:
         """Forget all frames: session time is that of another session from now on."""
-        self._polled_ns = self._reported_ns = self._refused_ns = None
+        self._polled_ns = self._reported_ns = None
         self._has_sent = False
         self.pipeline.clear()
         for reader in self._readers.values():
@@ -207,7 +187,7 @@ class CloudWorker:
         """
         self._wake.wait(timeout_s)
         self._wake.clear()
-        now_ns = self._outlet.now_ns()
+        now_ns = self._sink.now_ns()
         if self._polled_ns is not None and now_ns < self._polled_ns - BACK_NS:
             log.warning(
                 "session time went back by %.1f s: sources are opened anew", (self._polled_ns - now_ns) / SECOND
@@ -233,7 +213,7 @@ class CloudWorker:
 
     def make_report(self, *, connected: bool = True, fault: str = "") -> CameraReport:
         """Return the state of the work, with rates and means since the last report."""
-        now_ns = self._outlet.now_ns()
+        now_ns = self._sink.now_ns()
         elapsed_s = (now_ns - (now_ns if self._reported_ns is None else self._reported_ns)) / SECOND
         self._reported_ns = now_ns
         n, self._clouds = self._clouds, 0
@@ -277,17 +257,14 @@ class CloudWorker:
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
-    def _take_over(self, name: str, new: NewFrame, now_ns: int) -> None:
-        if self._openings.get(name) != new.opening:
-            self._openings[name] = new.opening
-            self._models[name] = new.model
-            self.pipeline.open_camera(name, new.model, new.depth_scale_m)
-        self.pipeline.offer(name, new.frame, now_ns)
+    def _take_over(self, name: str, new: SourceFrame, now_ns: int) -> None:
+        self._models[name] = new.camera
+        self.pipeline.offer(name, new, now_ns)
         picture = self._pictures.get(name)
         if picture is not None and picture.is_due(self._settings.picture_hz, now_ns):
             began_ns = self._clock_ns()
             try:
-                data = encode_picture(new.frame.color, self._settings.picture_quality)
+                data = encode_picture(new.frame.color)
             except Exception as error:
                 self._note_failure(picture, error)
                 return
@@ -315,7 +292,7 @@ class CloudWorker:
         self._publish(self._stream, cloud.frames, cloud.capture_ns, self.find_fault(now_ns), now_ns)
         self._note_stage("send", (self._clock_ns() - began_ns) / MILLISECOND)
         self._clouds += 1
-        self._age_ms += (self._outlet.now_ns() - cloud.capture_ns) / MILLISECOND
+        self._age_ms += (self._sink.now_ns() - cloud.capture_ns) / MILLISECOND
         return True
 
     def _note_failure(self, stream: _Stream, error: Exception) -> None:
@@ -341,9 +318,8 @@ class CloudWorker:
     ) -> None:
         described = stream.needs_info(fault, now_ns)
         info = self._make_info(stream, fault) if described else None
-        if not self._outlet.publish(stream.name, frames, capture_ns, stream.encoding, info):
-            self._refused_ns = now_ns if self._refused_ns is None else self._refused_ns
-            self._drops["send"] += self._has_sent or now_ns - self._refused_ns >= CONNECT_NS
+        if not self._sink.publish(stream.name, frames, capture_ns, stream.encoding, info):
+            self._drops["send"] += self._has_sent  # the first frames connect
             return
         self._has_sent = True
         if described:
@@ -410,29 +386,11 @@ def _kind(fault: Fault | None) -> str:
     return "" if fault is None else fault.fault
 
 
-def make_pipeline_camera(settings: CloudSettings, camera: CameraSettings) -> PipelineCamera:
-    """Return a camera of a camera file as the pipeline takes it."""
-    limits = DepthLimits(settings.low, settings.high, camera.nearest_m, camera.farthest_m)
-    error_m = math.inf if camera.error_mm is None else camera.error_mm / 1000.0
-    pose = None if camera.pose is None else camera.pose.to_matrix()
-    return PipelineCamera(camera.name, limits, error_m, pose, camera.body)
-
-
-def make_warm_filter(settings: CloudSettings) -> VoxelFilter:
-    """Return a filter that is compiled, and compile what removes points on robots: the first picture would take
-    seconds, in which nothing is reported."""
-    voxels = VoxelFilter(settings.voxel_m, max_cells=choose_max_cells(settings.points))
-    voxels.warm_up()
-    if settings.remove_robots:
-        warm_up_removal()
-    return voxels
-
-
-def encode_picture(color: Colors, quality: int) -> bytes:
+def encode_picture(color: Colors) -> bytes:
     """Return a picture, RGB, as JPEG."""
     import cv2
 
-    fits, data = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    fits, data = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not fits:
         raise ValueError(f"a picture of shape {color.shape} cannot be encoded as JPEG")
     return bytes(data.tobytes())

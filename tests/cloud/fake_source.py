@@ -1,4 +1,4 @@
-"""A source and an outlet by the test."""
+"""A source and a sink by the test."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ class FakeSource:
         closed: It was closed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, recorded_hz: float = 0.0) -> None:
+        self.recorded_hz = recorded_hz
         self.camera = CAMERA
         self.depth_scale_m = 0.001
         self.closed = False
@@ -48,12 +49,6 @@ class FakeSource:
         self.closed = True
 
 
-class FakeRecording(FakeSource):
-    """A recording at 5 Hz."""
-
-    recorded_hz = 5.0
-
-
 def make_frame(capture_ns: int, depth_mm: int = 1500) -> DepthFrame:
     """Return a wall with noise."""
     random = np.random.default_rng(capture_ns % 2**32)
@@ -61,7 +56,7 @@ def make_frame(capture_ns: int, depth_mm: int = 1500) -> DepthFrame:
     return DepthFrame(depth, np.full((30, 40, 3), 90, np.uint8), capture_ns, None)
 
 
-class FakeOutlet:
+class FakeSink:
     """Keeps what was published. `takes`: whether it takes anything."""
 
     def __init__(self) -> None:
@@ -86,7 +81,7 @@ class FakeOutlet:
         return next((one[4] for one in reversed(self.published) if one[0] == stream and one[4] is not None), None)
 
 
-class TimedOutlet(FakeOutlet):
+class TimedSink(FakeSink):
     """Its clock stands still until the test moves it."""
 
     def __init__(self) -> None:

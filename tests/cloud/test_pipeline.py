@@ -5,18 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple, quat_from_rotvec
-from iris_session.cloud.frames import DepthFrame
-from iris_session.cloud.pipeline import CloudPipeline, PipelineCamera, PipelineSettings
+from iris_session.cloud.camera_file import CameraPose, CameraSettings, CloudSettings
+from iris_session.cloud.frames import DepthFrame, SourceFrame
+from iris_session.cloud.pipeline import CloudPipeline
 from iris_session.cloud.voxels import (
     MAX_CELLS,
-    DepthLimits,
     Floats,
     PointSet,
     VoxelFilter,
@@ -26,13 +26,15 @@ from iris_session.cloud.voxels import (
 from iris_session.streams.cloud import decode_cloud
 
 MS = 1_000_000
-CAMERA = CameraModel(80, 60, 70.0, 70.0, 39.5, 29.5)
+CAMERA = CameraModel(160, 120, 140.0, 140.0, 79.5, 59.5)
+VOXEL_M = 0.03
 
 
-def make_frame(capture_ms: float, depth_mm: int = 1500, color: int = 100) -> DepthFrame:
+def make_frame(capture_ms: float, depth_mm: int = 1500, color: int = 100, **changes: Any) -> SourceFrame:
     """Return a wall before the camera."""
-    depth = np.full((60, 80), depth_mm, np.uint16)
-    return DepthFrame(depth, np.full((60, 80, 3), color, np.uint8), round(capture_ms * MS), None)
+    depth = np.full((120, 160), depth_mm, np.uint16)
+    frame = DepthFrame(depth, np.full((120, 160, 3), color, np.uint8), round(capture_ms * MS))
+    return SourceFrame(frame._replace(**changes), CAMERA, 0.001)
 
 
 def place(x: float) -> Floats:
@@ -43,23 +45,26 @@ def place(x: float) -> Floats:
 
 
 def make_pipeline(
-    *names: str, points: int = 50_000, voxels: VoxelFilter | None = None, **options: object
+    *names: str, points: int = 50_000, body: str = "", voxels: VoxelFilter | None = None, **options: Any
 ) -> CloudPipeline:
-    cameras = [
-        PipelineCamera(name, DepthLimits(), 0.01 * (i + 1), place(10.0 * i), str(options.get("body", "")))
+    """Return a pipeline of cameras that look along z, side by side every 10 m. The last one is on a body."""
+    cameras = tuple(
+        CameraSettings(
+            name=name,
+            source="folder",
+            error_mm=10.0 * (i + 1),
+            pose=CameraPose((10.0 * i, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
+            body=body if i == len(names) - 1 else "",
+        )
         for i, name in enumerate(names)
-    ]
-    options.pop("body", None)
-    pipeline = CloudPipeline(
-        PipelineSettings(points, 0.02),
-        cameras,
-        iter(range(0, 10**9, MS)).__next__,
-        voxels=VoxelFilter(0.02, use_numba=False) if voxels is None else voxels,
-        **options,  # type: ignore[arg-type]
     )
-    for name in names:
-        pipeline.open_camera(name, CAMERA, 0.001)
-    return pipeline
+    low, high = (-100.0, -100.0, -100.0), (100.0, 100.0, 100.0)
+    return CloudPipeline(
+        CloudSettings(stream="room", points=points, voxel_m=VOXEL_M, low=low, high=high, cameras=cameras),
+        iter(range(0, 10**9, MS)).__next__,
+        voxels=VoxelFilter(VOXEL_M, use_numba=False) if voxels is None else voxels,
+        **options,
+    )
 
 
 def test_one_camera_gives_its_newest_frame() -> None:
@@ -68,10 +73,10 @@ def test_one_camera_gives_its_newest_frame() -> None:
     for at in (0, 33, 66):
         pipeline.offer("front", make_frame(at), at * MS)
     frames = pipeline.take_frames(66 * MS)
-    assert frames["front"].frame.capture_ns == 66 * MS
+    assert frames["front"].capture_ns == 66 * MS
     assert pipeline.drops["superseded"] == 2
     cloud = pipeline.make_cloud(frames)
-    assert (cloud.capture_ns, cloud.cameras, cloud.voxel_m) == (66 * MS, ("front",), 0.02)
+    assert (cloud.capture_ns, cloud.cameras, cloud.voxel_m) == (66 * MS, ("front",), VOXEL_M)
     assert cloud.stages_ms == {"voxels": 1.0, "outliers": 1.0, "budget": 1.0, "encode": 1.0}
     assert set(cloud.frames) == {"full", "half", "quarter"}
     shown = decode_cloud(cloud.frames["full"])
@@ -254,8 +259,8 @@ def test_the_voxel_meets_the_budget_and_no_frame_is_above_it() -> None:
         assert cloud.n_points <= 1000
         assert len(decode_cloud(cloud.frames["full"]).positions) == cloud.n_points
         edges.append(cloud.voxel_m)
-    assert edges[0] == 0.02
-    assert edges[1] > 0.02
+    assert edges[0] == VOXEL_M
+    assert edges[1] > VOXEL_M
     assert len(set(edges[2:])) == 1, "it has settled"
     assert pipeline.drops["budget"] > 0
     settled = pipeline.drops["budget"]
@@ -266,7 +271,7 @@ def test_the_voxel_meets_the_budget_and_no_frame_is_above_it() -> None:
 
 def test_cells_grow_until_they_are_enough() -> None:
     """Fewer cells than the budget has points: else what comes last in a picture would never be seen."""
-    voxels = VoxelFilter(0.02, max_cells=300, use_numba=False)
+    voxels = VoxelFilter(VOXEL_M, max_cells=300, use_numba=False)
     pipeline = make_pipeline("front", points=50_000, voxels=voxels)
     overflows, edges = [], []
     for at in range(12):
@@ -293,11 +298,11 @@ def test_a_camera_on_a_body_is_placed_by_the_pose_at_its_capture() -> None:
     pipeline.offer("hand", make_frame(43), 48 * MS)
     known[10 * MS] = ((3.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     frames = pipeline.take_frames(50 * MS)
-    assert frames["hand"].frame.capture_ns == 10 * MS, "not replaced by one whose pose is not known"
+    assert frames["hand"].capture_ns == 10 * MS, "not replaced by one whose pose is not known"
     assert frames["hand"].T_world_camera[0, 3] == 3.0
     assert not pipeline.lacks_pose("hand")
     known[43 * MS] = known[10 * MS]
-    assert pipeline.take_frames(60 * MS)["hand"].frame.capture_ns == 43 * MS, "the later one still waited"
+    assert pipeline.take_frames(60 * MS)["hand"].capture_ns == 43 * MS, "the later one still waited"
 
 
 def test_a_frame_whose_pose_does_not_come_is_dropped_and_counted() -> None:
@@ -319,7 +324,7 @@ def test_waiting_frames_are_bounded() -> None:
 
 def test_a_frame_with_a_pose_of_its_own_is_placed_by_it() -> None:
     pipeline = make_pipeline("front")
-    pipeline.offer("front", make_frame(0)._replace(T_world_camera=place(-7.0)), 0)
+    pipeline.offer("front", make_frame(0, T_world_camera=place(-7.0)), 0)
     cloud = pipeline.make_cloud(pipeline.take_frames(0))
     assert decode_cloud(cloud.frames["full"]).positions[:, 0].mean() == pytest.approx(-7.0, abs=0.05)
 
@@ -391,21 +396,20 @@ def test_a_camera_on_a_moving_hand_draws_a_still_wall() -> None:
         t = capture_ns / 1000 / MS
         return (0.3 * math.sin(3.0 * t), 0.2 * t, 0.1 * t), quat_from_rotvec((0.2 * t, -0.3 * t, 0.1))
 
-    T_hand_camera = pose_to_matrix(((0.05, 0.0, 0.1), quat_from_rotvec((0.1, 0.0, 0.0))))
-    camera = PipelineCamera("hand", DepthLimits(), 0.01, T_hand_camera, "hand")
+    pose_on_hand = CameraPose((0.05, 0.0, 0.1), quat_from_rotvec((0.1, 0.0, 0.0)))
+    camera = CameraSettings(name="hand", source="folder", pose=pose_on_hand, body="hand", farthest_m=100.0)
+    low, high = (-100.0, -100.0, -100.0), (100.0, 100.0, 100.0)
     pipeline = CloudPipeline(
-        PipelineSettings(50_000, 0.02),
-        [camera],
+        CloudSettings(stream="room", voxel_m=VOXEL_M, low=low, high=high, cameras=(camera,)),
         lambda: 0,
         body_pose=lambda body, at: hand(at),
-        voxels=VoxelFilter(0.02, use_numba=False),
+        voxels=VoxelFilter(VOXEL_M, use_numba=False),
     )
-    pipeline.open_camera("hand", CAMERA, 0.0001)
     for at in (0, 300, 700):
-        pose = pose_to_matrix(hand(at * MS)) @ T_hand_camera
+        pose = pose_to_matrix(hand(at * MS)) @ pose_on_hand.to_matrix()
         along = pose[2, 0] * rays.x + pose[2, 1] * rays.y + pose[2, 2]
         depth = np.rint((2.0 - pose[2, 3]) / along / 0.0001).astype(np.uint16)
-        pipeline.offer("hand", make_frame(at)._replace(depth=depth), at * MS)
+        pipeline.offer("hand", make_frame(at, depth=depth)._replace(depth_scale_m=0.0001), at * MS)
         cloud = pipeline.make_cloud(pipeline.take_frames(at * MS))
         z = decode_cloud(cloud.frames["full"]).positions[:, 2]
         assert len(z) > 1000
@@ -414,16 +418,7 @@ def test_a_camera_on_a_moving_hand_draws_a_still_wall() -> None:
 
 def test_a_camera_without_a_pose_does_not_stop_the_other() -> None:
     """Its body may not be in this scene. Until that is known, it is waited for."""
-    pipeline = CloudPipeline(
-        PipelineSettings(50_000, 0.02),
-        [
-            PipelineCamera("front", DepthLimits(), 0.01, place(0.0)),
-            PipelineCamera("hand", DepthLimits(), 0.01, place(0.0), "gripper"),
-        ],
-        iter(range(0, 10**9, MS)).__next__,
-        body_pose=lambda body, at: None,
-        voxels=VoxelFilter(0.02, use_numba=False),
-    )
+    pipeline = make_pipeline("front", "hand", body="gripper", body_pose=lambda body, at: None)
     made = []
     for at in range(0, 600, 30):
         for name in ("front", "hand"):

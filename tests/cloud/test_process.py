@@ -15,7 +15,7 @@ import pytest
 from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.cloud import process
 from iris_session.cloud.config import CameraReport, CameraStart
-from iris_session.cloud.process import FETCH_AGAIN_NS, BodyHistory, SessionOutlet, SessionRobots, find_taken_stream
+from iris_session.cloud.process import FETCH_AGAIN_NS, BodyHistory, SessionRobots, SessionSink, find_taken_stream
 from iris_session.cloud.voxels import PointSet
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.status import DeliveryBudget
@@ -197,12 +197,12 @@ def test_without_shapes_all_points_stay_until_they_are_there(
     assert robots.warning
     monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
     monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
-    robots.is_ready(FETCH_AGAIN_NS[0] - 1)
-    assert robots.is_ready(FETCH_AGAIN_NS[0] - 1), "not tried again at once"
+    robots.is_ready(FETCH_AGAIN_NS - 1)
+    assert robots.is_ready(FETCH_AGAIN_NS - 1), "not tried again at once"
     if goes_back:
         robots.is_ready(-1)
     else:
-        robots.is_ready(FETCH_AGAIN_NS[0])
+        robots.is_ready(FETCH_AGAIN_NS)
     wait_for_fetch(robots)
     assert len(robots.remove(make_points(), 0).positions) == 1
     assert robots.warning == ""
@@ -221,7 +221,7 @@ def test_shapes_that_are_missing_are_a_warning_and_fetched_again(monkeypatch: py
         nonlocal at_ns
         robots.is_ready(at_ns)
         wait_for_fetch(robots)
-        at_ns += max(FETCH_AGAIN_NS)
+        at_ns += FETCH_AGAIN_NS
         return robots.warning
 
     assert fetch_again() == "points on robots stay in the cloud: 2 shapes are missing"
@@ -273,9 +273,9 @@ def test_a_frame_that_cannot_be_sent_is_dropped(error: Exception) -> None:
         raise error
 
     client: Any = SimpleNamespace(media=SimpleNamespace(publish=publish))
-    outlet = SessionOutlet(client)
-    assert not outlet.publish("room", b"", 0, "cloud", None)
-    assert not outlet.publish("room", b"", 0, "cloud", None)
+    sink = SessionSink(client)
+    assert not sink.publish("room", b"", 0, "cloud", None)
+    assert not sink.publish("room", b"", 0, "cloud", None)
 
 
 def test_a_stream_that_another_source_has_is_named_with_the_key_to_change() -> None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from anchors.camera import CameraModel
 from anchors.pose import PoseTuple
-from iris_session.cloud import robot_points
-from iris_session.cloud.robot_points import RobotPoints, find_robot_bodies, warm_up_removal
+from iris_session.cloud.robot_points import RobotPoints, find_robot_bodies
 from iris_session.physics import find_robots
 from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
@@ -26,7 +25,6 @@ from tests.cloud.robot_scene import load_robots
 
 EYES = ((1.3, -1.2, 0.9), (-1.2, -1.3, 0.8), (0.1, 1.6, 0.7))
 CAMERA = CameraModel(320, 240, 280.0, 280.0, 159.5, 119.5)
-backends = pytest.mark.parametrize("use_numba", [True, False], ids=["numba", "numpy"])
 
 
 class Holding(NamedTuple):
@@ -41,10 +39,10 @@ class Holding(NamedTuple):
     bodies: NDArray[np.int32]
     thing: int
 
-    def find(self, *, known: bool = True, **options: Any) -> NDArray[np.bool_]:
+    def find(self, *, known: bool = True) -> NDArray[np.bool_]:
         """Return the points on robots. `known`: whether the session knows the object."""
         streamed = [body if known else BodyInfo(body.id, body.name, body.moving) for body in self.streamed]
-        found = RobotPoints(self.spec, self.meshes, self.robots, streamed, **options)
+        found = RobotPoints(self.spec, self.meshes, self.robots, streamed)
         return found.find(self.points, self.body_pose, 7)
 
 
@@ -75,13 +73,12 @@ def hold_object(scene: str, folder: Path) -> Holding:
     )
 
 
-@backends
 @pytest.mark.parametrize("scene", ["panda", "handover"])
 def test_robots_are_gone_and_the_object_in_the_gripper_is_not(
-    scene: str, use_numba: bool, tmp_path_factory: pytest.TempPathFactory
+    scene: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     holding = hold_object(scene, tmp_path_factory.getbasetemp() / scene)
-    on_robot = holding.find(use_numba=use_numba)
+    on_robot = holding.find()
     robots = {body.id for body in find_robot_bodies(holding.spec, holding.robots)}
     of_robot, of_thing = np.isin(holding.bodies, list(robots)), holding.bodies == holding.thing
     assert of_robot.sum() > 10_000
@@ -99,8 +96,6 @@ def test_of_an_object_that_the_session_does_not_know_what_touches_the_fingers_go
     known, unknown = (holding.find(known=known)[of_thing].mean() for known in (True, False))
     assert known < 0.5 * unknown
     assert unknown <= 0.2
-    wider = holding.find(known=False, margin_m=0.05)[of_thing].mean()
-    assert wider > unknown
 
 
 def test_bodies_without_a_pose_are_counted_and_keep_their_points(tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -116,39 +111,14 @@ def test_bodies_without_a_pose_are_counted_and_keep_their_points(tmp_path_factor
     assert at_rest.n_unknown == 0
 
 
-def test_what_is_compiled_at_the_beginning_is_what_is_called(
-    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
-    called: list[tuple[Any, ...]] = []
-
-    class Kernels:
-        def measure_distances(self, *arrays: NDArray[Any]) -> None:
-            called.append(tuple((one.dtype, one.ndim, one.flags.c_contiguous) for one in arrays))
-
-    monkeypatch.setattr(robot_points, "load_kernels", lambda use_numba=None: Kernels())
-    warm_up_removal()
-    found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed)
-    assert len(called) == 1
-    found.find(holding.points, holding.body_pose, 7)
-    assert called[0] == called[1]
-
-
-@backends
 def test_clouds_without_points_and_scenes_without_robots_have_none(
-    use_numba: bool, tmp_path_factory: pytest.TempPathFactory
+    tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
-    found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed, use_numba=use_numba)
+    found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed)
     assert found.find(np.empty((0, 3), np.float32), holding.body_pose, 7).shape == (0,)
     odd = np.array([[math.nan, 0.0, 0.2], [math.inf, 0.0, 0.0], [1e30, -1e30, 0.0]], np.float32)
     assert not found.find(odd, holding.body_pose, 7).any()
-    without = RobotPoints(holding.spec, holding.meshes, (), holding.streamed, use_numba=use_numba)
+    without = RobotPoints(holding.spec, holding.meshes, (), holding.streamed)
     assert without.n_bodies == 0
     assert not without.find(holding.points, holding.body_pose, 7).any()
-
-
-@pytest.mark.parametrize("margin_m", [0.0, -1.0, math.nan, 1.0])
-def test_margins_out_of_range_are_refused(margin_m: float) -> None:
-    with pytest.raises(ValueError, match="margin_m"):
-        RobotPoints(SceneSpec(), {}, (), (), margin_m=margin_m)

@@ -8,16 +8,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from importlib import import_module
+from typing import Final
 
 from anchors.pose import PoseTuple
-from iris_session.cloud.camera_file import CameraSettings
-from iris_session.cloud.frames import DepthFrame, DepthSource, SourceEndedError, SourceError
+from iris_session.cloud.camera_file import CameraSettings, SourceName
+from iris_session.cloud.frames import DepthSource, SourceError
 from iris_session.protocol.media import MAX_IMAGE_SIZE
 from iris_session.system.extras import MissingExtraError
 
 #: Newest poses of bodies of the session's scene by name, as ((x, y, z), (w, x, y, z)), and their session time [ns];
 #: `None` before the first.
 BodyPoses = Callable[[], tuple[int, Mapping[str, PoseTuple]] | None]
+
+#: Module and class of each kind of source.
+_CLASSES: Final[Mapping[SourceName, tuple[str, str]]] = {
+    "folder": ("folder", "FolderSource"),
+    "mujoco": ("mujoco_camera", "MujocoCamera"),
+    "rerun": ("rerun_recording", "RerunSource"),
+    "mcap": ("mcap", "McapSource"),
+    "realsense": ("realsense", "RealSenseCamera"),
+    "orbbec": ("orbbec", "OrbbecCamera"),
+}
 
 
 def open_source(
@@ -40,7 +52,7 @@ def open_source(
     try:
         source = _open(settings, now_ns, body_poses)
     except Exception as error:
-        raise _name_camera(settings, error) from error
+        raise name_camera(settings, error) from error
     width, height = source.camera.width, source.camera.height
     wrong = ""
     if max(width, height) > MAX_IMAGE_SIZE:  # directions of so many pixels may be more than the memory holds
@@ -54,30 +66,7 @@ def open_source(
     return source
 
 
-def read_frame(settings: CameraSettings, source: DepthSource, timeout_s: float) -> DepthFrame | None:
-    """Read the next frame of a source, for who does not read it in a `SourceReader`.
-
-    Args:
-        settings: The camera.
-        source: Its source.
-        timeout_s: Longest wait [s].
-
-    Returns:
-        The frame, None if none came in time.
-
-    Raises:
-        SourceEndedError: The recording is over.
-        SourceError: The source failed, also in a vendor's package; one line that starts with the camera.
-    """
-    try:
-        return source.read(timeout_s)
-    except SourceEndedError:
-        raise
-    except Exception as error:
-        raise _name_camera(settings, error) from error
-
-
-def _name_camera(settings: CameraSettings, error: Exception) -> SourceError:
+def name_camera(settings: CameraSettings, error: Exception) -> SourceError:
     """Return the error of a source, or of a package or a file that it does not expect, as one line with the camera."""
     said = " ".join(str(error).split())
     if not isinstance(error, SourceError | MissingExtraError):
@@ -87,26 +76,8 @@ def _name_camera(settings: CameraSettings, error: Exception) -> SourceError:
 
 
 def _open(settings: CameraSettings, now_ns: Callable[[], int], body_poses: BodyPoses | None) -> DepthSource:
-    if settings.source == "folder":
-        from iris_session.cloud.sources.folder import FolderSource
-
-        return FolderSource(settings, now_ns)
-    if settings.source == "mujoco":
-        from iris_session.cloud.sources.mujoco_camera import MujocoCamera
-
-        return MujocoCamera(settings, now_ns, body_poses)
-    if settings.source == "rerun":
-        from iris_session.cloud.sources.rerun_recording import RerunSource
-
-        return RerunSource(settings, now_ns)
-    if settings.source == "mcap":
-        from iris_session.cloud.sources.mcap import McapSource
-
-        return McapSource(settings, now_ns)
-    if settings.source == "realsense":
-        from iris_session.cloud.sources.realsense import RealSenseCamera
-
-        return RealSenseCamera(settings, now_ns)
-    from iris_session.cloud.sources.orbbec import OrbbecCamera
-
-    return OrbbecCamera(settings, now_ns)
+    module, kind = _CLASSES[settings.source]
+    create = getattr(import_module(f"{__name__}.{module}"), kind)
+    given = (settings, now_ns, body_poses) if settings.source == "mujoco" else (settings, now_ns)
+    source: DepthSource = create(*given)
+    return source

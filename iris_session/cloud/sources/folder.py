@@ -16,7 +16,7 @@ from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.sources.playback import (
     DEFAULT_HZ,
     SECOND,
-    Playback,
+    RecordingSource,
     decode_picture,
     fit_color,
     to_depth,
@@ -25,7 +25,7 @@ from iris_session.cloud.sources.playback import (
 from iris_session.system.extras import require_package
 
 
-class FolderSource:
+class FolderSource(RecordingSource[str]):
     """Plays the pictures of a folder, in the order of their names.
 
     `pose` of the camera is the pose of the frame in which the poses of the files are, where there are such files.
@@ -44,25 +44,17 @@ class FolderSource:
         self._has_poses = any(self._folder.glob("*.pose.txt"))
         self._T_world_poses = settings.pose.to_matrix() if settings.pose else np.eye(4)
         self._interval_ns = SECOND / (settings.hz or DEFAULT_HZ)
-        self._playback = Playback(self._list_frames, now_ns, name=str(self._folder), loop=settings.loop)
+        super().__init__(settings, now_ns)
 
-    def read(self, timeout_s: float) -> DepthFrame | None:
-        """Return the next frame; see `DepthSource`."""
-        found = self._playback.next(timeout_s)
-        if found is None:
-            return None
-        name, capture_ns = found
-        file = self._folder / f"{name}.depth.png"
+    def _decode_frame(self, content: str, capture_ns: int) -> DepthFrame:
+        file = self._folder / f"{content}.depth.png"
         depth = to_depth(decode_picture(_read(file), str(file)), self.depth_scale_m, str(file))
-        color_file = self._folder / f"{name}.color.jpg"
+        color_file = self._folder / f"{content}.color.jpg"
         if not color_file.exists():
             color_file = color_file.with_suffix(".png")
         color = to_rgb(decode_picture(_read(color_file), str(color_file)), str(color_file))
-        pose = self._T_world_poses @ self._read_pose(name) if self._has_poses else None
+        pose = self._T_world_poses @ self._read_pose(content) if self._has_poses else None
         return DepthFrame(depth, fit_color(color, depth, str(file)), capture_ns, pose)
-
-    def close(self) -> None:
-        """Do nothing: files are open only while they are read."""
 
     def _list_frames(self) -> Iterator[tuple[int, str]]:
         for number, name in enumerate(self._names):

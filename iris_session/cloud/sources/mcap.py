@@ -20,8 +20,8 @@ from anchors.camera import CameraError, CameraModel
 from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.sources.playback import (
-    Playback,
     RecordedPicture,
+    RecordingSource,
     choose_channel,
     decode_picture,
     fit_color,
@@ -61,7 +61,7 @@ class _RecordedCamera(NamedTuple):
     lens: str
 
 
-class McapSource:
+class McapSource(RecordingSource[tuple[Any, Any]]):
     """Plays an MCAP file, message by message."""
 
     def __init__(self, settings: CameraSettings, now_ns: Callable[[], int]) -> None:
@@ -80,27 +80,14 @@ class McapSource:
                 break
         self._depth = choose_channel("depth", settings.depth, kinds["depth"], self._path)
         self._color = choose_channel("color", settings.color, kinds["color"], self._path)
-        self._playback = Playback(self._list_frames, now_ns, name=self._path, loop=settings.loop)
+        super().__init__(settings, now_ns)
         self.camera = settings.intrinsics or self._choose_camera(cameras)
 
-    def read(self, timeout_s: float) -> DepthFrame | None:
-        """Return the next frame; see `DepthSource`."""
-        found = self._playback.next(timeout_s)
-        if found is None:
-            return None
-        (depth, color), capture_ns = found
+    def _decode_frame(self, content: tuple[Any, Any], capture_ns: int) -> DepthFrame:
+        depth, color = content
         units = self._decode_depth(depth)
         rgb = to_rgb(_decode(color, f"{self._path}: {self._color}"), f"{self._path}: {self._color}")
         return DepthFrame(units, fit_color(rgb, units, self._path), capture_ns)
-
-    @property
-    def recorded_hz(self) -> float:
-        """Frames per second by their times, or as they are played; see `RecordedSource`."""
-        return self._playback.hz
-
-    def close(self) -> None:
-        """Close the file."""
-        self._playback.close()
 
     def _decode_depth(self, message: Any) -> npt.NDArray[np.uint16]:
         name = f"{self._path}: {self._depth}"

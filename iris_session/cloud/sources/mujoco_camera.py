@@ -22,7 +22,6 @@ from anchors.camera import CameraModel, pose_to_matrix
 from anchors.pose import PoseTuple
 from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
-from iris_session.cloud.robot_points import warm_up_removal
 from iris_session.cloud.sources.playback import DEFAULT_HZ, SECOND
 from iris_session.cloud.voxels import VoxelFilter
 
@@ -45,6 +44,8 @@ class MujocoCamera:
     Raises:
         SourceError: The model, the camera or a way to draw without a display is missing.
     """
+
+    recorded_hz = 0.0
 
     def __init__(
         self,
@@ -229,7 +230,7 @@ def _to_rotations(quaternions: Floats) -> Floats:
 def main() -> int:
     """Open the drawn cameras of a camera file and close them again: in a process that has nothing else to lose.
 
-    Then let the filters of their points be compiled: beside a session, at low priority, that takes much longer. The
+    Then let the filter of their points be compiled: beside a session, at low priority, that takes much longer. The
     file is on standard input, as `CloudSettings` in MessagePack. Why a camera cannot be drawn goes to standard output,
     on one line, with exit status 1.
     """
@@ -239,8 +240,6 @@ def main() -> int:
             if camera.source == "mujoco":
                 MujocoCamera(camera, time.monotonic_ns).close()
         VoxelFilter(settings.voxel_m).warm_up()
-        if settings.remove_robots:
-            warm_up_removal()
     except SourceError as error:
         print(error)
         return 1

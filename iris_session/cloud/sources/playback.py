@@ -7,6 +7,7 @@ A recording waits for a reader that is late: it is played more slowly, and no fr
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from statistics import median
@@ -15,7 +16,9 @@ from typing import Any, Final, Generic, Literal, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from iris_session.cloud.frames import SourceEndedError, SourceError
+from anchors.camera import CameraModel
+from iris_session.cloud.camera_file import CameraSettings
+from iris_session.cloud.frames import DepthFrame, SourceEndedError, SourceError
 from iris_session.protocol.media import MAX_IMAGE_SIZE
 from iris_session.protocol.names import AssetEncoding
 from iris_session.scene import AssetDecodeError
@@ -40,6 +43,43 @@ class RecordedPicture(NamedTuple, Generic[T]):
     t_ns: int
     kind: Literal["depth", "color"]
     content: T
+
+
+class RecordingSource(ABC, Generic[T]):
+    """A source that plays a recording. Subclasses set `camera` and `depth_scale_m`.
+
+    Args:
+        settings: The camera.
+        now_ns: Session time.
+    """
+
+    camera: CameraModel
+    depth_scale_m: float
+
+    def __init__(self, settings: CameraSettings, now_ns: Callable[[], int]) -> None:
+        self._playback = Playback(self._list_frames, now_ns, name=settings.path, loop=settings.loop)
+
+    def read(self, timeout_s: float) -> DepthFrame | None:
+        """Return the next frame; see `DepthSource`."""
+        due = self._playback.next(timeout_s)
+        return None if due is None else self._decode_frame(*due)
+
+    @property
+    def recorded_hz(self) -> float:
+        """Frames per second by their times, or as they are played; see `DepthSource`."""
+        return self._playback.hz
+
+    def close(self) -> None:
+        """Close the file."""
+        self._playback.close()
+
+    @abstractmethod
+    def _list_frames(self) -> Iterator[tuple[int, T]]:
+        """Begin anew: yield frames with their times in the recording [ns], in order of these."""
+
+    @abstractmethod
+    def _decode_frame(self, content: T, capture_ns: int) -> DepthFrame:
+        """Return a frame. Raises `SourceError`."""
 
 
 class Playback(Generic[T]):

@@ -20,6 +20,8 @@ from iris_session.system.extras import require_package
 class RealSenseCamera:
     """One device, by its serial number. Frames are dated by their arrival."""
 
+    recorded_hz = 0.0
+
     def __init__(self, settings: CameraSettings, now_ns: Callable[[], int]) -> None:
         require_package("pyrealsense2", 'source "realsense"')
         import pyrealsense2 as rs

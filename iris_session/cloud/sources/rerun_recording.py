@@ -17,8 +17,8 @@ from anchors.camera import CameraError, CameraModel
 from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
 from iris_session.cloud.sources.playback import (
-    Playback,
     RecordedPicture,
+    RecordingSource,
     choose_channel,
     decode_picture,
     fit_color,
@@ -39,7 +39,7 @@ _CHANNELS: Final = {1: [0], 2: [2, 1, 0], 3: [2, 1, 0], 4: [0, 1, 2], 5: [0, 1, 
 _N_CHANNELS: Final = {1: 1, 2: 3, 3: 4, 4: 3, 5: 4}
 
 
-class RerunSource:
+class RerunSource(RecordingSource[tuple[Any, Any]]):
     """Plays a Rerun file, chunk by chunk, twice: once for depth, once for colour.
 
     Times are those of the first timeline that is not `log_time`, else of `log_time`.
@@ -66,29 +66,16 @@ class RerunSource:
         # Depth in whole metres is depth in numbers with a point.
         self.depth_scale_m = settings.depth_scale_m or (1.0 / self._meter if self._meter > 1.0 else 0.001)
         self.camera = settings.intrinsics or self._find_camera(pinholes)
-        self._playback = Playback(self._list_frames, now_ns, name=self._path, loop=settings.loop)
+        super().__init__(settings, now_ns)
 
-    def read(self, timeout_s: float) -> DepthFrame | None:
-        """Return the next frame; see `DepthSource`."""
-        found = self._playback.next(timeout_s)
-        if found is None:
-            return None
-        (depth, color), capture_ns = found
+    def _decode_frame(self, content: tuple[Any, Any], capture_ns: int) -> DepthFrame:
+        depth, color = content
         pixels = _decode(depth, "depth", self._path)
         if pixels.dtype.kind == "f":
             pixels = pixels / (self._meter or 1.0)
         units = to_depth(pixels, self.depth_scale_m, f"{self._path}: {self._depth}")
         rgb = to_rgb(_decode(color, "color", self._path), f"{self._path}: {self._color}")
         return DepthFrame(units, fit_color(rgb, units, self._path), capture_ns)
-
-    @property
-    def recorded_hz(self) -> float:
-        """Frames per second by their times, or as they are played; see `RecordedSource`."""
-        return self._playback.hz
-
-    def close(self) -> None:
-        """Stop reading."""
-        self._playback.close()
 
     def _read_chunks(self, entity: str = "") -> Iterator[Any]:
         """Yield the chunks of one entity, or of all."""

@@ -213,10 +213,8 @@ def test_a_missing_driver_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_the_check_of_cameras_prepares_the_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     prepared: list[float] = []
     monkeypatch.setattr(VoxelFilter, "warm_up", lambda voxels: prepared.append(voxels.voxel_m))
-    removals: list[bool] = []
-    monkeypatch.setattr(mujoco_camera, "warm_up_removal", lambda: removals.append(True))
     no_model = CameraSettings(name="a", source="folder", path="pictures")
-    settings = CloudSettings(stream="room", cameras=(no_model,), voxel_m=0.02, remove_robots=True)
+    settings = CloudSettings(stream="room", cameras=(no_model,), voxel_m=0.02)
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(msgspec.msgpack.encode(settings))))
     assert mujoco_camera.main() == 0
-    assert (prepared, removals) == ([0.02], [True])
+    assert prepared == [0.02]
