@@ -123,8 +123,12 @@ class CloudCamera:
         self.rig = make_rig(case, seed)
         names = [f"camera{i}" for i in range(case.cameras)]
         low, high, nearest_m, farthest_m, _ = self.rig.limits
-        given = {"nearest_m": nearest_m, "farthest_m": farthest_m, "error_mm": 1e3 * ERROR_M}
-        cameras = tuple(CameraSettings(name=name, source="folder", **given) for name in names)
+        cameras = tuple(
+            CameraSettings(
+                name=name, source="folder", nearest_m=nearest_m, farthest_m=farthest_m, error_mm=1e3 * ERROR_M
+            )
+            for name in names
+        )
         settings = CloudSettings(
             stream=STREAM, points=case.points, voxel_m=case.voxel_m, low=low, high=high, cameras=cameras
         )

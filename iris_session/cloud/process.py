@@ -324,6 +324,23 @@ def write_report(descriptor: int, report: CameraReport) -> None:
         os.write(descriptor, msgspec.json.encode(report) + b"\n")
 
 
+def run_start(start: CameraStart, on_report: OnReport, is_ending: Callable[[], bool]) -> str:
+    """Run the cameras of a process, and report why they end. Return it, empty where they were to end."""
+    # Before the filter is compiled: on a busy machine that takes as long again as what was imported by now.
+    on_report(CameraReport(start.settings.stream, starting=True))
+    try:
+        fault = run_cameras(start.settings, make_client(start), on_report, is_ending)
+    except (ClientError, MissingExtraError) as error:
+        fault = str(error)
+    except Exception as error:
+        fault = describe_error(error)
+        if fault != start.known_fault:  # else once for every restart
+            log.exception("the camera process of %r ends", start.settings.stream)
+    if fault:
+        on_report(CameraReport(start.settings.stream, fault=fault))
+    return fault
+
+
 def main() -> int:
     """Run the camera process of one session. Exit status 1 if the session does not admit it."""
     configure_logging()
@@ -348,18 +365,7 @@ def main() -> int:
 
     gc.collect()
     gc.freeze()
-    # Before the filter is compiled: on a busy machine that takes as long again as what was imported by now.
-    write_report(reports, CameraReport(start.settings.stream, starting=True))
-    try:
-        fault = run_cameras(start.settings, make_client(start), partial(write_report, reports), is_ending)
-    except (ClientError, MissingExtraError) as error:
-        fault = str(error)
-    except Exception as error:
-        fault = describe_error(error)
-        if fault != start.known_fault:  # else once for every restart
-            log.exception("the camera process of %r ends", start.settings.stream)
-    if fault:
-        write_report(reports, CameraReport(start.settings.stream, fault=fault))
+    fault = run_start(start, partial(write_report, reports), is_ending)
     # A driver that hangs in a thread would keep the interpreter from ending.
     os._exit(1 if fault else 0)
 

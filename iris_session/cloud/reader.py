@@ -64,6 +64,9 @@ class SourceReader:
         self._is_outdated = False  # the source was opened by the clock of another session
         self._newest: SourceFrame | None = None
         self._failure = ""
+        self._source: DepthSource | None = None
+        self._n_frames = 0  # of this source
+        self._backoff = Backoff(REOPEN_S)
         self.superseded = self.refused = self.failures = 0
         self.read_ms = 0.0
         self._thread = threading.Thread(target=self._run, name=f"iris-camera-{name}"[:15], daemon=True)
@@ -108,52 +111,65 @@ class SourceReader:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
+    def step(self) -> float | None:
+        """Open the source, or read its next frame. The thread does nothing else.
+
+        Returns:
+            Seconds to wait before the next step; `None`: the recording is over.
+        """
+        with self._lock:
+            is_outdated, self._is_outdated = self._is_outdated, False
+        if is_outdated:
+            self._close()
+        try:
+            if self._source is None:
+                self._source, self._n_frames = self._open_source(), 0
+                with self._lock:
+                    self._health.restart(self._now_ns())
+            else:
+                self._read(self._source)
+        except SourceEndedError as error:
+            self._fail(str(error))
+            return None
+        except (SourceError, MissingExtraError) as error:
+            self._fail(str(error))
+        except Exception as error:  # of a driver: the other cameras go on
+            self._fail(describe_error(error))
+        else:
+            return 0.0
+        return self._backoff.next_delay()
+
     def _run(self) -> None:
-        backoff = Backoff(REOPEN_S)
-        while not self._stopping.is_set():
-            with self._lock:
-                self._is_outdated = False
-            try:
-                source = self._open_source()
-                try:
-                    with self._lock:
-                        self._health.restart(self._now_ns())
-                    self._read(source, backoff)
-                finally:
-                    with suppress(Exception):  # of a device that is gone
-                        source.close()
-                backoff.reset()
-                continue
-            except SourceEndedError as error:
-                self._fail(str(error))
-                return
-            except (SourceError, MissingExtraError) as error:
-                self._fail(str(error))
-            except Exception as error:  # of a driver: the other cameras go on
-                self._fail(describe_error(error))
-            self._stopping.wait(backoff.next_delay())
+        while not self._stopping.is_set() and (delay_s := self.step()) is not None:
+            self._stopping.wait(delay_s)
+        self._close()
+
+    def _close(self) -> None:
+        source, self._source = self._source, None
+        if source is not None:
+            with suppress(Exception):  # of a device that is gone
+                source.close()
 
     def _fail(self, text: str) -> None:
+        self._close()
         with self._lock:
             said = " ".join(text.split()).removeprefix(f"camera {self._name!r}: ")
             self._failure = (said or "the source failed")[:MAX_TEXT]
             self.failures += 1
         self._on_frame()
 
-    def _read(self, source: DepthSource, backoff: Backoff[float]) -> None:
-        """Read frames until the thread is to end, or the clock is another one. Raises what the source raises."""
-        frames = 0
-        while not self._stopping.is_set() and not self._is_outdated:
-            frame = source.read(READ_S)
-            if frame is None:
-                continue
-            read_ms = max(0, self._now_ns() - frame.capture_ns) / MILLISECOND
-            self.read_ms += (_SHARE if self.read_ms else 1.0) * (read_ms - self.read_ms)
-            frames += 1
-            if frames == HEALTHY_FRAMES:
-                backoff.reset()
-            self._take_over(SourceFrame(frame, source.camera, source.depth_scale_m), source.recorded_hz)
-            self._on_frame()
+    def _read(self, source: DepthSource) -> None:
+        """Read a frame. Raises what the source raises."""
+        frame = source.read(READ_S)
+        if frame is None:
+            return
+        read_ms = max(0, self._now_ns() - frame.capture_ns) / MILLISECOND
+        self.read_ms += (_SHARE if self.read_ms else 1.0) * (read_ms - self.read_ms)
+        self._n_frames += 1
+        if self._n_frames == HEALTHY_FRAMES:
+            self._backoff.reset()
+        self._take_over(SourceFrame(frame, source.camera, source.depth_scale_m), source.recorded_hz)
+        self._on_frame()
 
     def _take_over(self, new: SourceFrame, recorded_hz: float) -> None:
         with self._lock:

@@ -1,10 +1,9 @@
-"""A source and a sink by the test."""
+"""A source and a sink that the test moves, without threads and clocks."""
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from iris_session.cloud.frames import DepthFrame
 from iris_session.protocol.media import StreamInfo
 
 CAMERA = CameraModel(40, 30, 35.0, 35.0, 19.5, 14.5)
-DEADLINE_S = 60.0
 
 
 class FakeSource:
@@ -24,23 +22,17 @@ class FakeSource:
     """
 
     def __init__(self, recorded_hz: float = 0.0) -> None:
-        self.recorded_hz = recorded_hz
         self.camera = CAMERA
         self.depth_scale_m = 0.001
+        self.recorded_hz = recorded_hz
         self.closed = False
-        self._items: list[DepthFrame | Exception] = []
-        self._changed = threading.Condition()
+        self._items: deque[DepthFrame | Exception] = deque()
 
-    def put(self, item: DepthFrame | Exception) -> None:
-        with self._changed:
-            self._items.append(item)
-            self._changed.notify_all()
+    def put(self, *items: DepthFrame | Exception) -> None:
+        self._items.extend(items)
 
     def read(self, timeout_s: float) -> DepthFrame | None:
-        with self._changed:
-            if not self._items:
-                self._changed.wait(timeout_s)
-            item = self._items.pop(0) if self._items else None
+        item = self._items.popleft() if self._items else None
         if isinstance(item, Exception):
             raise item
         return item
@@ -57,14 +49,19 @@ def make_frame(capture_ns: int, depth_mm: int = 1500) -> DepthFrame:
 
 
 class FakeSink:
-    """Keeps what was published. `takes`: whether it takes anything."""
+    """Keeps what was published. Its clock stands still until the test moves it.
+
+    Attributes:
+        takes: Whether it takes anything.
+    """
 
     def __init__(self) -> None:
         self.published: list[tuple[str, bytes | Mapping[str, bytes], int, str, StreamInfo | None]] = []
         self.takes = True
+        self.time_ns = 10**12
 
     def now_ns(self) -> int:
-        return time.monotonic_ns()
+        return self.time_ns
 
     def publish(
         self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, encoding: str, info: StreamInfo | None
@@ -73,28 +70,6 @@ class FakeSink:
             self.published.append((stream, frames, capture_ns, encoding, info))
         return self.takes
 
-    def list_streams(self) -> list[str]:
-        return [one[0] for one in self.published]
-
     def newest_info(self, stream: str) -> StreamInfo | None:
-        """Return what was last said of a stream."""
+        """Return the last description of a stream."""
         return next((one[4] for one in reversed(self.published) if one[0] == stream and one[4] is not None), None)
-
-
-class TimedSink(FakeSink):
-    """Its clock stands still until the test moves it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.time_ns = 10**12
-
-    def now_ns(self) -> int:
-        return self.time_ns
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    """Poll `condition` until it is true."""
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 from types import SimpleNamespace
 from typing import Any
@@ -126,23 +124,23 @@ def wait_for_fetch(robots: SessionRobots) -> None:
     assert not robots._thread.is_alive()
 
 
-def test_an_error_that_nobody_expected_is_reported() -> None:
-    program = (
-        "from iris_session.cloud import process\n"
-        "def fail(*_):\n    raise KeyError('no such\\ncell')\n"
-        "process.run_cameras = fail\n"
-        "process.main()\n"
-    )
-    start = CameraStart(make_settings("front"))
-    known = msgspec.structs.replace(start, known_fault=r"KeyError: 'no such\ncell'")
-    for one, tracebacks in ((start, 1), (known, 0)):  # once, and not with every restart
-        data = msgspec.msgpack.encode(one)
-        ended = subprocess.run([sys.executable, "-c", program], input=data, capture_output=True, check=False)
-        assert ended.returncode == 1
-        begun, report = (msgspec.json.decode(line, type=CameraReport) for line in ended.stdout.splitlines())
-        assert (begun.stream, begun.starting, begun.fault) == ("room", True, "")
-        assert (report.stream, report.fault) == ("room", known.known_fault)
-        assert ended.stderr.count(b"Traceback") == tracebacks
+@pytest.mark.parametrize(("known_fault", "tracebacks"), [("", 1), ("KeyError: 'no such\\ncell'", 0)])
+def test_an_unexpected_error_is_reported_and_logged_once(
+    known_fault: str, tracebacks: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Once, and not with every restart."""
+
+    def fail(_settings: object, client: Any, *_: object) -> str:
+        client.close()
+        raise KeyError("no such\ncell")
+
+    monkeypatch.setattr(process, "run_cameras", fail)
+    start = msgspec.structs.replace(CameraStart(make_settings("front")), known_fault=known_fault)
+    reports: list[CameraReport] = []
+    fault = "KeyError: 'no such\\ncell'"
+    assert process.run_start(start, reports.append, lambda: False) == fault
+    assert [(one.stream, one.starting, one.fault) for one in reports] == [("room", True, ""), ("room", False, fault)]
+    assert caplog.text.count("Traceback") == tracebacks
 
 
 def test_points_on_robots_go_once_their_shapes_are_there(monkeypatch: pytest.MonkeyPatch) -> None:

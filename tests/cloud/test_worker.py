@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,104 +15,66 @@ import pytest
 
 from iris_session.cloud import worker
 from iris_session.cloud.camera_file import CameraSettings
-from iris_session.cloud.frames import DepthFrame, SourceError
+from iris_session.cloud.frames import SourceError
 from iris_session.cloud.health import Fault
 from iris_session.cloud.worker import CloudWorker
 from iris_session.protocol.media import find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
 from iris_session.streams.cloud import decode_cloud
 from tests.cloud.camera_settings import make_settings
-from tests.cloud.fake_source import DEADLINE_S, FakeSink, FakeSource, TimedSink, make_frame, wait_until
+from tests.cloud.fake_source import FakeSink, FakeSource, make_frame
 
 
 class Lab:
-    """A worker and its sources by camera."""
+    """A worker whose readers do a step each time that it gives a frame, in the thread of the test."""
 
-    def __init__(self, *names: str, sink: FakeSink | None = None, **options: Any) -> None:
-        self.sink = FakeSink() if sink is None else sink
+    def __init__(self, *names: str, **options: Any) -> None:
+        self.sink = FakeSink()
         self.sources: dict[str, FakeSource] = {}
         self.settings = make_settings(*names, **options)
         self.remover: Any = SimpleNamespace(is_ready=lambda at_ns: True, remove=lambda points, at_ns: points)
         self.worker = CloudWorker(self.settings, self.sink, self._open, time.perf_counter_ns, remover=self.remover)
-        self.worker.start()
-        self.poll_until(lambda: len(self.sources) == len(names))
+        self.open_sources()
 
     def _open(self, camera: CameraSettings, now_ns: Callable[[], int]) -> FakeSource:
         self.sources[camera.name] = FakeSource()
         return self.sources[camera.name]
 
-    def poll_until(self, condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + DEADLINE_S
-        while not condition():
-            assert time.monotonic() < deadline
-            self.worker.poll(0.01)
+    def open_sources(self) -> None:
+        for reader in self.worker._readers.values():
+            reader.step()
 
-    def show(self, name: str, **changes: Any) -> DepthFrame:
-        """Give a frame of a camera, and poll until it has been published."""
-        frame = make_frame(self.sink.now_ns())._replace(**changes)
-        self.sources[name].put(frame)
-        self.poll_until(lambda: any(one[2] == frame.capture_ns for one in self.sink.published))
-        return frame
-
-
-class TimedLab(Lab):
-    """A lab whose clock is moved by the test: reader and worker are done with each step before the next."""
-
-    sink: TimedSink
-
-    def __init__(self, *names: str, **options: Any) -> None:
-        super().__init__(*names, sink=TimedSink(), **options)
-
-    def step(self, ms: float, *names: str, late_ms: float = 0.0) -> None:
+    def step(self, ms: float, *names: str, late_ms: float = 0.0, **changes: Any) -> None:
         """Let time pass, give a frame of each of these cameras, and poll. `late_ms`: they were captured before."""
         self.sink.time_ns += round(ms * 1e6)
-        now_ns = self.sink.time_ns
         for name in names:
-            self.sources[name].put(make_frame(now_ns - round(late_ms * 1e6)))
-            reader = self.worker._readers[name]
-            wait_until(lambda reader=reader: reader._health.arrived_ns == now_ns)
+            frame = make_frame(self.sink.time_ns - round(late_ms * 1e6))
+            self.sources[name].put(frame._replace(**changes))
+            self.worker._readers[name].step()
+        self.worker.poll(0.0)
+
+    def fail(self, name: str, error: Exception) -> None:
+        """Let a source fail, and poll."""
+        self.sources[name].put(error)
+        self.worker._readers[name].step()
         self.worker.poll(0.0)
 
     def fault(self, stream: str = "room") -> tuple[str, str]:
         info = self.sink.newest_info(stream)
         return ("", "") if info is None else (info.fault, info.detail)
 
-
-@pytest.fixture
-def open_timed_lab() -> Iterator[Callable[..., TimedLab]]:
-    labs: list[TimedLab] = []
-
-    def start(*names: str, **options: Any) -> TimedLab:
-        labs.append(TimedLab(*names, **options))
-        return labs[-1]
-
-    yield start
-    for lab in labs:
-        assert lab.worker.close()
+    def count(self, stream: str) -> int:
+        """Return how many frames of a stream were published."""
+        return len([one for one in self.sink.published if one[0] == stream and one[1]])
 
 
-@pytest.fixture
-def open_lab() -> Iterator[Callable[..., Lab]]:
-    labs: list[Lab] = []
-
-    def start(*names: str, **options: Any) -> Lab:
-        labs.append(Lab(*names, **options))
-        return labs[-1]
-
-    yield start
-    for lab in labs:
-        assert lab.worker.close()
-        assert all(source.closed for source in lab.sources.values())
-
-
-def test_cloud_and_picture_of_a_camera(open_lab: Callable[..., Lab]) -> None:
-    lab = open_lab("front", picture_hz=10.0)
-    frame = lab.show("front")
-    lab.poll_until(lambda: len(lab.sink.published) == 2)
+def test_cloud_and_picture_of_a_camera() -> None:
+    lab = Lab("front", picture_hz=10.0)
+    lab.step(40, "front", late_ms=10)
     (name, picture, picture_ns, encoding, info), (cloud_name, frames, cloud_ns, cloud_encoding, cloud_info) = (
         lab.sink.published
     )
-    assert (name, encoding, picture_ns) == ("room-front", MediaEncoding.JPEG, frame.capture_ns)
+    assert (name, encoding, picture_ns) == ("room-front", MediaEncoding.JPEG, lab.sink.time_ns - 10_000_000)
     assert isinstance(picture, bytes)
     decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
     assert decoded is not None
@@ -120,7 +82,7 @@ def test_cloud_and_picture_of_a_camera(open_lab: Callable[..., Lab]) -> None:
     assert info is not None
     assert info.camera is not None
     assert (info.title, info.hz, info.camera.width, info.camera.fx) == ("Room: front", 10.0, 40, 35.0)
-    assert (cloud_name, cloud_encoding, cloud_ns) == ("room", MediaEncoding.CLOUD, frame.capture_ns)
+    assert (cloud_name, cloud_encoding, cloud_ns) == ("room", MediaEncoding.CLOUD, lab.sink.time_ns - 10_000_000)
     assert not isinstance(frames, bytes)
     assert set(frames) == {"full", "half", "quarter"}
     assert len(decode_cloud(frames["full"]).positions) > 100
@@ -128,8 +90,8 @@ def test_cloud_and_picture_of_a_camera(open_lab: Callable[..., Lab]) -> None:
     assert (cloud_info.title, cloud_info.audience, cloud_info.fault) == ("Room", "remote", "")
 
 
-def test_the_description_comes_once_a_second(open_timed_lab: Callable[..., TimedLab]) -> None:
-    lab = open_timed_lab("front", hz=100.0)
+def test_the_description_comes_once_a_second() -> None:
+    lab = Lab("front", hz=100.0)
     for _ in range(250):
         lab.step(10, "front")
     told = [one[2] for one in lab.sink.published if one[4] is not None]
@@ -139,8 +101,8 @@ def test_the_description_comes_once_a_second(open_timed_lab: Callable[..., Timed
     assert all(1.0 <= gap < 1.1 for gap in gaps)
 
 
-def test_clouds_and_pictures_have_the_rate_that_is_asked_for(open_timed_lab: Callable[..., TimedLab]) -> None:
-    lab = open_timed_lab("front", hz=5.0, picture_hz=2.0)
+def test_clouds_and_pictures_have_the_rate_that_is_asked_for() -> None:
+    lab = Lab("front", hz=5.0, picture_hz=2.0)
     for _ in range(100):  # 4 s of a camera at 25 Hz
         lab.step(40, "front")
     streams = [one[0] for one in lab.sink.published if one[1]]
@@ -150,8 +112,8 @@ def test_clouds_and_pictures_have_the_rate_that_is_asked_for(open_timed_lab: Cal
 
 
 @pytest.mark.parametrize("hz", [4.0, 7.0, 30.0])
-def test_a_cloud_has_the_rate_of_its_cameras(open_timed_lab: Callable[..., TimedLab], hz: float) -> None:
-    lab = open_timed_lab("left", "right", hz=30.0)
+def test_a_cloud_has_the_rate_of_its_cameras(hz: float) -> None:
+    lab = Lab("left", "right", hz=30.0)
     for _ in range(round(3 * hz)):
         lab.step(500 / hz, "left")
         lab.step(500 / hz, "right")
@@ -159,8 +121,8 @@ def test_a_cloud_has_the_rate_of_its_cameras(open_timed_lab: Callable[..., Timed
     assert len(clouds) >= 2 * 3 * hz - 3 if hz < 10.0 else len(clouds) >= 3 * hz - 3, "each or both in a cloud"
 
 
-def test_a_disk_or_bus_that_is_too_slow_is_named(open_timed_lab: Callable[..., TimedLab]) -> None:
-    lab = open_timed_lab("front", hz=30.0, picture_hz=10.0)
+def test_a_disk_or_bus_that_is_too_slow_is_named() -> None:
+    lab = Lab("front", hz=30.0, picture_hz=10.0)
     for _ in range(90):
         lab.step(33, "front")
     assert lab.fault() == ("", "")
@@ -181,9 +143,9 @@ def test_a_disk_or_bus_that_is_too_slow_is_named(open_timed_lab: Callable[..., T
 
 
 @pytest.mark.parametrize("jump_ms", [-5000.0, 3000.0])
-def test_captures_that_jump_are_named_and_shown(open_timed_lab: Callable[..., TimedLab], jump_ms: float) -> None:
+def test_captures_that_jump_are_named_and_shown(jump_ms: float) -> None:
     """`late_ms` below zero: they lie in the future."""
-    lab = open_timed_lab("front")
+    lab = Lab("front")
     for _ in range(10):
         lab.step(33, "front")
     lab.sink.published.clear()
@@ -199,25 +161,23 @@ def test_captures_that_jump_are_named_and_shown(open_timed_lab: Callable[..., Ti
     assert lab.fault() == ("", "")
 
 
-def test_a_fault_is_published_without_a_frame_while_none_comes(open_lab: Callable[..., Lab]) -> None:
-    lab = open_lab("front", picture_hz=10.0)
-    lab.sources["front"].put(SourceError("camera 'front': no such device: 0, there are none"))
-    lab.poll_until(lambda: len(lab.sink.published) == 2)
-    for stream, frames, _, _, info in lab.sink.published:
-        assert stream in {"room", "room-front"}
-        assert frames == {}
+def test_a_fault_is_published_without_a_frame_while_none_comes() -> None:
+    lab = Lab("front", picture_hz=10.0)
+    lab.fail("front", SourceError("camera 'front': no such device: 0, there are none"))
+    assert {one[0] for one in lab.sink.published} == {"room", "room-front"}
+    for _, frames, _, _, info in lab.sink.published:
+        assert (frames, info is not None) == ({}, True)
         assert info is not None
-        assert info.fault == StreamFault.SOURCE
         assert info.detail.removeprefix("camera front: ") == "no such device: 0, there are none"
-        assert info.camera is None
-    lab.poll_until(lambda: not lab.sources["front"].closed)
-    lab.show("front")
-    lab.poll_until(lambda: (told := lab.sink.newest_info("room")) is not None and told.fault == "")
+        assert (info.fault, info.camera) == (StreamFault.SOURCE, None)
+    lab.open_sources()
+    lab.step(500, "front")
+    assert lab.fault() == ("", "")
 
 
-def test_a_fault_whose_text_changes_is_told_once_a_second(open_timed_lab: Callable[..., TimedLab]) -> None:
+def test_a_fault_whose_text_changes_is_told_once_a_second() -> None:
     """As the number of seconds without a frame does, or the rate of frames that come too slowly."""
-    lab = open_timed_lab("front", hz=100.0)
+    lab = Lab("front", hz=100.0)
     texts = iter(range(10**6))
     lab.worker.find_fault = lambda now_ns: Fault(StreamFault.SLOW, str(next(texts)))  # type: ignore[method-assign]
     for _ in range(250):
@@ -225,19 +185,19 @@ def test_a_fault_whose_text_changes_is_told_once_a_second(open_timed_lab: Callab
     assert len(lab.sink.published) == 3
 
 
-def test_a_camera_that_fails_does_not_stop_the_other(open_lab: Callable[..., Lab]) -> None:
-    lab = open_lab("left", "right")
-    lab.sources["right"].put(SourceError("gone"))
-    lab.show("left")
+def test_a_camera_that_fails_does_not_stop_the_other() -> None:
+    lab = Lab("left", "right")
+    lab.fail("right", SourceError("gone"))
+    lab.step(40, "left")
     assert lab.worker.cloud is not None
     assert lab.worker.cloud.cameras == ("left",)
-    lab.poll_until(lambda: (told := lab.sink.newest_info("room")) is not None and told.detail == "camera right: gone")
+    assert lab.fault() == (StreamFault.SOURCE, "camera right: gone")
 
 
 def test_frames_that_cannot_be_made_end_nothing(
-    open_timed_lab: Callable[..., TimedLab], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    lab = open_timed_lab("front", picture_hz=30.0)
+    lab = Lab("front", picture_hz=30.0)
 
     def fail(*_: object) -> Any:
         raise RuntimeError("no such\ncell")
@@ -259,8 +219,8 @@ def test_frames_that_cannot_be_made_end_nothing(
     assert (lab.fault(), lab.worker.make_report().warning) == (("", ""), "")
 
 
-def test_a_camera_that_is_in_no_cloud_is_named(open_timed_lab: Callable[..., TimedLab]) -> None:
-    lab = open_timed_lab("left", "right")
+def test_a_camera_that_is_in_no_cloud_is_named() -> None:
+    lab = Lab("left", "right")
     for _ in range(50):
         lab.step(10, "right", late_ms=1000)
         lab.step(30, "left")
@@ -275,10 +235,8 @@ def test_a_camera_that_is_in_no_cloud_is_named(open_timed_lab: Callable[..., Tim
     assert lab.fault() == ("", "")
 
 
-def test_frames_that_no_one_takes_are_counted_once_there_is_a_connection(
-    open_timed_lab: Callable[..., TimedLab],
-) -> None:
-    lab = open_timed_lab("front")
+def test_frames_that_no_one_takes_are_counted_once_there_is_a_connection() -> None:
+    lab = Lab("front")
     lab.sink.takes = False
     for _ in range(20):
         lab.step(40, "front")
@@ -291,20 +249,22 @@ def test_frames_that_no_one_takes_are_counted_once_there_is_a_connection(
     assert lab.worker.count_drops() == {"send": 1}
 
 
-def test_another_session_gets_nothing_of_the_one_before(open_lab: Callable[..., Lab]) -> None:
-    lab = open_lab("front")
-    lab.show("front")
+def test_another_session_gets_nothing_of_the_one_before() -> None:
+    lab = Lab("front")
+    lab.step(40, "front")
     before = lab.sources["front"]
     lab.worker.restart_clock()
     lab.sink.published.clear()
     lab.worker.poll(0.0)
     assert lab.sink.published == []
-    lab.poll_until(lambda: lab.sources["front"] is not before)
-    lab.show("front")
+    lab.open_sources()
+    assert lab.sources["front"] is not before
+    lab.step(40, "front")
+    assert lab.count("room") == 1
 
 
-def test_what_has_no_pose_is_named(open_timed_lab: Callable[..., TimedLab]) -> None:
-    lab = open_timed_lab("front", "hand")
+def test_what_has_no_pose_is_named() -> None:
+    lab = Lab("front", "hand")
     assert not lab.settings.cameras[0].body
     cameras = lab.worker._cameras
     cameras["hand"] = msgspec.structs.replace(cameras["hand"], body="left/hand")
@@ -320,16 +280,16 @@ def test_what_has_no_pose_is_named(open_timed_lab: Callable[..., TimedLab]) -> N
     assert lab.fault() == ("", "")
 
 
-def test_session_time_that_goes_back_opens_the_sources_anew(open_timed_lab: Callable[..., TimedLab]) -> None:
+def test_session_time_that_goes_back_opens_the_sources_anew() -> None:
     """As of a session that is resumed after a reboot: frames would be due for as long as it ran before."""
-    lab = open_timed_lab("front", picture_hz=30.0)
+    lab = Lab("front", picture_hz=30.0)
     for _ in range(3):
         lab.step(40, "front")
     lab.step(-40)
     before = lab.sources["front"]
     assert not lab.worker._readers["front"]._is_outdated, "by so much a clock is slewed"
     lab.step(-60_000)
-    lab.poll_until(lambda: lab.sources["front"] is not before)
+    lab.open_sources()
     assert before.closed
     lab.sink.published.clear()
     lab.step(40, "front")
@@ -337,8 +297,8 @@ def test_session_time_that_goes_back_opens_the_sources_anew(open_timed_lab: Call
     assert lab.fault() == ("", "")
 
 
-def test_the_report(open_timed_lab: Callable[..., TimedLab]) -> None:
-    lab = open_timed_lab("front", picture_hz=30.0, hz=30.0)
+def test_the_report() -> None:
+    lab = Lab("front", picture_hz=30.0, hz=30.0)
     lab.worker.make_report()
     for _ in range(30):
         lab.step(33, "front", late_ms=20.0)
@@ -354,11 +314,11 @@ def test_the_report(open_timed_lab: Callable[..., TimedLab]) -> None:
     assert report.cameras["front"].fault == ""
 
 
-def test_a_camera_that_the_protocol_does_not_describe_is_published(open_lab: Callable[..., Lab]) -> None:
-    lab = open_lab("front", title="x" * 600, picture_hz=10.0)
+def test_a_camera_that_the_protocol_does_not_describe_is_published() -> None:
+    lab = Lab("front", title="x" * 600, picture_hz=10.0)
     far = np.eye(4)
     far[0, 3] = 1e7
-    lab.show("front", T_world_camera=far)
+    lab.step(40, "front", T_world_camera=far)
     info = lab.sink.newest_info("room-front")
     assert info is not None
     assert find_info_problem(info) == ""

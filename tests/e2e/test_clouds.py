@@ -1,37 +1,25 @@
-"""Clouds and pictures from a program to a Python client that joins later, and to the page in a real Chromium.
-
-And clouds of camera processes to clients over a good and a slow link, while keys come and go.
-"""
+"""Clouds and pictures from a program to a Python client that joins later, and to the page in a real Chromium."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-import json
-import os
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from statistics import median
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from iris_session import Client, CurveKeys, Recording, StreamCamera, StreamInfo, encode_cloud
-from iris_session.netsim.process import ImpairmentProcess, make_link_address
-from iris_session.protocol.names import BudgetClass
-from iris_session.security import KeyHome, KeyPair
+from iris_session import Client, StreamCamera, StreamInfo, encode_cloud
 from tests.e2e.browser import Page
 from tests.e2e.emulated_quest import HEADSET, INSTALL, IWER, aim_at
-from tests.e2e.scenario import Scenario
-from tests.e2e.session_process import COMMAND, END_WITH_PARENT, SessionProcess, run_command, wait_until
-from tests.e2e.test_cameras import find_stream, folder_camera, write_file, write_pictures
+from tests.e2e.session_process import SessionProcess, wait_until
 from tools.codegen.conversions import from_three, to_three
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.long]
 
 PINK: Final = (255, 0, 255)
 GREEN: Final = (0, 220, 60)
@@ -107,7 +95,6 @@ def run_camera(server: SessionProcess) -> Iterator[Camera]:
         camera.stop()
 
 
-@pytest.mark.long
 def test_a_cloud_at_rest_reaches_who_joins_later(
     serve: Callable[..., SessionProcess], open_page: Callable[..., Page], tmp_path: Path
 ) -> None:
@@ -197,45 +184,6 @@ def test_a_camera_is_seen_in_the_page_and_said_to_be_faulty_and_stale(
         assert page.errors == []
 
 
-@pytest.mark.long
-def test_in_ar_what_is_for_remote_people_is_not_subscribed_unless_chosen(
-    serve: Callable[..., SessionProcess], open_page: Callable[..., Page]
-) -> None:
-    server = serve("handover")
-    drawn = "JSON.stringify([...irisSession.view.clouds.drawn.keys()].sort())"
-    with Client(server.address, role="source", name="camera") as source:
-        source.start()  # else it would be silent while the page is waited for
-        wall = make_wall(PINK)
-
-        def publish(stream: str, audience: str) -> bool:
-            return source.media.publish(stream, wall, encoding="cloud", info=StreamInfo(audience=audience))
-
-        wait_until(lambda: publish("room", "remote"), "the source has a connection")
-        wait_until(lambda: publish("sketch", "all"), "it takes another cloud")
-        page = open_page(server, "quest", width=900, height=500, before=[IWER.read_text(), INSTALL])
-        page.wait(f"""{drawn} === '["room","sketch"]'""")
-        page.click("button", "Enter AR")
-        page.wait("irisSession.state.mode === 'immersive-ar' && irisSession.state.phase.phase === 'ready'")
-        page.wait(f"""{drawn} === '["sketch"]'""")
-
-        def count_subscribers(stream: str) -> int:
-            return next(one.subscribers for one in source.status().media if one.stream == stream)
-
-        wait_until(lambda: count_subscribers("room") == 0, "the room is not subscribed to")
-        page.evaluate("irisSession.headset.headset.session.end().then(() => null)")
-        page.wait(f"""{drawn} === '["room","sketch"]'""")
-        page.evaluate("document.querySelector('#panel-streams [data-stream=room] .note input').click()")
-        # The emulator has laid its canvas over the button.
-        page.evaluate(
-            "[...document.querySelectorAll('.headset button')].find((b) => b.innerText === 'Enter AR').click()"
-        )
-        page.wait("irisSession.state.mode === 'immersive-ar' && irisSession.state.phase.phase === 'ready'")
-        wait_until(lambda: count_subscribers("room") == 1, "the room is chosen by hand")
-        page.wait(f"""{drawn} === '["room","sketch"]'""")
-        assert page.errors == []
-
-
-@pytest.mark.long
 def test_a_camera_is_a_panel_in_the_headset_while_it_is_chosen(
     serve: Callable[..., SessionProcess], open_page: Callable[..., Page], tmp_path: Path
 ) -> None:
@@ -308,120 +256,6 @@ def test_a_camera_is_a_panel_in_the_headset_while_it_is_chosen(
         press("picture front", f"{panel} === undefined")
         wait_until(lambda: count_subscribers() == 0, "nothing is subscribed to")
         assert page.errors == []
-
-
-@contextlib.contextmanager
-def run_paired_camera(server: SessionProcess, file: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Pair a key in role camera, and run `iris-session cloud run` with it, as on another machine."""
-    shown = run_command("pair", "--address", server.address, "--no-wait", "--json", "--role", "camera", cwd=file.parent)
-    assert shown.returncode == 0, shown.stderr
-    options = [str(file), "--address", server.address, "--code", json.loads(shown.stdout)["code"]]
-    environment = {**os.environ, "IRIS_HOME": str(file.parent / "home")}
-    with (file.parent / "camera.out").open("wb") as out:
-        command = [*END_WITH_PARENT, *COMMAND, "cloud", "run", *options]
-        process = subprocess.Popen(command, stdout=out, stderr=out, env=environment)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
-@pytest.mark.long
-def test_two_cameras_reach_clients_over_good_and_slow_links_until_a_key_is_revoked(
-    serve: Callable[..., SessionProcess], tmp_path: Path
-) -> None:
-    """One camera is the session's, one has a paired key. Ann is here, eve behind a slow link, bob joins late."""
-    home = KeyHome()
-    server_key = home.load_server_key().public.encode()
-    keys = {name: KeyPair.generate() for name in ("ann", "eve", "bob")}
-    for name, pair in keys.items():
-        home.clients.allow_key(name, pair.public, ("observer",))
-    every = {"picture_hz": 0.0, "min_points": 1, "min_around": 0}  # of some 19,000 pixels
-    room, hall = (
-        write_file(tmp_path / f"{name}.toml", folder_camera(write_pictures(tmp_path / name)), **every)
-        for name in ("room", "hall")
-    )
-    server = serve("handover", "--curve", "--no-beacon", "--camera", str(room))
-    scenario = Scenario(server)
-    host, _, port = server.address.rpartition(":")
-    link, slow = make_link_address(71), tmp_path / "slow.json"
-    # Both clouds have 12 Mbit/s, a quarter of them 3 Mbit/s.
-    slow.write_text(json.dumps({"window_kib": 512, "phases": [{"delay_ms": 20, "rate_mbit": 5}]}))
-
-    def join(name: str, address: str = host, **options: Any) -> Client:
-        pair = keys[name]
-        curve = CurveKeys(server_key, pair.public.encode(), pair.secret.encode())
-        client = Client(f"{address}:{port}", role="observer", name=name, alignment="not_needed", curve=curve, **options)
-        return scenario.add(client)
-
-    with contextlib.ExitStack() as stack:
-        stack.callback(scenario.close)
-        camera = stack.enter_context(run_paired_camera(server, hall))
-        ann = join("ann")
-        here = [ann.media.cloud(name) for name in ("room", "hall")]
-        scenario.run_until(lambda: all(one.newest for one in here), "both clouds reach ann")
-        assert ann.connection.welcome is not None
-        endpoints = ann.connection.welcome.endpoints
-        ports = [int(port), endpoints.state, endpoints.media]
-        proxy = stack.enter_context(ImpairmentProcess({link: "lan"}, ports, target=host))
-        ages_ms: list[float] = []
-        eve = join("eve", link, on_state=lambda state: ages_ms.append(state.age_ns * 1e-6))
-        there = [eve.media.cloud(name) for name in ("room", "hall")]
-        scenario.run_until(lambda: all(one.newest for one in there), "both clouds reach eve")
-
-        proxy.execute(f"profile {slow}")
-
-        def has_settled() -> bool:
-            others = all(one.feed.budget_class == BudgetClass.FULL for one in here)
-            coarse = all(one.newest and one.newest.header.budget_class == BudgetClass.QUARTER for one in there)
-            return others and coarse and median(ages_ms[-60:]) < 150.0
-
-        scenario.run_until(has_settled, "eve has a quarter of the points and fresh state, ann has all")
-        received = [one.feed.received for one in there]
-        scenario.run_until(
-            lambda: (
-                all(one.feed.received > before + 5 for one, before in zip(there, received, strict=True))
-                and has_settled()  # a busy machine lowers the classes for a while
-                and all(one.newest and one.newest.header.budget_class == BudgetClass.FULL for one in here)
-            ),
-            "points go on coming over the slow link",
-        )
-        assert eve.media.delivery is not None
-        assert eve.media.delivery.reason
-        for fine, coarse in zip(here, there, strict=True):
-            assert fine.newest is not None
-            assert coarse.newest is not None
-            assert len(coarse.newest.positions) == pytest.approx(len(fine.newest.positions) / 4, rel=0.1)
-            extents = [np.ptp(one.newest.positions, axis=0)[1:] for one in (fine, coarse) if one.newest is not None]
-            assert extents[1] == pytest.approx(extents[0], rel=0.1), "every prefix is a fair sample of the wall"
-
-        late = [join("bob").media.cloud(name) for name in ("room", "hall")]
-        scenario.run_until(lambda: all(one.newest for one in late), "both clouds reach bob")
-
-        (entry,) = [one for one in home.clients.read().values() if one.roles == ("camera",)]
-        home.clients.revoke_key(entry.fingerprint)
-        scenario.run_until(lambda: camera.poll() is not None, "the camera whose key was revoked has ended")
-
-        def is_over(client: Client) -> bool:
-            told = find_stream(client, "hall")
-            return told is None or told.stale
-
-        scenario.run_until(lambda: all(map(is_over, scenario.clients)), "everyone knows that the hall has ended")
-        rooms = (here[0], there[0], late[0])
-        received = [one.feed.received for one in rooms]
-        scenario.run_until(
-            lambda: all(one.feed.received > before for one, before in zip(rooms, received, strict=True)),
-            "the room goes on for everyone",
-        )
-    server.finish()
-    with Recording.open(server.recording) as recording:
-        for name, ends in (("room", False), ("hall", True)):
-            clouds = list(recording.clouds(name))
-            assert len(clouds) > 2
-            assert all(len(one.positions) > 5_000 for one in clouds)
-            *_, last = recording.streams(name)
-            assert (last.info is None) == ends
 
 
 def measure_share(page: Page, color: tuple[int, int, int], path: Path) -> float:
