@@ -1,9 +1,8 @@
-"""Outliers of clouds, compared with statistical removal; beginnings of the frames that are made of them."""
+"""Outliers of clouds, compared with statistical removal."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -11,7 +10,6 @@ from scipy.spatial import cKDTree
 
 from iris_session.bench.cloud_room import WORKSPACE, make_room_camera, make_room_pose, render_room
 from iris_session.cloud.voxels import DepthLimits, VoxelFilter, make_rays
-from iris_session.streams.cloud import decode_cloud, encode_cloud
 
 VOXEL_M = 0.02
 CAMERA = make_room_camera(320, 180)
@@ -56,16 +54,3 @@ def test_clusters_that_survive_are_those_of_statistical_removal() -> None:
     assert 1 <= alive[0].sum() < 10, "surfaces"
     assert (alive[0] == alive[1]).all()
     assert ours[size[cluster] > 100].mean() > 0.97, "surfaces keep their points"
-
-
-@pytest.mark.parametrize("share", [0.5, 0.25, 0.1])
-def test_every_beginning_of_a_frame_covers_the_room_like_a_fair_sample(share: float) -> None:
-    points = filter_room(4)
-    frame = decode_cloud(encode_cloud(points, np.zeros(points.shape, np.uint8), voxel_m=VOXEL_M)["full"])
-    n = int(share * len(points))
-    samples = (frame.positions[:n], points[np.random.default_rng(2).permutation(len(points))[:n]])
-    spacing = [cKDTree(sample).query(sample, 2)[0][:, 1] for sample in samples]
-    covered = [cKDTree(sample).query(points)[0] for sample in samples]
-    for begin, fair in (spacing, covered):
-        assert begin.mean() == pytest.approx(fair.mean(), rel=0.1)
-        assert np.percentile(begin, 95) == pytest.approx(np.percentile(fair, 95), rel=0.1)

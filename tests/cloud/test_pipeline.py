@@ -16,11 +16,9 @@ from iris_session.cloud.camera_file import CameraPose, CameraSettings, CloudSett
 from iris_session.cloud.frames import DepthFrame, SourceFrame
 from iris_session.cloud.pipeline import CloudPipeline
 from iris_session.cloud.voxels import (
-    MAX_CELLS,
     Floats,
     PointSet,
     VoxelFilter,
-    choose_max_cells,
     make_rays,
 )
 from iris_session.streams.cloud import decode_cloud
@@ -150,16 +148,10 @@ def capture_evenly(hz: float, phase_ms: float = 0.0, late_ms: float = 5.0) -> Ca
     ("hz", "phase_ms"),
     [
         (30, 0),
-        (30, 14),
         (30, 20),
-        (15, 14),
         (15, 33),
-        (15, 52),
-        (10, 20),
         (10, 60),
-        (5, 14),
         (5, 45),
-        (5, 160),
         (1, 14),
     ],
 )
@@ -233,14 +225,6 @@ def test_a_camera_whose_captures_are_dated_too_early_is_named(late_ms: float) ->
     assert sight.pipeline.drops["join"] >= 50
 
 
-def test_a_camera_whose_captures_are_dated_too_late_is_shown() -> None:
-    def ahead(number: int) -> tuple[float, float]:
-        return 1000.0 * number / 30.0 + 5000.0, 1000.0 * number / 30.0 + 5.0
-
-    sight = run_cameras(capture_evenly(30), ahead)
-    assert sight.count("0", "1") >= 50
-
-
 def test_captures_of_all_cameras_may_go_back() -> None:
     def back(number: int) -> tuple[float, float]:
         captured = 1000.0 * number / 30.0
@@ -282,12 +266,6 @@ def test_cells_grow_until_they_are_enough() -> None:
     assert overflows[-6:] == [0] * 6
     assert len(set(edges[-6:])) == 1, "it has settled"
     assert voxels.n_cells > 100, "cells are no larger than needed"
-
-
-def test_there_are_cells_for_every_budget() -> None:
-    assert choose_max_cells(1_000) == MAX_CELLS
-    assert choose_max_cells(1_000_000) >= 1_500_000
-    assert VoxelFilter(0.01, max_cells=choose_max_cells(1_000_000)).max_cells >= 1_500_000
 
 
 def test_a_camera_on_a_body_is_placed_by_the_pose_at_its_capture() -> None:

@@ -77,24 +77,15 @@ def test_nothing_is_known_before_and_after_the_states_and_in_their_gaps() -> Non
     assert [lab.history.covers(at * MS) for at in (99, 100, 300, 500, 501)] == [False, True, True, True, False]
 
 
-def test_another_scene_begins_anew() -> None:
+def test_another_scene_and_another_clock_begin_anew() -> None:
+    """As of a session that is resumed after a reboot."""
     lab = Lab()
-    for at in (0, 16):
-        lab.add(at, 1.0)
+    lab.add(4990, 1.0)
     lab.client.scene.version = ("session", "other", 2)
-    lab.client.mirror.body_index = {"hand": 0, "base": 1}
-    lab.add(32, 7.0)
-    assert lab.find_x(8) is None
-    assert lab.find_x(32) is None, "one state is no interval"
-    lab.add(48, 7.0)
-    assert lab.find_x(40, "base") == 7.0
-
-
-def test_states_of_a_session_whose_time_went_back_begin_anew() -> None:
-    """As of one that is resumed after a reboot."""
-    lab = Lab()
     for at in (5000, 5016):
         lab.add(at, 1.0)
+    assert lab.find_x(5008) == 1.0
+    assert not lab.history.covers(4995 * MS), "one scene tells nothing of the other"
     for at in (3000, 3016):
         lab.add(at, 2.0)
     assert lab.find_x(3008) == 2.0

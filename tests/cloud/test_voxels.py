@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections import defaultdict
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -15,7 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anchors.camera import CameraModel
+from iris_session.cloud import voxels
 from iris_session.cloud.voxels import DepthLimits, PointSet, Rays, VoxelFilter, choose_voxel_m, make_rays
+from iris_session.system.extras import MissingExtraError
 
 VOXEL_M = 0.02
 CAMERA = CameraModel(80, 60, 70.0, 72.0, 39.5, 29.5)
@@ -162,17 +161,6 @@ def test_pictures_that_do_not_fit_are_refused(use_numba: bool, change: dict[str,
         VoxelFilter(VOXEL_M, use_numba=use_numba).add_depth(**arguments)
 
 
-@backends
-def test_directions_that_are_no_numbers_have_no_points(use_numba: bool) -> None:
-    depth, color = make_picture(0)
-    rays = make_rays(CAMERA)
-    rays.x[:30] = np.nan
-    found = run_filter([(depth, color, np.eye(4))], DepthLimits(), rays, use_numba=use_numba)
-    below = run_filter([(depth, color, np.eye(4))], DepthLimits(), make_rays(CAMERA), use_numba=use_numba)
-    assert np.isfinite(found.positions).all()
-    assert 0 < found.counts.sum() < 0.7 * below.counts.sum()
-
-
 @pytest.mark.parametrize("options", [{"voxel_m": 0.0}, {"voxel_m": np.nan}, {"max_cells": 0}, {"threads": 0}])
 def test_filters_that_cannot_be_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
@@ -189,29 +177,6 @@ def test_pictures_without_measurements_have_no_points(use_numba: bool, depth: in
     assert found.counts.sum() == points
 
 
-def test_real_frames_make_one_room(rgbd: Path) -> None:
-    """Views of a moving camera, merged by their poses: surfaces of one view lie on those of the others."""
-    matrix = np.loadtxt(rgbd / "camera-intrinsics.txt")
-    camera = CameraModel(640, 480, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    rays, limits = make_rays(camera), DepthLimits(farthest_m=3.5)
-    views = []
-    for number in (0, 10, 20):
-        depth = cv2.imread(str(rgbd / f"frame-{number:06d}.depth.png"), cv2.IMREAD_UNCHANGED)
-        color = cv2.imread(str(rgbd / f"frame-{number:06d}.color.jpg"))
-        assert depth is not None
-        assert color is not None
-        pose = np.loadtxt(rgbd / f"frame-{number:06d}.pose.txt")
-        one = VoxelFilter(0.01)
-        one.add_depth(depth.astype(np.uint16), color.astype(np.uint8), rays, pose, limits=limits)
-        views.append(one.collect(min_points=2, min_around=4).positions)
-        assert len(views[-1]) > 20_000
-    for first, second in ((0, 1), (1, 2), (0, 2)):
-        distance, _ = cKDTree(views[first]).query(views[second])
-        overlapping = distance[distance < 0.05]
-        assert len(overlapping) > 0.7 * len(distance)
-        assert overlapping.mean() < 0.015
-
-
 def test_the_edge_of_cells_meets_the_budget_and_then_stays() -> None:
     random = np.random.default_rng(4)
     for area_m2 in (0.01, 3.0, 40.0):
@@ -222,29 +187,14 @@ def test_the_edge_of_cells_meets_the_budget_and_then_stays() -> None:
         assert len(set(edges[3:])) <= 2  # a budget at the border of two steps is met by the larger one
         assert area_m2 / edges[-1] ** 2 <= 1.06 * 10_000
         assert edges[-1] == 0.005 or area_m2 / edges[-1] ** 2 >= 0.5 * 10_000
+    assert choose_voxel_m(0.5, 0, 10_000, 0.01) == pytest.approx(0.01), "an empty room"
 
 
 @backends
 def test_a_filter_that_was_prepared_is_empty(use_numba: bool) -> None:
-    voxels = VoxelFilter(0.02, use_numba=use_numba)
-    voxels.warm_up()
-    assert (voxels.n_cells, voxels.overflow, voxels.voxel_m) == (0, 0, 0.02)
-
-
-def test_without_numba_numpy_filters_and_says_so() -> None:
-    code = (
-        "import sys, logging; sys.modules['numba'] = None; logging.basicConfig(stream=sys.stdout)\n"
-        "from iris_session import VoxelFilter\n"
-        "VoxelFilter(0.01)\n"
-        "try: VoxelFilter(0.01, use_numba=True)\n"
-        "except ImportError as error: print('refused:', error)"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    first, second = found.splitlines()
-    assert "numpy" in first
-    assert second.startswith("refused:")
-    assert "iris-session[cloud]" in first
-    assert "iris-session[cloud]" in second
+    found = VoxelFilter(VOXEL_M, use_numba=use_numba)
+    found.warm_up()
+    assert (found.n_cells, found.overflow, found.voxel_m) == (0, 0, VOXEL_M)
 
 
 @backends
@@ -263,5 +213,15 @@ def test_the_edge_of_cells_can_change_from_picture_to_picture(use_numba: bool) -
         found.clear(0.0)
 
 
-def test_an_empty_room_has_the_smallest_cells() -> None:
-    assert choose_voxel_m(0.5, 0, 10_000, 0.01) == pytest.approx(0.01)
+def test_without_numba_numpy_filters_and_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(voxels, "_HAS_NUMBA", False)
+    depth, color = make_picture(1)
+    found = VoxelFilter(VOXEL_M)
+    assert "iris-session[cloud]" in caplog.text
+    found.add_depth(depth, color, make_rays(CAMERA), np.eye(4))
+    assert found.n_cells > 0
+    with pytest.raises(MissingExtraError) as caught:
+        VoxelFilter(VOXEL_M, use_numba=True)
+    assert caught.value.name == "numba"

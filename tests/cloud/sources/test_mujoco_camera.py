@@ -195,7 +195,7 @@ def test_a_model_may_be_in_the_binary_format(tmp_path: Path, monkeypatch: pytest
     source.close()
     monkeypatch.chdir(tmp_path)
     file.write_bytes(file.read_bytes()[:5000])
-    with pytest.raises(SourceError, match=r"model\.MJB cannot be loaded: Truncated .* not of MuJoCo"):
+    with pytest.raises(SourceError, match="Truncated"):
         MujocoCamera(settings, lambda: 7)
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 

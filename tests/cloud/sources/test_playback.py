@@ -95,18 +95,9 @@ def test_the_rate_is_that_of_the_times() -> None:
         assert playback.hz == 5.0
 
 
-def test_a_recording_of_one_picture_is_played_at_the_default_rate() -> None:
-    clock = Clock()
-    playback = play(clock, [0], loop=True)
-    assert [playback.next(1.0) for _ in range(2)] == [(0, 5_000 * MS), (0, 5_000 * MS + 33_333_333)]
-
-
-def test_an_empty_recording_is_refused() -> None:
+def test_empty_and_closed_recordings_have_no_frames() -> None:
     with pytest.raises(SourceError):
         play(Clock(), [])
-
-
-def test_closed_playback_is_over() -> None:
     playback = play(Clock(), [0, 30], loop=True)
     playback.close()
     with pytest.raises(SourceEndedError):
@@ -201,7 +192,7 @@ def test_a_picture_that_claims_to_be_huge_is_refused_by_its_header(end: str) -> 
     data = cv2.imencode(end, np.zeros((4, 4, 3), np.uint8))[1].tobytes()
     assert decode_picture(claim(data, 4), "x").shape == (4, 4, 3)
     for size in (65_535, 4_097):
-        with pytest.raises(SourceError, match=f"{size} x {size}: at most 4096 x 4096"):
+        with pytest.raises(SourceError, match=f"{size} x {size}"):
             decode_picture(claim(data, size), "x")
 
 
