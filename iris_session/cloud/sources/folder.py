@@ -43,7 +43,7 @@ class FolderSource(RecordingSource[str]):
             raise SourceError(f"{self._folder} has no pictures named NAME.depth.png with NAME.color.jpg or .png")
         self._has_poses = any(self._folder.glob("*.pose.txt"))
         self._T_world_poses = settings.pose.to_matrix() if settings.pose else np.eye(4)
-        self._interval_ns = SECOND / (settings.hz or DEFAULT_HZ)
+        self._period_ns = SECOND / (settings.hz or DEFAULT_HZ)
         super().__init__(settings, now_ns)
 
     def _decode_frame(self, content: str, capture_ns: int) -> DepthFrame:
@@ -58,7 +58,7 @@ class FolderSource(RecordingSource[str]):
 
     def _list_frames(self) -> Iterator[tuple[int, str]]:
         for number, name in enumerate(self._names):
-            yield round(number * self._interval_ns), name
+            yield round(number * self._period_ns), name
 
     def _read_pose(self, name: str) -> npt.NDArray[np.float64]:
         file = self._folder / f"{name}.pose.txt"

@@ -46,32 +46,31 @@ class RecordedPicture(NamedTuple, Generic[T]):
 
 
 class RecordingSource(ABC, Generic[T]):
-    """A source that plays a recording. Subclasses set `camera` and `depth_scale_m`.
+    """A source that plays a recording at the rate of its times. Subclasses set `camera` and `depth_scale_m`.
 
     Args:
         settings: The camera.
         now_ns: Session time.
+        sleep: Waits [s].
+
+    Raises:
+        SourceError: There are no frames.
     """
 
     camera: CameraModel
     depth_scale_m: float
 
-    def __init__(self, settings: CameraSettings, now_ns: Callable[[], int]) -> None:
-        self._playback = Playback(self._list_frames, now_ns, name=settings.path, loop=settings.loop)
-
-    def read(self, timeout_s: float) -> DepthFrame | None:
-        """Return the next frame; see `DepthSource`."""
-        due = self._playback.next(timeout_s)
-        return None if due is None else self._decode_frame(*due)
-
-    @property
-    def recorded_hz(self) -> float:
-        """Frames per second by their times, or as they are played; see `DepthSource`."""
-        return self._playback.hz
-
-    def close(self) -> None:
-        """Close the file."""
-        self._playback.close()
+    def __init__(
+        self, settings: CameraSettings, now_ns: Callable[[], int], sleep: Callable[[float], None] = time.sleep
+    ) -> None:
+        self._now_ns, self._sleep, self._name, self._loop = now_ns, sleep, settings.path, settings.loop
+        self._offset_ns: int | None = None  # session time minus time in the recording
+        self._interval_ns = round(SECOND / DEFAULT_HZ)
+        self._intervals: deque[int] = deque(maxlen=RATE_FRAMES)
+        self._frames = self._list_frames()
+        self._next = next(self._frames, None)
+        if self._next is None:
+            raise SourceError(f"{self._name} has no frames")
 
     @abstractmethod
     def _list_frames(self) -> Iterator[tuple[int, T]]:
@@ -81,51 +80,8 @@ class RecordingSource(ABC, Generic[T]):
     def _decode_frame(self, content: T, capture_ns: int) -> DepthFrame:
         """Return a frame. Raises `SourceError`."""
 
-
-class Playback(Generic[T]):
-    """Play frames at the rate of their times.
-
-    Args:
-        open_frames: Begins anew: frames with their times in the recording [ns], in order of these.
-        now_ns: Session time.
-        name: Of the recording, for errors.
-        loop: Begin anew at the end.
-        sleep: Waits [s].
-
-    Raises:
-        SourceError: There are no frames.
-    """
-
-    def __init__(
-        self,
-        open_frames: Callable[[], Iterator[tuple[int, T]]],
-        now_ns: Callable[[], int],
-        *,
-        name: str,
-        loop: bool,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._open_frames, self._now_ns, self._name, self._loop, self._sleep = open_frames, now_ns, name, loop, sleep
-        self._offset_ns: int | None = None  # session time minus time in the recording
-        self._interval_ns = round(SECOND / DEFAULT_HZ)
-        self._intervals: deque[int] = deque(maxlen=RATE_FRAMES)
-        self._frames = open_frames()
-        self._next = next(self._frames, None)
-        if self._next is None:
-            raise SourceError(f"{name} has no frames")
-
-    def next(self, timeout_s: float) -> tuple[T, int] | None:
-        """Return the next frame, and the session time at which it was due.
-
-        Args:
-            timeout_s: Longest wait [s].
-
-        Returns:
-            None: none is due in time.
-
-        Raises:
-            SourceEndedError: The recording is over.
-        """
+    def read(self, timeout_s: float) -> DepthFrame | None:
+        """Return the next frame, captured at the session time at which it was due; see `DepthSource`."""
         if self._next is None:
             raise SourceEndedError(f"{self._name} is over: loop = true plays it again")
         now_ns = self._now_ns()
@@ -134,12 +90,10 @@ class Playback(Generic[T]):
         wait_s = (self._next[0] + self._offset_ns - now_ns) / SECOND
         if wait_s > 0.0:
             self._sleep(min(wait_s, timeout_s))
-        if wait_s > timeout_s:
-            return None
-        return self._take()
+        return None if wait_s > timeout_s else self._decode_frame(*self._take(self._next, self._offset_ns))
 
     @property
-    def hz(self) -> float:
+    def recorded_hz(self) -> float:
         """Frames per second by their times, 0 before the first. Pauses between them do not count."""
         return SECOND / median(self._intervals) if self._intervals else 0.0
 
@@ -147,22 +101,20 @@ class Playback(Generic[T]):
         """Close the file that is read. Nothing is due afterwards."""
         self._frames, self._next, self._loop = iter(()), None, False
 
-    def _take(self) -> tuple[T, int]:
-        """Return the next frame and when it is due, and look at the one after it."""
-        assert self._next is not None
-        assert self._offset_ns is not None
-        t_ns, frame = self._next
-        due_ns = t_ns + self._offset_ns
+    def _take(self, present: tuple[int, T], offset_ns: int) -> tuple[T, int]:
+        """Return the present frame and when it is due, and look at the one after it."""
+        t_ns, content = present
+        due_ns = t_ns + offset_ns
         self._next = next(self._frames, None)
         if self._next is not None:
             self._interval_ns = max(self._next[0] - t_ns, 0) or self._interval_ns
             self._intervals.append(self._interval_ns)
         elif self._loop:
-            self._frames = self._open_frames()
+            self._frames = self._list_frames()
             self._next = next(self._frames, None)
             if self._next is not None:
                 self._offset_ns = due_ns + self._interval_ns - self._next[0]
-        return frame, due_ns
+        return content, due_ns
 
 
 def resample(frames: Iterator[tuple[int, T]], hz: float) -> Iterator[tuple[int, T]]:

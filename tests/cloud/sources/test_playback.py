@@ -12,11 +12,11 @@ import pytest
 
 from anchors.camera import CameraModel
 from iris_session.cloud.camera_file import CameraSettings
-from iris_session.cloud.frames import DepthSource, SourceEndedError, SourceError
+from iris_session.cloud.frames import DepthFrame, DepthSource, SourceEndedError, SourceError
 from iris_session.cloud.sources import open_source
 from iris_session.cloud.sources.playback import (
-    Playback,
     RecordedPicture,
+    RecordingSource,
     choose_channel,
     choose_device,
     decode_picture,
@@ -43,65 +43,75 @@ class Clock:
         self.t_ns += round(1e9 * seconds)
 
 
-def play(clock: Clock, times_ms: list[int], *, loop: bool = False) -> Playback[int]:
-    """Return a playback whose frames are their numbers."""
+class Recording(RecordingSource[int]):
+    """A recording whose frames have their numbers as depth."""
 
-    def open_frames() -> Iterator[tuple[int, int]]:
-        return iter([(100 * MS + t * MS, k) for k, t in enumerate(times_ms)])
+    camera, depth_scale_m = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0), 0.001
 
-    return Playback(open_frames, clock.now_ns, name="test", loop=loop, sleep=clock.sleep)
+    def __init__(self, clock: Clock, times_ms: list[int], *, loop: bool = False) -> None:
+        self._times_ms = times_ms
+        super().__init__(CameraSettings(name="a", source="mcap", loop=loop), clock.now_ns, clock.sleep)
+
+    def _list_frames(self) -> Iterator[tuple[int, int]]:
+        return iter([(100 * MS + t * MS, k) for k, t in enumerate(self._times_ms)])
+
+    def _decode_frame(self, content: int, capture_ns: int) -> DepthFrame:
+        return DepthFrame(np.full((1, 1), content, np.uint16), np.zeros((1, 1, 3), np.uint8), capture_ns)
+
+    def play(self, n: int = 1) -> list[tuple[int, int]]:
+        """Return numbers and times of the next frames."""
+        frames = [self.read(10.0) for _ in range(n)]
+        return [(int(one.depth[0, 0]), one.capture_ns) for one in frames if one is not None]
 
 
 def test_frames_come_at_their_times_and_again_after_the_end() -> None:
     clock = Clock()
-    playback = play(clock, [0, 30, 60], loop=True)
-    seen = [playback.next(1.0) for _ in range(5)]
+    seen = Recording(clock, [0, 30, 60], loop=True).play(5)
     assert seen == [(0, 5_000 * MS), (1, 5_030 * MS), (2, 5_060 * MS), (0, 5_090 * MS), (1, 5_120 * MS)]
     assert clock.t_ns == 5_120 * MS
 
 
 def test_a_recording_that_does_not_loop_ends() -> None:
-    clock = Clock()
-    playback = play(clock, [0, 30])
-    assert [playback.next(1.0) for _ in range(2)] == [(0, 5_000 * MS), (1, 5_030 * MS)]
+    recording = Recording(Clock(), [0, 30])
+    assert recording.play(2) == [(0, 5_000 * MS), (1, 5_030 * MS)]
     with pytest.raises(SourceEndedError):
-        playback.next(1.0)
+        recording.read(1.0)
 
 
 def test_no_frame_within_the_timeout() -> None:
     clock = Clock()
-    playback = play(clock, [0, 30])
-    playback.next(1.0)
-    assert playback.next(0.01) is None
+    recording = Recording(clock, [0, 30])
+    recording.play()
+    assert recording.read(0.01) is None
     assert clock.t_ns == 5_010 * MS
-    assert playback.next(0.05) == (1, 5_030 * MS)
+    assert recording.play() == [(1, 5_030 * MS)]
 
 
 def test_a_late_reader_is_waited_for() -> None:
     clock = Clock()
-    playback = play(clock, [0, 30, 60, 90, 120])
-    playback.next(1.0)
+    recording = Recording(clock, [0, 30, 60, 90, 120])
+    recording.play()
     clock.sleep(0.05)  # late by 20 ms: the rate holds
-    assert [playback.next(1.0) for _ in range(2)] == [(1, 5_030 * MS), (2, 5_060 * MS)]
+    assert recording.play(2) == [(1, 5_030 * MS), (2, 5_060 * MS)]
     clock.sleep(5.0)
-    assert [playback.next(1.0) for _ in range(2)] == [(3, 10_060 * MS), (4, 10_090 * MS)]
+    assert recording.play(2) == [(3, 10_060 * MS), (4, 10_090 * MS)]
 
 
 def test_the_rate_is_that_of_the_times() -> None:
-    playback = play(Clock(), [0, 200, 400, 9000, 9200, 9400])
-    assert playback.hz == 0.0
+    recording = Recording(Clock(), [0, 200, 400, 9000, 9200, 9400])
+    assert recording.recorded_hz == 0.0
     for _ in range(5):
-        playback.next(10.0)
-        assert playback.hz == 5.0
+        recording.play()
+        assert recording.recorded_hz == 5.0
 
 
 def test_empty_and_closed_recordings_have_no_frames() -> None:
     with pytest.raises(SourceError):
-        play(Clock(), [])
-    playback = play(Clock(), [0, 30], loop=True)
-    playback.close()
+        Recording(Clock(), [])
+    recording = Recording(Clock(), [0, 30], loop=True)
+    recording.close()
     with pytest.raises(SourceEndedError):
-        playback.next(1.0)
+        recording.read(1.0)
 
 
 def test_depth_is_paired_with_colour_of_its_time() -> None:
