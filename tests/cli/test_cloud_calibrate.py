@@ -170,8 +170,11 @@ def test_a_check_tells_which_camera_is_not_where_it_was_calibrated(
         p, q = pose_from_matrix(POSES["front"])
         pose = f"pose = {{position_m = [{p[0] + shift_m}, {p[1]}, {p[2]}], quaternion_wxyz = {list(q)}}}\n"
         file = room.write("front", more=f"error_mm = 10.0\n{pose}")
-        status = main(["cloud", "calibrate", str(file), *SHEET, "--frames", "1", "--check", "--json"])
+        command = ["cloud", "calibrate", str(file), *SHEET, "--frames", "1", "--check"]
+        status = main([*command, "--json"])
         result: dict[str, Any] = json.loads(capsys.readouterr().out)
+        assert main(command) == status
+        assert capsys.readouterr().out.startswith("front ")
         return status, result
 
     status, well = check(0.0)
