@@ -94,9 +94,9 @@ def test_a_killed_camera_process_comes_back_and_ends_with_its_session(
         picture = cv2.imdecode(np.frombuffer(wait_for_frames(ann, "room-front"), np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None
         assert picture.shape == (HEIGHT, WIDTH, 3)
-        description = find_stream(ann, "room")
-        assert description is not None
-        assert (description.title, description.audience) == ("Room", "remote")
+        assert ann.wait_for(
+            lambda _: (found := find_stream(ann, "room")) is not None and found.title == "Room", DEADLINE_S
+        )
         (camera,) = find_cameras(server)
         camera.kill()
         killed_ns = ann.session_now_ns()
