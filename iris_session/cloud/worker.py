@@ -1,6 +1,6 @@
 """The work of one camera process without its connection: sources, pipeline, pictures, faults, reports.
 
-It publishes through an `FrameSink`: a session, or nothing at all where a camera file is inspected. No sockets: session
+It publishes through a `FrameSink`: a session, or nothing at all where a camera file is inspected. No sockets: session
 time is that of the sink, and the clock that measures stages is an argument.
 """
 
