@@ -335,7 +335,7 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> tuple[
 
 
 class _Calibration(msgspec.Struct, frozen=True):
-    """What is read of the calibration of a camera."""
+    """Calibration of a camera, as far as it is read."""
 
     T_base_camera: CameraPose | None = None
     T_ee_camera: CameraPose | None = None
