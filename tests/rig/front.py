@@ -123,6 +123,8 @@ class RigFrontProcess:
         self.restarts = -1
         self._dies_at: int | None = None
         self._is_due = self._is_starting = False
+        #: The front does nothing until then.
+        self.stands_until_ns = 0
 
     pid = 0
 
@@ -189,7 +191,10 @@ class RigFrontProcess:
             self._simulation.call_at(self._simulation.now_ns, self._run_front)
 
     def _run_front(self) -> None:
-        self._is_due = False
+        self._is_due = self._simulation.now_ns < self.stands_until_ns
+        if self._is_due:
+            self._simulation.call_at(self.stands_until_ns, self._run_front)
+            return
         front = self.front
         while front is not None and front is self.front and not front.ended and front._run_once():
             pass

@@ -143,7 +143,8 @@ class _Publisher(Inbox):
         copies = [bytes(one) for one in frames]
         for connection in self._front.connections.values():
             sockets = connection.sockets
-            if sockets.subscribed is self._front and sockets.states_in_flight < STATE_ROOM:
+            is_subscribed = sockets.connection is connection and sockets.subscribed is self._front
+            if is_subscribed and sockets.states_in_flight < STATE_ROOM:
                 sockets.states_in_flight += 1
                 sockets.link.send(DOWN, lambda sockets=sockets: sockets.receive_state(copies))  # type: ignore[misc]
 
@@ -225,6 +226,11 @@ class Network:
         if notify:
             connection.sockets.link.send(DOWN, lambda: connection.sockets.lose_connection(connection))
 
+    def abandon(self, connection: Connection) -> None:
+        """End a TCP connection at the client's side alone, as a change of its address does: the front is not told."""
+        sockets = connection.sockets
+        sockets.link.send(DOWN, lambda: sockets.lose_connection(connection))
+
     # --- in place of the functions of `link.sockets` that ask the system ----------------------------------------------
 
     def peer_of(self, descriptor: int) -> tuple[str, int]:
@@ -274,8 +280,7 @@ class RigClientSockets:
         """The session is where the network has it."""
 
     def open_control(self) -> None:
-        if self.connection is not None:
-            self._network.close(self.connection, notify=False)
+        self._end_connection()
         self._control, self._is_lost = [], False
         self.connection = self._network.connect(self)
         self.version += 1
@@ -293,11 +298,14 @@ class RigClientSockets:
         self.close()
 
     def close(self) -> None:
+        self._end_connection()
+        self.subscribed = None
+
+    def _end_connection(self) -> None:
+        """End the connection, which the front learns after what was sent over it."""
         if self.connection is not None:
             connection, self.connection = self.connection, None
-            # A bye that was sent arrives first.
             self.link.send(UP, lambda: self._network.close(connection, notify=False))
-        self.subscribed = None
 
     # --- messages ---------------------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ import io
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import mujoco
 import pytest
@@ -35,6 +35,7 @@ from tests.rig.simulation import SECOND, Simulation, simulate_modules
 ADDRESS: Final = "127.0.0.1:7721"
 DEVICES: Final = ("desktop", "head", "joints", "target")
 SAMPLE_NS: Final = SECOND // 72
+T = TypeVar("T")
 
 
 class Hand:
@@ -63,7 +64,7 @@ class Hand:
         if self.client.connection.phase is ConnectionPhase.CLOSED:
             return
         self._rig.simulation.call_at(self._rig.simulation.now_ns + SAMPLE_NS, self._send)
-        if self.sending and self.client.ready:
+        if self.sending and self.client.ready and not self._rig.is_hanging(self.client):
             (x, y, z), q = self.pose
             vx, vy, vz = (v * SAMPLE_NS / SECOND for v in self.velocity)
             self.pose = ((x + vx, y + vy, z + vz), q)
@@ -134,6 +135,7 @@ class Rig:
         self._patch = pytest.MonkeyPatch()
         self._links = 0
         self._stands_until_ns = 0
+        self._hanging: dict[Client, int] = {}  # until when
         self._network = Network(self.simulation)
 
     def __enter__(self) -> Self:
@@ -218,11 +220,20 @@ class Rig:
         """Let the loop that takes ticks stand still: the machine pauses, or the user's program plots."""
         self._stands_until_ns = self.simulation.now_ns + round(seconds * SECOND)
 
+    def suspend_machine(self, seconds: float) -> None:
+        """Let the session and its front stand still, as when their machine sleeps."""
+        self.stop_loop(seconds)
+        self._front.stands_until_ns = self._stands_until_ns
+
     def kill_front(self) -> None:
         """End the front at once, as SIGKILL does. The session replaces it."""
+        self._front.kill()
+
+    @property
+    def _front(self) -> RigFrontProcess:
         front = self.session.processes.front
         assert isinstance(front, RigFrontProcess)
-        front.kill()
+        return front
 
     def _make_front(self, config: Any, scene: Any) -> RigFrontProcess:
         return RigFrontProcess(config, scene, self.simulation)
@@ -276,9 +287,10 @@ class Rig:
             status = main(list(arguments))
         return status, out.getvalue(), errors.getvalue()
 
-    def connect_raw(self) -> RigClientSockets:
-        """Open a control connection without a client behind it: send any bytes by `send_control`."""
+    def connect_raw(self, host: str = "203.0.113.1") -> RigClientSockets:
+        """Open a control connection from an address, without a client behind it: send any bytes by `send_control`."""
         sockets = self._make_sockets()
+        sockets.host_address = host
         sockets.open_control()
         return sockets
 
@@ -291,6 +303,21 @@ class Rig:
         connection = _sockets_of(client).connection
         assert connection is not None
         self._network.close(connection)
+
+    def roam(self, client: Client, host: str) -> None:
+        """Give a client another address. Its connections end, which the session does not learn."""
+        sockets = _sockets_of(client)
+        assert sockets.connection is not None
+        sockets.host_address = host
+        self._network.abandon(sockets.connection)
+
+    def hang(self, client: Client, seconds: float) -> None:
+        """Let the program of a client do nothing for a while: it neither reads nor sends. Its connection stays."""
+        self._hanging[client] = self.simulation.now_ns + round(seconds * SECOND)
+
+    def is_hanging(self, client: Client) -> bool:
+        """Return whether the program of a client stands still now."""
+        return self.simulation.now_ns < self._hanging.get(client, 0)
 
     def kill(self, client: Client) -> None:
         """End the program of a client, as SIGKILL does: no bye, its TCP connection closes."""
@@ -331,6 +358,10 @@ class Rig:
         hand.clutch = True
         self.run_until(lambda: hand.is_following, f"{hand.robot} follows {hand.client.name}", 1.0)
 
+    def list_events(self, name: str, kind: type[T]) -> list[tuple[int, T]]:
+        """Return session time [ns] and body of the events of a type that a client has received."""
+        return [(event.session_time, body) for event in self.events[name] if isinstance(body := event.body, kind)]
+
     def list_event_kinds(self, name: str) -> list[str]:
         """Return the types of the events that a client has received."""
         return [type(event.body).__name__ for event in self.events[name]]
@@ -360,6 +391,9 @@ class _Poller:
         if at_ns != self._due_ns or client.connection.phase is ConnectionPhase.CLOSED:
             return  # an earlier time has come up since
         self._due_ns = -1
+        if self._rig.is_hanging(client):
+            self._call_at(self._rig._hanging[client])
+            return
         try:
             client.poll(0.0)
         except ClientError as error:
