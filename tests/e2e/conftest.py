@@ -12,7 +12,6 @@ from typing import Any, Final
 
 import pytest
 
-from iris_session.client import Client
 from tests.client.harness import let_clients_wait
 from tests.e2e.browser import Browser, Page, printed_address, require_browser
 from tests.e2e.scenario import Hand, Scenario
@@ -31,10 +30,8 @@ SHUTDOWN_S: Final = 10.0
 #: Files that begin first: one of them at the end would keep one worker busy while the others have nothing left.
 #: Those that compute most lie between those that wait most.
 LONGEST: Final = (
-    "test_resume.py", "test_joining.py", "test_recovery.py",
-    "test_operators.py", "test_user_loop.py", "test_process_failures.py", "test_soak.py",
-    "test_process.py", "test_links.py", "test_shutdown.py", "test_security.py", "test_scene_changes.py",
-    "test_hostile_clients.py",
+    "test_resume.py", "test_joining.py", "test_process_failures.py", "test_soak.py", "test_process.py", "test_links.py",
+    "test_shutdown.py", "test_security.py", "test_hostile_clients.py",
 )  # fmt: skip
 
 
@@ -92,7 +89,7 @@ def marked_scenario(serve: Callable[..., SessionProcess], tmp_path: Path) -> Ite
 
 @pytest.fixture
 def scenario(own_scenario: Scenario) -> Scenario:
-    """The session of a test. Files whose tests leave it as it was replace this fixture by `shared_scenario`."""
+    """The session of a test."""
     return own_scenario
 
 
@@ -113,23 +110,6 @@ def shared_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session
         server.finish()
     finally:
         kill_all([server])
-
-
-@pytest.fixture
-def shared_scenario(shared_session: SessionProcess) -> Iterator[Scenario]:
-    """The shared session after a reset, without other participants and without leases."""
-    address = shared_session.address
-    with Client(address, role="director", name="host", alignment="not_needed").connect(DEADLINE_S) as host:
-
-        def is_empty() -> bool:
-            others = [p for p in host.mirror.participants.values() if p.id != host.participant_id and p.connected]
-            return not others and not any(lease.holder for lease in host.mirror.leases.values())
-
-        assert host.wait_for(lambda _: is_empty(), DEADLINE_S), "participants or leases of another test"
-        host.control("reset")
-    scenario = Scenario(shared_session)
-    yield scenario
-    scenario.close()
 
 
 @pytest.fixture(scope="module")

@@ -110,11 +110,6 @@ class Scenario:
 
         self.run_until(has_engaged, f"{hand.robot} follows {hand.client.name}")
 
-    def keep_engaged(self, hand: Hand) -> None:
-        """Engage again unless the robot follows: on a busy machine a sample may have come too late."""
-        if not self.is_following(hand):
-            self.engage(hand)
-
     def move_until(
         self, hand: Hand, velocity: tuple[float, float, float], condition: Callable[[], object], what: str
     ) -> None:

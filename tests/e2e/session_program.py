@@ -1,59 +1,63 @@
-"""Sessions as a lab's own programs run them, one kind each. A program, not a test.
+"""A session as a lab's own program runs it, which changes its scene. A program, not a test.
 
-python session_program.py HOST assets FOLDER ADDRESS...      serves assets of its own
-python session_program.py HOST media HZ BYTES                publishes the media stream `cloud`
+python session_program.py HOST RECORDING FOLDER      loads a scene when FOLDER has a file `table`, patches it by `patch`
 """
 
 from __future__ import annotations
 
 import sys
-import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import msgspec
+import mujoco
 
 from iris_session import Session, SessionConfig
-from iris_session.demo.scenes import scene_path
-from iris_session.link.front_process import FrontProcess
+from iris_session.demo.scenes import n_arms_scene, scene_path
+from iris_session.protocol.common import Pose
+from iris_session.protocol.scene import AddVisual, Geometry, SetVisual, Visual
+
+RED = (1.0, 0.0, 0.0, 1.0)
 
 
-def make_config(record: bool | Path = False) -> SessionConfig:
-    return SessionConfig(host=sys.argv[1], control_port=0, state_port=0, beacon_port=0, record=record)
+def compile_table() -> mujoco.MjModel:
+    """Compile the scene after the first one."""
+    spec = n_arms_scene(2, objects=3)
+    spec.option.timestep = 0.001
+    return spec.compile()
 
 
-def serve_assets(root: str, *addresses: str) -> None:
-    begin = FrontProcess.__init__
+def patch(session: Session) -> None:
+    """Make everything red, and add a lamp above the table."""
+    assert session.scene is not None
+    spec = session.scene
+    number = max(visual.id for visual in spec.visuals) + 1
+    geometry = Geometry("sphere", (0.1, 0.1, 0.1))
+    lamp = Visual(number, 0, "lamp", Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)), 0, geometry, -1, RED)
+    session.patch_scene(*(SetVisual(visual.id, rgba=RED) for visual in spec.visuals[:60]))
+    session.patch_scene(AddVisual(lamp))
 
-    def with_assets(self: FrontProcess, config: object, scene: object) -> None:
-        begin(self, config, msgspec.structs.replace(scene, asset_root=root, assets=addresses))  # type: ignore
 
-    FrontProcess.__init__ = with_assets  # type: ignore[method-assign,assignment]
-    with Session(scene_path("handover"), config=make_config()) as session:
-        print(f"on {session.address}, recording to nothing", flush=True)
-        session.run()
+def change_scenes(recording: str, folder: str) -> None:
+    pending: list[Any] = []
 
+    def poll() -> None:
+        if (Path(folder) / "table").exists():
+            (Path(folder) / "table").unlink()
+            pending.append(session.load_scene(compile_table()))
+        if (Path(folder) / "patch").exists():
+            (Path(folder) / "patch").unlink()
+            patch(session)
+            print("patched", flush=True)
+        for future in [future for future in pending if future.done()]:
+            pending.remove(future)
+            error = future.exception()
+            print("loaded" if error is None else f"{type(error).__name__}: {error}", flush=True)
 
-def publish_media(hz: str, size: str) -> None:
-    with Session(scene_path("handover"), config=make_config()) as session:
-        frame = bytes(int(size))
-
-        def publish() -> None:
-            while not session.stopping:
-                session.publish_media("cloud", frame)
-                time.sleep(1.0 / float(hz))
-
-        thread = threading.Thread(target=publish)
-        thread.start()
-        print(f"on {session.address}, recording to nothing", flush=True)
-        session.run()
-        thread.join()
+    config = SessionConfig(host=sys.argv[1], control_port=0, state_port=0, beacon_port=0, record=Path(recording))
+    with Session(str(scene_path("handover")), config=config) as session:
+        print(f"session on {session.address}, recording to {session.recording}", flush=True)
+        session.run(until=poll)
 
 
 if __name__ == "__main__":
-    programs: dict[str, Callable[..., None]] = {
-        "assets": serve_assets,
-        "media": publish_media,
-    }
-    programs[sys.argv[2]](*sys.argv[3:])
+    change_scenes(*sys.argv[2:])

@@ -13,17 +13,6 @@ from iris_session.recording import NotARecordingError, Recording
 from tests.e2e.scenario import Scenario
 
 
-def wait_for_new_state(scenario: Scenario, client: Client) -> None:
-    """Wait until `client` is in the session and has a state that was published after this call."""
-    begun_ns = client.session_now_ns()
-
-    def is_new() -> bool:
-        state = client.scene.state
-        return client.ready and state is not None and state.header.published_ns > begun_ns
-
-    scenario.run_until(is_new, f"{client.name} receives new state")
-
-
 def run_ticks(scenario: Scenario, client: Client, seconds: float) -> None:
     """Poll until `client` sees the physics `seconds` further than in a tick after this call."""
     begun_ns = client.session_now_ns()

@@ -53,7 +53,7 @@ def start(folder: Path) -> SessionProcess:
     """Start a session that loads and patches scenes on command."""
     folder.mkdir()
     recording = folder / "session.rrd"
-    program = [sys.executable, session_program.__file__, make_loopback_address(), "scenes"]
+    program = [sys.executable, session_program.__file__, make_loopback_address()]
     return SessionProcess(folder, recording, [*program, str(recording), str(folder)])
 
 

@@ -146,12 +146,6 @@ class Network:
         ip("-n", name, "addr", "add", f"{self.headset.address}/32", "dev", interface)
         ip("-n", name, "route", "add", "10.77.1.0/24", "dev", interface)
 
-    def move_to_other_subnet(self) -> None:
-        """Give the headset an address of another subnet, on the same cable."""
-        name, interface = self.headset.name, self.headset.interface
-        ip("-n", name, "addr", "flush", "dev", interface)
-        ip("-n", name, "addr", "add", "10.88.1.2/24", "brd", "+", "dev", interface)
-
     def allow_broadcasts(self) -> None:
         name, interface = self.headset.name, self.headset.interface
         ip("-n", name, "addr", "flush", "dev", interface)
