@@ -62,7 +62,10 @@ FORBIDDEN = {
     "link": {"mujoco", "rerun"},
     "alignment": SOCKETS | CLOCKS | RANDOM | {"mujoco", "rerun"},
     "front": {"mujoco", "rerun"},
-    "recording": set(),
+    "journal": (SOCKETS - {"zmq"}) | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
+    "rrd": SOCKETS | RANDOM | {"mujoco"},
+    "viewer": SOCKETS | CLOCKS | THREADS | RANDOM,
+    "recording": {"mujoco"},
     "replay": SOCKETS | CLOCKS | THREADS | RANDOM | {"zmq", "rerun"},
     "client": {"mujoco", "rerun"},
     "web": {"mujoco", "rerun"},
@@ -73,8 +76,8 @@ FORBIDDEN = {
 }
 #: Rooms whose result depends only on arguments: no set order, no addresses, no hash seed.
 PURE = ("anchors", "protocol", "authority", "control", "streams")
-#: The feed and the process of the recorder use sockets; the rest of `recording` reads and writes files.
-RECORDING_SOCKETS = {"feed.py", "process.py"}
+#: The feed and the process of the recorder use sockets; the rest of their rooms computes, or reads and writes files.
+RECORDER_SOCKETS = {"journal/feed.py", "recording/process.py"}
 #: Packages that only the sources of depth frames import. Clocks: they and the process; the client: the process.
 CLOUD_SOURCES = {"mujoco", "rerun", "mcap", "pyrealsense2", "pyorbbecsdk"}
 
@@ -185,8 +188,8 @@ def test_rooms_import_what_the_table_allows() -> None:
             wrong = outside & (CLOUD_SOURCES if shell else CLOUD_SOURCES | CLOCKS)
             wrong |= set() if shell else rooms_imported(path) & {"client"}
             offenders += [f"{name}: in cloud only its sources and process import {one}" for one in sorted(wrong)]
-        if room == "recording" and path.name not in RECORDING_SOCKETS and "zmq" in outside:
-            offenders.append(f"{name}: in recording only {sorted(RECORDING_SOCKETS)} import zmq")
+        if room in ("journal", "recording") and f"{room}/{path.name}" not in RECORDER_SOCKETS and "zmq" in outside:
+            offenders.append(f"{name}: in {room} only {sorted(RECORDER_SOCKETS)} import zmq")
     assert not offenders, "\n".join(offenders)
 
 

@@ -23,6 +23,8 @@ from msgspec import inspect
 from iris_session.client.address import Address
 from iris_session.client.errors import ClientError
 from iris_session.front.media.scheduler import MediaScheduler, MediaSubscriber
+from iris_session.journal import messages
+from iris_session.journal import rows as journal
 from iris_session.link import messages as link
 from iris_session.link.config import Ports, SceneInfo
 from iris_session.link.discovery import is_plausible
@@ -45,7 +47,6 @@ from iris_session.protocol.media import (
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
 from iris_session.protocol.status import DeliveryBudget
-from iris_session.recording import journal, messages
 from iris_session.security import KeysError
 from iris_session.security.allow_list import AllowedKey, AllowList
 from iris_session.security.curve import load_public, load_secret

@@ -29,12 +29,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.recording.blueprint import BACKGROUND
-from iris_session.recording.errors import RecordingError
-from iris_session.recording.paths import STATE_ENTITIES
-from iris_session.recording.rerun_tool import find_rerun, make_environment
-from iris_session.recording.rrd_file import read_chunks
-from iris_session.recording.view_copy import open_view_file
+from iris_session.journal.errors import RecordingError
+from iris_session.recording.viewer_export import open_view_file
+from iris_session.rrd.file import read_chunks
+from iris_session.rrd.paths import STATE_ENTITIES
+from iris_session.rrd.rerun_tool import find_rerun, make_environment
+from iris_session.viewer.blueprint import BACKGROUND
 
 HOST: Final = "127.0.0.1"
 SIZE: Final = "1600x1000"

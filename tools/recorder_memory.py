@@ -20,14 +20,14 @@ from typing import Final
 import numpy as np
 import psutil
 
+from iris_session.journal.messages import Batch, MetricRecord, StateFrame
+from iris_session.journal.rows import seal_keyframe
 from iris_session.protocol.client_messages import Sample, wrap_message
 from iris_session.protocol.codec import encode_client
 from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem
 from iris_session.recording import CLOSED, Keyframe, SessionHeader, header_root, make_row
-from iris_session.recording.journal import seal_keyframe
-from iris_session.recording.messages import Batch, MetricRecord, StateFrame
 from iris_session.recording.writer import RrdWriter
 
 TICK_NS: Final = 2_000_000

@@ -31,9 +31,10 @@ from iris_session.bench.record_naive import LOG_BATCH_S, LONG_BATCH_S, write_nai
 from iris_session.bench.record_session import BODIES, OPERATORS, BenchSession, SessionJob, make_record_scene
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.demo.scenes.generators import arm_names
-from iris_session.recording import NotARecordingError, Recording, paths
-from iris_session.recording.paths import part_path
-from iris_session.recording.rrd_file import scan_file
+from iris_session.recording import NotARecordingError, Recording
+from iris_session.rrd import paths
+from iris_session.rrd.file import scan_file
+from iris_session.rrd.paths import part_path
 from iris_session.system.process import PIPE, ChildProcess
 
 #: Rounds with a recording, and as many without; and the shortest of them.

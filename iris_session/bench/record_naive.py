@@ -15,11 +15,12 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import Pose
-from iris_session.recording import RecordedState, Recording, paths
-from iris_session.recording.picture import ScenePicture, SceneSource, escape_entity_part
-from iris_session.recording.record_batches import read_index
-from iris_session.recording.rrd_file import read_chunks
-from iris_session.recording.timelines import Moment, to_time_columns
+from iris_session.recording import RecordedState, Recording
+from iris_session.rrd import paths
+from iris_session.rrd.batches import read_index
+from iris_session.rrd.file import read_chunks
+from iris_session.viewer.scene_layer import SceneLayer, SceneSource, escape_entity_part
+from iris_session.viewer.timelines import Moment, to_time_columns
 
 #: Session time of a batch: of a program that collects for `rerun.send_columns` as long as a recorder does, and of one
 #: that calls `rerun.log`, whose batcher writes after 0.2 s (`ChunkBatcherConfig.flush_tick`).
@@ -38,7 +39,7 @@ def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
     states = list(recording.states())
     if states:
         header, first = recording.header, _make_moment(states[0], recording.header.origin_utc_ns)
-        picture = ScenePicture(log)
+        picture = SceneLayer(log)
         picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
         picture.draw(first)
     for rows in _split(_list_poses(states, recording.header.origin_utc_ns), batch_s):

@@ -14,8 +14,8 @@ from iris_session.cli.common import CommandError, add_json_option, ending_as_int
 from iris_session.cli.progress import ReadingProgress
 
 if TYPE_CHECKING:
-    from iris_session.recording.recorded_assets import AssetsSummary
     from iris_session.recording.summary import PersonSummary, RecordingSummary, StopSummary, StreamSummary
+    from iris_session.rrd.assets import AssetsSummary
 
 #: Lines of one kind that are printed; `--json` has all.
 MOST_LINES: Final = 20

@@ -112,7 +112,8 @@ def _export_assets(arguments: argparse.Namespace) -> int:
     import msgspec
 
     from iris_session.recording import Recording
-    from iris_session.recording.asset_export import export_assets
+    from iris_session.recording.reader import check_assets
+    from iris_session.rrd.assets import export_assets
 
     given = [f"--{name}" for name in ("hz", "robot", "object", "table") if getattr(arguments, name)]
     if given:
@@ -122,7 +123,17 @@ def _export_assets(arguments: argparse.Namespace) -> int:
         ProgressLine(arguments.path) as progress,
         Recording.open(arguments.path, warn=False) as recording,
     ):
-        report = export_assets(recording, arguments.out, force=arguments.force, progress=progress.show)
+        report = export_assets(
+            arguments.out,
+            check_assets(recording),
+            recording.assets(),
+            recording.scenes(),
+            finished=recording.all_closed,
+            force=arguments.force,
+            progress=progress.show,
+        )
+        damage = (*recording.missing, *recording.damage, *report.damage)
+        report = msgspec.structs.replace(report, damage=damage)
     if arguments.json:
         print_json(msgspec.to_builtins(report))
     else:

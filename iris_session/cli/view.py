@@ -19,7 +19,7 @@ from iris_session.cli.common import CommandError, ending_as_interrupts, to_print
 from iris_session.cli.progress import ReadingProgress
 
 if TYPE_CHECKING:
-    from iris_session.recording.view_copy import ViewFile
+    from iris_session.recording.viewer_export import ViewFile
 
 DEFAULT_FOLDER: Final = Path("sessions")
 HOST: Final = "127.0.0.1"
@@ -59,8 +59,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         nargs="?",
         type=Path,
         metavar="RECORDING",
-        help="a .rrd of a session, or a folder: the newest session in or below it (default: the folder sessions; with "
-        "--live the session that this machine records)",
+        help="a .rrd of a session, or a folder: the newest session in or below it (default: the folder sessions)",
     )
     parser.add_argument("--web", action="store_true", help="in a browser; the default where there is no display")
     parser.add_argument(
@@ -79,8 +78,8 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 def run(arguments: argparse.Namespace) -> int:
     """Make the copy and show it until the viewer is closed, or Ctrl-C."""
-    from iris_session.recording.rerun_tool import find_rerun
-    from iris_session.recording.view_copy import open_view_file
+    from iris_session.recording.viewer_export import open_view_file
+    from iris_session.rrd.rerun_tool import find_rerun
 
     if not 0 <= arguments.port < 65535:
         raise CommandError(f"--port {arguments.port} is not a port: give 1 to 65534")
@@ -89,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError(f"something listens on port {taken[0]} already: give another one, or leave --port out")
     tool = find_rerun()
     if arguments.live:
-        return _show_live(tool, arguments, find_live(arguments.path))
+        return _show_live(tool, arguments, find_live(arguments.path or DEFAULT_FOLDER))
     path = choose_recording(arguments.path or DEFAULT_FOLDER)
     with ending_as_interrupts(), ReadingProgress(path) as progress, open_view_file(path, progress.show_bytes) as view:
         progress.end()
@@ -109,30 +108,22 @@ def _show_live(tool: str, arguments: argparse.Namespace, path: Path) -> int:
         return _show(tool, arguments, None, path)
 
 
-def find_live(path: Path | None) -> Path:
-    """Return the first file of a recording that is being written: of a session, in or below a folder, or any.
+def find_live(path: Path) -> Path:
+    """Return the first file of a recording that is being written: of a session, or the newest in or below a folder.
 
     Raises:
         CommandError: There is none.
     """
-    from iris_session.recording.lock import list_written
+    from iris_session.recording.folders import find_newest_s, find_recordings, list_session_files
+    from iris_session.recording.lock import is_being_written
 
-    live = [Path(file) for file in list_written()]
-    belonging = [file for file in live if path is None or _belongs(file.resolve(), path.resolve())]
-    if not belonging:
-        what = "no session that is recorded runs on this machine" if path is None else f"no session writes {path}"
-        elsewhere = f"; this one is being written: {live[0]}" if live else ""
-        raise CommandError(f"{what}{elsewhere or ': leave --live out to see one that has ended'}")
-    return belonging[0]
-
-
-def _belongs(file: Path, path: Path) -> bool:
-    """Return whether a recording is of the session that `path` is a file of, or lies in or below the folder `path`."""
-    from iris_session.recording.folders import split_file_name
-
-    if path.is_dir():
-        return path in file.parents
-    return file.parent == path.parent and split_file_name(file.name)[0] == split_file_name(path.name)[0]
+    found = (
+        find_recordings(path, lambda _: None) if path.is_dir() else list_session_files(path) if path.exists() else []
+    )
+    for file in sorted(found, key=lambda file: find_newest_s([file]), reverse=True):
+        if is_being_written(file):
+            return file
+    raise CommandError(f"no session writes {path}: give its folder, or leave --live out to see one that has ended")
 
 
 def choose_recording(path: Path) -> Path:
@@ -271,7 +262,7 @@ def _wait(process: subprocess.Popen[bytes]) -> int:
 @contextmanager
 def _started(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
     """Start the viewer, which ends with this block."""
-    from iris_session.recording.rerun_tool import make_environment
+    from iris_session.rrd.rerun_tool import make_environment
 
     # In a group of its own, so that Ctrl-C reaches this process alone, which then ends it in order.
     process = subprocess.Popen(

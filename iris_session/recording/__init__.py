@@ -1,11 +1,14 @@
-"""Recording room: journal, feed to the recorder process, reading back, verification. See docs/architecture.md.
+"""Recordings of sessions: the recorder process that writes them, reading, verifying, summaries, copies and repair.
+
+A recording is one file or several parts; here they are found, locked, written (`process.py`, `writer.py`) and read
+(`reader.py`). Records are defined in `journal`, the container in `rrd`, what the viewer shows in `viewer`.
 
 Rerun is imported only where files are written or read, so that the authority stays light.
 """
 
-from iris_session.recording.errors import NotARecordingError, RecorderError, RecordingError
-from iris_session.recording.feed import FeedStats, RecorderFeed
-from iris_session.recording.journal import (
+from iris_session.journal.errors import NotARecordingError, RecorderError, RecordingError
+from iris_session.journal.feed import FeedStats, RecorderFeed
+from iris_session.journal.rows import (
     CLOSED,
     OPEN,
     Continues,
@@ -19,6 +22,7 @@ from iris_session.recording.journal import (
     pack_model,
     unpack_model,
 )
+from iris_session.journal.verification import Core, Problem, VerifyReport
 from iris_session.recording.lock import RecordingInUseError, RecordingLock
 from iris_session.recording.observations import (
     AlignmentHistory,
@@ -29,11 +33,11 @@ from iris_session.recording.observations import (
     read_alignment_history,
 )
 from iris_session.recording.reader import Recording
-from iris_session.recording.record_batches import RawSample, RecordedCloud, RecordedImage, RecordedState, RecordedStream
-from iris_session.recording.recorded_assets import RecordedScene
 from iris_session.recording.summary import RecordingSummary, summarise
 from iris_session.recording.supervise import RecorderProcess
-from iris_session.recording.verify import Core, Problem, VerifyReport, verify
+from iris_session.recording.verify import verify
+from iris_session.rrd.assets import RecordedScene
+from iris_session.rrd.batches import RawSample, RecordedCloud, RecordedImage, RecordedState, RecordedStream
 
 __all__ = [
     # write a recording

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from typing import Final
 
-from iris_session.recording.paths import part_path
+from iris_session.rrd.paths import part_path
 
 #: Smallest budget [bytes]: a file begins with the model, and its end needs room.
 MIN_BUDGET_BYTES: Final = 16_000_000

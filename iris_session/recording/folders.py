@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from iris_session.recording import paths
-from iris_session.recording.errors import NotARecordingError, RecorderError
+from iris_session.journal.errors import NotARecordingError, RecorderError
+from iris_session.rrd import paths
 
 #: Sessions that an error names.
 MOST_NAMED: Final = 3

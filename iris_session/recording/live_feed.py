@@ -4,8 +4,11 @@ It reads whole messages from the end of the file and hands them to Rerun's clien
 viewers: one that does not read makes this process wait, and what it has not got is in the file. Then the next part
 follows. The process ends with the session, or with the process that started it.
 
-The recorder writes rows of motion every few seconds, and exact states several times a second: of these the newest one
-is drawn beside what the file has.
+The recorder writes rows of motion once a second, and exact states several times a second: of these the newest one is
+drawn beside what the file has.
+
+Rerun's own server (`GrpcServerSink`) would have to run in the recorder of every session, beside its encoder: it takes
+the same data in a second stream, and forgets the oldest of it first, which is the scene.
 
 The viewer opens on the newest moment, where a recording opens at the first: the arrangement of views is sent with
 another play state.
@@ -23,10 +26,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from iris_session.recording import paths
-from iris_session.recording.errors import NotARecordingError
-from iris_session.recording.lock import find_writers
-from iris_session.recording.rrd_file import (
+from iris_session.journal.errors import NotARecordingError
+from iris_session.recording.lock import is_being_written
+from iris_session.rrd import paths
+from iris_session.rrd.file import (
     BLUEPRINT,
     END_MESSAGE,
     FILE_HEAD,
@@ -176,9 +179,9 @@ class LiveMotion:
 
     def draw(self, client: Any, data: bytes) -> None:
         """Draw the newest state in the bytes of a file, if one is in them."""
-        from iris_session.recording import record_batches
-        from iris_session.recording.people import get_device_entity
-        from iris_session.recording.timelines import Moment, set_moment
+        from iris_session.rrd import batches
+        from iris_session.viewer.participant_layer import get_device_entity
+        from iris_session.viewer.timelines import Moment, set_moment
 
         newest = None
         with tempfile.NamedTemporaryFile(suffix=".rrd") as file, suppress(NotARecordingError):
@@ -192,8 +195,8 @@ class LiveMotion:
                     newest = batch.slice(batch.num_rows - 1)
         if newest is None:
             return
-        (state,) = record_batches.decode_states(newest)
-        (sim_ns,), (wall_ns,) = (record_batches.read_index(newest, name) for name in (paths.SIM_TIME, paths.WALL_TIME))
+        (state,) = batches.decode_states(newest)
+        (sim_ns,), (wall_ns,) = (batches.read_index(newest, name) for name in (paths.SIM_TIME, paths.WALL_TIME))
         set_moment(client, Moment(state.step, sim_ns, state.session_time, wall_ns))
         if len(state.poses) == len(self._entities):
             for entity, pose in zip(self._entities, state.poses.tolist(), strict=True):
@@ -246,7 +249,7 @@ def follow(path: str, url: str, parent: int) -> None:
         if feed.poll():
             quiet_s = time.monotonic()
             continue
-        if time.monotonic() - quiet_s > ENDED_S and not find_writers(paths.split_part(path)[0]):
+        if time.monotonic() - quiet_s > ENDED_S and not is_being_written(paths.split_part(path)[0]):
             return
         time.sleep(POLL_S)
 

@@ -22,18 +22,10 @@ from typing import Final
 import msgspec
 import zmq
 
-from iris_session.protocol.common import Name
-from iris_session.protocol.status import ClientReport
-from iris_session.recording.asset_queue import AssetQueue
-from iris_session.recording.budget import RecordingBudget, describe_used_budget
-from iris_session.recording.errors import RecorderError, WriteError
-from iris_session.recording.footer import start_indexing
-from iris_session.recording.journal import SessionHeader
-from iris_session.recording.lock import RecordingLock
-from iris_session.recording.messages import (
+from iris_session.journal.errors import RecorderError, WriteError
+from iris_session.journal.messages import (
     BATCH,
     FAULT_PREFIX,
-    FINISH_SIGNAL,
     FRAME,
     HEADER,
     Batch,
@@ -45,8 +37,16 @@ from iris_session.recording.messages import (
     decode_vertices,
     encode_status,
 )
-from iris_session.recording.paths import part_path
+from iris_session.journal.rows import SessionHeader
+from iris_session.protocol.common import Name
+from iris_session.protocol.status import ClientReport
+from iris_session.recording.budget import RecordingBudget, describe_used_budget
+from iris_session.recording.lock import TRIED_S, RecordingLock
+from iris_session.recording.supervise import FINISH_SIGNAL
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd.assets import AssetQueue
+from iris_session.rrd.index import start_indexing
+from iris_session.rrd.paths import part_path
 from iris_session.system.log import configure_logging
 
 #: Period at which sockets are drained, instead of at every message: one wake-up for some twenty messages.
@@ -108,7 +108,7 @@ class RecorderLoop:
         self._begin_part()
         if os.path.exists(config.path):  # the first file may have been moved away
             try:
-                self._lock = RecordingLock(config.path, shared=True, patience_s=0.0)
+                self._lock = RecordingLock(config.path, shared=True, patience_s=TRIED_S)
             except RecorderError:
                 self._remove()  # another process continues this recording: leave no empty part behind
                 raise

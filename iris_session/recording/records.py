@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.journal.errors import RecordingError
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.codec import BAD_BYTES
 from iris_session.protocol.server_messages import Event, ParticipantChanged, ParticipantJoined
-from iris_session.recording.errors import RecordingError
 from iris_session.recording.observations import read_owners
 from iris_session.recording.reader import Recording
 

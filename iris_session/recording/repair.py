@@ -1,7 +1,6 @@
 """Repair a recording: everything that can be read of it, in one file with an index, and what is lost.
 
-All whole messages are kept as they were written, those after a fault too; motion that a killed recorder had not written
-follows them (`lost_motion.py`). The original is not changed.
+All whole messages are kept as they were written, those after a fault too. The original is not changed.
 """
 
 from __future__ import annotations
@@ -13,13 +12,12 @@ from typing import Final
 
 import msgspec
 
-from iris_session.recording import paths, rrd_file
-from iris_session.recording.errors import RecorderError
-from iris_session.recording.lock import describe_writers
-from iris_session.recording.lost_motion import open_with_lost_motion
+from iris_session.journal.errors import RecorderError
 from iris_session.recording.reader import Recording
-from iris_session.recording.rerun_tool import INDEX, rewrite
 from iris_session.recording.summary import SummaryBuilder
+from iris_session.rrd import file as rrd_file
+from iris_session.rrd import paths
+from iris_session.rrd.rerun_tool import INDEX, rewrite
 from iris_session.system.files import Replacement
 
 #: Checksums over the bytes of a file are wrong in a copy that leaves out some of them, or has several files.
@@ -80,19 +78,16 @@ def repair(
         ImportError: Rerun is not installed.
     """
     with Recording.open(path, warn=False) as recording:
-        if recording.writers:
-            raise RecorderError(f"{recording.files[0]} {describe_writers(recording.writers)}: repair it afterwards")
+        if recording.is_being_written:
+            raise RecorderError(f"{recording.files[0]} is being written: repair it afterwards")
         target = Path(output)
         _check_output(target, [*recording.files, *recording.unreadable_files], overwrite=overwrite)
         damaged = [*recording.damage]
         is_prefix = not damaged and len(recording.files) == 1
         try:
-            with (
-                open_with_lost_motion(recording.readable_files) as files,
-                Replacement(target, permissions=None) as replacement,
-            ):
+            with Replacement(target, permissions=None) as replacement:
                 options = () if is_prefix else _WITHOUT_MARKS
-                rewrite(INDEX, files, replacement.file, options=options, progress=progress)
+                rewrite(INDEX, recording.readable_files, replacement.file, options=options, progress=progress)
         except OSError as error:
             raise RecorderError(f"{target} cannot be written: {error.strerror or error}") from error
         builder = SummaryBuilder(recording.header.begins_after, resumed=recording.header.continues is not None)

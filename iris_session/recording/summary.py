@@ -18,6 +18,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from iris_session.journal.messages import ABRUPT, DenialRecord, EndMark
 from iris_session.protocol.common import Alignment, Lease
 from iris_session.protocol.names import TargetKind
 from iris_session.protocol.server_messages import (
@@ -38,11 +39,9 @@ from iris_session.protocol.server_messages import (
     SamplesRejected,
     SceneChanged,
 )
-from iris_session.recording.lock import describe_writers
-from iris_session.recording.messages import ABRUPT, DenialRecord, EndMark
 from iris_session.recording.reader import Recording
-from iris_session.recording.record_batches import DrawnVertices, FrameTime, RecordedStream, RowTimes
-from iris_session.recording.recorded_assets import AssetCollector, AssetFault, AssetPiece, AssetsSummary, RecordedScene
+from iris_session.rrd.assets import AssetCollector, AssetFault, AssetPiece, AssetsSummary, RecordedScene
+from iris_session.rrd.batches import DrawnVertices, FrameTime, RecordedStream, RowTimes
 
 #: Maximum number of lines about missing steps, and about missing events: a file may have any number of gaps.
 MOST_GAPS: Final = 100
@@ -269,8 +268,8 @@ def _read_size(file: str) -> int:
 
 def _describe_ending(recording: Recording, end_ns: int) -> str:
     """Return one line about an end that is not that of a session, empty for one that is."""
-    if recording.writers:
-        return f"{describe_writers(recording.writers)}: read as far as {_to_s(end_ns):g} s"
+    if recording.is_being_written:
+        return f"is being written: read as far as {_to_s(end_ns):g} s"
     if recording.end is not None:
         return recording.end.reason[:200] or (ABRUPT if recording.end.is_abrupt else "")
     cuts = "".join(f"; {cut}" for cut in recording.cuts)

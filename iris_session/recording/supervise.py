@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import tempfile
 import uuid
 from pathlib import Path
@@ -12,12 +13,14 @@ from typing import Final
 import msgspec
 import psutil
 
-from iris_session.recording.errors import RecorderError
-from iris_session.recording.messages import FAULT_PREFIX, FINISH_SIGNAL, RecorderConfig
-from iris_session.recording.paths import part_path
-from iris_session.recording.recorded_assets import NONE
+from iris_session.journal.errors import RecorderError
+from iris_session.journal.messages import FAULT_PREFIX, RecorderConfig
+from iris_session.rrd.assets import NONE
+from iris_session.rrd.paths import part_path
 from iris_session.system.process import PIPE, ChildProcess
 
+#: Signal by which a session tells its recorder to finish the file. SIGTERM may come from anybody.
+FINISH_SIGNAL: Final = signal.SIGUSR1
 #: Time limit of a start. It takes half a second on an idle machine.
 START_S: Final = 60.0
 #: Exit status of Python after an error that nothing has caught.

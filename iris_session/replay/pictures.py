@@ -24,10 +24,10 @@ from iris_session.protocol.names import Device
 from iris_session.protocol.scene import AddMaterial, AddVisual, Material, PatchOp, RemoveVisual, SetVisual, Visual
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem, SceneChanged
 from iris_session.recording import Recording, RecordingError
-from iris_session.recording.record_batches import RowTimes
-from iris_session.recording.story import SessionStory
 from iris_session.replay.simulation import Replay
+from iris_session.rrd.batches import RowTimes
 from iris_session.session.core import SessionCore
+from iris_session.viewer.narration import EventNarration
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -520,7 +520,7 @@ class _PeopleTrack:
         self._states = recording.states()
         self._ahead = next(self._states, None)
         self._newest: dict[tuple[str, str], PresenceItem] = {}
-        self._story = SessionStory()
+        self._story = EventNarration()
 
     def advance(self, time_ns: int) -> list[_Figure]:
         """Return the heads and hands at `time_ns`."""

@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 from iris_session.physics import UnknownNameError
 from iris_session.protocol.steps import Command
 from iris_session.recording import Recording as RecordedFile
-from iris_session.recording import RecordingError, paths, record_batches
+from iris_session.recording import RecordingError
 from iris_session.recording.records import DeviceSamples, list_event_records, read_device_samples
 from iris_session.replay import plant_reader
 from iris_session.replay.plant_reader import PlantReader, Quantity, list_moving, read_steps
 from iris_session.replay.simulation import Replay, ReplayedStep, StepSelector
+from iris_session.rrd import batches as record_batches
+from iris_session.rrd import paths
 
 ROBOT: Final = "robot"
 OBJECT: Final = "object"
@@ -252,7 +254,7 @@ class SessionRecording(RecordedFile):
     def _require(self, kind: str, name: str) -> None:
         """Raise `UnknownNameError` at once where only the first scene can have the name."""
         known = self._list_names(kind)
-        if name not in known and next(self._items(paths.MODELS, record_batches.decode_models), None) is None:
+        if name not in known and next(self._parts.iterate(paths.MODELS, record_batches.decode_models), None) is None:
             raise UnknownNameError(kind, name, known)
 
     def _read_series(self, target: str, name: str, kind: str, hz: float | None) -> TimeSeries:

@@ -12,10 +12,10 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
+from iris_session.journal.environment import compare_environment
+from iris_session.journal.rows import CLOSED, CRASHED, check_fields, check_keyframe
 from iris_session.protocol.entries import decode_entries
 from iris_session.recording import JournalRow, Keyframe, Recording, RecordingError
-from iris_session.recording.environment import compare_environment
-from iris_session.recording.journal import CLOSED, CRASHED, check_fields, check_keyframe
 from iris_session.session.core import SessionCore, StepOutcome
 from iris_session.session.verification import ReplayCore
 

@@ -28,7 +28,7 @@ from iris_session.protocol.discovery import DISCOVERY_PORT
 from iris_session.protocol.server_messages import MAX_MARKS
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording.budget import MIN_BUDGET_BYTES
-from iris_session.recording.recorded_assets import RECORD_ASSETS, SCENE
+from iris_session.rrd.assets import RECORD_ASSETS, SCENE
 from iris_session.session.errors import ConfigError, short_repr
 
 #: A printed sheet lying at the near edge of the demo table; `T_world_anchor` of anchor id "table".

@@ -19,6 +19,8 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from iris_session.journal.environment import describe_environment, read_boot_id
+from iris_session.journal.feed import SILENCE_S
 from iris_session.link import FrontConfig, FrontError, FrontProcess, Ports, addresses_of
 from iris_session.link.sockets import host_in_address
 from iris_session.protocol.client_messages import Marker
@@ -35,8 +37,6 @@ from iris_session.recording import (
     header_root,
     pack_model,
 )
-from iris_session.recording.environment import describe_environment, read_boot_id
-from iris_session.recording.feed import SILENCE_S
 from iris_session.recording.folders import check_new_recording
 from iris_session.scene.result import ComposedScene
 from iris_session.session.cameras import SessionCameras

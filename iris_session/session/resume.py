@@ -28,6 +28,9 @@ import msgspec
 import mujoco
 
 from iris_session.control import ControlError
+from iris_session.journal.environment import read_boot_id, use_one_blas_thread
+from iris_session.journal.rows import CRASHED, check_keyframe
+from iris_session.journal.verification import Models
 from iris_session.physics import (
     PhysicsError,
     compute_scene_hash,
@@ -54,12 +57,9 @@ from iris_session.recording import (
     check_row,
     unpack_model,
 )
-from iris_session.recording.environment import read_boot_id, use_one_blas_thread
 from iris_session.recording.folders import find_session_in
-from iris_session.recording.journal import CRASHED, check_keyframe
 from iris_session.recording.lock import PATIENCE_S
-from iris_session.recording.paths import resume_path, split_part, split_resume
-from iris_session.recording.verify import Models
+from iris_session.rrd.paths import resume_path, split_part, split_resume
 from iris_session.security.resume_tokens import encode_handback
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots
 from iris_session.session.core import CoreConfig, CoreState, SessionCore

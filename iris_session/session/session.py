@@ -31,6 +31,7 @@ from typing import Final, Self
 import mujoco
 
 from iris_session.control import ControlError
+from iris_session.journal.environment import use_one_blas_thread
 from iris_session.physics import Pacer, PacerStats, PhysicsError, load_model
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.client_messages import Assign, Control, EStop, SetScale
@@ -38,7 +39,6 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
-from iris_session.recording.environment import use_one_blas_thread
 from iris_session.session.attachment import Attachment, find_simulation
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots, check_timestep
 from iris_session.session.core import SessionCore, make_session_core, read_plant_state

@@ -17,6 +17,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.journal.messages import RobotLabels
+from iris_session.journal.rows import CRASHED, JournalRow, Keyframe, make_row
 from iris_session.physics import World
 from iris_session.protocol.client_messages import Control, Episode, EStop, GetSnapshot, Marker
 from iris_session.protocol.common import MAX_TEXT, Applied, Pose
@@ -35,8 +37,6 @@ from iris_session.protocol.names import ControlAction, DenialReason, EpisodeActi
 from iris_session.protocol.server_messages import BodyInfo, Reply, StateHeader
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Decision
-from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
-from iris_session.recording.messages import RobotLabels
 from iris_session.session.core import Plant, SessionCore, StepOutcome, ignore_lap
 from iris_session.session.deformables import DeformableSourceMesh
 from iris_session.session.errors import OwnershipError

@@ -10,11 +10,11 @@ import threading
 from collections.abc import Callable
 from typing import Final, Protocol
 
+from iris_session.journal.messages import RecorderStatus
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.status import RecorderReport
 from iris_session.recording import RecorderFeed, RecorderProcess, RecordingError
 from iris_session.recording.budget import LOW_SHARE, describe_used_budget
-from iris_session.recording.messages import RecorderStatus
 from iris_session.system.backoff import Backoff
 
 RESTART_DELAYS_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)

@@ -8,12 +8,12 @@ from pathlib import Path
 import msgspec
 
 from iris_session.authority import is_same_snapshot
+from iris_session.journal.environment import use_one_blas_thread
+from iris_session.journal.rows import SNAPSHOTS
+from iris_session.journal.verification import Models
 from iris_session.physics import decode_model
 from iris_session.protocol.entries import Entry
 from iris_session.recording import Keyframe, SessionHeader, VerifyReport, unpack_model, verify
-from iris_session.recording.environment import use_one_blas_thread
-from iris_session.recording.journal import SNAPSHOTS
-from iris_session.recording.verify import Models
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
 
 

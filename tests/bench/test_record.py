@@ -22,10 +22,10 @@ from iris_session.bench.record import (
     summarize_sizes,
 )
 from iris_session.bench.record_session import BODIES, make_record_scene
-from iris_session.recording.messages import StateFrame
-from iris_session.recording.paths import part_path
-from iris_session.recording.picture import escape_entity_part
+from iris_session.journal.messages import StateFrame
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd.paths import part_path
+from iris_session.viewer.scene_layer import escape_entity_part
 from tests.bench.test_report import _bench, _check
 from tests.recording.support import journal, read, write
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.recording.rrd_file import END_MESSAGE, FILE_HEAD, MAGIC
+from iris_session.rrd.file import END_MESSAGE, FILE_HEAD, MAGIC
 from iris_session.system.extras import EXTRAS
 
 #: Runs the command line where no package of an extra can be imported, also in its child processes.

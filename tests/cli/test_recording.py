@@ -15,9 +15,8 @@ import pytest
 from iris_session.cli import progress
 from iris_session.cli.main import INTERRUPTED, main
 from iris_session.cli.recording import MOST_LINES, format_line, format_summary
-from iris_session.recording import reader
+from iris_session.recording import parts
 from iris_session.recording.folders import find_recordings
-from iris_session.recording.recorded_assets import AssetsSummary
 from iris_session.recording.summary import (
     AlignmentSummary,
     DropSummary,
@@ -28,6 +27,7 @@ from iris_session.recording.summary import (
     StopSummary,
     StreamSummary,
 )
+from iris_session.rrd.assets import AssetsSummary
 from tests.recording.support import journal, write
 from tests.recording.test_summary import write_session
 
@@ -194,11 +194,11 @@ def test_end_from_outside_is_taken_as_ctrl_c(
     def refuse(*_: object) -> None:
         raise AssertionError(f"{number.name} ends the command at once")
 
-    def find_writers(_: object) -> list[int]:
+    def is_being_written(_: object) -> bool:
         os.kill(os.getpid(), number)
-        return []
+        return False
 
-    monkeypatch.setattr(reader, "find_writers", find_writers)
+    monkeypatch.setattr(parts, "is_being_written", is_being_written)
     monkeypatch.chdir(tmp_path)
     before = signal.signal(number, refuse), signal.getsignal(signal.SIGINT)
     try:

@@ -10,7 +10,7 @@ import pytest
 
 from iris_session.cli.main import main
 from iris_session.protocol.scene import decode_scene
-from iris_session.recording.recorded_assets import list_recorded_assets
+from iris_session.rrd.assets import list_recorded_assets
 from iris_session.scene import AssetStore
 from tests.recording.test_recorded_assets import Shared, record
 from tests.replay.support import Played, play

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import pytest
 
-from iris_session.recording.rrd_file import scan_file
+from iris_session.rrd.file import scan_file
 from tests.e2e import session_program
 from tests.e2e.scenario import Scenario
 from tests.e2e.session_process import (

@@ -16,11 +16,11 @@ import pytest
 from anchors.pose import PoseTuple, distance
 from iris_session.client import Client
 from iris_session.demo.scenes import scene_path
+from iris_session.journal.messages import Batch
 from iris_session.physics import load_model
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Lost, decode_entries
 from iris_session.recording import JournalRow, Recording
-from iris_session.recording.messages import Batch
 from iris_session.session.verification import verify_recording
 from tests.e2e.scenario import Scenario, is_driven
 from tests.e2e.session_process import run_verify

@@ -16,7 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from iris_session.recording.rrd_file import scan_file
+from iris_session.rrd.file import scan_file
 from tests.e2e.session_process import assert_all_end, list_descendants
 from tests.recording.support import journal, wait_until, write
 

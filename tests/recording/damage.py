@@ -11,11 +11,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from iris_session.recording import NotARecordingError, Recording, paths
+from iris_session.recording import NotARecordingError, Recording
 from iris_session.recording.repair import repair
-from iris_session.recording.rerun_tool import INDEX, find_rerun, rewrite
-from iris_session.recording.rrd_file import KIND_END, KIND_STORE_INFO, RrdMessage, read_message, scan_file
 from iris_session.recording.summary import summarise
+from iris_session.rrd import paths
+from iris_session.rrd.file import KIND_END, KIND_STORE_INFO, RrdMessage, read_message, scan_file
+from iris_session.rrd.rerun_tool import INDEX, find_rerun, rewrite
 from tests.recording.support import journal, write
 
 HEAD_BYTES = 16  # of a message

@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import rerun as rr
 
-from iris_session.recording import paths
-from iris_session.recording.rrd_file import read_chunks
+from iris_session.rrd import paths
+from iris_session.rrd.file import read_chunks
 
 _TIMELINES = (paths.STEP, paths.SIM_TIME, paths.SESSION_TIME, paths.WALL_TIME)
 _NO_VALUES = ("rerun.controls.RowId", "Clear:is_recursive")

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from anchors.pose import PoseTuple, apply, inverse
+from iris_session.journal.messages import Batch
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.entries import AlignmentAlarm, Entry, Join
@@ -20,7 +21,6 @@ from iris_session.protocol.server_messages import (
     ParticipantJoined,
 )
 from iris_session.recording import Settings, header_root, make_row
-from iris_session.recording.messages import Batch
 from iris_session.recording.writer import RrdWriter
 from tests.anchors.worlds import Viewpoint, viewpoint_around
 from tests.recording.support import make_header

@@ -14,6 +14,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from iris_session.journal.messages import Batch
+from iris_session.journal.rows import SNAPSHOTS, seal_keyframe
+from iris_session.journal.verification import Models
 from iris_session.protocol.client_messages import Marker, Sample
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, encode_entry
@@ -30,9 +33,6 @@ from iris_session.recording import (
     make_row,
     pack_model,
 )
-from iris_session.recording.journal import SNAPSHOTS, seal_keyframe
-from iris_session.recording.messages import Batch
-from iris_session.recording.verify import Models
 from iris_session.recording.writer import RrdWriter
 
 TICK_NS = 2_000_000

@@ -8,11 +8,19 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from iris_session.journal.messages import SceneAssets
 from iris_session.protocol.scene import encode_scene, list_assets
-from iris_session.recording import asset_queue
-from iris_session.recording.asset_queue import PATCH_PERIOD_NS, PIECE_BYTES, AssetQueue, AssetRows
-from iris_session.recording.messages import SceneAssets
-from iris_session.recording.recorded_assets import ALL, NONE, SCENE, list_recorded_assets
+from iris_session.rrd import assets as asset_queue
+from iris_session.rrd.assets import (
+    ALL,
+    NONE,
+    PATCH_PERIOD_NS,
+    PIECE_BYTES,
+    SCENE,
+    AssetQueue,
+    AssetRows,
+    list_recorded_assets,
+)
 from tests.recording.test_recorded_assets import Shared
 
 S = 1_000_000_000

@@ -12,13 +12,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from iris_session.journal.feed import RecorderFeed
+from iris_session.journal.messages import RecorderConfig
 from iris_session.recording import Recording, summarise, verify
 from iris_session.recording import process as process_module
 from iris_session.recording.budget import END_BYTES, LOW_SHARE, MIN_BUDGET_BYTES, RecordingBudget
-from iris_session.recording.feed import RecorderFeed
-from iris_session.recording.messages import RecorderConfig
-from iris_session.recording.paths import part_path
 from iris_session.recording.supervise import RecorderProcess
+from iris_session.rrd.paths import part_path
 from tests.recording.support import SmallCore, SmallSession, make_header, wait_until
 
 BUDGET = 1_500_000

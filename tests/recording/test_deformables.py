@@ -10,16 +10,17 @@ import mujoco
 import numpy as np
 import pytest
 
+from iris_session.journal.messages import Batch, SceneAssets, SceneModel, VertexFrame
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import SessionHeader, pack_model
-from iris_session.recording.deformables import CHECKERS, DARK, DrawnDeformable, build_checker
-from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
-from iris_session.recording.writer import MAX_PENDING_VERTICES, RrdWriter
+from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
 from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
+from iris_session.viewer.deformables import CHECKERS, DARK, DrawnDeformable, build_checker
+from iris_session.viewer.drawing import MAX_PENDING_VERTICES
 from tests.recording.support import column, read
 from tests.recording.test_writer import frame
 from tests.scene.models import flexes

@@ -7,7 +7,7 @@ import sys
 
 SCRIPT = """
 import numpy, scipy.linalg
-from iris_session.recording.environment import count_blas_threads, describe_environment, use_one_blas_thread
+from iris_session.journal.environment import count_blas_threads, describe_environment, use_one_blas_thread
 before = count_blas_threads()
 use_one_blas_thread()
 print(before, describe_environment()["blas_threads"], bool(describe_environment()["cpu"]))

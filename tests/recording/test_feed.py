@@ -12,22 +12,8 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.protocol.common import Denial, Pose
-from iris_session.protocol.server_messages import (
-    BodyInfo,
-    Event,
-    ParticipantChanged,
-    ParticipantInfo,
-    ParticipantJoined,
-    ParticipantLeft,
-    PresenceItem,
-    Reply,
-)
-from iris_session.protocol.steps import Command, Decision, OutgoingMessage
-from iris_session.recording import Keyframe, RecorderFeed, make_row
-from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS, JOURNAL_SHARE, PEOPLE, VERTEX_FRAMES
-from iris_session.recording.journal import check_keyframe
-from iris_session.recording.messages import (
+from iris_session.journal.feed import BATCH_ITEMS, BATCH_ROWS, JOURNAL_SHARE, PEOPLE, VERTEX_FRAMES
+from iris_session.journal.messages import (
     BATCH,
     FRAME,
     HEADER,
@@ -41,6 +27,20 @@ from iris_session.recording.messages import (
     decode_vertices,
     encode_status,
 )
+from iris_session.journal.rows import check_keyframe
+from iris_session.protocol.common import Denial, Pose
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    Event,
+    ParticipantChanged,
+    ParticipantInfo,
+    ParticipantJoined,
+    ParticipantLeft,
+    PresenceItem,
+    Reply,
+)
+from iris_session.protocol.steps import Command, Decision, OutgoingMessage
+from iris_session.recording import Keyframe, RecorderFeed, make_row
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
 from tests.recording.support import make_header

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.recording.errors import NotARecordingError, RecorderError
+from iris_session.journal.errors import NotARecordingError, RecorderError
 from iris_session.recording.folders import check_new_recording, find_recordings, find_session_in, group_by_session
 
 

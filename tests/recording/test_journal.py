@@ -10,10 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iris_session.protocol.client_messages import Marker
-from iris_session.protocol.entries import HOST, Entry, decode_entries, encode_entries
-from iris_session.recording import journal
-from iris_session.recording.journal import (
+from iris_session.journal import rows as journal
+from iris_session.journal.rows import (
     JournalRow,
     Keyframe,
     array_header,
@@ -27,6 +25,8 @@ from iris_session.recording.journal import (
     seal_keyframe,
     unpack_model,
 )
+from iris_session.protocol.client_messages import Marker
+from iris_session.protocol.entries import HOST, Entry, decode_entries, encode_entries
 from tests.recording.support import make_entries, make_header
 
 ROOT = b"r" * 16

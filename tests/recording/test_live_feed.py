@@ -16,15 +16,15 @@ import numpy as np
 import psutil
 import pytest
 
+from iris_session.journal.messages import Batch, StateFrame
 from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import NotARecordingError, live_feed
 from iris_session.recording.live_feed import LiveFeed, MessageTail
 from iris_session.recording.lock import RecordingLock
-from iris_session.recording.messages import Batch, StateFrame
-from iris_session.recording.rerun_tool import find_rerun, make_environment
-from iris_session.recording.rrd_file import KIND_END, read_message, scan_file
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd.file import KIND_END, read_message, scan_file
+from iris_session.rrd.rerun_tool import find_rerun, make_environment
 from iris_session.system.process import ChildProcess
 from tests.loopback import make_loopback_address
 from tests.recording.support import column, journal, make_header, read, wait_until, write

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import zmq
 
+from iris_session.journal.messages import RecorderConfig
+from iris_session.journal.rows import SessionHeader
 from iris_session.protocol.codec import encode_media_header
 from iris_session.protocol.media import MAX_STREAMS, MediaHeader, StreamCamera, StreamInfo
 from iris_session.recording import RecordedImage, RecordedStream, Recording
 from iris_session.recording import process as process_module
-from iris_session.recording.journal import SessionHeader
-from iris_session.recording.messages import RecorderConfig
 from iris_session.recording.writer import RrdWriter
 from iris_session.streams.cloud import decode_cloud, encode_cloud
 from tests.recording.support import column, read
@@ -139,7 +139,7 @@ def test_views_of_pictures_are_bounded(writer: RrdWriter) -> None:
         writer.add_media(message(f"s{i}", JPEG, encoding="jpeg"))
         writer.flush()
     writer.close()
-    assert len(writer._drawer.pictures) == MAX_STREAMS
+    assert len(writer._drawing._media.pictures) == MAX_STREAMS
     with Recording.open(writer.path) as recording:
         assert len(list(recording.pictures())) == MAX_STREAMS + 5
 

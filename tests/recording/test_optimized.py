@@ -14,12 +14,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from iris_session.journal.messages import Batch, DenialRecord, MetricRecord, StateFrame
 from iris_session.protocol.common import Denial
 from iris_session.protocol.server_messages import Event, MarkerAdded
-from iris_session.recording import CLOSED, OPEN, Recording, reader, rrd_file, verify
-from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, StateFrame
-from iris_session.recording.paths import DENIALS, ROWS, part_path
+from iris_session.recording import CLOSED, OPEN, Recording, verify
+from iris_session.recording import parts as recording_parts
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd import file as rrd_file
+from iris_session.rrd.paths import DENIALS, ROWS, part_path
 from tests.recording.support import SmallCore, journal, write
 
 STEPS = 200
@@ -245,11 +247,11 @@ def parts(tmp_path: Path) -> tuple[Path, Path]:
     return first, second
 
 
-@pytest.mark.parametrize("remembered", [reader.REPEATED_ITEMS, 20])
+@pytest.mark.parametrize("remembered", [recording_parts.REPEATED_ITEMS, 20])
 def test_parts_may_be_optimized_separately_or_merged(
     tmp_path: Path, parts: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, remembered: int
 ) -> None:
-    monkeypatch.setattr(reader, "REPEATED_ITEMS", remembered)
+    monkeypatch.setattr(recording_parts, "REPEATED_ITEMS", remembered)
     first, second = parts
     (tmp_path / "out").mkdir()
     for part in parts:

@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 import zmq
 
+from iris_session.journal.feed import BATCH_NS
+from iris_session.journal.messages import FRAME, HEADER, Batch, RecorderConfig, encode_batch, encode_header
 from iris_session.protocol.names import ArrayKind
 from iris_session.protocol.scene import list_assets
 from iris_session.protocol.server_messages import ParticipantInfo
@@ -34,11 +36,9 @@ from iris_session.recording import (
     verify,
 )
 from iris_session.recording import process as process_module
-from iris_session.recording.feed import BATCH_NS
-from iris_session.recording.messages import FRAME, HEADER, Batch, RecorderConfig, encode_batch, encode_header
-from iris_session.recording.paths import part_path
 from iris_session.recording.process import DRAIN_S, FLUSH_S
-from iris_session.recording.recorded_assets import ALL, list_recorded_assets
+from iris_session.rrd.assets import ALL, list_recorded_assets
+from iris_session.rrd.paths import part_path
 from iris_session.scene import AssetStore, decode_arrays
 from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -199,7 +199,7 @@ def test_recording_that_is_being_written_says_so(tmp_path: Path) -> None:
         session.take(100)
         wait_until(lambda: _status(feed).written >= 5)
         report = verify(path, SmallCore)
-        assert report.writers == [process.pid]
+        assert report.is_being_written
         assert report.ok, report.line()
         assert 0 < report.steps <= 100
         assert "being written" in report.line()
@@ -209,7 +209,7 @@ def test_recording_that_is_being_written_says_so(tmp_path: Path) -> None:
         assert process.close()
     report = verify(tmp_path, SmallCore)  # the folder stands for its session.rrd
     assert report.ok, report.line()
-    assert (report.steps, report.writers, report.finished) == (150, [], True)
+    assert (report.steps, report.is_being_written, report.finished) == (150, False, True)
 
 
 def test_batch_beyond_a_limit_is_counted_and_its_journal_kept(tmp_path: Path) -> None:

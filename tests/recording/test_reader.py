@@ -10,23 +10,24 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from iris_session.journal.rows import FORMAT, VERIFIERS
+from iris_session.journal.verification import Verification
 from iris_session.recording import (
     Continues,
     NotARecordingError,
     Recording,
     RecordingLock,
     VerifyReport,
-    paths,
-    reader,
-    rrd_file,
+    parts,
     verify,
 )
-from iris_session.recording.footer import add_index
-from iris_session.recording.journal import FORMAT, VERIFIERS
-from iris_session.recording.paths import part_path
-from iris_session.recording.rrd_stream import bytes_column, duration_index, sequence_index
-from iris_session.recording.verify import _Run
+from iris_session.recording.verify import _compare_past
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd import file as rrd_file
+from iris_session.rrd import paths
+from iris_session.rrd.index import add_index
+from iris_session.rrd.paths import part_path
+from iris_session.rrd.stream import bytes_column, duration_index, sequence_index
 from tests.recording.support import SmallCore, journal, write
 
 
@@ -127,7 +128,7 @@ def test_damaged_message_is_skipped(path: Path) -> None:
 
 
 def test_damage_is_a_list_of_lines(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reader, "MOST_DAMAGE", 3)
+    monkeypatch.setattr(parts, "MOST_DAMAGE", 3)
     data = bytearray(path.read_bytes())
     for victim in [m for m in rrd_file.scan_file(path).messages if m.kind == rrd_file.KIND_ARROW][-12:-3]:
         for i in range(victim.offset + 60, victim.offset + victim.length, 7):
@@ -137,7 +138,7 @@ def test_damage_is_a_list_of_lines(path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert len(list(recording.rows())) > 20
         assert len(recording.damage) == 4
         assert len(set(recording.damage)) == 4
-        assert recording.damage[-1] == reader.MORE_DAMAGE
+        assert recording.damage[-1] == parts.MORE_DAMAGE
 
 
 def test_parts_are_one_recording_and_repeated_rows_count_once(tmp_path: Path) -> None:
@@ -310,8 +311,8 @@ def test_marks_that_overlap_are_not_all_computed(path: Path, monkeypatch: pytest
 def test_header_without_continued_file_is_a_problem(path: Path) -> None:
     with Recording.open(path) as recording:
         for name in ("", "..", "../session.rrd", "a\0b", "x" * 300):
-            run = _Run(recording, None, VerifyReport(str(path)))
-            run.compare(Continues(name, -1, b""))
+            run = Verification(recording.header, recording.root, iter(()), None, VerifyReport(str(path)))
+            _compare_past(run, Continues(name, -1, b""))
             assert "header" in run.report.problems[-1].text
 
 

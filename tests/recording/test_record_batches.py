@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from iris_session.recording.record_batches import ROW_ID, count_joined_rows, get_entity, group_spans, join_pieces
+from iris_session.rrd.batches import ROW_ID, count_joined_rows, get_entity, group_spans, join_pieces
 
 COLUMNS = ("a", "b", "c")
 

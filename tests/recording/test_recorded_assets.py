@@ -11,14 +11,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from iris_session.journal.messages import Batch, SceneAssets
 from iris_session.protocol.scene import SceneSpec, decode_scene, list_assets
-from iris_session.recording import Recording, rrd_file, summarise, verify
-from iris_session.recording.asset_queue import AssetQueue
-from iris_session.recording.footer import add_index
-from iris_session.recording.messages import Batch, SceneAssets
-from iris_session.recording.paths import part_path
+from iris_session.recording import Recording, summarise, verify
 from iris_session.recording.reader import check_assets
-from iris_session.recording.recorded_assets import (
+from iris_session.recording.repair import repair
+from iris_session.recording.writer import RrdWriter
+from iris_session.rrd import file as rrd_file
+from iris_session.rrd.assets import (
     ALL,
     NONE,
     SCENE,
@@ -26,12 +26,13 @@ from iris_session.recording.recorded_assets import (
     AssetFault,
     AssetJoiner,
     AssetPiece,
+    AssetQueue,
     RecordedScene,
     check_piece,
     list_recorded_assets,
 )
-from iris_session.recording.repair import repair
-from iris_session.recording.writer import RrdWriter
+from iris_session.rrd.index import add_index
+from iris_session.rrd.paths import part_path
 from iris_session.scene import AssetStore, decode_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.recording.support import SmallCore, journal

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from iris_session.journal.messages import Batch
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import IDENTITY, Lease, Pose
 from iris_session.protocol.entries import Entry, Join
@@ -22,7 +23,6 @@ from iris_session.protocol.server_messages import (
     PauseChanged,
 )
 from iris_session.recording import Recording, RecordingError, header_root, make_row
-from iris_session.recording.messages import Batch
 from iris_session.recording.records import (
     ID_FIELDS,
     ID_LIST_FIELDS,

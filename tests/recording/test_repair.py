@@ -10,14 +10,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from iris_session.journal.errors import RecorderError
+from iris_session.journal.rows import seal_blob
 from iris_session.recording import NotARecordingError, Recording, header_root, verify
-from iris_session.recording.errors import RecorderError
-from iris_session.recording.journal import seal_blob
 from iris_session.recording.lock import RecordingLock
-from iris_session.recording.paths import part_path
 from iris_session.recording.repair import RepairReport, repair
-from iris_session.recording.rerun_tool import INDEX, rewrite
-from iris_session.recording.rrd_file import KIND_STORE_INFO, scan_file
+from iris_session.rrd.file import KIND_STORE_INFO, scan_file
+from iris_session.rrd.paths import part_path
+from iris_session.rrd.rerun_tool import INDEX, rewrite
 from tests.recording.damage import STEPS, Original, check_cut, check_repair, flip_bits, make_original
 from tests.recording.support import SmallCore, journal, write
 
@@ -197,7 +197,7 @@ def test_running_session_is_not_repaired(original: Original, tmp_path: Path) -> 
     path = Path(shutil.copy(original.path, tmp_path))
     lock = RecordingLock(path, shared=True)
     try:
-        with pytest.raises(RecorderError, match="is being written by process"):
+        with pytest.raises(RecorderError, match="is being written"):
             repair(path, tmp_path / "repaired.rrd")
     finally:
         lock.release()

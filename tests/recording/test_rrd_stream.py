@@ -10,11 +10,11 @@ from typing import Any
 import psutil
 import pytest
 
+from iris_session.journal.errors import WriteError
+from iris_session.journal.messages import Batch, MetricRecord
 from iris_session.recording import Recording
-from iris_session.recording.errors import WriteError
-from iris_session.recording.messages import Batch, MetricRecord
-from iris_session.recording.rrd_file import scan_file
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd.file import scan_file
 from tests.recording.support import journal
 
 

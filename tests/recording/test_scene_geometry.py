@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from anchors.pose import apply, compose
+from iris_session.journal.messages import SceneAssets
 from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import pack_model
-from iris_session.recording import scene_geometry as scene
-from iris_session.recording.messages import SceneAssets
-from iris_session.recording.picture import build_components
 from iris_session.scene import AssetMissingError, AssetStore, EncodeOptions
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.viewer import scene_geometry as scene
+from iris_session.viewer.scene_layer import build_components
 from tests.models import ALOHA, PANDA
 from tests.recording.support import XML, make_header
 from tests.scene.models import LOOKS, SHAPES, every_shape

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from iris_session.journal.messages import DenialRecord
 from iris_session.protocol.common import IDENTITY, Alignment, Denial, Lease
 from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.server_messages import (
@@ -31,12 +32,12 @@ from iris_session.protocol.server_messages import (
     SceneChanged,
 )
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
-from iris_session.recording import Recording, RecordingSummary, rrd_file, summarise
-from iris_session.recording.messages import DenialRecord
-from iris_session.recording.paths import part_path
-from iris_session.recording.record_batches import DrawnVertices, FrameTime, RecordedStream, RowTimes
+from iris_session.recording import Recording, RecordingSummary, summarise
 from iris_session.recording.summary import SummaryBuilder
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd import file as rrd_file
+from iris_session.rrd.batches import DrawnVertices, FrameTime, RecordedStream, RowTimes
+from iris_session.rrd.paths import part_path
 from tests.recording.support import TICK_NS, journal
 from tests.recording.test_deformables import World
 from tests.recording.test_media import message

@@ -8,6 +8,8 @@ from typing import get_args
 
 import msgspec
 
+from iris_session.journal import environment as versions
+from iris_session.journal.messages import DenialRecord
 from iris_session.protocol.common import Alignment, Denial, Lease, Pose
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
@@ -40,10 +42,7 @@ from iris_session.protocol.server_messages import (
     SceneChanged,
     TipCalibrated,
 )
-from iris_session.recording import environment as versions
-from iris_session.recording.messages import DenialRecord
-from iris_session.recording.story import PALETTE, LogLine, SessionStory
-from iris_session.recording.writer import describe_denial, describe_session
+from iris_session.viewer.narration import PALETTE, EventNarration, LogLine, describe_denial, describe_session
 from tests.recording.support import make_header
 
 POSE = Pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
@@ -53,20 +52,20 @@ def lease(target: str, holder: str, previous: str = "", cause: str = "acquired")
     return LeaseChanged(Lease(target, "robot", "exclusive", holder, 4), cause, previous)
 
 
-def ann_and_bob() -> SessionStory:
-    story = SessionStory()
+def ann_and_bob() -> EventNarration:
+    story = EventNarration()
     story.add_people([ParticipantInfo("p1", "ann", "operator", True), ParticipantInfo("p2", "bob", "operator", True)])
     return story
 
 
-def tell(story: SessionStory, *bodies: EventKind) -> list[LogLine]:
+def tell(story: EventNarration, *bodies: EventKind) -> list[LogLine]:
     return [story.add(Event(i, i, i, body))[0] for i, body in enumerate(bodies)]
 
 
 def test_events_are_sentences_with_names() -> None:
     measured = Alignment(2, "measured", POSE, covariance=(0.5,) * 36, error_at_robot_m=0.0017)
     assert tell(
-        SessionStory(),
+        EventNarration(),
         ParticipantJoined(ParticipantInfo("p1", "ann", "operator", True)),
         ParticipantJoined(ParticipantInfo("p2", "bob", "observer", True)),
         AlignmentChanged("p1", measured),
@@ -151,7 +150,7 @@ def test_every_kind_of_event_has_a_line_without_ids() -> None:
         assert not {"p1", "p2"} & set(re.findall(r"\w+", line.text)), line.text
 
 
-def changes(story: SessionStory, *bodies: EventKind) -> list[tuple[str, str]]:
+def changes(story: EventNarration, *bodies: EventKind) -> list[tuple[str, str]]:
     """Return the changed lanes and their new states."""
     found = [change for body in bodies for change in story.add(Event(1, 1, 1, body))[1]]
     return [("/".join(change.lane), change.state) for change in found]
@@ -195,15 +194,15 @@ def test_states_that_last_are_lanes() -> None:
 
 def test_lanes_of_a_later_part_end_what_began_before_it() -> None:
     free = lease("left", "", "p1", "released")
-    assert changes(SessionStory(), free) == []
-    later = SessionStory(is_first=False)
+    assert changes(EventNarration(), free) == []
+    later = EventNarration(is_first=False)
     later.add_people([ParticipantInfo("p1", "ann", "operator", True)])
     assert changes(later, free) == [("robots/left/holder", "")]
     assert changes(later, ParticipantLeft("p1", "bye")) == [("alignment/ann", "")]
 
 
 def test_colours_follow_the_order_of_joining() -> None:
-    story = SessionStory()
+    story = EventNarration()
     (change,) = story.add(Event(1, 1, 1, lease("left", "p2")))[1]
     assert change.colours == {"p2": story.find_colour("p2")}
     assert len({story.find_colour(f"p{i}") for i in range(1, 8)}) == 7

@@ -10,11 +10,11 @@ from typing import Any
 import msgspec
 import pytest
 
+from iris_session.journal.rows import CRASHED, Keyframe, make_row, seal_keyframe
+from iris_session.journal.verification import Models
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry
 from iris_session.recording import Recording, SessionHeader, verify
-from iris_session.recording.journal import CRASHED, Keyframe, make_row, seal_keyframe
-from iris_session.recording.verify import Models
 from tests.recording.support import TICK_NS, SmallCore, journal, write
 
 

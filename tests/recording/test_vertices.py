@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.recording.feed import BYTES_PER_S, PERIOD_NS, VERTEX_BYTES, VertexRateLimit
+from iris_session.journal.feed import BYTES_PER_S, PERIOD_NS, VERTEX_BYTES, VertexRateLimit
 
 S = 1_000_000_000
 

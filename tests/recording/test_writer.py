@@ -11,6 +11,16 @@ import numpy as np
 import pytest
 
 from anchors.pose import apply
+from iris_session.journal.messages import (
+    Batch,
+    DenialRecord,
+    HoldRecord,
+    MetricRecord,
+    RobotLabels,
+    SceneAssets,
+    SceneModel,
+    StateFrame,
+)
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.common import Alignment, Applied, Denial, Lease, Pose
 from iris_session.protocol.scene import (
@@ -42,24 +52,14 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.protocol.specs import RobotSpec
 from iris_session.recording import CLOSED, OPEN, Recording, SessionHeader, pack_model
-from iris_session.recording import scene_geometry as scene
-from iris_session.recording.blueprint import place_eye
-from iris_session.recording.messages import (
-    Batch,
-    DenialRecord,
-    HoldRecord,
-    MetricRecord,
-    RobotLabels,
-    SceneAssets,
-    SceneModel,
-    StateFrame,
-)
-from iris_session.recording.paths import part_path
-from iris_session.recording.picture import build_components
-from iris_session.recording.scene_geometry import VisualShape
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd.paths import part_path
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.viewer import scene_geometry as scene
+from iris_session.viewer.blueprint import place_eye
+from iris_session.viewer.scene_geometry import VisualShape
+from iris_session.viewer.scene_layer import build_components
 from tests.recording.support import XML, column, journal, make_header, read
 from tests.scene.models import every_shape
 

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.demo.scenes import scene_path
+from iris_session.journal.messages import Batch, SceneModel
+from iris_session.journal.rows import pack_model, seal_keyframe
 from iris_session.physics.load import encode_model, load_model
 from iris_session.protocol.entries import Entry
 from iris_session.recording import CLOSED, OPEN, Continues, JournalRow, Keyframe, SessionHeader, header_root, make_row
-from iris_session.recording.journal import pack_model, seal_keyframe
-from iris_session.recording.messages import Batch, SceneModel
 from iris_session.recording.writer import RrdWriter
 from iris_session.session.core import SessionCore, read_plant_state
 from tests.session.play import TICK_NS, entries, make_core

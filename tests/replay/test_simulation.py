@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from iris_session.journal.rows import CRASHED
 from iris_session.recording import OPEN, Continues, Recording, make_row
-from iris_session.recording.journal import CRASHED
 from iris_session.replay.simulation import Replay, ReplayError, StepSelector
 from iris_session.session.core import CoreState, SessionCore
 from tests.replay.support import KEYFRAME_STEPS, Played, damaged, play

@@ -10,12 +10,12 @@ import pytest
 
 from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
+from iris_session.journal.rows import CRASHED
 from iris_session.physics.carrier import Carrier
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry, ExternalReset, Join, decode_entries
 from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
-from iris_session.recording.journal import CRASHED
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
 from iris_session.session.draft import Frame, SceneDraft
 from iris_session.session.errors import OwnershipError

@@ -9,13 +9,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.journal.messages import Batch
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import IDENTITY, Applied
 from iris_session.protocol.entries import AlignmentAlarm, Entry, Join
 from iris_session.protocol.server_messages import Event, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording import JournalRow, Keyframe, Recording, TrackingFrame, header_root, read_alignment_history
-from iris_session.recording.messages import Batch
 from iris_session.recording.writer import RrdWriter
 from iris_session.session.stepper import Stepper
 from tests.recording.support import make_header

@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from anchors.pose import IDENTITY_QUAT, PoseTuple
 from iris_session.authority import AuthorityConfig
 from iris_session.demo.scenes import scene_path
+from iris_session.journal.environment import read_boot_id
+from iris_session.journal.messages import Batch
+from iris_session.journal.rows import CRASHED, seal_keyframe
 from iris_session.physics import encode_model, load_model
 from iris_session.protocol.client_messages import Marker, MoveAnchor
 from iris_session.protocol.common import Applied, Pose
@@ -42,9 +45,6 @@ from iris_session.recording import (
     make_row,
     pack_model,
 )
-from iris_session.recording.environment import read_boot_id
-from iris_session.recording.journal import CRASHED, seal_keyframe
-from iris_session.recording.messages import Batch
 from iris_session.security.resume_tokens import ResumeTokens, encode_handback
 from iris_session.session import resume
 from iris_session.session.config import SessionConfig

@@ -24,7 +24,7 @@ from iris_session.protocol.client_messages import Control
 from iris_session.protocol.scene import AddVisual, RemoveVisual, SetVisual, encode_scene
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
 from iris_session.protocol.status import StatusReport
-from iris_session.recording.rrd_file import scan_file
+from iris_session.rrd.file import scan_file
 from iris_session.scene import AssetStore
 from iris_session.session import owner, processes
 from iris_session.session.core import read_plant_state

@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from iris_session.journal.feed import FeedStats
+from iris_session.journal.messages import RecorderStatus
 from iris_session.physics import Pacer
 from iris_session.protocol.client_messages import MoveAnchor, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose
@@ -15,8 +17,6 @@ from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import Event, Handover, ParticipantLeft
 from iris_session.protocol.status import AnchorReport, ParticipantReport, RecorderReport
 from iris_session.protocol.steps import Admitted, Decision
-from iris_session.recording.feed import FeedStats
-from iris_session.recording.messages import RecorderStatus
 from iris_session.session.config import SessionConfig
 from iris_session.session.ledger import MAX_HANDOVERS, SessionLedger
 from iris_session.session.processes import SessionProcesses

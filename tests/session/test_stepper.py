@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from iris_session.journal.messages import RobotLabels
+from iris_session.journal.rows import CRASHED, JournalRow, Keyframe, check_row
 from iris_session.link import messages as link_messages
 from iris_session.protocol.client_messages import Assign, Control, EStop, Marker
 from iris_session.protocol.common import Applied
 from iris_session.protocol.entries import HOST, Entry, ExternalReset, PhysicsDiverged, RecordingGap, decode_entries
 from iris_session.protocol.server_messages import BodyInfo, Gap, StateHeader
 from iris_session.protocol.steps import Decision
-from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, check_row
-from iris_session.recording.messages import RobotLabels
 from iris_session.session.errors import OwnershipError
 from iris_session.session.stepper import MAX_HOST_ENTRIES, RESERVED_HOST_ENTRIES, Stepper
 from tests.session.play import TICK_NS, entries, make_core

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 
+from iris_session.journal.messages import RecorderStatus
 from iris_session.recording import RecordingError
-from iris_session.recording.messages import RecorderStatus
 from iris_session.session.supervision import (
     HANGING_NS,
     HEALTHY_NS,

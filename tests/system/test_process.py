@@ -60,7 +60,7 @@ def test_session_imports_nothing_from_the_working_folder(module_traps: Path) -> 
 def test_probe_imports_nothing_from_the_working_folder(module_traps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(module_traps)
     done = subprocess.run(
-        process.module_command("iris_session.recording.probe"),
+        process.module_command("iris_session.rrd.probe"),
         env=process.child_environment(), input='["readable", "/none"]\n', capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert "for a module" not in done.stderr

@@ -13,6 +13,8 @@ from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import ClientError
 from iris_session.client.identity import Identity
 from iris_session.front.state_publisher import StatePublisher
+from iris_session.journal import rows as journal
+from iris_session.journal.messages import decode_header
 from iris_session.link import SceneInfo
 from iris_session.link.messages import decode_decided
 from iris_session.protocol.client_messages import Heartbeat, Hello
@@ -27,8 +29,6 @@ from iris_session.protocol.server_messages import (
     ServerEnvelope,
     Welcome,
 )
-from iris_session.recording import journal
-from iris_session.recording.messages import decode_header
 from iris_session.security import KeysError
 from iris_session.security.allow_list import AllowList
 from iris_session.security.curve import load_public

@@ -13,16 +13,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.journal.messages import DenialRecord, EndMark, SceneModel, decode_scene
+from iris_session.journal.rows import JournalRow, Keyframe, open_blob
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.common import Applied
 from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
-from iris_session.recording import paths
-from iris_session.recording.journal import JournalRow, Keyframe, open_blob
-from iris_session.recording.messages import DenialRecord, EndMark, SceneModel, decode_scene
-from iris_session.recording.recorded_assets import RECORD_ASSETS, AssetFault, AssetPiece, RecordedScene, check_piece
-from iris_session.recording.rrd_file import Mark
+from iris_session.rrd import paths
+from iris_session.rrd.assets import RECORD_ASSETS, AssetFault, AssetPiece, RecordedScene, check_piece
+from iris_session.rrd.file import Mark
 
 #: Errors of decoding bytes that mean something else; the last one is Arrow's, for types that it cannot convert.
 UNREADABLE: Final = (msgspec.DecodeError, LookupError, TypeError, ValueError, ArithmeticError, NotImplementedError)

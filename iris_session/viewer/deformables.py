@@ -13,13 +13,13 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Deformable
-from iris_session.recording.scene_geometry import Pixels, Rgba8, to_rgba8
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.arrays import require_array
 from iris_session.scene.mesh_processing import normalise
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
+from iris_session.viewer.scene_geometry import Pixels, Rgba8, to_rgba8
 
 #: Fields of the checker pattern along the longest side of a surface, and the grey of the dark ones.
 CHECKERS: Final = 6

@@ -21,20 +21,8 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from iris_session.protocol.common import Applied
-from iris_session.protocol.server_messages import (
-    BodyInfo,
-    ParticipantChanged,
-    ParticipantInfo,
-    ParticipantJoined,
-    ParticipantLeft,
-    PresenceItem,
-    Reply,
-)
-from iris_session.protocol.steps import Decision
-from iris_session.recording import messages
-from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, seal_keyframe
-from iris_session.recording.messages import (
+from iris_session.journal import messages
+from iris_session.journal.messages import (
     Batch,
     DenialRecord,
     HoldRecord,
@@ -46,6 +34,18 @@ from iris_session.recording.messages import (
     StateFrame,
     VertexFrame,
 )
+from iris_session.journal.rows import JournalRow, Keyframe, SessionHeader, seal_keyframe
+from iris_session.protocol.common import Applied
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    ParticipantChanged,
+    ParticipantInfo,
+    ParticipantJoined,
+    ParticipantLeft,
+    PresenceItem,
+    Reply,
+)
+from iris_session.protocol.steps import Decision
 from iris_session.streams.deformable import read_header
 
 _T = TypeVar("_T")

@@ -17,11 +17,12 @@ from typing import Any
 import pytest
 import rerun.chunk
 
-from iris_session.recording import NotARecordingError, Recording, footer, rrd_file, verify
-from iris_session.recording.footer import add_index, start_indexing
-from iris_session.recording.probe import Prober
-from iris_session.recording.rerun_tool import find_rerun
-from iris_session.recording.rrd_file import END_MESSAGE, FILE_TAIL, scan_file
+from iris_session.recording import NotARecordingError, Recording, parts, verify
+from iris_session.rrd import file as rrd_file
+from iris_session.rrd import index as footer
+from iris_session.rrd.file import END_MESSAGE, FILE_TAIL, scan_file
+from iris_session.rrd.index import add_index, start_indexing
+from iris_session.rrd.rerun_tool import find_rerun
 from tests.recording.support import SmallCore, journal, recorder, wait_until, write
 
 STEPS = 200
@@ -73,7 +74,7 @@ def test_indexed_file_reads_and_verifies_like_before(closed: Path, indexed: Path
     with Recording.open(closed) as before, Recording.open(indexed) as after:
         assert list(after.rows()) == list(before.rows())
         assert (after.finished, after.damage, after.notes) == (True, [], [])
-        assert after._rewritten == set(), "it is no copy of Rerun's tools"
+        assert after._parts.rewritten == set(), "it is no copy of Rerun's tools"
     report = verify(indexed, SmallCore)
     assert report.ok, report.line()
     assert report.finished
@@ -221,11 +222,11 @@ def test_file_may_get_its_index_while_its_chunks_are_read(
 
 
 def test_file_may_get_its_index_while_it_is_opened(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def answer(prober: Prober, name: str) -> bool:
+    def answer(name: str) -> bool:
         monkeypatch.undo()
         return not add_index(name)
 
-    monkeypatch.setattr(Prober, "is_readable", answer)
+    monkeypatch.setattr(parts, "is_readable", answer)
     with Recording.open(path) as recording:
         assert has_index(path)
         assert (recording.damage, len(list(recording.rows()))) == ([], STEPS)

@@ -10,10 +10,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from iris_session.recording import paths
-from iris_session.recording.messages import RobotLabels
-from iris_session.recording.plots import GRIPPER, JOINTS, KINDS, TIP_SPEED, get_robot_entity
-from iris_session.recording.story import CRITICAL, ERROR, INFO, WARN
+from iris_session.journal.messages import RobotLabels
+from iris_session.rrd import paths
+from iris_session.viewer.narration import CRITICAL, ERROR, INFO, WARN
+from iris_session.viewer.plots import GRIPPER, JOINTS, KINDS, TIP_SPEED, get_robot_entity
 
 #: Eye of the 3D view, from the point that it looks at; this point, from the centre of the box of the bodies: below, so
 #: that people in front of them are seen too. Both in halves of the diagonal of the box, which is at least so long [m].

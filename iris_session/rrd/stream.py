@@ -21,7 +21,7 @@ import pyarrow as pa  # type: ignore[import-untyped]
 import rerun as rr
 from numpy.typing import NDArray
 
-from iris_session.recording.rrd_file import END_MESSAGE, FILE_HEAD, MAGIC, Mark, find_end
+from iris_session.rrd.file import END_MESSAGE, FILE_HEAD, MAGIC, Mark, find_end
 
 #: The stream's own batcher never acts: the writer sends whole columns, and `write` collects them.
 _BATCHER: Final = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)

@@ -1,4 +1,4 @@
-"""Picture of participants in a recording: heads and hands at the poses that the session had of them, names at robots,
+"""Participants and anchors in the viewer: heads and hands at the poses that the session had of them, names at robots,
 and the anchors that headsets are aligned to.
 
 A device is drawn at an entity of its own, which `MotionRows` moves. It appears with its first pose, and is cleared when
@@ -12,14 +12,14 @@ from typing import Any, Final, NamedTuple
 
 import rerun as rr
 
+from iris_session.journal.messages import StateFrame
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import PresenceItem
-from iris_session.recording import paths
-from iris_session.recording.messages import StateFrame
-from iris_session.recording.picture import escape_entity_part
-from iris_session.recording.story import FREE, Rgb, SessionStory
-from iris_session.recording.timelines import Moment, set_moment
+from iris_session.rrd import paths
+from iris_session.viewer.narration import FREE, EventNarration, Rgb
+from iris_session.viewer.scene_layer import escape_entity_part
+from iris_session.viewer.timelines import Moment, set_moment
 
 #: A device without a pose for so long is not drawn: it is not tracked any more [ns].
 STALE_NS: Final = 250_000_000
@@ -58,13 +58,13 @@ class _Shown(NamedTuple):
     label: str
 
 
-class PeoplePicture:
+class ParticipantLayer:
     """Devices of participants in one file. `is_first`: the file is no later part, whose robots may have holders."""
 
-    def __init__(self, recording: rr.RecordingStream, story: SessionStory, *, is_first: bool) -> None:
+    def __init__(self, recording: rr.RecordingStream, narration: EventNarration, *, is_first: bool) -> None:
         self._rec = recording
         self._is_first = is_first
-        self._story = story
+        self._narration = narration
         self._shown: dict[_Key, _Shown] = {}
         self._bases: dict[str, Base] = {}
 
@@ -115,12 +115,12 @@ class PeoplePicture:
     def _label(self, key: _Key) -> str:
         if key[1] != Device.HEAD:
             return ""
-        person = self._story.find_person(key[0])
+        person = self._narration.find_person(key[0])
         return f"{person.name} · {person.role}" if person.role else person.name
 
     def _draw_device(self, key: _Key, label: str, moment: Moment) -> None:
         """Draw a box for a head, with an arrow in the direction of view, and a ball for a hand."""
-        colours = [self._story.find_colour(key[0])]
+        colours = [self._narration.find_colour(key[0])]
         solid = rr.components.FillMode.Solid
         set_moment(self._rec, moment)
         if key[1] == Device.HEAD:
@@ -142,7 +142,7 @@ class PeoplePicture:
         self._rec.reset_time()
 
 
-class AnchorPicture:
+class AnchorLayer:
     """Anchors: axes at `T_world_anchor`, a label, and the stated error of the alignments to them as a ball.
 
     The error is that of the person whose alignment is worst: 95 % of the positions at the anchor are within it.

@@ -1,22 +1,20 @@
-"""Damaged Rerun files: find the readable messages of a file that was cut short or changed, without altering it.
+"""Rerun files: list their messages without decoding them, read chunks, and find bytes that were changed.
 
-An RRD file is a 12-byte header and messages of a 16-byte head (kind, length; little-endian uint64) and a body. Rerun's
-reader stops or aborts at the first body it cannot decode; this module makes a temporary copy of the readable messages.
+An RRD file is a 12-byte header and messages of a 16-byte head (kind, length; little-endian uint64) and a body. What
+cannot be decoded is found by `salvage.py`.
 """
 
 from __future__ import annotations
 
 import os
 import struct
-import tempfile
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
 
-from iris_session.recording.errors import NotARecordingError
-from iris_session.recording.probe import Prober
+from iris_session.journal.errors import NotARecordingError
 
 MAGIC: Final = b"RRF2"
 FILE_HEAD: Final = 12
@@ -38,8 +36,6 @@ ID_BYTES: Final = 160
 #: Number of messages that are written twice when a file is closed: the last mark, and the end of the journal.
 CLOSING: Final = 2
 _CHANGED: Final = "bytes {} to {} are not as they were written"
-#: Number of messages tested together; a group that fails is halved until the bad messages are isolated.
-GROUP: Final = 256
 #: Bytes searched at a time for messages after a damaged one.
 WINDOW_BYTES: Final = 1 << 20
 
@@ -57,7 +53,7 @@ class Scan(NamedTuple):
 
     `cut`: the file ends in the middle of a message, as after a kill or a full disk. Bytes after the end message do not
     belong to the file, except the tail after an index. `indexed`: the file ends with Rerun's index: it was made by one
-    of Rerun's tools, from one file or several, or it is a recorder's, with the index of `footer.py`.
+    of Rerun's tools, from one file or several, or it is a recorder's, with the index of `index.py`.
     """
 
     messages: list[RrdMessage]
@@ -203,9 +199,9 @@ def _crc(file: BinaryIO, mark: Mark) -> int:
 
 
 def read_chunks(path: str | Path, entities: str | Sequence[str]) -> Iterator[Any]:
-    """Yield the chunks of one entity or several in the order of the file. The file must be readable, see `Prober`.
+    """Yield the chunks of one entity or several in the order of the file. The file must be readable, see `is_readable`.
 
-    `/clouds/**` stands for all entities below `/clouds`. An index (`footer.py`) may be added meanwhile.
+    `/clouds/**` stands for all entities below `/clouds`. An index (`index.py`) may be added meanwhile.
 
     Raises `NotARecordingError` if the file can no longer be read.
     """
@@ -239,55 +235,6 @@ def get_size(path: str | Path) -> int:
         return -1
 
 
-def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
-    """Write the readable messages of `path` to `copy`. Return a line per omission.
-
-    Raises `NotARecordingError` if nothing is readable.
-    """
-    found = scan_file(path)
-    damage = [f"bytes {begin} to {end} hold no message and are left out" for begin, end in found.holes]
-    if found.good_bytes < found.size and not found.cut:
-        damage.append(f"nothing after byte {found.good_bytes} of {found.size} is readable")
-    messages = [m for m in found.messages if m.kind != KIND_END]
-    infos = [m for m in messages if m.kind == KIND_STORE_INFO]
-    with open(path, "rb") as file, tempfile.TemporaryDirectory() as folder:
-        # A recorder's file has the first of them twice: one that is damaged is left out like any other message.
-        bad = _Trial(file, [], Path(folder) / "trial.rrd", prober).bad_ones(infos)
-        infos = [m for m in infos if m not in bad]
-        if not infos:
-            raise NotARecordingError(f"{path} holds no recording that can be read")
-        trial = _Trial(file, infos, Path(folder) / "trial.rrd", prober)
-        others = [m for m in messages if m.kind != KIND_STORE_INFO]
-        for i in range(0, len(others), GROUP):
-            bad += trial.bad_ones(others[i : i + GROUP])
-        damage += [f"message of {m.length} bytes at byte {m.offset} is damaged and left out" for m in bad]
-        refused = {m.offset for m in bad}
-        _write(file, [m for m in messages if m.offset not in refused], Path(copy))
-    return damage if damage or found.cut else ["the footer is damaged: read without it"]
-
-
-class _Trial:
-    """Search for the messages of `file` that do not decode, by halving groups of them."""
-
-    def __init__(self, file: BinaryIO, infos: Sequence[RrdMessage], path: Path, prober: Prober) -> None:
-        self._file = file
-        self._infos = infos
-        self._path = path
-        self._prober = prober
-
-    def passes(self, group: Sequence[RrdMessage]) -> bool:
-        _write(self._file, [*self._infos, *group], self._path)
-        return self._prober.is_readable(self._path)
-
-    def bad_ones(self, group: Sequence[RrdMessage]) -> list[RrdMessage]:
-        if self.passes(group):
-            return []
-        if len(group) == 1:
-            return list(group)
-        half = len(group) // 2
-        return self.bad_ones(group[:half]) + self.bad_ones(group[half:])
-
-
 def read_message_head(data: bytes) -> tuple[int, int]:
     """Return kind and length of the message that `data` begins with."""
     kind, length = _HEAD.unpack_from(data)
@@ -304,6 +251,13 @@ def find_store_id(message: bytes, store: int) -> bytes:
     return head[at + 4 : at + 4 + head[at + 3]] if 0 <= at < len(head) - 3 else b""
 
 
+def count_recordings(path: str | Path, found: Scan) -> int:
+    """Return the number of recordings in a file."""
+    with open(path, "rb") as file:
+        infos = [read_message(file, message) for message in found.messages if message.kind == KIND_STORE_INFO]
+    return len({find_store_id(info, RECORDING) for info in infos} - {b""})
+
+
 def read_message(file: BinaryIO, message: RrdMessage) -> bytes:
     """Return head and body of a message of an open file."""
     file.seek(message.offset)
@@ -312,13 +266,7 @@ def read_message(file: BinaryIO, message: RrdMessage) -> bytes:
 
 def copy_messages(path: str | Path, messages: Sequence[RrdMessage], copy: str | Path) -> None:
     """Write messages of a file to `copy`."""
-    with open(path, "rb") as file:
-        _write(file, messages, Path(copy))
-
-
-def _write(file: BinaryIO, messages: Sequence[RrdMessage], path: Path) -> None:
-    file.seek(0)
-    with open(path, "wb") as out:
+    with open(path, "rb") as file, open(copy, "wb") as out:
         out.write(file.read(FILE_HEAD))
         for message in messages:
             out.write(read_message(file, message))

@@ -11,21 +11,18 @@ point clouds and pictures of cameras; the messages are in `front.media.recorder`
 
 from __future__ import annotations
 
-import signal
 import struct
 from typing import Final
 
 import msgspec
 
+from iris_session.journal.rows import JournalRow, Keyframe, SessionHeader
 from iris_session.protocol.codec import make_decoder
 from iris_session.protocol.common import Applied, Count, Denial, Name, Nanoseconds
 from iris_session.protocol.server_messages import BodyInfo, Event, ParticipantInfo, PresenceItem
-from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
 
 #: Prefix of the line on standard error with the reason why the recorder ended; other lines are Rerun's.
 FAULT_PREFIX: Final = "recorder: "
-#: Signal by which a session tells its recorder to finish the file. SIGTERM may come from anybody.
-FINISH_SIGNAL: Final = signal.SIGUSR1
 
 
 class RecorderConfig(msgspec.Struct, frozen=True):

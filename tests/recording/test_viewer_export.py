@@ -11,15 +11,15 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from iris_session.recording import NotARecordingError, Recording, view_copy
+from iris_session.journal.rows import Continues
+from iris_session.recording import NotARecordingError, Recording, viewer_export
 from iris_session.recording.folders import find_recordings, list_session_files
-from iris_session.recording.footer import add_index
-from iris_session.recording.journal import Continues
 from iris_session.recording.lock import RecordingLock
-from iris_session.recording.rerun_tool import RerunToolError, find_rerun
-from iris_session.recording.rrd_file import scan_file
-from iris_session.recording.view_copy import open_view_file
+from iris_session.recording.viewer_export import open_view_file
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd.file import scan_file
+from iris_session.rrd.index import add_index
+from iris_session.rrd.rerun_tool import RerunToolError, find_rerun
 from iris_session.system.files import Replacement
 from tests.recording.support import column, journal, read, write
 
@@ -151,7 +151,7 @@ def test_folder_that_cannot_be_written_gets_no_copy(path: Path, monkeypatch: pyt
                 raise PermissionError(errno.EACCES, "Permission denied")
             super().__init__(target, permissions=None)
 
-    monkeypatch.setattr(view_copy, "Replacement", Refusing)
+    monkeypatch.setattr(viewer_export, "Replacement", Refusing)
     with open_view_file(path) as view:
         assert (view.made, view.kept) == (True, False)
         assert "Permission denied" in view.notes[0]
@@ -165,7 +165,8 @@ def test_failure_leaves_the_old_copy(path: Path, tmp_path: Path, monkeypatch: py
         before = view.path.read_bytes()
     os.utime(path)
     tool = tmp_path / "tool"
-    tool.write_text("#!/bin/sh\necho part\necho 'Error: it broke' >&2\nexit 3\n")
+    reads = f'[ $2 = verify ] && exec {find_rerun()} "$@"'
+    tool.write_text(f"#!/bin/sh\n{reads}\necho part\necho 'Error: it broke' >&2\nexit 3\n")
     tool.chmod(0o755)
     monkeypatch.setenv("RERUN_CLI_PATH", str(tool))
     with pytest.raises(RerunToolError, match="it broke"), open_view_file(path):
@@ -176,7 +177,7 @@ def test_failure_leaves_the_old_copy(path: Path, tmp_path: Path, monkeypatch: py
 
 
 def test_short_memory_makes_an_index_only(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view_copy, "MEMORY_SHARE", 0.0)
+    monkeypatch.setattr(viewer_export, "MEMORY_SHARE", 0.0)
     n_messages = len(scan_file(path).messages)
     with open_view_file(path) as view:
         assert len(scan_file(view.path).messages) == n_messages
@@ -187,7 +188,7 @@ def test_small_file_with_an_index_needs_no_copy(path: Path, monkeypatch: pytest.
     assert add_index(path)
     with open_view_file(path) as view:
         assert (view.path, view.made) == (path, False)
-    monkeypatch.setattr(view_copy, "DIRECT_BYTES", 1000)
+    monkeypatch.setattr(viewer_export, "DIRECT_BYTES", 1000)
     with open_view_file(path) as view:
         assert view.path != path
 

@@ -1,4 +1,4 @@
-"""Story of a session as its events tell it: sentences for the log, and lanes of states over time. Pure.
+"""Narration of a session by its events: sentences for the log, and lanes of states over time. Pure.
 
 Participants go by name here, ids are in the data. A lane shows one thing that lasts: the holder of a robot, its clutch,
 the reason why it holds, the alignment of a participant, who has an object, e-stop, pause, and the episode.
@@ -11,6 +11,9 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
+from iris_session.journal.messages import DenialRecord
+from iris_session.journal.rows import CLOSED as CLASS_CLOSED
+from iris_session.journal.rows import SessionHeader
 from iris_session.protocol.common import Alignment
 from iris_session.protocol.names import AlignmentKind, HoldReason
 from iris_session.protocol.server_messages import (
@@ -129,7 +132,7 @@ class Person(NamedTuple):
     worn: bool = True
 
 
-class SessionStory:
+class EventNarration:
     """State of a session as far as its events tell it. Give it every event, in order.
 
     `is_first`: the file is no later part of a recording, in whose lanes something may be in force from the start.
@@ -399,3 +402,37 @@ def _to_device(device: str) -> str:
 
 def _join_fields(fields: dict[str, Any]) -> str:
     return " ".join(f"{name}={value}" for name, value in fields.items() if value not in ("", None, [], ()))
+
+
+# --- other texts for the viewer --------------------------------------------------------------------------------------
+
+
+def describe_denial(record: DenialRecord) -> LogLine:
+    """Return the log line of a denial: connection, reason, message, holder and advice."""
+    denial = record.denial
+    parts = [f"connection {record.connection}: {denial.reason}: {denial.message}"]
+    if denial.holder:
+        parts.append(f"held by {denial.holder_name or denial.holder}")
+    if denial.advice:
+        parts.append(denial.advice)
+    return LogLine(WARN, "; ".join(parts))
+
+
+def describe_session(header: SessionHeader, narration: EventNarration | None = None, duration_s: float = 0.0) -> str:
+    """Return a Markdown page about the recording. `narration`: at its end; `None`: it begins."""
+    versions = "\n".join(f"| {name} | {value} |" for name, value in header.versions.items())
+    parts = [f"# {header.session_name}"]
+    if narration is not None:
+        people = ", ".join(f"**{name}** ({role})" for name, role in narration.roles.items()) or "No one joined"
+        counts = f"{duration_s:.1f} s, handovers: {narration.handovers}, episodes: {narration.episodes}"
+        parts.append(f"{people}. {counts}.")
+    parts += [
+        f"Robots: {', '.join(r.name for r in header.robots) or 'none'}. "
+        f"Objects: {', '.join(o.name for o in header.objects) or 'none'}. "
+        f"Bodies: {len(header.bodies)}. Tick: {header.tick_period_ns / 1e6:g} ms.",
+        f"Recorded {header.created_utc}, class **{header.recording_class}**: `iris-session verify FILE` simulates "
+        + ("it again." if header.recording_class == CLASS_CLOSED else "decisions and control again."),
+        f"Session `{header.session_id}`",
+        f"| library | version |\n|---|---|\n{versions}\n",
+    ]
+    return "\n\n".join(parts)

@@ -17,12 +17,12 @@ from typing import BinaryIO, Final
 import msgspec
 import psutil
 
-from iris_session.recording import paths, rrd_file
-from iris_session.recording.errors import NotARecordingError, RecorderError
+from iris_session.journal.errors import NotARecordingError, RecorderError
 from iris_session.recording.folders import list_session_files, split_file_name
-from iris_session.recording.lost_motion import open_with_lost_motion
 from iris_session.recording.reader import Recording
-from iris_session.recording.rerun_tool import INDEX, OPTIMIZE, rewrite
+from iris_session.rrd import file as rrd_file
+from iris_session.rrd import paths
+from iris_session.rrd.rerun_tool import INDEX, OPTIMIZE, rewrite
 from iris_session.system.files import Replacement
 
 #: Memory that `rerun rrd optimize` takes for each byte, and the share of the free memory that it may take. A session
@@ -84,8 +84,7 @@ def open_view_file(path: Path, progress: Callable[[int, int], None] | None = Non
     with ExitStack() as temporary:
         with ExitStack() as opened:
             recordings, damage, notes = _open_recordings(files, opened)
-            parts = [part for recording in recordings for part in recording.readable_files]
-            sources = opened.enter_context(open_with_lost_motion(parts))
+            sources = [part for recording in recordings for part in recording.readable_files]
             read = tuple(Path(file) for recording in recordings for file in recording.files)
             kept = True
             try:
@@ -127,7 +126,7 @@ def _open_recordings(files: Sequence[Path], stack: ExitStack) -> tuple[list[Reco
         recordings.append(recording)
         damage += recording.missing + recording.damage
         notes += recording.notes + recording.cuts
-        if recording.writers:
+        if recording.is_being_written:
             notes.append(f"{file.name} is still being written: the copy shows it as it is now")
     if not recordings:
         raise NotARecordingError(damage[0])

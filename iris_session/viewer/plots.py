@@ -13,11 +13,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from iris_session.recording import paths
-from iris_session.recording.messages import RobotLabels, StateFrame
-from iris_session.recording.picture import escape_entity_part
-from iris_session.recording.story import SessionStory
-from iris_session.recording.timelines import Moment, to_time_columns
+from iris_session.journal.messages import RobotLabels, StateFrame
+from iris_session.rrd import paths
+from iris_session.viewer.narration import EventNarration
+from iris_session.viewer.scene_layer import escape_entity_part
+from iris_session.viewer.timelines import Moment, to_time_columns
 
 JOINTS: Final = "joints"
 GRIPPER: Final = "gripper"
@@ -66,9 +66,9 @@ MAX_NAMED: Final = 4096
 class MetricPlots:
     """Metrics: one entity for each, below the entity of its kind."""
 
-    def __init__(self, recording: rr.RecordingStream, story: SessionStory) -> None:
+    def __init__(self, recording: rr.RecordingStream, narration: EventNarration) -> None:
         self._rec = recording
-        self._story = story
+        self._narration = narration
         self._named: set[str] = set()
         self._rows: dict[str, list[tuple[Moment, float]]] = {}
         self._held: dict[str, float] = {}
@@ -103,14 +103,14 @@ class MetricPlots:
         known = KINDS.get(kind)
         if known is None:
             return
-        name = self._story.find_person(subject).name if known.of_people else subject
-        colours = [self._story.find_colour(subject)] if known.of_people else None
+        name = self._narration.find_person(subject).name if known.of_people else subject
+        colours = [self._narration.find_colour(subject)] if known.of_people else None
         steps = rr.components.InterpolationMode.StepAfter if kind in HELD else None
         series = rr.SeriesLines(names=[known.label.format(name)], colors=colours, interpolation_mode=steps)
         self._rec.log(entity, series, static=True, strict=True)
 
-    def write(self, now: Moment) -> int:
-        """Write what was collected. Values that are held reach until `now`. Return the number of chunks."""
+    def write(self, now: Moment) -> None:
+        """Write what was collected. Values that are held reach until `now`."""
         for entity, value in self._held.items() if now.session_ns > self._held_until_ns else ():
             rows = self._rows.setdefault(entity, [])
             if not rows or rows[-1][0].session_ns < now.session_ns:
@@ -121,7 +121,6 @@ class MetricPlots:
             times = to_time_columns(np.array([moment for moment, _ in rows], np.int64).T)
             columns = rr.Scalars.columns(scalars=[value for _, value in rows])
             rr.send_columns(entity, times, [*columns], recording=self._rec, strict=True)
-        return len(collected)
 
 
 class RobotPlots:
@@ -164,10 +163,10 @@ class RobotPlots:
             return np.full(len(tips), np.nan)
         return np.asarray(np.linalg.norm(tips - before[1], axis=1) / elapsed_s)
 
-    def write(self) -> int:
-        """Write what was collected. Return the number of chunks."""
+    def write(self) -> None:
+        """Write what was collected."""
         if not self._times:
-            return 0
+            return
         times, values = np.concatenate(self._times, axis=1), np.concatenate(self._values)
         self._times.clear()
         self._values.clear()
@@ -180,7 +179,6 @@ class RobotPlots:
             at += len(labels)
             self._send(robot, GRIPPER, [f"opening{of} [0 to 1]"], times, values[:, [n + i]])
             self._send(robot, TIP_SPEED, [f"tip speed{of} [m/s]"], times, values[:, [n + len(self.robots) + i]])
-        return 3 * len(self.robots)
 
     def _send(
         self, robot: RobotLabels, name: str, labels: list[str], times: NDArray[np.int64], values: NDArray[np.float64]

@@ -18,7 +18,7 @@ import rerun as rr
 from iris_session.protocol.codec import decode_media_header
 from iris_session.protocol.media import MAX_IMAGE_SIZE, MAX_STREAMS, MediaHeader, StreamInfo, is_stream_name
 from iris_session.protocol.names import AssetEncoding, BudgetClass, MediaEncoding
-from iris_session.recording import paths
+from iris_session.rrd import paths
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.images import read_stated_size
 from iris_session.streams.cloud import CloudFrame, decode_cloud

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import IDENTITY_POSE, PoseTuple, apply, compose, inverse
+from iris_session.journal.messages import RobotLabels, SceneAssets
+from iris_session.journal.rows import unpack_model
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import ArrayKind, AssetEncoding, GeometryKind, TextureKind
 from iris_session.protocol.scene import Deformable, Geometry, Rgba, SceneSpec, Visual, decode_scene
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import RobotSpec
-from iris_session.recording.journal import unpack_model
-from iris_session.recording.messages import RobotLabels, SceneAssets
 from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
 from iris_session.scene.cube_maps import Atlas, CubeMapReader, bake_cube_map, direction_scale
 from iris_session.scene.shapes import (

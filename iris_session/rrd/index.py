@@ -1,8 +1,8 @@
-"""Add Rerun's index, the footer, to a closed file: `python -m iris_session.recording.footer FILE MAX_BYTES`.
+"""Add Rerun's index, the footer, to a closed file: `python -m iris_session.rrd.index FILE MAX_BYTES`.
 
 With an index, Rerun's viewer loads what it shows; without, it reads all of a file first, and says meanwhile that
 loading has failed. The recorder writes none, because it would have to keep some 4 KB of every chunk. The chunks stay
-small and many: of a long session the copy of `view_copy.py` opens several times faster.
+small and many: of a long session the copy of `recording/viewer_export.py` opens several times faster.
 
 `rerun rrd filter` writes the messages of a file as they are, with an index behind them. That output is compared with
 the file byte by byte, and only then is the empty end message replaced by one with the index: everything before it stays
@@ -16,7 +16,6 @@ idle: neither the end of this session nor the next one waits for it. It takes ab
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -24,11 +23,11 @@ from typing import IO, BinaryIO, Final
 
 import psutil
 
-from iris_session.recording.errors import RecordingError
-from iris_session.recording.rerun_tool import INDEX, find_rerun, make_environment
-from iris_session.recording.rrd_file import END_MESSAGE, FILE_TAIL, FOOT, KIND_END, read_message_head, scan_file
+from iris_session.journal.errors import RecordingError
+from iris_session.rrd.file import END_MESSAGE, FILE_TAIL, FOOT, KIND_END, read_message_head, scan_file
+from iris_session.rrd.rerun_tool import INDEX, start_rrd
 from iris_session.system.priority import LAST_NICE, LOW_PRIORITY_NICE
-from iris_session.system.process import DEVNULL, ChildProcess
+from iris_session.system.process import DEVNULL, PIPE, ChildProcess
 
 #: Memory that `rerun rrd filter` takes for each message, and the share of the free memory that it may take.
 MESSAGE_BYTES: Final = 20_000
@@ -48,7 +47,7 @@ def start_indexing(path: str, max_bytes: int = 0) -> ChildProcess:
     `max_bytes`: bytes that the file may have with it; 0: any number.
     """
     return ChildProcess(
-        "iris_session.recording.footer",
+        "iris_session.rrd.index",
         [path, str(max_bytes)],
         config=b"",
         stdout=DEVNULL,
@@ -91,10 +90,7 @@ def _make_index(path: str | Path, file: BinaryIO, end: int) -> bytes:
 
     `end`: offset of the file's end message.
     """
-    command = [find_rerun(), "rrd", INDEX, str(Path(path).absolute())]
-    with subprocess.Popen(
-        command, stdin=DEVNULL, stdout=subprocess.PIPE, stderr=DEVNULL, env=make_environment()
-    ) as tool:
+    with start_rrd(INDEX, str(Path(path).absolute()), stdout=PIPE) as tool:
         try:
             assert tool.stdout is not None
             if not _is_same(file, tool.stdout, end):

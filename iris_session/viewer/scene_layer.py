@@ -19,15 +19,16 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple
+from iris_session.journal.messages import RobotLabels, SceneAssets
 from iris_session.protocol.scene import SceneSpec, Visual
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import RobotSpec
-from iris_session.recording import paths, scene_geometry
-from iris_session.recording.deformables import DrawnDeformable
-from iris_session.recording.messages import RobotLabels, SceneAssets
-from iris_session.recording.scene_geometry import SceneReader, VisualShape
-from iris_session.recording.timelines import Moment, set_moment, to_time_columns
+from iris_session.rrd import paths
 from iris_session.scene import SceneBuildError
+from iris_session.viewer import scene_geometry
+from iris_session.viewer.deformables import DrawnDeformable
+from iris_session.viewer.scene_geometry import SceneReader, VisualShape
+from iris_session.viewer.timelines import Moment, set_moment, to_time_columns
 
 #: Number of escaped names that are kept: Rerun takes longer for one than the recorder for all else of a row.
 MAX_ESCAPED: Final = 8192
@@ -56,7 +57,7 @@ class _Drawn(NamedTuple):
     shown: bool
 
 
-class ScenePicture:
+class SceneLayer:
     """Geometry of the scenes of one file. `is_first`: the file is no later part, which begins where others end.
 
     `deformables`: deformables of the present scene, by stream. `since_ns`: session time [ns] from which the present
@@ -65,7 +66,6 @@ class ScenePicture:
 
     def __init__(self, recording: rr.RecordingStream, *, is_first: bool = True) -> None:
         self._rec = recording
-        self._rec.set_log_time_enabled(False)
         self._is_first = is_first
         self._number = 0
         self._entities: dict[str, str] = {}
@@ -285,10 +285,10 @@ class MotionRows:
         indices = np.array([self._indices.setdefault(entity, len(self._indices)) for entity in entities], np.intp)
         self._parts.append((indices[which], times, poses))
 
-    def write(self) -> int:
-        """Write what was collected. Return the number of chunks."""
+    def write(self) -> None:
+        """Write what was collected."""
         if not self._parts:
-            return 0
+            return
         which = np.concatenate([part[0] for part in self._parts])
         order = np.argsort(which, kind="stable")
         times = np.concatenate([part[1] for part in self._parts], axis=1)[:, order]
@@ -300,10 +300,8 @@ class MotionRows:
                 columns = rr.Transform3D.columns(translation=rows[:, :3], quaternion=rows[:, [4, 5, 6, 3]])
                 times_of = to_time_columns(times[:, begin:end])
                 rr.send_columns(entity, times_of, [*columns], recording=self._rec, strict=True)
-        n = len(self._indices)
         self._indices.clear()
         self._parts.clear()
-        return n
 
 
 def build_components(form: VisualShape, rgba: scene_geometry.Rgba8, T_frame_visual: PoseTuple) -> list[Any]:

@@ -1,0 +1,302 @@
+"""Files of a recording, opened for reading: parts in order, temporary copies of damaged ones, and their rows.
+
+Nothing here knows what a row means: `reader.py` gives the decoders. The header is read here, because it tells which
+files belong together.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import zlib
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from itertools import pairwise
+from typing import Any, Final, TypeVar
+
+import msgspec
+
+from iris_session.journal.errors import NotARecordingError
+from iris_session.journal.messages import decode_header, decode_header_copy
+from iris_session.journal.rows import FORMAT, VERIFIERS, SessionHeader, blob_root, open_blob, unpack_model
+from iris_session.recording.lock import is_being_written
+from iris_session.rrd import batches, paths
+from iris_session.rrd import file as rrd_file
+from iris_session.rrd.batches import UNREADABLE, count_joined_rows, get_entity, group_spans, join_pieces
+from iris_session.rrd.rerun_tool import is_readable
+from iris_session.rrd.salvage import salvage
+
+_T = TypeVar("_T")
+#: Maximum number of lines in `damage`: a file may be damaged in any number of places.
+MOST_DAMAGE: Final = 200
+MORE_DAMAGE: Final = "and more of it is damaged than is listed here"
+#: Messages at the end of a file among which a recorder's last mark is: it, the end of the journal, and the end message.
+LAST_MESSAGES: Final = 8
+#: Upper bound of the items that a new part repeats: the content of the feed's window, minutes of rows.
+REPEATED_ITEMS: Final = 200_000
+
+
+class RecordingParts:
+    """Parts of a recording, open for reading until `close`.
+
+    Attributes:
+        files: Paths of the parts, in order; parts that cannot be read are left out.
+        unreadable_files: Those of which nothing can be read.
+        readable: Files that the parts are read from: a temporary copy of a damaged part.
+        rewritten: Those of `readable` that Rerun's tools have written.
+        damage: One line per place that could not be read, at most `MOST_DAMAGE`. Reading on may add lines.
+        missing: One line per missing part, or range of parts.
+        notes: One line per empty part and per file that holds more than one recording.
+        cuts: One line per part that ends in the middle of a write, as a kill leaves it.
+        is_being_written: A process was writing the recording when it was opened. What it has written so far is read,
+            from a copy.
+        header: The header of the session.
+        root: Chain value (16 bytes) before the first row.
+    """
+
+    def __init__(self, files: Sequence[str]) -> None:
+        """Open files.
+
+        Raises:
+            NotARecordingError: They hold no session header, or were recorded in another format.
+        """
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self.files: list[str] = []
+        self.unreadable_files: list[str] = []
+        self.readable: list[str] = []
+        self.rewritten: set[str] = set()
+        self.damage: list[str] = []
+        self.missing: list[str] = []
+        self.notes: list[str] = []
+        self.cuts: list[str] = []
+        self.is_being_written = is_being_written(paths.split_part(files[0])[0])
+        several: list[tuple[str, int]] = []  # files with more than one recording in them
+        try:
+            for path in files:
+                self._add_part(path, several)
+            self.header, self.root = self._read_header(files[0])
+        except BaseException:
+            self.close()
+            raise
+        one = f"session {self.header.session_name!r} of {self.header.created_utc or 'an unknown day'}"
+        for name, n in several:
+            self.notes.append(f"{name} holds {n} recordings: only {one} is read; make a file of each of the others")
+        self._find_missing(files)
+
+    def close(self) -> None:
+        """Remove the temporary copies of damaged parts. May be called twice."""
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+
+    def iterate_unique(
+        self, entities: str | Sequence[str], decode: Callable[[Any], Iterator[_T]], key: Callable[[_T], Hashable]
+    ) -> Iterator[_T]:
+        """Yield the items of all parts; what a part repeats from the end of the previous one counts once.
+
+        A file that Rerun's tools have rewritten may hold several parts: in it, every repeated item counts once.
+        """
+        before: frozenset[Hashable] = frozenset()
+        tail: deque[Hashable] = deque(maxlen=REPEATED_ITEMS)
+        seen: set[Hashable] = set()  # those keys in `tail` that came from a rewritten file
+        part = 0
+        for i, item in self.iterate(entities, decode):
+            if i != part:
+                part, before = i, frozenset(tail)
+            name = key(item)
+            if name in before or name in seen:
+                continue
+            if self.readable[i] in self.rewritten:
+                if len(tail) == REPEATED_ITEMS:
+                    seen.discard(tail[0])
+                seen.add(name)
+            tail.append(name)
+            yield item
+
+    def iterate(self, entities: str | Sequence[str], decode: Callable[[Any], Iterator[_T]]) -> Iterator[tuple[int, _T]]:
+        """Yield part number and item. Undecodable items are skipped with the rest of their chunk, see `damage`."""
+        for i, pieces in self._iterate_spans(entities):
+            try:
+                yield from ((i, item) for item in decode(join_pieces(pieces)))
+            except UNREADABLE as error:
+                place = f"{os.path.basename(self.files[i])}: {get_entity(pieces[0])}"
+                self._record_damage(f"{place} holds something damaged, which is left out: {_format_error(error)}")
+
+    def count_rows(self, entity: str) -> int:
+        """Return the number of rows of an entity; repeated rows count again."""
+        return sum(count_joined_rows(pieces) for _, pieces in self._iterate_spans(entity))
+
+    def _iterate_spans(self, entities: str | Sequence[str]) -> Iterator[tuple[int, list[Any]]]:
+        """Yield part number (from 0) and the record batches of some rows of one entity, over all parts in order."""
+        for i, path in enumerate(self.readable):
+            for pieces in group_spans(chunk.to_record_batch() for chunk in rrd_file.read_chunks(path, entities)):
+                yield i, pieces
+
+    def _add_part(self, path: str, several: list[tuple[str, int]]) -> None:
+        """Add a part, if readable. A part without content (its recorder ended before the first write) is only noted."""
+        try:
+            found = rrd_file.scan_file(path) if os.path.getsize(path) else None
+            if found is None or not (found.messages or found.holes):
+                self.notes.append(f"{os.path.basename(path)}: nothing was written into it")
+                return
+            if self.is_being_written:
+                self.readable.append(self._copy_start(path, found.good_bytes))
+                self.files.append(path)
+                return
+            if found.cut:
+                self.cuts.append(f"{os.path.basename(path)}: ends in the middle of a write, at byte {found.good_bytes}")
+            whole = found.good_bytes == found.size and not found.holes and _is_readable(path, found)
+            readable = path if whole else self._salvage(path)
+        except NotARecordingError as error:
+            self._record_damage(str(error))
+            self.unreadable_files.append(path)
+            return
+        except OSError as error:
+            self._record_damage(f"{path} cannot be read: {error.strerror or error}")
+            return
+        if found.indexed and not (whole and self._is_of_recorder(path, found)):
+            self.rewritten.add(readable)
+            if whole and (n := rrd_file.count_recordings(path, found)) > 1:
+                several.append((os.path.basename(path), n))
+        self.readable.append(readable)
+        self.files.append(path)
+
+    def _is_of_recorder(self, path: str, found: rrd_file.Scan) -> bool:
+        """Return whether a readable file with an index is a recorder's: one of its last marks is where it says."""
+        last = found.messages[-LAST_MESSAGES:]
+        infos = [m for m in found.messages[:-LAST_MESSAGES] if m.kind == rrd_file.KIND_STORE_INFO]
+        with self._copying(path) as copy:
+            rrd_file.copy_messages(path, [*infos, *(m for m in last if m.kind != rrd_file.KIND_END)], copy)
+        places = {m.offset for m in last}
+        with suppress(*UNREADABLE, NotARecordingError):
+            for chunk in rrd_file.read_chunks(copy, paths.MARKS):
+                if any(mark.end in places for mark in batches.decode_marks(chunk.to_record_batch())):
+                    return True
+        return False
+
+    def _copy_start(self, path: str, n_bytes: int) -> str:
+        """Copy the whole messages of a part that is being written: they stay the same while it is read."""
+        with self._copying(path) as copy, open(path, "rb") as source, open(copy, "wb") as target:
+            while n_bytes > 0 and (data := source.read(min(n_bytes, 1 << 20))):
+                target.write(data)
+                n_bytes -= len(data)
+        return copy
+
+    @contextmanager
+    def _copying(self, path: str) -> Iterator[str]:
+        """Yield the path of a temporary copy. Raises `NotARecordingError` if it cannot be written."""
+        try:
+            if self._folder is None:
+                self._folder = tempfile.TemporaryDirectory(prefix="iris-recording-")
+            yield os.path.join(self._folder.name, os.path.basename(path))
+        except OSError as error:
+            said = f"a temporary copy of {os.path.basename(path)} cannot be written: {error.strerror or error}"
+            raise NotARecordingError(said) from error
+
+    def _salvage(self, path: str) -> str:
+        with self._copying(path) as copy:
+            damage = salvage(path, copy)
+        self._record_damage(*(f"{os.path.basename(path)}: {line}" for line in damage))
+        return copy
+
+    def _record_damage(self, *lines: str) -> None:
+        """Add lines to `damage`, each once, up to `MOST_DAMAGE`."""
+        for line in lines:
+            if len(self.damage) <= MOST_DAMAGE and line not in self.damage:
+                self.damage.append(line if len(self.damage) < MOST_DAMAGE else MORE_DAMAGE)
+
+    def _find_missing(self, files: Sequence[str]) -> None:
+        """Note gaps in the part numbers of `files` (in order). A name may hold any number, so a gap is one line."""
+        base = os.path.basename(paths.split_part(files[0])[0])
+        numbers = [paths.split_part(path)[1] for path in files]
+        for before, after in pairwise(numbers):
+            first, last = paths.part_path(base, before + 1), paths.part_path(base, after - 1)
+            if after == before + 2:
+                self.missing.append(f"{first} is missing")
+            elif after > before + 2:
+                self.missing.append(f"{first} to {last} are missing")
+
+    def _iterate_blobs(self, entity: str) -> Iterator[tuple[int, bytes, bool]]:
+        """Yield part, header and whether its bytes are as written. It is near the beginning, so reading is short."""
+        for i, path in enumerate(self.readable):
+            chunk = next(rrd_file.read_chunks(path, entity), None)
+            if chunk is not None:
+                with suppress(*UNREADABLE):
+                    yield i, *open_blob(batches.read_values(chunk.to_record_batch(), "blob")[0])
+
+    def _read_header(self, path: str) -> tuple[SessionHeader, bytes]:
+        """Return the header, and the chain value that it gives."""
+        changed: tuple[SessionHeader, bytes] | None = None
+        fault = ""
+        for _, blob, intact in self._iterate_blobs(paths.HEADER):
+            try:
+                header = decode_header(blob)
+            except UNREADABLE as error:
+                fault = fault or _format_error(error)
+                continue
+            if not intact:
+                changed = changed or (header, blob_root(blob))
+                continue
+            if header.format != FORMAT:
+                had = f"{path} was recorded in format {header.format} on {header.created_utc[:10] or 'an unknown day'}"
+                right = VERIFIERS.get(header.format, "the one that made it")
+                raise NotARecordingError(
+                    f"{had}, this iris-session reads format {FORMAT}: verify or resume it with {right}"
+                )
+            self._leave_out_others(blob_root(blob))
+            return header, blob_root(blob)
+        found = self._restore_header(changed)
+        if found is not None:
+            return found
+        if fault:
+            raise NotARecordingError(f"the header of {path} is damaged: {fault}")
+        if self.is_being_written and not self.unreadable_files:
+            raise NotARecordingError(f"{path} is being written, and holds nothing to read yet")
+        said = self.damage + self.notes
+        why = f" ({said[0]})" if said else " (nothing was recorded, or it is not ours)"
+        raise NotARecordingError(f"{path} holds no session header{why}: give the .rrd file of a session")
+
+    def _restore_header(self, changed: tuple[SessionHeader, bytes] | None) -> tuple[SessionHeader, bytes] | None:
+        """Return the header from its copy, with the model of `changed`, the header whose bytes were changed, if that
+        is whole. Without a copy, as in files of earlier versions, return `changed`.
+        """
+        for _, blob, intact in self._iterate_blobs(paths.HEADER_COPY):
+            with suppress(*UNREADABLE):
+                copy = decode_header_copy(blob)
+                if not intact or copy.header.format != FORMAT:
+                    continue
+                model = b"" if changed is None else changed[0].model
+                try:
+                    unpack_model(model)
+                    lost = ""
+                except zlib.error:
+                    model, lost = b"", ", which has no model: the session cannot be simulated again"
+                self._record_damage(f"header: damaged, and read from its copy{lost}")
+                self._leave_out_others(copy.root)
+                return msgspec.structs.replace(copy.header, model=model), copy.root
+        if changed is not None:
+            self._record_damage("header: its bytes were changed (checksum)")
+        return changed
+
+    def _leave_out_others(self, root: bytes) -> None:
+        """Leave out parts with another header: files of another session that were moved into this folder."""
+        for i, blob, intact in reversed(list(self._iterate_blobs(paths.HEADER))):
+            if intact and blob_root(blob) != root:
+                self._record_damage(f"{os.path.basename(self.files[i])} is of another session, and left out")
+                del self.files[i], self.readable[i]
+
+
+def _is_readable(path: str, found: rrd_file.Scan) -> bool:
+    """Return whether a file decodes. One that got its index while it was read is read again."""
+    if not is_readable(path) and (rrd_file.get_size(path) == found.size or not is_readable(path)):
+        return False
+    try:
+        next(rrd_file.read_chunks(path, paths.HEADER), None)  # checks the index
+    except NotARecordingError:
+        return False
+    return True
+
+
+def _format_error(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,0 +1,529 @@
+"""Assets in a recording: what clients draw its scenes of, so that it can be shown where the original files are not.
+
+The file has a row per scene, with the hash of its specification, and each asset once, in pieces. An asset is known by
+its SHA-256, so every reader finds changed bytes. What `list_recorded_assets` returns is what a whole file has.
+
+`AssetQueue` reads assets of the session's store for the recorder, `AssetJoiner` and `AssetCollector` join and check
+them when a file is read, and `export_assets` writes them into a folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, Final, NamedTuple
+
+import msgspec
+
+from iris_session.assets.store import AssetStore
+from iris_session.journal.errors import RecordingError
+from iris_session.journal.messages import SceneAssets
+from iris_session.protocol.assets import MAX_ASSET_BYTES, is_address
+from iris_session.protocol.scene import MAX_SCENE_BYTES, MeshLevel, SceneError, SceneSpec, TextureLevel, decode_scene
+from iris_session.system.files import write_output
+
+#: What is recorded of each scene: its hash, what a client at the best level of detail needs, or all levels.
+NONE: Final = "none"
+SCENE: Final = "scene"
+ALL: Final = "all"
+RECORD_ASSETS: Final = (NONE, SCENE, ALL)
+SPECIFICATION: Final = "specification of the scene"
+#: Upper bound of the number of assets whose faults and names are kept: a hostile file may name any number.
+MOST_ASSETS: Final = 1 << 20
+#: Largest piece [bytes].
+PIECE_BYTES: Final = 512 << 10
+#: Time between the specifications of two patches [ns]: of patches in between, the last is recorded. The picture has
+#: all of them, and the journal.
+PATCH_PERIOD_NS: Final = 1_000_000_000
+#: Upper bound of what waits: scenes, and assets of them.
+MOST_SCENES: Final = 256
+MOST_QUEUED: Final = 1 << 16
+SCENES_FILE: Final = "scenes.json"
+#: Nothing is removed from a folder to make room.
+_NO_LIMIT: Final = 1 << 62
+
+
+class RecordedScene(NamedTuple):
+    """A scene or a patched one.
+
+    Attributes:
+        step: Newest step before it was loaded or patched; -1: the session began with it.
+        session_time: Session time of that step [ns].
+        hash: SHA-256 of its specification, as 64 hex digits: the asset to begin with.
+        recorded: What the session was to record of it: `none`, `scene` or `all`.
+    """
+
+    step: int
+    session_time: int
+    hash: str
+    recorded: str
+
+
+class AssetPiece(NamedTuple):
+    """Some bytes of an asset, from `offset` on, of `total`. `is_scene`: the asset is the specification of a scene."""
+
+    address: str
+    offset: int
+    total: int
+    is_scene: bool
+    data: bytes
+
+
+class AssetFault(NamedTuple):
+    """An asset that could not be recorded, and why."""
+
+    address: str
+    text: str
+
+
+class AssetsSummary(msgspec.Struct, frozen=True):
+    """Assets in a recording.
+
+    `recorded`: `none`, `scene` or `all`; empty if the file has no word of assets: it was made by an earlier version, or
+    the session shared no scene. `scenes`: number of scenes and patched scenes. `expected`: number of assets that belong
+    to them, as far as their specifications are there; `present`, `bytes`: those that are whole, and their size.
+    `left_out`: one line per asset that could not be recorded.
+    """
+
+    recorded: str = ""
+    scenes: int = 0
+    expected: int = 0
+    present: int = 0
+    bytes: int = 0
+    left_out: tuple[str, ...] = ()
+
+
+def list_recorded_assets(spec: SceneSpec, recorded: str) -> dict[str, str]:
+    """Return the assets of a scene besides its specification: address, and name for people, each once.
+
+    Args:
+        spec: The scene.
+        recorded: `NONE`, `SCENE` (the finest level of each mesh and texture) or `ALL`.
+    """
+    found: dict[str, str] = {}
+    if recorded == NONE:
+        return found
+    for i, one in enumerate(spec.hfields):
+        found.setdefault(one.address, f"height field {one.name or i}")
+    for i, deformable in enumerate(spec.deformables):
+        found.setdefault(deformable.address, f"deformable {deformable.name or i}")
+    ladders: list[tuple[str, Sequence[MeshLevel | TextureLevel]]] = []
+    ladders += [(f"mesh {mesh.name or i}", mesh.levels) for i, mesh in enumerate(spec.meshes)]
+    ladders += [(f"texture {texture.name or i}", texture.levels) for i, texture in enumerate(spec.textures)]
+    for depth in range(max((len(levels) for _, levels in ladders), default=0) if recorded == ALL else 1):
+        for name, levels in ladders:
+            if depth < len(levels):
+                found.setdefault(levels[depth].address, f"{name}, level {depth}" if depth else name)
+    return found
+
+
+class AssetJoiner:
+    """Joins the pieces of assets, which a recorder writes one asset after the other.
+
+    Attributes:
+        whole: Assets that were there with the right bytes, with their sizes.
+        broken: Assets that were there otherwise only: `changed` or `incomplete`.
+    """
+
+    def __init__(self) -> None:
+        self.whole: dict[str, int] = {}
+        self.broken: dict[str, str] = {}
+        self._address = ""
+        self._parts: list[bytes] = []
+        self._n_bytes = 0
+
+    def add(self, piece: AssetPiece) -> bytes | None:
+        """Add the next piece. Return the asset if it is whole now, and was not before."""
+        if piece.offset == 0:
+            self.end()
+            self._address, self._parts, self._n_bytes = piece.address, [], 0
+        if piece.address in self.whole:
+            self._address = ""
+            return None
+        if piece.address != self._address or piece.offset != self._n_bytes:  # a piece before it is lost
+            self.end()
+            self._set_broken(piece.address, "incomplete")
+            return None
+        self._parts.append(piece.data)
+        self._n_bytes += len(piece.data)
+        if self._n_bytes < piece.total:
+            return None
+        data = b"".join(self._parts)
+        self._address, self._parts = "", []
+        if hashlib.sha256(data).hexdigest() != piece.address:
+            self._set_broken(piece.address, "changed")
+            return None
+        self.broken.pop(piece.address, None)
+        if len(self.whole) < MOST_ASSETS:
+            self.whole[piece.address] = len(data)
+        return data
+
+    def end(self) -> None:
+        """Note the asset whose last pieces have not come."""
+        if self._address:
+            self._set_broken(self._address, "incomplete")
+        self._address, self._parts = "", []
+
+    def _set_broken(self, address: str, why: str) -> None:
+        if len(self.broken) < MOST_ASSETS:
+            self.broken[address] = why
+
+
+class AssetCollector:
+    """Compares the assets of a recording with what its scenes need. Takes items in any order but that of pieces."""
+
+    def __init__(self) -> None:
+        self._joiner = AssetJoiner()
+        self._scenes: dict[str, str] = {}  # what was to be recorded, by hash
+        self._changes: set[RecordedScene] = set()
+        self._names: dict[str, dict[str, str]] = {SCENE: {}, ALL: {}}
+        self._faults: dict[str, str] = {}
+
+    def add(self, item: RecordedScene | AssetPiece | AssetFault) -> None:
+        """Add an item of the recording. A part that repeats an item of the one before changes nothing."""
+        if isinstance(item, AssetPiece):
+            data = self._joiner.add(item)
+            if data is not None and item.is_scene:
+                self._read_scene(data)
+        elif isinstance(item, RecordedScene):
+            if len(self._changes) < MOST_ASSETS:
+                self._changes.add(item)
+                self._scenes[item.hash] = item.recorded
+        elif len(self._faults) < MOST_ASSETS:
+            self._faults[item.address] = item.text
+
+    def _read_scene(self, data: bytes) -> None:
+        if len(data) > MAX_SCENE_BYTES:
+            return
+        try:
+            spec = decode_scene(data)
+        except SceneError:  # its hash is right, so it was so in the session too: of another version
+            return
+        for recorded, names in self._names.items():
+            names.update(list_recorded_assets(spec, recorded))
+
+    def _list_expected(self) -> dict[str, str]:
+        """Return the assets that are to be in the file, with their names."""
+        expected = {scene: SPECIFICATION for scene, recorded in self._scenes.items() if recorded != NONE}
+        for recorded in set(self._scenes.values()):
+            expected.update(self._names.get(recorded, {}))
+        return expected
+
+    def summarise(self) -> AssetsSummary:
+        """Return the summary of what was added."""
+        expected, whole = self._list_expected(), self._joiner.whole
+        present = [size for address, size in whole.items() if address in expected]
+        left_out = tuple(
+            f"{_describe(expected, address)}: {text}" for address, text in self._faults.items() if address not in whole
+        )
+        recorded = next((kind for kind in reversed(RECORD_ASSETS) if kind in self._scenes.values()), "")
+        return AssetsSummary(recorded, len(self._changes), len(expected), len(present), sum(present), left_out)
+
+    def list_problems(self, *, finished: bool) -> list[str]:
+        """Return a line per asset that is damaged or missing, without those that could not be recorded.
+
+        Args:
+            finished: Recorders closed all files. One that was killed may have left assets to be written, and the next
+                one gets the newest scene only.
+        """
+        self._joiner.end()
+        expected, broken = self._list_expected(), self._joiner.broken
+        missing = [one for one in expected if one not in self._joiner.whole and one not in broken] if finished else []
+        damaged = {one: why for one, why in broken.items() if why == "changed" or finished}
+        lines = {**damaged, **dict.fromkeys(missing, "missing")}
+        return [
+            f"{_describe(expected, address)} {_WORDS[why]}"
+            for address, why in lines.items()
+            if address not in self._faults
+        ]
+
+
+_WORDS: Final = {
+    "changed": "is not as it was written: its bytes have another hash",
+    "incomplete": "is not whole: some of its bytes are missing",
+    "missing": "is missing",
+}
+
+
+def _describe(names: dict[str, str], address: str) -> str:
+    name = names.get(address)
+    return f"asset {address[:12]}" + (f" ({name[:80]})" if name else "")
+
+
+def check_piece(piece: AssetPiece) -> AssetPiece:
+    """Return a piece of a file. Raises `ValueError` if its address or numbers cannot be right."""
+    if not is_address(piece.address):
+        raise ValueError(f"{piece.address[:80]!r} is no address of an asset")
+    if not 0 <= piece.offset <= piece.offset + len(piece.data) <= piece.total <= MAX_ASSET_BYTES:
+        raise ValueError(f"bytes {piece.offset} and following of an asset of {piece.total} bytes")
+    return piece
+
+
+# --- assets on their way into a file ----------------------------------------------------------------------------------
+
+
+class AssetRows(NamedTuple):
+    """Rows of the three entities of assets that are to be written next."""
+
+    scenes: list[RecordedScene]
+    pieces: list[AssetPiece]
+    faults: list[AssetFault]
+
+
+@dataclass
+class _Waiting:
+    """A scene whose specification is not written yet."""
+
+    scene: SceneAssets
+    is_patch: bool
+
+
+@dataclass
+class _Reading:
+    """An asset that is being read."""
+
+    address: str
+    root: str
+    file: BinaryIO
+    total: int
+    is_scene: bool
+    offset: int = 0
+    digest: Any = field(default_factory=hashlib.sha256)
+    parts: list[bytes] = field(default_factory=list)  # of a specification
+
+
+class AssetQueue:
+    """Assets of the scenes of a session that are not in the file yet.
+
+    Args:
+        recorded: `none`, `scene` or `all`.
+        limit_bytes: Bytes of assets that the file may have; further ones are left out.
+
+    Attributes:
+        left_out: Number of assets that could not be recorded.
+        is_ending: Patches come no more, so none is waited for.
+    """
+
+    def __init__(self, recorded: str = NONE, limit_bytes: int | None = None) -> None:
+        self.left_out = 0
+        self.is_ending = False
+        self._recorded = recorded
+        self._room_bytes = limit_bytes
+        self._scenes: deque[_Waiting] = deque()
+        self._due_ns = 0
+        self._wanted: deque[tuple[str, str]] = deque()  # roots and addresses
+        self._known: set[str] = set()
+        self._reading: _Reading | None = None
+
+    def __bool__(self) -> bool:
+        """Return whether something waits to be written."""
+        return bool(self._scenes or self._wanted or self._reading)
+
+    def add_scene(self, scene: SceneAssets, *, is_patch: bool) -> None:
+        """Add a scene, or a patched one, which replaces a patched one that still waits."""
+        if not (scene.root and is_address(scene.scene_hash)):
+            return  # no assets are shared
+        if is_patch and self._scenes and self._scenes[-1].is_patch:
+            self._scenes.pop()
+        if len(self._scenes) >= MOST_SCENES:
+            self._scenes.popleft()
+            self.left_out += 1
+        self._scenes.append(_Waiting(scene, is_patch))
+
+    def read(self, now_ns: int, max_bytes: int) -> AssetRows:
+        """Return the next rows.
+
+        Args:
+            now_ns: Session time.
+            max_bytes: Bytes of assets in them.
+        """
+        rows = AssetRows([], [], [])
+        left = max_bytes
+        while left > 0 and (self._reading is not None or self._open_next(now_ns, rows)):
+            left -= self._read_piece(min(left, PIECE_BYTES), rows)
+        self.left_out += len(rows.faults)
+        return rows
+
+    def close(self, why: str) -> AssetRows:
+        """Give up what waits. Return rows that say so."""
+        rows = AssetRows([], [], [])
+        if self._reading is not None:
+            rows.faults.append(AssetFault(self._reading.address, why))
+            self._end_reading()
+        for waiting in self._scenes:
+            scene = waiting.scene
+            rows.scenes.append(RecordedScene(scene.step, scene.session_time, scene.scene_hash, self._recorded))
+            if self._recorded != NONE and scene.scene_hash not in self._known:
+                rows.faults.append(AssetFault(scene.scene_hash, why))
+        rows.faults.extend(AssetFault(address, why) for _, address in self._wanted)
+        self._scenes.clear()
+        self._wanted.clear()
+        self.left_out += len(rows.faults)
+        return rows
+
+    def _open_next(self, now_ns: int, rows: AssetRows) -> bool:
+        """Begin with the next asset, a specification before all others: it may be replaced in the store soon."""
+        while self._scenes and (self.is_ending or now_ns >= self._due_ns or not self._scenes[0].is_patch):
+            scene = self._scenes.popleft().scene
+            self._due_ns = now_ns + PATCH_PERIOD_NS
+            rows.scenes.append(RecordedScene(scene.step, scene.session_time, scene.scene_hash, self._recorded))
+            known = scene.scene_hash in self._known
+            self._known.add(scene.scene_hash)
+            if self._recorded != NONE and not known and self._open(scene.root, scene.scene_hash, rows, is_scene=True):
+                return True
+        while self._wanted:
+            if self._open(*self._wanted.popleft(), rows, is_scene=False):
+                return True
+        return False
+
+    def _open(self, root: str, address: str, rows: AssetRows, *, is_scene: bool) -> bool:
+        try:
+            file, total = AssetStore(root).open_file(address)
+        except (OSError, ValueError) as error:
+            rows.faults.append(AssetFault(address, f"it cannot be read: {getattr(error, 'strerror', None) or error}"))
+            return False
+        most = MAX_SCENE_BYTES if is_scene else MAX_ASSET_BYTES
+        if total > most:
+            why = f"it has {total} bytes, at most {most} are read"
+        elif self._room_bytes is not None and total > self._room_bytes:
+            why = "the budget of the recording has no room for it"
+        else:
+            self._reading = _Reading(address, root, file, total, is_scene)
+            return True
+        file.close()
+        rows.faults.append(AssetFault(address, why))
+        return False
+
+    def _read_piece(self, n_bytes: int, rows: AssetRows) -> int:
+        """Read the next piece. Return its bytes, at least 1."""
+        one = self._reading
+        assert one is not None
+        n_bytes = min(n_bytes, one.total - one.offset)
+        data, why = b"", "its file is shorter than it was"
+        try:
+            data = one.file.read(n_bytes)
+        except OSError as error:
+            why = error.strerror or str(error)
+        if len(data) < n_bytes:
+            rows.faults.append(AssetFault(one.address, f"it cannot be read: {why}"))
+            self._end_reading()
+            return 1
+        rows.pieces.append(AssetPiece(one.address, one.offset, one.total, one.is_scene, data))
+        one.offset += len(data)
+        one.digest.update(data)
+        if one.is_scene:
+            one.parts.append(data)
+        if self._room_bytes is not None:
+            self._room_bytes -= len(data)
+        if one.offset == one.total:
+            self._finish(one, rows)
+        return max(1, len(data))
+
+    def _finish(self, one: _Reading, rows: AssetRows) -> None:
+        """Check an asset that was read, and add the assets that a specification names."""
+        self._end_reading()
+        if one.digest.hexdigest() != one.address:
+            rows.faults.append(AssetFault(one.address, "it was damaged in the store"))
+            return
+        if not one.is_scene:
+            return
+        try:
+            spec = decode_scene(b"".join(one.parts))
+        except SceneError as error:
+            rows.faults.append(AssetFault(one.address, str(error)))
+            return
+        for address in list_recorded_assets(spec, self._recorded):
+            if address in self._known:
+                continue
+            if len(self._wanted) >= MOST_QUEUED:
+                rows.faults.append(AssetFault(address, "too many assets"))
+                continue
+            self._known.add(address)
+            self._wanted.append((one.root, address))
+
+    def _end_reading(self) -> None:
+        if self._reading is not None:
+            with suppress(OSError):
+                self._reading.file.close()
+        self._reading = None
+
+
+# --- export into a folder ---------------------------------------------------------------------------------------------
+
+
+class AssetExportError(RecordingError):
+    """The assets cannot be written to the given place, or there are none."""
+
+
+class AssetExport(msgspec.Struct, frozen=True):
+    """Result of an export.
+
+    `folder`: the asset store. `scenes`, `assets`, `bytes`: how much is in it. `damage`: one line per asset that is
+    damaged or missing. `left_out`: one line per asset that was not recorded.
+    """
+
+    folder: str
+    scenes: int
+    assets: int
+    bytes: int
+    damage: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def export_assets(
+    root: Path,
+    found: AssetCollector,
+    assets: Iterable[tuple[str, bytes]],
+    scenes: Iterable[RecordedScene],
+    *,
+    finished: bool,
+    force: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> AssetExport:
+    """Write assets and scenes into a folder, from which the scenes can be shown on any machine.
+
+    The folder is an asset store (`AssetStore`): each asset is a file that has its hash as its name. `scenes.json` lists
+    the scenes in order, each with the hash of its specification.
+
+    Args:
+        root: The folder; it is made if it does not exist.
+        found: What the recording has.
+        assets: Hash and bytes of its whole assets.
+        scenes: Its scenes, in order.
+        finished: See `AssetCollector.list_problems`.
+        force: Write into a folder that is not empty.
+        progress: Called with a text that says how far it is.
+
+    Returns:
+        What was written, and what is damaged or missing.
+
+    Raises:
+        AssetExportError: The folder is not empty or cannot be written, or the recording has no assets.
+        NotARecordingError: A file can no longer be read.
+    """
+    summary = found.summarise()
+    if not summary.present:
+        why = "its session was to record none" if summary.recorded else "it has no word of them"
+        raise AssetExportError(f"the recording holds no assets: {why}")
+    try:
+        if root.exists() and not root.is_dir():
+            raise AssetExportError(f"{root} is no folder: give one that is empty or does not exist")
+        if not force and root.exists() and any(root.iterdir()):
+            raise AssetExportError(f"the folder {root} is not empty: give another one, or --force")
+        store, n, n_bytes = AssetStore(root, _NO_LIMIT), 0, 0
+        for address, data in assets:
+            store.find(address)  # removes a damaged file of an earlier export, which `put` would take for the asset
+            store.put(data)
+            n, n_bytes = n + 1, n_bytes + len(data)
+            progress(f"{n:,} assets, {n_bytes / 1e6:.1f} MB")
+        listed = [{"step": one.step, "time_s": one.session_time * 1e-9, "hash": one.hash} for one in scenes]
+        write_output(root / SCENES_FILE, json.dumps({"scenes": listed}, indent=1).encode())
+    except OSError as error:
+        raise AssetExportError(f"{root} cannot be written: {error.strerror or error}") from error
+    damage = tuple(found.list_problems(finished=finished))
+    return AssetExport(str(root), len(listed), n, n_bytes, damage, summary.left_out)
