@@ -124,6 +124,7 @@ def _export_assets(arguments: argparse.Namespace) -> int:
         Recording.open(arguments.path, warn=False) as recording,
     ):
         report = export_assets(
+            recording.files[0],
             arguments.out,
             check_assets(recording),
             recording.assets(),

@@ -40,19 +40,11 @@ REPEATED_ITEMS: Final = 200_000
 class RecordingParts:
     """Parts of a recording, open for reading until `close`.
 
+    Attributes that are not described here are those of `Recording`.
+
     Attributes:
-        files: Paths of the parts, in order; parts that cannot be read are left out.
-        unreadable_files: Those of which nothing can be read.
         readable: Files that the parts are read from: a temporary copy of a damaged part.
         rewritten: Those of `readable` that Rerun's tools have written.
-        damage: One line per place that could not be read, at most `MOST_DAMAGE`. Reading on may add lines.
-        missing: One line per missing part, or range of parts.
-        notes: One line per empty part and per file that holds more than one recording.
-        cuts: One line per part that ends in the middle of a write, as a kill leaves it.
-        is_being_written: A process was writing the recording when it was opened. What it has written so far is read,
-            from a copy.
-        header: The header of the session.
-        root: Chain value (16 bytes) before the first row.
     """
 
     def __init__(self, files: Sequence[str]) -> None:

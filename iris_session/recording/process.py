@@ -97,6 +97,9 @@ class RecorderLoop:
     """Main loop of the recorder process. `stop` may be called from a signal handler."""
 
     def __init__(self, config: RecorderConfig) -> None:
+        # Another process may continue this recording: then no part is begun. Its first file may have been moved away.
+        is_there = config.part > 1 and os.path.exists(config.path)
+        lock = RecordingLock(config.path, shared=True, patience_s=TRIED_S) if is_there else None
         self._config = config
         self._context = zmq.Context(io_threads=1)
         self._feed = self._bind(zmq.DEALER, config.feed_endpoint)
@@ -106,12 +109,7 @@ class RecorderLoop:
         self._media = self._bind(zmq.PULL, config.media_endpoint, DRAIN_MEDIA) if config.media_endpoint else None
         self._budget = RecordingBudget(config.budget_bytes, config.path, config.part)
         self._begin_part()
-        if os.path.exists(config.path):  # the first file may have been moved away
-            try:
-                self._lock = RecordingLock(config.path, shared=True, patience_s=TRIED_S)
-            except RecorderError:
-                self._remove()  # another process continues this recording: leave no empty part behind
-                raise
+        self._lock = lock if config.part > 1 else RecordingLock(config.path, shared=True, patience_s=TRIED_S)
         self._header: SessionHeader | None = None
         self._instance = time.monotonic_ns()  # differs from that of every earlier recorder
         self._expecting = -1

@@ -1,7 +1,7 @@
 """Pictures of a recording: the state of a replayed step, drawn by MuJoCo's own renderer, without a display.
 
 A picture shows the newest step at its time, exactly as MuJoCo draws that state: nothing is interpolated. Patches of the
-scene are drawn as far as MuJoCo can: see `_Look`. Not here: encoding and files (`cli.recording_render`).
+scene are drawn as far as MuJoCo can: see `_ScenePatches`. Not here: encoding and files (`cli.recording_render`).
 """
 
 from __future__ import annotations
@@ -161,8 +161,8 @@ class RecordingPictures:
         self._recording, self._timeline, self._options = recording, timeline, options
         patched = any(isinstance(one.body, SceneChanged) and one.body.cause == "patch" for one in recording.events())
         self._replay = Replay(recording, with_control=patched)  # patches are state of the authority
-        self._artist: _Artist | None = None
-        self._views: dict[tuple[BodyInfo, ...], _Reach] = {}
+        self._artist: _Renderer | None = None
+        self._views: dict[tuple[BodyInfo, ...], _SceneBounds] = {}
         self._people = _PeopleTrack(recording) if options.people else None
         self._gl: Any = None
         self.notes: list[str] = []
@@ -226,7 +226,7 @@ class RecordingPictures:
         people = self._people.advance(time_ns) if self._people is not None else ()
         return self._artist.draw(core.world.data, core.authority.patches, people)
 
-    def _make_artist(self, core: SessionCore) -> _Artist:
+    def _make_artist(self, core: SessionCore) -> _Renderer:
         model, is_first = core.world.model, self._artist is None
         if self._artist is not None:
             self._artist.close()
@@ -237,9 +237,9 @@ class RecordingPictures:
             )
         camera = self._find_camera(model, is_required=is_first)
         if camera is None:
-            view = self._views.get(core.world.bodies) or _Reach(core.world.bodies)
+            view = self._views.get(core.world.bodies) or _SceneBounds(core.world.bodies)
             camera = view.make_camera(core, self._options.width / self._options.height)
-        return _Artist(model, camera, self._options, self.notes)
+        return _Renderer(model, camera, self._options, self.notes)
 
     def _find_camera(self, model: mujoco.MjModel, *, is_required: bool) -> mujoco.MjvCamera | None:
         """Return the camera of the options in a model; `None` for the view of all that moves."""
@@ -267,7 +267,7 @@ class RecordingPictures:
 # --- the default view -------------------------------------------------------------------------------------------------
 
 
-class _Reach:
+class _SceneBounds:
     """Places of the moving bodies of a scene in a span of time.
 
     `poses`: in the world at each moment, shape (n, 7), `x y z qw qx qy qz`, [m]. Without any: where they are now.
@@ -343,9 +343,9 @@ def _rotate(q: Floats, p: Floats) -> Floats:
 
 def _read_reach(
     recording: Recording, begin_ns: int, end_ns: int, *, with_people: bool
-) -> dict[tuple[BodyInfo, ...], _Reach]:
+) -> dict[tuple[BodyInfo, ...], _SceneBounds]:
     """Return the moving bodies of each scene in a span of time, at some moments, as the recorded states have them."""
-    found: dict[tuple[BodyInfo, ...], _Reach] = {}
+    found: dict[tuple[BodyInfo, ...], _SceneBounds] = {}
     bodies: tuple[BodyInfo, ...] = ()
     due_ns = begin_ns
     for state in recording.states():
@@ -354,7 +354,7 @@ def _read_reach(
         if state.bodies is not bodies:  # the same object in all states of a scene
             bodies, due_ns = state.bodies, max(begin_ns, state.session_time)
         if state.session_time >= due_ns and len(state.poses) == len(bodies):  # a file may hold any number
-            reach = found.setdefault(bodies, _Reach(bodies))
+            reach = found.setdefault(bodies, _SceneBounds(bodies))
             reach.poses.append(state.poses[reach.rows])
             reach.people += [np.array(one.pose.p) + PERSON_M * _CORNERS for one in state.presence if with_people]
             moments = max(1, min(MOMENTS, MOST_POSES // max(1, len(reach.rows))))
@@ -365,7 +365,7 @@ def _read_reach(
 # --- drawing ----------------------------------------------------------------------------------------------------------
 
 
-class _Artist:
+class _Renderer:
     """Draws the states of one model into the current OpenGL context."""
 
     def __init__(
@@ -376,7 +376,7 @@ class _Artist:
         self._camera, self._notes = camera, notes
         self._size = options.width, options.height
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = self._size
-        self._look = _Look(model, self._model)
+        self._look = _ScenePatches(model, self._model)
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(self._model, MORE_GEOMS + model.ngeom)
         try:
@@ -386,7 +386,7 @@ class _Artist:
             raise PictureError(f"no picture of {width} x {height} can be drawn here: {error}") from error
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
 
-    def draw(self, data: Any, patches: Sequence[PatchOp], people: Sequence[_Figure]) -> Image:
+    def draw(self, data: Any, patches: Sequence[PatchOp], people: Sequence[_AvatarMarker]) -> Image:
         """Return a picture of a state."""
         for note in self._look.apply(patches):
             if note not in self._notes:
@@ -409,7 +409,7 @@ class _Artist:
         self._context.free()
 
 
-class _Look:
+class _ScenePatches:
     """Patches of a scene, as changes of a model that is only drawn, and as geoms that are added to each picture.
 
     Patches are made for clients. MuJoCo lacks meshes and textures that they bring along: such visuals are left out.
@@ -497,7 +497,7 @@ def _add_geom(
     return geom
 
 
-class _Figure(NamedTuple):
+class _AvatarMarker(NamedTuple):
     """Head or hand of a participant. `colour`: RGB, 0..1."""
 
     item: PresenceItem
@@ -522,10 +522,10 @@ class _PeopleTrack:
         self._newest: dict[tuple[str, str], PresenceItem] = {}
         self._story = EventNarration()
 
-    def advance(self, time_ns: int) -> list[_Figure]:
+    def advance(self, time_ns: int) -> list[_AvatarMarker]:
         """Return the heads and hands at `time_ns`."""
         while self._ahead is not None and self._ahead.session_time <= time_ns:
             self._newest.update({(item.participant, item.device): item for item in self._ahead.presence})
             self._ahead = next(self._states, None)
         shown = [item for item in self._newest.values() if item.capture_ns > time_ns - PRESENCE_NS]
-        return [_Figure(one, tuple(c / 255.0 for c in self._story.find_colour(one.participant))) for one in shown]
+        return [_AvatarMarker(one, tuple(c / 255.0 for c in self._story.find_colour(one.participant))) for one in shown]

@@ -476,6 +476,7 @@ class AssetExport(msgspec.Struct, frozen=True):
 
 
 def export_assets(
+    name: str,
     root: Path,
     found: AssetCollector,
     assets: Iterable[tuple[str, bytes]],
@@ -491,6 +492,7 @@ def export_assets(
     the scenes in order, each with the hash of its specification.
 
     Args:
+        name: Name of the recording, for errors.
         root: The folder; it is made if it does not exist.
         found: What the recording has.
         assets: Hash and bytes of its whole assets.
@@ -509,7 +511,7 @@ def export_assets(
     summary = found.summarise()
     if not summary.present:
         why = "its session was to record none" if summary.recorded else "it has no word of them"
-        raise AssetExportError(f"the recording holds no assets: {why}")
+        raise AssetExportError(f"{name} holds no assets: {why}")
     try:
         if root.exists() and not root.is_dir():
             raise AssetExportError(f"{root} is no folder: give one that is empty or does not exist")

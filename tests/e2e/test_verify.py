@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import time
 from collections.abc import Callable
@@ -21,10 +22,12 @@ from iris_session.physics import load_model
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Lost, decode_entries
 from iris_session.recording import JournalRow, Recording
+from iris_session.rrd.file import scan_file
 from iris_session.session.verification import verify_recording
 from tests.e2e.scenario import Scenario, is_driven
-from tests.e2e.session_process import run_verify
+from tests.e2e.session_process import run_command, run_verify
 from tests.recording.support import write
+from tests.recording.test_kept_recordings import unpack
 
 pytestmark = pytest.mark.e2e
 
@@ -52,6 +55,19 @@ def recorded(scenario: Scenario) -> Path:
     return scenario.server.recording
 
 
+def test_command_finds_a_flipped_byte(tmp_path: Path) -> None:
+    path = unpack("closed", tmp_path)
+    data = bytearray(path.read_bytes())
+    victim = max(scan_file(path).messages[60:-1], key=lambda message: message.length)  # the last is the index
+    data[victim.offset + victim.length // 2] ^= 1
+    path.write_bytes(data)
+    done = run_command("verify", "--json", str(path), cwd=tmp_path)
+    assert done.returncode == 1, done.stderr
+    (report,) = json.loads(done.stdout)["files"]
+    assert not report["ok"]
+    assert any(str(victim.offset) in one["text"] for one in report["problems"])
+
+
 def copy_edited(path: Path, target: Path, change: Callable[[JournalRow], JournalRow]) -> Path:
     """Write a copy of the journal at `path` with `change` applied to every row."""
     with Recording.open(path) as recording:
@@ -59,6 +75,7 @@ def copy_edited(path: Path, target: Path, change: Callable[[JournalRow], Journal
         return write(target, recording.header, batch)
 
 
+@pytest.mark.long
 def test_disconnect_verifies_and_one_changed_byte_is_located(recorded: Path, tmp_path: Path) -> None:
     report = run_verify(recorded)
     assert report["recording_class"] == "closed"

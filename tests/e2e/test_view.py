@@ -21,6 +21,7 @@ from tests.e2e.session_process import assert_all_end, list_descendants
 from tests.recording.support import journal, wait_until, write
 
 DEADLINE_S = 60.0
+pytestmark = [pytest.mark.e2e, pytest.mark.long]
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,6 @@ def viewed(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
             process.kill()
 
 
-@pytest.mark.e2e
 def test_page_is_served_on_this_machine_only_until_ctrl_c(recording: Path) -> None:
     with viewed("view", recording, "--web", "--no-open") as (process, address):
         with urllib.request.urlopen(address, timeout=DEADLINE_S) as answer:
@@ -70,7 +70,6 @@ def test_page_is_served_on_this_machine_only_until_ctrl_c(recording: Path) -> No
         assert_all_end(viewers)
 
 
-@pytest.mark.e2e
 def test_viewer_that_is_killed_ends_the_command(recording: Path) -> None:
     with viewed("view", recording, "--web", "--no-open") as (process, _):
         (viewer,) = list_descendants(process.pid)
@@ -80,7 +79,6 @@ def test_viewer_that_is_killed_ends_the_command(recording: Path) -> None:
         assert "Rerun's viewer ended with exit status -9" in process.stdout.read()
 
 
-@pytest.mark.e2e
 def test_terminated_command_ends_the_viewer(recording: Path) -> None:
     with viewed("view", recording, "--web", "--no-open") as (process, _):
         viewers = list_descendants(process.pid)
@@ -97,7 +95,6 @@ def is_answered(address: str) -> bool:
     return True
 
 
-@pytest.mark.e2e
 def test_serve_shows_its_recording_while_it_is_written(tmp_path: Path) -> None:
     """The viewer and the process that feeds it end with the session."""
     path = tmp_path / "session.rrd"

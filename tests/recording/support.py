@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import struct
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -13,8 +15,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import pytest
 
-from iris_session.journal.messages import Batch
+from iris_session.journal.messages import Batch, RecorderConfig
 from iris_session.journal.rows import SNAPSHOTS, seal_keyframe
 from iris_session.journal.verification import Models
 from iris_session.protocol.client_messages import Marker, Sample
@@ -33,6 +36,7 @@ from iris_session.recording import (
     make_row,
     pack_model,
 )
+from iris_session.recording.process import RecorderLoop
 from iris_session.recording.writer import RrdWriter
 
 TICK_NS = 2_000_000
@@ -171,6 +175,70 @@ def recorder(path: Path) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
         if feed is not None:
             feed.close(0.0)
         process.close()
+
+
+class LoopRecorder:
+    """A recorder whose loop runs when the test says so, and the feed of its session, over all parts."""
+
+    def __init__(self, folder: Path, **options: Any) -> None:
+        self.folder, self.path = folder, folder / "session.rrd"
+        self._options = options
+        self.loop = self.begin(1)
+        self.feed = RecorderFeed(f"ipc://{folder}/f")
+
+    def begin(self, part: int, **options: Any) -> RecorderLoop:
+        """Start the recorder of a part, as the process does."""
+        endpoints = (f"ipc://{self.folder}/f", f"ipc://{self.folder}/s")
+        config = RecorderConfig(str(self.path), part, "r", *endpoints, 0, os.getppid(), **(self._options | options))
+        self.loop = RecorderLoop(config)
+        return self.loop
+
+    def pump(self, condition: Callable[[], object] | None = None) -> None:
+        """Drain and write until a condition holds; without one until all batches of the feed are in the file."""
+        until = condition or (lambda: not self.feed._window and not self.feed._backlog)
+        self.feed.flush()
+        self.loop._send_status(self.loop._received)
+        for _ in range(500):
+            self.loop._feed.poll(20)
+            self.loop._drain()
+            self.loop._flush()
+            self.loop._write_assets()
+            self.loop._send_status(self.loop._received)
+            self.feed._socket.poll(20)
+            self.feed.flush()
+            if until():
+                return
+        pytest.fail("the recorder does not get there")
+
+    def kill(self) -> None:
+        """End the loop as a kill does: nothing more is written, and the lock is released."""
+        if self.loop._context.closed:
+            return
+        self.loop._syncer.stop()
+        self.loop._context.destroy(linger=0)
+        stream: Any = self.loop._writer._stream
+        stream._file.close()
+        stream.recording.disconnect()
+        assert self.loop._lock is not None
+        self.loop._lock.release()
+
+    def finish(self) -> None:
+        """Close the file."""
+        self.loop._stopping = True
+        self.loop._close_file()
+        self.kill()
+
+
+@contextmanager
+def loop_recorder(**options: Any) -> Iterator[LoopRecorder]:
+    """Yield a recorder in a folder of its own: the path of a socket must be short."""
+    with tempfile.TemporaryDirectory(prefix="iris-") as folder:
+        one = LoopRecorder(Path(folder), **options)
+        try:
+            yield one
+        finally:
+            one.feed.close(0.0)
+            one.kill()
 
 
 def record(path: Path, steps: int, **header: object) -> SmallSession:

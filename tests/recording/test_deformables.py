@@ -101,18 +101,6 @@ def test_topology_is_written_once_and_vertices_as_they_move(world: World) -> Non
     assert world.writer.vertices_refused == 0
 
 
-def test_normals_are_those_of_adjacent_triangles(world: World) -> None:
-    """A tilted plane has one normal everywhere."""
-    vertices = world.vertices(0)
-    vertices[:, 2] = 1.0 + 0.5 * vertices[:, 0]
-    world.state(0)
-    world.publish(8, 0, vertices)
-    world.state(8)
-    normals = np.array(told(world.read()[CLOTH], "Mesh3D:vertex_normals")[8])
-    expected = np.array((-0.5, 0.0, 1.0)) / np.sqrt(1.25)
-    assert normals == pytest.approx(np.broadcast_to(expected, normals.shape), abs=0.02)
-
-
 def test_non_finite_vertices_are_finite_in_the_file(world: World) -> None:
     vertices = world.vertices(0)
     vertices[[0, 7]] = (np.nan, np.inf, -np.inf)
@@ -178,23 +166,6 @@ def test_vertices_of_the_previous_scene_are_rejected(world: World) -> None:
     found = world.read()
     assert list(told(found[CLOTH], "Mesh3D:vertex_positions")) == [0]
     assert sorted(told(found[CLOTH.replace("/1/", "/2/")], "Mesh3D:vertex_positions")) == [8, 16]
-    assert world.writer.vertices_refused == 1
-
-
-def test_vertices_of_the_last_state_before_a_scene_are_rejected(world: World) -> None:
-    """That state is later than the row before the scene, by the time that its step took."""
-    vertices = world.vertices(0)
-    world.state(0)
-    world.state(8)
-    hash_ = compute_scene_hash(bytes(encode_model(world.model)))
-    scene = SceneModel(8, 16_000_000, hash_, world.packed, (BodyInfo(1, "cup", moving=True),))  # 7 ns before the state
-    world.writer.add(Batch(scenes=[scene], assets=[world.assets]))
-    world.publish(8, 0, vertices + 0.1)
-    world.publish(9, 0, vertices + 0.2)
-    world.state(9)
-    moved = told(world.read()[CLOTH.replace("/1/", "/2/")], "Mesh3D:vertex_positions")
-    assert sorted(moved) == [8, 9]
-    assert np.array(moved[9]) == pytest.approx(vertices + 0.2, abs=1e-3)
     assert world.writer.vertices_refused == 1
 
 

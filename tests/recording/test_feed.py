@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -338,37 +337,6 @@ def test_recorder_that_starts_later_knows_participants_by_name(feed: RecorderFee
         1, 1, Decision(commands=(), events=tuple(Event(i, 1, 1, ParticipantJoined(p)) for i, p in enumerate(some)))
     )
     assert len(feed._people) == PEOPLE
-
-
-class _Spy:
-    """A socket that keeps how messages were sent."""
-
-    def __init__(self, socket: Any) -> None:
-        self._socket = socket
-        self.copied: list[bool] = []
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._socket, name)
-
-    def send_multipart(self, frames: Any, flags: int = 0, copy: bool = True) -> None:
-        self.copied.append(copy)
-        self._socket.send_multipart(frames, flags, copy=copy)
-
-
-def test_models_are_not_copied_by_the_thread_that_takes_steps(played, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    recorder, endpoint = played
-    feed = RecorderFeed(endpoint)
-    spy = _Spy(feed._socket)
-    feed._socket = spy  # type: ignore[assignment]
-    feed.send_header(msgspec.structs.replace(make_header(), model=os.urandom(1 << 20)))
-    steps(feed, 0, 10)
-    recorder.say(feed, 1, -1, -1)
-    feed.send_scene("hash", os.urandom(1 << 20), ())
-    sent = recorder.take(3)
-    assert [kind for kind, *_ in sent] == [HEADER, BATCH, BATCH]
-    assert max(len(body) for *_, body in sent) > 1 << 20
-    assert spy.copied == [False] * 3
-    feed.close(0.0)
 
 
 def test_a_model_larger_than_the_window_is_sent(played) -> None:  # type: ignore[no-untyped-def]

@@ -21,7 +21,7 @@ from iris_session.recording import NotARecordingError, Recording, parts, verify
 from iris_session.rrd import file as rrd_file
 from iris_session.rrd import index as footer
 from iris_session.rrd.file import END_MESSAGE, FILE_TAIL, scan_file
-from iris_session.rrd.index import add_index, start_indexing
+from iris_session.rrd.index import add_index
 from iris_session.rrd.rerun_tool import find_rerun
 from tests.recording.support import SmallCore, journal, recorder, wait_until, write
 
@@ -61,13 +61,6 @@ def test_index_follows_the_messages_as_they_were(closed: Path, indexed: Path) ->
     assert not has_index(closed)
     assert add_index(indexed), "once is enough"
     assert indexed.read_bytes() == data
-
-
-def test_time_of_a_file_is_that_of_its_recording(path: Path) -> None:
-    """So a copy that was made before is still that of the recording."""
-    before = path.stat()
-    assert add_index(path)
-    assert path.stat().st_mtime_ns == before.st_mtime_ns
 
 
 def test_indexed_file_reads_and_verifies_like_before(closed: Path, indexed: Path) -> None:
@@ -145,17 +138,6 @@ def test_full_disk_leaves_the_file_as_it_was(path: Path, monkeypatch: pytest.Mon
     assert path.read_bytes() == before
 
 
-def test_its_session_comes_after_all_others(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where Linux shares the processor among sessions, the priority of a process counts only in its own."""
-    groups, found = Path("/proc/self/autogroup"), tmp_path / "found"
-    tool = tmp_path / "tool"
-    tool.write_text(f"#!/bin/sh\ncat {groups} > {found}\nexit 3\n")
-    tool.chmod(0o755)
-    monkeypatch.setenv("RERUN_CLI_PATH", str(tool))
-    assert start_indexing(str(path)).wait(60.0) == 1
-    assert found.read_text().endswith(" nice 19\n") is groups.exists()
-
-
 @pytest.mark.parametrize(("name", "value"), [("RESERVE_BYTES", 1 << 60), ("MEMORY_SHARE", 0.0)])
 def test_short_disk_or_memory_is_left_alone(
     path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: float
@@ -190,17 +172,6 @@ def test_kill_during_the_write_leaves_a_finished_file(indexed: Path, tmp_path: P
         assert (report.finished, report.steps) == (True, STEPS)
 
 
-def test_file_may_get_its_index_while_it_is_scanned(
-    closed: Path, indexed: Path, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = indexed.read_bytes()
-    size = os.path.getsize(closed)
-    monkeypatch.setattr(os.path, "getsize", lambda _: size)
-    path.write_bytes(data)
-    found = rrd_file.scan_file(path)
-    assert (found.cut, found.indexed, found.good_bytes, found.size) == (False, True, len(data), len(data))
-
-
 def test_file_may_get_its_index_while_its_chunks_are_read(
     closed: Path, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -232,6 +203,8 @@ def test_file_may_get_its_index_while_it_is_opened(path: Path, monkeypatch: pyte
         assert (recording.damage, len(list(recording.rows()))) == ([], STEPS)
 
 
+@pytest.mark.e2e
+@pytest.mark.long
 def test_recorder_adds_the_index_after_it_has_ended(tmp_path: Path) -> None:
     from tests.recording.support import SmallSession
 

@@ -117,6 +117,8 @@ def play_states(path: Path) -> list[tuple[bytes, list[int]]]:
     return []
 
 
+@pytest.mark.e2e
+@pytest.mark.long
 def test_viewer_gets_everything_and_follows(closed: Path, tmp_path: Path) -> None:
     got = tmp_path / "got.rrd"
     with receiver(got) as (_, url):
@@ -128,6 +130,8 @@ def test_viewer_gets_everything_and_follows(closed: Path, tmp_path: Path) -> Non
     assert max(play_states(got))[1] == [3], "following, in place of paused"
 
 
+@pytest.mark.e2e
+@pytest.mark.long
 def test_newest_state_is_drawn_before_its_motion_is_in_the_file(tmp_path: Path) -> None:
     got, path = tmp_path / "got.rrd", tmp_path / "session.rrd"
     header = make_header()
@@ -158,6 +162,8 @@ def steps_moved(path: Path) -> list[int]:
         return []
 
 
+@pytest.mark.e2e
+@pytest.mark.long
 def test_viewer_that_stands_still_makes_only_the_feed_wait(closed: Path, tmp_path: Path) -> None:
     got, path = tmp_path / "got.rrd", tmp_path / "session.rrd"
     data = closed.read_bytes()
@@ -180,6 +186,8 @@ def test_viewer_that_stands_still_makes_only_the_feed_wait(closed: Path, tmp_pat
             assert feed.wait(60.0) == 0
 
 
+@pytest.mark.e2e
+@pytest.mark.long
 def test_feed_ends_with_its_parent_whatever_the_viewer_does(closed: Path) -> None:
     program = (
         "import sys; from iris_session.system.process import ChildProcess\n"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import msgspec
@@ -182,35 +180,6 @@ def test_streams_say_what_they_are_until_they_end(writer: RrdWriter) -> None:
         cleared = [one for one in read(Path(writer.path))[entity] if "Clear:is_recursive" in one.schema.names]
         (batch,) = cleared
         assert [value.value for value in batch.column("session_time")] == [at_ns], "what the viewer shows ends there"
-
-
-def test_files_without_descriptions_have_none(writer: RrdWriter) -> None:
-    writer.close()
-    with Recording.open(writer.path) as recording:
-        assert list(recording.streams()) == []
-
-
-def test_an_indexed_copy_reads_the_same(writer: RrdWriter, tmp_path: Path) -> None:
-    for seq in range(5):
-        writer.add_media(message("room", make_frame(2000, seq), seq, 100 + seq))
-        writer.add_media(message("room-front", JPEG + bytes([seq]), seq, 100 + seq, "jpeg", StreamInfo(f"{seq}")))
-        writer.flush()
-    for stream, encoding in (("room", "cloud"), ("room-front", "jpeg")):
-        writer.add_media(message(stream, None, 5, 200, encoding))
-    writer.add_media(message("room", make_frame(20), 6, 300))  # it is back
-    writer.close()
-    rerun = Path(sys.executable).parent / "rerun"
-    command = [rerun, "rrd", "optimize", "session.rrd", "-o", "indexed.rrd"]
-    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True, timeout=60)
-    with Recording.open(writer.path) as original, Recording.open(tmp_path / "indexed.rrd") as copy:
-        for one, other in zip(original.clouds(), copy.clouds(), strict=True):
-            assert np.array_equal(one.positions, other.positions)
-            assert one._replace(positions=None, colors=None) == other._replace(positions=None, colors=None)  # type: ignore[arg-type]
-        assert list(original.pictures()) == list(copy.pictures())
-        assert len(list(copy.clouds())) == 6
-        assert list(original.streams()) == list(copy.streams())
-        assert len(list(copy.streams("room-front"))) == 6
-        assert copy.damage == []
 
 
 def test_the_recorder_reads_media_only_while_nothing_more_important_waits(tmp_path: Path) -> None:

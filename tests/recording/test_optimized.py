@@ -20,8 +20,7 @@ from iris_session.protocol.server_messages import Event, MarkerAdded
 from iris_session.recording import CLOSED, OPEN, Recording, verify
 from iris_session.recording import parts as recording_parts
 from iris_session.recording.writer import RrdWriter
-from iris_session.rrd import file as rrd_file
-from iris_session.rrd.paths import DENIALS, ROWS, part_path
+from iris_session.rrd.paths import ROWS, part_path
 from tests.recording.support import SmallCore, journal, write
 
 STEPS = 200
@@ -103,49 +102,6 @@ def test_optimized_copy_reads_and_verifies_like_the_original(
     assert (report.steps, report.keyframes, report.finished) == (STEPS, 5, True)
 
 
-def test_equal_denials_are_counted_across_chunks(tmp_path: Path) -> None:
-    """A step with many denials, cut between any two, and repeated by the next part, which begins with that step."""
-    header, batch = journal(STEPS, CLOSED)
-    alike = [DenialRecord(7, 70, 3, Denial("held", "it is held"))] * 40
-    for number in (1, 2):
-        writer = RrdWriter(part_path(str(tmp_path / "session.rrd"), number), "id")
-        writer.write_header(header)
-        writer.add(Batch(rows=batch.rows[:10], denials=[*alike]))
-        writer.close()
-    copy = optimize(
-        tmp_path / "indexed.rrd", "--split-size-ratio", "1", "--max-rows", "7",
-        tmp_path / "session.rrd", tmp_path / "session.part2.rrd",
-    )  # fmt: skip
-    pieces = [chunk.num_rows for chunk in rrd_file.read_chunks(copy, DENIALS)]
-    assert len(pieces) > 2, "else this shows nothing"
-    for path in (copy, tmp_path / "session.rrd"):
-        with Recording.open(path) as recording:
-            assert list(recording.denials()) == alike
-
-
-def test_columns_are_in_separate_chunks(tmp_path: Path) -> None:
-    """Otherwise the tests above would show nothing."""
-    copy = optimize(tmp_path / "indexed.rrd", "--split-size-ratio", "1.5", record(tmp_path / "session.rrd", OPEN))
-    columns = [set(chunk.to_record_batch().schema.names) for chunk in rrd_file.read_chunks(copy, ROWS)]
-    assert any("plant" in names and "chain" not in names for names in columns)
-    assert rrd_file.scan_file(copy).indexed
-    assert not rrd_file.scan_file(tmp_path / "session.rrd").indexed
-
-
-def test_plant_state_of_some_rows(tmp_path: Path) -> None:
-    """As with publishers, which write it where it changes: merged chunks have null elsewhere."""
-    header, batch = journal(STEPS, CLOSED)
-    _, full = journal(STEPS, OPEN)
-    header = msgspec.structs.replace(header, recording_class=OPEN)
-    batch.rows[100:130] = full.rows[100:130]
-    path = write(tmp_path / "session.rrd", header, batch)
-    with Recording.open(path) as original, Recording.open(optimize(tmp_path / "indexed.rrd", path)) as copy:
-        rows = list(original.rows())
-        assert [row.step for row in rows if row.plant] == list(range(100, 130))
-        assert list(copy.rows()) == rows
-        assert copy.damage == []
-
-
 def changed(path: Path, to: Path, change: Callable[[Any], Any]) -> Path:
     """Write a copy with `change` applied to each record batch of the journal; `None` removes it."""
     from rerun.chunk import Chunk, LazyChunkStream, RrdReader
@@ -190,50 +146,12 @@ def test_missing_plant_is_found(tmp_path: Path, split: Path) -> None:
     assert 50 < first.step <= 100
 
 
-def test_altered_plant_is_found(tmp_path: Path, split: Path) -> None:
-    def alter(batch: Any) -> Any:
-        if "plant" not in batch.schema.names or 123 not in _steps(batch):
-            return batch
-        at = _steps(batch).index(123)
-        plant = bytearray(batch.column("plant")[at].as_py()[0])
-        plant[-3] ^= 1
-        return _set(batch, "plant", at, [bytes(plant)])
-
-    report = verify(changed(split, tmp_path / "c.rrd", alter), SmallCore)
-    first = report.problems[0]
-    assert (report.ok, first.step, first.kind, first.field) == (False, 123, "changed", "plant")
-
-
-def test_rows_with_a_single_column_are_missing(tmp_path: Path, split: Path) -> None:
-    def drop(batch: Any) -> Any:
-        return None if "chain" in batch.schema.names and 100 in _steps(batch) else batch
-
-    report = verify(changed(split, tmp_path / "c.rrd", drop), SmallCore)
-    assert not report.ok
-    assert len(report.gaps) == 1
-    assert report.gaps[0][0] <= 100 <= report.gaps[0][1]
-    assert any("c.rrd: /journal/rows" in line for line in report.damage)
-
-
 def test_missing_rows_are_a_gap(tmp_path: Path, split: Path) -> None:
     def drop(batch: Any) -> Any:
         return batch.filter(pa.array([not 100 <= step < 110 for step in _steps(batch)]))
 
     report = verify(changed(split, tmp_path / "c.rrd", drop), SmallCore)
     assert (report.ok, report.gaps, report.damage) == (False, [(100, 109)], [])
-
-
-def test_row_parts_of_different_steps_are_damage(tmp_path: Path, split: Path) -> None:
-    def alter(batch: Any) -> Any:
-        if "plant" not in batch.schema.names or 100 not in _steps(batch):
-            return batch
-        return _set(batch, "step", _steps(batch).index(100), 1100)
-
-    report = verify(changed(split, tmp_path / "c.rrd", alter), SmallCore)
-    assert not report.ok
-    assert report.damage == [
-        "c.rrd: /journal/rows holds something damaged, which is left out: rows have more than one step"
-    ]
 
 
 @pytest.fixture

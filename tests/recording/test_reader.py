@@ -194,12 +194,6 @@ def test_file_removed_during_reading_is_an_error(path: Path) -> None:
             list(recording.rows())
 
 
-@pytest.mark.parametrize("name", ["a\nb.rrd", 'a "b".rrd'])
-def test_a_file_may_have_any_name(path: Path, name: str) -> None:
-    with Recording.open(path.rename(path.with_name(name))) as recording:
-        assert (recording.damage, recording.finished) == ([], True)
-
-
 @pytest.mark.parametrize("state", ["written", "damaged", "indexed"])
 def test_full_temporary_disk_is_one_line_that_says_so(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str

@@ -205,20 +205,6 @@ def test_lost_message_of_a_closed_file_is_named(whole: Path, shared: Shared, tmp
     assert [one for one in report.problems if one.field == "asset" and "missing" in one.text]
 
 
-def test_part_that_was_killed_is_completed_by_the_next(shared: Shared, tmp_path: Path) -> None:
-    path = record(tmp_path / "session.rrd", shared)
-    offsets = list(_asset_messages(path))
-    path.write_bytes(path.read_bytes()[: offsets[len(offsets) // 2]])
-    record(Path(part_path(str(path), 2)), shared)
-    with Recording.open(path, warn=False) as recording:
-        found = check_assets(recording)
-        assert found.list_problems(finished=True) == []
-        summary = found.summarise()
-        assert summary.present == summary.expected == len(dict(recording.assets()))
-        assert [scene.hash for scene in recording.scenes()] == [shared.scene_hash], "each part has it"
-        assert summary.scenes == 1
-
-
 def test_assets_of_an_earlier_scene_that_a_kill_has_taken_are_no_damage(shared: Shared, tmp_path: Path) -> None:
     """The next recorder gets the newest scene only."""
     path = record(tmp_path / "session.rrd", shared)
@@ -238,7 +224,7 @@ def test_assets_of_an_earlier_scene_that_a_kill_has_taken_are_no_damage(shared: 
         assert summarise(recording).assets.present < summarise(recording).assets.expected
 
 
-@pytest.mark.parametrize("options", [(), ("--split-size-ratio", "1"), ("--max-rows", "2")])
+@pytest.mark.parametrize("options", [pytest.param((), marks=pytest.mark.long), ("--split-size-ratio", "1")])
 def test_copies_of_rerun_and_repaired_files_keep_them(whole: Path, tmp_path: Path, options: tuple[str, ...]) -> None:
     copy = optimize(tmp_path / "copy.rrd", whole, *options)
     repair(whole, tmp_path / "repaired.rrd")

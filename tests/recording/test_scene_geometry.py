@@ -86,38 +86,8 @@ def test_nested_fixed_bodies_move_with_their_root(tmp_path: Path) -> None:
     assert apply(T_world_arm, T_arm_visual[0]) == pytest.approx(tuple(data.geom_xpos[1]))
 
 
-def test_shape_with_two_cube_maps_is_cut_for_each(tmp_path: Path) -> None:
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><asset><texture name="c" type="cube" builtin="checker" rgb1="1 0 0" width="60" height="60"/>
-        <material name="along" texture="c"/><material name="uniform" texture="c" texuniform="true"/></asset><worldbody>
-        <geom type="ellipsoid" size="1 .5 .2" material="along"/>
-        <geom type="ellipsoid" size="1 .5 .2" material="uniform"/></worldbody></mujoco>"""
-    )
-    store = AssetStore(tmp_path)
-    spec = parse_mujoco(model, store).spec
-
-    def worn(reader: scene.SceneReader, visual: int) -> bytes:
-        uv = reader.read_shape(spec.visuals[visual]).uv
-        assert uv is not None
-        return uv.tobytes()
-
-    both = scene.SceneReader(spec, store, [])
-    found = [worn(both, visual) for visual in (0, 1)]
-    assert found == [worn(scene.SceneReader(spec, store, []), visual) for visual in (0, 1)]
-    assert found[0] != found[1]
 
 
-def test_tall_texture_is_reduced_like_a_wide_one(tmp_path: Path) -> None:
-    builder = SceneBuilder()
-    pixels = np.random.default_rng(1).integers(0, 255, (2 * scene.TEXTURE_SIDE, scene.TEXTURE_SIDE, 3), np.uint8)
-    corners, uvs = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0], [1, 0], [0, 1]]
-    for shown in (pixels, pixels.transpose(1, 0, 2), np.concatenate([pixels, pixels], axis=1)):
-        builder.add_mesh(vertices=corners, triangles=[[0, 1, 2]], uvs=uvs, texture=np.ascontiguousarray(shown))
-    store = AssetStore(tmp_path)
-    spec = builder.build(store).spec
-    reader = scene.SceneReader(spec, store, [])
-    found = [reader.read_texture(visual.material) for visual in spec.visuals]
-    assert [max(one.shape) for one in found if one is not None] == [scene.TEXTURE_SIDE] * 3
 
 
 @pytest.mark.parametrize("path", [ALOHA, PANDA], ids=["aloha", "panda"])

@@ -8,7 +8,6 @@ from typing import get_args
 
 import msgspec
 
-from iris_session.journal import environment as versions
 from iris_session.journal.messages import DenialRecord
 from iris_session.protocol.common import Alignment, Denial, Lease, Pose
 from iris_session.protocol.server_messages import (
@@ -228,11 +227,3 @@ def test_session_page_names_class_and_versions() -> None:
     story = ann_and_bob()
     page = describe_session(make_header(), story, 25.04)
     assert "**ann** (operator), **bob** (operator). 25.0 s, handovers: 0, episodes: 0." in page
-
-
-def test_versions_here_equal_versions_here() -> None:
-    here = versions.describe_environment()
-    assert here["numpy"] != "absent"
-    assert versions.compare_environment(here) == []
-    other = {**here, "numpy": "1.0", "gone": "2"}
-    assert [line.split(":")[0] for line in versions.compare_environment(other)] == ["gone", "numpy"]

@@ -523,18 +523,6 @@ def test_patch_changes_the_picture_from_its_step(tmp_path: Path) -> None:
     )
 
 
-def test_patch_before_the_first_state_is_the_initial_look(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path / "assets")
-    spec, assets = shared(store, mujoco.MjModel.from_xml_string(XML))
-    address = store.put(encode_scene(apply_patch(spec, [SetVisual(1, rgba=(1.0, 0.0, 0.0, 1.0))])))
-    writer = RrdWriter(tmp_path / "w.rrd", "id")
-    writer.write_header(make_header())
-    writer.add(Batch(assets=[assets]))
-    writer.add(Batch(assets=[SceneAssets(3, 9, str(store.root), address)]))
-    writer.close()
-    assert column(read(tmp_path / "w.rrd")["/scene/1/bodies/ball/g\\/ball"], "Ellipsoids3D:colors") == [[0xFF0000FF]]
-
-
 def test_missing_assets_are_reported_and_others_written(tmp_path: Path) -> None:
     store = AssetStore(tmp_path / "assets")
     spec, assets = shared(store, every_shape())

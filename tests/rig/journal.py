@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from iris_session.journal.rows import JournalRow, Keyframe
 from iris_session.physics import decode_model
 from iris_session.protocol.entries import decode_entries
 from iris_session.recording import unpack_model
-from iris_session.recording.journal import JournalRow, Keyframe
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
 
 
