@@ -31,7 +31,7 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     `path`: the recording; `part`: number of the file to write, which must not exist. Endpoints: `ipc://` sockets that
     the recorder binds; without `vertices_endpoint` deformables are drawn at rest, without `media_endpoint` no point
     clouds and pictures are recorded. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: id of the parent
-    process; the recorder ends after it, once the file is finished. `record_assets`: see `recorded_assets.py`.
+    process; the recorder ends after it, once the file is finished. `record_assets`: see `rrd/assets.py`.
     `budget_bytes`: see `budget.py`. `journal_only`: an error in the picture has ended the recorder before, and would
     come again: of batches only what verification needs is written, and no media.
     """

@@ -9,7 +9,7 @@ APPLICATION: Final = "iris-session"
 #: Name of the first file of a session in its folder.
 FIRST_FILE: Final = "session.rrd"
 SUFFIX: Final = ".rrd"
-#: Ending of copies for the viewer, see `view_copy.py`. They lie beside recordings and are none.
+#: Ending of copies for the viewer, see `recording/viewer_export.py`. They lie beside recordings and are none.
 VIEW_SUFFIX: Final = ".view.rrd"
 
 HEADER: Final = "/session/header"

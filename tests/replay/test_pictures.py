@@ -94,13 +94,13 @@ def reference(monkeypatch: pytest.MonkeyPatch) -> Reference:
 def cameras(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The cameras that are made from now on."""
     made: list[Any] = []
-    begin = pictures._Artist.__init__
+    begin = pictures._Renderer.__init__
 
     def keep(self: Any, model: Any, camera: Any, *rest: Any) -> None:
         made.append(camera)
         begin(self, model, camera, *rest)
 
-    monkeypatch.setattr(pictures._Artist, "__init__", keep)
+    monkeypatch.setattr(pictures._Renderer, "__init__", keep)
     return made
 
 
