@@ -346,7 +346,7 @@ class RrdWriter:
                 scalar_column("text", [one.text for one in faults], pa.string()),
             ],
         }
-        for (entity, columns), n in zip(tables.items(), map(len, rows), strict=True):
+        for (entity, columns), n in zip(tables.items(), (len(scenes), len(pieces), len(faults)), strict=True):
             if n:
                 times = [self._moments.spread_one(entity, self._newest_ns) for _ in range(n)]
                 self._send_columns(entity, [duration_index(paths.SESSION_TIME, times)], columns)
