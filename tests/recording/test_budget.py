@@ -90,4 +90,21 @@ def test_recorder_closes_its_file_and_the_session_goes_on() -> None:
         assert summary.ok
         assert "budget" in summary.ending
         assert one.path.stat().st_size <= BUDGET
-        assert RecordingBudget(BUDGET, str(one.path), 2).is_used_up(0), "no further part is begun"
+
+
+def test_recorder_that_was_killed_at_the_end_gets_no_further_part() -> None:
+    with loop_recorder(budget_bytes=BUDGET) as one:
+        session = SmallSession(one.feed)
+        session.take(10)
+        one.pump()
+        one.kill()
+        with open(one.path, "ab") as file:
+            file.truncate(BUDGET)
+        assert RecordingBudget(BUDGET, str(one.path), 2).is_used_up(0)
+        assert process_module.report_used_budget(msgspec.structs.replace(one.loop._config, part=2)) == 0
+        assert one.feed._socket.poll(20_000)
+        session.take(500)
+        assert one.feed.stats.recorder is not None
+        assert one.feed.stats.recorder.ended
+        assert one.feed.close()
+        assert [path.name for path in one.folder.glob("*.rrd")] == ["session.rrd"]

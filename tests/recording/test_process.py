@@ -36,6 +36,7 @@ from iris_session.recording import (
     verify,
 )
 from iris_session.recording import process as process_module
+from iris_session.recording.lock import is_being_written
 from iris_session.recording.process import DRAIN_S, FLUSH_S, RecorderLoop
 from iris_session.rrd.assets import ALL, list_recorded_assets
 from iris_session.rrd.paths import part_path
@@ -348,6 +349,7 @@ def test_file_is_finished_when_the_parent_dies(tmp_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(folder)}
     subprocess.run([sys.executable, "-c", script, str(path)], cwd=REPOSITORY, timeout=60, check=False, env=environment)
     wait_until(lambda: not list(folder.iterdir()))  # no other process can remove the folder of the sockets
+    wait_until(lambda: not is_being_written(path))
     with Recording.open(path) as recording:
         assert recording.finished
         assert [row.step for row in recording.rows()] == list(range(200))
