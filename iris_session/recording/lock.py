@@ -17,8 +17,10 @@ from iris_session.journal.errors import RecorderError
 
 #: Time in which a recorder whose session was killed can write its data and end.
 PATIENCE_S: Final = 15.0
-#: Time in which a process that only tries the lock has released it.
+#: Time in which a process that only tries the lock has released it: for a recorder, which gives up after that, and for
+#: another process that tries it.
 TRIED_S: Final = 1.0
+OTHERS_TRY_S: Final = 0.05
 _BUSY: Final = (errno.EAGAIN, errno.EACCES)
 
 
@@ -80,7 +82,7 @@ def is_being_written(path: str | os.PathLike[str]) -> bool:
 
 def _is_free(path: str | os.PathLike[str], *, shared: bool) -> bool:
     try:
-        RecordingLock(path, shared=shared, patience_s=0.0).release()
+        RecordingLock(path, shared=shared, patience_s=OTHERS_TRY_S).release()
     except RecordingInUseError:
         return False
     except RecorderError:
