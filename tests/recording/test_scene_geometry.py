@@ -86,10 +86,6 @@ def test_nested_fixed_bodies_move_with_their_root(tmp_path: Path) -> None:
     assert apply(T_world_arm, T_arm_visual[0]) == pytest.approx(tuple(data.geom_xpos[1]))
 
 
-
-
-
-
 @pytest.mark.parametrize("path", [ALOHA, PANDA], ids=["aloha", "panda"])
 def test_every_geom_of_real_robots_is_placed_as_in_mujoco(path: Path, tmp_path: Path) -> None:
     """In another configuration than that of the specification."""
