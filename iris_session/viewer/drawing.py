@@ -32,9 +32,9 @@ from iris_session.viewer.plots import RobotPlots, get_robot_entity
 from iris_session.viewer.scene_layer import MotionRows, SceneLayer, SceneSource
 from iris_session.viewer.timelines import Moment, MomentTable, to_time_columns
 
-#: Period in which motion and plots are written [ns]: a chunk is mostly its schema, and a kill of the recorder takes
-#: what is not written from the picture.
-COLLECT_NS: Final = 1_000_000_000
+#: Period in which motion and plots are written [ns]: a chunk is mostly its schema, so that every second instead makes a
+#: file a sixth larger; a kill of the recorder takes what is not written from the picture.
+COLLECT_NS: Final = 4_000_000_000
 #: Difference of a pose from the one drawn that is not seen, [m] and in the quaternion: bodies at rest jitter by less.
 UNSEEN: Final = np.array([2e-5] * 3 + [5e-5] * 4)
 #: Maximum number of pending vertex frames whose states are not in the file yet.
