@@ -114,6 +114,11 @@ def distance(a: Vec3, b: Vec3) -> float:
     return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
+def pose_to_dict(T: PoseTuple) -> dict[str, list[float]]:
+    """Return a pose as a JSON object."""
+    return {"position_m": list(T[0]), "quaternion_wxyz": list(T[1])}
+
+
 def is_rigid(T: PoseTuple, reach_m: float = 1e3) -> bool:
     """Return whether untrusted numbers are a pose: finite, unit quaternion (to 1 %), coordinates within `reach_m`."""
     p, q = T

@@ -1,9 +1,7 @@
-"""Benchmark clients: up to four real clients in one process, which log the states they receive, with their times.
+"""Clients of the benchmarks: up to four real clients in one process, which log the states they receive.
 
-    python -m iris_session.bench.clients < job.json
-
-Prints `ready`, reads `begin end` (session time in ns), runs through that window, writes its log as one .npz file.
-Ages use the session's own clock (one machine, CLOCK_MONOTONIC), not the clients' estimate of it.
+Plug-ins of `bench.worker`. They join when they are made; `measure` runs through a window of session time and writes a
+log as one .npz file. Ages use the session's own clock (one machine, CLOCK_MONOTONIC), not the clients' estimate of it.
 """
 
 from __future__ import annotations
@@ -12,16 +10,16 @@ import contextlib
 import gc
 import hashlib
 import math
-import selectors
-import sys
 import time
 import zlib
-from typing import Final
+from typing import Any, ClassVar, Final
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple
+from iris_session.bench.worker import POLL_S, Plugin
 from iris_session.client import Client, ClientGroup, CurveKeys, SceneState
 from iris_session.protocol.common import Applied
 from iris_session.protocol.names import Device
@@ -36,29 +34,67 @@ JOIN_S: Final = 30.0
 
 
 class ClientJob(msgspec.Struct, frozen=True):
-    """One client. `robot`: robot to drive with the right controller. `samples`: send 3 devices x 72 Hz. `link`: address
-    of its impaired link; empty: none."""
+    """One client.
+
+    Attributes:
+        name: Its name.
+        role: Its role.
+        robot: Robot to drive with the right controller.
+        samples: Send 3 devices x 72 Hz.
+        link: Address of its impaired link; empty: none.
+        loads_s: Of a browser: times in the window at which it fetches assets [s].
+    """
 
     name: str
     role: str
     robot: str = ""
     samples: bool = False
     link: str = ""
+    loads_s: tuple[float, ...] = ()
 
 
 class Job(msgspec.Struct, frozen=True):
-    """Job of one process. `keep_poses`: log every decoded pose of every frame. Keys: Z85 text; empty: plain. `page`:
-    address of the session's page, for browsers."""
+    """Job of one process.
+
+    Attributes:
+        address: Address of the session.
+        origin_ns: Session time zero on CLOCK_MONOTONIC.
+        log: File to write.
+        clients: The clients.
+        keep_poses: Log every decoded pose of every frame.
+        stream: Media stream to subscribe to; empty: none.
+        topology: File of the topology of a deformable stream, instead of the scene's asset.
+        server_public, public, secret: CURVE keys, Z85 text; empty: plain.
+        page: Address of the session's page, for browsers.
+    """
 
     address: str
     origin_ns: int
     log: str
     clients: tuple[ClientJob, ...]
     keep_poses: bool = False
+    stream: str = ""
+    topology: str = ""
     server_public: str = ""
     public: str = ""
     secret: str = ""
     page: str = ""
+
+    @property
+    def curve(self) -> CurveKeys | None:
+        """Keys of a client, `None` for a plain session."""
+        if not self.server_public:
+            return None
+        return CurveKeys(self.server_public.encode(), self.public.encode(), self.secret.encode())
+
+    def session_time_ns(self) -> int:
+        """Return the present session time [ns]."""
+        return time.monotonic_ns() - self.origin_ns
+
+    def write_log(self, columns: dict[str, dict[str, NDArray[Any]]]) -> None:
+        """Write the columns of every client, by its name."""
+        flat = {f"{name}.{key}": column for name, own in columns.items() for key, column in own.items()}
+        np.savez(self.log, allow_pickle=False, **flat)
 
 
 def make_web_secret(secret: str, name: str) -> bytes:
@@ -72,9 +108,6 @@ class BenchClient:
     def __init__(self, job: Job, spec: ClientJob) -> None:
         self.spec = spec
         self._job = job
-        curve = None
-        if job.server_public:
-            curve = CurveKeys(job.server_public.encode(), job.public.encode(), job.secret.encode())
         devices = DEVICES if spec.samples else ()
         self.client = Client(
             f"{spec.link}:{job.address.rpartition(':')[2]}" if spec.link else job.address,
@@ -82,7 +115,7 @@ class BenchClient:
             name=spec.name,
             devices=devices,
             alignment="not_needed",
-            curve=curve,
+            curve=job.curve,
             on_state=self._on_state,
         )
         self.recording = False
@@ -104,7 +137,7 @@ class BenchClient:
         if len(self.ticks) >= (len(self.poses) if self._job.keep_poses else MAX_FRAMES):
             self.overflow += 1
             return
-        self.handed_ns.append(time.monotonic_ns() - self._job.origin_ns)
+        self.handed_ns.append(self._job.session_time_ns())
         self.ticks.append(state.header.tick)
         self.state_ns.append(state.header.session_time)
         self.published_ns.append(state.header.published_ns)
@@ -141,6 +174,9 @@ class BenchClient:
         self.sent += len(samples) * self.client.send_samples(samples)
         self._open_samples = max(0, self._open_samples - 1)
 
+    def receive(self) -> None:
+        """Take what came since the last call; a client of states has had it by `on_state`."""
+
     def _pose(self, t: float, device: int) -> PoseTuple:
         """Return a pose on a slow circle of 3 cm radius, so that inverse kinematics always has work."""
         angle = 2.0 * math.pi * (0.25 * t + self._phase)
@@ -150,66 +186,61 @@ class BenchClient:
     def next_ns(self) -> int:
         return self._next_ns if self.spec.samples else 2**63 - 1
 
+    def to_columns(self) -> dict[str, NDArray[Any]]:
+        """Return the log."""
+        counters = self.client.connection.stream.counters
+        counts = [self.sent, self.overflow, counters.superseded, counters.rigid_messages, counters.rigid_bytes]
+        names = ("ticks", "handed_ns", "state_ns", "published_ns", "applied_seq")
+        columns = {name: np.array(getattr(self, name), np.int64) for name in names}
+        columns["counts"] = np.array(counts, np.int64)
+        return columns | ({"poses": self.poses[: len(self.ticks)]} if self._job.keep_poses else {})
+
 
 def _find_applied_seq(applied: tuple[Applied, ...], robot: str) -> int:
     return next((a.seq for a in applied if a.robot == robot), -1) if robot else -1
 
 
-def run(job: Job) -> None:
-    """Join, wait for the window, measure, and write the log."""
-    clients = [BenchClient(job, spec) for spec in job.clients]
-    for client in clients:
-        client.join()
-    gc.collect()
-    gc.freeze()
-    gc.disable()  # as a latency-sensitive application does: nothing here creates cycles
-    print("ready", flush=True)
-    selector = selectors.DefaultSelector()
-    selector.register(sys.stdin, selectors.EVENT_READ)
-    group = ClientGroup([c.client for c in clients])
-    begin = end = 0
-    cpu_s = time.process_time()
-    while not end or _session_time_ns(job) < end:
-        now = _session_time_ns(job)
-        if not end and selector.select(0):
-            begin, end = map(int, sys.stdin.readline().split())
-            for client in clients:
-                client.prepare((end - begin) * 1e-9)
-            cpu_s = time.process_time()
-        for client in clients:
-            client.recording = bool(end) and begin <= now < end
+class StateClients(Plugin):
+    """Clients of one process."""
+
+    job_type = Job
+    client_type: ClassVar[type[BenchClient]] = BenchClient
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(job)
+        self._clients = [self.client_type(job, spec) for spec in job.clients]
+        for client in self._clients:
+            client.join()
+        self._group = ClientGroup([client.client for client in self._clients])
+        gc.collect()
+        gc.freeze()
+        gc.disable()  # as a latency-sensitive application does: nothing here creates cycles
+
+    def poll(self) -> None:
+        """Send the samples that are due, and receive."""
+        now = self.job.session_time_ns()
+        for client in self._clients:
             client.step(now)
-        wake = min(now + 20_000_000, *(c.next_ns for c in clients))
-        group.poll(max(0.0, (wake - _session_time_ns(job)) * 1e-9))
-    cpu_share = (time.process_time() - cpu_s) / ((end - begin) * 1e-9)
-    _write_log(job, clients, cpu_share)
-    for client in clients:
-        with contextlib.suppress(Exception):  # the session may have ended first
-            client.client.close()
+        wake = min(now + round(POLL_S * 1e9), *(client.next_ns for client in self._clients))
+        self._group.poll(max(0.0, (wake - self.job.session_time_ns()) * 1e-9))
+        for client in self._clients:
+            client.receive()
 
+    def measure(self, begin_ns: int, end_ns: int) -> None:
+        """Run through a window of session time [ns], and write the log."""
+        for client in self._clients:
+            client.prepare((end_ns - begin_ns) * 1e-9)
+        cpu_s = time.process_time()
+        while (now := self.job.session_time_ns()) < end_ns:
+            for client in self._clients:
+                client.recording = begin_ns <= now
+            self.poll()
+        cpu_share = (time.process_time() - cpu_s) / ((end_ns - begin_ns) * 1e-9)
+        share = {"cpu_share": np.array([cpu_share / len(self._clients)])}
+        self.job.write_log({client.spec.name: client.to_columns() | share for client in self._clients})
 
-def _session_time_ns(job: Job) -> int:
-    return time.monotonic_ns() - job.origin_ns
-
-
-def _write_log(job: Job, clients: list[BenchClient], cpu_share: float) -> None:
-    columns: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.int64 | np.float64]]] = {}
-    for client in clients:
-        name = client.spec.name
-        counters = client.client.connection.stream.counters
-        columns[f"{name}.ticks"] = np.array(client.ticks, np.int64)
-        columns[f"{name}.handed_ns"] = np.array(client.handed_ns, np.int64)
-        columns[f"{name}.state_ns"] = np.array(client.state_ns, np.int64)
-        columns[f"{name}.published_ns"] = np.array(client.published_ns, np.int64)
-        columns[f"{name}.applied_seq"] = np.array(client.applied_seq, np.int64)
-        columns[f"{name}.counts"] = np.array(
-            [client.sent, client.overflow, counters.superseded, counters.rigid_messages, counters.rigid_bytes], np.int64
-        )
-        columns[f"{name}.cpu_share"] = np.array([cpu_share / len(clients)])
-        if job.keep_poses:
-            columns[f"{name}.poses"] = client.poses[: len(client.ticks)]
-    np.savez(job.log, allow_pickle=False, **columns)
-
-
-if __name__ == "__main__":
-    run(msgspec.json.decode(sys.stdin.readline(), type=Job))
+    def close(self) -> None:
+        """Leave the session."""
+        for client in self._clients:
+            with contextlib.suppress(Exception):
+                client.client.close()

@@ -6,20 +6,18 @@ pictures come at `BESIDE_HZ`, in every second of alternating intervals.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
-
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloud_camera import CloudCase, CloudJob
-from iris_session.bench.harness import Action, BenchRun, group_clients, measure
-from iris_session.bench.report import BenchError, BenchReport, make_bar
+from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure
+from iris_session.bench.intervals import plan_rounds
+from iris_session.bench.report import BenchReport, make_bar
+from iris_session.bench.worker import Worker
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.physics import PacerStats
@@ -27,9 +25,8 @@ from iris_session.scene.builder import SceneBuilder
 from iris_session.session.config import SessionConfig
 from iris_session.session.scene_publisher import ScenePublisher
 from iris_session.system.extras import require_package
-from iris_session.system.process import PIPE, ChildProcess
 
-CAMERA: Final = "iris_session.bench.cloud_camera"
+CAMERA: Final = "iris_session.bench.cloud_camera:Camera"
 MIN_HZ: Final = 30.0
 MIN_HZ_BESIDE: Final = 10.0
 BESIDE_HZ: Final = 15.0
@@ -40,8 +37,6 @@ LEAD_S: Final = 1.0
 SHORTEST_S: Final = 0.5
 ROUNDS: Final = 4
 ROOM: Final = "room"
-#: In which a command is answered, such as that for the pictures; more than a case takes [s].
-ANSWER_S: Final = 600.0
 
 
 def run_cloud(
@@ -70,19 +65,20 @@ def run_cloud(
     cases = _make_cases(points, cameras, beside, progress)
     params: dict[str, Any] = {"points": points, "cameras": cameras, "seconds": seconds, "seed": seed, "beside": beside}
     progress("making the pictures")
-    with open_child(CAMERA, CloudJob(cases, seed)) as camera:
+    with Worker(CAMERA, CloudJob(cases, seed)) as camera:
+        camera.read()
         if beside:
             return BenchReport("cloud", params, *_measure_beside(camera, seconds, seed, progress))
         with ScenePublisher(
             SceneBuilder("bench"), SessionConfig(control_port=0, state_port=0, record=False)
         ) as session:
-            _ask(camera, f"connect {session.address}")
+            camera.ask("connect", session.address)
             found = {}
             for case in cases:
                 progress(f"measuring {case.name}")
-                found[case.name] = _ask(camera, f"run {case.name} {seconds / len(cases)}")
+                found[case.name] = camera.ask("run", case.name, seconds / len(cases))
         progress("measuring the filters of numpy and open3d")
-        compared = _ask(camera, "compare")
+        compared = camera.ask("compare")
         if compared["open3d_voxel_ms"] is None:
             progress("open3d cannot be imported: pip install 'iris-session[open3d]', and libusb-1.0-0 of the system")
         results = {**found.pop(ROOM), **compared, **found}
@@ -103,68 +99,38 @@ def _make_cases(points: int, cameras: int, beside: bool, progress: Callable[[str
     return tuple(cases)
 
 
-@contextlib.contextmanager
-def open_child(module: str, job: msgspec.Struct) -> Iterator[ChildProcess]:
-    """Start a process that answers commands, and wait until it is ready."""
-    with ChildProcess(module, stdout=PIPE, own_group=True) as child:
-        child.write(msgspec.json.encode(job) + b"\n")
-        read_answer(child)
-        yield child
-
-
-def read_answer(child: ChildProcess) -> dict[str, Any]:
-    """Return the answer to a command. Raises `BenchError`."""
-    try:
-        answer: dict[str, Any] = json.loads(child.read_line(ANSWER_S))
-    except (EOFError, TimeoutError) as error:
-        raise BenchError(f"a process of the benchmark failed: {error}") from None
-    return answer
-
-
-def _ask(child: ChildProcess, command: str) -> dict[str, Any]:
-    child.write(command.encode() + b"\n")
-    return read_answer(child)
-
-
 # --- beside a session -------------------------------------------------------------------------------------------------
 
 
 def _measure_beside(
-    camera: ChildProcess, seconds: float, seed: int, progress: Callable[[str], None]
+    camera: Worker, seconds: float, seed: int, progress: Callable[[str], None]
 ) -> tuple[dict[str, Any], tuple[Any, ...]]:
     """Return results and bars of intervals with and without clouds."""
-    rounds = max(1, min(ROUNDS, int((seconds - LEAD_S) / (2 * SHORTEST_S))))
-    length_s = max(SHORTEST_S, (seconds - LEAD_S) / (2 * rounds))
+    plan = plan_rounds(("without", "with"), seconds, ROUNDS, SHORTEST_S, LEAD_S)  # without a camera first
     readings: list[PacerStats] = []  # at the end of the lead and of each interval
 
-    def read_ticks(arena: BenchRun) -> None:
-        stats = arena.session.lateness()
+    def read_ticks(run: BenchRun) -> None:
+        stats = run.session.lateness()
         assert stats is not None
         readings.append(stats)
 
-    def begin_clouds(_: BenchRun) -> None:
-        camera.write(f"run {ROOM} {length_s}\n".encode())
-
-    actions: list[Action] = [
-        (0.0, lambda arena: camera.write(f"connect {arena.session.address}\n".encode())),
-        (LEAD_S, read_ticks),
-    ]
-    for number in range(2 * rounds):  # without a camera first
-        begin_s = LEAD_S + number * length_s
-        actions += [(begin_s, begin_clouds)] if number % 2 else []
-        actions.append((begin_s + length_s, read_ticks))
+    actions: list[Action] = [(0.0, lambda run: camera.send("connect", run.session.address)), (LEAD_S, read_ticks)]
+    for one in plan:
+        if one.kind == "with":
+            actions.append((one.begin_s, lambda _: camera.send("run", ROOM, plan[0].length_s)))
+        actions.append((one.end_s, read_ticks))
     arms = arm_names(2)
     people = [ClientJob(f"operator{i}", "operator", arm, samples=True) for i, arm in enumerate(arms)]
     got = measure(
         n_arms_scene(2).compile(),
-        group_clients([*people, ClientJob("observer", "observer")]),
-        LEAD_S + 2 * rounds * length_s + 0.2,
+        {CLIENTS: group_clients([*people, ClientJob("observer", "observer")])},
+        plan[-1].end_s + 0.2,
         seed=seed,
         actions=actions,
         progress=progress,
     )
-    read_answer(camera)  # to `connect`
-    runs = [read_answer(camera) for _ in range(rounds)]
+    camera.read()  # the answer to `connect`
+    runs = [camera.read() for _ in plan[1::2]]
     late = {"": 0, "_without": 0}
     ticks = {"": 0, "_without": 0}
     for number, (before, after) in enumerate(itertools.pairwise(readings)):
@@ -176,10 +142,8 @@ def _measure_beside(
         **worst,
         **{f"late_tick_share{key}": round(late[key] / max(1, ticks[key]), 6) for key in late},
         "ticks": sum(ticks.values()),
-        "rounds": rounds,
-        "late_causes": got.late_causes,
-        "scheduling": got.scheduling,
-        "drops": got.drops,
+        "rounds": len(runs),
+        **got.summarize("late_causes", "scheduling", "drops"),
     }
     bound = max(LATE_SHARE, results["late_tick_share_without"])
     bars = (make_bar(results, "hz", ">=", MIN_HZ_BESIDE), make_bar(results, "late_tick_share", "<=", bound))

@@ -1,17 +1,10 @@
-"""Camera process of `bench cloud`: pictures that are ready in memory become clouds that are sent to the session.
-
-    python -m iris_session.bench.cloud_camera
-
-Commands on standard input, each answered by one JSON line: the cases, as JSON; `connect ADDRESS`; `run CASE SECONDS`;
-`compare`.
-"""
+"""Camera process of `bench cloud`: pictures that are ready in memory become clouds that are sent to the session."""
 
 from __future__ import annotations
 
 import importlib
 import math
 import os
-import sys
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -25,14 +18,11 @@ from numpy.typing import NDArray
 
 from anchors.camera import CameraModel
 from iris_session.bench.cloud_room import WORKSPACE, RoomPicture, make_room_camera, make_room_pose, render_room
-from iris_session.bench.cloud_source import STREAM, publish
-from iris_session.client import Client
+from iris_session.bench.cloud_source import MediaPublisher
 from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceFrame
 from iris_session.cloud.pipeline import Cloud, CloudPipeline, PlacedFrame
 from iris_session.cloud.voxels import DepthLimits, pack_keys
-from iris_session.streams.cloud import encode_cloud
-from iris_session.system.priority import lower_thread_priority
 
 STAGES: Final = ("read", "voxels", "outliers", "budget", "encode", "send")
 ERROR_M: Final = 0.01
@@ -150,16 +140,34 @@ class CloudCamera:
         read_ms = (time.perf_counter_ns() - began_ns) * 1e-6
         return self._pipeline.make_cloud(frames), read_ms
 
-    def run(self, client: Client, seconds: float) -> dict[str, Any]:
-        """Make and send clouds for some seconds. Return the results."""
+
+class Camera(MediaPublisher):
+    """Publisher of the clouds of its cases."""
+
+    job_type = CloudJob
+    role = "camera"
+
+    def __init__(self, job: CloudJob) -> None:
+        super().__init__(job)
+        self._cameras = {case.name: CloudCamera(case, job.seed) for case in job.cases}
+
+    def compare(self) -> dict[str, float | None]:
+        """Return what the voxel filters of numpy and open3d take for a picture of the first case [ms]."""
+        case = self.job.cases[0]
+        return compare_filters(self._cameras[case.name].rig, case.voxel_m)
+
+    def run(self, case: str, seconds: float) -> dict[str, Any]:
+        """Make and send clouds of a case for some seconds. Return the results."""
+        assert self._client is not None
+        camera, client = self._cameras[case], self._client
         stages: dict[str, list[float]] = defaultdict(list)
         totals, points, edges, refused = [], [], [], 0
         cpu_s, begin = time.process_time(), time.perf_counter()
         while (began := time.perf_counter()) - begin < seconds:
             now_ns = client.session_now_ns()
-            cloud, stages_ms = self.make_cloud(now_ns)
+            cloud, stages_ms = camera.make_cloud(now_ns)
             made = time.perf_counter()
-            sent = publish(client, STREAM, cloud.frames, now_ns)
+            sent = self.publish(cloud.frames, now_ns)
             client.poll(0.0)
             ended = time.perf_counter()
             refused += not sent
@@ -168,7 +176,7 @@ class CloudCamera:
             totals.append((ended - began) * 1e3)
             points.append(cloud.n_points)
             edges.append(cloud.voxel_m)
-            due = begin + len(totals) / self.case.hz if self.case.hz else 0.0
+            due = begin + len(totals) / camera.case.hz if camera.case.hz else 0.0
             while (left := due - time.perf_counter()) > 0.0:
                 client.poll(left)
         elapsed_s = time.perf_counter() - begin
@@ -227,33 +235,3 @@ def _time_ms(call: Any) -> float:
         call()
         spent.append((time.perf_counter() - began) * 1e3)
     return round(median(spent), 3)
-
-
-def main() -> None:
-    """Serve commands until the end of standard input."""
-    lower_thread_priority()  # of this thread and those that it starts, as in a camera process
-    job = msgspec.json.decode(sys.stdin.readline(), type=CloudJob)
-    cameras = {case.name: CloudCamera(case, job.seed) for case in job.cases}
-    client: Client | None = None
-    print("{}", flush=True)
-    for line in sys.stdin:
-        command, *words = line.split()
-        answer: dict[str, Any] = {}
-        if command == "connect":
-            client = Client(words[0], role="camera", name="camera", alignment="not_needed")
-            client.connect(30.0)
-            nothing = encode_cloud(np.empty((0, 3)), np.empty((0, 3), np.uint8))
-            while not client.media.publish(STREAM, nothing, encoding="cloud"):  # the first call connects
-                client.poll(0.02)
-        elif command == "run" and client is not None:
-            answer = cameras[words[0]].run(client, float(words[1]))
-        elif command == "compare":
-            first = job.cases[0]
-            answer = compare_filters(cameras[first.name].rig, first.voxel_m)
-        print(msgspec.json.encode(answer).decode(), flush=True)
-    if client is not None:
-        client.close()
-
-
-if __name__ == "__main__":
-    main()

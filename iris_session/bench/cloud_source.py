@@ -1,20 +1,15 @@
-"""Source of `bench cloud-stream`: points in motion, encoded and published by a process of its own.
-
-    python -m iris_session.bench.cloud_source
-
-Commands on standard input, each answered by one JSON line: the job, as JSON; `connect ADDRESS [KEYS]`; `run SECONDS`.
-"""
+"""Source of `bench cloud-stream`: points in motion, encoded and published by a process of its own."""
 
 from __future__ import annotations
 
-import sys
 import time
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.bench.worker import POLL_S, Plugin
 from iris_session.client import Client, CurveKeys
 from iris_session.client.errors import NotConnectedError
 from iris_session.cloud.pipeline import CLASSES
@@ -67,58 +62,78 @@ class MovingCloud:
         return encode_cloud(self.compute_positions(t), self.colors, voxel_m=VOXEL_M, error_m=ERROR_M, classes=CLASSES)
 
 
-def publish(client: Client, stream: str, frames: dict[str, bytes], capture_ns: int) -> bool:
-    """Publish a cloud. Return false if the link takes nothing, or the client is reconnecting."""
-    try:
-        return client.media.publish(stream, frames, capture_ns=capture_ns, encoding="cloud")
-    except NotConnectedError:
-        return False
+class MediaPublisher(Plugin):
+    """Plug-in that publishes clouds. `role`: in which it joins."""
+
+    role: ClassVar[str]
+
+    def __init__(self, job: Any) -> None:
+        super().__init__(job)
+        lower_thread_priority()  # of this thread and those that it starts, as in a camera process
+        self._client: Client | None = None
+
+    def connect(self, address: str, *keys: str) -> None:
+        """Join a session, with the keys of an encrypted one."""
+        curve = CurveKeys(*(key.encode() for key in keys)) if keys else None
+        self._client = Client(address, role=self.role, name=self.role, alignment="not_needed", curve=curve)
+        self._client.connect(30.0)
+        nothing = encode_cloud(np.empty((0, 3)), np.empty((0, 3), np.uint8))
+        until_s = time.monotonic() + 30.0
+        while not self._client.media.publish(STREAM, nothing, encoding="cloud"):  # the first call connects
+            if time.monotonic() > until_s:
+                raise TimeoutError("the session takes no media")
+            self._client.poll(POLL_S)
+
+    def poll(self) -> None:
+        """Keep the connection alive."""
+        if self._client is None:
+            super().poll()
+        else:
+            self._client.poll(POLL_S)
+
+    def close(self) -> None:
+        """Leave the session."""
+        if self._client is not None:
+            self._client.close()
+
+    def publish(self, frames: dict[str, bytes], capture_ns: int) -> bool:
+        """Publish a cloud. Return false if the link takes nothing, or the client is reconnecting."""
+        assert self._client is not None
+        try:
+            return self._client.media.publish(STREAM, frames, capture_ns=capture_ns, encoding="cloud")
+        except NotConnectedError:
+            return False
 
 
-def run(cloud: MovingCloud, client: Client, hz: int, seconds: float) -> dict[str, Any]:
-    """Publish for some seconds. Return captures [ns] of the frames by number, and what their encoding took [ms]."""
-    captures: dict[int, int] = {}
-    encode_ms, refused = [], 0
-    begin = time.perf_counter()
-    number = 0
-    while (now := time.perf_counter()) < begin + seconds:
-        if now < begin + number / hz:
-            client.poll(begin + number / hz - now)
-            continue
-        capture_ns = client.session_now_ns()
-        positions = cloud.compute_positions(number / hz)
-        began_ns = time.perf_counter_ns()
-        frames = encode_cloud(positions, cloud.colors, voxel_m=VOXEL_M, error_m=ERROR_M, classes=CLASSES)
-        encode_ms.append((time.perf_counter_ns() - began_ns) * 1e-6)
-        refused += not publish(client, STREAM, frames, capture_ns)
-        captures[number] = capture_ns
-        number = max(number + 1, int((time.perf_counter() - begin) * hz))  # frames without time for them are left out
-    return {"captures": captures, "encode_ms": encode_ms, "refused": refused}
+class Source(MediaPublisher):
+    """Publisher of a moving cloud."""
 
+    job_type = SourceJob
+    role = "source"
 
-def main() -> None:
-    """Serve commands until the end of standard input."""
-    lower_thread_priority()  # of this thread and those that it starts, as in a camera process
-    job = msgspec.json.decode(sys.stdin.readline(), type=SourceJob)
-    cloud = MovingCloud(job.points, job.seed)
-    client: Client | None = None
-    print("{}", flush=True)
-    for line in sys.stdin:
-        command, *words = line.split()
-        answer: dict[str, Any] = {}
-        if command == "connect":
-            curve = CurveKeys(*(key.encode() for key in words[1:])) if len(words) > 1 else None
-            client = Client(words[0], role="source", name="source", alignment="not_needed", curve=curve)
-            client.connect(30.0)
-            nothing = encode_cloud(np.empty((0, 3)), np.empty((0, 3), np.uint8))
-            while not client.media.publish(STREAM, nothing, encoding="cloud"):  # the first call connects
-                client.poll(0.02)
-        elif command == "run" and client is not None:
-            answer = run(cloud, client, job.hz, float(words[0]))
-        print(msgspec.json.encode(answer).decode(), flush=True)
-    if client is not None:
-        client.close()
+    def __init__(self, job: SourceJob) -> None:
+        super().__init__(job)
+        self._cloud = MovingCloud(job.points, job.seed)
 
-
-if __name__ == "__main__":
-    main()
+    def run(self, seconds: float) -> dict[str, Any]:
+        """Publish for some seconds. Return captures [ns] of the frames by number, and what their encoding took [ms]."""
+        assert self._client is not None
+        hz: int = self.job.hz
+        captures: dict[int, int] = {}
+        encode_ms, refused = [], 0
+        begin = time.perf_counter()
+        number = 0
+        while (now := time.perf_counter()) < begin + seconds:
+            if now < begin + number / hz:
+                self._client.poll(begin + number / hz - now)
+                continue
+            capture_ns = self._client.session_now_ns()
+            positions = self._cloud.compute_positions(number / hz)
+            began_ns = time.perf_counter_ns()
+            frames = encode_cloud(positions, self._cloud.colors, voxel_m=VOXEL_M, error_m=ERROR_M, classes=CLASSES)
+            encode_ms.append((time.perf_counter_ns() - began_ns) * 1e-6)
+            refused += not self.publish(frames, capture_ns)
+            captures[number] = capture_ns
+            # Frames without time for them are left out.
+            number = max(number + 1, int((time.perf_counter() - begin) * hz))
+        return {"captures": captures, "encode_ms": encode_ms, "refused": refused}

@@ -7,31 +7,31 @@ comes before, and after that; in the last part there is none.
 
 from __future__ import annotations
 
-import functools
 import json
 import tempfile
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.cloud import open_child, read_answer
-from iris_session.bench.cloud_clients import UNCHECKED, CloudStreamJob
-from iris_session.bench.cloud_clients import CloudColumn as Column
 from iris_session.bench.cloud_source import STREAM, MovingCloud, SourceJob
-from iris_session.bench.harness import Action, BenchRun, Log, Measurement, measure
+from iris_session.bench.harness import Action, BenchRun, Measurement, measure
+from iris_session.bench.intervals import Interval, Log, compute_age_p99_ms, plan_intervals, plan_rounds
+from iris_session.bench.media_clients import UNCHECKED
+from iris_session.bench.media_clients import MediaColumn as Column
 from iris_session.bench.report import Bar, BenchError, BenchReport, compute_percentile, make_bar
+from iris_session.bench.worker import Worker
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.netsim.process import make_link_address
 from iris_session.streams.cloud import decode_cloud, read_header
 
-SOURCE: Final = "iris_session.bench.cloud_source"
-CLIENTS: Final = "iris_session.bench.cloud_clients"
+SOURCE: Final = "iris_session.bench.cloud_source:Source"
+CLIENTS: Final = "iris_session.bench.media_clients:CloudClients"
 #: Moving rigid bodies beside the cloud.
 BODIES: Final = 50
 ROUNDS: Final = 4
@@ -46,23 +46,12 @@ WITHOUT, WITH, SLOW, SLOW_WITHOUT = "without", "with", "slow", "slow_without"
 MS: Final = 1e-6
 
 
-class Interval(NamedTuple):
-    """A part of the window, in seconds from its beginning."""
-
-    kind: str
-    begin_s: float
-    end_s: float
-
-
-def plan_intervals(seconds: float, mbit: float) -> list[Interval]:
+def plan_stream(seconds: float, mbit: float) -> list[Interval]:
     """Return the intervals of a window."""
-    if mbit:
-        kinds: tuple[str, ...] = (WITH, SLOW, SLOW_WITHOUT)
-    else:
-        rounds = max(1, min(ROUNDS, int((seconds - LEAD_S) / (2 * SHORTEST_S))))
-        kinds = (WITHOUT, WITH) * rounds
-    length_s = max(SHORTEST_S, (seconds - LEAD_S) / len(kinds))
-    return [Interval(kind, LEAD_S + i * length_s, LEAD_S + (i + 1) * length_s) for i, kind in enumerate(kinds)]
+    if not mbit:
+        return plan_rounds((WITHOUT, WITH), seconds, ROUNDS, SHORTEST_S, LEAD_S)
+    kinds = (WITH, SLOW, SLOW_WITHOUT)
+    return plan_intervals(kinds, [max(SHORTEST_S, (seconds - LEAD_S) / len(kinds))] * len(kinds), LEAD_S)
 
 
 def run_cloud_stream(
@@ -87,7 +76,7 @@ def run_cloud_stream(
         curve: Encrypt and authenticate.
         progress: Called with short texts.
     """
-    plan = plan_intervals(seconds, mbit)
+    plan = plan_stream(seconds, mbit)
     specs = [ClientJob(f"client{i}", "observer") for i in range(clients)]
     links: dict[str, str] = {}
     if mbit:
@@ -95,42 +84,40 @@ def run_cloud_stream(
         links = {spec.link: "none" for spec in specs}
     with (
         tempfile.TemporaryDirectory(prefix="iris-bench-") as folder,
-        open_child(SOURCE, SourceJob(points, hz, seed)) as source,
+        Worker(SOURCE, SourceJob(points, hz, seed)) as source,
     ):
+        source.read()
         profile = Path(folder) / "slow.json"
         profile.write_text(json.dumps({"phases": [{"rate_mbit": mbit, "delay_ms": 2}]}))
 
-        def write(command: str) -> Callable[[BenchRun], None]:
-            return lambda _: source.write(f"{command}\n".encode())
+        def connect(run: BenchRun) -> None:
+            job = run.workers[0].job
+            keys = [job.server_public, job.public, job.secret] if job.server_public else []
+            source.send("connect", run.session.address, *keys)
 
-        def connect(arena: BenchRun) -> None:
-            job = arena.processes[0].job
-            keys = f" {job.server_public} {job.public} {job.secret}" if job.server_public else ""
-            source.write(f"connect {arena.session.address}{keys}\n".encode())
-
-        def slow_links(arena: BenchRun) -> None:
-            assert arena.proxy is not None
-            arena.proxy.send(f"profile {profile}")
+        def slow_links(run: BenchRun) -> None:
+            assert run.proxy is not None
+            run.proxy.send(f"profile {profile}")
 
         actions: list[Action] = [(0.0, connect)]
-        for interval in plan:
-            length_s = interval.end_s - interval.begin_s
-            actions += [(interval.begin_s, slow_links)] if interval.kind == SLOW else []
-            actions += [(interval.begin_s, write(f"run {length_s}"))] if interval.kind in (WITH, SLOW) else []
+        for one in plan:
+            if one.kind == SLOW:
+                actions.append((one.begin_s, slow_links))
+            if one.kind in (WITH, SLOW):
+                actions.append((one.begin_s, lambda _: source.send("run", plan[0].length_s)))
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
-            [(spec,) for spec in specs],
+            {CLIENTS: [(spec,) for spec in specs]},
             plan[-1].end_s,
             links=links,
             seed=seed,
             actions=actions,
             curve=curve,
-            module=CLIENTS,
-            make_job=functools.partial(CloudStreamJob, stream=STREAM),
+            stream=STREAM,
             progress=progress,
         )
-        read_answer(source)  # to `connect`
-        runs = [read_answer(source) for one in plan if one.kind in (WITH, SLOW)]
+        source.read()  # the answer to `connect`
+        runs = [source.read() for one in plan if one.kind in (WITH, SLOW)]
     progress("comparing the delivered clouds with those of the source")
     results = summarize(got, plan, runs, MovingCloud(points, seed), hz)
     params: dict[str, Any] = {"points": points, "hz": hz, "clients": clients, "seconds": plan[-1].end_s}
@@ -143,14 +130,14 @@ def summarize(
 ) -> dict[str, Any]:
     """Return the results of a window."""
     logs = list(got.logs.values())
-    clouds = np.concatenate([log["clouds"] for log in logs])
+    clouds = np.concatenate([log["frames"] for log in logs])
     if not (clouds[:, Column.LEVEL] == 0).any():
         raise BenchError("no whole cloud reached a client within the window")
     streamed = [one for one in plan if one.kind == WITH]
-    fast = [np.concatenate([_select(log["clouds"], Column.HANDED, got, one) for one in streamed]) for log in logs]
+    fast = [np.concatenate([_select(log["frames"], Column.HANDED, got, one) for one in streamed]) for log in logs]
     fast = [one[one[:, Column.LEVEL] == 0] for one in fast]  # a coarser class is less than was asked for
     rows = np.concatenate(fast)
-    length_s = sum(one.end_s - one.begin_s for one in streamed)
+    length_s = sum(one.length_s for one in streamed)
     counts = np.sum([log["counts"] for log in logs], axis=0).tolist()
     superseded, dropped, malformed, overflow, heads = counts
     whole = clouds[clouds[:, Column.LEVEL] == 0]
@@ -174,21 +161,19 @@ def summarize(
     for kind, key in ((WITH, ""), (WITHOUT, "_without"), (SLOW, "_slow"), (SLOW_WITHOUT, "_slow_without")):
         intervals = [one for one in plan if one.kind == kind]
         if intervals:
-            p99s = [_compute_state_p99(logs, got, one) for one in intervals]
+            p99s = [compute_age_p99_ms(logs, got.begin_ns, one.begin_s, one.end_s) for one in intervals]
             results[f"state_age_ms_p99{key}"] = round(float(np.median(p99s)), 3)
     for slow in (one for one in plan if one.kind == SLOW):
         results |= _summarize_slow(logs, got, slow)
-        lowered = slow._replace(begin_s=min(slow.begin_s + MAX_LOWER_S, slow.end_s - SHORTEST_S / 2))
-        results["state_age_ms_p99_slow_lowered"] = round(_compute_state_p99(logs, got, lowered), 3)
+        lowered_s = min(slow.begin_s + MAX_LOWER_S, slow.end_s - SHORTEST_S / 2)
+        results["state_age_ms_p99_slow_lowered"] = compute_age_p99_ms(logs, got.begin_ns, lowered_s, slow.end_s)
     return results | {
         "frames_refused": sum(run["refused"] for run in runs),
         "frames_superseded": superseded,
         "frames_dropped": dropped,
         "frames_malformed": malformed,
         "frames_not_logged": overflow,
-        "late_tick_share": round(got.stats.late_share, 6),
-        "scheduling": got.scheduling,
-        "drops": got.drops,
+        **got.summarize("late_tick_share", "scheduling", "drops"),
     }
 
 
@@ -200,14 +185,13 @@ def _summarize_slow(logs: Sequence[Log], got: Measurement, slow: Interval) -> di
     """
     known_s, lower_s, gaps_s, rates = [], [], [], []
     for log in logs:
-        rows = _select(log["clouds"], Column.HANDED, got, slow)
+        rows = _select(log["frames"], Column.HANDED, got, slow)
         at_s = (rows[:, Column.HANDED] - got.begin_ns) * 1e-9 - slow.begin_s
         levels = _select(log["levels"], 0, got, slow)
         known_s.append(_first(((levels[:, 0] - got.begin_ns) * 1e-9 - slow.begin_s)[levels[:, 1] > 0]))
         lower_s.append(_first(at_s[rows[:, Column.LEVEL] > 0]))
-        length_s = slow.end_s - slow.begin_s
-        gaps_s.append(float(np.diff(np.concatenate([[0.0], at_s, [length_s]])).max()))
-        rates.append(float(np.count_nonzero(at_s >= MAX_LOWER_S)) / max(length_s - MAX_LOWER_S, 0.1))
+        gaps_s.append(float(np.diff(np.concatenate([[0.0], at_s, [slow.length_s]])).max()))
+        rates.append(float(np.count_nonzero(at_s >= MAX_LOWER_S)) / max(slow.length_s - MAX_LOWER_S, 0.1))
     return {
         "lower_class_after_s": round(max(known_s), 3),
         "lower_cloud_after_s": round(max(lower_s), 3),
@@ -244,17 +228,7 @@ def _make_bars(results: dict[str, Any], hz: int, mbit: float) -> list[Bar]:
 
 def _select(rows: NDArray[Any], column: int, got: Measurement, interval: Interval) -> NDArray[Any]:
     """Return the rows with a session time within an interval."""
-    at_s = (rows[:, column] - got.begin_ns) * 1e-9
-    return np.asarray(rows[(at_s >= interval.begin_s) & (at_s < interval.end_s)])
-
-
-def _compute_state_p99(logs: Sequence[Log], got: Measurement, interval: Interval) -> float:
-    rows = [
-        _select(np.stack([log["handed_ns"], log["handed_ns"] - log["state_ns"]], axis=1), 0, got, interval)
-        for log in logs
-    ]
-    ages = np.concatenate(rows)[:, 1]
-    return float(np.percentile(ages, 99)) * MS if len(ages) else float("inf")
+    return np.asarray(rows[interval.contains(rows[:, column], got.begin_ns)])
 
 
 def _compare(clouds: NDArray[Any], runs: Sequence[dict[str, Any]], cloud: MovingCloud, hz: int) -> tuple[float, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import tempfile
 import time
@@ -16,9 +15,10 @@ import zstandard
 
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloth_motion import HZ, ClothMotion, load_cloth_motion
-from iris_session.bench.deformable_clients import DeformableJob
-from iris_session.bench.harness import Log, Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import NO_BARS, BenchError, BenchReport, compute_percentile, make_bar
+from iris_session.bench.harness import Measurement, assign_links, group_clients, measure
+from iris_session.bench.intervals import Log
+from iris_session.bench.media_clients import MediaColumn as Column
+from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, make_link_report
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.names import BudgetClass
 from iris_session.session.session import Session
@@ -26,6 +26,7 @@ from iris_session.streams.deformable import COARSER, DeformableDecoder, Deformab
 from iris_session.streams.deformable_topology import DeformableTopology
 
 STREAM: Final = "cloth"
+CLIENTS: Final = "iris_session.bench.media_clients:DeformableClients"
 BOUND_M: Final = 0.0005
 #: Moving rigid bodies beside the cloth.
 BODIES: Final = 50
@@ -68,13 +69,13 @@ def run_deformable(
         file.write_bytes(topology.to_bytes())
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
-            group_clients(specs),
+            {CLIENTS: group_clients(specs)},
             seconds,
             links=links,
             seed=seed,
             curve=curve,
-            module="iris_session.bench.deformable_clients",
-            make_job=functools.partial(DeformableJob, stream=STREAM, topology=str(file)),
+            stream=STREAM,
+            topology=str(file),
             on_tick=source.publish,
             progress=progress,
         )
@@ -89,9 +90,7 @@ def run_deformable(
     ]
     params: dict[str, Any] = {"vertices": vertices, "clients": clients, "seconds": seconds, "seed": seed}
     params |= {"curve": curve, "hz": HZ, "bound_mm": BOUND_M * 1e3}
-    if profile:
-        params |= {"profile": profile, "bars": NO_BARS}
-    return BenchReport("deformable", params, results, () if profile else tuple(bars), _measure_reference(motion))
+    return make_link_report("deformable", params, results, bars, profile, _measure_reference(motion))
 
 
 class _ClothSource:
@@ -137,8 +136,8 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
     rows = np.array([row[1:] for row in source.encoded if got.begin_ns <= row[0] < end_ns]).reshape(-1, 3)
     spent, sizes = rows[:, :2] * 1e-6, rows[:, 2]
     logs = got.logs.values()
-    ages = np.concatenate([(log["handed_ns"] - log["capture_ns"]) * 1e-6 for log in logs])
-    decode = np.concatenate([log["decode_ns"] for log in logs]) * 1e-6
+    frames = np.concatenate([log["frames"] for log in logs])
+    ages, decode = (frames[:, Column.HANDED] - frames[:, Column.CAPTURE]) * 1e-6, frames[:, Column.DECODED] * 1e-6
     if not len(ages) or not len(spent):
         raise BenchError("no frame of the cloth reached a client within the window")
     superseded, dropped, malformed, overflow, heads = np.sum([log["counts"] for log in logs], axis=0).tolist()
@@ -148,7 +147,7 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
         "encode_ms_p99": compute_percentile(spent[:, 0], 99),
         "mbit_per_s": round(float(sent) * 8e-6 / got.seconds, 3),
         "max_error_mm": round(_compute_max_error_m(got.logs, source) * 1e3, 5),
-        "delivered_hz_min": round(min(len(log["handed_ns"]) for log in logs) / got.seconds, 2),
+        "delivered_hz_min": round(min(len(log["frames"]) for log in logs) / got.seconds, 2),
         "encode_cpu_ms_p50": compute_percentile(spent[:, 1], 50),
         "encode_cpu_ms_p99": compute_percentile(spent[:, 1], 99),
         "decode_cpu_ms_p50": compute_percentile(decode, 50),
@@ -161,10 +160,7 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
         "frames_dropped": dropped,
         "frames_malformed": malformed,
         "frames_not_logged": overflow,
-        "late_tick_share": round(got.stats.late_share, 6),
-        "late_causes": got.late_causes,
-        "scheduling": got.scheduling,
-        "drops": got.drops,
+        **got.summarize("late_tick_share", "late_causes", "scheduling", "drops"),
     }
 
 
@@ -188,10 +184,10 @@ def _compute_max_error_m(logs: dict[str, Log], source: _ClothSource) -> float:
 
 def _iterate_payloads(log: Log) -> Iterator[tuple[int, int, bytes]]:
     """Yield `capture_ns`, checksum and payload of every frame that one client decoded."""
-    end = np.cumsum(log["sizes"])
-    for i, capture_ns in enumerate(log["capture_ns"]):
-        payload = log["payloads"][end[i] - log["sizes"][i] : end[i]].tobytes()
-        yield int(capture_ns), int(log["checksums"][i]), payload
+    ends = np.cumsum(log["frames"][:, Column.SIZE])
+    for row, end in zip(log["frames"].tolist(), ends.tolist(), strict=True):
+        payload = log["payloads"][end - row[Column.SIZE] : end].tobytes()
+        yield row[Column.CAPTURE], row[Column.CHECKSUM], payload
 
 
 def _measure_offline(motion: ClothMotion, topology: DeformableTopology) -> dict[str, Any]:

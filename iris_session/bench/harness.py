@@ -6,7 +6,6 @@ Clients join directly, or over an impaired link: then the impairment proxy of `n
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import os
 import tempfile
@@ -24,7 +23,9 @@ from numpy.typing import NDArray
 
 from iris_session.authority.config import UNALIGNED, AuthorityConfig
 from iris_session.bench.clients import ClientJob, Job, make_web_secret
+from iris_session.bench.intervals import Log
 from iris_session.bench.report import BenchError
+from iris_session.bench.worker import Worker
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.physics import PacerStats
 from iris_session.protocol.client_messages import Sample
@@ -34,19 +35,19 @@ from iris_session.protocol.server_messages import StateHeader
 from iris_session.security import WEB, KeyHome, KeyPair, encode_key
 from iris_session.session.config import SessionConfig
 from iris_session.session.session import Session
-from iris_session.system.process import PIPE, ChildProcess
 
 #: The bars are stated for at most four clients in one process.
 CLIENTS_PER_PROCESS: Final = 4
 WARM_UP_S: Final = 3.0
-#: Time in which client processes have to end after the measurement [s].
+#: Time in which clients have joined, and in which they have written their logs after the window [s].
+JOIN_S: Final = 60.0
 EXIT_S: Final = 60.0
-CLIENTS: Final = "iris_session.bench.clients"
-BROWSERS: Final = "iris_session.bench.web_clients"
-TABS: Final = "iris_session.bench.web_tab"
-Log = dict[str, NDArray[Any]]
-
-
+#: Time in which client processes leave the session [s].
+LEAVE_S: Final = 5.0
+#: Plug-ins of clients.
+CLIENTS: Final = "iris_session.bench.clients:StateClients"
+BROWSERS: Final = "iris_session.bench.web_clients:Browsers"
+TABS: Final = "iris_session.bench.web_tab:Tab"
 Group = tuple[ClientJob, ...]  # the clients of one process
 
 
@@ -97,31 +98,31 @@ class Measurement:
     begin_ns: int = 0
     recorder_cpu_share: float = 0.0
 
+    def summarize(self, *keys: str) -> dict[str, Any]:
+        """Return some of what is measured of the session itself, under the keys of reports."""
+        found = {
+            "server_cpu_share": round(self.cpu_share, 3),
+            "late_tick_share": round(self.stats.late_share, 6),
+            "lateness_ms_p99": round(self.stats.p99_ns * 1e-6, 3),
+            "ticks": self.stats.ticks,
+            "frames_not_logged": sum(int(log["counts"][1]) for log in self.logs.values() if "counts" in log),
+            "late_causes": self.late_causes,
+            "scheduling": self.scheduling,
+            "drops": self.drops,
+        }
+        return {key: found[key] for key in keys}
 
-class ClientProcess:
-    """Process of one group of clients. `module`: the module that it runs."""
 
-    def __init__(self, job: Job, module: str = CLIENTS) -> None:
+class ClientWorker(Worker):
+    """Process of one group of clients."""
+
+    def __init__(self, plugin: str, job: Job) -> None:
         self.job = job
-        self._process = ChildProcess(module, stdout=PIPE, own_group=True)  # Ctrl-C ends the benchmark, which ends it
-        self._process.write(msgspec.json.encode(job) + b"\n")
+        super().__init__(plugin, job)
 
-    def is_ready(self) -> bool:
-        """Return whether its clients have joined. Raise `BenchError` if the process ended."""
-        if not self._process.is_running:
-            raise BenchError(f"a client process ended with status {self._process.exit_status} before it was ready")
-        return b"ready" in self._process.read_available_lines()
-
-    def set_window(self, begin_ns: int, end_ns: int) -> None:
-        self._process.write(f"{begin_ns} {end_ns}\n".encode())
-
-    def read_result(self) -> dict[str, Log]:
-        """Return the logs by client name, once the process has ended."""
-        status = self._process.wait(EXIT_S)
-        if status is None:
-            raise BenchError(f"a client process still runs {EXIT_S:g} s after the end of the measurement")
-        if status != 0:
-            raise BenchError(f"a client process failed with exit status {status}")
+    def read_logs(self) -> dict[str, Log]:
+        """Return the logs by client name, once the window is over."""
+        self.read(EXIT_S)
         with np.load(self.job.log) as columns:
             logs: dict[str, Log] = {}
             for key in columns.files:
@@ -129,29 +130,14 @@ class ClientProcess:
                 logs.setdefault(name, {})[column] = columns[key]
         return logs
 
-    @property
-    def running(self) -> bool:
-        return self._process.is_running
-
-    def send_signal(self, number: int) -> None:
-        """Send a signal to the process, for example to stop or continue it."""
-        self._process.send_signal(number)
-
-    def send_line(self, text: str) -> None:
-        """Write a line to the process's standard input."""
-        self._process.write(f"{text}\n".encode())
-
-    def kill(self) -> None:
-        self._process.close()
-
 
 @dataclass
 class BenchRun:
     """Running benchmark, on which an action of `measure` acts. `by_client`: processes by client name."""
 
     session: Session
-    processes: list[ClientProcess]
-    by_client: dict[str, ClientProcess]
+    workers: list[ClientWorker]
+    by_client: dict[str, ClientWorker]
     proxy: ImpairmentProcess | None
 
 
@@ -177,11 +163,9 @@ Action = tuple[float, Callable[[BenchRun], None]]
 
 def measure(
     model: mujoco.MjModel,
-    groups: Sequence[Group],
+    groups: Mapping[str, Sequence[Group]],
     seconds: float,
     *,
-    browsers: Sequence[Group] = (),
-    tabs: Sequence[Group] = (),
     links: Mapping[str, str] = MappingProxyType({}),
     seed: int = 0,
     actions: Sequence[Action] = (),
@@ -189,8 +173,8 @@ def measure(
     curve: bool = False,
     assets: bool | Path = False,
     record: bool | Path = False,
-    module: str = CLIENTS,
-    make_job: Callable[..., Job] = Job,
+    stream: str = "",
+    topology: str = "",
     on_tick: Callable[[Session], None] = lambda _: None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Measurement:
@@ -198,10 +182,9 @@ def measure(
 
     Args:
         model: Model of the session.
-        groups: Clients by process.
+        groups: Clients by process, by plug-in: `CLIENTS`, `BROWSERS` at the session's page without a picture, `TABS`
+            in a real Chromium, or that of a benchmark.
         seconds: Length of the measured window.
-        browsers: Browsers at the session's page by process, without a picture.
-        tabs: The same in a real Chromium.
         links: Link profile by address.
         seed: Random seed of the links.
         actions: Functions to call during the window, in order of their times.
@@ -209,59 +192,51 @@ def measure(
         curve: Encrypt and authenticate.
         assets: Store of the scene's assets; False: clients get poses only.
         record: File of the recording; False: none.
-        module: Module that client processes run.
-        make_job: Constructor of their jobs.
+        stream: Media stream that clients subscribe to.
+        topology: File of its topology.
         on_tick: Called after every tick, warm-up included.
         progress: Called with short texts.
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
-        people = [spec.name for group in browsers for spec in group]
-        keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else None
+        people = [spec.name for group in groups.get(BROWSERS, ()) for spec in group]
+        keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else {}
         config = make_session_config(assets=assets, record=record, curve=curve)
         session = stack.enter_context(Session(model, config=config))
         proxy = None
         if links:
             ports = session.processes.front_ports
             proxy = stack.enter_context(ImpairmentProcess(links, ports.for_clients, target=ports.host, seed=seed))
-        arena = BenchRun(session, [], {}, proxy)
+        run = BenchRun(session, [], {}, proxy)
         page = "" if session.processes.web is None else session.processes.web.address
-        if (browsers or tabs) and not page:
+        if groups.keys() & {BROWSERS, TABS} and not page:
             raise BenchError("the session has no page for browsers")
-        kinds = [(module, make_job, group) for group in groups]
-        kinds += [(BROWSERS, functools.partial(Job, page=page), group) for group in browsers]
-        kinds += [(TABS, functools.partial(Job, page=page + _make_code(session)), group) for group in tabs]
-        for i, (kind, make, group) in enumerate(kinds):
-            job = make(
-                session.address,
-                session.origin_ns,
-                str(folder / f"log{i}.npz"),
-                group,
-                keep_poses,
-                **({} if keys is None else keys),
-            )
-            process = ClientProcess(job, kind)
-            stack.callback(process.kill)
-            arena.processes.append(process)
-            arena.by_client.update((spec.name, process) for spec in group)
-        return _run_session(arena, seconds, actions, on_tick, keep_poses, progress)
+        job = Job(session.address, session.origin_ns, "", (), keep_poses, stream, topology, page=page, **keys)
+        for plugin, own in groups.items():
+            for group in own:
+                job = msgspec.structs.replace(job, log=str(folder / f"log{len(run.workers)}.npz"), clients=group)
+                code = _make_code(session) if plugin == TABS else ""
+                worker = ClientWorker(plugin, msgspec.structs.replace(job, page=page + code))
+                stack.callback(worker.close, exit_s=LEAVE_S)
+                run.workers.append(worker)
+                run.by_client.update((spec.name, worker) for spec in group)
+        return _run_session(run, seconds, actions, on_tick, keep_poses, progress)
 
 
 def _run_session(
-    arena: BenchRun,
+    run: BenchRun,
     seconds: float,
     actions: Sequence[Action],
     on_tick: Callable[[Session], None],
     keep_poses: bool,
     progress: Callable[[str], None],
 ) -> Measurement:
-    session, processes = arena.session, arena.processes
-    waiting = list(processes)
-    progress(f"waiting for {len(processes)} client processes")
-    session.run(seconds=60.0, until=_limit_rate(0.05, session.clock, lambda: _are_all_ready(waiting)))
-    _raise_if_stopped(session)
-    if waiting:
-        raise BenchError("the clients did not join within 60 s")
+    session, workers = run.session, run.workers
+    progress(f"waiting for {len(workers)} client processes")
+    if not _run_until_answered(session, workers, JOIN_S):
+        raise BenchError(f"the clients did not join within {JOIN_S:g} s")
+    for worker in workers:
+        worker.read()
     progress(f"warm-up, then measuring {seconds:g} s")
     truth: dict[int, NDArray[np.float64]] = {}
     received: dict[tuple[int, str], list[tuple[int, int]]] = {}
@@ -271,11 +246,13 @@ def _run_session(
     connections, names = dict(session.stepper.ledger.connections), session.stepper.ledger.names_by_id()
     begin = session.clock() + round(WARM_UP_S * 1e9)
     end = begin + round(seconds * 1e9)
-    for process in processes:
-        process.set_window(begin, end)
-    restart = [] if arena.proxy is None else [(0.0, _start_profiles)]
+    for worker in workers:
+        worker.send("measure", begin, end)
+    # The times of link profiles count from the beginning of the window.
+    proxy = run.proxy
+    restart: list[Action] = [] if proxy is None else [(0.0, lambda _: proxy.send("start"))]
     meter = _Meter(session, begin, end)
-    script = _Schedule(arena, begin, [*restart, *actions])
+    script = _Schedule(run, begin, [*restart, *actions])
 
     def until() -> bool:
         on_tick(session)
@@ -284,10 +261,9 @@ def _run_session(
     session.run(until=until)
     _raise_if_stopped(session)
     stats, cpu_share, recorder_cpu_share = meter.result()
-    session.run(seconds=30.0, until=_limit_rate(0.05, session.clock, lambda: not any(p.running for p in processes)))
-    _raise_if_stopped(session)
+    _run_until_answered(session, workers, EXIT_S)
     received = {key: [s for s in samples if begin <= s[1] < end] for key, samples in received.items()}
-    logs = {name: log for process in processes for name, log in process.read_result().items()}
+    logs = {name: log for worker in workers for name, log in worker.read_logs().items()}
     status = session.status()
     ledger = session.stepper.ledger
     return Measurement(
@@ -307,29 +283,32 @@ def _run_session(
     )
 
 
+def _run_until_answered(session: Session, workers: Sequence[ClientWorker], seconds: float) -> bool:
+    """Run the session until every worker has answered its call, at most some seconds. Return whether all have."""
+    session.run(
+        seconds=seconds, until=_limit_rate(0.05, session.clock, lambda: all(one.has_answered() for one in workers))
+    )
+    _raise_if_stopped(session)
+    return all(one.has_answered() for one in workers)
+
+
 def _raise_if_stopped(session: Session) -> None:
     """Raise `KeyboardInterrupt` if the session was stopped by Ctrl-C: the benchmark has no result then."""
     if session.stopping:
         raise KeyboardInterrupt
 
 
-def _start_profiles(arena: BenchRun) -> None:
-    """Start the link profiles: their times count from the beginning of the window."""
-    assert arena.proxy is not None
-    arena.proxy.send("start")
-
-
 class _Schedule:
     """Calls the actions of a window at their times."""
 
-    def __init__(self, arena: BenchRun, begin_ns: int, actions: Sequence[Action]) -> None:
-        self._arena = arena
+    def __init__(self, run: BenchRun, begin_ns: int, actions: Sequence[Action]) -> None:
+        self._run = run
         self._actions = [(begin_ns + round(at_s * 1e9), action) for at_s, action in actions]
 
     def run_due(self) -> bool:
         """Call the actions that are due. Return False, for `Session.run(until=...)`."""
-        while self._actions and self._arena.session.clock() >= self._actions[0][0]:
-            self._actions.pop(0)[1](self._arena)
+        while self._actions and self._run.session.clock() >= self._actions[0][0]:
+            self._actions.pop(0)[1](self._run)
         return False
 
 
@@ -368,11 +347,6 @@ class _Meter:
             ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
         )
         return stats, (cpu1 - cpu0) / window_s, (recorder1 - recorder0) / window_s
-
-
-def _are_all_ready(waiting: list[ClientProcess]) -> bool:
-    waiting[:] = [process for process in waiting if not process.is_ready()]
-    return not waiting
 
 
 def _limit_rate(period_s: float, clock: Callable[[], int], check: Callable[[], bool]) -> Callable[[], bool]:

@@ -9,8 +9,9 @@ import numpy as np
 
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import NO_BARS, BenchReport, compute_percentile, make_bar
+from iris_session.bench.harness import CLIENTS, Measurement, assign_links, group_clients, measure
+from iris_session.bench.report import BenchReport, compute_percentile, make_bar, make_link_report
+from iris_session.bench.state import SESSION_KEYS
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.protocol.names import Device
@@ -51,7 +52,8 @@ def run_input(
     specs, links = assign_links(specs, profile)
     progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(operators + observers)
-    got = measure(model, group_clients(specs), seconds, links=links, seed=seed, curve=curve, progress=progress)
+    groups = {CLIENTS: group_clients(specs)}
+    got = measure(model, groups, seconds, links=links, seed=seed, curve=curve, progress=progress)
     responses = compute_response_ms(got, [spec.name for spec in specs if spec.robot])
     tick_ms = model.opt.timestep * 1e3
     received = sum(map(len, got.received.values()))
@@ -59,16 +61,9 @@ def run_input(
         "response_ms_p50": compute_percentile(responses, 50),
         "response_ms_p99": compute_percentile(responses, 99),
         "samples_followed": len(responses),
-        "late_tick_share": round(got.stats.late_share, 6),
-        "lateness_ms_p99": round(got.stats.p99_ns * 1e-6, 3),
-        "ticks": got.stats.ticks,
         "samples_per_s": round(received / got.seconds, 1),
         "rejected": got.rejected,
-        "server_cpu_share": round(got.cpu_share, 3),
-        "frames_not_logged": sum(int(log["counts"][1]) for log in got.logs.values()),
-        "late_causes": got.late_causes,
-        "scheduling": got.scheduling,
-        "drops": got.drops,
+        **got.summarize(*SESSION_KEYS),
     }
     bound = 2.0 * tick_ms + STATE_PERIOD_MS + (6.0 if curve else STATE_BAR_MS)
     sent = 3 * 72.0 * operators
@@ -78,16 +73,9 @@ def run_input(
         make_bar(results, "samples_per_s", ">=", 0.98 * sent),
         make_bar(results, "samples_followed", ">=", 0.95 * 72.0 * operators * (seconds - 1.0)),
     ]
-    params: dict[str, Any] = {
-        "operators": operators,
-        "robots": robots,
-        "observers": observers,
-        "seconds": seconds,
-        "curve": curve,
-    }
-    if profile:
-        params |= {"profile": profile, "seed": seed, "bars": NO_BARS}
-    return BenchReport("input", params, results, () if profile else tuple(bars), reference)
+    params = {"operators": operators, "robots": robots, "observers": observers, "seconds": seconds, "curve": curve}
+    params |= {"seed": seed} if profile else {}
+    return make_link_report("input", params, results, bars, profile, reference)
 
 
 def compute_response_ms(got: Measurement, names: list[str]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -6,28 +6,28 @@ program of the same priority that only copies memory.
 
 from __future__ import annotations
 
+import math
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import msgspec
 import mujoco
-import numpy as np
 import zmq
 
 from iris_session.assets.store import AssetStore
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import Log, group_clients, measure
+from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure
+from iris_session.bench.intervals import Log, compute_age_p99_ms
 from iris_session.bench.join_clients import CopyInterval, JoinJob, JoinResult
 from iris_session.bench.join_scene import PreparedScene, make_join_model
 from iris_session.bench.report import BenchError, BenchReport, make_bar
-from iris_session.session.session import Session
-from iris_session.system.process import PIPE, ChildProcess, child_environment, module_command
+from iris_session.bench.worker import Worker
+from iris_session.system.process import PIPE, child_environment, module_command
 
 #: Time from the beginning of the window to the join; the baseline of the others is measured first.
 BEGIN_S: Final = 4.0
@@ -71,25 +71,33 @@ def run_join(
         if ready.built:
             raise BenchError(f"{ready.built} assets were encoded again although the cache is warm")
         paths = [store.path(address) for address in ready.sizes]
-        joiner = stack.enter_context(_Joiner(folder, stack.enter_context(_BulkServer(paths)).port))
+        port = stack.enter_context(_serve_in_bulk(paths))
+        joiner = stack.enter_context(Worker("iris_session.bench.join_clients:Joiner", JoinJob(str(folder / "cache"))))
+        joiner.read()  # it is made
+
+        def start_join(run: BenchRun) -> None:
+            for _ in range(2):
+                joiner.send("join", run.session.address, run.session.origin_ns)
+            joiner.send("copy_memory", run.session.origin_ns)
+
+        actions: list[Action] = [(BEGIN_S, start_join)]
         got = measure(
             model,
-            group_clients([ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)]),
+            {CLIENTS: group_clients([ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)])},
             seconds,
-            actions=[(BEGIN_S, lambda _: joiner.start_join())],
+            actions=actions,
             assets=store.root,
-            on_tick=joiner.prepare,
             seed=seed,
             progress=progress,
         )
-        first, second, copied, bare_s = joiner.read_result()
+        first, second = (msgspec.convert(joiner.read(), JoinResult) for _ in range(2))
+        copied = msgspec.convert(joiner.read(), CopyInterval)
+        bare_s: float = joiner.ask("transfer_in_bulk", port)
     results = {
         **_summarize(cold, ready, first, second),
         "others_age_ms_p99": _compute_age_p99_ms(got.logs, first.begin_ns, second.end_ns),
         "others_age_ms_p99_baseline": _compute_age_p99_ms(got.logs, got.begin_ns, first.begin_ns),
-        "late_tick_share": round(got.stats.late_share, 6),
-        "scheduling": got.scheduling,
-        "drops": got.drops,
+        **got.summarize("late_tick_share", "scheduling", "drops"),
     }
     params = {"objects": objects, "assets_mb": assets_mb, "clients": clients, "seconds": seconds, "seed": seed}
     reference = {
@@ -135,84 +143,29 @@ def _prepare_scene(model: Path, store: Path) -> PreparedScene:
 
 def _compute_age_p99_ms(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:
     """Return the 99th percentile of the age of state at all clients [ms], of frames between two session times."""
-    ages = [
-        (log["handed_ns"] - log["state_ns"])[(log["handed_ns"] >= begin_ns) & (log["handed_ns"] < end_ns)]
-        for log in logs.values()
-    ]
-    together = np.concatenate(ages)
-    if not len(together):
+    p99_ms = compute_age_p99_ms(logs.values(), begin_ns, 0.0, (end_ns - begin_ns) * 1e-9)
+    if not math.isfinite(p99_ms):
         raise BenchError("no client received state while the client joined, or before or after it: increase --seconds")
-    return round(float(np.percentile(together, 99)) * 1e-6, 3)
+    return p99_ms
 
 
-class _Joiner:
-    """Process that joins. It is started before it is needed: starting Python is not part of joining."""
+@contextmanager
+def _serve_in_bulk(paths: list[Path]) -> Iterator[int]:
+    """Serve all assets in one message, in a thread. Yield the port."""
+    with zmq.Context() as context:
+        socket = context.socket(zmq.REP)
+        port = socket.bind_to_random_port("tcp://127.0.0.1")
 
-    def __init__(self, folder: Path, bare_port: int) -> None:
-        self._cache, self._bare_port = str(folder / "cache"), bare_port
-        self._process: ChildProcess | None = None
+        def serve() -> None:
+            with suppress(zmq.ZMQError):  # closed
+                socket.recv()
+                socket.send_multipart([path.read_bytes() for path in paths], copy=False)
+                socket.poll(60_000)  # until it is sent
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None) -> None:
-        if self._process is not None:
-            self._process.close()
-
-    def prepare(self, session: Session) -> None:
-        """Start the process, once, during the warm-up."""
-        if self._process is not None:
-            return
-        job = JoinJob(session.address, session.origin_ns, self._cache, self._bare_port)
-        self._process = ChildProcess("iris_session.bench.join_clients", stdout=PIPE, own_group=True)
-        self._write_line(msgspec.json.encode(job))
-
-    def start_join(self) -> None:
-        """Let the process join."""
-        self._write_line(b"go")
-
-    def _write_line(self, line: bytes) -> None:
-        assert self._process is not None
-        self._process.write(line + b"\n")
-
-    def read_result(self) -> tuple[JoinResult, JoinResult, CopyInterval, float]:
-        """Return the first and second join, the interval of copying, and the seconds of the bulk transfer, run now."""
-        self._read_line()
-        first, second = (msgspec.json.decode(self._read_line(), type=JoinResult) for _ in range(2))
-        copied = msgspec.json.decode(self._read_line(), type=CopyInterval)
-        self._write_line(b"bare")
-        return first, second, copied, float(self._read_line())
-
-    def _read_line(self) -> bytes:
-        assert self._process is not None
+        thread = threading.Thread(target=serve, name="bench-bare", daemon=True)
+        thread.start()
         try:
-            return self._process.read_line()
-        except EOFError:
-            raise BenchError("the joining client failed; see its messages") from None
-
-
-class _BulkServer:
-    """Server of all assets in one message, in a thread."""
-
-    def __init__(self, paths: list[Path]) -> None:
-        self._paths = paths
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.REP)
-        self.port = self._socket.bind_to_random_port("tcp://127.0.0.1")
-        self._thread = threading.Thread(target=self._run, name="bench-bare", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None) -> None:
-        self._context.destroy(linger=0)
-        self._thread.join()
-
-    def _run(self) -> None:
-        try:
-            self._socket.recv()
-            self._socket.send_multipart([path.read_bytes() for path in self._paths], copy=False)
-            self._socket.poll(60_000)  # until it is sent
-        except zmq.ZMQError:  # closed
-            return
+            yield port
+        finally:
+            context.destroy(linger=0)
+            thread.join()

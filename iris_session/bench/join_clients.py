@@ -1,17 +1,11 @@
 """Process that joins in `bench join`: a client with an empty cache, then one with the cache of the first.
 
 It also runs the references: threads of the same priority that only copy memory, and a bulk transfer.
-
-    python -m iris_session.bench.join_clients < job.json
-
-Prints `ready`, waits for a line, joins twice, and prints a `JoinResult` for each as one line of JSON, then a
-`CopyInterval`; waits for another line, and prints the seconds of the bulk transfer.
 """
 
 from __future__ import annotations
 
 import gc
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -21,6 +15,7 @@ import msgspec
 import numpy as np
 import zmq
 
+from iris_session.bench.worker import Plugin
 from iris_session.client import AssetStore, Client
 from iris_session.protocol.scene import SceneSpec, decode_scene, list_assets
 from iris_session.scene import decode_image, decode_mesh
@@ -36,12 +31,9 @@ COPY_BYTES: Final = 16 << 20
 
 
 class JoinJob(msgspec.Struct, frozen=True):
-    """Job of the process. `bare_port`: port of the bulk transfer."""
+    """Job of the process. `cache`: folder of assets, empty at first."""
 
-    address: str
-    origin_ns: int
     cache: str
-    bare_port: int
 
 
 class JoinResult(msgspec.Struct, frozen=True):
@@ -60,36 +52,6 @@ class JoinResult(msgspec.Struct, frozen=True):
     end_ns: int
 
 
-def join(job: JoinJob) -> JoinResult:
-    """Join with one client and fetch the whole scene. Raises what the client raises."""
-    begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
-    with Client(job.address, role="observer", name="joiner", alignment="not_needed") as client:
-        client.assets.cache = AssetStore(job.cache)
-        scene = client.connection.mirror.scene_hash
-        first = client.assets.fetch([scene], decode=lambda _, data: decode_scene(data))
-        client.wait_for(lambda _: first.done, JOIN_S)
-        first.check()
-        spec: SceneSpec = first.decoded[scene]
-        sizes, decode = list_assets(spec), _make_decoder(spec)
-        shapes = {mesh.levels[-1].address for mesh in spec.meshes} | {field.address for field in spec.hfields}
-        rest = client.assets.fetch(sizes, decode=decode)
-        client.wait_for(lambda _: shapes.isdisjoint(rest.pending), JOIN_S)
-        picture_ns = time.monotonic_ns()
-        client.wait_for(lambda _: rest.done, JOIN_S)
-        end_ns = time.monotonic_ns()
-        rest.check()
-        assert len(rest.decoded) == len(sizes)
-        return JoinResult(
-            (picture_ns - begin_ns) * 1e-9,
-            (end_ns - begin_ns) * 1e-9,
-            first.bytes_received + rest.bytes_received,
-            1 + len(sizes),
-            time.process_time() - cpu_s,
-            begin_ns - job.origin_ns,
-            end_ns - job.origin_ns,
-        )
-
-
 class CopyInterval(msgspec.Struct, frozen=True):
     """Interval in which memory was copied, in session time."""
 
@@ -97,27 +59,78 @@ class CopyInterval(msgspec.Struct, frozen=True):
     end_ns: int
 
 
-def copy_memory(origin_ns: int) -> CopyInterval:
-    """Copy memory at the priority of a client's asset threads.
+class Joiner(Plugin):
+    """Plug-in that joins. It is started before it is needed: starting Python is not part of joining."""
 
-    This is the cost of any program that leaves no core idle. numpy copies without holding Python's lock.
-    """
-    time.sleep(PAUSE_S)
-    begin_ns = time.monotonic_ns()
-    end_ns = begin_ns + round(COPY_S * 1e9)
+    job_type = JoinJob
 
-    def copy_until_end() -> None:
-        lower_thread_priority()
-        source, target = np.ones(COPY_BYTES, np.uint8), np.zeros(COPY_BYTES, np.uint8)
-        while time.monotonic_ns() < end_ns:
-            np.copyto(target, source)
+    def __init__(self, job: JoinJob) -> None:
+        super().__init__(job)
+        gc.collect()
+        gc.freeze()  # Python and its libraries are not part of joining
 
-    threads = [threading.Thread(target=copy_until_end) for _ in range(COPY_THREADS)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return CopyInterval(begin_ns - origin_ns, end_ns - origin_ns)
+    def join(self, address: str, origin_ns: int) -> JoinResult:
+        """Join with one client and fetch the whole scene. Raises what the client raises."""
+        begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
+        with Client(address, role="observer", name="joiner", alignment="not_needed") as client:
+            client.assets.cache = AssetStore(self.job.cache)
+            scene = client.connection.mirror.scene_hash
+            first = client.assets.fetch([scene], decode=lambda _, data: decode_scene(data))
+            client.wait_for(lambda _: first.done, JOIN_S)
+            first.check()
+            spec: SceneSpec = first.decoded[scene]
+            sizes, decode = list_assets(spec), _make_decoder(spec)
+            shapes = {mesh.levels[-1].address for mesh in spec.meshes} | {field.address for field in spec.hfields}
+            rest = client.assets.fetch(sizes, decode=decode)
+            client.wait_for(lambda _: shapes.isdisjoint(rest.pending), JOIN_S)
+            picture_ns = time.monotonic_ns()
+            client.wait_for(lambda _: rest.done, JOIN_S)
+            end_ns = time.monotonic_ns()
+            rest.check()
+            assert len(rest.decoded) == len(sizes)
+            return JoinResult(
+                (picture_ns - begin_ns) * 1e-9,
+                (end_ns - begin_ns) * 1e-9,
+                first.bytes_received + rest.bytes_received,
+                1 + len(sizes),
+                time.process_time() - cpu_s,
+                begin_ns - origin_ns,
+                end_ns - origin_ns,
+            )
+
+    def copy_memory(self, origin_ns: int) -> CopyInterval:
+        """Copy memory at the priority of a client's asset threads.
+
+        This is the cost of any program that leaves no core idle. numpy copies without holding Python's lock.
+        """
+        time.sleep(PAUSE_S)
+        begin_ns = time.monotonic_ns()
+        end_ns = begin_ns + round(COPY_S * 1e9)
+
+        def copy_until_end() -> None:
+            lower_thread_priority()
+            source, target = np.ones(COPY_BYTES, np.uint8), np.zeros(COPY_BYTES, np.uint8)
+            while time.monotonic_ns() < end_ns:
+                np.copyto(target, source)
+
+        threads = [threading.Thread(target=copy_until_end) for _ in range(COPY_THREADS)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return CopyInterval(begin_ns - origin_ns, end_ns - origin_ns)
+
+    def transfer_in_bulk(self, port: int) -> float:
+        """Return the seconds for all bytes in one ZeroMQ message: nothing is checked, stored or decoded."""
+        with zmq.Context() as context, context.socket(zmq.REQ) as asking:
+            asking.linger = 0
+            asking.connect(f"tcp://127.0.0.1:{port}")
+            began_s = time.perf_counter()
+            asking.send(b"everything")
+            if not asking.poll(round(JOIN_S * 1e3)):
+                raise TimeoutError("the bulk transfer did not arrive")
+            asking.recv_multipart(copy=False)
+            return time.perf_counter() - began_s
 
 
 def _make_decoder(spec: SceneSpec) -> Callable[[str, memoryview], Any]:
@@ -131,32 +144,3 @@ def _make_decoder(spec: SceneSpec) -> Callable[[str, memoryview], Any]:
         return decode_image(data, images[address])
 
     return decode
-
-
-def transfer_in_bulk(port: int) -> float:
-    """Return the seconds for all bytes in one ZeroMQ message: nothing is checked, stored or decoded."""
-    with zmq.Context() as context, context.socket(zmq.REQ) as asking:
-        asking.linger = 0
-        asking.connect(f"tcp://127.0.0.1:{port}")
-        began_s = time.perf_counter()
-        asking.send(b"everything")
-        asking.recv_multipart(copy=False)
-        return time.perf_counter() - began_s
-
-
-def main() -> None:
-    """Run the process."""
-    job = msgspec.json.decode(sys.stdin.readline(), type=JoinJob)
-    gc.collect()
-    gc.freeze()  # Python and its libraries are not part of joining
-    print("ready", flush=True)
-    sys.stdin.readline()
-    for _ in range(2):
-        print(msgspec.json.encode(join(job)).decode(), flush=True)
-    print(msgspec.json.encode(copy_memory(job.origin_ns)).decode(), flush=True)
-    sys.stdin.readline()
-    print(transfer_in_bulk(job.bare_port), flush=True)
-
-
-if __name__ == "__main__":
-    main()

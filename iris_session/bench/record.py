@@ -26,10 +26,11 @@ import numpy as np
 import psutil
 
 from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.harness import ClientProcess, Measurement, group_clients, measure
+from iris_session.bench.harness import CLIENTS, Measurement, group_clients, measure
 from iris_session.bench.record_naive import LOG_BATCH_S, LONG_BATCH_S, write_naive_log
 from iris_session.bench.record_session import BODIES, OPERATORS, BenchSession, SessionJob, make_record_scene
 from iris_session.bench.report import BenchError, BenchReport, make_bar
+from iris_session.bench.worker import Worker
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.recording import NotARecordingError, Recording
 from iris_session.rrd import paths
@@ -132,7 +133,8 @@ def _make_operators() -> list[ClientJob]:
 
 def _measure_round(record: Path | bool, seconds: float, seed: int, progress: Callable[[str], None]) -> Measurement:
     model = make_record_scene(seed).compile()
-    return measure(model, group_clients(_make_operators()), seconds, record=record, seed=seed, progress=progress)
+    groups = {CLIENTS: group_clients(_make_operators())}
+    return measure(model, groups, seconds, record=record, seed=seed, progress=progress)
 
 
 def _wait_for_index(path: Path) -> None:
@@ -282,9 +284,7 @@ class RecordedSession:
                 raise BenchError(f"a session that is to be killed did not start: {error}") from None
             self._origin_ns = listening.origin_ns
             job = Job(listening.address, listening.origin_ns, "", tuple(_make_operators()))
-            self._operators = ClientProcess(job)
-            stack.callback(self._operators.kill)
-            _wait_until(self._operators.is_ready, START_S, "the operators did not join")
+            stack.enter_context(Worker(CLIENTS, job)).read(START_S)
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -341,11 +341,3 @@ class RecordedSession:
         for process in alive:
             with suppress(psutil.Error):
                 process.kill()
-
-
-def _wait_until(condition: Callable[[], bool], timeout_s: float, failure: str) -> None:
-    until = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > until:
-            raise BenchError(f"{failure} within {timeout_s:g} s")
-        time.sleep(POLL_S)

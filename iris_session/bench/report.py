@@ -7,6 +7,7 @@ import math
 import os
 import platform
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from typing import Any, Final
@@ -105,6 +106,20 @@ class BenchReport(msgspec.Struct, frozen=True):
         if self.parallel_speed < MAX_PARALLEL_SPEED:
             rows.append(f"with all processors in use, a thread is {self.parallel_speed:.2f} times as fast as alone")
         return "\n".join(rows)
+
+
+def make_link_report(
+    name: str,
+    params: dict[str, Any],
+    results: dict[str, Any],
+    bars: Sequence[Bar],
+    profile: str,
+    reference: dict[str, float] | None = None,
+) -> BenchReport:
+    """Return the report of a benchmark whose clients may have links; with a link profile its bars do not apply."""
+    if not profile:
+        return BenchReport(name, params, results, tuple(bars), reference)
+    return BenchReport(name, params | {"profile": profile, "bars": NO_BARS}, results, (), reference)
 
 
 def read_stolen_time() -> tuple[float, float]:

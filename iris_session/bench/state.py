@@ -9,12 +9,16 @@ import numpy as np
 
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import NO_BARS, BenchError, BenchReport, compute_percentile, make_bar
+from iris_session.bench.harness import CLIENTS, Measurement, assign_links, group_clients, measure
+from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, make_link_report
 from iris_session.demo.scenes import free_bodies_scene
 
 #: The bar applies under input: this many of the clients send 3 devices x 72 Hz of samples.
 SENDERS = 8
+SESSION_KEYS = (
+    *("server_cpu_share", "late_tick_share", "lateness_ms_p99", "ticks", "frames_not_logged", "late_causes"),
+    *("scheduling", "drops"),
+)
 
 
 def run_state(
@@ -45,9 +49,8 @@ def run_state(
     specs, links = assign_links(specs, profile)
     progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(clients)
-    got = measure(
-        model, group_clients(specs), seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress
-    )
+    groups = {CLIENTS: group_clients(specs)}
+    got = measure(model, groups, seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress)
     progress("comparing every delivered frame with the state at its tick")
     ages = np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
     inside = np.concatenate([(log["published_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
@@ -67,16 +70,9 @@ def run_state(
         "bytes_per_body": round(total / messages / bodies, 2),
         "max_position_error_mm": round(position_mm, 5),
         "max_rotation_error_deg": round(rotation_deg, 5),
-        "server_cpu_share": round(got.cpu_share, 3),
         "client_cpu_share": round(float(np.mean([log["cpu_share"][0] for log in got.logs.values()])), 4),
-        "late_tick_share": round(got.stats.late_share, 6),
-        "lateness_ms_p99": round(got.stats.p99_ns * 1e-6, 3),
-        "ticks": got.stats.ticks,
         "samples_per_s": round(sum(int(log["counts"][0]) for log in got.logs.values()) / (got.seconds + 3.0), 1),
-        "frames_not_logged": sum(int(log["counts"][1]) for log in got.logs.values()),
-        "late_causes": got.late_causes,
-        "scheduling": got.scheduling,
-        "drops": got.drops,
+        **got.summarize(*SESSION_KEYS),
     }
     bars = [
         make_bar(results, "age_ms_p99", "<=", 6.0 if curve else 3.0),
@@ -86,17 +82,8 @@ def run_state(
         make_bar(results, "bytes_per_frame", "<=", 200.0 + 12.0 * bodies),  # 3,800 for 300 bodies
         make_bar(results, "delivered_hz_min", ">=", 59.0),
     ]
-    params: dict[str, Any] = {
-        "clients": clients,
-        "bodies": bodies,
-        "seconds": seconds,
-        "seed": seed,
-        "curve": curve,
-        "hz": 60,
-    }
-    if profile:
-        params |= {"profile": profile, "bars": NO_BARS}
-    return BenchReport("state", params, results, () if profile else tuple(bars), reference)
+    params = {"clients": clients, "bodies": bodies, "seconds": seconds, "seed": seed, "curve": curve, "hz": 60}
+    return make_link_report("state", params, results, bars, profile, reference)
 
 
 def compute_errors(got: Measurement) -> tuple[float, float]:

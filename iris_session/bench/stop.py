@@ -35,6 +35,7 @@ SAMPLE_STEPS: Final = 7
 FORCE_AFTER_S: Final = 0.2
 WALL_AFTER_S: Final = 0.5
 LUNGE_S: Final = 0.6
+MAX_PRESS_S: Final = 60.0
 MAX_FORCE_RATIO: Final = 0.3
 MAX_LUNGE_RAD: Final = 0.03
 _PILOT: Final = 1
@@ -104,7 +105,7 @@ class Case(msgspec.Struct, frozen=True):
     grip_kept: bool
 
 
-class Rehearsal:
+class StopScenario:
     """A session of one operator who presses the arm against the wall with a hand that goes on for `press_s`."""
 
     def __init__(self, kind: str, press_s: float) -> None:
@@ -132,7 +133,7 @@ class Rehearsal:
     def now_ns(self) -> int:
         return (self.step_number + 1) * TICK_NS
 
-    def say(self, message: EntryMessage, connection: int = _PILOT) -> Entry:
+    def submit(self, message: EntryMessage, connection: int = _PILOT) -> Entry:
         return Entry(connection, connection, self.now_ns, message)
 
     def run(self, seconds: float, entries: Sequence[Entry] = (), n_ticks: int = 1) -> None:
@@ -148,10 +149,10 @@ class Rehearsal:
             2: Acquire(1, ("arm",)),
         }
         first = opening.get(self.step_number)
-        said = [*entries] if first is None else [*entries, self.say(first)]
+        entries_now = [*entries] if first is None else [*entries, self.submit(first)]
         if self.sends and self.step_number > 3 and self.step_number % SAMPLE_STEPS == 0:
-            said.append(self.say(self._make_sample()))
-        self.outcome = self.core.step(self.now_ns, said, n_ticks, digest=False)
+            entries_now.append(self.submit(self._make_sample()))
+        self.outcome = self.core.step(self.now_ns, entries_now, n_ticks, digest=False)
         self.step_number += 1
         if n_ticks and self.outcome.decision.commands[0].kind != CommandKind.HOLD:
             self.push = float(np.abs(measure_push(self.core.world.data)).max())
@@ -191,65 +192,65 @@ class Rehearsal:
         return command.kind != CommandKind.HOLD and self.core.world.data.ncon > 0
 
 
-def _open_clutch(run: Rehearsal) -> None:
+def _open_clutch(run: StopScenario) -> None:
     run.changes["clutch"] = False
 
 
-def _fall_silent(run: Rehearsal) -> None:
+def _fall_silent(run: StopScenario) -> None:
     run.sends = False
 
 
-def _lose_tracking(run: Rehearsal) -> None:
+def _lose_tracking(run: StopScenario) -> None:
     run.changes["tracked"] = False
 
 
-def _take_off(run: Rehearsal) -> None:
+def _take_off(run: StopScenario) -> None:
     run.changes["worn"] = False
 
 
-def _stop(run: Rehearsal) -> None:
-    run.step([run.say(EStop())])
+def _stop(run: StopScenario) -> None:
+    run.step([run.submit(EStop())])
 
 
-def _disconnect(run: Rehearsal) -> None:
+def _disconnect(run: StopScenario) -> None:
     run.sends = False
-    run.step([run.say(Lost("timeout"))])
+    run.step([run.submit(Lost("timeout"))])
 
 
-def _release(run: Rehearsal) -> None:
-    run.step([run.say(Release(0, (Target("arm", 1),)))])
+def _release(run: StopScenario) -> None:
+    run.step([run.submit(Release(0, (Target("arm", 1),)))])
 
 
-def _recentre(run: Rehearsal) -> None:
-    run.step([run.say(TrackingEpoch(1))])
+def _recentre(run: StopScenario) -> None:
+    run.step([run.submit(TrackingEpoch(1))])
 
 
-def _send_late(run: Rehearsal) -> None:
+def _send_late(run: StopScenario) -> None:
     run.changes["capture_ns"] = 0
 
 
-def _pause(run: Rehearsal) -> None:
-    run.step([run.say(Control(0, "pause"), HOST)], 0)
+def _pause(run: StopScenario) -> None:
+    run.step([run.submit(Control(0, "pause"), HOST)], 0)
     run.sends = False
     run.run(0.2, n_ticks=0)
-    run.step([run.say(Control(0, "resume"), HOST)])
+    run.step([run.submit(Control(0, "resume"), HOST)])
 
 
-def _stand_still(run: Rehearsal) -> None:
+def _stand_still(run: StopScenario) -> None:
     run.step_number += 500
     run.sends = False
 
 
-def _resume(run: Rehearsal) -> None:
+def _resume(run: StopScenario) -> None:
     state = run.core.snapshot()
     run.core = run.make_core(run.kind)
     run.core.restore(state)
     run.sends = False
-    run.step([run.say(SessionResumed(1_000_000_000), HOST)])
+    run.step([run.submit(SessionResumed(1_000_000_000), HOST)])
 
 
 #: What makes a hold begin, by cause.
-CAUSES: Final[dict[str, Callable[[Rehearsal], None]]] = {
+CAUSES: Final[dict[str, Callable[[StopScenario], None]]] = {
     "clutch_open": _open_clutch,
     "stale": _fall_silent,
     "estop": _stop,
@@ -265,7 +266,7 @@ CAUSES: Final[dict[str, Callable[[Rehearsal], None]]] = {
 }
 
 
-def run_case(run: Rehearsal, cause: str) -> Case:
+def run_case(run: StopScenario, cause: str) -> Case:
     """Let a hold begin by `cause`, take the wall away after `WALL_AFTER_S`, and measure."""
     grip = float(run.core.world.data.ctrl[3])
     CAUSES[cause](run)
@@ -295,13 +296,14 @@ def run_stop(seconds: float = 1.0, progress: Callable[[str], None] = lambda _: N
     """Measure every kind of actuator and every cause of a hold.
 
     Args:
-        seconds: Time for which each arm presses against the wall [s of simulation].
+        seconds: Time for which each arm presses against the wall [s of simulation], at most `MAX_PRESS_S`.
         progress: Called with short texts.
     """
+    seconds = min(seconds, MAX_PRESS_S)
     cases: dict[str, dict[str, Case]] = {}
     for kind in KINDS:
         progress(kind)
-        run = Rehearsal(kind, seconds)
+        run = StopScenario(kind, seconds)
         restore = run.save()
         for cause in CAUSES:
             restore()

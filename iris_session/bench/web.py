@@ -18,15 +18,28 @@ import psutil
 
 from iris_session.bench.chromium import MissingToolError, find_tools
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import Action, BenchRun, Log, Measurement, group_clients, measure
-from iris_session.bench.report import Bar, BenchError, BenchReport, compute_percentile, make_bar
-from iris_session.bench.slow_client import (
-    BASELINE,
-    SHORTEST_S,
-    StallInterval,
-    measure_after_stall,
-    measure_others_p99,
+from iris_session.bench.harness import (
+    BROWSERS,
+    CLIENTS,
+    TABS,
+    Action,
+    BenchRun,
+    Group,
+    Measurement,
+    group_clients,
+    measure,
 )
+from iris_session.bench.intervals import (
+    SHORTEST_STALL_S,
+    Interval,
+    Log,
+    compute_age_p99_ms,
+    plan_intervals,
+    summarize_runs,
+    summarize_stalls,
+)
+from iris_session.bench.report import Bar, BenchError, BenchReport, compute_percentile, make_bar
+from iris_session.bench.slow_client import BASELINE
 from iris_session.bench.web_tab import STOPS_S
 from iris_session.demo.scenes.aloha import aloha_scene
 from iris_session.protocol.client_messages import EStop
@@ -46,8 +59,7 @@ FLAT_S: Final = 300.0
 ROUNDS: Final = 3
 FROZEN, LOADING = "frozen", "loading"
 #: Lengths of the intervals [s].
-LENGTHS: Final = {BASELINE: SHORTEST_S, FROZEN: SHORTEST_S, LOADING: 10.0}
-LOAD_BYTES: Final = 200_000_000
+LENGTHS: Final = {BASELINE: SHORTEST_STALL_S, FROZEN: SHORTEST_STALL_S, LOADING: 10.0}
 REFERENCE, TAB, SPECIAL = "zeromq", "tab", "special"
 _CPU_END_S: Final = 0.1  # before the end of the window
 #: The scene: the ALOHA stations in free motion, and a sheet of vertices that swings above them. What it moves is what a
@@ -73,14 +85,10 @@ _SHEET: Final = """
 """
 
 
-def plan_web_intervals(seconds: float) -> list[StallInterval]:
+def plan_web_intervals(seconds: float) -> list[Interval]:
     """Return rounds of baseline, frozen and loading before the e-stops: as many as fit, at least one, at most three."""
     rounds = max(1, min(ROUNDS, int((seconds - STOPS_S) / sum(LENGTHS.values()))))
-    plan: list[StallInterval] = []
-    for kind in list(LENGTHS) * rounds:
-        begin_s = plan[-1].end_s if plan else 0.0
-        plan.append(StallInterval(kind, begin_s, begin_s + LENGTHS[kind]))
-    return plan
+    return plan_intervals(list(LENGTHS) * rounds, list(LENGTHS.values()) * rounds)
 
 
 def run_web(
@@ -116,13 +124,16 @@ def run_web(
     plan = plan_web_intervals(seconds)
     total_s = max(seconds, plan[-1].end_s + STOPS_S)
     others = [ClientJob(f"browser{i}", "observer") for i in range(clients - (1 if missing else 2))]
-    gateway, stops, resumed = _GatewayMeter(), _StopMeter(), dict[StallInterval, int]()
+    gateway, stops, resumed = _GatewayMeter(), _StopMeter(), dict[Interval, int]()
+    special = ClientJob(SPECIAL, "observer", loads_s=tuple(one.stall_s for one in plan if one.kind == LOADING))
+    groups: dict[str, list[Group]] = {
+        CLIENTS: [(ClientJob(REFERENCE, "observer"),)],
+        BROWSERS: [*group_clients(others), (special,)],
+    }
     got = measure(
         make_web_model(vertices, seed),
-        group_clients([ClientJob(REFERENCE, "observer")]),
+        groups if missing else {**groups, TABS: [(ClientJob(TAB, "director"),)]},
         total_s,
-        browsers=[*group_clients(others), (ClientJob(SPECIAL, "observer"),)],
-        tabs=[] if missing else [(ClientJob(TAB, "director"),)],
         actions=sorted(
             [
                 (0.0, gateway.read),
@@ -143,7 +154,9 @@ def run_web(
     if not missing:
         results |= summarize_tab(got.logs[TAB], stops.stops)
         results["delivered_hz_min"] = min(results["delivered_hz_min"], results["tab_state_hz"])
-    results |= gateway.summarize() | _summarize_session(got)
+    results |= gateway.summarize() | got.summarize(
+        *("server_cpu_share", "late_tick_share", "lateness_ms_p99", "ticks", "frames_not_logged", "scheduling", "drops")
+    )
     params: dict[str, Any] = {"clients": clients, "vertices": vertices, "seconds": total_s}
     params |= {"rounds": len(plan) // 3, "seed": seed, "curve": curve, "tab": missing or "chromium", "hz": int(HZ)}
     log = got.logs[REFERENCE]
@@ -191,7 +204,7 @@ def summarize_ages(logs: Sequence[Log]) -> dict[str, float]:
 
 
 def summarize_browsers(
-    got: Measurement, names: list[str], plan: list[StallInterval], resumed: dict[StallInterval, int]
+    got: Measurement, names: list[str], plan: list[Interval], resumed: dict[Interval, int]
 ) -> dict[str, Any]:
     """Return the results of the browsers without a picture. `names`: those that are never disturbed."""
     logs = [got.logs[name] for name in names]
@@ -200,34 +213,19 @@ def summarize_browsers(
         **summarize_ages(logs),
     }
     loads = got.logs[SPECIAL]["loads"].reshape(-1, 3)
-    loading = [
-        StallInterval(LOADING, *(float(at_ns - got.begin_ns) * 1e-9 for at_ns in (begin_ns, end_ns)))
-        for begin_ns, end_ns, _ in loads
-    ]
-    runs = {
-        "baseline": [s for s in plan if s.kind == BASELINE],
-        "with_frozen_tab": [s for s in plan if s.kind == FROZEN],
+    loading = [((begin_ns - got.begin_ns) * 1e-9, (end_ns - got.begin_ns) * 1e-9) for begin_ns, end_ns, _ in loads]
+    spans = {
+        "baseline": [(one.stall_s, one.end_s) for one in plan if one.kind == BASELINE],
+        "with_frozen_tab": [(one.stall_s, one.end_s) for one in plan if one.kind == FROZEN],
+        "with_assets_in_flight": loading,
     }
-    p99s = {key: [measure_others_p99(got.logs, names, got.begin_ns, s) for s in spans] for key, spans in runs.items()}
-    p99s["with_assets_in_flight"] = [_measure_p99_within(logs, got.begin_ns, s) for s in loading] or [math.inf]
-    for key, values in p99s.items():
-        results[f"others_age_ms_p99_{key}"] = round(float(np.median(values)), 3)
-        results[f"others_age_ms_p99_{key}_runs"] = {str(i + 1): round(p99, 3) for i, p99 in enumerate(values)}
-    frozen = [s for s in plan if s.kind == FROZEN]
-    after = [measure_after_stall(got.logs[SPECIAL], got.begin_ns, s, resumed[s]) for s in frozen]
-    results["resume_first_age_ms"] = round(max(first for first, _ in after), 3)
-    results["resume_fresh_after_ms"] = round(max(fresh for _, fresh in after), 3)
+    for key, own in spans.items():
+        p99s = [compute_age_p99_ms(logs, got.begin_ns, *span) for span in own] or [math.inf]
+        results |= summarize_runs(f"others_age_ms_p99_{key}", p99s)
+    results |= summarize_stalls(got.logs[SPECIAL], got.begin_ns, resumed, FROZEN)
     results["assets_mb"] = round(float(loads[:, 2].sum()) * 1e-6, 1)
-    results["assets_s"] = round(sum(s.end_s - s.begin_s for s in loading), 3)
+    results["assets_s"] = round(float(sum(end_s - begin_s for begin_s, end_s in loading)), 3)
     return results
-
-
-def _measure_p99_within(logs: Sequence[Log], begin_ns: int, interval: StallInterval) -> float:
-    """Return the 99th percentile of the ages within the whole of an interval [ms]."""
-    low, high = (begin_ns + at_s * 1e9 for at_s in (interval.begin_s, interval.end_s))
-    ages = [compute_ages(log)[(log["handed_ns"] >= low) & (log["handed_ns"] < high)] for log in logs]
-    together = np.concatenate(ages)
-    return float(np.percentile(together, 99)) if len(together) else math.inf
 
 
 def summarize_tab(log: Log, stops: Sequence[tuple[int, int]]) -> dict[str, Any]:
@@ -267,18 +265,6 @@ def _find_first_after(stops: Sequence[tuple[int, int]], at_ns: int) -> tuple[int
     return next((stop for stop in stops if stop[0] >= at_ns), None)
 
 
-def _summarize_session(got: Measurement) -> dict[str, Any]:
-    return {
-        "server_cpu_share": round(got.cpu_share, 3),
-        "late_tick_share": round(got.stats.late_share, 6),
-        "lateness_ms_p99": round(got.stats.p99_ns * 1e-6, 3),
-        "ticks": got.stats.ticks,
-        "frames_not_logged": sum(int(log["counts"][1]) for log in got.logs.values() if "counts" in log),
-        "scheduling": got.scheduling,
-        "drops": got.drops,
-    }
-
-
 # --- actions ----------------------------------------------------------------------------------------------------------
 
 
@@ -291,19 +277,17 @@ def _find_missing_tool() -> str:
     return ""
 
 
-def _plan_actions(plan: list[StallInterval], resumed: dict[StallInterval, int]) -> list[Action]:
-    """Return the actions that freeze the special browser and let it load; `resumed`: ends of freezing [ns]."""
+def _plan_actions(plan: list[Interval], resumed: dict[Interval, int]) -> list[Action]:
+    """Return the actions that freeze the special browser; `resumed`: ends of freezing [ns]."""
     actions: list[Action] = []
     for interval in plan:
         if interval.kind == FROZEN:
             actions.append((interval.stall_s, lambda run: run.by_client[SPECIAL].send_signal(signal.SIGSTOP)))
             actions.append((interval.resume_s, lambda run, s=interval: _resume(run, s, resumed)))  # type: ignore[misc]
-        elif interval.kind == LOADING:
-            actions.append((interval.stall_s, lambda run: run.by_client[SPECIAL].send_line(f"load {LOAD_BYTES}")))
     return actions
 
 
-def _resume(run: BenchRun, interval: StallInterval, resumed: dict[StallInterval, int]) -> None:
+def _resume(run: BenchRun, interval: Interval, resumed: dict[Interval, int]) -> None:
     resumed[interval] = run.session.clock()
     run.by_client[SPECIAL].send_signal(signal.SIGCONT)
 

@@ -1,10 +1,7 @@
-"""Clients of `bench web`: up to four browsers in one process, which log the states they receive, with their times.
+"""Browsers of `bench web`: up to four in one process, which log the states they receive, with their times.
 
-    python -m iris_session.bench.web_clients < job.json
-
-Same protocol as `bench.clients`: prints `ready`, reads `begin end`, writes its log as one .npz file. A browser here
-joins, keeps its connection alive and decodes every state as the page does, over a WebSocket; it draws nothing. Within
-the window each line `load BYTES` lets the first browser fetch that much: the largest asset, again and again.
+A browser here joins, keeps its connection alive and decodes every state as the page does, over a WebSocket; it draws
+nothing. At the times of its job it fetches assets: the largest one, again and again.
 """
 
 from __future__ import annotations
@@ -12,17 +9,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
-import sys
 import time
 from collections.abc import Sequence
 from http import HTTPStatus
-from typing import Final
+from typing import Any, Final
 
 import aiohttp
-import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from iris_session.bench.clients import JOIN_S, MAX_FRAMES, ClientJob, Job, make_web_secret
+from iris_session.bench.worker import POLL_S, Plugin
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.state_stream import SceneState
 from iris_session.client.core.status import ConnectionPhase
@@ -36,6 +33,8 @@ from iris_session.web import wire
 TICK_S: Final = 0.05
 #: Assets fetched at once; the page fetches as many.
 LOADS: Final = 6
+#: Bytes that a browser fetches at each of its times.
+LOAD_BYTES: Final = 200_000_000
 
 
 class BenchBrowser:
@@ -90,9 +89,10 @@ class BenchBrowser:
             elif isinstance(told := wire.decode_gateway_message(frames[0]), wire.Ticket):
                 self._ticket = told.ticket
 
-    async def load(self, http: aiohttp.ClientSession, size: int) -> None:
-        """Fetch the largest asset of the scene until `size` bytes have come. Notes when, and how much came so far."""
-        begin_ns = time.monotonic_ns() - self._job.origin_ns
+    async def load(self, http: aiohttp.ClientSession, at_s: float) -> None:
+        """Fetch assets from a time of the window on. Notes when, and how much came so far."""
+        await asyncio.sleep((self.begin_ns - self._job.session_time_ns()) * 1e-9 + at_s)
+        begin_ns = self._job.session_time_ns()
         row = len(self.loads)
         self.loads.append((begin_ns, begin_ns, 0))
         spec = decode_scene(await self._fetch(http, self.connection.mirror.scene_hash))
@@ -100,9 +100,9 @@ class BenchBrowser:
         largest = max(sizes, key=lambda address: sizes[address])  # a gateway limits requests
 
         async def fetch_until_enough() -> None:
-            while self.loads[row][2] < size:
+            while self.loads[row][2] < LOAD_BYTES:
                 n = len(await self._fetch(http, largest))
-                self.loads[row] = (begin_ns, time.monotonic_ns() - self._job.origin_ns, self.loads[row][2] + n)
+                self.loads[row] = (begin_ns, self._job.session_time_ns(), self.loads[row][2] + n)
 
         await asyncio.gather(*(fetch_until_enough() for _ in range(LOADS)))
 
@@ -136,7 +136,7 @@ class BenchBrowser:
             await self._socket.send_bytes(wire.encode_frames(wire.CONTROL, [outgoing[1]]))
 
     def _log(self, state: SceneState) -> None:
-        now_ns = time.monotonic_ns() - self._job.origin_ns
+        now_ns = self._job.session_time_ns()
         if not self.begin_ns <= now_ns < self.end_ns:
             return
         if len(self.ticks) >= MAX_FRAMES:
@@ -147,69 +147,71 @@ class BenchBrowser:
         self.state_ns.append(state.header.session_time)
         self.published_ns.append(state.header.published_ns)
 
-    def to_columns(self) -> dict[str, np.ndarray[tuple[int, ...], np.dtype[np.int64]]]:
+    def to_columns(self) -> dict[str, NDArray[Any]]:
         """Return the log, with the columns of `bench.clients`."""
         counters = self.connection.stream.counters
         counts = [0, self.overflow, counters.superseded, counters.rigid_messages, counters.rigid_bytes]
-        columns: dict[str, Sequence[int | tuple[int, ...]]] = {
-            "ticks": self.ticks,
-            "handed_ns": self.handed_ns,
-            "state_ns": self.state_ns,
-            "published_ns": self.published_ns,
-            "counts": counts,
-            "loads": self.loads,
-        }
+        names = ("ticks", "handed_ns", "state_ns", "published_ns", "loads")
+        columns: dict[str, Sequence[Any]] = {"counts": counts, **{name: getattr(self, name) for name in names}}
         return {key: np.array(column, np.int64) for key, column in columns.items()}
 
 
-async def run(job: Job) -> None:
-    """Join, wait for the window, measure, and write the log."""
-    browsers = [BenchBrowser(job, spec) for spec in job.clients]
-    # The certificate is of this machine's own making.
-    connector = aiohttp.TCPConnector(ssl=False, limit=0)
-    commands = await _open_stdin()
-    async with (
-        aiohttp.ClientSession(connector=connector, auto_decompress=False) as http,
-        asyncio.TaskGroup() as group,
-    ):
-        for browser in browsers:
-            await browser.join(http)
-        readers = [group.create_task(browser.read()) for browser in browsers]
-        timers = [group.create_task(browser.keep_alive()) for browser in browsers]
-        async with asyncio.timeout(JOIN_S):
-            while not all(browser.is_ready for browser in browsers):
-                await asyncio.sleep(TICK_S)
+class Browsers(Plugin):
+    """Browsers of one process. Their loop runs while they are polled and while they are measured."""
+
+    job_type = Job
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(job)
+        self._browsers = [BenchBrowser(job, spec) for spec in job.clients]
+        self._loop = asyncio.new_event_loop()
+        self._tasks: list[asyncio.Task[None]] = []  # which do not end by themselves
+        self._loads: list[asyncio.Task[None]] = []
+        self._loop.run_until_complete(self._join())
         gc.collect()
         gc.freeze()
         gc.disable()  # as `bench.clients` does
-        print("ready", flush=True)
-        begin_ns, end_ns = map(int, (await commands.readline()).split())
-        for browser in browsers:
+
+    def poll(self) -> None:
+        """Let the browsers read and send."""
+        self._loop.run_until_complete(self._run(POLL_S))
+
+    def measure(self, begin_ns: int, end_ns: int) -> None:
+        """Run through a window of session time [ns], and write the log."""
+        for browser in self._browsers:
             browser.begin_ns, browser.end_ns = begin_ns, end_ns
-        loading = group.create_task(_load_on_command(commands, browsers[0], http))
-        await asyncio.sleep((end_ns + job.origin_ns - time.monotonic_ns()) * 1e-9)
-        lost = [browser.spec.name for browser, reader in zip(browsers, readers, strict=True) if reader.done()]
-        log = {f"{b.spec.name}.{key}": column for b in browsers for key, column in b.to_columns().items()}
-        np.savez(job.log, allow_pickle=False, **log)
-        for task in (*readers, *timers, loading):
+            self._loads += [self._loop.create_task(browser.load(self._http, at_s)) for at_s in browser.spec.loads_s]
+        self._loop.run_until_complete(self._run((end_ns - self.job.session_time_ns()) * 1e-9))
+        self.job.write_log({browser.spec.name: browser.to_columns() for browser in self._browsers})
+
+    def close(self) -> None:
+        """Leave the session."""
+        self._loop.run_until_complete(self._leave())
+
+    async def _join(self) -> None:
+        # The certificate is of this machine's own making.
+        connector = aiohttp.TCPConnector(ssl=False, limit=0)
+        self._http = aiohttp.ClientSession(connector=connector, auto_decompress=False)
+        for browser in self._browsers:
+            await browser.join(self._http)
+            self._tasks += [self._loop.create_task(one) for one in (browser.read(), browser.keep_alive())]
+        async with asyncio.timeout(JOIN_S):
+            while not all(browser.is_ready for browser in self._browsers):
+                await self._run(TICK_S)
+
+    async def _run(self, seconds: float) -> None:
+        """Let all tasks run for some seconds. Raises what a task has raised."""
+        tasks = (*self._tasks, *self._loads)
+        await asyncio.wait(tasks, timeout=max(0.0, seconds), return_when=asyncio.FIRST_EXCEPTION)
+        for task in tasks:
+            if task.done():
+                task.result()
+        if any(task.done() for task in self._tasks):
+            raise ConnectionError("the gateway closed the WebSocket of a browser")
+
+    async def _leave(self) -> None:
+        for task in (*self._tasks, *self._loads):
             task.cancel()
-        for browser in browsers:
+        for browser in self._browsers:
             await browser.close()
-    if lost:
-        sys.exit(f"bench web: the gateway closed the WebSocket of {', '.join(lost)}")
-
-
-async def _open_stdin() -> asyncio.StreamReader:
-    """Return standard input as a stream, which does not keep the process from ending."""
-    reader = asyncio.StreamReader()
-    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
-    return reader
-
-
-async def _load_on_command(commands: asyncio.StreamReader, browser: BenchBrowser, http: aiohttp.ClientSession) -> None:
-    while line := await commands.readline():
-        await browser.load(http, int(line.split()[1]))
-
-
-if __name__ == "__main__":
-    asyncio.run(run(msgspec.json.decode(sys.stdin.readline(), type=Job)))
+        await self._http.close()

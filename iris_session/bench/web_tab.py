@@ -2,26 +2,22 @@
 
 Where there is no graphics card, WebGL's draw calls do nothing during the measurement; all else of the page runs.
 
-    python -m iris_session.bench.web_tab < job.json
-
-Same protocol as `bench.clients`: prints `ready`, reads `begin end`, writes its log as one .npz file. In the last
-seconds of the window it presses the e-stop of the page, and clears it.
+In the last seconds of the window it presses the e-stop of the page, and clears it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
-from collections.abc import Callable
 from typing import Any, Final
 
-import msgspec
 import numpy as np
 import psutil
+from numpy.typing import NDArray
 
-from iris_session.bench.chromium import BrowserError, Chromium, find_tools
-from iris_session.bench.clients import JOIN_S, ClientJob, Job
+from iris_session.bench.chromium import Chromium, find_tools
+from iris_session.bench.clients import JOIN_S, Job
+from iris_session.bench.worker import Plugin
 
 #: End of the window in which e-stops are pressed [s]; their number.
 STOPS_S: Final = 8.0
@@ -111,25 +107,30 @@ _PROBE: Final = """
 """
 
 
-class BenchTab:
+class Tab(Plugin):
     """One tab with its log."""
 
-    def __init__(self, job: Job, spec: ClientJob) -> None:
-        self._job = job
-        self._name = spec.name
+    job_type = Job
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(job)
+        self._name = job.clients[0].name
         self._chromium = Chromium(find_tools())
         self._heap: list[tuple[float, float, float]] = []
+        try:
+            self._join()
+        except BaseException:
+            self.close()
+            raise
 
-    def __enter__(self) -> BenchTab:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the browser."""
         self._chromium.close()
 
-    def join(self) -> None:
+    def _join(self) -> None:
         """Open the page, pair where the address has a code, and wait until the whole scene is drawn."""
-        self._call("open", url=self._job.page, before=[_PROBE], width=WIDTH, height=HEIGHT)
-        if "#c=" in self._job.page:
+        self._call("open", url=self.job.page, before=[_PROBE], width=WIDTH, height=HEIGHT)
+        if "#c=" in self.job.page:
             self._wait("document.querySelector('dialog').open")
             self._call("press", key="Enter")
         self._wait(_READY)
@@ -137,7 +138,7 @@ class BenchTab:
         self._call("evaluate", script=f"{_IS_SOFTWARE} && irisBench.skipDraws()")
 
     def measure(self, begin_ns: int, end_ns: int) -> None:
-        """Measure a window of session time [ns], the last seconds of which are for e-stops."""
+        """Measure a window of session time [ns], the last seconds of which are for e-stops, and write the log."""
         self._sleep_until(begin_ns)
         self._call("evaluate", script="irisBench.begin()")
         last_ns = end_ns - round(STOPS_S * 1e9)
@@ -146,6 +147,7 @@ class BenchTab:
             self._sleep_until(int(at_ns))
             self._read_memory((at_ns - begin_ns) * 1e-9)
         self._press_stops(end_ns)
+        self.job.write_log({self._name: self._read_columns()})
 
     def _press_stops(self, end_ns: int) -> None:
         period_ns = round(STOPS_S * 1e9 / (STOPS + 1))
@@ -169,10 +171,10 @@ class BenchTab:
                     resident = max(resident, process.memory_info().rss)
         self._heap.append((at_s, heap / 2**20, resident / 2**20))
 
-    def to_columns(self) -> dict[str, np.ndarray[Any, Any]]:
+    def _read_columns(self) -> dict[str, NDArray[Any]]:
         """Return the log. `clicks_ns`: session time of each click, as the browser has seen it."""
         found = self._call("evaluate", script="irisBench.end()")
-        offset_ns = time.time_ns() - time.monotonic_ns() + self._job.origin_ns
+        offset_ns = time.time_ns() - time.monotonic_ns() + self.job.origin_ns
         return {
             "js_ms": np.array(found["js_ms"]),
             "render_ms": np.array(found["render_ms"]),
@@ -190,22 +192,4 @@ class BenchTab:
         self._call("wait", script=script, timeout_ms=1000 * timeout_s)
 
     def _sleep_until(self, session_ns: int) -> None:
-        time.sleep(max(0.0, (session_ns + self._job.origin_ns - time.monotonic_ns()) * 1e-9))
-
-
-def run(job: Job, read_line: Callable[[], str] = sys.stdin.readline) -> None:
-    """Join, wait for the window, measure, and write the log."""
-    (spec,) = job.clients
-    with BenchTab(job, spec) as tab:
-        tab.join()
-        print("ready", flush=True)
-        begin_ns, end_ns = map(int, read_line().split())
-        tab.measure(begin_ns, end_ns)
-        np.savez(job.log, allow_pickle=False, **{f"{spec.name}.{k}": column for k, column in tab.to_columns().items()})
-
-
-if __name__ == "__main__":
-    try:
-        run(msgspec.json.decode(sys.stdin.readline(), type=Job))
-    except BrowserError as error:
-        sys.exit(f"bench web: the tab: {error}")
+        time.sleep(max(0.0, (session_ns - self.job.session_time_ns()) * 1e-9))

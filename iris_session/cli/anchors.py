@@ -10,12 +10,16 @@ import csv
 import json
 import math
 import re
-from collections import Counter
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from anchors.camera_calibration import (
+    CalibrationPicture,
+    calibration_to_toml,
+    solve_from_known_sheets,
+    solve_from_robot_poses,
+)
 from iris_session.cli.anchors_session import (
     register_align,
     register_move,
@@ -25,21 +29,30 @@ from iris_session.cli.anchors_session import (
 )
 from iris_session.cli.common import (
     CommandError,
+    add_command,
     add_json_option,
     open_scene,
     parse_length,
     parse_pose,
-    pose_to_dict,
     print_json,
     write_file,
 )
 
 if TYPE_CHECKING:
     from anchors.camera import CameraModel
-    from anchors.detection import SheetDetection
     from anchors.pose import PoseTuple, Vec3
     from anchors.sheet import Sheet
 
+#: For `cloud calibrate` too.
+__all__ = [
+    "CalibrationPicture",
+    "calibration_to_toml",
+    "format_calibration",
+    "make_sheets",
+    "parse_named_length",
+    "parse_named_pose",
+    "solve_from_known_sheets",
+]
 #: Edges of the code where none is given: with its marks it must be smaller to fit on A4.
 PLAIN_SHEET_M: Final = 0.160
 MARKED_SHEET_M: Final = 0.140
@@ -47,19 +60,21 @@ MARKED_SHEET_M: Final = 0.140
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `anchors`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "anchors",
+        None,
         help="print anchor sheets, align headsets, calibrate cameras",
         description="Print sheets that headsets and cameras detect, align headsets to them, and calibrate cameras.",
-        epilog="examples:\n"
-        "  iris-session anchors print --size 160mm --id table --out table.pdf\n"
-        "  iris-session anchors example > anchors.toml\n"
-        "  iris-session anchors status --watch\n"
-        "  iris-session anchors align start ann\n"
-        "  iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd --out anchors.toml\n"
-        "  iris-session anchors calibrate-camera pictures --sheet table=160mm --poses poses.csv\n"
-        "  iris-session anchors calibrate-camera pictures --sheet table=160mm --at table=0,-0.45,0,1,0,0,0",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session anchors print --size 160mm --id table --out table.pdf
+            iris-session anchors example > anchors.toml
+            iris-session anchors status --watch
+            iris-session anchors align start ann
+            iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd --out anchors.toml
+            iris-session anchors calibrate-camera pictures --sheet table=160mm --poses poses.csv
+            iris-session anchors calibrate-camera pictures --sheet table=160mm --at table=0,-0.45,0,1,0,0,0
+        """,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_print(actions)
@@ -74,17 +89,19 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `print`."""
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "print",
+        run_print,
         help="write a sheet as PDF or SVG",
         description="Write a sheet of exact size: a QR code with the anchor's id between four markers that cameras "
         "detect from a distance, and a ruler to check the printed size. With --marks also four crosses, to be "
         "pricked and touched with a controller by devices that cannot read the code.",
-        epilog="examples:\n"
-        "  iris-session anchors print --size 160mm --id table --out table.pdf\n"
-        "  iris-session anchors print --id shelf --paper a3 --size 200mm\n"
-        "  iris-session anchors print --marks --out table.pdf",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session anchors print --size 160mm --id table --out table.pdf
+            iris-session anchors print --id shelf --paper a3 --size 200mm
+            iris-session anchors print --marks --out table.pdf
+        """,
     )
     one.add_argument(
         "--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (160mm; with --marks 140mm)"
@@ -94,18 +111,21 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
     one.add_argument("--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
     add_json_option(one)
-    one.set_defaults(run=run_print)
 
 
 def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `example`."""
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "example",
+        run_example,
         help="an anchors file to edit, for `serve --anchors`",
         description="Print the anchors of a scene as a file to edit. Pass it as `serve --anchors FILE`.",
-        epilog="examples:\n  iris-session anchors example > anchors.toml\n  iris-session anchors example handover\n"
-        "  iris-session anchors example --marks > anchors.toml",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session anchors example > anchors.toml
+            iris-session anchors example handover
+            iris-session anchors example --marks > anchors.toml
+        """,
     )
     one.add_argument(
         "scene",
@@ -115,7 +135,6 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
     )
     one.add_argument("--marks", action="store_true", help="of sheets with marks, as `print --marks` writes them")
     add_json_option(one)
-    one.set_defaults(run=run_example)
 
 
 def run_print(arguments: argparse.Namespace) -> int:
@@ -185,16 +204,6 @@ PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 COLUMNS: Final = ("image", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
-@dataclass(frozen=True)
-class CalibrationPicture:
-    """One picture and the sheets detected in it. `camera_name`: name of its folder."""
-
-    path: Path
-    camera_name: str
-    camera: CameraModel
-    sightings: tuple[SheetDetection, ...]
-
-
 def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
     """Calibrate cameras from pictures. Return the object that `--json` prints.
 
@@ -211,7 +220,12 @@ def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
     pictures = _read_pictures(arguments.folder, arguments.intrinsics, sheets)
     if len({picture.camera_name for picture in pictures}) > 1:
         raise CommandError("--poses calibrates one camera at a time: give the folder of that camera")
-    return _solve_from_robot_poses(pictures, poses, arguments)
+    missing = [picture.path.name for picture in pictures if picture.path.name not in poses]
+    if missing:
+        raise CommandError(f"{arguments.poses} has no line for {missing[0]} ({len(missing)} pictures have no pose)")
+    return solve_from_robot_poses(
+        pictures, poses, camera_on_hand=arguments.camera_on_hand, T_ee_sheet=arguments.in_hand
+    )
 
 
 def make_sheets(sizes: Iterable[tuple[str, float]]) -> list[Sheet]:
@@ -328,187 +342,7 @@ def _read_camera(folder: Path, intrinsics: Path | None, width: int, height: int)
         raise CommandError(f"{path}: {error}") from error
 
 
-# --- solving ----------------------------------------------------------------------------------------------------------
-
-
-def _solve_from_robot_poses(
-    pictures: list[CalibrationPicture], poses: dict[str, PoseTuple], arguments: argparse.Namespace
-) -> dict[str, Any]:
-    from anchors.pose import compose, inverse
-    from anchors.robot_world import CalibrationError, solve_camera_on_hand, solve_robot_world
-
-    missing = [picture.path.name for picture in pictures if picture.path.name not in poses]
-    if missing:
-        raise CommandError(f"{arguments.poses} has no line for {missing[0]} ({len(missing)} pictures have no pose)")
-    seen = [picture for picture in pictures if picture.sightings]
-    if not seen:
-        raise CalibrationError(_format_no_sheet_found(len(pictures)))
-    robot = [poses[picture.path.name] for picture in seen]
-    if arguments.in_hand is not None:
-        return _solve_with_known_hand_pose(pictures, seen, robot, arguments.in_hand)
-    found = [picture.sightings[0] for picture in seen]
-    solver = solve_camera_on_hand if arguments.camera_on_hand else solve_robot_world
-    solved = solver(robot, [one.T_camera_sheet for one in found], [one.covariance for one in found])
-    X, Y = solved.T_base_camera, solved.T_ee_marker
-    result: dict[str, Any]
-    if arguments.camera_on_hand:
-        expected = [compose(inverse(compose(T, Y)), X) for T in robot]
-        result = {"T_ee_camera": pose_to_dict(Y), "T_base_sheet": pose_to_dict(X)}
-    else:
-        expected = [compose(inverse(X), compose(T, Y)) for T in robot]
-        result = {
-            "T_base_camera": pose_to_dict(X),
-            "T_ee_sheet": pose_to_dict(Y),
-            **_estimate_error(solved.covariance, X),
-        }
-    left_out = {str(seen[k].path) for k in solved.left_out}
-    rows = _compute_residuals(pictures, {p.path: [T] for p, T in zip(seen, expected, strict=True)}, left_out)
-    return {
-        "mode": "camera-on-hand" if arguments.camera_on_hand else "sheet-on-hand",
-        **result,
-        **_summarize_fit(rows),
-        "turned_deg": math.degrees(solved.spread_rad),
-        "pictures": rows,
-    }
-
-
-def _solve_with_known_hand_pose(
-    pictures: list[CalibrationPicture], seen: list[CalibrationPicture], robot: list[PoseTuple], T_ee_sheet: PoseTuple
-) -> dict[str, Any]:
-    """Solve with a known pose of the sheet on the hand: its pose is then known in every picture."""
-    from anchors.camera_rig import SheetView, solve_rig
-    from anchors.pose import compose, inverse
-
-    known = {str(p.path): compose(T, T_ee_sheet) for p, T in zip(seen, robot, strict=True)}
-    views = [SheetView("camera", str(p.path), p.sightings[0].T_camera_sheet, p.sightings[0].covariance) for p in seen]
-    rig = solve_rig(views, known)
-    at = rig.cameras["camera"]
-    rows = _compute_residuals(pictures, {p.path: [compose(inverse(at), known[str(p.path)])] for p in seen}, set())
-    return {
-        "mode": "sheet-in-hand",
-        "T_base_camera": pose_to_dict(at),
-        **_estimate_error(rig.covariances["camera"], at),
-        **_summarize_fit(rows),
-        "pictures": rows,
-    }
-
-
-def solve_from_known_sheets(
-    pictures: list[CalibrationPicture], known: Mapping[str, PoseTuple], *, at_rest: bool = False
-) -> tuple[dict[str, Any], dict[str, tuple[float, ...]]]:
-    """Solve the poses of cameras by sheets, of which some are at known poses.
-
-    Args:
-        pictures: Pictures of all cameras, and the sheets in them.
-        known: `T_base_sheet` by id.
-        at_rest: Nothing moved between the pictures of a camera: they share their errors, and count as one.
-
-    Returns:
-        The object that `--json` prints, and the covariances of the cameras (36 values, base frame).
-
-    Raises:
-        CalibrationError: The pictures do not determine a result.
-    """
-    from anchors.camera_rig import SheetView, solve_rig
-    from anchors.pose import compose, inverse
-    from anchors.robot_world import CalibrationError
-
-    views = [
-        SheetView(picture.camera_name, one.anchor_id, one.T_camera_sheet, one.covariance)
-        for picture in pictures
-        for one in picture.sightings
-        if not one.ambiguous
-    ]
-    if not views:
-        raise CalibrationError(_format_no_sheet_found(len(pictures)))
-    blind = {picture.camera_name for picture in pictures} - {view.camera for view in views}
-    if blind:
-        raise CalibrationError(f"camera {', '.join(sorted(blind))} saw no sheet: {_NO_SHEET_HINT}")
-    rig = solve_rig(views, known)
-    seen = Counter(picture.camera_name for picture in pictures if picture.sightings)
-    covariances = {
-        name: tuple(v * (seen[name] if at_rest else 1) for v in covariance)
-        for name, covariance in rig.covariances.items()
-    }
-    expected = {
-        p.path: [compose(inverse(rig.cameras[p.camera_name]), rig.sheets[one.anchor_id]) for one in p.sightings]
-        for p in pictures
-    }
-    rows = _compute_residuals(pictures, expected, set())
-    cameras = {
-        name: {"T_base_camera": pose_to_dict(at), **_estimate_error(covariances[name], at)}
-        for name, at in rig.cameras.items()
-    }
-    result = {
-        "mode": "sheets-of-known-place",
-        **(next(iter(cameras.values())) if len(cameras) == 1 else {"cameras": cameras}),
-        "sheets": {name: {"T_base_sheet": pose_to_dict(at)} for name, at in rig.sheets.items()},
-        **_summarize_fit(rows),
-        "pictures": rows,
-    }
-    return result, covariances
-
-
-_NO_SHEET_HINT: Final = (
-    "are --sheet and its size those of the print, are the pictures sharp, is the whole sheet in them?"
-)
-
-
-def _format_no_sheet_found(n: int) -> str:
-    return f"no sheet was found in {n} picture{'s' * (n != 1)}: {_NO_SHEET_HINT}"
-
-
 # --- output -----------------------------------------------------------------------------------------------------------
-
-
-def _compute_residuals(
-    pictures: list[CalibrationPicture], expected: dict[Path, list[PoseTuple]], left_out: set[str]
-) -> list[dict[str, Any]]:
-    """Return per picture and sheet the residual between detection and result, in space and in the picture."""
-    import numpy as np
-
-    from anchors.pose import distance, quat_angle
-    from anchors.sheet import Sheet
-
-    rows: list[dict[str, Any]] = []
-    for picture in pictures:
-        if not picture.sightings:
-            rows.append({"file": picture.path.name, "camera": picture.camera_name, "found": False})
-        for one, T in zip(picture.sightings, expected.get(picture.path, []), strict=False):
-            corners = Sheet(one.anchor_id, one.edge_m).marker_corners.reshape(-1, 3)
-            off = picture.camera.project(corners, one.T_camera_sheet) - picture.camera.project(corners, T)
-            rows.append(
-                {
-                    "file": picture.path.name,
-                    "camera": picture.camera_name,
-                    "found": True,
-                    "sheet": one.anchor_id,
-                    "used": str(picture.path) not in left_out,
-                    "residual_mm": 1e3 * distance(one.T_camera_sheet[0], T[0]),
-                    "residual_deg": math.degrees(quat_angle(one.T_camera_sheet[1], T[1])),
-                    "residual_px": float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
-                    "markers": one.markers,
-                }
-            )
-    return rows
-
-
-def _summarize_fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    used = [row for row in rows if row.get("used")]
-
-    def rms(key: str) -> float:
-        return math.sqrt(sum(row[key] ** 2 for row in used) / max(len(used), 1))
-
-    fit = {f"{key}_rms": rms(key) for key in ("residual_mm", "residual_deg", "residual_px")}
-    return {"used": len(used), "left_out": sum(row.get("used") is False for row in rows), **fit}
-
-
-def _estimate_error(covariance: tuple[float, ...], at: PoseTuple) -> dict[str, float]:
-    """Return the 95 % bound of the position and the standard deviation of the rotation."""
-    from anchors.alignment import position_error_p95
-
-    turn = math.sqrt(covariance[21] + covariance[28] + covariance[35])
-    return {"error_mm_p95": 1e3 * position_error_p95(covariance, at[0], at[0]), "sigma_deg": math.degrees(turn)}
 
 
 def format_calibration(result: dict[str, Any]) -> list[str]:
@@ -547,46 +381,24 @@ def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]
     return found
 
 
-def calibration_to_toml(result: dict[str, Any]) -> str:
-    """Return the result as TOML: named poses and residuals."""
-    lines = ["# Written by iris-session. Metres; quaternions w first."]
-    lines += [f'mode = "{result["mode"]}"']
-    lines += [f"{key} = {result[key]!r}" for key in ("residual_mm_rms", "residual_deg_rms", "residual_px_rms")]
-    lines += [f"{key} = {result[key]!r}" for key in ("error_mm_p95", "sigma_deg") if key in result]
-    for key, value in result.items():
-        if key.startswith("T_"):
-            lines += ["", f"[{key}]", *_format_toml_pose(value)]
-    for kind in ("cameras", "sheets"):
-        for name, part in result.get(kind, {}).items():
-            quoted = name.replace("\\", "\\\\").replace('"', '\\"')
-            stated = [f"{key} = {part[key]!r}" for key in ("error_mm_p95", "sigma_deg") if key in part]
-            lines += ["", f'[{kind}."{quoted}"]', *stated] if stated else []
-            for key, value in part.items():
-                if key.startswith("T_"):
-                    lines += ["", f'[{kind}."{quoted}".{key}]', *_format_toml_pose(value)]
-    return "\n".join([*lines, ""])
-
-
-def _format_toml_pose(value: dict[str, list[float]]) -> list[str]:
-    return [f"{key} = [{', '.join(repr(v) for v in value[key])}]" for key in ("position_m", "quaternion_wxyz")]
-
-
 def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `calibrate-camera`."""
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "calibrate-camera",
+        run_calibrate,
         help="calibrate the pose of a camera",
         description="Compute T_base_camera from pictures: of a sheet on the robot's hand while the hand moves "
         "(--poses), or of sheets at known poses (--at). Prints residuals, and refuses pictures that do not "
         "determine the result.",
-        epilog="poses.csv, metres and unit quaternions, one line per picture:\n"
+        examples="""
+            iris-session anchors calibrate-camera pictures --sheet table=160mm --poses poses.csv
+            iris-session anchors calibrate-camera pictures --sheet table=160mm --at table=0,-0.45,0,1,0,0,0
+        """,
+        notes="poses.csv, metres and unit quaternions, one line per picture:\n"
         "  image,x,y,z,qw,qx,qy,qz\n"
         "  0001.png,0.412,0.031,0.388,0.0012,0.9998,0.0131,0.0021\n\n"
-        "Several cameras at once: one folder each below FOLDER, with its own intrinsics.toml.\n\n"
-        "examples:\n"
-        "  iris-session anchors calibrate-camera pictures --sheet table=160mm --poses poses.csv\n"
-        "  iris-session anchors calibrate-camera pictures --sheet table=160mm --at table=0,-0.45,0,1,0,0,0",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "Several cameras at once: one folder each below FOLDER, with its own intrinsics.toml.",
     )
     one.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the pictures")
     one.add_argument(
@@ -624,7 +436,6 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
     )
     one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
     add_json_option(one)
-    one.set_defaults(run=run_calibrate)
 
 
 def parse_named_length(text: str) -> tuple[str, float]:

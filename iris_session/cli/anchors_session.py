@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import count
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -14,14 +15,17 @@ from typing import TYPE_CHECKING, Any, Final
 from iris_session.cli.common import (
     CommandError,
     add_address_options,
+    add_command,
     add_json_option,
     add_pose_option,
     check_session_reachable,
+    find_participant,
     pose_to_dict,
     print_json,
     to_printable,
     write_file,
 )
+from iris_session.cli.progress import ProgressLine
 from iris_session.cli.status import add_watch_options, open_status, watch_status
 from iris_session.doctor.headset_checks import is_consistent
 from iris_session.protocol.names import AlignAction, AlignmentKind
@@ -43,35 +47,38 @@ MAX_LISTED_SHEETS: Final = 8
 
 def register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `status`."""
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "status",
+        run_status,
         help="how well the headsets of a running session are aligned",
         description="Join as an observer and print for every headset the basis of its alignment, then the anchors, and "
         "the cross-checks between pairs of headsets.",
-        epilog="examples:\n"
-        "  iris-session anchors status\n"
-        "  iris-session anchors status 192.168.1.20 --watch\n"
-        "  iris-session anchors status --json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session anchors status
+            iris-session anchors status 192.168.1.20 --watch
+            iris-session anchors status --json
+        """,
     )
     add_address_options(one)
     add_watch_options(one, one)
     add_json_option(one)
-    one.set_defaults(run=run_status)
 
 
 def register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `align`."""
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "align",
+        run_align,
         help="start or stop measuring the alignment of headsets",
         description="`start` discards earlier observations and measures again; `stop` keeps the alignment in force and "
         "ignores later observations. The present alignment stays until there is a better one. Joins as a director.",
-        epilog="examples:\n"
-        "  iris-session anchors align start                   every participant with a headset\n"
-        "  iris-session anchors align start ann\n"
-        "  iris-session anchors align stop p3 --address 192.168.1.20",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session anchors align start                   every participant with a headset
+            iris-session anchors align start ann
+            iris-session anchors align stop p3 --address 192.168.1.20
+        """,
     )
     one.add_argument("what", choices=sorted(AlignAction.ALL))
     one.add_argument(
@@ -83,47 +90,48 @@ def register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser])
     )
     add_address_options(one, option=True)
     add_json_option(one)
-    one.set_defaults(run=run_align)
 
 
 def register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `place`."""
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "place",
+        run_place,
         help="align a headset by hand",
         description="Set the pose of the tracking frame of a headset, T_world_tracking, or with --offset an offset to "
         "the measured alignment, which voids its stated error. Joins as a director.",
-        epilog="examples:\n"
-        "  iris-session anchors place ann --pose 0.4,0,0,1,0,0,0\n"
-        "  iris-session anchors place ann --offset --pose -0.01,0,0,1,0,0,0",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session anchors place ann --pose 0.4,0,0,1,0,0,0
+            iris-session anchors place ann --offset --pose -0.01,0,0,1,0,0,0
+        """,
     )
     one.add_argument("participant", metavar="PARTICIPANT", help="name or id")
     add_pose_option(one, "T_world_tracking, or the offset in the world")
     one.add_argument("--offset", action="store_true", help="the pose is an offset to the measured alignment")
     add_address_options(one, option=True)
     add_json_option(one)
-    one.set_defaults(run=run_place)
 
 
 def register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `move`."""
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "move",
+        run_move,
         help="set the pose of an anchor of the session",
         description="Change T_world_anchor: the shared scene moves for every headset whose measured alignment uses "
         "that anchor. Further than 5 m only with --force. Joins as a director.",
-        epilog="examples:\n"
-        "  iris-session anchors move table --pose 0,-0.45,0,1,0,0,0\n"
-        "  iris-session anchors move table --pose -0.2,0.1,0,0.7071068,0,0,0.7071068",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session anchors move table --pose 0,-0.45,0,1,0,0,0
+            iris-session anchors move table --pose -0.2,0.1,0,0.7071068,0,0,0.7071068
+        """,
     )
     one.add_argument("anchor", metavar="ANCHOR", help="id of the anchor, see `anchors status`")
     add_pose_option(one, "T_world_anchor")
     one.add_argument("--force", action="store_true", help="allow more than 5 m from the present position")
     add_address_options(one, option=True)
     add_json_option(one)
-    one.set_defaults(run=run_move)
 
 
 # --- align, place, move -----------------------------------------------------------------------------------------------
@@ -180,7 +188,7 @@ def run_align(arguments: argparse.Namespace) -> int:
 def run_place(arguments: argparse.Namespace) -> int:
     """Place the alignment of one participant."""
     with join_as_director(arguments) as client:
-        (one,) = select_participants(client, arguments.participant, allow_all=False)
+        one = find_participant(client, arguments.participant)
         client.alignment.place(one.id, arguments.pose, offset=arguments.offset)
     if arguments.json:
         print_json({"ok": True, "participant": {"id": one.id, "name": one.name}, "offset": arguments.offset})
@@ -227,26 +235,19 @@ def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:
     return ""
 
 
-def select_participants(client: Client, name: str, *, allow_all: bool = True) -> list[ParticipantInfo]:
-    """Return the participants with an id or name, or all with a headset for `all`.
+def select_participants(client: Client, name: str) -> list[ParticipantInfo]:
+    """Return the participant with an id or name, or all with a headset for `all`.
 
     Raises:
-        CommandError: No participant, or more than one, has that name. The text lists the candidates.
+        CommandError: There is none, or several have the name.
     """
-    people = sorted(client.mirror.participants.values(), key=lambda one: (len(one.id), one.id))
+    people = list(client.mirror.participants.values())
+    if name != ALL_PARTICIPANTS or any(name in (one.id, one.name) for one in people):
+        return [find_participant(client, name)]
     headsets = [one for one in people if one.alignment is None or one.alignment.kind != AlignmentKind.NOT_NEEDED]
-    candidates = ", ".join(f"{one.name} ({one.id})" for one in headsets) or "none"
-    found = [one for one in people if one.id == name] or [one for one in people if one.name == name]
-    if not found and name == ALL_PARTICIPANTS and allow_all:
-        found = [one for one in headsets if one.connected]
-        if not found:
-            raise CommandError("no participant of this session has a headset that is aligned", status=1)
-        return found
+    found = sorted((one for one in headsets if one.connected), key=lambda one: (len(one.id), one.id))
     if not found:
-        raise CommandError(to_printable(f"no participant is called '{name}'; with a headset: {candidates}"))
-    if len(found) > 1:
-        ids = ", ".join(f"{one.id} ({one.role}{'' if one.connected else ', disconnected'})" for one in found)
-        raise CommandError(to_printable(f"{len(found)} participants are called '{name}', give an id: {ids}"))
+        raise CommandError("no participant of this session has a headset that is aligned", status=1)
     return found
 
 
@@ -391,18 +392,20 @@ MAX_LISTED: Final = 12
 
 def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `solve`."""
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "solve",
+        run_solve,
         help="solve the alignments of a recording again, and the poses of its sheets",
         description="Read every observation of a recording and solve alignments again, with the observations before "
         "and after each moment. Prints the error of each alignment that was in force, observations that contradict it, "
         "and sheets that were moved. With two or more sheets it also solves their relative poses, as a file for "
         "`serve --anchors`.",
-        epilog="examples:\n"
-        "  iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd\n"
-        "  iris-session anchors solve session.rrd --anchors anchors.toml --json\n"
-        "  iris-session anchors solve session.rrd --out anchors.toml",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd
+            iris-session anchors solve session.rrd --anchors anchors.toml --json
+            iris-session anchors solve session.rrd --out anchors.toml
+        """,
     )
     one.add_argument(
         "recording", type=Path, metavar="RECORDING", help="a .rrd file; later parts are found by their names"
@@ -412,7 +415,6 @@ def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser])
     )
     one.add_argument("--out", type=Path, metavar="FILE", help="write the poses of the sheets, for `serve --anchors`")
     add_json_option(one)
-    one.set_defaults(run=run_solve)
 
 
 def run_solve(arguments: argparse.Namespace) -> int:
@@ -423,17 +425,18 @@ def run_solve(arguments: argparse.Namespace) -> int:
     from iris_session.session.config import load_anchors
 
     given = None if arguments.anchors is None else load_anchors(arguments.anchors)
-    with Recording.open(arguments.recording, warn=False) as recording:
-        looks = read_alignment_history(recording, make_progress_printer("reading"))
+    path: Path = arguments.recording
+    with Recording.open(path, warn=False) as recording, ProgressLine(path) as progress:
+        looks = read_alignment_history(recording, lambda done, total: progress.show(f"reading: {done} of {total}"))
         saved = _load_reference_anchors(recording, given)
         anchors = AnchorHistory(looks, dict(saved.anchors), given)
-        results = _resolve_frames(looks, anchors, saved.sizes)
-        relative = solve_relative_poses(looks, _replace_anchors(saved, anchors.last_poses))
+        results = _resolve_frames(looks, anchors, saved.sizes, progress)
+        relative = solve_relative_poses(looks, replace(saved, anchors=anchors.last_poses))
         damage = recording.damage + recording.missing
     wanted = arguments.out is not None
     written = _write_constellation(arguments.out, relative) if wanted and relative.solved is not None else ""
     if arguments.json:
-        print_json(solution_to_dict(str(arguments.recording), looks, results, relative, damage, written))
+        print_json(solution_to_dict(str(path), looks, results, relative, damage, written))
     else:
         for line in format_solution(looks, results, relative, damage):
             print(to_printable(line))
@@ -442,18 +445,6 @@ def run_solve(arguments: argparse.Namespace) -> int:
     if wanted and not written:  # the results are printed nevertheless
         raise CommandError(f"{arguments.out} is not written: {relative.advice}", status=1)
     return 0
-
-
-def make_progress_printer(what: str) -> Callable[[int, int], None] | None:
-    """Return a function that prints progress, or None if standard error is not a terminal."""
-    if not sys.stderr.isatty():
-        return None
-
-    def show(done: int, total: int) -> None:
-        end = "" if done < total else "\n"
-        print(f"\r{what}: {done} of {total}", end=end, file=sys.stderr, flush=True)
-
-    return show
 
 
 def _load_reference_anchors(recording: Recording, given: Constellation | None) -> Constellation:
@@ -469,29 +460,21 @@ def _load_reference_anchors(recording: Recording, given: Constellation | None) -
     return Constellation(next(iter(places), ""), places, {}, sizes, marks)
 
 
-def _replace_anchors(saved: Constellation, anchors: dict[str, PoseTuple]) -> Constellation:
-    from anchors.constellation import Constellation
-
-    return Constellation(saved.reference, anchors, saved.error_m, saved.sizes, saved.marks)
-
-
-def _resolve_frames(looks: AlignmentHistory, anchors: Any, sizes: dict[str, float]) -> list[FrameResult]:
+def _resolve_frames(
+    looks: AlignmentHistory, anchors: Any, sizes: dict[str, float], progress: ProgressLine
+) -> list[FrameResult]:
     from iris_session.alignment.resolve import resolve_frame
 
     by_frame = {frame: [one for one in looks.in_force if one.frame == frame] for frame in looks.observations}
-    total = sum(map(len, by_frame.values()))
-    show, done = make_progress_printer("solving"), 0
-    results = []
+    done, total = count(1), sum(map(len, by_frame.values()))
 
     def advance() -> None:
-        nonlocal done
-        done += 1
-        if show is not None:
-            show(done, total)
+        progress.show(f"solving: {next(done)} of {total}")
 
-    for frame, every in looks.observations.items():
-        results.append(resolve_frame(frame, every, by_frame[frame], anchors, sizes, advance))
-    return results
+    return [
+        resolve_frame(frame, every, by_frame[frame], anchors, sizes, advance)
+        for frame, every in looks.observations.items()
+    ]
 
 
 def _write_constellation(path: Path, relative: RelativePoses) -> str:

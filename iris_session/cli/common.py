@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import math
 import re
 import signal
 import socket
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from anchors.pose import pose_to_dict as pose_to_dict  # noqa: PLC0414 - for all commands
 from iris_session.protocol.names import AssignmentPolicy, LeaseMode
 from iris_session.system.files import write_output
 
@@ -21,7 +23,9 @@ if TYPE_CHECKING:
     import mujoco
 
     from anchors.pose import PoseTuple
+    from iris_session.client import Client
     from iris_session.demo.named_scenes import NamedScene
+    from iris_session.protocol.server_messages import ParticipantInfo
 
 
 #: Bytes of each unit of a size.
@@ -92,15 +96,24 @@ def list_expected_errors() -> tuple[type[Exception], ...]:
     )
 
 
+def parse_number(text: str, is_valid: Callable[[float], bool], wanted: str) -> float:
+    """Parse the number of an option.
+
+    Args:
+        text: What was given.
+        is_valid: Whether the option takes a number.
+        wanted: What it is and what to give, for the error.
+    """
+    with suppress(ValueError):
+        number = float(text)
+        if math.isfinite(number) and is_valid(number):
+            return number
+    raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
+
+
 def parse_seconds(text: str) -> float:
     """Parse the duration of an option [s]."""
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not (math.isfinite(seconds) and seconds > 0.0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a duration: give seconds above 0, for example 30")
-    return seconds
+    return parse_number(text, lambda s: s > 0.0, "a duration: give seconds above 0, for example 30")
 
 
 def parse_cloud_rate(text: str) -> float:
@@ -108,15 +121,11 @@ def parse_cloud_rate(text: str) -> float:
     from iris_session.session.config import MAX_CLOUDS_HZ, MIN_CLOUDS_HZ
 
     number = text.lower().removesuffix("hz").strip()
-    try:
-        hz = 0.0 if number == "off" else float(number)
-    except ValueError:
-        hz = math.nan
-    if not (hz == 0.0 or MIN_CLOUDS_HZ <= hz <= MAX_CLOUDS_HZ):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a rate: give {MIN_CLOUDS_HZ:g} to {MAX_CLOUDS_HZ:g} a second, for example 2Hz, or off"
-        )
-    return hz
+    return parse_number(
+        "0" if number == "off" else number,
+        lambda hz: hz == 0.0 or MIN_CLOUDS_HZ <= hz <= MAX_CLOUDS_HZ,
+        f"a rate: give {MIN_CLOUDS_HZ:g} to {MAX_CLOUDS_HZ:g} a second, for example 2Hz, or off",
+    )
 
 
 def parse_budget(text: str) -> int:
@@ -137,6 +146,45 @@ def parse_port_base(text: str) -> int:
     if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 65529:
         raise argparse.ArgumentTypeError(f"{text!r} is not a base of seven ports: give 1 to 65529, for example 7730")
     return int(text)
+
+
+def add_command(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    run: Callable[[argparse.Namespace], int] | None,
+    *,
+    help: str,
+    description: str,
+    examples: str,
+    notes: str = "",
+) -> argparse.ArgumentParser:
+    """Add a command, or an action of one.
+
+    Args:
+        commands: Commands or actions to add it to.
+        name: Its name.
+        run: Function that runs it and returns the exit status; `None` for a command that has actions.
+        help: Its line in the list of commands.
+        description: What it does, at the top of its help.
+        examples: Examples, one a line, at the end of its help; may be indented.
+        notes: Text before the examples.
+
+    Returns:
+        The parser, for its options.
+    """
+    lines = inspect.cleandoc(examples).split("\n")
+    title = "examples" if len(lines) > 1 else "example"
+    epilog = f"{notes}\n\n" * bool(notes) + "\n  ".join((f"{title}:", *lines))
+    parser = commands.add_parser(
+        name,
+        help=help,
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    if run is not None:
+        parser.set_defaults(run=run)
+    return parser
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -194,6 +242,23 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
             f"(TCP port {address.port}: {error.strerror or error})"
             f"{'' if arguments.address else describe_own_sessions()}"
         ) from None
+
+
+def find_participant(client: Client, name: str) -> ParticipantInfo:
+    """Return the participant with an id or name.
+
+    Raises:
+        CommandError: No participant, or more than one, has that name. The text lists the candidates.
+    """
+    people = sorted(client.mirror.participants.values(), key=lambda one: (len(one.id), one.id))
+    found = [one for one in people if one.id == name] or [one for one in people if one.name == name]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        ids = ", ".join(f"{one.id} ({one.role}{'' if one.connected else ', disconnected'})" for one in found)
+        raise CommandError(to_printable(f"{len(found)} participants are named {name!r}: give one of the ids {ids}"))
+    others = ", ".join(f"{one.name} ({one.id})" for one in people if one.id != client.participant_id) or "none"
+    raise CommandError(to_printable(f"no participant {name!r} in the session; there are: {others}"))
 
 
 def describe_own_sessions() -> str:
@@ -354,11 +419,6 @@ def parse_pose(text: str) -> PoseTuple:
     x, y, z, *q = numbers
     norm = math.hypot(*q)
     return (x, y, z), (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
-
-
-def pose_to_dict(T: PoseTuple) -> dict[str, list[float]]:
-    """Return a pose as a JSON object."""
-    return {"position_m": list(T[0]), "quaternion_wxyz": list(T[1])}
 
 
 def join_negative_poses(arguments: Sequence[str]) -> list[str]:

@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from iris_session.cli.common import (
     CommandError,
     add_address_options,
+    add_command,
     add_json_option,
     check_session_reachable,
+    find_participant,
     print_json,
     to_printable,
 )
@@ -120,19 +122,18 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 def _add_command(
     commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, text: str, act: Action, *examples: str
 ) -> argparse.ArgumentParser:
-    lines = [f"  iris-session {example}" for example in examples]
-    lines.append(f"  iris-session {examples[0]} --session lab-1")
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         name,
+        run,
         help=text,
         description=f"{text[0].upper()}{text[1:]}. The session is the one on this machine, or that of --address or "
         "--session.",
-        epilog="examples:\n" + "\n".join(lines),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="\n".join(f"iris-session {example}" for example in (*examples, f"{examples[0]} --session lab-1")),
     )
     add_address_options(parser, option=True)
     add_json_option(parser)
-    parser.set_defaults(run=run, act=act, roles=DIRECTORS)
+    parser.set_defaults(act=act, roles=DIRECTORS)
     return parser
 
 
@@ -275,7 +276,7 @@ def control_physics(client: Client, arguments: argparse.Namespace) -> Outcome:
 
 def assign_robots(client: Client, arguments: argparse.Namespace) -> Outcome:
     """Give robots to a participant."""
-    person = find_participant(client, arguments.person)
+    person = find_participant(client, arguments.person).id
     robots = _split_names([arguments.robots])
     leases = client.assign(robots, person)
     return Outcome(
@@ -286,7 +287,7 @@ def assign_robots(client: Client, arguments: argparse.Namespace) -> Outcome:
 
 def rename_participant(client: Client, arguments: argparse.Namespace) -> Outcome:
     """Give a participant another name."""
-    person = find_participant(client, arguments.person)
+    person = find_participant(client, arguments.person).id
     before = client.mirror.participants[person].name
     client.request(Rename(0, person, arguments.name))
     client.wait_for(lambda one: _find_name(one, person) != before, NEWS_S)
@@ -301,28 +302,10 @@ def _find_name(client: Client, person: str) -> str:
 
 def set_role(client: Client, arguments: argparse.Namespace) -> Outcome:
     """Give a participant another role."""
-    person = find_participant(client, arguments.person)
+    person = find_participant(client, arguments.person).id
     client.request(SetRole(0, person, arguments.role))
     name = _find_name(client, person)
     return Outcome(f"{name} ({person}) is now {arguments.role}", {"participant": person, "role": arguments.role})
-
-
-def find_participant(client: Client, person: str) -> str:
-    """Return the id of the participant with that id or name.
-
-    Raises:
-        CommandError: There is none, or several have the name.
-    """
-    participants = client.mirror.participants
-    if person in participants:
-        return person
-    found = [one.id for one in participants.values() if one.name == person]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise CommandError(f"{len(found)} participants are named {person!r}: give one of the ids {', '.join(found)}")
-    others = [f"{one.name} ({one.id})" for one in participants.values() if one.id != client.participant_id]
-    raise CommandError(f"no participant {person!r} in the session; there are: {', '.join(others) or 'none'}")
 
 
 def release_robots(client: Client, arguments: argparse.Namespace) -> Outcome:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import add_json_option, add_session_options, parse_seconds, print_json
+from iris_session.cli.common import (
+    add_command,
+    add_json_option,
+    add_session_options,
+    parse_number,
+    parse_seconds,
+    print_json,
+)
 from iris_session.cli.view import live_viewer
 
 if TYPE_CHECKING:
@@ -20,8 +26,10 @@ if TYPE_CHECKING:
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `demo`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "demo",
+        run,
         help="emulated operators hand over objects, fold a cloth, or stow soft bodies",
         description="Run a whole session with emulated operators in other processes. Exit status 0 only if every "
         "object changed hands by contact alone (or was folded, or stowed) and the recording verifies bit for bit.\n\n"
@@ -33,10 +41,14 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  cloud      handover before two depth cameras; an observer watches their point cloud and pictures. The\n"
         "             cameras are drawn: needs OpenGL without a display (Debian: libegl1 libgl1-mesa-dri)\n\n"
         "The models of panda and aloha come from IRIS_DATA or the package mujoco-menagerie.",
-        epilog="examples:\n  iris-session demo handover\n  iris-session demo handover --seed 7 --json\n"
-        "  iris-session demo handover --operators 8 --observers 8\n  iris-session demo aloha --profile busy-wifi\n"
-        "  iris-session demo panda --latency 40\n  iris-session demo cloud --record cloud.rrd",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session demo handover
+            iris-session demo handover --seed 7 --json
+            iris-session demo handover --operators 8 --observers 8
+            iris-session demo aloha --profile busy-wifi
+            iris-session demo panda --latency 40
+            iris-session demo cloud --record cloud.rrd
+        """,
     )
     parser.add_argument("demo", choices=("handover", "panda", "aloha", "cloth", "soft", "cloud"))
     parser.add_argument(
@@ -62,18 +74,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     add_session_options(parser)
     add_json_option(parser)
-    parser.set_defaults(run=run, control_port=0, state_port=0)
+    parser.set_defaults(control_port=0, state_port=0)
 
 
 def parse_milliseconds(text: str) -> float:
     """Parse the delay of an option [ms]."""
-    try:
-        delay = float(text)
-    except ValueError:
-        delay = math.nan
-    if not 0.0 <= delay <= 10_000.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a delay: give 0 to 10000 milliseconds, for example 40")
-    return delay
+    return parse_number(text, lambda ms: 0.0 <= ms <= 10_000.0, "a delay: give 0 to 10000 milliseconds, for example 40")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import add_address_options, add_json_option, print_json, to_printable
+from iris_session.cli.common import add_address_options, add_command, add_json_option, print_json, to_printable
 from iris_session.protocol.names import Role
 
 if TYPE_CHECKING:
@@ -20,17 +20,19 @@ MARKS: Final = {"ok": "ok     ", "warning": "WARNING", "failed": "FAILED ", "ski
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `doctor`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "doctor",
+        run,
         help="what is wrong, why, and what to do",
         description="Check the route to a session, keys and joining, and the status of the session, one check after "
         "the other. Exit status 1 if a check failed. It joins for two seconds, as an observer.",
-        epilog="examples:\n"
-        "  iris-session doctor                      the session on this machine\n"
-        "  iris-session doctor 192.168.1.20         from a client's machine\n"
-        "  iris-session doctor --session lab-1 --code 7KQ2-M4XD-9PTR\n"
-        "  iris-session doctor --server             the machine that serves, or will serve",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session doctor                      the session on this machine
+            iris-session doctor 192.168.1.20         from a client's machine
+            iris-session doctor --session lab-1 --code 7KQ2-M4XD-9PTR
+            iris-session doctor --server             the machine that serves, or will serve
+        """,
     )
     add_address_options(parser, code="a join code to try; it is used up")
     parser.add_argument(
@@ -43,7 +45,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("--all", action="store_true", help="also print skipped checks")
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

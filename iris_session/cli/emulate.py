@@ -6,25 +6,32 @@ import argparse
 import os
 import sys
 
-from iris_session.cli.common import CommandError, add_address_options, check_session_reachable, parse_seconds
+from iris_session.cli.common import (
+    CommandError,
+    add_address_options,
+    add_command,
+    check_session_reachable,
+    parse_seconds,
+)
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `emulate`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "emulate",
+        run,
         help="join with emulated headsets",
         description="Emulated operators join a session: each has its own tracking frame, observes the sheet until it "
         "is aligned, acquires a robot and works. Ends when every operator with a task is done, or after --seconds.",
-        epilog="examples:\n"
-        "  iris-session emulate                                   one operator who moves a robot\n"
-        "  iris-session emulate --behaviour observer --count 3    three observers\n"
-        "  iris-session emulate 192.168.0.10 --code 7KQ2-M4XD-9PTR     the first time at a session in the lab\n"
-        "  iris-session emulate --session lab-1                   later, by its name\n"
-        "  iris-session emulate --headset name=ann,behaviour=giver,robot=left "
-        "--headset name=bob,behaviour=receiver,robot=right\n"
-        "  iris-session emulate --drift 30 --bump-at 20 --glance-every 5   a headset that drifts and is bumped",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session emulate                                   one operator who moves a robot
+            iris-session emulate --behaviour observer --count 3    three observers
+            iris-session emulate 192.168.0.10 --code 7KQ2-M4XD-9PTR     the first time at a session in the lab
+            iris-session emulate --session lab-1                   later, by its name
+            iris-session emulate --headset name=ann,behaviour=giver,robot=left --headset name=bob,behaviour=receiver,robot=right
+            iris-session emulate --drift 30 --bump-at 20 --glance-every 5   a headset that drifts and is bumped
+        """,  # noqa: E501
     )
     add_address_options(parser, code="join code of `iris-session pair`, needed the first time")
     parser.add_argument("--behaviour", default="wander", help="giver, receiver, wander, idle or observer")
@@ -58,7 +65,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--orders", action="store_true", help="read orders from standard input: bump, recentre, drift or steady NAME"
     )
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

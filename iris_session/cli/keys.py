@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import CommandError, add_json_option, print_json
+from iris_session.cli.common import CommandError, add_command, add_json_option, print_json
 from iris_session.cli.pair import add_role_option, parse_roles
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import CURVE
@@ -19,37 +19,43 @@ if TYPE_CHECKING:
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `keys`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "keys",
+        None,
         help="list, allow and revoke the keys that may join",
         description="Manage the keys that may join encrypted sessions of this user, and show the user's own keys. "
         "Running sessions apply changes within half a second: a revoked key is disconnected at once.",
-        epilog="examples:\n"
-        "  iris-session keys list\n"
-        "  iris-session keys revoke quest-3\n"
-        "  iris-session keys allow ann ann.key --role operator    a key received without a join code\n"
-        "  iris-session keys allow me                             this user, on the server's machine\n"
-        "  iris-session keys show                                 fingerprints of this user",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session keys list
+            iris-session keys revoke quest-3
+            iris-session keys allow ann ann.key --role operator    a key received without a join code
+            iris-session keys allow me                             this user, on the server's machine
+            iris-session keys show                                 fingerprints of this user
+        """,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "list",
+        run_list,
         help="keys that may join",
         description="List the keys that may join.",
-        epilog="example:\n  iris-session keys list --json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session keys list --json
+        """,
     )
     add_json_option(one)
-    one.set_defaults(run=run_list)
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "allow",
+        run_allow,
         help="allow a key",
         description="Add a key to the list, or change its roles. Without a key: this user's own, to direct too.",
-        epilog="examples:\n"
-        "  iris-session keys allow ann ann.key --role operator\n"
-        "  iris-session keys allow me --role any",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session keys allow ann ann.key --role operator
+            iris-session keys allow me --role any
+        """,
     )
     one.add_argument("name", help="name of the key in the list")
     one.add_argument(
@@ -59,34 +65,39 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="ZeroMQ certificate (*.key), or the public key as 40 characters of Z85 (default: this user's own)",
     )
     add_role_option(one)
-    one.set_defaults(run=run_allow)
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "revoke",
+        run_revoke,
         help="revoke a key",
         description="Remove a key from the list; participants who use it are disconnected.",
-        epilog="example:\n  iris-session keys revoke quest-3",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session keys revoke quest-3
+        """,
     )
     one.add_argument("name", help="name or fingerprint in the list")
-    one.set_defaults(run=run_revoke)
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "show",
+        run_show,
         help="own fingerprints",
         description="Show the folder of keys, and the user's own keys.",
-        epilog="example:\n  iris-session keys show",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session keys show
+        """,
     )
     add_json_option(one)
-    one.set_defaults(run=run_show)
-    one = actions.add_parser(
+    one = add_command(
+        actions,
         "forget",
+        run_forget,
         help="forget the key of a server",
         description="Remove the stored key of a session's address, so that a new key can be trusted.",
-        epilog="example:\n  iris-session keys forget 192.168.1.20:7721",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session keys forget 192.168.1.20:7721
+        """,
     )
     one.add_argument("address", help="HOST:PORT as used to join")
-    one.set_defaults(run=run_forget)
 
 
 def run_list(arguments: argparse.Namespace) -> int:

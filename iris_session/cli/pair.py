@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from iris_session.cli.common import CommandError, add_json_option, print_json
+from iris_session.cli.common import CommandError, add_command, add_json_option, parse_number, print_json
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import DEFAULT_ROLES
 from iris_session.security.private_folder import KeysBusyError
@@ -30,20 +30,22 @@ FAILURE_TEXTS: Final = {
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `pair`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "pair",
+        run,
         help="pair a new device with the session on this machine",
         description="Create a join code for one new device and show it, with address and key of the session, as a QR "
         "code. It is valid for ten minutes, one device, and five wrong attempts. Waits until it is used; Ctrl-C "
         "makes it void.",
-        epilog="examples:\n"
-        "  iris-session pair                               scan the code, or type it\n"
-        "  iris-session pair --role director --name ann    a key that may direct\n"
-        "  iris-session pair --web                         a link for a browser, as a QR code\n"
-        "  iris-session pair --web --role observer         a browser that may look only\n"
-        "  iris-session pair --png code.png --no-wait      to show on another screen\n"
-        "  iris-session pair --address 10.0.0.5:7721       address at which others reach this machine",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session pair                               scan the code, or type it
+            iris-session pair --role director --name ann    a key that may direct
+            iris-session pair --web                         a link for a browser, as a QR code
+            iris-session pair --web --role observer         a browser that may look only
+            iris-session pair --png code.png --no-wait      to show on another screen
+            iris-session pair --address 10.0.0.5:7721       address at which others reach this machine
+        """,
     )
     add_role_option(parser)
     parser.add_argument("--minutes", type=_parse_minutes, default=10.0, metavar="M", help="validity in minutes (10)")
@@ -70,7 +72,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("--no-wait", action="store_true", help="do not wait until the code is used")
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def add_role_option(parser: argparse.ArgumentParser) -> None:
@@ -130,15 +131,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _parse_minutes(text: str) -> float:
-    try:
-        minutes = float(text)
-    except ValueError:
-        minutes = 0.0
-    if not 0.0 < minutes <= MAX_MINUTES:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a time: give more than 0 and at most {MAX_MINUTES:g} minutes"
-        )
-    return minutes
+    wanted = f"a time: give more than 0 and at most {MAX_MINUTES:g} minutes"
+    return parse_number(text, lambda minutes: 0.0 < minutes <= MAX_MINUTES, wanted)
 
 
 def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[str]) -> Certificate | None:

@@ -5,21 +5,24 @@ from __future__ import annotations
 import argparse
 import sys
 
-from iris_session.cli.common import add_json_option, explain_no_robots, open_scene, print_json
+from iris_session.cli.common import add_command, add_json_option, explain_no_robots, open_scene, print_json
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `robots`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "robots",
+        run,
         help="show the robots found in a model, as TOML to edit",
         description="Print the robots found in a model. Edit the output and pass it as `serve --robots FILE`.",
-        epilog="examples:\n  iris-session robots scene.xml > robots.toml\n  iris-session robots handover",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session robots scene.xml > robots.toml
+            iris-session robots handover
+        """,
     )
     parser.add_argument("scene", help="MJCF or MJB file, or the name of a scene (see `iris-session serve --help`)")
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,13 +7,12 @@ without it (`SceneBuilder`).
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from iris_session.cli.common import CommandError, add_json_option, open_scene, print_json
+from iris_session.cli.common import CommandError, add_command, add_json_option, open_scene, parse_number, print_json
 
 if TYPE_CHECKING:
     from iris_session.protocol.scene import SceneSpec
@@ -33,38 +32,46 @@ class _ParsedScene(NamedTuple):
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `scene`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "scene",
+        None,
         help="inspect what clients receive of a scene, or export it to GLB",
         description="Inspect what clients receive of a scene, or export it to GLB.",
-        epilog="examples:\n  iris-session scene inspect scene.xml\n  iris-session scene inspect arm.urdf\n"
-        "  iris-session scene inspect part.stl --scale 0.001    (a part in millimetres)\n"
-        "  iris-session scene export handover handover.glb",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session scene inspect scene.xml
+            iris-session scene inspect arm.urdf
+            iris-session scene inspect part.stl --scale 0.001    (a part in millimetres)
+            iris-session scene export handover handover.glb
+        """,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    inspect = actions.add_parser(
+    inspect = add_command(
+        actions,
         "inspect",
+        run_inspect,
         help="tree, extent, sizes, heavy parts, warnings for headsets",
         description="Show what clients receive of a scene, which parts are heavy, and what is too much for a Quest 3.",
-        epilog="examples:\n  iris-session scene inspect scene.xml\n"
-        "  iris-session scene inspect part.stl --scale 0.001    (a part in millimetres)",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session scene inspect scene.xml
+            iris-session scene inspect part.stl --scale 0.001    (a part in millimetres)
+        """,
     )
     _add_scene_arguments(inspect)
     add_json_option(inspect)
-    inspect.set_defaults(run=run_inspect)
-    export = actions.add_parser(
+    export = add_command(
+        actions,
         "export",
+        run_export,
         help="write the scene as a GLB file",
         description="Write the initial scene as GLB (glTF 2.0): meshes, textures and colours, y up.",
-        epilog="example:\n  iris-session scene export handover handover.glb",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session scene export handover handover.glb
+        """,
     )
     _add_scene_arguments(export)
     export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")
     add_json_option(export)
-    export.set_defaults(run=run_export)
 
 
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -260,15 +267,8 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _parse_factor(text: str) -> float:
-    try:
-        factor = float(text)
-    except ValueError:
-        factor = math.nan
-    if not (math.isfinite(factor) and factor > 0.0):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a factor: give a number above 0, for example 0.001 for a file in millimetres"
-        )
-    return factor
+    wanted = "a factor: give a number above 0, for example 0.001 for a file in millimetres"
+    return parse_number(text, lambda factor: factor > 0.0, wanted)
 
 
 def expand_path(text: str | Path) -> Path:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from iris_session.cli.common import (
     CommandError,
+    add_command,
     add_json_option,
     add_session_options,
     explain_no_robots,
@@ -33,25 +34,27 @@ if TYPE_CHECKING:
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `serve`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "serve",
+        run,
         help="share a MuJoCo scene, or show a file",
         description="Share a MuJoCo scene in real time until Ctrl-C. Robots are found in the model, or given by name. "
         "Other files (GLB, STL, OBJ, ...) are shown as they are, a URDF in its zero configuration.",
-        epilog=f"named scenes (panda and aloha need the package mujoco-menagerie):\n{format_scene_names()}\n\n"
-        "examples:\n"
-        "  iris-session serve scene.xml\n"
-        "  iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request\n"
-        "  iris-session serve scene.xml --anchors anchors.toml\n"
-        "  iris-session serve scene.xml --camera room.toml    (a point cloud; see `iris-session cloud example`)\n"
-        "  iris-session serve handover --assign ann=left --assign bob=right\n"
-        "  iris-session serve aloha --seconds 30\n"
-        "  iris-session serve handover --interface wlan0 --name lab-1\n"
-        "  iris-session serve handover --port-base 7730    (a second session on this machine)\n"
-        "  iris-session serve part.glb    (shown; nothing moves)\n"
-        "  iris-session serve part.stl --scale 0.001    (a part in millimetres)\n"
-        "  iris-session serve --resume sessions/20261121T093000.000000Z-handover    (continue where it ended)",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session serve scene.xml
+            iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request
+            iris-session serve scene.xml --anchors anchors.toml
+            iris-session serve scene.xml --camera room.toml    (a point cloud; see `iris-session cloud example`)
+            iris-session serve handover --assign ann=left --assign bob=right
+            iris-session serve aloha --seconds 30
+            iris-session serve handover --interface wlan0 --name lab-1
+            iris-session serve handover --port-base 7730    (a second session on this machine)
+            iris-session serve part.glb    (shown; nothing moves)
+            iris-session serve part.stl --scale 0.001    (a part in millimetres)
+            iris-session serve --resume sessions/20261121T093000.000000Z-handover    (continue where it ended)
+        """,
+        notes=f"named scenes (panda and aloha need the package mujoco-menagerie):\n{format_scene_names()}",
     )
     parser.add_argument("scene", nargs="?", help="MJCF or MJB file, a file to show, or the name of a scene, see below")
     parser.add_argument("--robots", type=Path, metavar="TOML", help="robots of the model; see `iris-session robots`")
@@ -93,7 +96,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
     add_session_options(parser)
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:

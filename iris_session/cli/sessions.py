@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import argparse
 
-from iris_session.cli.common import add_json_option, parse_seconds, print_json
+from iris_session.cli.common import add_command, add_json_option, parse_seconds, print_json
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `sessions`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "sessions",
+        run,
         help="list the sessions on this network",
         description="List the sessions that announce themselves on the networks of this machine. If an access point "
         "blocks broadcasts, none is heard: type the address of the session, or scan the code of `iris-session pair`.",
-        epilog="examples:\n  iris-session sessions\n  iris-session sessions --seconds 3 --json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session sessions
+            iris-session sessions --seconds 3 --json
+        """,
     )
     parser.add_argument("--seconds", type=parse_seconds, default=1.0, help="listen this long (default: %(default)g)")
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from iris_session.cli.common import (
     CommandError,
     add_address_options,
+    add_command,
     add_json_option,
     check_session_reachable,
     parse_seconds,
@@ -33,16 +34,18 @@ FIRST_REPORT_S: Final = 1.2
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `status`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "status",
+        run,
         help="status of a session: participants, robots, ages, late ticks, recorder",
         description="Join as the observer `status`, print the status of the session, and leave.",
-        epilog="examples:\n"
-        "  iris-session status\n"
-        "  iris-session status 192.168.1.20 --watch\n"
-        "  iris-session status --json\n"
-        "  iris-session status --metrics-port 9463      http://127.0.0.1:9463/metrics for Prometheus",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session status
+            iris-session status 192.168.1.20 --watch
+            iris-session status --json
+            iris-session status --metrics-port 9463      http://127.0.0.1:9463/metrics for Prometheus
+        """,
     )
     add_address_options(parser)
     form = parser.add_mutually_exclusive_group()
@@ -52,7 +55,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--metrics-port", type=int, default=None, metavar="PORT", help="serve the metrics on 127.0.0.1 over HTTP"
     )
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def add_watch_options(group: argparse._ActionsContainer, parser: argparse.ArgumentParser) -> None:

@@ -7,25 +7,34 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
+from iris_session.cli.common import (
+    CommandError,
+    add_command,
+    add_json_option,
+    ending_as_interrupts,
+    print_json,
+    to_printable,
+)
+from iris_session.cli.progress import ReadingProgress
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `verify`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "verify",
+        run,
         help="re-simulate a recording and compare it bit for bit",
         description="Re-simulate recordings. Exit status 0 only if every step of every file is identical.",
-        epilog="examples:\n"
-        "  iris-session verify sessions/*/session.rrd\n"
-        "  iris-session verify sessions             every recording in a folder and below it",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session verify sessions/*/session.rrd
+            iris-session verify sessions             every recording in a folder and below it
+        """,
     )
     parser.add_argument(
         "files", nargs="+", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it"
     )
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -37,21 +46,15 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.session.verification import verify_recording
 
     reports: list[VerifyReport] = []
-    progress = sys.stderr.isatty()
 
     def refuse(path: str, why: str) -> None:  # must not hide the others
         reports.append(VerifyReport(path, problems=[Problem(-1, "unreadable", "file", why)]))
         print(to_printable(f"iris-session: {why}"), file=sys.stderr)
 
     for path in list_files(arguments.files, lambda error: refuse(str(error.filename), str(error))):
-
-        def show(done: int, total: int, path: Path = path) -> None:
-            text = to_printable(f"{path}: step {done} of {total}")
-            print(f"\r{text}", end="" if done < total else "\n", file=sys.stderr)
-
         try:
-            with ending_as_interrupts():
-                report = verify_recording(path, show if progress else None)
+            with ending_as_interrupts(), ReadingProgress(path) as progress:
+                report = verify_recording(path, progress.show)
         except RecordingError as error:
             refuse(str(path), str(error))
             continue

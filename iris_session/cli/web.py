@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import sys
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import CommandError, add_address_options, add_page_options, check_session_reachable
+from iris_session.cli.common import (
+    CommandError,
+    add_address_options,
+    add_command,
+    add_page_options,
+    check_session_reachable,
+)
 from iris_session.system.extras import require_package
 
 if TYPE_CHECKING:
@@ -20,17 +25,19 @@ CONNECT_S = 15.0
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `web`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "web",
+        run,
         help="serve the page for browsers for a session on another machine",
         description="Serve the page for browsers, and the gateway behind it, for a session on another machine. A "
         "session of this machine does so by itself. At an encrypted session the key of this user must be allowed in "
         "role gateway, and in the roles of those who join here: `iris-session pair --role any` there.",
-        epilog="examples:\n"
-        "  iris-session web 192.168.0.10\n"
-        "  iris-session web 192.168.0.10:7721 --code 7KQ2-M4XD-9PTR    the first time\n"
-        "  iris-session web 192.168.0.10 --host 127.0.0.1              for browsers of this machine only",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session web 192.168.0.10
+            iris-session web 192.168.0.10:7721 --code 7KQ2-M4XD-9PTR    the first time
+            iris-session web 192.168.0.10 --host 127.0.0.1              for browsers of this machine only
+        """,
     )
     add_address_options(parser)
     parser.add_argument(
@@ -39,11 +46,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="address to listen on (default: all addresses; 127.0.0.1 if the session is not encrypted)",
     )
     add_page_options(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until Ctrl-C. Exit status 1 if the session does not admit the gateway."""
+    import asyncio
+
     for package in ("aiohttp", "cryptography"):
         require_package(package, "the page for browsers")
     from iris_session.client.endpoint_resolver import parse_connect_request, resolve_blocking

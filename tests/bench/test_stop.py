@@ -7,18 +7,27 @@ from collections.abc import Callable
 import pytest
 
 from iris_session.bench import stop
-from iris_session.bench.stop import CAUSES, KINDS, MAX_FORCE_RATIO, MAX_LUNGE_RAD, Case, Rehearsal, run_case, run_stop
+from iris_session.bench.stop import (
+    CAUSES,
+    KINDS,
+    MAX_FORCE_RATIO,
+    MAX_LUNGE_RAD,
+    Case,
+    StopScenario,
+    run_case,
+    run_stop,
+)
 
 
 @pytest.fixture(scope="module", params=KINDS)
-def pressed(request: pytest.FixtureRequest) -> tuple[Rehearsal, Callable[[], None]]:
+def pressed(request: pytest.FixtureRequest) -> tuple[StopScenario, Callable[[], None]]:
     """A session whose arm presses against the wall, and what puts it back there."""
-    run = Rehearsal(request.param, 0.5)
+    run = StopScenario(request.param, 0.5)
     return run, run.save()
 
 
 @pytest.mark.parametrize("cause", CAUSES)
-def test_every_cause_of_a_hold_lets_go(pressed: tuple[Rehearsal, Callable[[], None]], cause: str) -> None:
+def test_every_cause_of_a_hold_lets_go(pressed: tuple[StopScenario, Callable[[], None]], cause: str) -> None:
     run, restore = pressed
     restore()
     case = run_case(run, cause)
@@ -48,7 +57,7 @@ def test_one_case_that_pushes_lunges_or_loses_its_grip_fails_the_report(
         def save(self) -> Callable[[], None]:
             return lambda: None
 
-    monkeypatch.setattr(stop, "Rehearsal", Still)
+    monkeypatch.setattr(stop, "StopScenario", Still)
     monkeypatch.setattr(stop, "run_case", lambda run, cause: next(cases))
     report = run_stop()
     assert report.results["worst_force_ratio_after_200ms"] == last.force_ratio
