@@ -25,7 +25,6 @@ from anchors.pose import (
     Quat,
     Vec3,
     compose,
-    distance,
     inverse,
     is_rigid,
     is_valid_point,
@@ -52,7 +51,6 @@ from anchors.uncertainty import (
     isotropic_covariance,
     length_p95,
     position_error_p95,
-    rotation_error_p95,
     validate_covariance,
 )
 from anchors.viewpoints import AnchorObservation, GroupKey, MergedObservation, ObservationBuffer, ViewpointGroup
@@ -135,11 +133,6 @@ class AlignmentEstimate:
     def error_at(self, point_world: Vec3) -> float:
         """Return the stated p95 [m] of the position error at a point of the world, infinite when refused."""
         return math.inf if self.refused else position_error_p95(self.covariance, self.pivot_world, point_world)
-
-    @property
-    def rotation_error_rad(self) -> float:
-        """Stated p95 [rad] of the rotation, infinite when refused."""
-        return math.inf if self.refused else rotation_error_p95(self.covariance)
 
 
 @dataclass
@@ -483,16 +476,3 @@ def size_advice(groups: Mapping[GroupKey, ViewpointGroup], tolerance: float) -> 
         if high - low > tolerance * low:
             return f"sheet '{anchor_id}' is seen in different sizes: is there a second one, printed at another scale?"
     return ""
-
-
-def error_advice(error_m: float, limit_m: float, pivot_world: Vec3, point_world: Vec3, n_viewpoints: int) -> str:
-    """Return how to bring the error at a point below its limit; empty if it is below."""
-    if error_m <= limit_m:
-        return ""
-    far = distance(pivot_world, point_world)
-    wrong = f"the error {far:.1f} m from the sheet would be {error_m * 1e3:.0f} mm, {limit_m * 1e3:.0f} are allowed: "
-    if n_viewpoints < 3:
-        return wrong + "look at the sheet from several sides, from about half a metre"
-    if far > 0.8:
-        return wrong + "add a sheet near the robot"
-    return wrong + "step closer to the sheet"

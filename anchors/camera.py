@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anchors.pose import PoseTuple, quat_from_rotvec, quat_to_rotvec
+from anchors.lie import Array, quat_exp, quat_from_matrix, quat_to_matrix, to_quat, to_vec3
+from anchors.pose import PoseTuple, quat_to_rotvec
 
-Array = NDArray[np.float64]
 _N_DISTORTION: Final = (0, 4, 5, 8)
 
 
@@ -150,27 +149,26 @@ def to_rvec_tvec(pose: PoseTuple) -> tuple[Array, Array]:
 
 def pose_from_rvec_tvec(rvec: Array, tvec: Array) -> PoseTuple:
     """Return the pose of a rotation vector and translation."""
-    r, t = np.asarray(rvec).ravel(), np.asarray(tvec).ravel()
-    return (float(t[0]), float(t[1]), float(t[2])), quat_from_rotvec((float(r[0]), float(r[1]), float(r[2])))
+    return to_vec3(np.ravel(tvec)), to_quat(quat_exp(np.ravel(rvec)))
 
 
 def pose_to_matrix(pose: PoseTuple) -> Array:
     """Return the matrix (4, 4) of a pose."""
-    (x, y, z), (w, i, j, k) = pose
-    return np.array(
-        [
-            [1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j), x],
-            [2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i), y],
-            [2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j), z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    M = np.eye(4)
+    M[:3, :3], M[:3, 3] = quat_to_matrix(np.array(pose[1])), pose[0]
+    return M
 
 
 def pose_from_matrix(matrix: Array) -> PoseTuple:
     """Return the pose of a matrix (4, 4); its rotation is made orthonormal (nearest in the least-squares sense)."""
-    from scipy.spatial.transform import Rotation
-
     u, _, vt = np.linalg.svd(matrix[:3, :3])
     turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return pose_from_rvec_tvec(Rotation.from_matrix(turn).as_rotvec(), matrix[:3, 3])
+    return to_vec3(matrix[:3, 3]), to_quat(quat_from_matrix(turn))
+
+
+def apply_increment(matrix: Array, step: Array) -> Array:
+    """Return the pose (4, 4) moved by `step[:3]` [m], and rotated on the left about its own origin by `step[3:]`."""
+    out = np.eye(4)
+    out[:3, :3] = quat_to_matrix(quat_exp(step[3:])) @ matrix[:3, :3]
+    out[:3, 3] = matrix[:3, 3] + step[:3]
+    return out

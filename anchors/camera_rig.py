@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anchors.camera import pose_from_matrix, pose_to_matrix
+from anchors.camera import apply_increment, pose_from_matrix, pose_to_matrix
+from anchors.lie import Array
 from anchors.pose import PoseTuple, compose, inverse
 from anchors.robot_world import CalibrationError
 
-Array = NDArray[np.float64]
 #: Errors of the print and its pose, in addition to the covariance of a picture: [m], [rad] per axis.
 _FLOOR: Final = (0.0003, math.radians(0.05))
 
@@ -106,7 +105,6 @@ def _least_squares(
     views: Sequence[SheetView], poses: dict[_Name, Array], free: list[_Name]
 ) -> tuple[dict[_Name, Array], Array, float]:
     from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
 
     floor = np.diag([_FLOOR[0] ** 2] * 3 + [_FLOOR[1] ** 2] * 3)
     whiteners = [np.linalg.inv(np.linalg.cholesky(np.reshape(view.covariance, (6, 6)) + floor)) for view in views]
@@ -114,10 +112,7 @@ def _least_squares(
     def apply_increments(p: Array) -> dict[_Name, Array]:
         out = dict(poses)
         for name, step in zip(free, p.reshape(-1, 6), strict=True):
-            M = np.eye(4)
-            M[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ poses[name][:3, :3]
-            M[:3, 3] = poses[name][:3, 3] + step[:3]
-            out[name] = M
+            out[name] = apply_increment(poses[name], step)
         return out
 
     def residuals(p: Array) -> Array:

@@ -18,7 +18,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_to_matrix, swing
+from anchors.lie import (
+    Array,
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_to_matrix,
+    swing,
+    to_quat,
+    to_vec3,
+)
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, apply, compose, inverse, is_rigid, quat_angle, quat_normalize
 from anchors.uncertainty import NoiseModel, isotropic_covariance, length_p95
 from anchors.viewpoints import AnchorObservation, ViewpointGroup
@@ -258,24 +268,22 @@ def _to_solution(
     anchors = {graph.reference: graph.T_world_reference}
     error = {graph.reference: 0.0}
     for i, name in enumerate(graph.unknown):
-        anchors[name] = _to_pose(p[i], q[i])
+        anchors[name] = (to_vec3(p[i]), to_quat(q[i]))
         error[name] = length_p95(covariance[6 * i : 6 * i + 3, 6 * i : 6 * i + 3])
-    headsets = {key: _to_pose(p[graph.n_anchors + i], q[graph.n_anchors + i]) for i, key in enumerate(graph.headsets)}
+    headsets = {
+        key: (to_vec3(p[graph.n_anchors + i]), to_quat(q[graph.n_anchors + i])) for i, key in enumerate(graph.headsets)
+    }
     off: dict[str, list[float]] = {}
     rejected = []
     for e, weight in zip(graph.edges, weights.tolist(), strict=True):
         if weight == 0.0:
             rejected.append((e.headset, e.tracking_epoch, e.viewpoint_id, e.anchor_id))
             continue
-        seen = apply(headsets[e.headset, e.tracking_epoch], (float(e.p[0]), float(e.p[1]), float(e.p[2])))
+        seen = apply(headsets[e.headset, e.tracking_epoch], to_vec3(e.p))
         off.setdefault(e.anchor_id, []).append(math.dist(seen, anchors[e.anchor_id][0]))
     rms = {name: math.sqrt(sum(d * d for d in ds) / len(ds)) for name, ds in off.items()}
     known = {name: size for name, size in sizes.items() if name in anchors}
     return ConstellationSolution(Constellation(graph.reference, anchors, error, known), headsets, rms, tuple(rejected))
-
-
-def _to_pose(p: Array, q: Array) -> PoseTuple:
-    return (float(p[0]), float(p[1]), float(p[2])), quat_normalize((float(q[0]), float(q[1]), float(q[2]), float(q[3])))
 
 
 @dataclass(frozen=True)

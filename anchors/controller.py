@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_to_matrix, to_vec3
 from anchors.pose import PoseTuple, Vec3, compose, is_rigid, quat_normalize
 from anchors.uncertainty import isotropic_covariance, length_p95
 
@@ -112,12 +112,7 @@ def calibrate_tip(
     elif tip_sigma > max_sigma_m:
         advice = f"the tip is known to {tip_sigma * 1e3:.1f} mm only: turn further, in every direction"
     stated = () if advice else tuple(covariance[:3, :3].ravel().tolist())
-    return TipCalibration(_to_vec3(x[:3]), _to_vec3(x[3:]), tip_sigma, residual, n, bool(advice), advice, stated)
-
-
-def tip_position(T_tracking_controller: PoseTuple, p_controller_tip: Vec3) -> Vec3:
-    """Return the position of the tip in the tracking frame [m]."""
-    return compose(T_tracking_controller, (p_controller_tip, (1.0, 0.0, 0.0, 0.0)))[0]
+    return TipCalibration(to_vec3(x[:3]), to_vec3(x[3:]), tip_sigma, residual, n, bool(advice), advice, stated)
 
 
 def _correlated_covariance(A: Array, q: Array, squares: float) -> tuple[Array, float]:
@@ -148,7 +143,3 @@ def _second_axis_rotation(q: Array) -> float:
 
 def _refuse(advice: str) -> TipCalibration:
     return TipCalibration(_ZERO, _ZERO, math.inf, math.inf, 0, True, advice)
-
-
-def _to_vec3(v: Array) -> Vec3:
-    return (float(v[0]), float(v[1]), float(v[2]))

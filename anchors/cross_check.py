@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anchors.alignment import AlignmentEstimate
-from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_to_matrix, to_vec3
 from anchors.pose import PoseTuple, Vec3, compose, is_rigid, is_valid_point
 from anchors.uncertainty import NoiseModel, isotropic_covariance, length_p95
 
@@ -35,11 +35,6 @@ class Disagreement(NamedTuple):
     expected_p95_m: float
     p_world: Vec3
     n: int
-
-    @property
-    def is_expected(self) -> bool:
-        """False beyond twice the p95 (by chance about one pair in 10^4 for errors along one axis, fewer for others)."""
-        return self.error_m <= 2.0 * self.expected_p95_m
 
 
 @dataclass(frozen=True)
@@ -204,7 +199,7 @@ class CrossCheck:
         ]
         between = np.median([np.subtract(x[0], y[0]) for x, y in placed], axis=0)
         middle = np.median([np.add(x[0], y[0]) for x, y in placed], axis=0) / 2.0
-        at: Vec3 = (float(middle[0]), float(middle[1]), float(middle[2]))
+        at = to_vec3(middle)
         S = estimates[0].covariance_at(at) + estimates[1].covariance_at(at)
         for estimate, seen in zip(estimates, looks, strict=True):
             S = S + self._observation_noise(estimate, seen)

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.camera import CameraModel, pose_from_rvec_tvec, to_rvec_tvec
+from anchors.lie import Array, left_jacobian
 from anchors.photometric import PhotometricFit, fit_print
 from anchors.pose import PoseTuple
 from anchors.sheet import Sheet, load_dictionary
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 #: Minimum number of its four markers by which a sheet is identified: a single one may be misread from clutter.
@@ -321,13 +321,7 @@ def _detect_by_corners(
 def _to_pose_covariance(by_rvec: Array, rvec: Array) -> Array:
     """Convert a covariance (6, 6) of (rotation vector, translation) to (translation, small rotation in the camera
     frame) by the left Jacobian of the exponential map (Barfoot 2017, section 7.1.5)."""
-    angle = float(np.linalg.norm(rvec))
-    left = np.eye(3)
-    if angle > 1e-9:
-        x, y, z = rvec / angle
-        K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        left = np.eye(3) + (1 - math.cos(angle)) / angle * K + (1 - math.sin(angle) / angle) * K @ K
     turn = np.zeros((6, 6))
     turn[:3, 3:] = np.eye(3)
-    turn[3:, :3] = left
+    turn[3:, :3] = left_jacobian(rvec)
     return np.asarray(turn @ by_rvec @ turn.T)

@@ -18,7 +18,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from anchors.alignment import AlignmentEstimate
-from anchors.lie import Array, quat_to_matrix
+from anchors.lie import Array, quat_to_matrix, to_vec3
 from anchors.pose import PoseTuple, Vec3, apply, distance, is_rigid, is_valid_point, quat_angle
 from anchors.uncertainty import NoiseModel, isotropic_covariance
 
@@ -253,7 +253,7 @@ class DriftMonitor:
         if alignment is None or alignment.refused or alignment.tracking_epoch != self.tracking_epoch:
             return 0.0
         p_world = self.anchors[anchor_id][0]
-        placed = apply(alignment.T_world_tracking, (float(now.p[0]), float(now.p[1]), float(now.p[2])))
+        placed = apply(alignment.T_world_tracking, to_vec3(now.p))
         R = quat_to_matrix(np.array(alignment.T_world_tracking[1]))
         C = alignment.covariance_at(p_world) + R @ (now.own + now.common) @ R.T
         return _significant(np.array(placed) - p_world, C, self.config.min_difference_m)

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.pose import quat_from_rotvec, quat_mul
+from anchors.pose import Quat, Vec3, quat_from_rotvec, quat_mul, quat_normalize
 
 Array = NDArray[np.float64]
 
@@ -93,6 +93,18 @@ def quat_from_matrix(R: Array) -> Array:
     return np.asarray(-q if q[0] < 0.0 else q)
 
 
+def to_vec3(v: Array) -> Vec3:
+    """Return a vector (3,) as plain floats."""
+    x, y, z = v.tolist()
+    return x, y, z
+
+
+def to_quat(q: Array) -> Quat:
+    """Return a quaternion (4,) as plain floats of unit length."""
+    w, x, y, z = q.tolist()
+    return quat_normalize((w, x, y, z))
+
+
 def skew(v: Array) -> Array:
     """Return cross-product matrices `(..., 3, 3)`: `skew(a) @ b == cross(a, b)`."""
     out = np.zeros((*v.shape[:-1], 3, 3))
@@ -109,17 +121,6 @@ def left_jacobian(r: Array) -> Array:
     if angle < 1e-4:  # series: the closed forms cancel
         return np.asarray(np.eye(3) + 0.5 * K + K @ K / 6.0)
     return np.asarray(np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * (K @ K))
-
-
-def se3_exp(xi: Array) -> tuple[Array, Array]:
-    """Return the pose (position (3,), quaternion (4,)) of a twist (6,), position part first."""
-    return left_jacobian(xi[3:]) @ xi[:3], quat_exp(xi[3:])
-
-
-def se3_log(p: Array, q: Array) -> Array:
-    """Return the twist (6,) of a pose; the inverse of `se3_exp` for rotations below pi."""
-    r = quat_log(q)
-    return np.concatenate((np.linalg.solve(left_jacobian(r), p), r))
 
 
 def swing(q: Array) -> Array:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from anchors.alignment import AlignmentConfig, AlignmentEstimate
-from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, skew, swing
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, skew, swing, to_quat, to_vec3
 from anchors.pose import PoseTuple, Vec3, apply, compose, inverse
 from anchors.touch import Touch, TouchNoise
 from anchors.uncertainty import Z999, chi2_quantile, isotropic_covariance, length_p95, validate_covariance
@@ -146,13 +146,10 @@ def _update(before: AlignmentEstimate, C: Array, z: Array, H: Array, noise: Arra
     q = quat_multiply(quat_exp(d[3:]), np.array(before.T_world_tracking[1]))
     pivot = np.array(before.pivot_world) + d[:3]
     t = pivot - quat_to_matrix(q) @ np.array(p_pivot)
-    x, y, z_ = pivot.tolist()
-    qw, qx, qy, qz = q.tolist()
-    px, py, pz = t.tolist()
     return replace(
         before,
-        T_world_tracking=((px, py, pz), (qw, qx, qy, qz)),
+        T_world_tracking=(to_vec3(t), to_quat(q)),
         covariance=tuple(C.ravel().tolist()),
-        pivot_world=(x, y, z_),
+        pivot_world=to_vec3(pivot),
         error_at_anchor_m=length_p95(C[:3, :3]),
     )

@@ -16,11 +16,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import CameraModel, pose_from_matrix, pose_to_matrix
+from anchors.camera import CameraModel, apply_increment, pose_from_matrix, pose_to_matrix
+from anchors.lie import Array, skew
 from anchors.pose import PoseTuple
 from anchors.sheet import HALF_HEIGHT, HALF_WIDTH, MARKER_EDGE, Sheet
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 #: Texels of the print per edge of the code.
@@ -84,7 +84,7 @@ def fit_print(
     covariance = _CORRELATED * np.linalg.inv(normal) + _floor_covariance(camera, sheet, M)
     # From the camera's origin, about which the increments turn, to that of the sheet.
     shift = np.eye(6)
-    shift[:3, 3:] = -_cross(M[:3, 3])
+    shift[:3, 3:] = -skew(M[:3, 3])
     return PhotometricFit(pose_from_matrix(M), shift @ covariance @ shift.T, rms)
 
 
@@ -144,7 +144,8 @@ def _fit(view: _View, sheet: Sheet, M: Array, blur: float, iterations: int) -> t
             step = np.linalg.solve(normal, J.T @ (weights * r))[6:]
         except np.linalg.LinAlgError:
             return None
-        M = _exp(step * min(1.0, _MAX_TURN_RAD / max(float(np.linalg.norm(step[3:])), 1e-12))) @ M
+        step = step * min(1.0, _MAX_TURN_RAD / max(float(np.linalg.norm(step[3:])), 1e-12))
+        M = apply_increment(np.eye(4), step) @ M  # about the camera's origin
         if float(np.abs(step).max()) < 1e-6:  # a micrometre, a microradian
             break
     mean_contrast = float(np.mean(contrast))
@@ -242,18 +243,3 @@ def _floor_covariance(camera: CameraModel, sheet: Sheet, M: Array) -> Array:
         rows.append(np.column_stack([du * s, dv * s, dw * s, *_rotation_derivatives(du, dv, dw, x, y)]))
     J = np.concatenate(rows)
     return np.asarray(np.linalg.inv(J.T @ J) * _FLOOR_PX**2)
-
-
-def _exp(step: Array) -> Array:
-    """Return the matrix (4, 4) that rotates by `step[3:]` [rad] about the origin, then translates by `step[:3]` [m]."""
-    from scipy.spatial.transform import Rotation
-
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix()
-    out[:3, 3] = step[:3]
-    return out
-
-
-def _cross(v: Array) -> Array:
-    """Return the matrix (3, 3) of the cross product `v x`."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

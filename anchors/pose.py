@@ -109,6 +109,21 @@ def apply(a: PoseTuple, p: Vec3) -> Vec3:
     return (a[0][0] + r[0], a[0][1] + r[1], a[0][2] + r[2])
 
 
+def interpolate_about_pivot(old: PoseTuple, new: PoseTuple, pivot_tracking: Vec3, share: float) -> PoseTuple:
+    """Interpolate `T_world_tracking`: the pivot moves on a straight line and everything rotates about it, so that a
+    small rotation moves nothing far at the anchor."""
+    r = quat_to_rotvec(quat_mul(new[1], quat_conj(old[1])))
+    q = quat_mul(quat_from_rotvec((share * r[0], share * r[1], share * r[2])), old[1])
+    a, b = apply(old, pivot_tracking), apply(new, pivot_tracking)
+    turned = quat_rotate(q, pivot_tracking)
+    p = (
+        a[0] + share * (b[0] - a[0]) - turned[0],
+        a[1] + share * (b[1] - a[1]) - turned[1],
+        a[2] + share * (b[2] - a[2]) - turned[2],
+    )
+    return compose((p, q), ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+
+
 def distance(a: Vec3, b: Vec3) -> float:
     """Return the Euclidean distance [m] of two points."""
     return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)

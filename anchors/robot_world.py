@@ -17,12 +17,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anchors.camera import pose_from_matrix, pose_to_matrix
-from anchors.pose import PoseTuple, compose, inverse
-
-Array = NDArray[np.float64]
+from anchors.camera import apply_increment, pose_from_matrix, pose_to_matrix
+from anchors.lie import Array, skew
+from anchors.pose import PoseTuple, inverse
 
 MIN_POSES: Final = 3
 #: Rotations of the marker, rms about the second of its main axes: with less, the position along the first is free.
@@ -71,17 +69,6 @@ class RobotWorldCalibration:
     @property
     def used(self) -> tuple[int, ...]:
         return tuple(k for k in range(len(self.residuals)) if k not in self.left_out)
-
-    def compute_rms(self) -> tuple[float, float]:
-        """Return the root mean square of the residuals of the pictures used: [m], [rad]."""
-        kept = np.array([self.residuals[k] for k in self.used])
-        m, rad = np.sqrt(np.mean(kept**2, axis=0))
-        return float(m), float(rad)
-
-
-def solve_single_pose(T_base_ee: PoseTuple, T_ee_marker: PoseTuple, T_camera_marker: PoseTuple) -> PoseTuple:
-    """Return `T_base_camera` from one picture, if the pose of the marker on the hand is known."""
-    return compose(compose(T_base_ee, T_ee_marker), inverse(T_camera_marker))
 
 
 def solve_robot_world(
@@ -211,7 +198,7 @@ def _closed_form(data: _Data) -> tuple[Array, Array]:
     linearly."""
     from scipy.spatial.transform import Rotation
 
-    i, j = _index_pairs(len(data.A))
+    i, j = np.triu_indices(len(data.A), 1)
     a, b = np.linalg.inv(data.A[j]) @ data.A[i], np.linalg.inv(data.B[j]) @ data.B[i]
     alpha, beta = (Rotation.from_matrix(m[:, :3, :3]).as_rotvec() for m in (a, b))
     u, _, vt = np.linalg.svd(alpha.T @ beta)
@@ -232,34 +219,20 @@ def _least_squares(data: _Data) -> tuple[Array, Array, Array]:
 
     X, Y = _closed_form(data)
     solved = least_squares(
-        lambda p: data.whiten(_apply_increment(X, p[:6]), _apply_increment(Y, p[6:])).ravel(),
+        lambda p: data.whiten(apply_increment(X, p[:6]), apply_increment(Y, p[6:])).ravel(),
         np.zeros(12),
         loss="huber",
         f_scale=3.0,
         x_scale="jac",
     )
-    return _apply_increment(X, solved.x[:6]), _apply_increment(Y, solved.x[6:]), np.asarray(solved.jac.T @ solved.jac)
-
-
-def _apply_increment(M: Array, step: Array) -> Array:
-    from scipy.spatial.transform import Rotation
-
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ M[:3, :3]
-    out[:3, 3] = M[:3, 3] + step[:3]
-    return out
-
-
-def _index_pairs(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    i, j = np.triu_indices(n, 1)
-    return i, j
+    return apply_increment(X, solved.x[:6]), apply_increment(Y, solved.x[6:]), np.asarray(solved.jac.T @ solved.jac)
 
 
 def _rotation_spread(A: Array) -> float:
     """Return the root mean square rotation [rad] between poses about the second of the main axes."""
     from scipy.spatial.transform import Rotation
 
-    i, j = _index_pairs(len(A))
+    i, j = np.triu_indices(len(A), 1)
     turns = Rotation.from_matrix(A[i, :3, :3].transpose(0, 2, 1) @ A[j, :3, :3]).as_rotvec()
     return math.sqrt(max(float(np.linalg.eigvalsh(turns.T @ turns / len(turns))[1]), 0.0))
 
@@ -273,9 +246,9 @@ def _disagreement_text(agreeing: int, n: int) -> str:
 def _invert_covariance(T: PoseTuple, covariance: Sequence[float]) -> tuple[float, ...]:
     """Return the covariance (36 values) of the inverse of a pose."""
     M = pose_to_matrix(T)
-    R, (x, y, z) = M[:3, :3], M[:3, 3]
+    R = M[:3, :3]
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = -R.T
-    J[:3, 3:] = -R.T @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    J[:3, 3:] = -R.T @ skew(M[:3, 3])
     C = J @ np.asarray(covariance, dtype=np.float64).reshape(6, 6) @ J.T
     return tuple(float(v) for v in C.ravel())

@@ -17,8 +17,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_perturb, quat_to_matrix, skew, swing
-from anchors.pose import PoseTuple, quat_normalize
+from anchors.lie import (
+    Array,
+    quat_conjugate,
+    quat_log,
+    quat_multiply,
+    quat_perturb,
+    quat_to_matrix,
+    skew,
+    swing,
+    to_quat,
+    to_vec3,
+)
+from anchors.pose import PoseTuple
 from anchors.uncertainty import Z999, chi2_quantile
 from anchors.viewpoints import MergedObservation, circular_median
 
@@ -315,5 +326,4 @@ def to_inverse_pose(t: Array, q: Array) -> PoseTuple:
     """Return `T_b_a` as plain floats from `T_a_b` (translation (3,), quaternion (4,))."""
     q_inv = quat_conjugate(q)
     p = -(quat_to_matrix(q_inv) @ t)
-    unit = quat_normalize((float(q_inv[0]), float(q_inv[1]), float(q_inv[2]), float(q_inv[3])))
-    return (float(p[0]), float(p[1]), float(p[2])), unit
+    return to_vec3(p), to_quat(q_inv)

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from anchors.alignment import AlignmentConfig, AlignmentEstimate
-from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, skew, swing
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, skew, swing, to_vec3
 from anchors.pose import IDENTITY_POSE, Quat, Vec3, distance
 from anchors.solver import to_inverse_pose, to_world_covariance
 from anchors.uncertainty import Z99, chi2_quantile, position_error_p95
@@ -140,9 +140,11 @@ def register_touches(
     if in_line:
         return _refuse(tracking_epoch, in_line, names)
     by_name = [[t for t in touches if t.point == name] for name in names]
-    torn = [name for name, same in zip(names, by_name, strict=True) if _is_torn(same, tips)]
-    if torn:
-        return _refuse(tracking_epoch, f"point '{torn[0]}' was touched in two places: touch it again", torn)
+    inconsistent = [name for name, same in zip(names, by_name, strict=True) if _has_inconsistent_touches(same, tips)]
+    if inconsistent:
+        return _refuse(
+            tracking_epoch, f"point '{inconsistent[0]}' was touched in two places: touch it again", inconsistent
+        )
     tip = np.array([np.mean([t.p_tracking_tip for t in same], axis=0) for same in by_name])
     noise = TouchNoise.of_touches(by_name, tips)
     fit = _fit(world, tip, noise, config)
@@ -174,7 +176,7 @@ def suggest_point(points_world: Mapping[str, Vec3], touched: Sequence[str]) -> s
     return max(left, key=spread)
 
 
-def _is_torn(same: Sequence[Touch], tips: Mapping[str, Sequence[float]]) -> bool:
+def _has_inconsistent_touches(same: Sequence[Touch], tips: Mapping[str, Sequence[float]]) -> bool:
     """Return whether the touches of one point lie further apart than their noise."""
     p = np.array([t.p_tracking_tip for t in same])
     variance = max(t.sigma_m**2 + float(np.trace(np.reshape(tips.get(t.tip, _NO_TIP), (3, 3)))) for t in same)
@@ -353,7 +355,7 @@ def _estimate(
     pivot = world.mean(axis=0)
     wider = fit.chi2 / fit.freedom if fit.chi2 > chi2_quantile(fit.freedom, Z99) else 1.0
     covariance = tuple(float(v) for v in (wider * to_world_covariance(fit.q, fit.covariance, pivot)).ravel())
-    at: Vec3 = (float(pivot[0]), float(pivot[1]), float(pivot[2]))
+    at = to_vec3(pivot)
     error = position_error_p95(covariance, at, at)
     tilt = float(np.linalg.norm(swing(fit.q)))
     refused = not error <= config.max_error_m

@@ -63,11 +63,6 @@ def position_error_p95(covariance: Sequence[float] | Array, pivot_world: Vec3, p
     return length_p95(covariance_at_point(covariance, pivot_world, point_world))
 
 
-def rotation_error_p95(covariance: Sequence[float] | Array) -> float:
-    """Return the stated 95 % bound [rad] of the rotation error."""
-    return length_p95(np.asarray(covariance, dtype=np.float64).reshape(6, 6)[3:, 3:])
-
-
 # --- noise of observations --------------------------------------------------------------------------------------------
 #
 # Covariances of observations are 6x6, position [m] then rotation [rad], in the axes of the tracking frame. The part

@@ -23,11 +23,11 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from anchors.correction import interpolate_about_pivot
 from anchors.pose import (
     apply,
     compose,
     distance,
+    interpolate_about_pivot,
     inverse,
     quat_angle,
     quat_conj,

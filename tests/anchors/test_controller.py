@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from anchors.controller import TipCalibration, calibrate_tip, controller_covariance, holder_anchor, tip_position
+from anchors.controller import TipCalibration, calibrate_tip, controller_covariance, holder_anchor
 from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix
-from anchors.pose import PoseTuple, compose, inverse, quat_from_rotvec
+from anchors.pose import PoseTuple, apply, compose, inverse, quat_from_rotvec
 
 TIP = np.array([0.01, -0.02, -0.12])
 PIVOT = np.array([0.4, 1.1, -0.3])
@@ -39,7 +39,7 @@ def test_tip_is_accurate() -> None:
     assert math.dist(got.p_tracking_pivot, PIVOT) < 0.001
     assert got.residual_m == pytest.approx(0.001 * math.sqrt(3.0), rel=0.2)
     pose = _poses(_cone_rotations(), sigma_m=0.0)[7]
-    assert math.dist(tip_position(pose, got.p_controller_tip), PIVOT) < 0.001
+    assert math.dist(apply(pose, got.p_controller_tip), PIVOT) < 0.001
 
 
 def test_wrong_readings_are_excluded() -> None:

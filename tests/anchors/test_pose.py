@@ -55,3 +55,13 @@ def test_normalize_rejects_zero_and_non_finite() -> None:
 def test_yaw() -> None:
     assert np.allclose(ps.quat_rotate(ps.quat_from_yaw(math.pi / 2), (1.0, 0.0, 0.0)), (0.0, 1.0, 0.0))
     assert ps.distance((0.0, 0.0, 0.0), (3.0, 4.0, 0.0)) == 5.0
+
+
+def test_pivot_moves_on_a_straight_line() -> None:
+    old: ps.PoseTuple = ((0.0, 0.0, 0.0), ps.quat_from_yaw(0.3))
+    new: ps.PoseTuple = ((0.02, -0.01, 0.0), ps.quat_from_rotvec((0.01, 0.0, 0.33)))
+    pivot = ps.apply(ps.inverse(new), (0.5, 2.0, 0.7))
+    a, b = np.array(ps.apply(old, pivot)), np.array(ps.apply(new, pivot))
+    for share in (0.0, 0.25, 0.5, 1.0):
+        moved = ps.apply(ps.interpolate_about_pivot(old, new, pivot, share), pivot)
+        assert np.allclose(moved, a + share * (b - a), atol=1e-12)
