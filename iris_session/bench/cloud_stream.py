@@ -51,7 +51,7 @@ def plan_stream(seconds: float, mbit: float) -> list[Interval]:
     if not mbit:
         return plan_rounds((WITHOUT, WITH), seconds, ROUNDS, SHORTEST_S, LEAD_S)
     kinds = (WITH, SLOW, SLOW_WITHOUT)
-    return plan_intervals(kinds, [max(SHORTEST_S, (seconds - LEAD_S) / len(kinds))] * len(kinds), LEAD_S)
+    return plan_intervals(kinds, max(SHORTEST_S, (seconds - LEAD_S) / len(kinds)), LEAD_S)
 
 
 def run_cloud_stream(

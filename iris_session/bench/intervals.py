@@ -43,13 +43,9 @@ class Interval(NamedTuple):
         return select_between(times_ns, begin_ns, self.begin_s, self.end_s)
 
 
-def plan_intervals(kinds: Sequence[str], lengths_s: Sequence[float], begin_s: float = 0.0) -> list[Interval]:
-    """Return intervals one after the other."""
-    plan: list[Interval] = []
-    for kind, length_s in zip(kinds, lengths_s, strict=True):
-        start_s = plan[-1].end_s if plan else begin_s
-        plan.append(Interval(kind, start_s, start_s + length_s))
-    return plan
+def plan_intervals(kinds: Sequence[str], length_s: float, begin_s: float = 0.0) -> list[Interval]:
+    """Return intervals of one length, one after the other."""
+    return [Interval(kind, begin_s + i * length_s, begin_s + (i + 1) * length_s) for i, kind in enumerate(kinds)]
 
 
 def plan_rounds(
@@ -58,7 +54,7 @@ def plan_rounds(
     """Return rounds of the kinds in turn that fill the seconds after the lead: as many as fit, 1 to `rounds`."""
     rounds = max(1, min(rounds, int((seconds - lead_s) / (len(kinds) * shortest_s))))
     length_s = max(shortest_s, (seconds - lead_s) / (len(kinds) * rounds))
-    return plan_intervals(list(kinds) * rounds, [length_s] * (len(kinds) * rounds), lead_s)
+    return plan_intervals(list(kinds) * rounds, length_s, lead_s)
 
 
 def select_between(times_ns: NDArray[Any], begin_ns: int, from_s: float, to_s: float) -> NDArray[np.bool_]:

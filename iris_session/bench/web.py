@@ -11,6 +11,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import Any, Final
 
 import numpy as np
@@ -34,7 +35,6 @@ from iris_session.bench.intervals import (
     Interval,
     Log,
     compute_age_p99_ms,
-    plan_intervals,
     summarize_runs,
     summarize_stalls,
 )
@@ -88,7 +88,9 @@ _SHEET: Final = """
 def plan_web_intervals(seconds: float) -> list[Interval]:
     """Return rounds of baseline, frozen and loading before the e-stops: as many as fit, at least one, at most three."""
     rounds = max(1, min(ROUNDS, int((seconds - STOPS_S) / sum(LENGTHS.values()))))
-    return plan_intervals(list(LENGTHS) * rounds, list(LENGTHS.values()) * rounds)
+    ends_s = accumulate(list(LENGTHS.values()) * rounds)
+    kinds = list(LENGTHS) * rounds
+    return [Interval(kind, end_s - LENGTHS[kind], end_s) for kind, end_s in zip(kinds, ends_s, strict=True)]
 
 
 def run_web(

@@ -22,6 +22,8 @@ from iris_session.system.process import PIPE, ChildProcess, take_stdout
 #: Time in which a call is answered, such as that for pictures or for a whole window [s].
 ANSWER_S: Final = 600.0
 POLL_S: Final = 0.02
+#: In which a process that has closed its output ends [s].
+EXIT_S: Final = 10.0
 
 
 class Plugin:
@@ -83,7 +85,7 @@ class Worker(ChildProcess):
         return self.read(timeout_s)
 
     def _make_error(self) -> BenchError:
-        return BenchError(f"{self._name}, a process of the benchmark, failed with exit status {self.wait(1.0)}")
+        return BenchError(f"{self._name}, a process of the benchmark, failed with exit status {self.wait(EXIT_S)}")
 
 
 def run_plugin(name: str) -> None:

@@ -1,36 +1,32 @@
-"""Baseline of the benchmarks: receivers in other processes, and their failures."""
+"""Baseline of the benchmarks: its loop, in simulated time."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
-from iris_session.bench import baseline as room
-from iris_session.bench.baseline import measure_baseline
-from iris_session.bench.report import BenchError
+from iris_session.bench import baseline
 
 
-def test_every_receiver_is_measured_and_ended() -> None:
-    found = measure_baseline(5, seconds=1.5)
-    assert 0.0 < found["bare_age_ms_p50"] <= found["bare_age_ms_p99"]
-    assert 0.0 <= found["bare_late_tick_share"] <= 1.0
-    assert found["bare_lateness_ms_p99"] > 0.0
+class Clock:
+    """A time module whose time passes only while a program sleeps, or its socket sends."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    def sleep(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
+
+    def send(self, _: bytes) -> None:
+        self.sleep(0.005)
 
 
-def test_blocked_loop_is_late() -> None:
-    class SlowSocket:
-        """A socket that takes 5 ms for every frame."""
-
-        def send(self, _: bytes) -> None:
-            room.time.sleep(0.005)
-
-    lateness = room._run_loop(SlowSocket(), 0.2)  # type: ignore[arg-type]
-    assert sum(ns > room.PERIOD_NS for ns in lateness) >= 8  # each of about 12 frames delays its own tick
-
-
-def test_failed_receiver_is_named() -> None:
-    dead = subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"], stdout=subprocess.PIPE)
-    with pytest.raises(BenchError, match="failed with status 3"):
-        room._read_ages(dead)
+def test_frame_that_blocks_the_loop_makes_its_own_tick_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr(baseline, "time", clock)
+    lateness = baseline._run_loop(clock, 0.2)  # type: ignore[arg-type]
+    assert len(lateness) == 100
+    late = [ns for ns in lateness if ns > baseline.PERIOD_NS]
+    assert 12 <= len(late) <= 24, "the ticks of the twelve frames, and some after them"

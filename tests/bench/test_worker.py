@@ -1,0 +1,64 @@
+"""Processes of benchmarks: calls, answers and failures, and a session with real clients."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import msgspec
+import pytest
+
+from iris_session.bench.report import BenchError
+from iris_session.bench.worker import Plugin, Worker
+from iris_session.cli.main import main
+
+
+class EchoJob(msgspec.Struct, frozen=True):
+    """Job of a plug-in that does nothing."""
+
+    text: str
+
+
+class Echo(Plugin):
+    """Plug-in that repeats its job."""
+
+    job_type = EchoJob
+
+    def __init__(self, job: EchoJob) -> None:
+        if not job.text:
+            raise SystemExit(3)
+        super().__init__(job)
+        print("libraries print here")
+
+    def repeat(self, n: int) -> dict[str, Any]:
+        return {"text": self.job.text * n}
+
+    def end(self) -> None:
+        raise SystemExit(4)
+
+
+ECHO = "tests.bench.test_worker:Echo"
+
+
+def test_calls_are_answered_in_their_order_and_failures_are_named() -> None:
+    with Worker(ECHO, EchoJob("ha")) as worker:
+        worker.send("repeat", 2)
+        worker.send("repeat", 1)
+        assert [worker.read(30.0) for _ in range(3)] == [None, {"text": "haha"}, {"text": "ha"}]
+        with pytest.raises(BenchError, match=r"Echo.*4"):
+            worker.ask("end", timeout_s=30.0)
+    with Worker(ECHO, EchoJob("")) as worker, pytest.raises(BenchError, match=r"Echo.*3"):
+        worker.read(30.0)
+
+
+@pytest.mark.long
+@pytest.mark.e2e
+def test_state_of_a_session_with_clients(capfd: pytest.CaptureFixture[str]) -> None:
+    """A whole benchmark: what clients decode is what the session had."""
+    # A busy machine may stand still for ten of these seconds.
+    assert main(["bench", "state", "--clients", "2", "--bodies", "20", "--seconds", "12", "--curve", "--json"]) == 0
+    got = json.loads(capfd.readouterr().out)["results"]
+    assert 0.0 < got["max_position_error_mm"] <= 0.1
+    assert 0.0 < got["max_rotation_error_deg"] <= 0.05
+    assert 0.0 < got["age_ms_p50"] <= got["age_ms_p95"] <= got["age_ms_p99"]
+    assert got["frames_not_logged"] == 0
