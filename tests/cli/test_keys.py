@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import socket
-import threading
 import time
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -18,6 +17,7 @@ from zmq.auth import create_certificates
 
 from iris_session.cli.common import CommandError, check_session_reachable, describe_own_sessions
 from iris_session.cli.main import main
+from iris_session.cli.pair import FAILURE_TEXTS
 from iris_session.client.address import Address
 from iris_session.doctor.runner import LOCAL, find_default_address
 from iris_session.protocol import pairing
@@ -67,20 +67,15 @@ def test_allow_list_revoke(home: KeyHome, tmp_path: Path, capsys: Capture) -> No
     assert list(home.clients.read()) == [bob.fingerprint]
 
 
-def test_allow_without_key_adds_own_key(home: KeyHome, capsys: Capture) -> None:
-    assert main(["keys", "allow", "me", "--role", "any"]) == 0
-    own = home.load_identity()
-    assert [(one.name, one.roles) for one in home.clients.read().values()] == [("me", ())]
-    assert own.fingerprint in capsys.readouterr().out
-
-
-def test_own_key_may_direct_the_own_session(home: KeyHome) -> None:
-    assert main(["keys", "allow", "me"]) == 0
-    (entry,) = home.clients.read().values()
-    assert set(entry.roles) == {"operator", "observer", "agent", "leader", "director"}
-    assert main(["keys", "allow", "me", "--role", "observer"]) == 0
-    (entry,) = home.clients.read().values()
-    assert entry.roles == ("observer",)
+def test_allow_without_a_key_adds_the_own_one_which_may_direct(home: KeyHome, capsys: Capture) -> None:
+    for options, roles in (
+        (["--role", "any"], set()),
+        ([], {"operator", "observer", "agent", "leader", "director"}),
+        (["--role", "observer"], {"observer"}),
+    ):
+        assert main(["keys", "allow", "me", *options]) == 0
+        assert home.load_identity().fingerprint in capsys.readouterr().out
+        assert [(one.name, set(one.roles)) for one in home.clients.read().values()] == [("me", roles)]
 
 
 def test_default_address_is_the_own_session(home: KeyHome) -> None:
@@ -134,28 +129,20 @@ def test_show_creates_nothing(home: KeyHome, capsys: Capture) -> None:
     assert not home.path.exists()
 
 
-def test_show_prints_both_public_keys_and_no_secret(home: KeyHome, capsys: Capture) -> None:
-    home.load_server_key()
-    home.load_identity()
+def test_show_prints_public_keys_and_the_certificate_of_the_page(home: KeyHome, capsys: Capture) -> None:
+    server, own = home.load_server_key(), home.load_identity()
+    made = load_or_make_certificate(home, ["192.168.0.10"])
     assert main(["keys", "show", "--json"]) == 0
     text = capsys.readouterr().out
     shown = json.loads(text)
-    assert shown["server"]["fingerprint"] == home.load_server_key().fingerprint
-    assert shown["identity"]["key"] == home.load_identity().public
+    assert shown["server"]["fingerprint"] == server.fingerprint
+    assert shown["identity"]["key"] == own.public
+    assert shown["certificate"] == {"fingerprint": made.fingerprint, "key": made.key}
     assert main(["keys", "show"]) == 0
-    text += capsys.readouterr().out
-    assert home.load_server_key().secret not in text
-    assert home.load_identity().secret not in text
-
-
-def test_show_prints_the_certificate_of_the_page(home: KeyHome, capsys: Capture) -> None:
-    made = load_or_make_certificate(home, ["192.168.0.10"])
-    assert main(["keys", "show", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["certificate"] == {"fingerprint": made.fingerprint, "key": made.key}
-    assert main(["keys", "show"]) == 0
-    text = capsys.readouterr().out
-    assert made.fingerprint in text
-    assert "192.168.0.10" in text
+    lines = capsys.readouterr().out
+    assert made.fingerprint in lines
+    assert "192.168.0.10" in lines
+    assert not any(one.secret in text + lines for one in (server, own))
 
 
 def test_pair_web_shows_a_link_that_works_behind_the_gateway(home: KeyHome, capsys: Capture) -> None:
@@ -288,25 +275,21 @@ def test_pair_keeps_waiting_while_another_process_locks_the_list(
 def test_pair_waits_and_prints_paired_name(
     lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch, full: bool
 ) -> None:
-    ann = KeyPair.generate()
+    """The code is used while the command waits; with a full disk the key does not come on the list."""
+    ann, server = KeyPair.generate(), lab.load_server_key()
 
     def full_disk(_entries: object) -> None:
         raise KeysError("No space left on device")
 
-    def use() -> None:
+    def use_code(_seconds: float) -> None:
         if full:
             monkeypatch.setattr(lab.clients, "replace_all", full_disk)
-        server = lab.load_server_key()
-        while not lab.join_codes.list_for_server(server.fingerprint):
-            time.sleep(0.01)
         (made,) = [one for one in lab.join_codes.read() if one.secret]
         proof = pairing.make_client_proof(made.secret, server.raw_public, ann.raw_public)
         with nullcontext() if not full else pytest.raises(KeysError):
             lab.join_codes.redeem(server.raw_public, ann.public, proof, "ann", lab.clients)
 
-    user = threading.Thread(target=use)
-    user.start()
+    monkeypatch.setattr("iris_session.cli.pair.time.sleep", use_code)
     assert main(["pair", "--role", "observer"]) == full
-    user.join()
-    expected = "used, but the key is not on the list" if full else f"paired: ann ({ann.fingerprint})"
+    expected = FAILURE_TEXTS["not_listed"] if full else f"paired: ann ({ann.fingerprint})"
     assert expected in capsys.readouterr().out

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import json
-import subprocess
+import os
+import signal
 import sys
 
 import pytest
 
-from iris_session.cli.live import EventFilter, TerminalView, _render_table, format_event
+from iris_session.cli.live import EventFilter, TerminalView, _render_table, format_event, main
 from iris_session.protocol.common import IDENTITY, Alignment, Lease
 from iris_session.protocol.server_messages import (
     AlignmentChanged,
@@ -78,32 +79,27 @@ def test_unchanged_cross_checks_are_hidden() -> None:
     assert noteworthy(Event(3, 0, 0, MarkerAdded("p1", "hello")))
 
 
-def test_table_shows_offline_participants_and_emergency_stop() -> None:
+def test_table_shows_participants_and_why_nothing_moves() -> None:
     from rich.console import Console
 
     console = Console(file=io.StringIO(), width=140)
-    console.print(_render_table("lab", STATUS, ["something happened"]))
+    status = {**STATUS, "paused": True, "pause_reason": "NaN in QPOS at DOF 3"}
+    console.print(_render_table("lab", status, ["something happened"]))
     assert isinstance(console.file, io.StringIO)
     text = console.file.getvalue()
     for part in ("ann (p1) [offline]", "4.2 mm", "21 ms", "E-STOP", "late 0.10 %", "drops 3", "something happened"):
         assert part in text
+    assert "NaN in QPOS at DOF 3" in text
 
 
-def test_table_gives_the_reason_for_which_physics_stands_still() -> None:
-    from rich.console import Console
-
-    console = Console(file=io.StringIO(), width=140)
-    console.print(_render_table("lab", {**STATUS, "paused": True, "pause_reason": "NaN in QPOS at DOF 3"}, []))
-    assert isinstance(console.file, io.StringIO)
-    assert "NaN in QPOS at DOF 3" in console.file.getvalue()
-
-
-def test_display_process_prints_events_and_ignores_truncated_lines() -> None:
-    lines = b'{"status": {}, "events": ["one"]}\n{"status": {}, "ev\n{"status": {}, "events": ["two"]}\n'
-    done = subprocess.run(
-        [sys.executable, "-m", "iris_session.cli.live", "title"], input=lines, capture_output=True, check=True
-    )
-    assert done.stdout.decode().split() == ["one", "two"]
+def test_display_prints_events_and_ignores_truncated_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = '{"status": {}, "events": ["one"]}\n{"status": {}, "ev\n{"status": {}, "events": ["two"]}\n'
+    monkeypatch.setattr(sys, "stdin", io.StringIO(lines))
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    assert main("title") == 0
+    assert capsys.readouterr().out.split() == ["one", "two"]
 
 
 class _Session:
@@ -124,8 +120,6 @@ class _Session:
 
 def test_slow_display_delays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Refreshes that do not fit into the pipe are skipped and counted; none is truncated, and no event is lost."""
-    import os
-
     session = _Session()
     view = TerminalView(session, io.StringIO(), "title")  # type: ignore[arg-type]
     read, write = os.pipe()
