@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 import zmq
 
+from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, compute_percentile
-from iris_session.bench.worker import Plugin, Worker
 from iris_session.system.priority import freeze_garbage_collector, tick_priority
 
 PERIOD_NS: Final = 2_000_000
@@ -49,7 +49,7 @@ def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, floa
         port = socket.bind_to_random_port("tcp://127.0.0.1")
         shares = [min(PER_PROCESS, receivers - i) for i in range(0, receivers, PER_PROCESS)]
         address = f"tcp://127.0.0.1:{port}"
-        workers = [stack.enter_context(Worker(RECEIVERS, ReceiverJob(address, n))) for n in shares]
+        workers = [stack.enter_context(PluginProcess(RECEIVERS, ReceiverJob(address, n))) for n in shares]
         for worker in workers:
             worker.send("receive")
         for _ in range(receivers):
@@ -68,7 +68,7 @@ def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, floa
     }
 
 
-def _read_ages(worker: Worker) -> list[int]:
+def _read_ages(worker: PluginProcess) -> list[int]:
     worker.read(_JOIN_S)  # it is made
     ages: list[int] = worker.read(_JOIN_S)
     if not ages:

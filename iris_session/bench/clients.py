@@ -1,6 +1,6 @@
 """Clients of the benchmarks: up to four real clients in one process, which log the states they receive.
 
-Plug-ins of `bench.worker`. They join when they are made; `measure` runs through a window of session time and writes a
+Plug-ins of `bench.plugins`. They join when they are made; `measure` runs through a window of session time and writes a
 log as one .npz file. Ages use the session's own clock (one machine, CLOCK_MONOTONIC), not the clients' estimate of it.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple
-from iris_session.bench.worker import POLL_S, Plugin
+from iris_session.bench.plugins import POLL_S, Plugin
 from iris_session.client import Client, ClientGroup, CurveKeys, SceneState
 from iris_session.protocol.common import Applied
 from iris_session.protocol.names import Device

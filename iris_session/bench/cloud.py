@@ -16,8 +16,8 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloud_camera import CloudCase, CloudJob
 from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure
 from iris_session.bench.intervals import plan_rounds
+from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchReport, make_bar
-from iris_session.bench.worker import Worker
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.physics import PacerStats
@@ -26,7 +26,7 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.scene_publisher import ScenePublisher
 from iris_session.system.extras import require_package
 
-CAMERA: Final = "iris_session.bench.cloud_camera:Camera"
+CAMERA: Final = "iris_session.bench.cloud_camera:CameraPublisher"
 MIN_HZ: Final = 30.0
 MIN_HZ_BESIDE: Final = 10.0
 BESIDE_HZ: Final = 15.0
@@ -65,7 +65,7 @@ def run_cloud(
     cases = _make_cases(points, cameras, beside, progress)
     params: dict[str, Any] = {"points": points, "cameras": cameras, "seconds": seconds, "seed": seed, "beside": beside}
     progress("making the pictures")
-    with Worker(CAMERA, CloudJob(cases, seed)) as camera:
+    with PluginProcess(CAMERA, CloudJob(cases, seed)) as camera:
         camera.read()
         if beside:
             return BenchReport("cloud", params, *_measure_beside(camera, seconds, seed, progress))
@@ -103,7 +103,7 @@ def _make_cases(points: int, cameras: int, beside: bool, progress: Callable[[str
 
 
 def _measure_beside(
-    camera: Worker, seconds: float, seed: int, progress: Callable[[str], None]
+    camera: PluginProcess, seconds: float, seed: int, progress: Callable[[str], None]
 ) -> tuple[dict[str, Any], tuple[Any, ...]]:
     """Return results and bars of intervals with and without clouds."""
     plan = plan_rounds(("without", "with"), seconds, ROUNDS, SHORTEST_S, LEAD_S)  # without a camera first

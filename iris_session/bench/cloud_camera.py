@@ -141,7 +141,7 @@ class CloudCamera:
         return self._pipeline.make_cloud(frames), read_ms
 
 
-class Camera(MediaPublisher):
+class CameraPublisher(MediaPublisher):
     """Publisher of the clouds of its cases."""
 
     job_type = CloudJob

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.worker import POLL_S, Plugin
+from iris_session.bench.plugins import POLL_S, Plugin
 from iris_session.client import Client, CurveKeys
 from iris_session.client.errors import NotConnectedError
 from iris_session.cloud.pipeline import CLASSES

@@ -24,8 +24,8 @@ from iris_session.bench.harness import Action, BenchRun, Measurement, measure
 from iris_session.bench.intervals import Interval, Log, compute_age_p99_ms, plan_intervals, plan_rounds
 from iris_session.bench.media_clients import UNCHECKED
 from iris_session.bench.media_clients import MediaColumn as Column
+from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import Bar, BenchError, BenchReport, compute_percentile, make_bar
-from iris_session.bench.worker import Worker
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.netsim.process import make_link_address
 from iris_session.streams.cloud import decode_cloud, read_header
@@ -84,14 +84,14 @@ def run_cloud_stream(
         links = {spec.link: "none" for spec in specs}
     with (
         tempfile.TemporaryDirectory(prefix="iris-bench-") as folder,
-        Worker(SOURCE, SourceJob(points, hz, seed)) as source,
+        PluginProcess(SOURCE, SourceJob(points, hz, seed)) as source,
     ):
         source.read()
         profile = Path(folder) / "slow.json"
         profile.write_text(json.dumps({"phases": [{"rate_mbit": mbit, "delay_ms": 2}]}))
 
         def connect(run: BenchRun) -> None:
-            job = run.workers[0].job
+            job = run.processes[0].job
             keys = [job.server_public, job.public, job.secret] if job.server_public else []
             source.send("connect", run.session.address, *keys)
 

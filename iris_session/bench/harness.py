@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from iris_session.authority.config import UNALIGNED, AuthorityConfig
 from iris_session.bench.clients import ClientJob, Job, make_web_secret
 from iris_session.bench.intervals import Log
+from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchError
-from iris_session.bench.worker import Worker
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.physics import PacerStats
 from iris_session.protocol.client_messages import Sample
@@ -113,7 +113,7 @@ class Measurement:
         return {key: found[key] for key in keys}
 
 
-class ClientWorker(Worker):
+class ClientProcess(PluginProcess):
     """Process of one group of clients."""
 
     def __init__(self, plugin: str, job: Job) -> None:
@@ -136,8 +136,8 @@ class BenchRun:
     """Running benchmark, on which an action of `measure` acts. `by_client`: processes by client name."""
 
     session: Session
-    workers: list[ClientWorker]
-    by_client: dict[str, ClientWorker]
+    processes: list[ClientProcess]
+    by_client: dict[str, ClientProcess]
     proxy: ImpairmentProcess | None
 
 
@@ -214,11 +214,11 @@ def measure(
         job = Job(session.address, session.origin_ns, "", (), keep_poses, stream, topology, page=page, **keys)
         for plugin, own in groups.items():
             for group in own:
-                job = msgspec.structs.replace(job, log=str(folder / f"log{len(run.workers)}.npz"), clients=group)
+                job = msgspec.structs.replace(job, log=str(folder / f"log{len(run.processes)}.npz"), clients=group)
                 code = _make_code(session) if plugin == TABS else ""
-                worker = ClientWorker(plugin, msgspec.structs.replace(job, page=page + code))
+                worker = ClientProcess(plugin, msgspec.structs.replace(job, page=page + code))
                 stack.callback(worker.close, exit_s=LEAVE_S)
-                run.workers.append(worker)
+                run.processes.append(worker)
                 run.by_client.update((spec.name, worker) for spec in group)
         return _run_session(run, seconds, actions, on_tick, keep_poses, progress)
 
@@ -231,7 +231,7 @@ def _run_session(
     keep_poses: bool,
     progress: Callable[[str], None],
 ) -> Measurement:
-    session, workers = run.session, run.workers
+    session, workers = run.session, run.processes
     progress(f"waiting for {len(workers)} client processes")
     if not _run_until_answered(session, workers, JOIN_S):
         raise BenchError(f"the clients did not join within {JOIN_S:g} s")
@@ -283,7 +283,7 @@ def _run_session(
     )
 
 
-def _run_until_answered(session: Session, workers: Sequence[ClientWorker], seconds: float) -> bool:
+def _run_until_answered(session: Session, workers: Sequence[ClientProcess], seconds: float) -> bool:
     """Run the session until every worker has answered its call, at most some seconds. Return whether all have."""
     session.run(
         seconds=seconds, until=_limit_rate(0.05, session.clock, lambda: all(one.has_answered() for one in workers))

@@ -25,8 +25,8 @@ from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients,
 from iris_session.bench.intervals import Log, compute_age_p99_ms
 from iris_session.bench.join_clients import CopyInterval, JoinJob, JoinResult
 from iris_session.bench.join_scene import PreparedScene, make_join_model
+from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
-from iris_session.bench.worker import Worker
 from iris_session.system.process import PIPE, child_environment, module_command
 
 #: Time from the beginning of the window to the join; the baseline of the others is measured first.
@@ -72,7 +72,9 @@ def run_join(
             raise BenchError(f"{ready.built} assets were encoded again although the cache is warm")
         paths = [store.path(address) for address in ready.sizes]
         port = stack.enter_context(_serve_in_bulk(paths))
-        joiner = stack.enter_context(Worker("iris_session.bench.join_clients:Joiner", JoinJob(str(folder / "cache"))))
+        joiner = stack.enter_context(
+            PluginProcess("iris_session.bench.join_clients:Joiner", JoinJob(str(folder / "cache")))
+        )
         joiner.read()  # it is made
 
         def start_join(run: BenchRun) -> None:

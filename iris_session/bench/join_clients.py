@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import zmq
 
-from iris_session.bench.worker import Plugin
+from iris_session.bench.plugins import Plugin
 from iris_session.client import AssetStore, Client
 from iris_session.protocol.scene import SceneSpec, decode_scene, list_assets
 from iris_session.scene import decode_image, decode_mesh

@@ -27,10 +27,10 @@ import psutil
 
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.harness import CLIENTS, Measurement, group_clients, measure
+from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.record_naive import LOG_BATCH_S, LONG_BATCH_S, write_naive_log
 from iris_session.bench.record_session import BODIES, OPERATORS, BenchSession, SessionJob, make_record_scene
 from iris_session.bench.report import BenchError, BenchReport, make_bar
-from iris_session.bench.worker import Worker
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.recording import NotARecordingError, Recording
 from iris_session.rrd import paths
@@ -284,7 +284,7 @@ class RecordedSession:
                 raise BenchError(f"a session that is to be killed did not start: {error}") from None
             self._origin_ns = listening.origin_ns
             job = Job(listening.address, listening.origin_ns, "", tuple(_make_operators()))
-            stack.enter_context(Worker(CLIENTS, job)).read(START_S)
+            stack.enter_context(PluginProcess(CLIENTS, job)).read(START_S)
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:

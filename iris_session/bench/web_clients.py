@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.bench.clients import JOIN_S, MAX_FRAMES, ClientJob, Job, make_web_secret
-from iris_session.bench.worker import POLL_S, Plugin
+from iris_session.bench.plugins import POLL_S, Plugin
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.state_stream import SceneState
 from iris_session.client.core.status import ConnectionPhase

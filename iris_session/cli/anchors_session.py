@@ -282,8 +282,7 @@ def to_dict(report: StatusReport) -> dict[str, Any]:
 
     kept = ("id", "name", "role", "connected", "tracking_epoch", "alignment", "alignment_age_ns", "alignment_void_ns")
     people = [
-        {**{name: getattr(p, name) for name in kept}, "alignment_report": msgspec.to_builtins(p.alignment_report)}
-        for p in list_headsets(report)
+        {**_pick(p, *kept), "alignment_report": msgspec.to_builtins(p.alignment_report)} for p in list_headsets(report)
     ]
     checks = [{**msgspec.to_builtins(one), "as_expected": is_consistent(one)} for one in report.cross_checks]
     return {
@@ -610,9 +609,7 @@ def solution_to_dict(
     """Return the object that `--json` prints."""
     people = [
         {
-            "id": one.id,
-            "name": one.name,
-            "role": one.role,
+            **_pick(one, "id", "name", "role"),
             "frames": [_frame_to_dict(r) for r in results if r.frame.participant == one.id],
         }
         for one in looks.participants.values()
@@ -630,50 +627,33 @@ def solution_to_dict(
 
 
 def _frame_to_dict(r: FrameResult) -> dict[str, Any]:
+    last = r.last
     return {
-        "run": r.frame.run,
-        "tracking_epoch": r.frame.tracking_epoch,
-        "jumps": r.frame.jumps,
-        "looks": r.looks,
-        "viewpoints": r.viewpoints,
-        "sheets": r.sheets,
+        **_pick(r.frame, "run", "tracking_epoch", "jumps"),
+        **_pick(r, "looks", "viewpoints", "sheets", "unused"),
         "first_s": r.first_ns * 1e-9,
         "last_s": r.last_ns * 1e-9,
-        "unused": r.unused,
-        "refused": r.last.refused,
-        "advice": r.last.advice,
-        "T_world_tracking": None if r.last.refused else pose_to_dict(r.last.T_world_tracking),
-        "error_at_anchor_m": None if r.last.refused else r.last.error_at_anchor_m,
-        "residual_tilt_rad": r.last.residual_tilt_rad,
+        **_pick(last, "refused", "advice", "residual_tilt_rad"),
+        "T_world_tracking": None if last.refused else pose_to_dict(last.T_world_tracking),
+        "error_at_anchor_m": None if last.refused else last.error_at_anchor_m,
         "alignments": [_alignment_to_dict(one) for one in r.compared],
         "outliers": [
             {
-                "anchor_id": o.anchor_id,
-                "viewpoint_id": o.viewpoint_id,
-                "looks": o.looks,
-                "off_m": o.off_m,
-                "off_rad": o.off_rad,
-                "expected_p95_m": o.expected_p95_m,
-                "at_s": o.at_ns * 1e-9,
+                **_pick(one, "anchor_id", "viewpoint_id", "looks", "off_m", "off_rad", "expected_p95_m"),
+                "at_s": one.at_ns * 1e-9,
             }
-            for o in r.outliers
+            for one in r.outliers
         ],
     }
 
 
 def _alignment_to_dict(one: LiveComparison) -> dict[str, Any]:
-    a, until = one.live.alignment, one.live.until_ns
+    until_ns = one.live.until_ns
     return {
-        "version": a.version,
-        "kind": a.kind,
-        "offset": a.offset,
+        **_pick(one.live.alignment, "version", "kind", "offset"),
         "since_s": one.live.since_ns * 1e-9,
-        "until_s": None if until < 0 else until * 1e-9,
-        "off_m": one.off_m,
-        "off_rad": one.off_rad,
-        "off_end_m": one.off_end_m,
-        "stated_m": one.stated_m,
-        "solved_m": one.solved_m,
+        "until_s": None if until_ns < 0 else until_ns * 1e-9,
+        **_pick(one, "off_m", "off_rad", "off_end_m", "stated_m", "solved_m"),
         "beyond": one.is_beyond_stated,
     }
 
@@ -686,11 +666,15 @@ def _constellation_to_dict(relative: RelativePoses) -> dict[str, Any]:
         name: {**pose_to_dict(pose), "error_m": c.error_m[name], "residual_m": relative.solved.residuals_m.get(name)}
         for name, pose in c.anchors.items()
     }
-    moved = [{"anchor_id": m.anchor_id, "distance_m": m.distance_m, "angle_rad": m.angle_rad} for m in relative.moved]
     return {
         "reference": c.reference,
         "anchors": sheets,
         "rejected": [list(one) for one in relative.solved.rejected],
-        "moved": moved,
+        "moved": [_pick(one, "anchor_id", "distance_m", "angle_rad") for one in relative.moved],
         "advice": relative.moved_advice,
     }
+
+
+def _pick(value: object, *names: str) -> dict[str, Any]:
+    """Return some attributes of an object by their names."""
+    return {name: getattr(value, name) for name in names}

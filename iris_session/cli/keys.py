@@ -41,9 +41,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         run_list,
         help="keys that may join",
         description="List the keys that may join.",
-        examples="""
-            iris-session keys list --json
-        """,
+        examples="iris-session keys list --json",
     )
     add_json_option(one)
     one = add_command(
@@ -71,9 +69,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         run_revoke,
         help="revoke a key",
         description="Remove a key from the list; participants who use it are disconnected.",
-        examples="""
-            iris-session keys revoke quest-3
-        """,
+        examples="iris-session keys revoke quest-3",
     )
     one.add_argument("name", help="name or fingerprint in the list")
     one = add_command(
@@ -82,9 +78,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         run_show,
         help="own fingerprints",
         description="Show the folder of keys, and the user's own keys.",
-        examples="""
-            iris-session keys show
-        """,
+        examples="iris-session keys show",
     )
     add_json_option(one)
     one = add_command(
@@ -93,9 +87,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         run_forget,
         help="forget the key of a server",
         description="Remove the stored key of a session's address, so that a new key can be trusted.",
-        examples="""
-            iris-session keys forget 192.168.1.20:7721
-        """,
+        examples="iris-session keys forget 192.168.1.20:7721",
     )
     one.add_argument("address", help="HOST:PORT as used to join")
 
@@ -106,18 +98,8 @@ def run_list(arguments: argparse.Namespace) -> int:
 
     keys = KeyHome().clients.read()
     if arguments.json:
-        rows = [
-            {
-                "name": one.name,
-                "fingerprint": mark,
-                "key": one.key,
-                "roles": list(one.roles),
-                "kind": one.kind,
-                "added": one.added,
-                "last_seen": one.last_seen,
-            }
-            for mark, one in keys.items()
-        ]
+        names = ("name", "key", "roles", "kind", "added", "last_seen")
+        rows = [{"fingerprint": mark, **{name: getattr(one, name) for name in names}} for mark, one in keys.items()]
         print_json({"keys": rows})
         return 0
     if not keys:

@@ -65,9 +65,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         run_export,
         help="write the scene as a GLB file",
         description="Write the initial scene as GLB (glTF 2.0): meshes, textures and colours, y up.",
-        examples="""
-            iris-session scene export handover handover.glb
-        """,
+        examples="iris-session scene export handover handover.glb",
     )
     _add_scene_arguments(export)
     export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")

@@ -32,15 +32,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     known = known_fingerprints()
     found = find_sessions(arguments.seconds)
+    names = ("name", "address", "addresses", "session_id", "kind", "key_fingerprint")
     rows = [
         {
-            "name": one.name,
-            "address": one.address,
-            "addresses": list(one.addresses),
-            "session_id": one.session_id,
-            "kind": one.kind,
+            **{name: getattr(one, name) for name in names},
             "encrypted": bool(one.key_fingerprint),
-            "key_fingerprint": one.key_fingerprint,
             "known": one.key_fingerprint in known,
         }
         for one in found

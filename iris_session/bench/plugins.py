@@ -1,6 +1,6 @@
 """The processes of a benchmark beside its session: each runs one plug-in, which the benchmark calls by lines of JSON.
 
-    python -m iris_session.bench.worker iris_session.bench.clients:StateClients
+    python -m iris_session.bench.plugins iris_session.bench.clients:StateClients
 
 The first line of standard input is the job of the plug-in, every later one a call: `["measure", 1000, 2000]`. Each is
 answered by one line, the job too: what the method returned, as JSON. Between calls the plug-in is polled.
@@ -27,7 +27,7 @@ EXIT_S: Final = 10.0
 
 
 class Plugin:
-    """What a worker runs. Public methods are calls; `job_type` is the type of the job that the plug-in is made of."""
+    """Base of plug-ins. Public methods are calls; `job_type` is the type of the job that a plug-in is made of."""
 
     job_type: ClassVar[type[msgspec.Struct]]
 
@@ -42,7 +42,7 @@ class Plugin:
         """Release what the plug-in holds; the session may have ended first."""
 
 
-class Worker(ChildProcess):
+class PluginProcess(ChildProcess):
     """A process that runs a plug-in.
 
     Args:
@@ -53,7 +53,7 @@ class Worker(ChildProcess):
     def __init__(self, plugin: str, job: msgspec.Struct) -> None:
         self._name = plugin.partition(":")[2]
         # Ctrl-C ends the benchmark, which ends this.
-        super().__init__("iris_session.bench.worker", [plugin], stdout=PIPE, own_group=True)
+        super().__init__("iris_session.bench.plugins", [plugin], stdout=PIPE, own_group=True)
         self._answers: list[bytes] = []
         self.write(msgspec.json.encode(job) + b"\n")
 

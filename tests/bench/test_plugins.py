@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 import pytest
 
+from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError
-from iris_session.bench.worker import Plugin, Worker
 from iris_session.cli.main import main
 
 
@@ -37,17 +37,17 @@ class Echo(Plugin):
         raise SystemExit(4)
 
 
-ECHO = "tests.bench.test_worker:Echo"
+ECHO = "tests.bench.test_plugins:Echo"
 
 
 def test_calls_are_answered_in_their_order_and_failures_are_named() -> None:
-    with Worker(ECHO, EchoJob("ha")) as worker:
+    with PluginProcess(ECHO, EchoJob("ha")) as worker:
         worker.send("repeat", 2)
         worker.send("repeat", 1)
         assert [worker.read(30.0) for _ in range(3)] == [None, {"text": "haha"}, {"text": "ha"}]
         with pytest.raises(BenchError, match=r"Echo.*4"):
             worker.ask("end", timeout_s=30.0)
-    with Worker(ECHO, EchoJob("")) as worker, pytest.raises(BenchError, match=r"Echo.*3"):
+    with PluginProcess(ECHO, EchoJob("")) as worker, pytest.raises(BenchError, match=r"Echo.*3"):
         worker.read(30.0)
 
 
