@@ -1,13 +1,15 @@
 """Motion that `bench deformable` streams: a cloth of 1 m with two guided corners, simulated once by MuJoCo.
 
 It is swung, dragged over a ball, lowered to the floor, and lifted again, so it folds and wrinkles. Simulating
-100 x 100 vertices takes some minutes (a cloth vertex is a body), so the result is kept in the user's cache folder.
+100 x 100 vertices takes seven to ten minutes of a processor (a cloth vertex is a body), so the result is kept in the
+user's cache folder: the first run with a seed takes that much longer.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import time
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -113,7 +115,7 @@ def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambd
     spacing = EDGE_M / (side - 1)
     hands = _Hands(seed)
     left, right = (" ".join(map(str, p)) for p in hands.positions_at(0.0))
-    progress(f"simulating a cloth of {side} x {side} vertices once: this takes some minutes for 100 x 100")
+    progress(f"simulating a cloth of {side} x {side} vertices once: this takes ten minutes for 100 x 100")
     model = mujoco.MjModel.from_xml_string(
         _SCENE.format(
             grips=_format_grips(side),
@@ -127,9 +129,11 @@ def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambd
     )
     data = mujoco.MjData(model)
     frames = np.empty((HZ * SECONDS, model.nflexvert, 3))
+    began_s = time.monotonic()
     for frame in range(len(frames)):
-        if frame % (HZ // 2) == 0:
-            progress(f"{frame / HZ:g} s of {SECONDS} s are simulated")
+        if frame and frame % (HZ // 2) == 0:
+            left_s = (time.monotonic() - began_s) * (len(frames) / frame - 1.0)
+            progress(f"{frame / HZ:g} s of {SECONDS} s are simulated, {left_s:.0f} s left")
         for _ in range(STEPS_PER_FRAME):
             data.mocap_pos[:] = hands.positions_at(data.time)
             mujoco.mj_step(model, data)
