@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from anchors.lie import Array
+from anchors.lie import Array, to_vec3
 from anchors.pose import (
     PoseTuple,
     Quat,
@@ -342,8 +342,7 @@ class AlignmentEstimator:
     ) -> AlignmentEstimate:
         wider = s.chi2 / s.freedom if s.freedom > 0.0 and s.chi2 > chi2_quantile(s.freedom, Z99) else 1.0
         pivot = s.inside @ b.p_world / float(s.inside.sum())
-        x, y, z = pivot.tolist()
-        pivot_world = (x, y, z)
+        pivot_world = to_vec3(pivot)
         in_the_world = to_world_covariance(s.q, s.covariance, pivot) * wider
         covariance = tuple(in_the_world.ravel().tolist())
         error = length_p95(in_the_world[:3, :3])

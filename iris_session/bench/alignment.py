@@ -19,8 +19,8 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_to_matrix
-from anchors.pose import IDENTITY_POSE, PoseTuple, Quat, Vec3, quat_from_yaw
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_to_matrix, to_quat, to_vec3
+from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, quat_from_yaw
 from anchors.touch import Touch, register_touches
 from anchors.uncertainty import length_p95
 from iris_session.bench.report import Bar, BenchReport, make_bar
@@ -111,7 +111,7 @@ class SimulatedHeadset:
         """Return the position of a controller's tip that touches a mark once."""
         p = p_mark + self.rng.normal(0.0, sigma_m, (1, 3))
         origin, q = self.T_world_tracking(self.now_s)
-        return [_to_vec3(v) for v in ((p - origin) @ quat_to_matrix(q)).tolist()]
+        return [to_vec3(v) for v in (p - origin) @ quat_to_matrix(q)]
 
     def _report(self, anchor_id: str, p: Array, q: Array, heads: Array) -> list[ReportedObservation]:
         """Transform observations from world to tracking, each at its time, and go to the next viewpoint."""
@@ -122,10 +122,8 @@ class SimulatedHeadset:
         p_tracking, head_tracking = (p - origin) @ R.T, (heads - origin) @ R.T
         q_tracking = quat_multiply(q_inv, q)
         out = [
-            ReportedObservation(anchor_id, (_to_vec3(a), _to_quat(b)), _to_vec3(h), round(t * 1e9), self.viewpoints)
-            for a, b, h, t in zip(
-                p_tracking.tolist(), q_tracking.tolist(), head_tracking.tolist(), times.tolist(), strict=True
-            )
+            ReportedObservation(anchor_id, (to_vec3(a), to_quat(b)), to_vec3(h), round(t * 1e9), self.viewpoints)
+            for a, b, h, t in zip(p_tracking, q_tracking, head_tracking, times.tolist(), strict=True)
         ]
         self.viewpoints += 1
         self.now_s = float(times[-1]) + PERIOD_S
@@ -134,14 +132,6 @@ class SimulatedHeadset:
     def walk(self) -> None:
         """Advance the time by a walk to the next viewpoint."""
         self.now_s += WALK_S
-
-
-def _to_vec3(v: list[float]) -> Vec3:
-    return (v[0], v[1], v[2])
-
-
-def _to_quat(v: list[float]) -> Quat:
-    return (v[0], v[1], v[2], v[3])
 
 
 # --- benchmark --------------------------------------------------------------------------------------------------------
@@ -340,7 +330,7 @@ def _evaluate_pair(
     for name, X in points.items():
         tally.errors.setdefault(name, []).append(error(X))
         if stated:
-            at: Vec3 = (float(X[0]), float(X[1]), float(X[2]))
+            at = to_vec3(X)
             p95 = length_p95(stated[0].covariance_at(at) + stated[1].covariance_at(at))
             tally.covered.setdefault(name, []).append(error(X) <= p95)
     tally.errors.setdefault("hull", []).append(max(error(X) for X in hull))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anchors.alignment import AlignmentEstimate
-from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix
+from anchors.lie import quat_exp, quat_multiply, quat_to_matrix, to_quat, to_vec3
 from anchors.persistent import (
     PersistentConfig,
     align_persistent,
@@ -16,7 +16,7 @@ from anchors.persistent import (
     covariance_at_anchor,
     inflate_covariance,
 )
-from anchors.pose import PoseTuple, Quat, Vec3, apply, compose, distance, inverse, quat_from_rotvec, quat_from_yaw
+from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_from_rotvec, quat_from_yaw
 from anchors.sheet import compute_marks
 from anchors.touch import Touch
 from anchors.uncertainty import isotropic_covariance, length_p95
@@ -34,26 +34,16 @@ def _turn_p95(estimate: AlignmentEstimate) -> float:
     return length_p95(np.reshape(estimate.covariance, (6, 6))[3:, 3:])
 
 
-def _to_vec3(p: Array) -> Vec3:
-    x, y, z = p.tolist()
-    return (x, y, z)
-
-
-def _to_quat(q: Array) -> Quat:
-    w, x, y, z = q.tolist()
-    return (w, x, y, z)
-
-
 def _found_again(rng: np.random.Generator, T_world_tracking: PoseTuple) -> PoseTuple:
     """Return where a device sees the anchor, wrong as the inflated covariance says."""
     p, q = compose(inverse(T_world_tracking), T_WORLD_ANCHOR)
     d = rng.multivariate_normal(np.zeros(6), inflate_covariance(EARLIER))
-    return _to_vec3(np.array(p) + d[:3]), _to_quat(quat_multiply(quat_exp(d[3:]), np.array(q)))
+    return to_vec3(np.array(p) + d[:3]), to_quat(quat_multiply(quat_exp(d[3:]), np.array(q)))
 
 
 def _touch(name: str, rng: np.random.Generator | None = None, T: PoseTuple = T_WORLD_TRACKING) -> Touch:
     p = np.array(apply(inverse(T), MARKS[name]))
-    return Touch(name, _to_vec3(p if rng is None else p + rng.normal(0.0, SIGMA_M, 3)), SIGMA_M)
+    return Touch(name, to_vec3(p if rng is None else p + rng.normal(0.0, SIGMA_M, 3)), SIGMA_M)
 
 
 def test_exact_place_gives_the_exact_alignment() -> None:
@@ -104,12 +94,12 @@ def test_covariance_is_stored_in_the_axes_of_the_anchor(yaw: float) -> None:
         turn = quat_exp(d[3:])
         p = np.array(T_WORLD_ANCHOR[0])
         place = np.array(pivot) + quat_to_matrix(turn) @ (p - np.array(pivot)) + d[:3]
-        found = (_to_vec3(place), _to_quat(quat_multiply(turn, np.array(T_WORLD_ANCHOR[1]))))
+        found = (to_vec3(place), to_quat(quat_multiply(turn, np.array(T_WORLD_ANCHOR[1]))))
         seen = compose(inverse(T_WORLD_TRACKING), found)
         kept = align_persistent(anchor, seen, stored, 0, config)
         assert kept is not None
         at = np.array(apply(T_tracking_now, marks["1"])) + rng.normal(0.0, SIGMA_M, 3)
-        got = confirm_alignment(kept, marks, [Touch("1", _to_vec3(at), SIGMA_M)])
+        got = confirm_alignment(kept, marks, [Touch("1", to_vec3(at), SIGMA_M)])
         refused += got.refused
         off = [distance(apply(one.T_world_tracking, apply(T_tracking_now, far)), far) for one in (kept, got)]
         inside += off[0] <= kept.error_at(far)

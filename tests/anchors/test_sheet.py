@@ -64,11 +64,6 @@ def test_largest_sheet_fits_and_a_larger_one_is_refused(paper: str) -> None:
         to_svg(Sheet("table", (largest + 1) / 1000.0), paper)
 
 
-def test_unknown_paper_is_refused() -> None:
-    with pytest.raises(SheetError, match="'a9': a5, a4"):
-        to_pdf(TABLE, "a9")
-
-
 def test_pdf_has_the_exact_size() -> None:
     """Edges of the black area of the rasterised page are within a twentieth of a millimetre of the layout."""
     page = _raster(to_pdf(TABLE))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, to_vec3
 from anchors.pose import PoseTuple, Vec3, apply, compose, inverse
 from anchors.uncertainty import NoiseModel
 
@@ -33,7 +33,7 @@ class Viewpoint:
         error = self.common + self._draw(self._each)
         p, q = T_world_anchor or self.T_world_anchor
         turned = quat_multiply(quat_exp(error[3:]), np.array(q)).tolist()
-        seen: PoseTuple = (_vec3(np.array(p) + error[:3]), (turned[0], turned[1], turned[2], turned[3]))
+        seen: PoseTuple = (to_vec3(np.array(p) + error[:3]), (turned[0], turned[1], turned[2], turned[3]))
         return compose(inverse(T_world_tracking), seen)
 
     def head_pose(self, T_world_tracking: PoseTuple) -> Vec3:
@@ -46,14 +46,16 @@ class Viewpoint:
 def viewpoint_around(rng: np.random.Generator, p: Vec3, d: float) -> Vec3:
     """Return a pose about `d` metres from a point, 40 to 80 degrees up."""
     up, way = math.radians(rng.uniform(40.0, 80.0)), rng.uniform(-math.pi, math.pi)
-    return _vec3(np.array(p) + d * np.array([math.cos(up) * math.cos(way), math.cos(up) * math.sin(way), math.sin(up)]))
+    return to_vec3(
+        np.array(p) + d * np.array([math.cos(up) * math.cos(way), math.cos(up) * math.sin(way), math.sin(up)])
+    )
 
 
 def tracking_frame(rng: np.random.Generator, tilt_deg: float = 0.2) -> PoseTuple:
     """Return a random, nearly level `T_world_tracking`."""
     tilt = quat_exp(np.append(rng.normal(0.0, math.radians(tilt_deg), 2), 0.0))
     q = quat_multiply(tilt, quat_exp(np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)]))).tolist()
-    return _vec3(rng.uniform(-2.0, 2.0, 3)), (q[0], q[1], q[2], q[3])
+    return to_vec3(rng.uniform(-2.0, 2.0, 3)), (q[0], q[1], q[2], q[3])
 
 
 def shifted(T: PoseTuple, by: Vec3) -> PoseTuple:
@@ -63,7 +65,3 @@ def shifted(T: PoseTuple, by: Vec3) -> PoseTuple:
 
 def axis(q: tuple[float, ...], i: int) -> Array:
     return np.asarray(quat_to_matrix(np.array(q))[:, i])
-
-
-def _vec3(v: Array) -> Vec3:
-    return (float(v[0]), float(v[1]), float(v[2]))
