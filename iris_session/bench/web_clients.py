@@ -89,9 +89,14 @@ class BenchBrowser:
             elif isinstance(told := wire.decode_gateway_message(frames[0]), wire.Ticket):
                 self._ticket = told.ticket
 
-    async def load(self, http: aiohttp.ClientSession, at_s: float) -> None:
-        """Fetch assets from a time of the window on. Notes when, and how much came so far."""
-        await asyncio.sleep((self.begin_ns - self._job.session_time_ns()) * 1e-9 + at_s)
+    async def load_at_times(self, http: aiohttp.ClientSession) -> None:
+        """Fetch assets at each of its times in the window, one after the other."""
+        for at_s in self.spec.loads_s:
+            await asyncio.sleep((self.begin_ns - self._job.session_time_ns()) * 1e-9 + at_s)
+            await self._load(http)
+
+    async def _load(self, http: aiohttp.ClientSession) -> None:
+        """Fetch the largest asset until `LOAD_BYTES` have come. Notes when, and how much came so far."""
         begin_ns = self._job.session_time_ns()
         row = len(self.loads)
         self.loads.append((begin_ns, begin_ns, 0))
@@ -180,7 +185,7 @@ class Browsers(Plugin):
         """Run through a window of session time [ns], and write the log."""
         for browser in self._browsers:
             browser.begin_ns, browser.end_ns = begin_ns, end_ns
-            self._loads += [self._loop.create_task(browser.load(self._http, at_s)) for at_s in browser.spec.loads_s]
+            self._loads.append(self._loop.create_task(browser.load_at_times(self._http)))
         self._loop.run_until_complete(self._run((end_ns - self.job.session_time_ns()) * 1e-9))
         self.job.write_log({browser.spec.name: browser.to_columns() for browser in self._browsers})
 
