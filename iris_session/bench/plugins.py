@@ -12,6 +12,7 @@ import importlib
 import json
 import select
 import sys
+import time
 from typing import Any, ClassVar, Final
 
 import msgspec
@@ -36,7 +37,7 @@ class Plugin:
 
     def poll(self) -> None:
         """Do what is due between calls; takes `POLL_S` at most."""
-        select.select([sys.stdin], [], [], POLL_S)
+        time.sleep(POLL_S)
 
     def close(self) -> None:
         """Release what the plug-in holds; the session may have ended first."""
@@ -92,13 +93,15 @@ def run_plugin(name: str) -> None:
     """Make a plug-in of the job on standard input, and answer calls until standard input ends."""
     module, _, kind = name.partition(":")
     plugin_type: type[Plugin] = getattr(importlib.import_module(module), kind)
-    # Without a buffer, so that `select` sees a line that has come.
+    # Without a buffer, so that `poll` sees a line that has come.
     with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as calls, open(take_stdout(), "wb", 0) as answers:
         plugin = plugin_type(msgspec.json.decode(calls.readline(), type=plugin_type.job_type))
         try:
             answers.write(b"null\n")
+            ready = select.poll()
+            ready.register(calls, select.POLLIN)
             while True:
-                while not select.select([calls], [], [], 0.0)[0]:
+                while not ready.poll(0):
                     plugin.poll()
                 line = calls.readline()
                 if not line:
