@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from anchors.camera import CameraModel
 from iris_session.bench.cloud_room import WORKSPACE, RoomPicture, make_room_camera, make_room_pose, render_room
-from iris_session.bench.cloud_source import MediaPublisher
+from iris_session.bench.cloud_source import STREAM, MediaPublisher
 from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceFrame
 from iris_session.cloud.pipeline import Cloud, CloudPipeline, PlacedFrame
