@@ -70,7 +70,7 @@ def make_stages() -> tuple[Stage, ...]:
         Stage("format", (str(BIN / "ruff"), "format", "--check", ".")),
         Stage("types", (str(BIN / "mypy"),)),
         make_pytest(
-            "core, covered",
+            "core",
             "not e2e and not long",
             *("-p", "no:xdist", *covered, "--cov-report=term:skip-covered", f"--cov-fail-under={CORE_PERCENT}"),
             *core_tests,
@@ -96,7 +96,7 @@ def make_long_stages() -> tuple[Stage, ...]:
     core = ",".join(f"iris_session/{room}/*" for room in CORE)
     return (
         make_pytest(
-            "all units, covered",
+            "all units",
             "not e2e",
             *("-n", str(UNIT_JOBS), "--dist", "worksteal", "--cov", "--cov-report=", "tests"),
         ),
