@@ -9,20 +9,22 @@ import hashlib
 from collections.abc import Sequence
 from typing import Final, Protocol
 
-from iris_session.front.connection_guard import HelloRateLimiter, max_connections_per_key
+from iris_session.front.connection_guard import max_connections_per_key
 from iris_session.front.connections import FrontConnection, Peer, Route
 from iris_session.front.context import FrontContext
 from iris_session.front.key_budgets import KeyBudget
 from iris_session.link.sockets import peer_of
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
-from iris_session.protocol.limits import RateLimiter, count_events, weigh_request
+from iris_session.protocol.limits import KeyedBuckets, RateLimiter, TokenBucket, count_events, weigh_request
 from iris_session.protocol.names import AuditKind, DenialReason, RefusalCode, Role
 from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
 from iris_session.protocol.steps import Admitted
 from iris_session.security import compute_fingerprint
 
 SECRET_BYTES = 16  # 128 bits, made by the client
+#: Sources of hellos that have a token bucket of their own.
+MAX_SOURCES: Final = 256
 #: Secret of a person behind a gateway: its SHA-256 is the web identity.
 WEB_SECRET_BYTES: Final = 32
 #: SHA-256 of the public key in a gateway's certificate.
@@ -60,7 +62,11 @@ class Admission:
         self._guard = context.guard
         self._budgets = context.budgets
         self._channels = channels
-        self._hellos = HelloRateLimiter(context.config.limits)
+        limits = context.config.limits
+        #: A source is a key, an address in a session without keys, or behind a gateway a secret. Each has a few hellos
+        #: of its own, so that a new client is admitted during a flood of others; beyond them it uses shared ones.
+        self._own_hellos = KeyedBuckets(limits.hellos_per_source, limits.hello_source_burst, MAX_SOURCES)
+        self._shared_hellos = TokenBucket(limits.hellos_per_second, limits.hello_burst)
         self._rates: dict[int, RateLimiter] = {}
 
     def handle_hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> Entry | None:
@@ -128,8 +134,11 @@ class Admission:
             if not rates.allow(Hello, now_ns):
                 return False
         elif self.find_gateway(route.routing_id, peer) is not None:
-            return self._hellos.allow(compute_fingerprint(hello.secret, b"iris-secret"), now_ns)
-        return self._hellos.allow(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
+            return self._take_hello(compute_fingerprint(hello.secret, b"iris-secret"), now_ns)
+        return self._take_hello(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
+
+    def _take_hello(self, source: str, now_ns: int) -> bool:
+        return self._own_hellos.take(source, now_ns) or self._shared_hellos.take(now_ns)
 
     def _take_budget(self, key_id: str, hello: Hello, gateway: FrontConnection | None, now_ns: int) -> KeyBudget:
         """Return the budget of a key, less what a hello causes. Raises `_RefusedError` when it is used up."""

@@ -18,10 +18,9 @@ import zmq
 
 from iris_session.assets.chunk_scheduler import ADVICE, ChunkReader, ChunkScheduler
 from iris_session.assets.store import ServedAssets
-from iris_session.front.channel_guard import ChannelGuard
-from iris_session.front.memory_guard import PendingConnection
 from iris_session.link.config import MILLISECOND, FrontConfig
 from iris_session.link.sockets import open_assets, readable, watch_tcp
+from iris_session.link.tcp_guard import PendingConnection, TcpGuard
 from iris_session.protocol.assets import AssetChunk, AssetRefused
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
@@ -43,8 +42,6 @@ FAULT_S: Final = 0.25
 #: As plain integers: operations on the enumerations take longer than the calls that use them.
 _DONTWAIT: Final = int(zmq.DONTWAIT)
 _MORE: Final = int(zmq.DONTWAIT | zmq.SNDMORE)
-#: Unread bytes of one reader at most: far more than all its requests.
-REQUEST_BYTES: Final = 65_536
 
 
 #: A folder, with the addresses of the assets served from it.
@@ -107,7 +104,7 @@ class AssetServer:
         late_until_ns: Session time until which the server yields to the front's loop.
     """
 
-    def __init__(self, sockets: AssetSockets, guard: ChannelGuard, now_ns: Callable[[], int]) -> None:
+    def __init__(self, sockets: AssetSockets, guard: TcpGuard, now_ns: Callable[[], int]) -> None:
         self._sockets = sockets
         self._socket = sockets.socket
         self._guard = guard
@@ -213,8 +210,8 @@ class AssetServer:
         return ""
 
     def _read_connection_events(self) -> None:
-        for descriptor in self._guard.read_events(self._now_ns()):
-            self._scheduler.remove_descriptor(descriptor)
+        for event in self._guard.read_events(self._now_ns()):
+            self._scheduler.remove_descriptor(event.descriptor)
 
     def _count_reasons(self, reasons: Iterable[str]) -> None:
         for reason in filter(None, reasons):
@@ -244,7 +241,8 @@ class AssetServer:
                 continue
             self._read_connection_events()
             refused = self._handle_request(route, descriptor, user, frame, single=len(lengths) == 1)
-            self._count_reasons([self._guard.record_message(descriptor, user, lengths, counts=int(refused))])
+            self._guard.establish(descriptor, user)
+            self._count_reasons([self._guard.record_message(descriptor, lengths, int(refused))])
 
     def _handle_request(self, route: bytes, descriptor: int, user: str, frame: zmq.Frame, *, single: bool) -> bool:
         """Handle one message. Return whether it was refused."""

@@ -7,7 +7,7 @@ id does not get it. Limits on TCP connections are in `connection_guard`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple
 
 import msgspec
@@ -15,7 +15,7 @@ import zmq
 
 from iris_session.front.key_budgets import KeyBudget
 from iris_session.link.config import SECOND, FrontLimits
-from iris_session.link.sockets import tcp_counts
+from iris_session.link.tcp_guard import TrafficCounter
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.limits import Drops, RateLimiter, TokenBucket
@@ -28,12 +28,6 @@ _encoder = msgspec.msgpack.Encoder()
 MAX_KEPT: Final = 256
 #: A client's report that is older says nothing about the present.
 REPORT_EXPIRY_NS: Final = 3 * SECOND
-#: ZMTP 3: flags and length before a frame, the length in one byte or eight.
-_SHORT: Final = 255
-_SHORT_HEADER: Final = 2
-_LONG_HEADER: Final = 9
-#: CurveZMQ: name of the command, nonce, authenticator and flags around every frame.
-_CURVE: Final = 8 + 8 + 16 + 1
 
 
 class Route(NamedTuple):
@@ -212,46 +206,6 @@ class ConnectionTable:
 def encode_envelope_prefix(connection_epoch: int) -> bytes:
     """Encode a `ServerEnvelope` up to its message, so that one encoded message serves every connection."""
     return b"\x93" + _encoder.encode(PROTOCOL_VERSION) + _encoder.encode(connection_epoch)
-
-
-class TrafficCounter:
-    """Count the bytes that are pending in libzmq for and from each TCP connection, which libzmq does not report.
-
-    What was handed to libzmq, less what the peer has acknowledged to the system, waits to be sent. What the system has
-    received, less what was read, waits to be read. Both are off by the handshake, which does not matter when megabytes
-    are looked for. `curve`: whether the socket is encrypted.
-    """
-
-    def __init__(self, *, curve: bool = False) -> None:
-        self._overhead = _CURVE if curve else 0
-        self._sent: dict[int, int] = {}
-        self._received: dict[int, int] = {}
-
-    def reset(self, descriptor: int) -> None:
-        """Start anew for a descriptor: a TCP connection was accepted or has ended."""
-        self._sent.pop(descriptor, None)
-        self._received.pop(descriptor, None)
-
-    def count_sent(self, descriptor: int, frames: Iterable[bytes]) -> None:
-        """Count a message that was handed to libzmq for a connection."""
-        self._sent[descriptor] = self._sent.get(descriptor, 0) + sum(self._wire_length(len(one)) for one in frames)
-
-    def count_received(self, descriptor: int, length: int) -> None:
-        """Count a frame that was read from a connection."""
-        self._received[descriptor] = self._received.get(descriptor, 0) + self._wire_length(length)
-
-    def pending_bytes(self, descriptor: int) -> int:
-        """Return the bytes pending in both directions, 0 where the system does not count them."""
-        counts = tcp_counts(descriptor)
-        if counts is None:
-            return 0
-        to_send = self._sent.get(descriptor, 0) - counts.acknowledged
-        to_read = counts.received - self._received.get(descriptor, 0)
-        return max(0, to_send) + max(0, to_read)
-
-    def _wire_length(self, length: int) -> int:
-        length += self._overhead
-        return length + (_SHORT_HEADER if length <= _SHORT else _LONG_HEADER)
 
 
 class ControlSender:

@@ -19,7 +19,7 @@ from iris_session.front.asset_server import AssetSockets, open_asset_sockets
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
 from iris_session.front.connection_guard import ConnectionGuard, max_connections_per_key
-from iris_session.front.connections import ConnectionTable, ControlSender, FrontConnection, TrafficCounter
+from iris_session.front.connections import ConnectionTable, ControlSender, FrontConnection
 from iris_session.front.discovery import Listeners, choose_address_host, list_reachable_hosts, open_with_introduction
 from iris_session.front.key_budgets import KeyBudgets
 from iris_session.front.state_publisher import StatePublisher
@@ -35,6 +35,7 @@ from iris_session.link.sockets import (
     open_state,
     watch_tcp,
 )
+from iris_session.link.tcp_guard import TrafficCounter
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AuditKind
 from iris_session.security import KeysError

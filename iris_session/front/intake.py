@@ -135,7 +135,7 @@ class Intake:
             if entry is not None:
                 self._coalescer.offer(entry)
             else:
-                self._count_stranger(route, peer, now_ns)
+                self._count_unauthenticated(route, peer, now_ns)
         elif route.on_behalf_of and self._admission.find_gateway(route.routing_id, peer) is None:
             self._admission.report_forged_gateway(route, peer, now_ns)
             self._count_rejection(peer, None, now_ns)
@@ -143,7 +143,7 @@ class Intake:
         elif isinstance(message, Disconnected):
             self._handle_disconnected(route, peer, message, connection, now_ns)
         elif connection is None:
-            self._count_stranger(route, peer, now_ns)
+            self._count_unauthenticated(route, peer, now_ns)
             text = "this connection has not said hello: say hello (again)"
             self._send_fault(route, None, FaultCode.HELLO, text, now_ns)
         else:
@@ -221,11 +221,11 @@ class Intake:
             return
         kind = type(message)
         self._offer_late_epoch(connection, kind, now_ns)
-        excess = self._find_excess(connection, message, size, now_ns)
+        excess = self._check_rate(connection, message, size, now_ns)
         if excess:
             self._reject_excess(connection, envelope, excess, now_ns)
             return
-        if isinstance(message, Heartbeat) and not self._take_worn(connection, message.worn, now_ns):
+        if isinstance(message, Heartbeat) and not self._allow_worn_change(connection, message.worn, now_ns):
             message = Heartbeat(connection.worn)  # it is alive, and as worn as before
         if isinstance(message, TrackingEpoch):
             connection.late_epoch = None
@@ -268,7 +268,7 @@ class Intake:
             connection.late_epoch = None
             self._coalescer.offer(late)
 
-    def _find_excess(self, connection: FrontConnection, message: ClientMessage, size: int, now_ns: int) -> str:
+    def _check_rate(self, connection: FrontConnection, message: ClientMessage, size: int, now_ns: int) -> str:
         """Return which limit of its type or of its key a message exceeds, or an empty string."""
         kind = type(message)
         if not connection.rates.allow(kind, now_ns):
@@ -298,15 +298,15 @@ class Intake:
         self._send_fault(connection.route, connection, FaultCode.RATE, excess, now_ns)
         self._send_denial(connection, message, excess, now_ns)
 
-    def _take_worn(self, connection: FrontConnection, worn: bool, now_ns: int) -> bool:
+    def _allow_worn_change(self, connection: FrontConnection, worn: bool, now_ns: int) -> bool:
         """Return whether a headset may be worn or not as a message says. Putting it on is an event, as is taking it off
         later, which passes always."""
-        if worn and not connection.worn and not self._take_edge(connection, now_ns):
+        if worn and not connection.worn and not self._allow_clutch_edge(connection, now_ns):
             return False
         connection.worn = worn
         return True
 
-    def _take_edge(self, connection: FrontConnection, now_ns: int) -> bool:
+    def _allow_clutch_edge(self, connection: FrontConnection, now_ns: int) -> bool:
         """Take an edge that makes something happen and will be undone from the budget of the key."""
         reason = connection.budget.take_request(now_ns, 0, _EDGE_EVENTS)
         if reason:
@@ -314,15 +314,15 @@ class Intake:
             self._count_flood(connection, get_tag(Sample), now_ns)
         return not reason
 
-    def _take_edges(self, connection: FrontConnection, sample: Sample, now_ns: int) -> bool:
+    def _allow_edges(self, connection: FrontConnection, sample: Sample, now_ns: int) -> bool:
         """Return whether the events that a sample causes are within the budget of its key.
 
         It causes some when the headset is put on or the clutch closes. The opposite passes always: it stops a robot.
         """
-        if not self._take_worn(connection, sample.worn, now_ns):
+        if not self._allow_worn_change(connection, sample.worn, now_ns):
             return False
         closes = bool(sample.targets) and sample.clutch and not connection.clutches.get(sample.device, False)
-        if closes and not self._take_edge(connection, now_ns):
+        if closes and not self._allow_clutch_edge(connection, now_ns):
             return False
         if sample.device in connection.clutches or len(connection.clutches) < _MAX_DEVICES:
             # Closed without targets it drives nothing: the edge comes with them.
@@ -353,7 +353,7 @@ class Intake:
         """Offer a sample to the authority and the recorder; status and alignment get it before it is limited."""
         self._status.record_sample(connection.number, sample, now_ns)
         self._alignment.process_sample(connection, sample, now_ns)
-        if not self._take_edges(connection, sample, now_ns):
+        if not self._allow_edges(connection, sample, now_ns):
             return
         if connection.role == Role.OBSERVER:
             presence = self._presence.limit(connection, sample, now_ns)
@@ -370,7 +370,7 @@ class Intake:
         if self._guard.rate_limit(peer, connection, detail, now_ns) and connection is not None:
             self._outbox.failed.setdefault(connection.number, "flood")
 
-    def _count_stranger(self, route: Route, peer: Peer, now_ns: int) -> None:
+    def _count_unauthenticated(self, route: Route, peer: Peer, now_ns: int) -> None:
         """Count a rejected message without a connection: behind a gateway it must not use up what the gateway may send
         before hello."""
         self._count_rejection(peer, self._admission.find_gateway(route.routing_id, peer), now_ns)

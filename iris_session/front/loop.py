@@ -16,9 +16,8 @@ import zmq
 from iris_session.alignment.service import AlignmentService
 from iris_session.alignment.worker import ThreadWorker
 from iris_session.front.admission import Admission
-from iris_session.front.asset_server import REQUEST_BYTES, AssetServer
+from iris_session.front.asset_server import AssetServer
 from iris_session.front.asset_service import AssetService
-from iris_session.front.channel_guard import ChannelBounds, ChannelGuard
 from iris_session.front.connections import Peer
 from iris_session.front.context import FrontContext, FrontSockets, Service, find_channel_share, open_front
 from iris_session.front.disconnects import DisconnectHandler
@@ -38,6 +37,7 @@ from iris_session.front.uplink import Uplink
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND, FrontStart
 from iris_session.link.sockets import MEDIA_THREAD_NAME, readable
+from iris_session.link.tcp_guard import TcpBounds, TcpGuard, TrafficCounter, make_reasons
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.system.priority import lower_named_thread_priority
@@ -53,8 +53,8 @@ COLLECT_NS: Final = 10_000 * MILLISECOND
 #: Between the last message and the end of the connections: libzmq drops what a client (with `IMMEDIATE`) has not read
 #: when its connection closes.
 FAREWELL_S: Final = 0.1
-#: Unread bytes of one subscriber to media at most: far more than subscriptions to all its topics.
-SUBSCRIBER_BYTES: Final = 65_536
+#: Unread bytes of one connection for media or assets at most: far more than all its subscriptions or requests.
+READER_BYTES: Final = 65_536
 ENDED: Final = "closed by its owner"
 ORPHANED: Final = "its process is gone"
 
@@ -267,18 +267,17 @@ def _make_alignment_service(context: FrontContext) -> AlignmentService:
 
 
 def _make_media_proxy(context: FrontContext, sockets: FrontSockets) -> MediaProxy:
-    limits, curve = context.config.limits, context.keyring.key is not None
-    share = partial(find_channel_share, context.keyring, limits)
-    viewers = ChannelBounds(limits.subscribers, SUBSCRIBER_BYTES, find_share=share)
-    sources = ChannelBounds(limits.sources, limits.source_bytes, limits.source_bytes, limits.ingest_bytes, share)
+    limits = context.config.limits
+    sources = _make_bounds(context, limits.sources, limits.source_bytes)
+    sources = sources._replace(owner_bytes=limits.source_bytes, total_bytes=limits.ingest_bytes)
     return MediaProxy(
         sockets.media.socket,
-        ChannelGuard(sockets.media.monitor, limits, viewers, curve=curve),
-        ChannelGuard(sockets.ingest.monitor, limits, sources, curve=curve),
+        _make_guard(context, "media", sockets.media.monitor, _make_bounds(context, limits.subscribers)),
+        _make_guard(context, "media", sockets.ingest.monitor, sources),
         sockets.local_ingest,
         sockets.ingest.socket,
         context.now_ns,
-        encrypted=curve,
+        encrypted=context.keyring.key is not None,
         recorder=_make_media_recorder(context, sockets),
     )
 
@@ -291,8 +290,23 @@ def _make_media_recorder(context: FrontContext, sockets: FrontSockets) -> MediaR
 
 
 def _make_asset_server(context: FrontContext, sockets: FrontSockets) -> AssetServer:
-    limits, curve, monitor = context.config.limits, context.keyring.key is not None, sockets.assets.monitor
-    share = partial(find_channel_share, context.keyring, limits)
-    bounds = ChannelBounds(limits.subscribers, REQUEST_BYTES, find_share=share)
-    guard = ChannelGuard(monitor, limits, bounds, curve=curve, name="assets")
+    bounds = _make_bounds(context, context.config.limits.subscribers)
+    guard = _make_guard(context, "assets", sockets.assets.monitor, bounds)
     return AssetServer(sockets.assets, guard, context.now_ns)
+
+
+def _make_bounds(context: FrontContext, connections: int, unread_bytes: int = READER_BYTES) -> TcpBounds:
+    """Return the bounds of a channel with at most so many connections, and as many that have said nothing."""
+    limits = context.config.limits
+    return TcpBounds(
+        unauthenticated=connections,
+        established=connections,
+        find_share=partial(find_channel_share, context.keyring, limits),
+        silence_ns=limits.hello_timeout_ns,
+        unread_bytes=unread_bytes,
+    )
+
+
+def _make_guard(context: FrontContext, channel: str, monitor: zmq.Socket[bytes], bounds: TcpBounds) -> TcpGuard:
+    traffic = TrafficCounter(curve=context.keyring.key is not None)
+    return TcpGuard(bounds, make_reasons(channel), monitor, traffic=traffic)

@@ -32,7 +32,7 @@ def main() -> int:
     limits = fit_limits(start.config.limits, raise_descriptor_limit())
     if limits is not start.config.limits:
         text = "few file descriptors (ulimit -n): at most %d subscribers, and %d connections that have said nothing"
-        log.warning(text, limits.subscribers, limits.strangers)
+        log.warning(text, limits.subscribers, limits.unauthenticated)
         start = msgspec.structs.replace(start, config=msgspec.structs.replace(start.config, limits=limits))
     sys.setswitchinterval(SWITCH_S)
     try:

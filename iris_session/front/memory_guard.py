@@ -2,7 +2,7 @@
 
 Connections of all sockets are compared: the owner (a key, or an address before the key is known) with the most pending
 bytes loses its largest connection. A connection that holds little is never closed, however slow it is: that would not
-help. `connection_guard` counts the pending bytes of each socket.
+help. `TcpGuard` counts the pending bytes of each socket.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import Final, NamedTuple
+from typing import Final
 
 import psutil
 
 from iris_session.link.config import MEBIBYTE, MILLISECOND
+from iris_session.link.tcp_guard import PendingConnection
 from iris_session.protocol.limits import Drops
 
 MEMORY_PERIOD_NS: Final = 100 * MILLISECOND
@@ -29,22 +30,6 @@ MIN_EVICT_SHARE: Final = 1 / 32  # of the bytes that the front may hold
 #: Above this many bytes, freed memory is given back to the system from time to time, so that a flood leaves nothing.
 TRIM_BYTES: Final = 16 * MEBIBYTE
 TRIM_PERIOD_NS: Final = 5000 * MILLISECOND
-
-
-class PendingConnection(NamedTuple):
-    """One connection, or several that are closed together, and the bytes pending in it.
-
-    Attributes:
-        owner: Key, or address where the key is not known.
-        bytes: Pending in both directions.
-        label: Name for the status.
-        close: Closes it, or them. Returns the number of connections closed, 0 when they have ended already.
-    """
-
-    owner: str
-    bytes: int
-    label: str
-    close: Callable[[], int]
 
 
 def select_largest(connections: Iterable[PendingConnection], min_bytes: int) -> PendingConnection | None:

@@ -37,7 +37,7 @@ class FrontLimits(msgspec.Struct, frozen=True):
         resume_tokens: Resume tokens that are remembered.
         excess_per_s, excess_burst: Rate limit of rejected messages of one TCP connection, which is closed above it. An
             honest client with a fault in its loop is reported by its rate limits long before.
-        strangers: TCP connections that have not sent `hello`, and as many again to the state socket that have not
+        unauthenticated: TCP connections that have not sent `hello`, and as many again to the state socket that have not
             subscribed.
         hello_timeout_ns: Longest time in that state [ns].
         subscribers: TCP connections to the state socket that have subscribed; also connections to the media socket, and
@@ -67,7 +67,7 @@ class FrontLimits(msgspec.Struct, frozen=True):
     resume_tokens: int = 256
     excess_per_s: float = 2000.0
     excess_burst: int = 4000
-    strangers: int = 1024
+    unauthenticated: int = 1024
     hello_timeout_ns: int = 10 * SECOND
     subscribers: int = 512
     sources: int = 64

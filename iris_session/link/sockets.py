@@ -61,7 +61,7 @@ STUCK_MS: Final = 30_000
 FILE_DESCRIPTORS: Final = 8192
 #: Descriptors for everything but connections: listeners, files, assets that are being sent.
 RESERVED_DESCRIPTORS: Final = 256
-#: Channels whose connections count as strangers before they have said or subscribed anything: control, state, media,
+#: Channels whose connections are unauthenticated before they have said or subscribed anything: control, state, media,
 #: media ingest, assets.
 _CHANNELS: Final = 5
 _WITH_SUBSCRIBERS: Final = 3  # state, media, assets
@@ -276,14 +276,14 @@ def fit_limits(limits: FrontLimits, descriptors: int) -> FrontLimits:
 
     Participants keep their places; what has less room are connections that have said nothing, subscribers and sources.
     """
-    wanted = _CHANNELS * limits.strangers + _WITH_SUBSCRIBERS * limits.subscribers + limits.sources
+    wanted = _CHANNELS * limits.unauthenticated + _WITH_SUBSCRIBERS * limits.subscribers + limits.sources
     room = descriptors - RESERVED_DESCRIPTORS - limits.connections
     if wanted <= room:
         return limits
     share = max(0.0, room / wanted)
     return msgspec.structs.replace(
         limits,
-        strangers=max(8, int(share * limits.strangers)),
+        unauthenticated=max(8, int(share * limits.unauthenticated)),
         subscribers=max(8, int(share * limits.subscribers)),
         sources=max(2, int(share * limits.sources)),
     )

@@ -1,9 +1,9 @@
 """TCP connections of the gateway: accepted within limits, with TLS, and closed when they do nothing.
 
 aiohttp has no limit of connections, and none of the time in which a request must come. So connections are accepted
-here, counted per address (of IPv6, per network), and given to aiohttp behind a protocol of our own (`WatchedProtocol`),
-which notes their end. A connection is a stranger until a request of it has a ticket, or the session has welcomed its
-browser. Only few of a browser are none.
+here, limited by `TcpGuard`, and given to aiohttp behind a protocol of our own (`WatchedProtocol`), which notes their
+end. A connection counts for its network until a request of it has a ticket, or the session has welcomed its browser;
+then it counts for that.
 """
 
 from __future__ import annotations
@@ -14,18 +14,16 @@ import re
 import socket
 import ssl
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
+from iris_session.link.config import SECOND
+from iris_session.link.tcp_guard import TcpBounds, TcpConnection, TcpGuard, TcpReasons
 from iris_session.protocol.limits import Drops, KeyedBuckets, find_network
 from iris_session.web.sockets import limit_unsent
 
-#: Connections in all, and strangers among them in all and of one address; above it the oldest are evicted.
-MAX_CONNECTIONS: Final = 512
-MAX_STRANGERS: Final = 256
-MAX_STRANGERS_PER_ADDRESS: Final = 128
-#: Connections of one browser that are no strangers. It has two WebSockets, and 16 assets at once.
-MAX_TRUSTED_PER_BROWSER: Final = 24
+#: Connections of one browser that are established. It has two WebSockets, and 16 assets at once.
+MAX_PER_BROWSER: Final = 24
 #: Of one address: handshakes of TLS, which cost a millisecond each, and requests. The page has some ten files.
 HANDSHAKES_PER_S, HANDSHAKE_BURST = 20.0, 120
 REQUESTS_PER_S, REQUEST_BURST = 200.0, 1000
@@ -34,6 +32,16 @@ MAX_ADDRESSES: Final = 1024
 FIRST_BYTE_S: Final = 5.0
 HANDSHAKE_S: Final = 8.0
 IDLE_S: Final = 15.0
+#: A connection is established when a request of it has a ticket, or the session has welcomed its browser.
+BOUNDS: Final = TcpBounds(
+    unauthenticated=256,
+    unauthenticated_per_owner=128,
+    established=256,
+    silence_ns=round(IDLE_S * SECOND),
+    idle_ns=round(IDLE_S * SECOND),
+    unread_bytes=0,
+)
+REASONS: Final = TcpReasons("web", "web_connections", "web_connections", "web_idle", "", "web_connections_per_address")
 _SWEEP_S: Final = 1.0
 _BACKLOG: Final = 256
 #: Pause when the system gives no connection, for lack of descriptors for example.
@@ -42,81 +50,6 @@ _TLS_HANDSHAKE: Final = 0x16
 _MAX_PLAIN_REQUEST: Final = 2048
 _HOST_LINE: Final = re.compile(rb"\r\nhost:[ \t]*([A-Za-z0-9._:\[\]-]{1,260})[ \t]*\r\n", re.IGNORECASE)
 _PATH: Final = re.compile(rb"[A-Z]{3,7} (/[A-Za-z0-9._~!$&'()*+,;=:@%/?-]{0,500}) HTTP/1\.")
-
-
-class Connection:
-    """One TCP connection.
-
-    Attributes:
-        address: Of its peer; of IPv6 its network.
-        requests: Under way now.
-        browser: Name of the browser that it belongs to, empty for a stranger.
-    """
-
-    __slots__ = ("address", "browser", "close", "idle_since", "requests")
-
-    def __init__(self, address: str, now: float, close: Callable[[], None]) -> None:
-        self.address = find_network(address)
-        self.close = close
-        self.idle_since = now
-        self.requests = 0
-        self.browser = ""
-
-
-class ConnectionLimiter:
-    """Table of connections, and which of them are evicted for others. Pure: times [s] are arguments."""
-
-    def __init__(self, drops: Drops) -> None:
-        self._drops = drops
-        self._connections: dict[Connection, None] = {}  # the oldest first
-
-    def __len__(self) -> int:
-        return len(self._connections)
-
-    def add(self, connection: Connection) -> list[Connection]:
-        """Add a connection. Return those to close so that the limits hold, perhaps this one itself."""
-        self._connections[connection] = None
-        strangers: dict[str, list[Connection]] = {}  # by address
-        idle: dict[str, list[Connection]] = {}  # those of browsers without a request, by browser
-        for one in self._connections:
-            if not one.browser:
-                strangers.setdefault(one.address, []).append(one)
-            elif not one.requests:
-                idle.setdefault(one.browser, []).append(one)
-        evicted: list[Connection] = []
-        theirs = strangers[connection.address]
-        if len(theirs) > MAX_STRANGERS_PER_ADDRESS:
-            evicted.append(theirs[0])
-            self._drops.count("web_connections_per_address")
-        elif sum(map(len, strangers.values())) > MAX_STRANGERS:
-            evicted.append(max(strangers.values(), key=len)[0])
-            self._drops.count("web_connections")
-        elif len(self._connections) > MAX_CONNECTIONS:
-            evicted.append(max((*idle.values(), *strangers.values()), key=len)[0])
-            self._drops.count("web_connections")
-        return evicted
-
-    def trust(self, connection: Connection, browser: str) -> None:
-        """Note that a connection belongs to a browser. It stays a stranger when that has many others."""
-        if connection.browser:
-            return
-        if sum(one.browser == browser for one in self._connections) < MAX_TRUSTED_PER_BROWSER:
-            connection.browser = browser
-
-    def remove(self, connection: Connection) -> None:
-        """Remove a connection that is closed."""
-        self._connections.pop(connection, None)
-
-    def select_idle(self, now: float) -> list[Connection]:
-        """Return the connections without a request for too long: they sent none, or only part of one."""
-        idle = [one for one in self._connections if not one.requests and now - one.idle_since > IDLE_S]
-        if idle:
-            self._drops.count("web_idle", n=len(idle))
-        return idle
-
-    def list_all(self) -> list[Connection]:
-        """Return all connections."""
-        return list(self._connections)
 
 
 class WatchedProtocol(asyncio.Protocol):
@@ -166,15 +99,15 @@ class Listener:
         self._make_protocol = make_protocol
         self._tls = tls
         self._drops = drops
-        self._limiter = ConnectionLimiter(drops)
+        self._guard = TcpGuard(BOUNDS, REASONS, close=self._close_connection)
+        self._closers: dict[TcpConnection, Callable[[], object]] = {}
         self._handshakes = KeyedBuckets(HANDSHAKES_PER_S, HANDSHAKE_BURST, MAX_ADDRESSES)
         self._requests = KeyedBuckets(REQUESTS_PER_S, REQUEST_BURST, MAX_ADDRESSES)
-        self._by_peer: dict[tuple[str, int], Connection] = {}
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
 
     def __len__(self) -> int:
-        return len(self._limiter)
+        return len(self._guard)
 
     def listen(self, sockets: Sequence[socket.socket]) -> None:
         """Start to accept connections on listening sockets."""
@@ -183,13 +116,18 @@ class Listener:
             self._start(self._accept(one))
         self._start(self._sweep())
 
-    def find(self, peer: object) -> Connection | None:
-        """Return the connection of a peer, as `peername` of its transport is."""
-        return self._by_peer.get(peer[:2]) if isinstance(peer, tuple) else None
+    def find(self, transport: asyncio.BaseTransport | None) -> TcpConnection | None:
+        """Return the connection of a transport, `None` when it is closed."""
+        sock = None if transport is None else transport.get_extra_info("socket")
+        return None if sock is None else self._guard.find(sock.fileno())
 
-    def trust(self, connection: Connection, browser: str) -> None:
-        """Note that a connection belongs to a browser, by the name of that."""
-        self._limiter.trust(connection, browser)
+    def establish(self, transport: asyncio.BaseTransport | None, browser: str) -> None:
+        """Note that a connection belongs to a browser, by the name of that, unless it has many others."""
+        connection = self.find(transport)
+        if connection is None or connection.is_established:
+            return
+        if sum(one.owner == browser for one in self._guard.table.values()) < MAX_PER_BROWSER:
+            connection.is_established, connection.owner = True, browser
 
     def allow_handshake(self, address: str) -> bool:
         """Return whether an address may make one more handshake of TLS now."""
@@ -198,9 +136,9 @@ class Listener:
         self._drops.count("web_handshake_rate")
         return False
 
-    def allow_request(self, connection: Connection) -> bool:
-        """Return whether the address of a connection may make one more request now."""
-        if self._requests.take(connection.address, time.monotonic_ns()):
+    def allow_request(self, address: str) -> bool:
+        """Return whether an address may make one more request now."""
+        if self._requests.take(find_network(address), time.monotonic_ns()):
             return True
         self._drops.count("web_request_rate")
         return False
@@ -210,8 +148,8 @@ class Listener:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        for connection in self._limiter.list_all():
-            connection.close()
+        for close in list(self._closers.values()):
+            close()
 
     def _start(self, work: object) -> None:
         task: asyncio.Task[None] = self._loop.create_task(work)  # type: ignore[arg-type]
@@ -229,24 +167,33 @@ class Listener:
             if self._tls is not None and not self.allow_handshake(str(peer[0])):
                 sock.close()
                 continue
-            self._start(self._serve(sock, (str(peer[0]), int(peer[1]))))
+            self._start(self._serve(sock))
 
     async def _sweep(self) -> None:
         while True:
             await asyncio.sleep(_SWEEP_S)
-            for connection in self._limiter.select_idle(self._loop.time()):
-                connection.close()
+            self._count(self._guard.tick(time.monotonic_ns()))
 
-    async def _serve(self, sock: socket.socket, peer: tuple[str, int]) -> None:
+    def _count(self, reasons: Iterable[str]) -> None:
+        for reason in reasons:
+            self._drops.count(reason)
+
+    def _close_connection(self, descriptor: int, peer: tuple[str, int], *, discard: bool = False) -> bool:
+        connection = self._guard.find(descriptor)
+        if connection is not None:
+            self._closers.pop(connection)()
+        return True
+
+    async def _serve(self, sock: socket.socket) -> None:
         """Make a connection of an accepted socket: count it, sniff TLS, shake hands."""
         task = asyncio.current_task()
         assert task is not None
-        connection = Connection(peer[0], self._loop.time(), lambda: _cancel(task))
-        self._by_peer[peer] = connection
+        descriptor = sock.fileno()
+        connection = self._guard.add(descriptor, time.monotonic_ns())
+        self._closers[connection] = task.cancel
         is_passed_on = False
         try:
-            for evicted in self._limiter.add(connection):
-                evicted.close()
+            self._count(self._guard.evict_excess())
             sock.setblocking(False)
             limit_unsent(sock)
             if self._tls is not None and not await self._begins_with_tls(sock):
@@ -254,10 +201,10 @@ class Listener:
                 return
 
             def on_made(transport: asyncio.Transport) -> None:
-                connection.close = transport.abort
-                connection.idle_since = self._loop.time()
+                self._closers[connection] = transport.abort
+                connection.quiet_ns = time.monotonic_ns()
 
-            protocol = WatchedProtocol(self._make_protocol(), on_made, lambda: self._remove(connection, peer))
+            protocol = WatchedProtocol(self._make_protocol(), on_made, lambda: self._remove(descriptor, connection))
             is_passed_on = True
             try:
                 await self._loop.connect_accepted_socket(
@@ -270,14 +217,14 @@ class Listener:
             self._drops.count("web_handshake")
         finally:
             if not is_passed_on:
-                self._remove(connection, peer)
+                self._remove(descriptor, connection)
                 with contextlib.suppress(OSError):
                     sock.close()
 
-    def _remove(self, connection: Connection, peer: tuple[str, int]) -> None:
-        self._limiter.remove(connection)
-        if self._by_peer.get(peer) is connection:
-            del self._by_peer[peer]
+    def _remove(self, descriptor: int, connection: TcpConnection) -> None:
+        self._closers.pop(connection, None)
+        if self._guard.find(descriptor) is connection:  # else it was evicted
+            self._guard.remove(descriptor)
 
     async def _begins_with_tls(self, sock: socket.socket) -> bool:
         """Return whether the first byte begins a handshake of TLS. Raises `TimeoutError` when none comes."""
@@ -318,10 +265,6 @@ class Listener:
             else:
                 answer = b"HTTP/1.1 400 Bad Request\r\n"
             await self._loop.sock_sendall(sock, answer + b"Content-Length: 0\r\nConnection: close\r\n\r\n")
-
-
-def _cancel(task: asyncio.Task[None]) -> None:
-    task.cancel()
 
 
 def open_listening_sockets(hosts: Sequence[str], port: int) -> list[socket.socket]:

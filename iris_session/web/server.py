@@ -23,7 +23,7 @@ from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.limits import Drops, TokenBucket
 from iris_session.web.assets import TOO_MANY, AssetUnavailableError, ByteRate, GatewayAssets
 from iris_session.web.hub import NAME_BYTES, Browser, Closing, Hub
-from iris_session.web.listener import Connection, Listener
+from iris_session.web.listener import Listener
 from iris_session.web.page import HostCheck, PageFiles, make_security_headers
 from iris_session.web.sockets import count_acknowledged, count_unacknowledged
 from iris_session.web.wire import (
@@ -268,23 +268,18 @@ class WebServer:
 
     # --- every request ------------------------------------------------------------------------------------------------
 
-    def _find_connection(self, request: web.Request) -> Connection | None:
-        transport = request.transport
-        if transport is None or self._listener is None:
-            return None
-        return self._listener.find(transport.get_extra_info("peername"))
-
-    def _trust(self, connection: Connection | None, browser: Browser) -> None:
-        if connection is not None and self._listener is not None:
-            self._listener.trust(connection, browser.name)
+    def _establish(self, request: web.Request, browser: Browser) -> None:
+        if self._listener is not None:
+            self._listener.establish(request.transport, browser.name)
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Check where a request comes from, and turn every error into an answer."""
-        connection = self._find_connection(request)
+        connection = None if self._listener is None else self._listener.find(request.transport)
         if connection is not None:
-            if self._listener is not None and not self._listener.allow_request(connection):
-                connection.close()
+            if self._listener is not None and not self._listener.allow_request(connection.address[0]):
+                if request.transport is not None:
+                    request.transport.abort()
                 raise ConnectionResetError
             connection.requests += 1
         try:
@@ -292,7 +287,7 @@ class WebServer:
         finally:
             if connection is not None:
                 connection.requests -= 1
-                connection.idle_since = asyncio.get_running_loop().time()
+                connection.quiet_ns = time.monotonic_ns()
 
     async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         host = self._hosts.find_host(request.headers.get("Host"))
@@ -360,7 +355,7 @@ class WebServer:
         if n >= ASSETS_PER_BROWSER or sum(self._loads.values()) >= ASSETS_IN_ALL:
             self._drops.count("web_assets_at_once")
             raise web.HTTPTooManyRequests(reason="too many assets at once")
-        self._trust(self._find_connection(request), browser)
+        self._establish(request, browser)
         self._loads[browser.name] = n + 1
         try:
             return await self._send_asset(request, address, browser)
@@ -438,7 +433,7 @@ class WebServer:
             return socket
         browser.wake = writer.wake
         self._session.watch_state()
-        writing = asyncio.create_task(self._write_session(browser, writer, self._find_connection(request)))
+        writing = asyncio.create_task(self._write_session(browser, writer, request))
         try:
             await self._read_session(browser, socket)
         finally:
@@ -464,13 +459,13 @@ class WebServer:
         if kind == WSMsgType.ERROR or socket.close_code in (WSCloseCode.MESSAGE_TOO_BIG, WSCloseCode.PROTOCOL_ERROR):
             self._drops.count("web_malformed")
 
-    async def _write_session(self, browser: Browser, writer: SocketWriter, connection: Connection | None) -> None:
+    async def _write_session(self, browser: Browser, writer: SocketWriter, request: web.Request) -> None:
         """Write control messages in order, and in between the newest state while there is room."""
         hub = self._hub
         while browser.closing is None:
             await writer.wait()
             if browser.is_admitted:
-                self._trust(connection, browser)
+                self._establish(request, browser)
             while browser.closing is None:
                 message = hub.take_message(browser)
                 if message is None and browser.latest and writer.has_room(STATE_WINDOW):
@@ -511,7 +506,7 @@ class WebServer:
         if browser is None:
             await writer.close(Closing(CLOSE_NOT_ALLOWED, "the first message must be a valid ticket"))
             return socket
-        self._trust(self._find_connection(request), browser)
+        self._establish(request, browser)
         before, self._media[browser.name] = self._media.get(browser.name), writer
         if before is not None:
             await before.close(Closing(CLOSE_LIMIT, "another media socket of this participant was opened"))

@@ -5,14 +5,16 @@ from __future__ import annotations
 import socket
 
 from iris_session.front.audit import AuditTrail
-from iris_session.front.connection_guard import CHECK_PERIOD_NS, ConnectionGuard
-from iris_session.front.connections import ConnectionTable, FrontConnection, Peer, Route, TrafficCounter
+from iris_session.front.connection_guard import ConnectionGuard
+from iris_session.front.connections import ConnectionTable, FrontConnection, Peer, Route
 from iris_session.link.config import SECOND, FrontLimits
+from iris_session.link.tcp_guard import TcpBounds, TrafficCounter
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Audit, Entry
 from iris_session.protocol.limits import Drops
 
-LIMITS = FrontLimits(strangers=3, hello_timeout_ns=10 * SECOND)
+CHECK_PERIOD_NS = TcpBounds().check_period_ns
+LIMITS = FrontLimits(unauthenticated=3, hello_timeout_ns=10 * SECOND)
 
 
 class ControlSocketRig:

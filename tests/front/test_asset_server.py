@@ -17,9 +17,9 @@ import zmq
 
 from iris_session.assets.store import ServedAssets
 from iris_session.front.asset_server import AssetAccess, AssetServer, AssetSockets, open_asset_sockets
-from iris_session.front.channel_guard import ChannelBounds, ChannelGuard
 from iris_session.link import FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port
+from iris_session.link.tcp_guard import TcpBounds, TcpGuard, make_reasons
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, MAX_ASSET_REQUESTS, AssetRequest
 from iris_session.protocol.client_messages import Heartbeat
 from iris_session.protocol.codec import encode_asset_request
@@ -275,7 +275,7 @@ def test_only_the_key_of_the_connection_fetches_until_it_is_revoked(lab: Lab, tm
 def alone(tmp_path: Path) -> Iterator[tuple[AssetServer, AssetSockets, str]]:
     """The server thread without a front; it serves one asset to connection 1."""
     sockets = open_asset_sockets(FrontConfig(), None)
-    guard = ChannelGuard(sockets.monitor, FrontLimits(), ChannelBounds(8, 65_536), curve=False, name="assets")
+    guard = TcpGuard(TcpBounds(), make_reasons("assets"), sockets.monitor)
     server = AssetServer(sockets, guard, time.monotonic_ns)
     address = put(tmp_path, b"asset")
     server.set_access(AssetAccess({1: ""}, frozenset(), ((str(tmp_path), (address,)),)))

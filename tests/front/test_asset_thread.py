@@ -9,9 +9,9 @@ import pytest
 import zmq
 
 from iris_session.front.asset_server import CHUNKS, YIELD_MS, AssetAccess, AssetServer, open_asset_sockets
-from iris_session.front.channel_guard import MAX_COUNTED_MESSAGES, ChannelBounds, ChannelGuard
-from iris_session.link import FrontConfig, FrontLimits
+from iris_session.link import FrontConfig
 from iris_session.link.sockets import bound_port
+from iris_session.link.tcp_guard import TcpBounds, TcpGuard, make_reasons
 from iris_session.protocol.assets import AssetRequest
 from iris_session.protocol.codec import encode_asset_request
 from iris_session.protocol.names import AssetRefusal
@@ -23,7 +23,7 @@ class Still:
 
     def __init__(self, root: Path) -> None:
         self.sockets = open_asset_sockets(FrontConfig(), None)
-        guard = ChannelGuard(self.sockets.monitor, FrontLimits(), ChannelBounds(8, 65_536), curve=False, name="assets")
+        guard = TcpGuard(TcpBounds(), make_reasons("assets"), self.sockets.monitor)
         self.now_ns = 1
         self.server = AssetServer(self.sockets, guard, lambda: self.now_ns)
         self.address = put(root, b"asset")
@@ -75,7 +75,7 @@ def test_late_loop_sends_one_chunk_per_interval(still: Still) -> None:
 
 
 def test_only_refused_requests_count_as_a_flood(still: Still) -> None:
-    for n in range(1, MAX_COUNTED_MESSAGES + 10):
+    for n in range(1, TcpBounds().counted_messages + 10):
         still.now_ns += 10_000_000  # slower than any rate
         still.take(1)
         still.server._send_chunks()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import resource
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -11,30 +9,21 @@ from collections.abc import Callable, Iterator
 import pytest
 import zmq
 
-from iris_session.front import connection_guard
 from iris_session.front.connection_guard import (
     BEFORE_HELLO,
-    CHECK_PERIOD_NS,
-    EARLY_BURST,
-    FLOOD_CONNECTIONS_PER_S,
-    MAX_SOURCES,
-    MAX_TOPIC_BYTES,
-    MAX_TOPICS,
-    MAX_WARNINGS,
-    HelloRateLimiter,
-    SubscriberGuard,
-    TcpConnection,
+    FloodPolicy,
+    StateGuard,
+    StatePolicy,
     max_connections_per_key,
-    select_evictions,
-    select_share_evictions,
 )
 from iris_session.front.connections import FrontConnection, Route
 from iris_session.link.config import SECOND, FrontConfig, FrontLimits
-from iris_session.link.sockets import bound_port, close_tcp, open_state, peer_of, tcp_counts, watch_tcp
+from iris_session.link.sockets import bound_port, open_state, watch_tcp
+from iris_session.link.tcp_guard import TcpBounds
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.limits import Drops
-from tests.front.control_rig import LIMITS, ControlSocketRig, is_closed
+from tests.front.control_rig import CHECK_PERIOD_NS, LIMITS, ControlSocketRig, is_closed
 
 
 @pytest.fixture
@@ -152,7 +141,7 @@ def test_slow_excess_is_never_cut_off(rig: ControlSocketRig) -> None:
 
 def test_many_connections_within_a_second_are_reported(rig: ControlSocketRig) -> None:
     peer, _ = rig.open()
-    for _ in range(FLOOD_CONNECTIONS_PER_S):
+    for _ in range(FloodPolicy().connections_per_s):
         rig.guard.add(peer.descriptor, rig.now_ns)
     assert [audit.detail for audit in rig.audits] == ["connections"]
     rig.now_ns += 2 * SECOND
@@ -163,80 +152,18 @@ def test_many_connections_within_a_second_are_reported(rig: ControlSocketRig) ->
 def test_memory_of_floods_is_bounded(rig: ControlSocketRig) -> None:
     for i in range(1000):
         rig.guard.report_flood(f"10.0.{i // 250}.{i % 250}", "sample", rig.now_ns)
-    assert len(rig.guard.list_warnings(rig.now_ns)) == MAX_WARNINGS
+    assert len(rig.guard.list_warnings(rig.now_ns)) == FloodPolicy().max_warnings
     rig.guard.report_flood("10.0.0.9", "x" * 600, rig.now_ns)
     assert max(map(len, rig.guard.list_warnings(rig.now_ns))) == MAX_TEXT
     rig.guard.report_flood("", "memory: closed Ann", rig.now_ns, warning="memory ran short: closed Ann")
     assert rig.guard.list_warnings(rig.now_ns)[-1].endswith("closed Ann")
 
 
-def test_a_close_that_fails_is_tried_again(rig: ControlSocketRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, theirs = rig.open()
-    with monkeypatch.context() as patch:
-        patch.setattr(connection_guard, "close_tcp", lambda *_, **__: False)
-        rig.look(11 * SECOND)
-    assert not is_closed(theirs)
-    rig.look()
-    assert is_closed(theirs)
-    assert rig.drops.by_reason == {"close_failed": 1, "no_hello": 1}
-
-
-def test_close_needs_no_new_descriptor(rig: ControlSocketRig) -> None:
-    peer, theirs = rig.open()
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
-    try:
-        with pytest.raises(OSError, match="Too many open files"):
-            os.dup(0)
-        assert peer_of(peer.descriptor) == theirs.getsockname()
-        assert tcp_counts(peer.descriptor) is not None
-        assert close_tcp(peer.descriptor, theirs.getsockname())
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    assert is_closed(theirs)
-
-
-@pytest.mark.parametrize("discard", [False, True])
-def test_close_discards_what_is_unread(discard: bool) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        theirs = socket.create_connection(server.getsockname())
-        ours, address = server.accept()
-        with theirs, ours:
-            theirs.sendall(bytes(1000))
-            ours.recv(1, socket.MSG_PEEK)  # it has come
-            assert close_tcp(ours.fileno(), address, discard=discard)
-            assert len(ours.recv(2000)) == (0 if discard else 1000)
-            assert is_closed(theirs)
-
-
-def test_descriptors_that_are_not_tcp_stay_open() -> None:
-    read, write = os.pipe()
-    for descriptor in (read, 10_000):
-        assert peer_of(descriptor) == ("", 0)
-        assert tcp_counts(descriptor) is None
-        assert not close_tcp(descriptor, ("", 0))
-    os.write(write, b"x")
-    assert os.read(read, 1) == b"x"
-    os.close(read)
-    os.close(write)
-
-
-def test_evictions_follow_the_given_order() -> None:
-    def visitor(who: str) -> TcpConnection:
-        one = TcpConnection(("", 0), 0)
-        one.owner = who
-        return one
-
-    door = list(enumerate(map(visitor, "baaabcab")))
-    assert select_evictions(door, 8) == select_evictions(door, 100) == []
-    assert select_evictions(door, 7) == [1]
-    assert select_evictions(door, 3) == [1, 0, 2, 3, 4]
-    assert sorted(select_evictions(door, 0)) == list(range(8))
-
-
 # --- subscribers of the state socket --------------------------------------------------------------------------------
 
-STATE_LIMITS = FrontLimits(strangers=4, subscribers=3, hello_timeout_ns=1000 * SECOND)
+#: Topics that do not exist and may be subscribed to.
+MAX_UNKNOWN = TcpBounds().counted_messages // StatePolicy().unknown_topic_weight
+STATE_LIMITS = FrontLimits(unauthenticated=4, subscribers=3, hello_timeout_ns=1000 * SECOND)
 
 
 class StateSocketRig:
@@ -247,10 +174,10 @@ class StateSocketRig:
         self.drops = Drops()
         self.floods: list[str] = []
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self.subscribers = SubscriberGuard(
+        self.subscribers = StateGuard(
             self.drops,
             STATE_LIMITS,
-            lambda address, what, now_ns, key: self.floods.append(what),
+            lambda address, key, now_ns: self.floods.append(address),
             lambda address, now_ns: None,
         )
         self.tcp: list[socket.socket] = []
@@ -325,7 +252,7 @@ def test_silent_connections_do_not_block_subscribers(state_rig: StateSocketRig) 
 
 def test_silent_connections_of_the_address_with_most_are_evicted(state_rig: StateSocketRig) -> None:
     newcomer = state_rig.bare("127.0.0.2")
-    hog = [state_rig.bare() for _ in range(STATE_LIMITS.strangers + 1)]
+    hog = [state_rig.bare() for _ in range(STATE_LIMITS.unauthenticated + 1)]
     state_rig.turns(lambda: state_rig.drops.by_reason.get("strangers_too_many") == 2, "room")
     state_rig.turns(lambda: ended(hog[0]) and ended(hog[1]), "an end of the oldest of them")
     assert not any(map(ended, (newcomer, *hog[2:])))
@@ -367,7 +294,7 @@ def test_subscriber_that_floods_is_cut_off(state_rig: StateSocketRig) -> None:
         return "flood_cut" in state_rig.drops.by_reason
 
     state_rig.turns(cut, "end of the flood")
-    assert state_rig.floods == ["subscriptions"]
+    assert state_rig.floods == ["127.0.0.1"]
     assert state_rig.drops.by_reason["flood_cut"] == 1
     quiet.recv_multipart()
     state_rig.turns(lambda: state_rig.gets_state(quiet), "state")
@@ -378,7 +305,7 @@ def test_connections_of_a_closed_state_socket_are_not_counted(state_rig: StateSo
         ann = state_rig.subscriber()
         state_rig.bare()
         state_rig.turns(lambda ann=ann: state_rig.gets_state(ann) and len(state_rig.subscribers) == 2, "both")  # type: ignore[misc]
-        before = state_rig.subscribers._monitor
+        before = state_rig.subscribers._tcp._monitor
         assert before is not None
         state_rig.state.close(linger=0)
         state_rig.turns(lambda: len(state_rig.subscribers) == 0, "nobody")
@@ -386,37 +313,6 @@ def test_connections_of_a_closed_state_socket_are_not_counted(state_rig: StateSo
         state_rig.open()
         assert before.closed
         assert state_rig.opened == opened + 2
-
-
-# --- hellos ---------------------------------------------------------------------------------------------------------
-
-HELLO_LIMITS = FrontLimits(hellos_per_second=10.0, hello_burst=20, hellos_per_source=1.0, hello_source_burst=4)
-
-
-def taken(shares: HelloRateLimiter, source: str, now_ns: int, n: int = 1000) -> int:
-    return sum(shares.allow(source, now_ns) for _ in range(n))
-
-
-def test_new_source_is_admitted_during_a_flood_of_another() -> None:
-    shares = HelloRateLimiter(HELLO_LIMITS)
-    assert taken(shares, "flood", SECOND) == 24
-    assert taken(shares, "ann", SECOND) == 4
-    assert taken(shares, "bob", SECOND, 2) == 2
-    assert taken(shares, "flood", 2 * SECOND) == 11
-    assert taken(shares, "ann", 2 * SECOND) == 1
-
-
-def test_one_key_may_use_capacity_that_no_other_needs() -> None:
-    assert taken(HelloRateLimiter(FrontLimits()), "lab", SECOND, 64) == 64
-
-
-def test_sources_are_bounded_and_the_newest_kept() -> None:
-    shares = HelloRateLimiter(HELLO_LIMITS)
-    taken(shares, "first", SECOND)
-    for number in range(MAX_SOURCES):
-        shares.allow(f"key{number}", SECOND)
-    assert len(shares._own) == MAX_SOURCES
-    assert taken(shares, f"key{MAX_SOURCES - 1}", SECOND) == 3
 
 
 def test_one_key_leaves_connections_to_others() -> None:
@@ -437,31 +333,16 @@ def count_topic(state_rig: StateSocketRig, topics: list[bytes]) -> None:
 
 
 def test_topics_that_do_not_exist_are_counted_and_sixteen_are_enough(state_rig: StateSocketRig) -> None:
-    count_topic(state_rig, [b"x%d" % i for i in range(MAX_TOPICS)])
-    assert state_rig.drops.by_reason == {"state_topic_unknown": MAX_TOPICS}
-    count_topic(state_rig, [b"y%d" % i for i in range(MAX_TOPICS + 1)])
+    count_topic(state_rig, [b"x%d" % i for i in range(MAX_UNKNOWN)])
+    assert state_rig.drops.by_reason == {"state_topic_unknown": MAX_UNKNOWN}
+    count_topic(state_rig, [b"y%d" % i for i in range(MAX_UNKNOWN + 1)])
     state_rig.turns(lambda: "flood_cut" in state_rig.drops.by_reason, "its end")
-    assert state_rig.floods[0] == "subscriptions"
+    assert state_rig.floods[0] == "127.0.0.1"
 
 
 def test_a_long_topic_ends_its_connection_at_once(state_rig: StateSocketRig) -> None:
-    count_topic(state_rig, [b"x" * (MAX_TOPIC_BYTES + 1)])
+    count_topic(state_rig, [b"x" * (StatePolicy().max_topic_bytes + 1)])
     state_rig.turns(lambda: "flood_cut" in state_rig.drops.by_reason, "its end")
-
-
-def test_what_a_subscriber_that_is_cut_off_has_sent_besides_is_discarded(
-    state_rig: StateSocketRig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    discarded: list[bool] = []
-
-    def close(descriptor: int, peer: tuple[str, int], *, discard: bool = False) -> bool:
-        discarded.append(discard)
-        return close_tcp(descriptor, peer, discard=discard)
-
-    monkeypatch.setattr(connection_guard, "close_tcp", close)
-    count_topic(state_rig, [b"x" * (MAX_TOPIC_BYTES + 1)])
-    state_rig.turns(lambda: "flood_cut" in state_rig.drops.by_reason, "its end")
-    assert discarded == [True]
 
 
 def test_every_beginning_of_a_topic_may_be_subscribed_to(state_rig: StateSocketRig) -> None:
@@ -474,25 +355,14 @@ def test_every_beginning_of_a_topic_may_be_subscribed_to(state_rig: StateSocketR
     assert state_rig.drops.by_reason == {}
 
 
-def test_the_newest_connections_of_a_key_above_its_share_are_closed() -> None:
-    def make(owner: str) -> TcpConnection:
-        one = TcpConnection(("", 0), 0)
-        one.owner = owner
-        return one
-
-    newest_first = list(enumerate(map(make, "aabaca")))
-    assert select_share_evictions(newest_first, lambda owner: 2) == [0, 1]
-    assert select_share_evictions(newest_first, lambda owner: {"a": 4, "b": 0, "c": 1}[owner]) == [2]
-
-
 def test_connections_that_end_before_they_subscribe_are_counted_and_many_are_named(state_rig: StateSocketRig) -> None:
     """Without encryption libzmq itself closes a connection with a topic that is too long."""
     deadline = time.monotonic() + 30.0
-    for n in range(EARLY_BURST + 1):
+    for n in range(StatePolicy().early_burst + 1):
         assert state_rig.floods == []
         state_rig.bare().close()
         while state_rig.drops.by_reason.get("state_closed_early", 0) <= n:
             assert time.monotonic() < deadline, "a connection that ended is not counted"
             state_rig.subscribers.tick(state_rig.now_ns)
             time.sleep(0.001)
-    assert state_rig.floods == ["subscriptions"]
+    assert len(state_rig.floods) == 1

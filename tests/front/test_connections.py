@@ -7,7 +7,7 @@ import time
 import pytest
 import zmq
 
-from iris_session.front.connections import TrafficCounter
+from iris_session.link.tcp_guard import TrafficCounter
 
 #: Greeting and handshake, both ways, and what the other end says of itself.
 HANDSHAKE = 2000

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.front.channel_guard import ChannelBounds, ChannelGuard
 from iris_session.front.media import proxy as media_module
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import MediaSubscriber
 from iris_session.link import FrontLimits
 from iris_session.link.media_source import MediaSource
 from iris_session.link.sockets import IO_THREADS, watch_tcp
+from iris_session.link.tcp_guard import TcpBounds, TcpGuard, make_reasons
 from iris_session.protocol.client_messages import Heartbeat
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES
@@ -516,7 +516,7 @@ class InProcess:
     """A proxy in this process, on plain loopback, whose time stands still: nothing ends by silence."""
 
     def __init__(self, folder: Path) -> None:
-        limits, self.endpoint = FrontLimits(), f"ipc://{folder}/media"
+        self.endpoint = f"ipc://{folder}/media"
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(IO_THREADS)
         out, local, remote = (self.context.socket(kind) for kind in (zmq.XPUB, zmq.PULL, zmq.PULL))
         out.setsockopt(zmq.XPUB_MANUAL, 1)
@@ -524,7 +524,7 @@ class InProcess:
         local.bind(self.endpoint)
         self.port = remote.bind_to_random_port("tcp://127.0.0.1")
         guards = [
-            ChannelGuard(watch_tcp(one, name), limits, ChannelBounds(8, 1 << 20), curve=False)
+            TcpGuard(TcpBounds(unread_bytes=1 << 20), make_reasons("media"), watch_tcp(one, name))
             for one, name in ((out, "out"), (remote, "in"))
         ]
         self.proxy = MediaProxy(out, *guards, local, remote, lambda: SECOND, encrypted=False)
@@ -584,7 +584,7 @@ def test_fault_of_the_thread_loses_pending_work_and_is_logged_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(media_module, "FAULT_S", 0.001)
-    limits, endpoint = FrontLimits(), f"ipc://{tmp_path}/media"
+    endpoint = f"ipc://{tmp_path}/media"
     with zmq.Context() as context:
         out, local, remote = (context.socket(kind) for kind in (zmq.XPUB, zmq.PULL, zmq.PULL))
         out.setsockopt(zmq.XPUB_MANUAL, 1)
@@ -592,7 +592,7 @@ def test_fault_of_the_thread_loses_pending_work_and_is_logged_once(
         local.bind(endpoint)
         remote.bind_to_random_port("tcp://127.0.0.1")
         guard = [
-            ChannelGuard(watch_tcp(one, name), limits, ChannelBounds(8, 1 << 20), curve=False)
+            TcpGuard(TcpBounds(unread_bytes=1 << 20), make_reasons("media"), watch_tcp(one, name))
             for one, name in ((out, "fault-out"), (remote, "fault-in"))
         ]
         proxy = MediaProxy(out, *guard, local, remote, time.monotonic_ns, encrypted=False)

@@ -59,9 +59,9 @@ def test_limits_fit_into_the_descriptors_of_the_system(descriptors: int) -> None
     assert fitted.connections == limits.connections
     assert (fitted is limits) == (descriptors >= FILE_DESCRIPTORS), "the limit that the front asks for is enough"
     if descriptors >= 1024:
-        used = 5 * fitted.strangers + 3 * fitted.subscribers + fitted.sources + fitted.connections
+        used = 5 * fitted.unauthenticated + 3 * fitted.subscribers + fitted.sources + fitted.connections
         assert used + RESERVED_DESCRIPTORS <= descriptors
-    assert min(fitted.strangers, fitted.subscribers, fitted.sources) > 0
+    assert min(fitted.unauthenticated, fitted.subscribers, fitted.sources) > 0
 
 
 @pytest.mark.parametrize("discard", [True, False])

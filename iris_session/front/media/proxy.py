@@ -15,10 +15,9 @@ from typing import Any, Final
 
 import zmq
 
-from iris_session.front.channel_guard import MAX_COUNTED_MESSAGES, ChannelFlood, ChannelGuard
 from iris_session.front.media.recorder import MediaRecorder
 from iris_session.front.media.scheduler import LOCAL, MediaScheduler
-from iris_session.front.memory_guard import PendingConnection
+from iris_session.link.tcp_guard import PendingConnection, TcpFlood, TcpGuard
 from iris_session.protocol.codec import decode_media_push
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.media import CLASSES, parse_topic
@@ -66,8 +65,8 @@ class MediaProxy:
     def __init__(
         self,
         out: zmq.Socket[bytes],
-        subscriber_guard: ChannelGuard,
-        source_guard: ChannelGuard,
+        subscriber_guard: TcpGuard,
+        source_guard: TcpGuard,
         local: zmq.Socket[bytes] | None,
         remote: zmq.Socket[bytes],
         now_ns: Callable[[], int],
@@ -109,7 +108,7 @@ class MediaProxy:
         """Return the connections of subscribers and sources and what is unread of them."""
         return [*self._subscriber_guard.list_pending(), *self._source_guard.list_pending()]
 
-    def pop_floods(self) -> list[ChannelFlood]:
+    def pop_floods(self) -> list[TcpFlood]:
         """Return the connections of sources that were closed for a flood since the last call."""
         return self._source_guard.pop_floods()
 
@@ -150,7 +149,7 @@ class MediaProxy:
                 poller.register(one, zmq.POLLIN)
         waits = False
         while not self._stopping:
-            ready = dict(poller.poll(RETRY_MS if waits or self._source_guard.has_pending else IDLE_MS))
+            ready = dict(poller.poll(RETRY_MS if waits or self._source_guard.has_unread else IDLE_MS))
             self._read_connection_events()
             closed = [*self._subscriber_guard.tick(self._now_ns()), *self._source_guard.tick(self._now_ns())]
             if self._out in ready:
@@ -172,10 +171,10 @@ class MediaProxy:
         sources, readers = self._source_guard.read_events(now_ns), self._subscriber_guard.read_events(now_ns)
         if sources or readers:
             with self.lock:
-                for descriptor in sources:
-                    self.scheduler.release_streams(descriptor)
-                for descriptor in readers:
-                    self.scheduler.remove_reader(descriptor)
+                for event in sources:
+                    self.scheduler.release_streams(event.descriptor)
+                for event in readers:
+                    self.scheduler.remove_reader(event.descriptor)
 
     def _count_reasons(self, reasons: Iterable[str]) -> None:
         for reason in filter(None, reasons):
@@ -212,11 +211,12 @@ class MediaProxy:
                 continue  # libzmq unsubscribes a connection that has ended: its monitor reported that
             self._read_connection_events()
             if not is_subscription:
-                weight = MAX_COUNTED_MESSAGES + 1
+                weight = 1 + self._subscriber_guard.bounds.counted_messages
             else:
                 weight = 1 if parse_topic(data[1:]) is not None else UNKNOWN_TOPIC_WEIGHT
             user = self._read_user_id(frame)
-            cut = self._subscriber_guard.record_message(descriptor, user, (len(data),), counts=weight)
+            self._subscriber_guard.establish(descriptor, user)
+            cut = self._subscriber_guard.record_message(descriptor, (len(data),), weight)
             if is_subscription and self._order_lost and not cut:
                 cut = self._subscriber_guard.evict(descriptor, "media_order_lost")
             with self.lock:
@@ -268,11 +268,12 @@ class MediaProxy:
                     self.undecided.add(user)
         self._read_connection_events()
         descriptor = _read_descriptor(frames[0])
-        cut = self._source_guard.record_message(descriptor, user, lengths, counts=int(not allowed))
+        self._source_guard.establish(descriptor, user)
+        cut = self._source_guard.record_message(descriptor, lengths, int(not allowed))
         with self.lock:
             self._count_reasons((cut,))
         if allowed:
-            self._push_frames(frames, user, descriptor if self._source_guard.has_connection(descriptor) else None)
+            self._push_frames(frames, user, descriptor if self._source_guard.find(descriptor) else None)
 
     def _push_frames(self, frames: list[zmq.Frame], user: str, connection: int | None) -> None:
         try:

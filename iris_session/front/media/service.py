@@ -10,7 +10,6 @@ from typing import Any, Final
 
 import msgspec
 
-from iris_session.front.channel_guard import ChannelFlood
 from iris_session.front.connections import FrontConnection
 from iris_session.front.context import FrontContext
 from iris_session.front.key_budgets import IngestBackoff
@@ -27,7 +26,8 @@ from iris_session.front.media.budget import (
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import LOCAL, DeliveryCounters, MediaSubscriber, StreamStats
 from iris_session.link.sockets import tcp_counts
-from iris_session.protocol.limits import TokenBucket
+from iris_session.link.tcp_guard import TcpFlood
+from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES, TokenBucket
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ClientReport, DeliveryBudget, MediaStreamReport
@@ -42,6 +42,8 @@ DESCRIPTIONS_PER_S: Final = 1.0
 DESCRIPTION_BURST: Final = 4
 #: Two sources of one stream are reported for so long after something was refused.
 REFUSED_NS: Final = 3 * SECOND
+#: More than this is unread only of a peer whose key was accepted: before, libzmq takes one command of a frame's size.
+UNAUTHENTICATED_BYTES: Final = 2 * MAX_MEDIA_FRAME_BYTES
 #: Refused keys that are remembered.
 MAX_REFUSED: Final = 256
 #: Sources that a warning names.
@@ -266,9 +268,10 @@ class MediaService:
         with self._proxy.lock:
             self._proxy.scheduler.set_subscribers(subscribers, self._context.now_ns())
 
-    def _refuse_flooder(self, flood: ChannelFlood, now_ns: int) -> None:
+    def _refuse_flooder(self, flood: TcpFlood, now_ns: int) -> None:
         """Refuse new connections of a source that flooded, and report it by the names of the keys that it may have."""
-        if not flood.has_key or self._keyring.key is None:
+        has_key = bool(flood.key_id) or flood.unread > UNAUTHENTICATED_BYTES
+        if not has_key or self._keyring.key is None:
             self._context.guard.report_flood(flood.address, "media ingest", now_ns)
             return
         refused = self._backoff.refuse(flood.address, flood.key_id, flood.opened_ns, now_ns)
