@@ -552,7 +552,7 @@ def check_web(data: bytes) -> None:
     channel, frames = wire.decode_frames(data)
     assert sum(map(len, frames)) < len(data)
     if channel == wire.MEDIA_WISHES:
-        wire.decode_wishes(frames[0])
+        wire.decode_subscriptions(frames[0])
     elif channel == wire.GATEWAY:
         wire.decode_gateway_message(frames[0])
     else:

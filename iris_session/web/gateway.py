@@ -36,6 +36,7 @@ from iris_session.client.sockets import (
     MEDIA_RCVBUF,
     STATE_HWM,
     STATE_RCVBUF,
+    ClientSockets,
     CurveKeys,
     open_socket,
 )
@@ -53,7 +54,8 @@ from iris_session.web.certificate import list_host_names, make_tls_context
 from iris_session.web.config import GatewayConfig, GatewayReport, GatewayStart
 from iris_session.web.hub import TICKET_BYTES, Browser, Hub
 from iris_session.web.listener import Listener, open_listening_sockets
-from iris_session.web.page import HostCheck, PageFiles
+from iris_session.web.origin import HostCheck
+from iris_session.web.page import PageFiles
 from iris_session.web.server import READY_S, WebServer
 from iris_session.web.sockets import SocketReader
 from iris_session.web.wire import CLOSE_ENDED, CLOSE_RESTART
@@ -260,6 +262,12 @@ class SessionLink:
         assets.connect(f"tcp://{host_port(self._config.host, welcome.endpoints.assets)}")
         return assets
 
+    def make_asset_sockets(self) -> ClientSockets:
+        """Return sockets with which assets can be fetched, while the gateway is admitted."""
+        sockets = ClientSockets()
+        sockets.set_target(self._config.host, self._config.control_port, self._keys)
+        return sockets
+
     def find_epoch(self) -> int:
         """Return the connection epoch of the gateway, 0 while it is not admitted."""
         return self.connection.connection_epoch if self._ready.is_set() else 0
@@ -307,7 +315,7 @@ class MediaFeedSocket:
         self._reader = SocketReader(media, self._receive, batch=1)
         self._timer: asyncio.TimerHandle | None = None
 
-    def set_wishes(self, streams: frozenset[str]) -> None:
+    def set_subscriptions(self, streams: frozenset[str]) -> None:
         """Subscribe to these streams, and to no others, as soon as the session has sent the browser's budget."""
         self._wanted = streams
         self._subscribe()
@@ -369,7 +377,7 @@ class Gateway:
         self._port = sockets[0].getsockname()[1]
         link = SessionLink(config, self._hub)
         store = AssetStore(config.asset_root or default_root("client-assets"))
-        assets = GatewayAssets(store, link.open_assets, link.find_epoch, self._drops)
+        assets = GatewayAssets(store, link.connection, link.make_asset_sockets(), link.open_assets, self._drops)
         names = (*config.names, *list_host_names())
         server = WebServer(self._hub, link, assets, HostCheck(names, secure=tls is not None), PageFiles())
         listener = Listener(await server.start(), tls, self._drops)

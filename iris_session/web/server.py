@@ -24,7 +24,8 @@ from iris_session.protocol.limits import Drops, TokenBucket
 from iris_session.web.assets import TOO_MANY, AssetUnavailableError, ByteRate, GatewayAssets
 from iris_session.web.hub import NAME_BYTES, Browser, Closing, Hub
 from iris_session.web.listener import Listener
-from iris_session.web.page import HostCheck, PageFiles, make_security_headers
+from iris_session.web.origin import HostCheck, make_security_headers
+from iris_session.web.page import PageFiles
 from iris_session.web.sockets import count_acknowledged, count_unacknowledged
 from iris_session.web.wire import (
     CLOSE_LIMIT,
@@ -40,7 +41,7 @@ from iris_session.web.wire import (
     Ticket,
     decode_frames,
     decode_gateway_message,
-    decode_wishes,
+    decode_subscriptions,
     encode_frames,
     make_fragment,
 )
@@ -71,8 +72,8 @@ ASSET_PIECE: Final = 65_536
 #: Bytes of assets per second, to all together: more than a headset takes over Wi-Fi, and encrypting them leaves most of
 #: the loop to the state of others.
 ASSET_BYTES_PER_S: Final = 48e6
-#: Messages a second on a media socket: wishes and tickets, nothing else.
-_WISHES_PER_S, _WISHES_BURST = 5.0, 20
+#: Messages a second on a media socket: subscriptions and tickets, nothing else.
+_SUBSCRIPTIONS_PER_S, _SUBSCRIPTIONS_BURST = 5.0, 20
 _RANGE: Final = re.compile(r"bytes=(\d{0,15})-(\d{0,15})")
 _TICKET_HEADER: Final = "X-Iris-Ticket"
 _MAX_REASON: Final = 120
@@ -108,7 +109,7 @@ class SessionSide(Protocol):
 class MediaFeedSide(Protocol):
     """Subscription to media of one browser."""
 
-    def set_wishes(self, streams: frozenset[str]) -> None:
+    def set_subscriptions(self, streams: frozenset[str]) -> None:
         """Subscribe to these streams, and to no others."""
         ...
 
@@ -543,7 +544,7 @@ class WebServer:
     async def _read_media(
         self, browser: Browser, socket: web.WebSocketResponse, feed: MediaFeedSide, writer: SocketWriter
     ) -> None:
-        rate = TokenBucket(_WISHES_PER_S, _WISHES_BURST, time.monotonic_ns())
+        rate = TokenBucket(_SUBSCRIPTIONS_PER_S, _SUBSCRIPTIONS_BURST, time.monotonic_ns())
         while browser.is_admitted:
             message = await socket.receive()
             if message.type != WSMsgType.BINARY:
@@ -557,7 +558,9 @@ class WebServer:
                 channel, frames = decode_frames(message.data)
                 if channel == GATEWAY:  # a fresh ticket: it is the same participant
                     continue
-                feed.set_wishes(decode_wishes(frames[0] if channel == MEDIA_WISHES and len(frames) == 1 else b""))
+                feed.set_subscriptions(
+                    decode_subscriptions(frames[0] if channel == MEDIA_WISHES and len(frames) == 1 else b"")
+                )
             except ProtocolError as error:
                 self._drops.count("web_malformed")
                 await writer.close(Closing(CLOSE_NOT_ALLOWED, str(error)))

@@ -11,6 +11,7 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated, Final, NamedTuple
 
+import msgpack
 import msgspec
 
 from iris_session.protocol.codec import BAD_BYTES, Bytes
@@ -27,8 +28,8 @@ MEDIA_WISHES: Final = 4
 GATEWAY: Final = 5
 #: WebSocket message of a client at most [bytes].
 MAX_CLIENT_MESSAGE: Final = 65_536
-#: Streams that a client may wish for, as many as a session has.
-MAX_WISHES: Final = 16
+#: Streams that a client may subscribe to, as many as a session has.
+MAX_SUBSCRIPTIONS: Final = 16
 #: Server messages that are larger are none of those that a gateway acts on.
 MAX_PEEKED: Final = 65_536
 
@@ -45,6 +46,8 @@ _HEAD: Final = 2
 _LENGTH: Final = 4
 _MAX_FRAMES: Final = 255
 _ENVELOPE_ELEMENTS: Final = 4
+#: Bytes of a name that MessagePack encodes with one byte of length.
+_MAX_NAME: Final = 31
 
 # Of the frames of a WebSocket: opcode of a binary message (0: it goes on), marks of its end and of long lengths.
 _BINARY: Final = 2
@@ -114,7 +117,7 @@ class _ClientEnvelope(msgspec.Struct, array_like=True):
 _server: Final = msgspec.msgpack.Decoder(_ServerEnvelope)
 _client: Final = msgspec.msgpack.Decoder(_ClientEnvelope)
 _gateway: Final[msgspec.msgpack.Decoder[GatewayMessage]] = msgspec.msgpack.Decoder(GatewayMessage)
-_wishes: Final = msgspec.msgpack.Decoder(Annotated[list[str], msgspec.Meta(max_length=MAX_WISHES)])
+_subscriptions: Final = msgspec.msgpack.Decoder(Annotated[list[str], msgspec.Meta(max_length=MAX_SUBSCRIPTIONS)])
 _encoder: Final = msgspec.msgpack.Encoder()
 
 
@@ -171,20 +174,20 @@ def decode_gateway_message(frame: Bytes) -> GatewayMessage:
         raise MalformedError(f"no message of a gateway: {error}") from None
 
 
-def encode_wishes(streams: Sequence[str]) -> bytes:
+def encode_subscriptions(streams: Sequence[str]) -> bytes:
     """Return the WebSocket message that names all media streams that are wanted."""
     return encode_frames(MEDIA_WISHES, (_encoder.encode(list(streams)),))
 
 
-def decode_wishes(frame: Bytes) -> frozenset[str]:
+def decode_subscriptions(frame: Bytes) -> frozenset[str]:
     """Decode the frame of channel 4. Raises `MalformedError`."""
     try:
-        names = _wishes.decode(frame)
+        names = _subscriptions.decode(frame)
     except BAD_BYTES as error:
-        raise MalformedError(f"no media wishes: {error}") from None
+        raise MalformedError(f"no media subscriptions: {error}") from None
     for name in names:
         if not is_stream_name(name):
-            raise MalformedError(f"no media wishes: {name[:64]!r} cannot be the name of a stream")
+            raise MalformedError(f"no media subscriptions: {name[:64]!r} cannot be the name of a stream")
     return frozenset(names)
 
 
@@ -199,21 +202,27 @@ def splice_name(envelope: Bytes, name: str) -> bytes:
         MalformedError: It is no envelope.
         TooLargeError: `name` has more than 31 bytes.
     """
-    data = memoryview(envelope)
     encoded = name.encode()
-    if len(encoded) > 31:
-        raise TooLargeError("name", len(encoded), 31)
-    elements, at = _read_array(data)
-    version, at = _read_integer(data, at)
+    if len(encoded) > _MAX_NAME:
+        raise TooLargeError("name", len(encoded), _MAX_NAME)
+    unpacker = msgpack.Unpacker(read_size=64)
+    unpacker.feed(envelope)
+    try:
+        n_elements, version, epoch = unpacker.read_array_header(), unpacker.unpack(), unpacker.unpack()
+        begin = unpacker.tell()
+        before, end = unpacker.unpack(), unpacker.tell()
+    except (ValueError, msgpack.UnpackException) as error:
+        raise MalformedError(f"no envelope: {error}") from None
+    if type(version) is not int or type(epoch) is not int or not isinstance(before, str):
+        raise MalformedError("no envelope: version and connection_epoch must be integers, on_behalf_of a string")
     if version != PROTOCOL_VERSION:
         raise ProtocolVersionError(version)
-    if elements < _ENVELOPE_ELEMENTS:
-        raise MalformedError(f"no envelope: {elements} elements, {_ENVELOPE_ELEMENTS} are needed")
-    _, at = _read_integer(data, at)
-    length, after = _read_string(data, at)
-    if length:
+    if n_elements < _ENVELOPE_ELEMENTS:
+        raise MalformedError(f"no envelope: {n_elements} elements, {_ENVELOPE_ELEMENTS} are needed")
+    if before:
         raise ForgedNameError
-    return b"".join((data[:at], bytes((0xA0 | len(encoded),)), encoded, data[after:]))
+    data = memoryview(envelope)
+    return b"".join((data[:begin], _encoder.encode(name), data[end:]))
 
 
 def peek_client_type(envelope: Bytes) -> str:
@@ -236,49 +245,3 @@ def peek_server_message(envelope: Bytes) -> ServerHead:
     except BAD_BYTES:
         return ServerHead(0, "", "")
     return ServerHead(found.connection_epoch, found.message.type, found.message.code)
-
-
-def _read_array(data: memoryview) -> tuple[int, int]:
-    """Return the number of elements of the array at the beginning, and where they begin."""
-    first = data[0] if len(data) else 0
-    if first & 0xF0 == 0x90:
-        return first & 0x0F, 1
-    width = {0xDC: 2, 0xDD: 4}.get(first, 0)
-    if not width or len(data) < 1 + width:
-        raise MalformedError("no envelope: expected a MessagePack array that starts with the version")
-    return int.from_bytes(data[1 : 1 + width], "big"), 1 + width
-
-
-#: Bytes after the first one, by it: unsigned, then signed integers.
-_INTEGERS: Final = {0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8}
-_FIRST_SIGNED: Final = 0xD0
-_STRINGS: Final = {0xD9: 1, 0xDA: 2, 0xDB: 4}
-
-
-def _read_integer(data: memoryview, at: int) -> tuple[int, int]:
-    """Return the integer at `at`, and where the next element begins."""
-    first = data[at] if at < len(data) else 0xC1
-    if first < 0x80:
-        return first, at + 1
-    if first >= 0xE0:
-        return first - 0x100, at + 1
-    width = _INTEGERS.get(first, 0)
-    if not width or len(data) < at + 1 + width:
-        raise MalformedError("no envelope: version and connection_epoch must be integers")
-    value = int.from_bytes(data[at + 1 : at + 1 + width], "big", signed=first >= _FIRST_SIGNED)
-    return value, at + 1 + width
-
-
-def _read_string(data: memoryview, at: int) -> tuple[int, int]:
-    """Return the length of the string at `at`, and where the next element begins."""
-    first = data[at] if at < len(data) else 0xC1
-    if first & 0xE0 == 0xA0:
-        length, begin = first & 0x1F, at + 1
-    else:
-        width = _STRINGS.get(first, 0)
-        if not width or len(data) < at + 1 + width:
-            raise MalformedError("no envelope: on_behalf_of must be a string")
-        length, begin = int.from_bytes(data[at + 1 : at + 1 + width], "big"), at + 1 + width
-    if len(data) < begin + length:
-        raise MalformedError("no envelope: it ends within on_behalf_of")
-    return length, begin + length

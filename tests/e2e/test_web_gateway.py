@@ -251,7 +251,7 @@ def test_hostile_messages_close_their_sender_only(page: str) -> None:
 def test_media_need_a_ticket(page: str) -> None:
     async def work() -> None:
         async with browsers(page, "ann") as (ann,):
-            for first in (b"", b"\x05\x01\x01\x00\x00\x00\x80", wire.encode_wishes(["cloud"])):
+            for first in (b"", b"\x05\x01\x01\x00\x00\x00\x80", wire.encode_subscriptions(["cloud"])):
                 media = await ann.http.ws_connect(f"{page}v1/media", protocols=[wire.SUBPROTOCOL])
                 await media.send_bytes(first)
                 message = await media.receive(10.0)

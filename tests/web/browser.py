@@ -140,7 +140,7 @@ class WebBrowser:
         self._media_socket = socket
         message = wire.Ticket(self.ticket if ticket is None else ticket)
         await socket.send_bytes(wire.encode_gateway_message(message))
-        await socket.send_bytes(wire.encode_wishes(streams))
+        await socket.send_bytes(wire.encode_subscriptions(streams))
         self._tasks.append(asyncio.create_task(self._read_media(socket)))
         return socket
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.web.page import INDEX, HostCheck, PageFiles, make_security_headers
+from iris_session.web.origin import HostCheck, make_security_headers
+from iris_session.web.page import INDEX, PageFiles
 
 
 def test_without_a_page_words_say_how_to_build_it(tmp_path: Path) -> None:

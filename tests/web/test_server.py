@@ -12,7 +12,8 @@ from aiohttp import ClientSession, WSMsgType, web
 
 from iris_session.web import server, wire
 from iris_session.web.hub import Hub
-from iris_session.web.page import HostCheck, PageFiles
+from iris_session.web.origin import HostCheck
+from iris_session.web.page import PageFiles
 from iris_session.web.server import MEDIA_PIECE, SocketWriter, WebServer
 
 

@@ -51,8 +51,8 @@ def test_containers_that_must_be_refused(row: dict[str, Any]) -> None:
 def test_gateway_messages(row: dict[str, Any]) -> None:
     data, value = bytes.fromhex(row["hex"]), row["value"]
     if isinstance(value, list):
-        assert wire.decode_wishes(data) == frozenset(value)
-        assert wire.decode_frames(wire.encode_wishes(value))[1][0] == data
+        assert wire.decode_subscriptions(data) == frozenset(value)
+        assert wire.decode_frames(wire.encode_subscriptions(value))[1][0] == data
         return
     message = wire.decode_gateway_message(data)
     assert {**msgspec.to_builtins(message), **value} == msgspec.to_builtins(message)
@@ -80,7 +80,7 @@ def test_arbitrary_bytes_raise_protocol_errors_only(data: bytes) -> None:
     for decode in (
         wire.decode_frames,
         wire.decode_gateway_message,
-        wire.decode_wishes,
+        wire.decode_subscriptions,
         lambda data: wire.splice_name(data, "web-00112233aabb"),
         wire.peek_client_type,
         wire.peek_server_message,
@@ -112,10 +112,10 @@ def test_names_have_one_byte_of_length() -> None:
         wire.splice_name(encode_client(wrap_message(Heartbeat())), "n" * 32)
 
 
-def test_wishes_are_bounded_names() -> None:
+def test_subscriptions_are_bounded_names() -> None:
     for names in (["a"] * 17, ["-x"], [""], ["a/b"]):
         with pytest.raises(MalformedError):
-            wire.decode_wishes(msgspec.msgpack.encode(names))
+            wire.decode_subscriptions(msgspec.msgpack.encode(names))
 
 
 def test_frames_are_counted_in_a_byte() -> None:
