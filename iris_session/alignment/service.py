@@ -106,8 +106,8 @@ class _HeadsetState:
         self.tips: dict[str, Observation] = {}
         self.next_tip_ns = 0
 
-    def change_estimator(self, change: Callable[[], object]) -> None:
-        """Do what invalidates earlier estimates; after the one that is being computed, which does not count then."""
+    def run_or_defer(self, change: Callable[[], object]) -> None:
+        """Run a change of the estimator now, or after the estimate that is being computed, which is then discarded."""
         if self.busy:
             self.is_outdated = True
             self.waiting.append(change)
@@ -265,7 +265,7 @@ class AlignmentService:
         if alarm.beside:
             self._cross_check.discard_target(alarm.anchor_id)
             return
-        state.change_estimator(state.estimator.reset)
+        state.run_or_defer(state.estimator.reset)
         state.monitor.mute()
         self._cross_check.discard_observations(number)
 
@@ -325,7 +325,7 @@ class AlignmentService:
         self._tips[participant] = tips
         _limit_size(self._tips, self._max_remembered)
         for state in self._find_states(participant):
-            state.change_estimator(partial(state.estimator.set_tip, device, covariance))
+            state.run_or_defer(partial(state.estimator.set_tip, device, covariance))
 
     def _apply_alignment(self, state: _HeadsetState, alignment: Alignment | None) -> None:
         measured = alignment is not None and alignment.kind == AlignmentKind.MEASURED and not alignment.offset
@@ -338,10 +338,10 @@ class AlignmentService:
             _limit_size(self._stopped, self._max_remembered)
         for state in self._find_states(run.participant):
             if run.running:
-                state.change_estimator(state.estimator.start_run)
+                state.run_or_defer(state.estimator.start_run)
                 state.monitor.start_run()
             else:
-                state.change_estimator(partial(setattr, state.estimator, "running", False))
+                state.run_or_defer(partial(setattr, state.estimator, "running", False))
 
     def _move_anchor(self, anchor_id: str, T_world_anchor: Pose) -> None:
         pose = (T_world_anchor.p, T_world_anchor.q)
@@ -350,7 +350,7 @@ class AlignmentService:
         self.anchors[anchor_id] = pose
         self._cross_check.discard_target(anchor_id)
         for state in self._states.values():
-            state.change_estimator(state.estimator.on_anchors_moved)
+            state.run_or_defer(state.estimator.on_anchors_moved)
             state.monitor.on_anchor_moved(anchor_id)
 
     def _find_states(self, participant: str) -> list[_HeadsetState]:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import gc
 import time
+from collections.abc import Callable
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import zmq
 
@@ -37,9 +38,10 @@ from iris_session.front.uplink import Uplink
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND, FrontStart
 from iris_session.link.sockets import MEDIA_THREAD_NAME, readable
-from iris_session.link.tcp_guard import TcpBounds, TcpGuard, TrafficCounter, make_reasons
+from iris_session.link.tcp_guard import PendingConnection, TcpBounds, TcpGuard, TrafficCounter, make_reasons
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
+from iris_session.security.zap import Authenticator
 from iris_session.system.priority import lower_named_thread_priority
 from iris_session.system.process import is_parent
 
@@ -76,50 +78,32 @@ class Front:
         self.cut_off = False
         context, sockets = self._context, self._sockets = open_front(start)
         self._link, self._control = sockets.link, sockets.control.socket
-        # Media are encrypted and decrypted as fast as they come: on a busy machine state, control and clients go first.
-        lower_named_thread_priority(MEDIA_THREAD_NAME)
-        proxy = _make_media_proxy(context, sockets)
+        self._authenticator = sockets.authenticator
         backoff = IngestBackoff()
-        media = MediaService(context, proxy, backoff)
-        asset_server = _make_asset_server(context, sockets)
-        assets = AssetService(context, asset_server)
-        alignment = _make_alignment_service(context)
-        status = StatusService(context, media, assets, alignment)
-        admission = Admission(context, (media, assets))
-        pairing = PairingService(context)
-        endpoint, authority = context.config.recorder_endpoint, context.authority
-        raw = RawFeed(sockets.context, endpoint, context.drops, lambda: authority.is_recorded)
-        self._intake = Intake(context, admission, pairing, status, alignment, raw)
-        self._disconnects = DisconnectHandler(context, sockets.control.monitor, admission, status, alignment)
-        revocation = RevocationService(context, self._disconnects, self._reopen_state)
+        channels = _make_channels(context, sockets, backoff)
+        clients = _make_client_parts(context, sockets, channels)
+        revocation = RevocationService(context, clients.disconnects, self._reopen_state)
+        self._intake, self._disconnects = clients.intake, clients.disconnects
         self._downlink = Downlink(
-            context, sockets.link, admission, self._disconnects, revocation, alignment, assets, media
+            context,
+            sockets.link,
+            clients.admission,
+            clients.disconnects,
+            revocation,
+            clients.alignment,
+            channels.assets,
+            channels.media,
         )
         self._uplink = Uplink(context, sockets.link)
-        self._authenticator = sockets.authenticator
         if self._authenticator is not None:
-            self._authenticator.is_revoked = context.tokens.is_revoked
-            handshakes = HandshakeLimiter(
-                context.config.limits.key,
-                context.drops,
-                context.keyring.may_be_gateway,
-                context.guard.is_banned,
-                backoff,
-            )
-            self._authenticator.is_rate_limited = lambda domain, mark, address: (
-                not handshakes.allow(domain, mark, address, context.now_ns())
-            )
-        memory = MemoryGuard(
-            context.config.limits.memory_bytes,
-            (context.guard.list_pending, proxy.list_pending, asset_server.list_pending),
-            proxy.release_memory,
-            self._report_eviction,
-            context.drops,
-        )
+            _limit_handshakes(self._authenticator, context, backoff)
+        pending = (context.guard.list_pending, *channels.list_pending)
+        max_bytes = context.config.limits.memory_bytes
+        memory = MemoryGuard(max_bytes, pending, channels.release_media, self._report_eviction, context.drops)
         #: In the order of their ticks.
-        self._services: list[Service] = [context.keyring, status, media, context.guard, context.budgets, memory]
-        self._services += [pairing, revocation]
-        self._services += [context.audit, assets, *self._make_announcements(pairing), alignment, raw]
+        self._services: list[Service] = [context.keyring, clients.status, channels.media]
+        self._services += [context.guard, context.budgets, memory, clients.pairing, revocation, context.audit]
+        self._services += [channels.assets, *self._make_announcements(clients.pairing), clients.alignment, clients.raw]
         self._next_services_ns = self._next_collect_ns = 0
 
     def _make_announcements(self, pairing: PairingService) -> list[Service]:
@@ -250,6 +234,60 @@ class Front:
         authority.stalled = stalled
         if not is_parent(self._start.parent_pid):
             self.end(ORPHANED)
+
+
+class _Channels(NamedTuple):
+    """Media and assets, each with a thread of its own, and what `MemoryGuard` needs of them."""
+
+    media: MediaService
+    assets: AssetService
+    list_pending: tuple[Callable[[], list[PendingConnection]], ...]
+    release_media: Callable[[], str]
+
+
+class _ClientParts(NamedTuple):
+    """The parts that handle clients on the control socket."""
+
+    alignment: AlignmentService
+    status: StatusService
+    admission: Admission
+    pairing: PairingService
+    raw: RawFeed
+    intake: Intake
+    disconnects: DisconnectHandler
+
+
+def _make_channels(context: FrontContext, sockets: FrontSockets, backoff: IngestBackoff) -> _Channels:
+    # Media are encrypted and decrypted as fast as they come: on a busy machine state, control and clients go first.
+    lower_named_thread_priority(MEDIA_THREAD_NAME)
+    proxy = _make_media_proxy(context, sockets)
+    media = MediaService(context, proxy, backoff)
+    server = _make_asset_server(context, sockets)
+    assets = AssetService(context, server)
+    return _Channels(media, assets, (proxy.list_pending, server.list_pending), proxy.release_memory)
+
+
+def _make_client_parts(context: FrontContext, sockets: FrontSockets, channels: _Channels) -> _ClientParts:
+    alignment = _make_alignment_service(context)
+    status = StatusService(context, channels.media, channels.assets, alignment)
+    admission = Admission(context, (channels.media, channels.assets))
+    pairing = PairingService(context)
+    authority = context.authority
+    raw = RawFeed(sockets.context, context.config.recorder_endpoint, context.drops, lambda: authority.is_recorded)
+    intake = Intake(context, admission, pairing, status, alignment, raw)
+    disconnects = DisconnectHandler(context, sockets.control.monitor, admission, status, alignment)
+    return _ClientParts(alignment, status, admission, pairing, raw, intake, disconnects)
+
+
+def _limit_handshakes(authenticator: Authenticator, context: FrontContext, backoff: IngestBackoff) -> None:
+    """Limit how often a key opens connections, and refuse revoked ones."""
+    handshakes = HandshakeLimiter(
+        context.config.limits.key, context.drops, context.keyring.may_be_gateway, context.guard.is_banned, backoff
+    )
+    authenticator.is_revoked = context.tokens.is_revoked
+    authenticator.is_rate_limited = lambda domain, mark, address: (
+        not handshakes.allow(domain, mark, address, context.now_ns())
+    )
 
 
 def _make_alignment_service(context: FrontContext) -> AlignmentService:

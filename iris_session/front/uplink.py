@@ -40,8 +40,8 @@ class Uplink:
         elif self._coalescer.urgent and used < 2 * limit:
             batch = self._coalescer.take_batch(urgent_only=True)
         if self._tokens.changed and (batch or self._is_authority_listening):
-            handback = link.Handback(self._authority.step, self._tokens.encode())
-            self._socket.send_multipart((link.HANDBACK, link.encoder.encode(handback)), zmq.DONTWAIT)
+            state = link.TokenState(self._authority.step, self._tokens.encode())
+            self._socket.send_multipart((link.HANDBACK, link.encoder.encode(state)), zmq.DONTWAIT)
         if batch:
             self._socket.send_multipart((link.ENTRIES, encode_entries(batch)), zmq.DONTWAIT)
             self._batches += 1

@@ -129,7 +129,7 @@ class FrontLink:
                 self._entries += decode_entries(payload)
                 batches += 1
             elif kind == messages.HANDBACK:
-                self._take_handback(messages.decode_handback(payload))
+                self._take_token_state(messages.decode_token_state(payload))
             elif kind == messages.STATUS:
                 self.status = messages.add_status(self._status_before, messages.decode_status(payload))
             elif kind == messages.READY:
@@ -146,9 +146,9 @@ class FrontLink:
             self._send(messages.ACK, bytes((self._taken,)))
             self._taken = 0
 
-    def _take_handback(self, handback: messages.Handback) -> None:
-        self.handback = handback.state
-        self._revocations = {key: step for key, step in self._revocations.items() if step > handback.step}
+    def _take_token_state(self, state: messages.TokenState) -> None:
+        self.handback = state.state
+        self._revocations = {key: step for key, step in self._revocations.items() if step > state.step}
 
     def _repeat_revocations(self) -> None:
         """Revoke keys again at a front that is ready: the one before may have ended before it read that."""

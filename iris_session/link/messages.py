@@ -21,7 +21,7 @@ from iris_session.protocol.steps import Admitted, Dropped, OutgoingMessage
 READY: Final = b"R"  # Ports
 FAILED: Final = b"F"  # utf-8, one line
 ENTRIES: Final = b"E"  # list[Entry]
-HANDBACK: Final = b"H"  # Handback, sent before an entry that depends on it
+HANDBACK: Final = b"H"  # TokenState, sent before an entry that depends on it
 STATUS: Final = b"S"  # FrontStatus
 BEAT: Final = b"B"  # empty: the front works but has nothing to send; not sent while the authority stands still
 
@@ -51,7 +51,7 @@ class Decided(msgspec.Struct, frozen=True, array_like=True):
     dropped: tuple[Dropped, ...] = ()
 
 
-class Handback(msgspec.Struct, frozen=True, array_like=True):
+class TokenState(msgspec.Struct, frozen=True, array_like=True):
     """State of the front for its successor. `state`: opaque bytes. `step`: that of the newest `Decided` before it."""
 
     step: int
@@ -91,7 +91,7 @@ def add_status(before: FrontStatus, status: FrontStatus) -> FrontStatus:
 
 encoder: Final = msgspec.msgpack.Encoder()
 decode_decided: Final = make_decoder(Decided)
-decode_handback: Final = make_decoder(Handback)
+decode_token_state: Final = make_decoder(TokenState)
 decode_status: Final = make_decoder(FrontStatus)
 decode_ports: Final = make_decoder(Ports)
 decode_scene: Final = make_decoder(SceneInfo)

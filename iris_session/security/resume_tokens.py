@@ -20,13 +20,13 @@ class _TokenRecord(msgspec.Struct, array_like=True):
     behind: str = ""  # key of the gateway that connects the participant
 
 
-class _Handback(msgspec.Struct, array_like=True):
+class _TokenState(msgspec.Struct, array_like=True):
     next_connection: int
     records: list[_TokenRecord]
     revoked: list[str] = []
 
 
-_decoder = msgspec.msgpack.Decoder(_Handback)
+_decoder = msgspec.msgpack.Decoder(_TokenState)
 
 
 def _hash_token(token: bytes) -> bytes:
@@ -38,9 +38,9 @@ def encode_handback(last_connection: int, blob: bytes = b"") -> bytes:
 
     Raises `msgspec.DecodeError` for bytes that are not an encoded table.
     """
-    handback = _decoder.decode(blob) if blob else _Handback(1, [])
-    handback.next_connection = max(handback.next_connection, last_connection + 1)
-    return msgspec.msgpack.encode(handback)
+    state = _decoder.decode(blob) if blob else _TokenState(1, [])
+    state.next_connection = max(state.next_connection, last_connection + 1)
+    return msgspec.msgpack.encode(state)
 
 
 class ResumeTokens:
@@ -50,11 +50,11 @@ class ResumeTokens:
     """
 
     def __init__(self, capacity: int, blob: bytes = b"") -> None:
-        handback = _decoder.decode(blob) if blob else _Handback(1, [])
+        state = _decoder.decode(blob) if blob else _TokenState(1, [])
         self._capacity = capacity
-        self._next_connection = handback.next_connection
-        self._records = {record.digest: record for record in handback.records}
-        self._revoked = dict.fromkeys(handback.revoked)
+        self._next_connection = state.next_connection
+        self._records = {record.digest: record for record in state.records}
+        self._revoked = dict.fromkeys(state.revoked)
         self.changed = False
 
     def allocate_connection(self) -> int:
@@ -131,5 +131,5 @@ class ResumeTokens:
         """Return the table as bytes and reset `changed`."""
         self.changed = False
         return msgspec.msgpack.encode(
-            _Handback(self._next_connection, list(self._records.values()), list(self._revoked))
+            _TokenState(self._next_connection, list(self._records.values()), list(self._revoked))
         )

@@ -41,7 +41,7 @@ class Pair:
         self.far.send_multipart((kind, payload))
 
     def hand_back(self, step: int, state: bytes) -> None:
-        self.say(messages.HANDBACK, msgspec.msgpack.encode(messages.Handback(step, state)))
+        self.say(messages.HANDBACK, msgspec.msgpack.encode(messages.TokenState(step, state)))
 
     def ready(self) -> None:
         self.say(messages.READY, msgspec.msgpack.encode(Ports("127.0.0.1", 1, 2)))
