@@ -8,6 +8,7 @@ id does not get it. Limits on TCP connections are in `connection_guard`.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import msgspec
@@ -44,6 +45,7 @@ class Peer(NamedTuple):
     user_id: str
 
 
+@dataclass(slots=True, eq=False)
 class FrontConnection:
     """One accepted `hello`, until the connection is removed.
 
@@ -65,75 +67,39 @@ class FrontConnection:
         clutches: Whether the clutch is closed, by device, as it said last.
     """
 
-    __slots__ = (
-        "address",
-        "admitted",
-        "budget",
-        "clutches",
-        "confirmed",
-        "consecutive_drops",
-        "denials",
-        "faults",
-        "flood_last_ns",
-        "flood_since_ns",
-        "gateway",
-        "hello",
-        "key_id",
-        "last_heard_ns",
-        "late_epoch",
-        "number",
-        "participant_id",
-        "peer",
-        "prefix",
-        "presence_due_ns",
-        "presence_worn",
-        "rates",
-        "report",
-        "reported_ns",
-        "role",
-        "route",
-        "web",
-        "worn",
-    )
+    number: int
+    route: Route
+    peer: Peer
+    address: tuple[str, int]
+    key_id: str
+    hello: Hello
+    gateway: int
+    budget: KeyBudget = field(default_factory=lambda: KeyBudget(FrontLimits()))
+    web: bool = False
+    role: str = ""
+    admitted: bool = False
+    participant_id: str = ""
+    confirmed: bool = False
+    last_heard_ns: int = 0
+    consecutive_drops: int = 0
+    flood_last_ns: int = 0
+    flood_since_ns: int = 0
+    faults: TokenBucket = field(default_factory=lambda: TokenBucket(2.0, 5))
+    #: As many as an honest client makes requests of one kind.
+    denials: TokenBucket = field(default_factory=lambda: TokenBucket(20.0, 40))
+    late_epoch: Entry | None = None
+    rates: RateLimiter = field(default_factory=RateLimiter)
+    presence_due_ns: dict[str, int] = field(default_factory=dict)
+    presence_worn: bool = True
+    report: ClientReport | None = None
+    reported_ns: int = 0
+    worn: bool = True
+    clutches: dict[str, bool] = field(default_factory=dict)
+    prefix: bytes = field(init=False)
 
-    def __init__(
-        self,
-        number: int,
-        route: Route,
-        peer: Peer,
-        address: tuple[str, int],
-        key_id: str,
-        hello: Hello,
-        gateway: int,
-        budget: KeyBudget | None = None,
-    ) -> None:
-        self.web = False
-        self.role = hello.role
-        self.number = number
-        self.route = route
-        self.peer = peer
-        self.address = address
-        self.key_id = key_id
-        self.hello = hello
-        self.gateway = gateway
-        self.budget = budget if budget is not None else KeyBudget(FrontLimits())
-        self.admitted = False
-        self.participant_id = ""
-        self.confirmed = False
-        self.last_heard_ns = 0
-        self.consecutive_drops = 0
-        self.flood_last_ns = self.flood_since_ns = 0
-        self.faults = TokenBucket(2.0, 5)
-        self.denials = TokenBucket(20.0, 40)  # as many as an honest client makes requests of one kind
-        self.late_epoch: Entry | None = None
-        self.rates = RateLimiter()
-        self.prefix = encode_envelope_prefix(number)
-        self.presence_due_ns: dict[str, int] = {}
-        self.presence_worn = True
-        self.report: ClientReport | None = None
-        self.reported_ns = 0
-        self.worn = True
-        self.clutches: dict[str, bool] = {}
+    def __post_init__(self) -> None:
+        self.role = self.role or self.hello.role
+        self.prefix = encode_envelope_prefix(self.number)
 
     def recent_report(self, now_ns: int) -> ClientReport | None:
         """Return the client's newest report, `None` if it is older than `REPORT_EXPIRY_NS`."""

@@ -120,8 +120,6 @@ class NewestFrame(NamedTuple):
 class _Subscription:
     """One connection's subscription to one stream. `seq`: of the frame that its readers got last, -1 for none."""
 
-    __slots__ = ("bytes", "delivered", "dropped", "due", "pending", "readers", "seq")
-
     def __init__(self) -> None:
         self.pending = False
         self.seq = -1
@@ -131,6 +129,16 @@ class _Subscription:
     @property
     def counters(self) -> DeliveryCounters:
         return DeliveryCounters(self.delivered, self.due, self.bytes)
+
+
+class _Subscriber:
+    """State of a connection that may subscribe."""
+
+    def __init__(self, settings: MediaSubscriber, now_ns: int) -> None:
+        self.settings = settings
+        self.streams: set[str] = set()  # that it is subscribed to
+        self.ended = DeliveryCounters()  # of subscriptions that have ended
+        self.newest = TokenBucket(NEWEST_PER_S, MAX_STREAMS, now_ns)
 
 
 class _Stream:
@@ -179,15 +187,10 @@ class MediaScheduler:
 
     def __init__(self) -> None:
         self._streams: dict[str, _Stream] = {}
-        self._subscribers: dict[int, MediaSubscriber] = {}
-        self._subscriptions: dict[tuple[int, str], _Subscription] = {}
-        self._by_number: dict[int, set[str]] = {}  # subscribed streams by connection
-        self._by_stream: dict[str, dict[int, _Subscription]] = {}  # the same by stream and connection
-        self._by_reader: dict[int, set[tuple[int, str]]] = {}  # by descriptor
-        self._ended_counters: dict[int, DeliveryCounters] = {}  # of subscriptions that have ended
-        self._newest_buckets: dict[int, TokenBucket] = {}
-        self._delayed: dict[int, dict[str, None]] = {}  # streams by connection that wait for its bucket
+        self._subscribers: dict[int, _Subscriber] = {}  # by connection number
+        self._subscriptions: dict[str, dict[int, _Subscription]] = {}  # by stream and connection number
         self._pending: deque[tuple[int, str]] = deque()
+        self._delayed: dict[tuple[int, str], None] = {}  # whose newest frame waits for the bucket of the connection
         self._paused_until_ns = 0
         self._refused: dict[tuple[int, str], tuple[int, int]] = {}  # by sender and stream: since when, and when last
         self._left: deque[int] = deque(maxlen=MAX_LEFT)
@@ -201,16 +204,15 @@ class MediaScheduler:
     def set_subscribers(self, listeners: Mapping[int, MediaSubscriber], now_ns: int) -> None:
         """Set the connections that may subscribe, and their levels from now on. Who gets more gets the newest frame: it
         may be the last one, and have been left out."""
-        before = {key: self._find_level(*key) for key in self._subscriptions}
-        self._subscribers = dict(listeners)
-        for number in [number for number in self._by_number if number not in self._subscribers]:
+        before = [(key, self._find_level(*key)) for key in self._list_keys()]
+        for number in [number for number in self._subscribers if number not in listeners]:
             for stream in self.list_subscriptions(number):
-                self._remove_subscription(number, stream)
-        for known in (self._ended_counters, self._newest_buckets, self._delayed):
-            for number in [number for number in known if number not in self._subscribers]:
-                del known[number]
+                self._end_subscription(number, stream)
+            del self._subscribers[number]
+        for number, settings in listeners.items():
+            self._subscribers.setdefault(number, _Subscriber(settings, now_ns)).settings = settings
         self._refused = {key: times for key, times in self._refused.items() if key[0] in self._subscribers}
-        for key, level in before.items():
+        for key, level in before:
             if self._find_level(*key) < level:
                 self._offer_newest(key, now_ns)
 
@@ -221,68 +223,79 @@ class MediaScheduler:
         Returns:
             False if the key is not that of the connection, or it has too many subscriptions.
         """
-        listener = self._subscribers.get(number)
-        if listener is None or listener.user_id != user_id:
-            self._count_drop("media_refused")
+        subscriber = self._subscribers.get(number)
+        if subscriber is None or subscriber.settings.user_id != user_id:
+            self.count_drop("media_refused")
             return False
-        subscription = self._subscriptions.get((number, stream))
+        subscription = self._find_subscription(number, stream)
         if subscription is None:
-            if len(self._by_number.get(number, ())) >= MAX_STREAMS:
-                self._count_drop("media_subscriptions_full")
+            if len(subscriber.streams) >= MAX_STREAMS:
+                self.count_drop("media_subscriptions_full")
                 return False
-            subscription = self._add_subscription(number, stream)
+            subscriber.streams.add(stream)
+            subscription = self._subscriptions.setdefault(stream, {})[number] = _Subscription()
         if reader not in subscription.readers:
             subscription.readers.add(reader)
             subscription.seq = -1  # a client that has connected again may have lost what it had
-        self._by_reader.setdefault(reader, set()).add((number, stream))
         self._offer_newest((number, stream), now_ns)
         return True
 
     def unsubscribe(self, number: int, stream: str, reader: int) -> None:
         """Remove a reader of a subscription, which ends with its last one: a reconnecting client may have two."""
-        self._by_reader.get(reader, set()).discard((number, stream))
-        subscription = self._subscriptions.get((number, stream))
+        subscription = self._find_subscription(number, stream)
         if subscription is None or reader not in subscription.readers:
             return
         subscription.readers.remove(reader)
         if not subscription.readers:
-            self._remove_subscription(number, stream)
-            self._ended_counters[number] = self._ended_counters.get(number, DeliveryCounters()).combine(
-                subscription.counters
-            )
+            self._end_subscription(number, stream)
 
     def remove_reader(self, reader: int) -> None:
         """Remove a TCP connection that has ended, with its subscriptions."""
         self._paces.pop(reader, None)  # the next connection may have its descriptor
-        for number, stream in sorted(self._by_reader.pop(reader, ())):
+        for number, stream in self._list_keys():
             self.unsubscribe(number, stream, reader)
 
     def list_subscriptions(self, number: int) -> list[str]:
         """Return the streams that a connection subscribed to."""
-        return sorted(self._by_number.get(number, ()))
+        subscriber = self._subscribers.get(number)
+        return [] if subscriber is None else sorted(subscriber.streams)
 
     def list_readers(self, number: int) -> set[int]:
         """Return the descriptors by which a connection gets media."""
-        streams = self._by_number.get(number, ())
-        return {reader for stream in streams for reader in self._subscriptions[number, stream].readers}
+        streams = self.list_subscriptions(number)
+        return {reader for stream in streams for reader in self._subscriptions[stream][number].readers}
 
     def read_counters(self, number: int) -> DeliveryCounters:
         """Return the counters of all subscriptions of a connection."""
-        total = self._ended_counters.get(number, DeliveryCounters())
-        for stream in self._by_number.get(number, ()):
-            total = total.combine(self._subscriptions[number, stream].counters)
+        subscriber = self._subscribers.get(number)
+        total = DeliveryCounters() if subscriber is None else subscriber.ended
+        for stream in self.list_subscriptions(number):
+            total = total.combine(self._subscriptions[stream][number].counters)
         return total
 
     def pop_paces(self) -> dict[int, float]:
         """Return the readers whose rate has changed since the last call, with bytes per second, 0 for no limit."""
         wanted: dict[int, float] = {}
         for number, one in self._subscribers.items():
-            if one.bytes_per_s:
-                wanted |= dict.fromkeys(self.list_readers(number), one.bytes_per_s)
+            if one.settings.bytes_per_s:
+                wanted |= dict.fromkeys(self.list_readers(number), one.settings.bytes_per_s)
         ended = self._paces.keys() - wanted.keys()
         changed = {reader: pace for reader, pace in wanted.items() if self._paces.get(reader) != pace}
         self._paces = wanted
-        return changed | dict.fromkeys(ended & self._by_reader.keys(), 0.0)
+        return changed | dict.fromkeys(ended, 0.0)
+
+    def _end_subscription(self, number: int, stream: str) -> None:
+        subscriber, numbers = self._subscribers[number], self._subscriptions[stream]
+        subscriber.ended = subscriber.ended.combine(numbers.pop(number).counters)
+        subscriber.streams.remove(stream)
+        if not numbers:
+            del self._subscriptions[stream]
+
+    def _find_subscription(self, number: int, stream: str) -> _Subscription | None:
+        return self._subscriptions.get(stream, {}).get(number)
+
+    def _list_keys(self) -> list[tuple[int, str]]:
+        return [(number, stream) for stream, numbers in self._subscriptions.items() for number in numbers]
 
     # --- frames ------------------------------------------------------------------------------------------------------
 
@@ -296,13 +309,13 @@ class MediaScheduler:
         fits = len(frames) == len(levels) == len(push.classes) == len(set(levels))
         fits = fits and (0 in levels or (not levels and push.info is not None))
         if not fits or not is_stream_name(push.stream):
-            self._count_drop("media_malformed")
+            self.count_drop("media_malformed")
             return False
         if now_ns < self._paused_until_ns:
-            self._count_drop("media_memory")
+            self.count_drop("media_memory")
             return False
         if push.connection_epoch in self._left:
-            self._count_drop("media_source_left")
+            self.count_drop("media_source_left")
             return False
         sender = LOCAL if connection == LOCAL else self._find_sender(push.connection_epoch, source)
         stream = self._find_stream(push.stream, source, connection, sender, now_ns)
@@ -320,8 +333,10 @@ class MediaScheduler:
         for level in range(NONE_LEVEL):
             frame, due = stream.select_frame(level)
             stream.level_bytes[level] += len(frame) if due else 0
-        for number, subscription in self._by_stream.get(push.stream, {}).items():
-            self._mark_due((number, push.stream), subscription, stream)
+        for number, subscription in self._subscriptions.get(push.stream, {}).items():
+            level = self._find_level(number, push.stream)
+            if level < NONE_LEVEL and stream.select_frame(level)[1]:
+                self._mark_due((number, push.stream), subscription)
         return True
 
     def flush(self, send: Send, now_ns: int) -> bool:
@@ -329,7 +344,7 @@ class MediaScheduler:
         self._offer_delayed(now_ns)
         for _ in range(len(self._pending)):
             key = self._pending.popleft()
-            subscription = self._subscriptions.get(key)
+            subscription = self._find_subscription(*key)
             if subscription is None or not subscription.pending:
                 continue
             if self._send(key, subscription, send, now_ns):
@@ -354,7 +369,7 @@ class MediaScheduler:
         for name in sorted(self._streams):
             stream = self._streams[name]
             rates, hz = stream.compute_rates()
-            subscribers = len(self._by_stream.get(name, ()))
+            subscribers = len(self._subscriptions.get(name, ()))
             found[name] = StreamStats(
                 rates,
                 hz,
@@ -400,12 +415,12 @@ class MediaScheduler:
         for stream in held:
             stream.push, stream.frames = None, {}
         for key in self._pending:
-            subscription = self._subscriptions.get(key)
+            subscription = self._find_subscription(*key)
             if subscription is not None and subscription.pending:
                 subscription.pending = False
                 if sizes.get(key[1], 0) >= STUCK_BYTES:
                     self._stuck |= subscription.readers
-                self._count_drop("media_memory")
+                self.count_drop("media_memory")
         self._pending.clear()
         if held:
             self._paused_until_ns = until_ns
@@ -415,8 +430,9 @@ class MediaScheduler:
         """Release every frame after a fault, and what is due, which may be inconsistent. Subscriptions stay."""
         for stream in self._streams.values():
             stream.push, stream.frames = None, {}
-        for subscription in self._subscriptions.values():
-            subscription.pending = False
+        for numbers in self._subscriptions.values():
+            for subscription in numbers.values():
+                subscription.pending = False
         self._pending.clear()
 
     def pop_stuck(self) -> set[int]:
@@ -432,8 +448,8 @@ class MediaScheduler:
         return taken
 
     def count_drop(self, reason: str) -> None:
-        """Count a frame that was dropped before it came here."""
-        self._count_drop(reason)
+        """Count a frame or subscription that was dropped."""
+        self.drops[reason] = self.drops.get(reason, 0) + 1
 
     def release_streams(self, connection: int) -> None:
         """Let the streams of a connection that has ended be taken over by the next one of the same key."""
@@ -455,32 +471,16 @@ class MediaScheduler:
 
     # --- helpers -----------------------------------------------------------------------------------------------------
 
-    def _add_subscription(self, number: int, stream: str) -> _Subscription:
-        subscription = self._subscriptions[number, stream] = _Subscription()
-        self._by_number.setdefault(number, set()).add(stream)
-        self._by_stream.setdefault(stream, {})[number] = subscription
-        return subscription
-
-    def _remove_subscription(self, number: int, stream: str) -> None:
-        del self._subscriptions[number, stream]
-        streams, numbers = self._by_number[number], self._by_stream[stream]
-        streams.remove(stream)
-        del numbers[number]
-        if not streams:
-            del self._by_number[number]
-        if not numbers:
-            del self._by_stream[stream]
-
     def _find_sender(self, number: int, source: str) -> int:
         """Return the connection number that a source states, 0 if that connection has another key."""
-        connection = self._subscribers.get(number)
-        return number if connection is not None and connection.user_id == source else 0
+        subscriber = self._subscribers.get(number)
+        return number if subscriber is not None and subscriber.settings.user_id == source else 0
 
     def _find_stream(self, name: str, source: str, connection: int | None, sender: int, now_ns: int) -> _Stream | None:
         stream = self._streams.get(name)
         if stream is None:
             if len(self._streams) >= MAX_STREAMS:
-                self._count_drop("media_streams_full")
+                self.count_drop("media_streams_full")
                 return None
             # A restarted front numbers above its predecessor: no stream has a thousand frames a second.
             stream = self._streams[name] = _Stream(source, connection, now_ns // MILLISECOND, now_ns)
@@ -488,7 +488,7 @@ class MediaScheduler:
             has_ended = stream.source == source and stream.connection is None
             if not has_ended and now_ns - stream.heard_ns < TAKEOVER_NS:
                 stream.refused_ns = now_ns
-                self._count_drop("media_stream_taken")
+                self.count_drop("media_stream_taken")
                 if sender > 0:
                     since_ns, last_ns = self._refused.get((sender, name), (now_ns, now_ns))
                     self._refused[sender, name] = since_ns if now_ns - last_ns < TAKEOVER_NS else now_ns, now_ns
@@ -503,55 +503,45 @@ class MediaScheduler:
 
     def _take_info(self, stream: _Stream, info: StreamInfo) -> None:
         if find_info_problem(info):
-            self._count_drop("media_info_malformed")
+            self.count_drop("media_info_malformed")
             return
         title, detail = _cut_text(info.title, MAX_TITLE), _cut_text(info.detail, MAX_DETAIL)
         stream.info = msgspec.structs.replace(info, title=title, detail=detail)
 
     def _find_level(self, number: int, stream: str) -> int:
-        listener = self._subscribers.get(number)
-        return NONE_LEVEL if listener is None else listener.levels.get(stream, listener.default_level)
+        subscriber = self._subscribers.get(number)
+        if subscriber is None:
+            return NONE_LEVEL
+        return subscriber.settings.levels.get(stream, subscriber.settings.default_level)
 
-    def _needs_newest(self, key: tuple[int, str]) -> bool:
-        """Return whether a subscription has not had the newest frame of its stream, and is not about to get it."""
-        subscription, stream = self._subscriptions.get(key), self._streams.get(key[1])
+    def _find_missing_newest(self, key: tuple[int, str]) -> _Subscription | None:
+        """Return a subscription that has not had the newest frame of its stream, and is not about to get it."""
+        subscription, stream = self._find_subscription(*key), self._streams.get(key[1])
         if subscription is None or stream is None or not stream.frames or subscription.pending:
-            return False
-        return subscription.seq != stream.seq and self._find_level(*key) < NONE_LEVEL
+            return None
+        return subscription if subscription.seq != stream.seq and self._find_level(*key) < NONE_LEVEL else None
 
     def _offer_newest(self, key: tuple[int, str], now_ns: int) -> None:
         """Mark the newest frame of a stream due for a subscription that has not had it: now, or when its connection may
         have another."""
-        if not self._needs_newest(key):
+        subscription = self._find_missing_newest(key)
+        if subscription is None:
             return
-        bucket = self._newest_buckets.setdefault(key[0], TokenBucket(NEWEST_PER_S, MAX_STREAMS, now_ns))
-        if bucket.take(now_ns):
-            self._mark_newest(key)
+        if self._subscribers[key[0]].newest.take(now_ns):
+            self._mark_due(key, subscription)
         else:
-            self._delayed.setdefault(key[0], {})[key[1]] = None
-            self._count_drop("media_newest_rate")
+            self._delayed[key] = None
+            self.count_drop("media_newest_rate")
 
     def _offer_delayed(self, now_ns: int) -> None:
-        for number, streams in list(self._delayed.items()):
-            for stream in list(streams):
-                if self._needs_newest((number, stream)):
-                    if not self._newest_buckets[number].take(now_ns):
-                        break
-                    self._mark_newest((number, stream))
-                del streams[stream]
-            if not streams:
-                del self._delayed[number]
+        for key in list(self._delayed):
+            subscription = self._find_missing_newest(key)
+            if subscription is None or self._subscribers[key[0]].newest.take(now_ns):
+                del self._delayed[key]
+                if subscription is not None:
+                    self._mark_due(key, subscription)
 
-    def _mark_newest(self, key: tuple[int, str]) -> None:
-        subscription = self._subscriptions[key]
-        subscription.due += 1
-        subscription.pending = True
-        self._pending.append(key)
-
-    def _mark_due(self, key: tuple[int, str], subscription: _Subscription, stream: _Stream) -> None:
-        level = self._find_level(*key)
-        if level >= NONE_LEVEL or not stream.select_frame(level)[1]:
-            return
+    def _mark_due(self, key: tuple[int, str], subscription: _Subscription) -> None:
         subscription.due += 1
         if subscription.pending:
             subscription.dropped += 1
@@ -587,9 +577,6 @@ class MediaScheduler:
         subscription.delivered += 1
         subscription.bytes += len(topic) + len(frame)
         return True
-
-    def _count_drop(self, reason: str) -> None:
-        self.drops[reason] = self.drops.get(reason, 0) + 1
 
 
 def _cut_text(text: str, length: int) -> str:
