@@ -183,14 +183,14 @@ class FrontControl:
     SETTINGS: Final[Mapping[str, Any]] = {}
 
     def __init__(self, rng: Random) -> None:
-        from tests.front.harness import FrontSession
+        from tests.front.process_harness import ProcessSession
 
         self._rng = rng
         many = dict.fromkeys(("messages", "requests", "events", "handshakes", "estops"), 10**6)
         bursts = {name[:-1] + "_burst": 10**6 for name in many}
         key = KeyLimits(connections=1000, bytes=1e9, byte_burst=10**9, **many, **bursts)
         limits = FrontLimits(hellos_per_second=1e4, hello_burst=10_000, excess_per_s=1e6, excess_burst=10**6, key=key)
-        self.session = FrontSession(limits=limits, silence_ns=10**12, **self.SETTINGS)
+        self.session = ProcessSession(limits=limits, silence_ns=10**12, **self.SETTINGS)
         self.process = psutil.Process(self.session.process.pid)
         self._corpus = Corpus(rng, client_messages())
         self._peers: list[zmq.Socket[bytes]] = []
@@ -546,7 +546,7 @@ class FrontAssets(FrontControl):
     LIFE: Final = 300
 
     def __init__(self, rng: Random) -> None:
-        from tests.front.harness import scene
+        from tests.front.process_harness import scene
 
         super().__init__(rng)
         self._corpus = Corpus(rng, [make_asset_request])

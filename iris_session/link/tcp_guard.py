@@ -228,7 +228,7 @@ class TcpGuard:
         reasons: Drop reasons.
         monitor: Monitor of a ZeroMQ socket, for `read_events`; closed by `close`.
         traffic: Counter of the bytes that were read and sent.
-        close: Closes a connection; another one than `close_tcp` where libzmq does not own it.
+        close: Closes a connection where libzmq does not own it; `None`: `close_tcp`.
     """
 
     def __init__(
@@ -238,7 +238,7 @@ class TcpGuard:
         monitor: zmq.Socket[bytes] | None = None,
         *,
         traffic: TrafficCounter | None = None,
-        close: CloseTcp = close_tcp,
+        close: CloseTcp | None = None,
     ) -> None:
         self.bounds = bounds
         self.traffic = TrafficCounter() if traffic is None else traffic
@@ -415,7 +415,8 @@ class TcpGuard:
         connection = self._table.get(descriptor)
         if connection is None:
             return ""
-        closed = self._close(descriptor, connection.address, discard=self.bounds.discards_unread)
+        close = self._close or close_tcp
+        closed = close(descriptor, connection.address, discard=self.bounds.discards_unread)
         if not closed and peer_of(descriptor) == connection.address:
             return CLOSE_FAILED
         self._table.pop(descriptor, None)
@@ -441,7 +442,7 @@ class TcpGuard:
                 connection.owner,
                 connection.unread,
                 f"a connection to {self._reasons.channel} from {connection.address[0]}",
-                partial(self._close, descriptor, connection.address),
+                partial(self._close or close_tcp, descriptor, connection.address),
             )
             for descriptor, connection in self._unread
         ]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.scenario import Scenario
-from tests.front.harness import FrontSession
+from tests.front.process_harness import ProcessSession
 
 pytestmark = pytest.mark.e2e
 
@@ -67,7 +67,7 @@ def test_silent_and_half_open_connections_are_closed_and_disturb_no_client(scena
 def test_garbage_in_an_encrypted_handshake_closes_the_connection(tmp_path: Path) -> None:
     home = tmp_path / "home"
     home.mkdir(mode=0o700)
-    front = FrontSession(curve=True, key_home=str(home))
+    front = ProcessSession(curve=True, key_home=str(home))
     try:
         curve = GREETING[:12] + b"CURVE".ljust(20, b"\0") + bytes(32)
         for size in (0, 1, 199, 200, 5000):

@@ -8,23 +8,18 @@ from __future__ import annotations
 import os
 import resource
 import sys
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from iris_session.alignment.estimator import ConnectionEstimator
 from iris_session.front.main import main
 from iris_session.link import front_process
-from iris_session.protocol.entries import AlignmentProposal
 from iris_session.system.process import ChildProcess
 
-SLOW_ESTIMATES, FEW_DESCRIPTORS = "slow_estimates", "few_descriptors"
-ESTIMATE_S = 3.0
+FEW_DESCRIPTORS = "few_descriptors"
 DESCRIPTORS = 512
-_propose = ConnectionEstimator.propose
 
 
 def run_altered(monkeypatch: pytest.MonkeyPatch, condition: str) -> None:
@@ -36,14 +31,6 @@ def run_altered(monkeypatch: pytest.MonkeyPatch, condition: str) -> None:
     monkeypatch.setattr(front_process, "ChildProcess", lambda _module, **options: altered(**options))
 
 
-def _propose_slowly(estimator: ConnectionEstimator, now_ns: int) -> AlignmentProposal | None:
-    time.sleep(ESTIMATE_S)
-    return _propose(estimator, now_ns)
-
-
 if __name__ == "__main__":
-    if sys.argv[1] == SLOW_ESTIMATES:
-        ConnectionEstimator.propose = _propose_slowly  # type: ignore[method-assign]
-    else:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
     sys.exit(main())

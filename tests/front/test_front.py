@@ -1,4 +1,4 @@
-"""The real front process against well-behaved clients: join, identity, resume, snapshots, state, alignment."""
+"""The front against well-behaved clients: join, identity, resume, snapshots, state, alignment."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from collections.abc import Callable
 
 import msgspec
 import numpy as np
-import pytest
-import zmq
 
 from iris_session.protocol.client_messages import (
     Acquire,
@@ -21,7 +19,6 @@ from iris_session.protocol.client_messages import (
     Hello,
     Marker,
     Observation,
-    Sample,
     wrap_message,
 )
 from iris_session.protocol.codec import decode_presence, decode_state_header, encode_client
@@ -40,7 +37,6 @@ from iris_session.protocol.steps import Admitted, Decision, Dropped, OutgoingMes
 from iris_session.streams.rigid import RigidDecoder
 from tests.front.harness import N_BODIES, FrontSession
 
-pytestmark = pytest.mark.e2e
 OpenSession = Callable[..., FrontSession]
 
 
@@ -300,25 +296,6 @@ def test_observations_become_proposals_not_entries(open_session: OpenSession) ->
         lambda: any("table" in e.message.advice for e in session.entries if isinstance(e.message, AlignmentProposal)),
         "advice that names the known anchors",
     )
-
-
-def test_raw_samples_go_to_the_recorder(open_session: OpenSession, tmp_path: object) -> None:
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    recorder = context.socket(zmq.PULL)
-    recorder.bind(f"ipc://{tmp_path}/recorder")
-    session = open_session(recorder_endpoint=f"ipc://{tmp_path}/recorder")
-    client = session.client()
-    client.join()
-    for seq in range(20):
-        client.send(Sample("head", "pose", seq, 0, 1, 0, 1, pose=IDENTITY))
-    rows: list[tuple[int, int, bytes]] = []
-    while len(rows) < 20:
-        assert recorder.poll(30_000)
-        rows += msgspec.msgpack.decode(recorder.recv())
-    samples = [msgspec.msgpack.decode(data, type=Sample) for _, _, data in rows]
-    assert [s.seq for s in samples] == list(range(20))
-    assert all(connection == 1 for connection, _, _ in rows)
-    context.destroy(linger=0)
 
 
 def test_gateway_sends_for_participants_and_they_leave_with_it(session: FrontSession) -> None:

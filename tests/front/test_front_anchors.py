@@ -1,18 +1,14 @@
-"""Live anchors through a real front process: from samples and observations to entries, and events back into it."""
+"""Live anchors through a front: from samples and observations to entries, and events back into it."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
-import pytest
-
-from iris_session.protocol.client_messages import ClockPing, Observation, Sample, Samples
+from iris_session.protocol.client_messages import Observation, Sample, Samples
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import AlignmentAlarm, AlignmentProposal
-from iris_session.protocol.server_messages import AnchorMoved, ClockPong, Event
+from iris_session.protocol.server_messages import AnchorMoved, Event
 from iris_session.protocol.steps import Decision
-from tests.front.altered_front import ESTIMATE_S, SLOW_ESTIMATES, run_altered
 from tests.front.harness import FrontSession
 
 
@@ -43,26 +39,3 @@ def test_moved_anchor_realigns_observers_and_bump_is_an_alarm(
     (alarm,) = session.wait_entries(AlignmentAlarm)
     assert alarm.connection == 1
     assert alarm.message.kind == "jump"  # type: ignore[union-attr]
-
-
-def test_the_loop_answers_while_an_estimate_is_computed(
-    open_session: Callable[..., FrontSession], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run_altered(monkeypatch, SLOW_ESTIMATES)
-    session = open_session(anchors={"table": Pose((1.0, 0.0, 0.8), IDENTITY.q)})
-    client = session.client()
-    client.join(devices=("head",))
-    for i in range(8):
-        pose = Pose((0.5, 0.0, 0.3), IDENTITY.q)
-        client.send(Sample("head", "pose", i + 1, 1000 * i, 1, 1, 0, pose=pose))
-        client.send(Observation("table", "qr", Pose((0.5, 0.0, -0.2), IDENTITY.q), 1000 * i, 1, i))
-    began, longest_s = time.monotonic(), 0.0
-    while not any(isinstance(entry.message, AlignmentProposal) for entry in session.entries):
-        assert time.monotonic() < began + 60.0, "no proposal"
-        sent, n = time.monotonic(), len(client.got(ClockPong))
-        client.send(ClockPing(0))
-        client.wait_for(ClockPong, n + 1)
-        longest_s = max(longest_s, time.monotonic() - sent)
-        session.pump(lambda at=sent + 0.1: time.monotonic() > at)  # type: ignore[misc]  # below the rate limit
-    assert time.monotonic() - began > ESTIMATE_S
-    assert longest_s < ESTIMATE_S / 2

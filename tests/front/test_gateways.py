@@ -6,7 +6,6 @@ import os
 
 import numpy as np
 import pytest
-import zmq
 
 from iris_session.protocol.client_messages import Hello, Marker, RemoveParticipant
 from iris_session.protocol.entries import Join, Lost
@@ -121,39 +120,10 @@ def test_added_roles_end_no_connection(lab: Lab) -> None:
     assert not [e for e in lab.session.entries if isinstance(e.message, Lost)]
 
 
-class Watcher:
-    """A subscriber of state that notes when it is disconnected."""
-
-    def __init__(self, lab: Lab, pair: KeyPair) -> None:
-        self.lab = lab
-        self.socket = lab.session.subscriber(curve=lab.curve(pair))
-        self._monitor = self.socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
-
-    def frame(self) -> None:
-        """Wait for a state that is sent after this call."""
-        while self.socket.poll(0):
-            self.socket.recv_multipart()
-
-        def comes() -> bool:
-            self.lab.session.send_state(np.zeros((3, 7)))
-            return bool(self.socket.poll(0))
-
-        self.lab.session.pump(comes, "state", 30.0)
-
-    @property
-    def disconnected(self) -> bool:
-        return bool(self._monitor.poll(0))
-
-    def close(self) -> None:
-        self.socket.disable_monitor()
-        self._monitor.close()
-
-
 @pytest.mark.parametrize("who", ["behind a gateway", "without state", "with state"])
 def test_subscribers_reconnect_only_when_a_subscribed_key_is_revoked(lab: Lab, who: str) -> None:
     bob, _ = lab.allowed("bob")
-    watcher = Watcher(lab, bob)
-    watcher.frame()
+    watcher = lab.session.subscriber(curve=lab.curve(bob))
     if who == "behind a gateway":
         gateway = Gateway(lab, "gateway", "operator")
         key_id = gateway.enter("tab1", "operator").key_id
@@ -162,16 +132,14 @@ def test_subscribers_reconnect_only_when_a_subscribed_key_is_revoked(lab: Lab, w
     else:
         ann, client = lab.allowed("ann")
         if who == "with state":
-            other = Watcher(lab, ann)
-            other.frame()
-            other.close()
+            lab.session.subscriber(curve=lab.curve(ann))
         dropped = Dropped(client.epoch, "revoked", ann.fingerprint)
     lab.session.once(Decision((), dropped=(dropped,)))
     client.wait_for(ProtocolFault)
     lab.session.wait_entries(RemoveParticipant)
-    watcher.frame()
-    assert watcher.disconnected == (who == "with state")
-    watcher.close()
+    assert watcher.disconnects == (who == "with state")
+    lab.session.send_state(np.zeros((3, 7)))
+    lab.session.pump(lambda: watcher.frames, "state")
 
 
 def test_what_a_client_behind_a_gateway_sends_counts_as_its_own(lab: Lab) -> None:

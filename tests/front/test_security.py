@@ -1,16 +1,15 @@
-"""Unknown, allowed, paired and revoked keys at a real front process."""
+"""Unknown, allowed, paired and revoked keys."""
 
 from __future__ import annotations
 
 import json
-import socket
 import time
 from pathlib import Path
 
 import numpy as np
-import zmq
 from zmq.auth import create_certificates
 
+from iris_session.link.config import SECOND
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import EStop, Heartbeat, Hello, Marker, Pair, RemoveParticipant
 from iris_session.protocol.entries import Audit, Join, Lost
@@ -73,7 +72,7 @@ def test_code_pairs_one_key_with_the_roles_of_the_code(lab: Lab) -> None:
 def test_wrong_codes_void_the_code_and_are_audited_with_their_count(lab: Lab) -> None:
     eve = KeyPair.generate()
     code, made = lab.home.join_codes.create(lab.server)
-    client, began = lab.client(eve), time.monotonic()
+    client = lab.client(eve)
     for n in range(1, 6):
         answer = lab.refused(client, Pair("eve", b"x" * 32), n)
         assert (answer.code, answer.message) == (RefusalCode.CODE, "this join code is wrong, used or expired")
@@ -85,7 +84,7 @@ def test_wrong_codes_void_the_code_and_are_audited_with_their_count(lab: Lab) ->
     assert len(lab.audits(AuditKind.CODE_EXHAUSTED)) == 1
     refused = lab.audits(AuditKind.CODE_REFUSED, 5)
     assert sum(a.count for a in refused) == 5
-    assert len(refused) <= 2 + (time.monotonic() - began), "at most once a second"
+    assert len(refused) <= 2, "at most once a second"
 
 
 def test_attempts_per_address_are_bounded_for_all_codes(lab: Lab) -> None:
@@ -124,19 +123,6 @@ def test_expired_code_pairs_no_key(lab: Lab) -> None:
     assert lab.home.clients.read() == {}
 
 
-def test_pairing_waits_only_for_a_locked_list(lab: Lab) -> None:
-    ann = KeyPair.generate()
-    code, _ = lab.home.join_codes.create(lab.server)
-    _, bob = lab.allowed("bob")
-    client = lab.client(ann)
-    with lab.home.folder.lock():
-        client.send(Pair("ann", lab.proof(code, ann)))
-        bob.send(Marker(1, "meanwhile"))
-        lab.session.wait_entries(Marker)
-        assert client.got(Paired) == []
-    client.wait_for(Paired)
-
-
 def test_unencrypted_sessions_refuse_pairing(session: FrontSession) -> None:
     client = session.client()
     client.send(Pair("ann", b"x" * 32))
@@ -147,32 +133,21 @@ def test_revoked_key_is_disconnected_and_others_have_state_within_a_second(lab: 
     ann, ann_client = lab.allowed("ann")
     bob, bob_client = lab.allowed("bob")
     ann_state, bob_state = (lab.session.subscriber(curve=lab.curve(pair)) for pair in (ann, bob))
-    poses = np.zeros((3, 7))
-    frames, at, gap = {"ann": 0, "bob": 0}, time.monotonic(), 0.0
-
-    def stream() -> dict[str, int]:
-        nonlocal at, gap
-        lab.session.send_state(poses)
-        for name, sub in (("ann", ann_state), ("bob", bob_state)):
-            while sub.poll(0):
-                sub.recv_multipart()
-                frames[name] += 1
-                if name == "bob":
-                    at, gap = time.monotonic(), max(gap, time.monotonic() - at)
-        return frames
-
-    lab.session.pump(lambda: min(stream().values()) > 0, "state for both")
-    revoked_at, gap = time.monotonic(), 0.0
+    lab.session.send_state(np.zeros((3, 7)))
+    lab.session.pump(lambda: ann_state.frames and bob_state.frames, "state for both")
+    before, revoked_ns = len(lab.session.entries), lab.session.now_ns
     lab.home.clients.revoke_key("ann")
-    lab.session.pump(lambda: bool(stream() and ann_client.got(ProtocolFault)), "ann is told")
-    told_after = time.monotonic() - revoked_at
-    assert ann_client.got(ProtocolFault)[-1].code == FaultCode.REVOKED
-    before = len(lab.session.entries)
-    then = dict(frames)
-    lab.session.pump(lambda: stream()["bob"] > then["bob"] + 100, "state for bob again")
-    # Half a second and one second, on a machine with time to spare: printed, because others may have none.
-    print(f"told after {told_after:.3f} s, the others had no state for {gap:.3f} s")
-    assert frames["ann"] - then["ann"] <= 10, "only what was under way"
+    assert ann_client.wait_for(ProtocolFault).code == FaultCode.REVOKED
+    ann_state.frames.clear()
+    bob_state.frames.clear()
+
+    def has_state() -> bool:
+        lab.session.send_state(np.zeros((3, 7)))
+        return bool(bob_state.frames)
+
+    lab.session.pump(has_state, "state for bob again")
+    assert lab.session.now_ns - revoked_ns < SECOND
+    assert not ann_state.frames
     (lost,) = lab.session.wait_entries(Lost)
     assert lost.message == Lost("revoked")
     assert lab.session.wait_entries(RemoveParticipant)[0].message == RemoveParticipant(0, "p1", reason="key revoked")
@@ -188,16 +163,13 @@ def test_revoked_key_is_disconnected_and_others_have_state_within_a_second(lab: 
 def test_revoked_connection_is_unknown_until_it_is_closed(lab: Lab) -> None:
     """Its TCP connection was authenticated while the key was valid."""
     _, client = lab.allowed("ann")
-    monitor = client.socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
     lab.home.clients.revoke_key("ann")
     client.wait_for(ProtocolFault)
     client.send(EStop("ann"))
     for _ in range(3):
         client.send(Hello("operator", "ann"))
     assert client.wait_for(Refused).code == RefusalCode.UNPAIRED
-    lab.session.pump(lambda: bool(monitor.poll(0)), "its TCP connection is closed")
-    client.socket.disable_monitor()
-    monitor.close()
+    lab.session.pump(lambda: not client.is_connected, "its TCP connection is closed")
     assert len(lab.session.wait_entries(Join)) == 1
     assert not [e for e in lab.session.entries if isinstance(e.message, EStop)]
 
@@ -321,16 +293,15 @@ def test_participants_of_a_gateway_have_the_other_roles_of_its_key(lab: Lab) -> 
 
 
 def test_audits_of_a_flood_are_bounded_and_add_up(lab: Lab) -> None:
-    clients, began = [lab.client(KeyPair.generate()) for _ in range(5)], time.monotonic()
+    clients = [lab.client(KeyPair.generate()) for _ in range(5)]
     for _ in range(40):
         for client in clients:
             client.send(Hello("operator", "Eve"))
     audits = lab.audits(AuditKind.KEY_REFUSED, 200)
     assert sum(a.count for a in audits) == 200
-    seconds = time.monotonic() - began
-    assert len(audits) <= 2 + seconds, "at most once a second"
+    assert len(audits) <= 3, "at most once a second"
     answers = len([m for client in clients for m in client.got(Refused)])
-    assert answers <= 20 + 20 * seconds, "answers to strangers are bounded"
+    assert answers <= 40, "answers to unknown keys are bounded"
 
 
 def test_damaged_list_keeps_the_previous_keys(lab: Lab) -> None:
@@ -363,12 +334,3 @@ def test_list_may_be_edited_during_the_session(lab: Lab) -> None:
     lab.session.wait_entries(Marker)
     path.chmod(0o600)  # as the session said
     assert bob.wait_for(ProtocolFault).code == FaultCode.REVOKED
-
-
-def test_unfinished_handshakes_hold_no_resources(lab: Lab) -> None:
-    sockets = [socket.create_connection((lab.session.host, lab.session.ports.control)) for _ in range(50)]
-    try:
-        lab.allowed("ann")
-    finally:
-        for one in sockets:
-            one.close()

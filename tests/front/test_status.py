@@ -1,8 +1,7 @@
-"""The status report of a real front, with a scripted authority."""
+"""The status report of a front, with a scripted authority."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import msgspec
@@ -153,7 +152,7 @@ def test_delays_of_samples_are_measured(session: FrontSession) -> None:
 
     ann = ask(session, client, measured).participants[0]
     assert ann.capture_to_receive is not None
-    assert 30.0 <= ann.capture_to_receive.p50 < 10_000.0  # ms, on a busy machine
+    assert 30.0 <= ann.capture_to_receive.p50 < 60.0
 
 
 def test_concurrent_requests_get_the_same_report(session: FrontSession) -> None:
@@ -171,11 +170,11 @@ def test_concurrent_requests_get_the_same_report(session: FrontSession) -> None:
 def test_status_requests_are_rate_limited(session: FrontSession) -> None:
     client = session.client()
     client.join()
-    limit, began = LIMITS[GetStatus], time.monotonic()
+    limit = LIMITS[GetStatus]
     for n in range(limit.burst + 10):
         client.send(GetStatus(n + 1))
     assert client.wait_for(ProtocolFault).code == FaultCode.RATE
-    assert len(client.got(StatusReport)) <= limit.burst + limit.per_second * (time.monotonic() - began)
+    assert len(client.got(StatusReport)) <= limit.burst
 
 
 def test_client_can_request_status_before_admission(session: FrontSession) -> None:
@@ -202,13 +201,11 @@ def test_front_reports_a_stalled_authority(open_session: Callable[..., FrontSess
     welcome = client.join()
     session.process.link.send_report(half(row(welcome.participant_id)))
     session.once()
-    while not client.got(ProtocolFault):  # the authority says nothing: no steps meanwhile
-        assert client.socket.poll(30_000)
-        client.receive()
+    for _ in range(200):
+        session.run_front()  # the authority says nothing
+    assert [fault.code for fault in client.got(ProtocolFault)] == [FaultCode.STALLED]
     client.send(GetStatus(1))
-    while not client.got(StatusReport):
-        assert client.socket.poll(30_000)
-        client.receive()
+    session.run_front()
     (report,) = client.got(StatusReport)
     assert report.stalled
     assert report.authority_silent_ns > 500 * MS

@@ -28,11 +28,11 @@ from iris_session.protocol.server_messages import ProtocolFault, Snapshot
 from iris_session.protocol.status import DeliveryBudget
 from iris_session.security import KeyHome
 from tests.front.altered_front import DESCRIPTORS, FEW_DESCRIPTORS, run_altered
-from tests.front.harness import LONG_NS, FrontSession, RawClient, scene
+from tests.front.process_harness import LONG_NS, ProcessClient, ProcessSession, scene
 from tests.loopback import make_loopback_address
 
 pytestmark = pytest.mark.e2e
-OpenSession = Callable[..., FrontSession]
+OpenSession = Callable[..., ProcessSession]
 
 
 def gone(pid: int) -> bool:
@@ -50,7 +50,7 @@ def wait(condition: Callable[[], bool], what: str) -> None:
         time.sleep(0.005)
 
 
-def wait_until_told(client: RawClient) -> list[str]:
+def wait_until_told(client: ProcessClient) -> list[str]:
     """Wait for the word of the end, which may come after the end of the front. Return the codes of all faults."""
 
     def codes() -> list[str]:
@@ -162,8 +162,8 @@ def test_folder_too_long_for_a_socket_is_not_used(monkeypatch: pytest.MonkeyPatc
     assert list(folder.iterdir()) == []
 
 
-def test_ipv6(open_session: OpenSession) -> None:
-    session = open_session(host="::1")
+def test_ipv6(open_process: OpenSession) -> None:
+    session = open_process(host="::1")
     assert session.ports.host == "[::1]"
     with session.context.socket(zmq.DEALER) as client:
         client.linger = 0
@@ -174,7 +174,8 @@ def test_ipv6(open_session: OpenSession) -> None:
         session.pump(lambda: bool(client.poll(0)), "welcome over IPv6")
 
 
-def test_clients_are_notified_when_the_session_is_closed(session: FrontSession) -> None:
+def test_clients_are_notified_when_the_session_is_closed(process_session: ProcessSession) -> None:
+    session = process_session
     client = session.client()
     client.join()
     client.wait_for(DeliveryBudget)
@@ -182,12 +183,14 @@ def test_clients_are_notified_when_the_session_is_closed(session: FrontSession) 
     assert wait_until_told(client) == ["session_ended"]
 
 
-def test_ctrl_c_in_the_terminal_reaches_only_the_parent(session: FrontSession) -> None:
+def test_ctrl_c_in_the_terminal_reaches_only_the_parent(process_session: ProcessSession) -> None:
+    session = process_session
     assert os.getsid(session.process.pid) == session.process.pid != os.getsid(0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_signals_end_the_front_cleanly(session: FrontSession, number: signal.Signals) -> None:
+def test_signals_end_the_front_cleanly(process_session: ProcessSession, number: signal.Signals) -> None:
+    session = process_session
     client = session.client()
     client.join()
     os.kill(session.process.pid, number)
@@ -195,7 +198,8 @@ def test_signals_end_the_front_cleanly(session: FrontSession, number: signal.Sig
     assert wait_until_told(client)[-1] == "session_ended"
 
 
-def test_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(session: FrontSession) -> None:
+def test_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(process_session: ProcessSession) -> None:
+    session = process_session
     client = session.client()
     token = client.join().resume_token
     session.once()
@@ -215,7 +219,8 @@ def test_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(sessi
     assert welcome.connection_epoch == 2
 
 
-def test_front_that_cannot_listen_again_says_why(session: FrontSession) -> None:
+def test_front_that_cannot_listen_again_says_why(process_session: ProcessSession) -> None:
+    session = process_session
     address = session.host, session.ports.control
     os.kill(session.process.pid, signal.SIGKILL)
     wait(lambda: not session.process.alive, "crash")
@@ -233,7 +238,8 @@ def test_front_that_cannot_listen_again_says_why(session: FrontSession) -> None:
         assert f"port {address[1]}" in session.process.fault
 
 
-def test_failed_start_of_a_front_is_retried(session: FrontSession, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_start_of_a_front_is_retried(process_session: ProcessSession, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = process_session
     os.kill(session.process.pid, signal.SIGKILL)
     wait(lambda: not session.process.alive, "crash")
     ports = session.process.link.ports
@@ -253,7 +259,8 @@ def test_failed_start_of_a_front_is_retried(session: FrontSession, monkeypatch: 
     assert session.process.link.ports == ports
 
 
-def test_hanging_front_is_replaced(session: FrontSession) -> None:
+def test_hanging_front_is_replaced(process_session: ProcessSession) -> None:
+    session = process_session
     client = session.client()
     token = client.join().resume_token
     session.once()
@@ -267,7 +274,8 @@ def test_hanging_front_is_replaced(session: FrontSession) -> None:
     assert client.join(resume_token=token).resumed
 
 
-def test_stalled_authority_does_not_replace_the_front(session: FrontSession) -> None:
+def test_stalled_authority_does_not_replace_the_front(process_session: ProcessSession) -> None:
+    session = process_session
     client = session.client()
     client.join()
     os.kill(session.process.pid, signal.SIGSTOP)
@@ -278,7 +286,8 @@ def test_stalled_authority_does_not_replace_the_front(session: FrontSession) -> 
     assert session.process.alive
 
 
-def test_scene_changed_during_a_restart_reaches_the_new_front(session: FrontSession) -> None:
+def test_scene_changed_during_a_restart_reaches_the_new_front(process_session: ProcessSession) -> None:
+    session = process_session
     session.once()
     os.kill(session.process.pid, signal.SIGKILL)
     wait(lambda: not session.process.alive, "crash")
@@ -291,7 +300,8 @@ def test_scene_changed_during_a_restart_reaches_the_new_front(session: FrontSess
     assert len(client.wait_for(Snapshot).bodies) == 5
 
 
-def test_drop_counts_survive_a_restart_of_the_front(session: FrontSession) -> None:
+def test_drop_counts_survive_a_restart_of_the_front(process_session: ProcessSession) -> None:
+    session = process_session
     client = session.client()
     client.join()
     client.socket.send(b"nonsense")
@@ -305,7 +315,8 @@ def test_drop_counts_survive_a_restart_of_the_front(session: FrontSession) -> No
     session.pump(lambda: session.process.link.status.drops["malformed"] == 2, "sum")
 
 
-def test_new_front_numbers_states_above_its_predecessor(session: FrontSession) -> None:
+def test_new_front_numbers_states_above_its_predecessor(process_session: ProcessSession) -> None:
+    session = process_session
     poses = np.zeros((3, 7))
     client = session.client()
     client.join()
@@ -323,7 +334,8 @@ def test_new_front_numbers_states_above_its_predecessor(session: FrontSession) -
     assert client.wait_for(Snapshot, 2).state_seq > before
 
 
-def test_closed_link_ends_the_front(session: FrontSession) -> None:
+def test_closed_link_ends_the_front(process_session: ProcessSession) -> None:
+    session = process_session
     client = session.client()
     client.join()
     session.process.link.close()
@@ -331,8 +343,8 @@ def test_closed_link_ends_the_front(session: FrontSession) -> None:
     assert wait_until_told(client)[-1] == "session_ended"
 
 
-def test_stalled_and_recovered_are_reported_once_each(open_session: OpenSession) -> None:
-    session = open_session(stall_ns=FrontConfig().stall_ns)
+def test_stalled_and_recovered_are_reported_once_each(open_process: OpenSession) -> None:
+    session = open_process(stall_ns=FrontConfig().stall_ns)
     client = session.client()
     client.join()
     client.wait_for(DeliveryBudget)
@@ -354,7 +366,7 @@ import sys, time
 from iris_session.link import FrontConfig, FrontProcess
 from iris_session.protocol.steps import Admitted, Decision
 from iris_session.protocol.entries import Join
-from tests.front.harness import scene
+from tests.front.process_harness import scene
 process = FrontProcess(FrontConfig(control_port=0, state_port=0), scene())
 print(process.start().control, process.pid, flush=True)
 while True:
@@ -392,14 +404,14 @@ def test_front_ends_with_its_parent(number: signal.Signals, tmp_path: Path) -> N
 
 
 def test_curve_accepts_only_allowed_keys_and_identifies_clients_by_key(
-    open_session: OpenSession, tmp_path: Path
+    open_process: OpenSession, tmp_path: Path
 ) -> None:
     keys = tmp_path / "clients"
     keys.mkdir()
     server_public, _ = _certificate(tmp_path, "server")
     ann = _certificate(keys, "ann")
     eve = _certificate(tmp_path, "eve")
-    session = open_session(curve_secret_file=str(tmp_path / "server.key_secret"), curve_clients_dir=str(keys))
+    session = open_process(curve_secret_file=str(tmp_path / "server.key_secret"), curve_clients_dir=str(keys))
     assert session.ports.key_fingerprint
     allowed = session.client(curve=(server_public, *ann))
     again = session.client(curve=(server_public, *ann))
@@ -441,10 +453,10 @@ def _certificate(folder: Path, name: str) -> tuple[bytes, bytes]:
     return public, secret
 
 
-def test_few_descriptors_are_kept_for_clients(open_session: OpenSession, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_descriptors_are_kept_for_clients(open_process: OpenSession, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many connections that say nothing as the system gives descriptors: most are closed, and a client joins."""
     run_altered(monkeypatch, FEW_DESCRIPTORS)
-    session = open_session(limits=FrontLimits(hello_timeout_ns=LONG_NS))  # they are closed for being too many alone
+    session = open_process(limits=FrontLimits(hello_timeout_ns=LONG_NS))  # they are closed for being too many alone
     silent = [socket.create_connection((session.host, session.ports.state)) for _ in range(DESCRIPTORS)]
     session.wait_drops("strangers_too_many")
     session.client().join()

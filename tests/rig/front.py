@@ -219,7 +219,7 @@ def install_front(network: Network, patch: pytest.MonkeyPatch) -> None:
     patch.setattr(front_loop, "lower_named_thread_priority", lambda _: None)
     patch.setattr(front_loop, "is_parent", lambda _: True)
     for name, module in list(sys.modules.items()):
-        if name.startswith("iris_session.front"):
+        if name.startswith(("iris_session.front", "iris_session.link.tcp_guard")):
             for function in ("peer_of", "close_tcp", "tcp_counts", "pace_tcp"):
                 if hasattr(module, function):
                     patch.setattr(module, function, getattr(network, function))
