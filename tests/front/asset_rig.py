@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import zmq
@@ -12,7 +13,7 @@ import zmq
 from iris_session.link import SceneInfo
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.codec import decode_asset_chunk, decode_asset_refused, encode_asset_request
-from tests.front.harness import FrontSession, scene
+from tests.front.harness import scene
 
 Curve = tuple[bytes, bytes, bytes]
 
@@ -33,7 +34,7 @@ def with_assets(root: Path, *assets: str) -> SceneInfo:
 class Fetcher:
     """A DEALER on the assets port; keeps the answers to its requests by number."""
 
-    def __init__(self, session: FrontSession, epoch: int, curve: Curve | None = None, **options: int) -> None:
+    def __init__(self, session: Any, epoch: int, curve: Curve | None = None, **options: int) -> None:
         self.session = session
         self.epoch = epoch
         self.socket = session.context.socket(zmq.DEALER)

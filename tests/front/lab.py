@@ -1,4 +1,4 @@
-"""An encrypted session at a real front process, with allowed and unknown keys."""
+"""An encrypted session with allowed and unknown keys, in this process or with a front process."""
 
 from __future__ import annotations
 

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import zmq
 
 from iris_session.front.media import proxy as media_module
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import MediaSubscriber
-from iris_session.link import FrontLimits
 from iris_session.link.media_source import MediaSource
 from iris_session.link.sockets import IO_THREADS, watch_tcp
 from iris_session.link.tcp_guard import TcpBounds, TcpGuard, make_reasons
@@ -24,11 +21,10 @@ from iris_session.protocol.client_messages import Heartbeat
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES
 from iris_session.protocol.media import MediaHeader, make_topic
-from iris_session.protocol.names import BudgetClass
-from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, ParticipantReport, StatusReport
+from iris_session.protocol.status import DeliveryBudget
 from iris_session.security import KeyPair
-from tests.front.harness import N_BODIES, FrontSession, RawClient
-from tests.front.lab import Lab, Open
+from tests.front.lab import Lab
+from tests.front.process_harness import ProcessClient, ProcessSession
 
 Curve = tuple[bytes, bytes, bytes]
 SECOND = 1_000_000_000
@@ -37,7 +33,9 @@ SECOND = 1_000_000_000
 class Viewer:
     """A SUB socket on the media port, and the frames it received."""
 
-    def __init__(self, session: FrontSession, topics: list[bytes], curve: Curve | None = None, hwm: int = 1000) -> None:
+    def __init__(
+        self, session: ProcessSession, topics: list[bytes], curve: Curve | None = None, hwm: int = 1000
+    ) -> None:
         self.socket = session.context.socket(zmq.SUB)
         self.socket.linger = 0
         self.socket.rcvhwm = hwm
@@ -58,14 +56,14 @@ class Viewer:
 class Stage:
     """A publisher of `cloud` at every step, and viewers, which are kept alive on slow machines, too."""
 
-    def __init__(self, session: FrontSession) -> None:
+    def __init__(self, session: ProcessSession) -> None:
         self.session = session
         self.viewers: list[Viewer] = []
         self.size = 500
         self.publishing = True
         self.period_s = 0.0  # at least, between two frames
         self._published_s = 0.0
-        self._here: list[RawClient] = []
+        self._here: list[ProcessClient] = []
         self._beat_s = 0.0
         self._once, session.once = session.once, self._step  # type: ignore[method-assign,assignment]
 
@@ -83,7 +81,7 @@ class Stage:
     def until(self, condition: Callable[[], object], what: str) -> None:
         self.session.pump(lambda: bool(condition()), what)
 
-    def joined(self, client: RawClient, name: str = "ann") -> RawClient:
+    def joined(self, client: ProcessClient, name: str = "ann") -> ProcessClient:
         if client.welcome is None:
             client.join("observer", name)
         self._here.append(client)
@@ -91,7 +89,7 @@ class Stage:
         return client
 
     def viewer(
-        self, client: RawClient, curve: Curve | None = None, stream: str = "cloud", epoch: int = 0, hwm: int = 1000
+        self, client: ProcessClient, curve: Curve | None = None, stream: str = "cloud", epoch: int = 0, hwm: int = 1000
     ) -> Viewer:
         self.viewers.append(Viewer(self.session, [make_topic(epoch or client.epoch, stream)], curve, hwm))
         return self.viewers[-1]
@@ -105,78 +103,21 @@ class Stage:
 
 
 @pytest.fixture
-def media(session: FrontSession) -> Iterator[Stage]:
-    stage = Stage(session)
+def media(process_session: ProcessSession) -> Iterator[Stage]:
+    stage = Stage(process_session)
     yield stage
     stage.close()
 
 
 @pytest.fixture
-def locked(lab: Lab) -> Iterator[tuple[Lab, Stage]]:
-    stage = Stage(lab.session)
-    yield lab, stage
+def locked(process_lab: Lab) -> Iterator[tuple[Lab, Stage]]:
+    stage = Stage(process_lab.session)
+    yield process_lab, stage
     stage.close()
 
 
-def budgets(client: RawClient) -> dict[str, str]:
+def budgets(client: ProcessClient) -> dict[str, str]:
     return {one.stream: one.budget_class for one in client.got(DeliveryBudget)[-1].streams}
-
-
-def test_subscriber_gets_the_newest_frames(media: Stage) -> None:
-    session = media.session
-    ann = media.joined(session.client())
-    viewer = media.viewer(ann)
-    media.until(lambda: viewer.take() >= 5, "media")
-    topic, header, data = viewer.got[-1]
-    assert topic == make_topic(ann.epoch, "cloud") + b"full"
-    assert (header.stream, header.budget_class, header.scene_epoch, header.encoding) == ("cloud", "full", 1, "bytes")
-    assert header.capture_ns <= header.published_ns <= session.process.link.now_ns
-    assert data == b"c" * 500
-    assert [b[1].seq for b in viewer.got] == sorted({b[1].seq for b in viewer.got})
-    media.until(lambda: budgets(ann) == {"cloud": "full"}, "ann is told of the stream")
-
-
-def test_status_lists_streams_of_each_client(media: Stage) -> None:
-    session, media.period_s = media.session, 0.02  # frames that come faster than they are read lower the class
-    ann = media.joined(session.client())
-    viewer = media.viewer(ann)
-    media.until(lambda: viewer.take() >= 5, "media")
-    assert ann.welcome is not None
-    row = ParticipantReport(ann.welcome.participant_id, "ann", "observer", True)
-    session.process.link.send_report(StatusReport(0, "", "", 0, participants=(row,)))
-
-    asked_s = 0.0
-
-    def told() -> bool:
-        nonlocal asked_s
-        viewer.take()  # who does not read is sent less
-        if time.monotonic() > asked_s + 0.3:
-            asked_s = time.monotonic()
-            ann.send(GetStatus())
-        reports = ann.got(StatusReport)
-        if not reports or not reports[-1].participants:  # the authority's half is on its way
-            return False
-        report, mine = reports[-1], reports[-1].participants[0]
-        return bool(report.media and mine.media and mine.media_bytes_per_s) and (
-            (report.media[0].stream, report.media[0].subscribers) == ("cloud", 1)
-            and (mine.budget_class, mine.media[0].stream, mine.media[0].budget_class) == ("full", "cloud", "full")
-            and report.media[0].hz > 0.0
-        )
-
-    media.until(told, "the stream and its subscriber")
-
-
-def test_unknown_topics_are_counted(media: Stage) -> None:
-    session = media.session
-    ann = media.joined(session.client())
-    bad = Viewer(session, [b"", b"media/", b"cloud", make_topic(ann.epoch + 7, "cloud")])
-    media.viewers.append(bad)
-    other = media.viewer(ann, stream="other")
-    media.drops("media_topic_unknown", 3)
-    media.drops("media_refused", 1)
-    good = media.viewer(ann)
-    media.until(lambda: good.take() >= 20, "media")
-    assert (bad.take(), other.take()) == (0, 0)
 
 
 def test_a_message_that_is_no_subscription_takes_no_ones_frames(media: Stage) -> None:
@@ -213,138 +154,12 @@ def test_a_message_that_is_no_subscription_takes_no_ones_frames(media: Stage) ->
     other.close()
 
 
-@pytest.mark.parametrize("port", ["media", "media_ingest"])
-def test_only_silent_media_connections_are_closed(open_session: Open, port: str) -> None:
-    session = open_session(limits=FrontLimits(hello_timeout_ns=1_500_000_000))
-    media = Stage(session)
-    ann = media.joined(session.client())
-    viewer = media.viewer(ann)
-    with socket.create_connection((session.host, getattr(session.ports, port))) as silent:
-        media.drops("media_silent")
-        silent.settimeout(30.0)
-        while silent.recv(4096):
-            pass
-    seen = viewer.take()
-    media.until(lambda: viewer.take() > seen + 100, "ann goes on")
-    assert session.process.link.status.drops["media_silent"] == 1
-    media.close()
-
-
-def test_endless_message_is_cut_off(open_session: Open) -> None:
-    """libzmq would collect it in memory; its own sockets cannot send one."""
-    session = open_session(limits=FrontLimits(source_bytes=1 << 20))
-    media = Stage(session)
-    ann = media.joined(session.client())
-    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
-    ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x04PUSH"
-    frame = b"\x03" + (100_000).to_bytes(8, "big") + bytes(100_000)  # and more of the same message
-    with socket.create_connection((session.host, session.ports.media_ingest)) as source:
-        source.settimeout(30.0)
-        source.sendall(greeting + b"\x04" + bytes([len(ready)]) + ready)
-        answer = b""
-        while b"PULL" not in answer:
-            answer += source.recv(4096)
-        source.sendall(20 * frame)
-        media.drops("media_flood")
-    viewer = media.viewer(ann)
-    media.until(lambda: viewer.take() > 20, "ann gets media")
-    media.close()
-
-
-def test_excess_media_subscribers_are_closed_and_the_first_stay(open_session: Open) -> None:
-    session = open_session(limits=FrontLimits(subscribers=2))
-    media = Stage(session)
-    ann = media.joined(session.client())
-    viewer = media.viewer(ann)
-    media.until(lambda: viewer.take() >= 1, "media")
-    for _ in range(4):
-        media.viewer(ann)
-    media.drops("media_too_many", 2)
-    seen = viewer.take()
-    media.until(lambda: viewer.take() > seen + 20, "ann goes on")
-    media.close()
-
-
-def test_stalled_viewer_delays_no_other_and_gets_less(media: Stage) -> None:
-    session = media.session
-    media.size = 100_000
-    ann, bob = (media.joined(session.client(), name) for name in ("ann", "bob"))
-    viewer, stuck = media.viewer(ann), media.viewer(bob, hwm=1)
-    media.until(lambda: viewer.take() > 0, "media")
-    media.until(lambda: viewer.take() >= 0 and budgets(bob).get("cloud") == BudgetClass.NONE, "bob gets none")
-    told = bob.got(DeliveryBudget)[-1]
-    assert (told.budget_class, told.reason) == (BudgetClass.NONE, "the link does not take all media")
-    media.until(lambda: viewer.take() and budgets(ann) == {"cloud": BudgetClass.FULL}, "ann has all of it")
-    media.drops("media_superseded")
-    before = len(viewer.got)
-    media.until(lambda: viewer.take() >= before + 20, "ann goes on")
-    assert stuck.take() >= 1
-
-
-def test_client_may_request_less_media(media: Stage) -> None:
-    session = media.session
-    media.size = 20_000
-    ann = media.joined(session.client())
-    viewer = media.viewer(ann)
-    media.until(lambda: viewer.take() > 100, "media")
-
-    def asks() -> bool:
-        viewer.take()
-        ann.send(ClientReport(1.0, 1.0, 60, media_limit_mbit_per_s=0.001))
-        session.process.link.poll()
-        return budgets(ann) == {"cloud": BudgetClass.NONE}
-
-    media.until(asks, "none")
-    assert ann.got(DeliveryBudget)[-1].reason
-
-
-def test_client_without_state_gets_less_media(media: Stage) -> None:
-    """A client that received nothing cannot report missed state; the front knows what it sent."""
-    session = media.session
-    ann = media.joined(session.client())
-    viewer = media.viewer(ann)
-    media.until(lambda: viewer.take() > 100, "media")
-    poses = np.zeros((N_BODIES, 7))
-    poses[:, 3] = 1.0
-
-    rounds = 0
-
-    def starves() -> bool:
-        nonlocal rounds
-        viewer.take()
-        for _ in range(30):
-            session.send_state(poses)
-        rounds += 1
-        ann.send(ClientReport(1.0, 1.0, 60) if rounds < 100 else ClientReport(0.0, 0.0, 0))
-        time.sleep(0.01)
-        return any("of state was missed" in told.reason for told in ann.got(DeliveryBudget))
-
-    media.until(starves, "less, for want of state")
-
-
-def test_restarted_front_accepts_media(media: Stage) -> None:
-    session = media.session
-    ann = media.joined(session.client())
-    viewer = media.viewer(ann)
-    media.until(lambda: viewer.take() >= 1, "media")
-    old_seq = viewer.got[-1][1].seq
-    session.process.restart()
-    media.until(lambda: session.process.link.ports is not None, "a new front")
-    assert session.process.link.ports is not None
-    session.ports = session.process.link.ports
-    bob = media.joined(session.client(), "bob")
-    again = media.viewer(bob)
-    media.until(lambda: again.take() >= 1, "media of the new front")
-    assert again.got[0][1].seq > old_seq
-
-
-def test_invalid_media_are_an_error_of_the_publisher(media: Stage) -> None:
-    with pytest.raises(ValueError, match="name"):
-        media.session.process.publish_media("a b", b"x", 0, 0, "bytes")
-    with pytest.raises(ValueError, match="'full'"):
-        media.session.process.publish_media("a", {"half": b"x"}, 0, 0, "bytes")
-    with pytest.raises(ValueError, match="8388608"):
-        media.session.process.publish_media("a", bytes(8_388_609), 0, 0, "bytes")
+@pytest.mark.parametrize(("stream", "frames"), [("a b", b"x"), ("a", {"half": b"x"}), ("a", bytes(8_388_609))])
+def test_invalid_media_are_an_error_of_the_publisher(tmp_path: Path, stream: str, frames: object) -> None:
+    source = MediaSource(f"ipc://{tmp_path}/front")
+    with pytest.raises(ValueError, match=r"name|'full'|8388608"):
+        source.publish(stream, frames, 0, 0, "bytes")  # type: ignore[arg-type]
+    source.close()
 
 
 def test_publishing_media_after_the_end_raises(tmp_path: Path) -> None:
@@ -379,31 +194,6 @@ def test_only_the_key_of_a_connection_opens_its_media(locked: tuple[Lab, Stage])
     stage.until(lambda: anns.take() >= seen + 20, "what bob takes back is not ann's")
     assert eves.take() == 0
     assert bobs.got == []
-
-
-def test_revoked_key_gets_no_media_and_others_do(locked: tuple[Lab, Stage]) -> None:
-    lab, stage = locked
-    ann, client = lab.allowed("ann")
-    bob, other = lab.allowed("bob")
-    stage.joined(client)
-    stage.joined(other, "bob")
-    anns, bobs = stage.viewer(client, lab.curve(ann)), stage.viewer(other, lab.curve(bob))
-    stage.until(lambda: min(anns.take(), bobs.take()) >= 1, "media")
-    lab.home.clients.revoke_key(ann.fingerprint)
-    lab.audits("key_revoked")
-    stage.until(lambda: bobs.take() >= 0 and _quiet(anns), "nothing more for ann")
-    last, seen = len(anns.got), bobs.take()
-    stage.until(lambda: bobs.take() >= seen + 20, "bob goes on")
-    assert anns.take() == last
-    again = stage.viewer(client, lab.curve(ann))
-    stage.until(lambda: bobs.take() >= seen + 40, "bob goes on")
-    assert again.take() == 0
-
-
-def _quiet(viewer: Viewer) -> bool:
-    """Return whether nothing is received for a while."""
-    before = viewer.take()
-    return not viewer.socket.poll(100) and viewer.take() == before
 
 
 def test_only_sources_may_push_media(locked: tuple[Lab, Stage]) -> None:
