@@ -241,46 +241,6 @@ def state_rig() -> Iterator[StateSocketRig]:
     one.close()
 
 
-def test_silent_connections_do_not_block_subscribers(state_rig: StateSocketRig) -> None:
-    for _ in range(STATE_LIMITS.subscribers + 1):
-        state_rig.bare()
-    state_rig.turns(lambda: len(state_rig.subscribers) == STATE_LIMITS.subscribers + 1, "bare connections")
-    ann = state_rig.subscriber()
-    state_rig.turns(lambda: state_rig.gets_state(ann), "state")
-    assert state_rig.drops.by_reason == {}
-
-
-def test_silent_connections_of_the_address_with_most_are_evicted(state_rig: StateSocketRig) -> None:
-    newcomer = state_rig.bare("127.0.0.2")
-    hog = [state_rig.bare() for _ in range(STATE_LIMITS.unauthenticated + 1)]
-    state_rig.turns(lambda: state_rig.drops.by_reason.get("strangers_too_many") == 2, "room")
-    state_rig.turns(lambda: ended(hog[0]) and ended(hog[1]), "an end of the oldest of them")
-    assert not any(map(ended, (newcomer, *hog[2:])))
-
-
-def test_connection_without_subscription_is_closed(state_rig: StateSocketRig) -> None:
-    ann = state_rig.subscriber()
-    state_rig.turns(lambda: state_rig.gets_state(ann), "state")
-    state_rig.bare()
-    state_rig.turns(lambda: len(state_rig.subscribers) == 2, "both")
-    state_rig.now_ns += 1001 * SECOND
-    state_rig.turns(lambda: len(state_rig.subscribers) == 1, "the end of the silent one")
-    assert state_rig.drops.by_reason == {"no_subscription": 1}
-    ann.recv_multipart()
-    state_rig.turns(lambda: state_rig.gets_state(ann), "state")
-
-
-def test_subscribers_are_bounded_and_existing_ones_stay(state_rig: StateSocketRig) -> None:
-    first = [state_rig.subscriber() for _ in range(STATE_LIMITS.subscribers)]
-    state_rig.turns(lambda: all(state_rig.gets_state(one) for one in first), "state for all")
-    state_rig.subscriber()
-    state_rig.turns(lambda: state_rig.drops.by_reason.get("subscribers_too_many", 0) > 0, "room")
-    for one in first:
-        while one.poll(0):
-            one.recv_multipart()
-    state_rig.turns(lambda: all(state_rig.gets_state(one) for one in first), "state for those of before")
-
-
 def test_subscriber_that_floods_is_cut_off(state_rig: StateSocketRig) -> None:
     quiet, talker = state_rig.subscriber(), state_rig.subscriber()
     state_rig.turns(lambda: state_rig.gets_state(quiet), "state")

@@ -23,7 +23,6 @@ from iris_session.link.interfaces import Interface
 from iris_session.protocol.codec import decode_beacon, decode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.limits import Drops
-from tests.front.harness import FrontSession
 from tests.loopback import make_loopback_address
 
 BEACON = Beacon(1, "s1", "lab-1", "live", "", 7721, 7722, 0, 0, 0, "mark")
@@ -209,25 +208,6 @@ def test_port_in_use_is_an_error_that_closes_opened_sockets() -> None:
         listener.close()
     with pytest.raises(FrontError, match=r"203\.0\.113\.9"):
         open_listeners(["203.0.113.9"], 0)
-
-
-def test_front_introduces_itself_on_every_address() -> None:
-    session = FrontSession(listen=("127.0.0.1", "::1"), session_id="abc")
-    try:
-        assert session.ports.reachable == ("127.0.0.1", "::1")
-        for host in ("127.0.0.1", "::1"):
-            with socket.create_connection((host, session.ports.control - 1)) as visitor:
-                introduction = decode_introduction(read(visitor))
-            assert introduction is not None
-            assert introduction.beacon.session_id == "abc"
-            assert introduction.beacon.session_name == "test"
-            assert (introduction.beacon.control, introduction.beacon.state) == (
-                session.ports.control,
-                session.ports.state,
-            )
-            assert (introduction.server_key, introduction.pairing, introduction.participants) == ("", False, 0)
-    finally:
-        session.close()
 
 
 def _in_use(port: int) -> int:

@@ -14,7 +14,6 @@ from iris_session.protocol.client_messages import (
     Bye,
     ClockPing,
     EStop,
-    GetSnapshot,
     Heartbeat,
     Hello,
     Marker,
@@ -33,7 +32,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     Welcome,
 )
-from iris_session.protocol.steps import Admitted, Decision, Dropped, OutgoingMessage
+from iris_session.protocol.steps import Decision, Dropped, OutgoingMessage
 from iris_session.streams.rigid import RigidDecoder
 from tests.front.harness import N_BODIES, FrontSession
 
@@ -81,6 +80,11 @@ def test_hello_without_secret_is_refused(session: FrontSession) -> None:
     client.send(Hello("operator", "Ann"))
     assert client.wait_for(Refused).code == "identity"
     assert not session.entries
+
+
+def test_states_of_another_scene_are_dropped_and_counted(session: FrontSession) -> None:
+    session.send_state(np.zeros((N_BODIES + 1, 7)))
+    assert session.wait_drops("state_of_other_scene") == 1
 
 
 def test_the_same_secret_has_the_same_key_id_on_every_connection(session: FrontSession) -> None:
@@ -218,15 +222,6 @@ def test_snapshot_is_filled_and_comes_after_the_events_of_its_step(session: Fron
     assert not other.got(Snapshot)
 
 
-def test_snapshot_before_the_first_state_has_the_poses_of_the_scene(session: FrontSession) -> None:
-    client = session.client()
-    client.join()
-    client.send(GetSnapshot(1))
-    assert client.wait_for(Snapshot).state_seq == 0
-    (bulk,) = next(bulk for message, bulk in client.inbox if isinstance(message, Snapshot))
-    assert np.frombuffer(bulk).reshape(-1, 7)[:, 3].tolist() == [1.0] * N_BODIES
-
-
 def test_state_reaches_subscribers_stamped_and_decodable(session: FrontSession) -> None:
     sub = session.subscriber()
     poses = np.zeros((N_BODIES, 7))
@@ -248,11 +243,6 @@ def test_state_reaches_subscribers_stamped_and_decodable(session: FrontSession) 
         assert header.session_time <= header.published_ns
         assert decoder.apply(header.state_seq, header.base_seq, payload)
     assert abs(decoder.poses[0, 0] - poses[0, 0]) < 0.5
-
-
-def test_states_of_another_scene_are_dropped_and_counted(session: FrontSession) -> None:
-    session.send_state(np.zeros((N_BODIES + 1, 7)))
-    assert session.wait_drops("state_of_other_scene") == 1
 
 
 def test_presence_is_published_latest_per_device(session: FrontSession) -> None:
@@ -324,11 +314,6 @@ def test_wrong_connection_epoch_is_left_to_the_authority(session: FrontSession) 
     client.socket.send(encode_client(wrap_message(Acquire(1), 77)))
     (acquire,) = session.wait_entries(Acquire)
     assert (acquire.connection, acquire.connection_epoch) == (1, 77)
-
-
-def test_welcome_for_a_closed_connection_is_ignored(session: FrontSession) -> None:
-    session.once(Decision((), admitted=(Admitted(99, "p99", "operator", False),)))
-    session.client().join()
 
 
 def test_silent_gateway_disconnects_its_participants(open_session: OpenSession) -> None:

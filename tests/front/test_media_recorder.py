@@ -161,28 +161,6 @@ def test_stream_ends_in_the_encoding_that_it_changes_from(rig: Rig, other: str) 
     assert rig.drops() == {}
 
 
-def test_new_encoding_waits_for_the_end_of_the_one_before(rig: Rig) -> None:
-    rig.push("room", bytes(1_000_000))
-    rig.tick()
-    for _ in range(20):
-        rig.push("block", bytes(1_000_000))
-        rig.tick(take=False)
-        rig.now_ns += PERIOD_NS
-    rig.push("room", b"picture", "jpeg")
-    rig.tick(take=False)
-    assert "room" not in {header.stream for header, _ in rig.got[1:]}
-    found: list[tuple[str, str]] = []
-
-    def takes() -> bool:
-        while rig.socket.poll(0):
-            header = decode_media_header(rig.socket.recv_multipart()[0])
-            found.append((header.stream, header.encoding))
-        return ("room", "jpeg") in found
-
-    rig.wait(takes)
-    assert [one for one in found if one[0] == "room"] == [("room", "cloud"), ("room", "jpeg")]
-
-
 def test_only_clouds_and_pictures_go(rig: Rig) -> None:
     for encoding in ("bytes", "deformable", "cloud", "jpeg", "of tomorrow"):
         rig.push(encoding.replace(" ", "-"), encoding=encoding)

@@ -30,7 +30,6 @@ from iris_session.protocol.media import (
     StreamCamera,
     StreamInfo,
     make_topic,
-    parse_topic,
 )
 
 MS = 1_000_000
@@ -447,29 +446,6 @@ def test_subscribing_over_and_over_gets_no_frame_each_time() -> None:
     assert len(wire.got[ANN]) == before + 1  # frames after it come as ever
 
 
-def test_stream_at_rest_comes_later_to_who_subscribed_over_and_over() -> None:
-    wire = Wire()
-    for n in range(3):
-        wire.push(stream=f"s{n}")
-    for _ in range(2 * MAX_STREAMS):
-        wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
-        wire.push()
-        wire.hub.unsubscribe(ANN, "cloud", 1)
-        wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
-        wire.hub.flush(wire.send, wire.now_ns)
-        wire.hub.unsubscribe(ANN, "cloud", 1)
-    wire.got[ANN].clear()
-    for n in range(3):
-        wire.hub.subscribe(ANN, f"s{n}", "a", 1, wire.now_ns)
-    wire.hub.unsubscribe(ANN, "s1", 1)
-    assert not wire.hub.flush(wire.send, wire.now_ns)
-    assert wire.got[ANN] == []
-    for _ in range(40):
-        wire.now_ns += 50 * MS
-        wire.hub.flush(wire.send, wire.now_ns)
-    assert [header.stream for header, _ in wire.got[ANN]] == ["s0", "s2"]
-
-
 def test_restarted_front_numbers_frames_above_its_predecessor() -> None:
     wire, later = Wire(), Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
@@ -613,12 +589,6 @@ def test_stream_at_rest_is_stale_while_its_frame_is_missing() -> None:
     wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
     wire.hub.flush(wire.send, wire.now_ns)
     assert len(wire.got[ANN]) == 1
-
-
-def test_topics() -> None:
-    assert parse_topic(make_topic(12, "cloud.1")) == (12, "cloud.1")
-    for bad in (b"", b"media/", b"media/0/x/", b"media/1/x", b"media/1/a/b/", b"media/1//", b"media/-1/x/", b"\xff"):
-        assert parse_topic(bad) is None
 
 
 def test_pace_of_a_connection_is_told_once_for_each_of_its_readers() -> None:

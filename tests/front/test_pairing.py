@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,15 @@ import pytest
 
 from iris_session.front import pairing as pairing_service
 from iris_session.front.connections import Peer, Route
-from iris_session.front.pairing import BURST, MAX_PENDING, PATIENCE_NS, RETRY_S, PairingService
+from iris_session.front.pairing import BURST, MAX_PENDING, PATIENCE_NS, PairingService
 from iris_session.front.revocation import CHECK_PERIOD_NS, RevocationService
 from iris_session.link.config import SECOND
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Pair
-from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired
-from iris_session.security import AllowedKey, JoinCode, KeyHome, KeyPair, KeysError
-from iris_session.security.allow_list import AllowList
-from iris_session.security.keyring import PAIRING_PREFIX, Keyring, open_keyring
+from iris_session.security import KeyHome, KeyPair
+from iris_session.security.keyring import PAIRING_PREFIX, Keyring
 from tests.front.fakes import make_context
 from tests.front.slow_disk import slow_disk, turns
 
@@ -187,24 +184,6 @@ def test_unreadable_allow_list_is_read_again(
     assert rig.keyring.find_key(own.fingerprint) is None
 
 
-def test_paired_key_is_accepted_although_the_list_is_unreadable(
-    rig: PairingRig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The code is used up, so an answer that the key was revoked would be wrong."""
-    own = KeyPair.generate()
-    code, _ = rig.home.join_codes.create(rig.server)
-
-    def unreadable() -> dict[str, AllowedKey]:
-        raise KeysError("Too many open files") from OSError(errno.EMFILE, "Too many open files")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(rig.keyring, "_read", unreadable)
-        rig.asks(own, rig.proof(code, own))
-        assert isinstance(rig.answer(own), Paired)
-    rig.turn()
-    assert rig.keyring.find_key(own.fingerprint) is not None
-
-
 def test_lost_pairing_answer_is_sent_again(rig: PairingRig) -> None:
     """The answer was late or its connection broke, while the code is used up and the key allowed."""
     own = KeyPair.generate()
@@ -230,32 +209,6 @@ def test_lost_pairing_answer_is_sent_again(rig: PairingRig) -> None:
     assert rig.answers(own)[3].code == RefusalCode.CODE, "who was taken off the list needs another code"
 
 
-def test_restarted_front_repeats_the_answer_of_a_pairing(rig: PairingRig) -> None:
-    """The front ended between writing the list and answering: the code is used up, and the client asks again."""
-    own = KeyPair.generate()
-    code, _ = rig.home.join_codes.create(rig.server)
-    proof = rig.proof(code, own)
-    rig.asks(own, proof)
-    first = rig.answer(own)
-    assert isinstance(first, Paired)
-    restarted = PairingRig(rig.home.path)
-    try:
-        restarted.asks(own, proof)
-        assert restarted.answer(own) == first
-        eve = KeyPair.generate()
-        restarted.asks(eve, proof, descriptor=2)
-        assert restarted.answer(eve).code == RefusalCode.CODE
-        restarted.asks(own, b"x" * 32)
-        turns(restarted.turn, lambda: len(restarted.answers(own)) == 2)
-        assert restarted.answers(own)[1].code == RefusalCode.CODE
-        rig.home.clients.revoke_key(own.fingerprint)
-        turns(restarted.turn, lambda: restarted.keyring.find_key(own.fingerprint) is None)
-        restarted.asks(own, proof)
-        assert restarted.answers(own)[2].code == RefusalCode.CODE, "a revoked key needs another code"
-    finally:
-        restarted.keyring.close()
-
-
 def test_pairing_waits_while_the_list_is_missing(rig: PairingRig) -> None:
     """An editor replaces the list: one that is written meanwhile would have the new key alone."""
     ann, bob = KeyPair.generate(), KeyPair.generate()
@@ -273,35 +226,6 @@ def test_pairing_waits_while_the_list_is_missing(rig: PairingRig) -> None:
     assert set(rig.home.clients.read()) == {ann.fingerprint, bob.fingerprint}
 
 
-def test_no_pairing_writes_a_list_that_is_missing(rig: PairingRig) -> None:
-    ann = KeyPair.generate()
-    rig.home.clients.allow_key("bob", KeyPair.generate().public)
-    rig.keyring.reload_if_changed()
-    code, _ = rig.home.join_codes.create(rig.server)
-    (rig.home.path / "clients.json").rename(rig.home.path / "clients.json~")
-    rig.asks(ann, rig.proof(code, ann))
-    rig.turn()
-    rig.keyring.close()  # whatever was begun is over
-    rig.turn()
-    assert rig.answers(ann) == []
-    assert not (rig.home.path / "clients.json").exists()
-
-
-def test_revocation_by_a_director_waits_for_a_list_that_is_missing(rig: PairingRig) -> None:
-    """Else the key would be listed again, for the next session, when an editor has put the list back."""
-    own = KeyPair.generate()
-    rig.home.clients.allow_key("ann", own.public)
-    rig.keyring.reload_if_changed()
-    away = (rig.home.path / "clients.json").rename(rig.home.path / "clients.json~")
-    rig.revocation.revoke(own.fingerprint, rig.now_ns)
-    rig.turn()
-    rig.keyring.close()  # whatever was begun is over
-    rig.turn()
-    away.rename(rig.home.path / "clients.json")
-    turns(rig.turn, lambda: own.fingerprint not in rig.keyring.pending_revocations)
-    assert rig.home.clients.read() == {}
-
-
 def test_attempts_of_one_key_with_one_code_are_answered_alike(rig: PairingRig) -> None:
     """Several programs of one user pair at the same time, as emulated headsets do."""
     own = KeyPair.generate()
@@ -312,77 +236,6 @@ def test_attempts_of_one_key_with_one_code_are_answered_alike(rig: PairingRig) -
     first, *others = rig.answers(own)
     assert isinstance(first, Paired)
     assert others == [first, first]
-
-
-def test_attempt_of_a_key_waits_for_another_of_it_that_has_used_the_code(
-    rig: PairingRig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    own, eve = KeyPair.generate(), KeyPair.generate()
-    code, _ = rig.home.join_codes.create(rig.server)
-    is_used, goes_on, replace = threading.Event(), threading.Event(), AllowList.replace_all
-
-    def replace_later(*arguments: Any) -> None:
-        is_used.set()
-        assert goes_on.wait(30.0)
-        replace(*arguments)
-
-    monkeypatch.setattr(AllowList, "replace_all", replace_later)
-    rig.asks(own, rig.proof(code, own))
-    turns(rig.turn, is_used.is_set)
-    rig.asks(own, rig.proof(code, own))
-    rig.asks(eve, b"x" * 32, descriptor=2)
-    goes_on.set()
-    turns(rig.turn, lambda: len(rig.answers(own)) == 2)
-    assert [type(one) for one in rig.answers(own)] == [Paired, Paired]
-    assert rig.answer(eve).code == RefusalCode.CODE
-
-
-def test_certificates_are_read_again_with_any_modification_time(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """As with `cp -p` or rsync: a replaced key is revoked at once. A damaged certificate is logged once."""
-    folder = tmp_path / "clients"
-    folder.mkdir()
-    first, second = KeyPair.generate(), KeyPair.generate()
-    server = KeyHome(tmp_path / "home")
-    server.load_server_key()
-    drops = Drops()
-    keyring = open_keyring("", str(server.path / "server.key_secret"), str(folder), drops)
-    path = folder / "ann.key"
-
-    def write(text: str) -> None:
-        path.write_text(text)
-        os.utime(path, ns=(0, 0))
-        keyring.reload_if_changed()
-
-    write(f'public-key = "{first.public}"')
-    assert keyring.find_key(first.fingerprint) is not None
-    write(f'public-key = "{second.public}"')
-    assert keyring.find_key(first.fingerprint) is None
-    assert set(keyring.removed) == {first.fingerprint}
-    assert keyring.find_key(second.fingerprint) is not None
-    (folder / "bob.key").write_text("nothing")
-    for _ in range(3):
-        (folder / "other").touch()
-        keyring.reload_if_changed()
-    reported = caplog.text
-    assert reported.count("certificate bob.key") == 1
-    assert drops.by_reason["certificate_unusable"] == 1
-    assert keyring.find_key(second.fingerprint) is not None
-    keyring.close()
-
-
-def test_revoked_key_may_join_after_pairing_again(rig: PairingRig) -> None:
-    own = KeyPair.generate()
-    rig.home.clients.allow_key("ann", own.public)
-    rig.turn()
-    rig.revocation.revoke(own.fingerprint, rig.now_ns)
-    turns(rig.turn, lambda: not rig.keyring.pending_revocations)
-    code, _ = rig.home.join_codes.create(rig.server)
-    rig.asks(own, rig.proof(code, own))
-    assert isinstance(rig.answer(own), Paired)
-    rig.turn()
-    assert not rig.tokens.is_revoked(own.fingerprint)
 
 
 def test_key_that_a_front_revoked_before_it_was_killed_leaves_the_list(rig: PairingRig) -> None:
@@ -442,28 +295,3 @@ def test_pending_attempts_are_bounded_and_time_out(rig: PairingRig, monkeypatch:
         assert {rig.answer(own).message for own in waiting} == {"the list of keys is busy"}
         assert {rig.answer(own).code for own in waiting} == {RefusalCode.RATE}, "nothing was tried: ask again"
     assert isinstance(rig.answer(first), Paired)
-
-
-def test_unreadable_codes_are_read_again_and_logged_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """No descriptor is left for a while, and the file does not change meanwhile."""
-    rig, now_s, tries = PairingRig(tmp_path / "home"), 1000.0, 0
-    rig.home.join_codes.create(rig.server)
-    with monkeypatch.context() as patch:
-
-        def fails(_server: str) -> tuple[JoinCode, ...]:
-            nonlocal tries
-            tries += 1
-            raise KeysError("Too many open files")
-
-        patch.setattr(rig.home.join_codes, "list_for_server", fails)
-        patch.setattr(pairing_service.time, "monotonic", lambda: now_s)
-        for _ in range(3):
-            assert not rig.pairing.has_open_code
-        now_s += RETRY_S
-        assert not rig.pairing.has_open_code
-    assert tries == 2
-    assert caplog.text.count("Too many open files") == 1
-    monkeypatch.setattr(pairing_service.time, "monotonic", lambda: now_s + RETRY_S)
-    assert rig.pairing.has_open_code

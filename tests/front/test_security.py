@@ -114,15 +114,6 @@ def test_flood_of_pairing_is_cut_off(lab: Lab) -> None:
     lab.session.wait_entries(Heartbeat)
 
 
-def test_expired_code_pairs_no_key(lab: Lab) -> None:
-    ann = KeyPair.generate()
-    code, made = lab.home.join_codes.create(lab.server, minutes=0.0005)
-    lab.session.pump(lambda: time.time() > made.expires, "the code expires")
-    answer = lab.refused(lab.client(ann), Pair("ann", lab.proof(code, ann)))
-    assert (answer.code, answer.advice) == (RefusalCode.CODE, "run `iris-session pair` where the session runs")
-    assert lab.home.clients.read() == {}
-
-
 def test_unencrypted_sessions_refuse_pairing(session: FrontSession) -> None:
     client = session.client()
     client.send(Pair("ann", b"x" * 32))
@@ -186,14 +177,6 @@ def test_removed_role_ends_connections_in_that_role(lab: Lab) -> None:
     assert client.got(ProtocolFault) == []
 
 
-def test_removal_by_a_director_revokes_the_key(lab: Lab) -> None:
-    pair, client = lab.allowed("ann")
-    lab.session.once(Decision((), dropped=(Dropped(1, "revoked", pair.fingerprint),)))
-    assert client.wait_for(ProtocolFault).code == FaultCode.REVOKED
-    lab.session.pump(lambda: lab.home.clients.read() == {}, "off the list")
-    assert lab.refused(lab.client(pair), Hello("operator", "ann")).code == RefusalCode.UNPAIRED
-
-
 def test_director_revokes_although_the_list_is_read_only(open_session: Open, tmp_path: Path) -> None:
     """A folder of certificates is not changed; the key is refused by this session."""
     folder = tmp_path / "clients"
@@ -215,17 +198,6 @@ def test_director_revokes_although_the_list_is_read_only(open_session: Open, tmp
     late = session.client(curve=curve)
     late.send(Hello("operator", "ann"))
     assert late.wait_for(Refused).code == RefusalCode.UNPAIRED
-
-
-def test_revoked_key_joins_after_it_is_allowed_again(lab: Lab) -> None:
-    pair, client = lab.allowed("ann")
-    lab.home.clients.revoke_key("ann")
-    client.wait_for(ProtocolFault)
-    code, _ = lab.home.join_codes.create(lab.server)
-    back = lab.client(pair)
-    back.send(Pair("ann", lab.proof(code, pair)))
-    back.wait_for(Paired)
-    lab.client(pair).join(name="ann")
 
 
 def test_removed_participant_is_notified_and_may_rejoin(lab: Lab) -> None:

@@ -188,13 +188,6 @@ def test_client_can_request_status_before_admission(session: FrontSession) -> No
     assert report.request_id == 7
 
 
-def test_unknown_peers_cannot_request_status(session: FrontSession) -> None:
-    client = session.client()
-    client.send(GetStatus(1))
-    assert client.wait_for(ProtocolFault).code == FaultCode.HELLO
-    assert client.got(StatusReport) == []
-
-
 def test_front_reports_a_stalled_authority(open_session: Callable[..., FrontSession]) -> None:
     session = open_session(stall_ns=500 * MS)
     client = session.client()
@@ -219,15 +212,6 @@ def test_reason_of_a_disconnect_is_kept(session: FrontSession) -> None:
     ann.close()
     report = ask(session, bob, lambda r: bool(r.participants) and not r.participants[0].connected)
     assert report.participants[0].lost == "closed"
-
-
-def test_report_from_before_a_reconnect_is_not_returned(session: FrontSession) -> None:
-    client = session.client()
-    welcome = client.join()
-    session.process.link.send_report(half(row(welcome.participant_id)))
-    report = ask(session, client, lambda r: bool(r.participants))
-    assert not report.participants[0].reported
-    assert report.participants[0].state_age is None
 
 
 @pytest.mark.parametrize(

@@ -137,13 +137,6 @@ class TestIdentity:
             ada.secret = os.urandom(n)
             assert gateway.refused(ada).code == RefusalCode.IDENTITY, n
 
-    def test_other_gateways_go_on_as_before(self, lab: Lab) -> None:
-        gateway, ada = open_gateway(lab, "gateway", "observer", certificate=b""), Person()
-        ada.secret = os.urandom(16)
-        _, join = gateway.enter(ada, "observer")
-        assert join.roles == ("observer",)
-        assert join.key_id != compute_fingerprint(hashlib.sha256(ada.secret).digest())
-
     def test_curve_entry_is_no_web_identity_and_the_other_way_round(self, lab: Lab) -> None:
         gateway, ada = open_gateway(lab), Person()
         lab.home.clients.allow_key("ada", encode_key(ada.identity))
@@ -178,14 +171,6 @@ class TestIdentity:
         ada.name = "tab9"
         assert gateway.refused(ada).code == RefusalCode.FULL
 
-    def test_plain_session_has_no_list(self, open_session: Open) -> None:
-        session = open_session()
-        gateway, ada = Gateway(session, None), Person()
-        _, join = gateway.enter(ada, "director")
-        assert (join.key_id, join.roles) == (ada.fingerprint, PERSONAL_ROLES)
-        ada.secret = os.urandom(16)
-        assert gateway.enter(ada)[1].roles == ()
-
 
 class TestRoles:
     @pytest.mark.parametrize(
@@ -204,12 +189,6 @@ class TestRoles:
         gateway, ada = open_gateway(lab, *through), Person()
         allow(lab, ada, *own)
         assert gateway.enter(ada, "observer")[1].roles == left
-
-    @pytest.mark.parametrize("own", [("director",), ("gateway",)])
-    def test_no_common_role(self, lab: Lab, own: tuple[str, ...]) -> None:
-        gateway, ada = open_gateway(lab, "gateway", "observer"), Person()
-        allow(lab, ada, *own)
-        assert gateway.refused(ada, ada.hello(own[0])).code == "role"
 
     def test_role_taken_from_the_person(self, lab: Lab) -> None:
         gateway, ada, bob = open_gateway(lab), Person(), Person("bob")
@@ -274,13 +253,6 @@ class TestPairing:
         client.wait_for(Paired)
         assert gateway.refused(ada, ada.pair(code)).code == RefusalCode.CODE
 
-    def test_used_code(self, lab: Lab) -> None:
-        gateway, ada, eve = open_gateway(lab), Person(), Person("eve")
-        code, _ = lab.home.join_codes.create(lab.server, web_key=CERTIFICATE)
-        gateway.ask("ada", ada.pair(code), Paired)
-        assert gateway.refused(eve, eve.pair(code)).code == RefusalCode.CODE
-        assert gateway.refused(eve).code == RefusalCode.UNPAIRED
-
     def test_wrong_code_uses_an_attempt(self, lab: Lab) -> None:
         gateway, ada = open_gateway(lab), Person()
         _, made = lab.home.join_codes.create(lab.server, web_key=CERTIFICATE)
@@ -305,31 +277,10 @@ class TestPairing:
         assert after is not None
         assert after.attempts_left == made.attempts_left, "it was not meant"
 
-    def test_proof_over_the_key_of_the_session_is_not_enough_behind_a_gateway(self, lab: Lab) -> None:
-        gateway, ada = open_gateway(lab), Person()
-        code, _ = lab.home.join_codes.create(lab.server, web_key=CERTIFICATE)
-        assert gateway.refused(ada, ada.pair(code, lab.server.raw_public)).code == RefusalCode.CODE
-
     def test_gateway_without_certificate(self, lab: Lab) -> None:
         gateway, ada = open_gateway(lab, certificate=b""), Person()
         code, _ = lab.home.join_codes.create(lab.server, web_key=CERTIFICATE)
         assert "certificate" in gateway.refused(ada, ada.pair(code)).message
-
-    def test_identity_of_a_wrong_length(self, lab: Lab) -> None:
-        gateway, ada = open_gateway(lab), Person()
-        lab.home.join_codes.create(lab.server, web_key=CERTIFICATE)
-        for n in (0, 31, 33):
-            answer = gateway.refused(ada, Pair("ada", bytes(32), identity=bytes(n)))
-            assert (answer.code, f"{n} bytes" in answer.message) == (RefusalCode.CODE, True)
-
-    def test_identity_that_is_the_key_of_a_client(self, lab: Lab) -> None:
-        """A client's public key is no secret: whoever has a code must not turn its entry into another."""
-        gateway, ada = open_gateway(lab), Person()
-        bob, _ = lab.allowed("bob", "operator")
-        ada.identity = bob.raw_public
-        code, _ = lab.home.join_codes.create(lab.server, web_key=CERTIFICATE)
-        assert "kind curve" in gateway.refused(ada, ada.pair(code)).message
-        assert lab.home.clients.read()[bob.fingerprint].name == "bob"
 
     def test_only_a_gateway_pairs_others(self, lab: Lab) -> None:
         ada = Person()
@@ -340,11 +291,6 @@ class TestPairing:
             client.wait_for(ProtocolFault)
         assert not lab.home.clients.read().get(ada.fingerprint)
         assert lab.audits(AuditKind.GATEWAY_REFUSED)
-
-    def test_plain_session_pairs_nobody(self, open_session: Open) -> None:
-        session = open_session()
-        gateway, ada = Gateway(session, None), Person()
-        assert "not encrypted" in gateway.refused(ada, ada.pair("0000-0000-0000")).message
 
     def test_new_code_after_a_revocation(self, lab: Lab) -> None:
         gateway, ada = open_gateway(lab), Person()
@@ -416,11 +362,6 @@ class TestOwnGateway:
             return bool(sub.poll(0))
 
         lab.session.pump(comes, "state")
-
-    def test_another_key_is_still_unknown(self, own: tuple[Lab, KeyPair]) -> None:
-        lab, _ = own
-        client = lab.client(KeyPair.generate())
-        assert lab.refused(client, Hello("gateway", "web", secret=client.secret)).code == RefusalCode.UNPAIRED
 
 
 class TestDisconnected:
