@@ -19,7 +19,7 @@ import zmq
 from iris_session.assets.chunk_scheduler import ADVICE, ChunkReader, ChunkScheduler
 from iris_session.assets.store import ServedAssets
 from iris_session.link.config import MILLISECOND, FrontConfig
-from iris_session.link.sockets import open_assets, readable, watch_tcp
+from iris_session.link.sockets import open_assets, read_peer, readable, watch_tcp
 from iris_session.link.tcp_guard import PendingConnection, TcpGuard
 from iris_session.protocol.assets import AssetChunk, AssetRefused
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
@@ -233,10 +233,8 @@ class AssetServer:
                 extra = self._socket.recv(_DONTWAIT, copy=False)
                 lengths.append(len(extra))
                 more = extra.more
-            try:
-                descriptor = int(frame.get(zmq.SRCFD))
-                user = str(frame.get("User-Id")) if self._encrypted else ""
-            except zmq.ZMQError:
+            descriptor, user = read_peer(frame, encrypted=self._encrypted)
+            if descriptor < 0:
                 self._count_reasons(["assets_unversioned_peer"])
                 continue
             self._read_connection_events()

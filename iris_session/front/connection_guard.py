@@ -19,7 +19,7 @@ from iris_session.front.audit import AuditTrail
 from iris_session.front.connections import ConnectionTable, FrontConnection, Peer
 from iris_session.front.key_budgets import remember
 from iris_session.link.config import SECOND, FrontLimits
-from iris_session.link.sockets import close_tcp, readable
+from iris_session.link.sockets import close_tcp, read_peer, readable
 from iris_session.link.tcp_guard import (
     PendingConnection,
     TcpBounds,
@@ -193,13 +193,10 @@ class StateGuard:
                 frame = state.recv(zmq.DONTWAIT, copy=False)
             except zmq.Again:
                 return
-            try:
-                descriptor = int(frame.get(zmq.SRCFD))
-            except zmq.ZMQError:  # a ZeroMQ of before 2013: without its connection
-                continue
+            descriptor, user = read_peer(frame, encrypted=not self._is_plain)
             self._read_events(now_ns)  # after the message: by now libzmq has reported its connection
             if self._tcp.find(descriptor) is not None:
-                self._record_subscription(descriptor, _read_user_id(frame), frame.bytes)
+                self._record_subscription(descriptor, user, frame.bytes)
 
     def _record_subscription(self, descriptor: int, user: str, data: bytes) -> None:
         topic, counts = data[1:], 1
@@ -212,13 +209,6 @@ class StateGuard:
         reason = self._tcp.record_message(descriptor, (len(data),), counts)
         if reason:
             self._drops.count(reason)
-
-
-def _read_user_id(frame: zmq.Frame) -> str:
-    try:
-        return str(frame.get("User-Id"))
-    except zmq.ZMQError:  # without keys
-        return ""
 
 
 class ConnectionGuard:

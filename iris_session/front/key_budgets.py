@@ -59,20 +59,6 @@ class KeyBudget:
         connections: Connections that use it.
     """
 
-    __slots__ = (
-        "_bytes",
-        "_estops",
-        "_events",
-        "_messages",
-        "_requests",
-        "connections",
-        "is_gateway",
-        "late_estop",
-        "parent",
-        "rejections",
-        "used_ns",
-    )
-
     def __init__(
         self, limits: FrontLimits, now_ns: int = 0, *, is_gateway: bool = False, parent: KeyBudget | None = None
     ) -> None:

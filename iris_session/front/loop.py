@@ -37,7 +37,7 @@ from iris_session.front.status import StatusService
 from iris_session.front.uplink import Uplink
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND, FrontStart
-from iris_session.link.sockets import MEDIA_THREAD_NAME, readable
+from iris_session.link.sockets import MEDIA_THREAD_NAME, read_peer, readable
 from iris_session.link.tcp_guard import PendingConnection, TcpBounds, TcpGuard, TrafficCounter, make_reasons
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
@@ -188,9 +188,8 @@ class Front:
             while more:
                 more = control.recv(zmq.DONTWAIT, copy=False).more
                 extra += 1
-            try:
-                peer = Peer(int(frame.get(zmq.SRCFD)), str(frame.get("User-Id")) if with_user else "")
-            except zmq.ZMQError:  # a browser, or a ZeroMQ of before 2013: without its connection
+            peer = Peer(*read_peer(frame, encrypted=with_user))
+            if peer.descriptor < 0:
                 self._context.drops.count("unversioned_peer")
                 continue
             self._context.traffic.count_received(peer.descriptor, len(frame.buffer))

@@ -156,6 +156,18 @@ def bound_port(bound: zmq.Socket[bytes]) -> int:
     return int(bound.getsockopt_string(zmq.LAST_ENDPOINT).rsplit(":", 1)[1])
 
 
+def read_peer(frame: zmq.Frame, *, encrypted: bool) -> tuple[int, str]:
+    """Return the descriptor of the TCP connection by which a frame came, and the CURVE user id of its peer.
+
+    The descriptor is -1 if libzmq does not know it: of a browser, or a ZeroMQ of before 2013. The user id is empty
+    without encryption.
+    """
+    try:
+        return int(frame.get(zmq.SRCFD)), str(frame.get("User-Id")) if encrypted else ""
+    except zmq.ZMQError:
+        return -1, ""
+
+
 def watch_tcp(
     watched: zmq.Socket[bytes], name: str, events: int = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
 ) -> zmq.Socket[bytes]:

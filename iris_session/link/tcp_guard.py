@@ -11,6 +11,7 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple, Protocol
 
@@ -87,6 +88,7 @@ def make_reasons(channel: str) -> TcpReasons:
     return TcpReasons(channel, too_many, too_many, f"{channel}_silent", f"{channel}_flood")
 
 
+@dataclass(slots=True, eq=False)
 class TcpConnection:
     """One TCP connection to a listening socket.
 
@@ -103,26 +105,19 @@ class TcpConnection:
         rejections: Token bucket of rejected messages, made with the first of them.
     """
 
-    __slots__ = (
-        "address",
-        "counted_messages",
-        "is_closed",
-        "is_established",
-        "opened_ns",
-        "owner",
-        "quiet_ns",
-        "rejections",
-        "requests",
-        "unread",
-    )
+    address: tuple[str, int]
+    opened_ns: int
+    owner: str = ""
+    quiet_ns: int = 0
+    is_established: bool = False
+    requests: int = 0
+    counted_messages: int = 0
+    unread: int = 0
+    is_closed: bool = False
+    rejections: TokenBucket | None = None
 
-    def __init__(self, address: tuple[str, int], now_ns: int) -> None:
-        self.address = address
-        self.owner = find_network(address[0])
-        self.opened_ns = self.quiet_ns = now_ns
-        self.is_established = self.is_closed = False
-        self.requests = self.counted_messages = self.unread = 0
-        self.rejections: TokenBucket | None = None
+    def __post_init__(self) -> None:
+        self.owner, self.quiet_ns = find_network(self.address[0]), self.opened_ns
 
     @property
     def key_id(self) -> str:

@@ -14,7 +14,7 @@ import re
 import secrets
 import time
 from collections.abc import Awaitable, Callable
-from typing import Any, Final, Protocol
+from typing import Final
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
@@ -26,6 +26,7 @@ from iris_session.web.hub import NAME_BYTES, Browser, Closing, Hub
 from iris_session.web.listener import Listener
 from iris_session.web.origin import HostCheck, make_security_headers
 from iris_session.web.page import PageFiles
+from iris_session.web.session_link import MediaFeedSocket, SessionLink
 from iris_session.web.sockets import count_acknowledged, count_unacknowledged
 from iris_session.web.wire import (
     CLOSE_LIMIT,
@@ -62,8 +63,6 @@ _CHECK_S: Final = 0.5
 _CLOSE_S: Final = 1.0
 _SMALL_MESSAGE: Final = 32_768
 TICKET_S: Final = 5.0
-#: Time for the gateway to be admitted by the session, before a WebSocket is closed with "come again".
-READY_S: Final = 5.0
 #: Requests for assets at once: of one participant, and of all.
 ASSETS_PER_BROWSER: Final = 16
 ASSETS_IN_ALL: Final = 128
@@ -80,44 +79,6 @@ _MAX_REASON: Final = 120
 _FAULT_LOG_S: Final = 10.0
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-
-
-class SessionSide(Protocol):
-    """The gateway's sockets to the session, as the server uses them."""
-
-    async def wait_ready(self) -> bool:
-        """Return whether the session has admitted the gateway, waiting for it a moment."""
-        ...
-
-    def send(self, envelope: bytes) -> bool:
-        """Send a message of a browser. False: too much waits for the session."""
-        ...
-
-    def watch_state(self) -> None:
-        """Subscribe to the state while there are browsers."""
-        ...
-
-    def open_media(self, browser: Browser, on_frames: Callable[[list[bytes]], None]) -> MediaFeedSide:
-        """Return a subscription to media for a browser."""
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """Return the content of `/v1/info`."""
-        ...
-
-
-class MediaFeedSide(Protocol):
-    """Subscription to media of one browser."""
-
-    def set_subscriptions(self, streams: frozenset[str]) -> None:
-        """Subscribe to these streams, and to no others."""
-        ...
-
-    def resume(self) -> None:
-        """Read the next frame."""
-        ...
-
-    def close(self) -> None: ...
 
 
 class SocketWriter:
@@ -220,7 +181,7 @@ class WebServer:
     """
 
     def __init__(
-        self, hub: Hub, session: SessionSide, assets: GatewayAssets, hosts: HostCheck, page: PageFiles
+        self, hub: Hub, session: SessionLink, assets: GatewayAssets, hosts: HostCheck, page: PageFiles
     ) -> None:
         self._hub = hub
         self._drops: Drops = hub.drops
@@ -542,7 +503,7 @@ class WebServer:
         return self._hub.find_ticket(ticket.ticket, time.monotonic_ns())
 
     async def _read_media(
-        self, browser: Browser, socket: web.WebSocketResponse, feed: MediaFeedSide, writer: SocketWriter
+        self, browser: Browser, socket: web.WebSocketResponse, feed: MediaFeedSocket, writer: SocketWriter
     ) -> None:
         rate = TokenBucket(_SUBSCRIPTIONS_PER_S, _SUBSCRIPTIONS_BURST, time.monotonic_ns())
         while browser.is_admitted:
@@ -566,7 +527,7 @@ class WebServer:
                 await writer.close(Closing(CLOSE_NOT_ALLOWED, str(error)))
                 return
 
-    async def _write_media(self, browser: Browser, stream: MediaWriter, feed: MediaFeedSide) -> None:
+    async def _write_media(self, browser: Browser, stream: MediaWriter, feed: MediaFeedSocket) -> None:
         """Write frames one at a time; the next one is read from the session when there is room for it."""
         writer = stream.writer
         while browser.is_admitted:

@@ -6,8 +6,8 @@ import asyncio
 
 from iris_session.protocol.limits import Drops
 from iris_session.web.config import GatewayConfig
-from iris_session.web.gateway import SessionLink
 from iris_session.web.hub import Hub, HubLimits
+from iris_session.web.session_link import SessionLink
 
 
 def test_media_do_not_share_the_io_thread_of_state() -> None:

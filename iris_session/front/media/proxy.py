@@ -17,6 +17,7 @@ import zmq
 
 from iris_session.front.media.recorder import MediaRecorder
 from iris_session.front.media.scheduler import LOCAL, MediaScheduler
+from iris_session.link.sockets import read_peer
 from iris_session.link.tcp_guard import PendingConnection, TcpFlood, TcpGuard
 from iris_session.protocol.codec import decode_media_push
 from iris_session.protocol.errors import ProtocolError
@@ -206,7 +207,7 @@ class MediaProxy:
             data = frame.bytes
             is_subscription = data[:1] in _SUBSCRIPTIONS
             self._order_lost |= not is_subscription
-            descriptor = _read_descriptor(frame)
+            descriptor, user = read_peer(frame, encrypted=self._encrypted)
             if descriptor < 0:
                 continue  # libzmq unsubscribes a connection that has ended: its monitor reported that
             self._read_connection_events()
@@ -214,7 +215,6 @@ class MediaProxy:
                 weight = 1 + self._subscriber_guard.bounds.counted_messages
             else:
                 weight = 1 if parse_topic(data[1:]) is not None else UNKNOWN_TOPIC_WEIGHT
-            user = self._read_user_id(frame)
             self._subscriber_guard.establish(descriptor, user)
             cut = self._subscriber_guard.record_message(descriptor, (len(data),), weight)
             if is_subscription and self._order_lost and not cut:
@@ -236,9 +236,6 @@ class MediaProxy:
         elif self.scheduler.subscribe(*topic, user, descriptor, self._now_ns()):
             self._out.setsockopt(zmq.SUBSCRIBE, data[1:])
 
-    def _read_user_id(self, frame: zmq.Frame) -> str:
-        return str(frame.get("User-Id")) if self._encrypted else ""
-
     # --- frames ------------------------------------------------------------------------------------------------------
 
     def _receive_frames(self, socket: zmq.Socket[bytes]) -> None:
@@ -259,7 +256,7 @@ class MediaProxy:
                 self._push_frames(frames, "", LOCAL)
 
     def _handle_remote_frames(self, frames: list[zmq.Frame], lengths: list[int]) -> None:
-        user = self._read_user_id(frames[0])
+        descriptor, user = read_peer(frames[0], encrypted=self._encrypted)
         with self.lock:
             allowed = not user or user in self.sources
             if not allowed:
@@ -267,7 +264,6 @@ class MediaProxy:
                 if user not in self.refused and len(self.undecided) < MAX_UNDECIDED:
                     self.undecided.add(user)
         self._read_connection_events()
-        descriptor = _read_descriptor(frames[0])
         self._source_guard.establish(descriptor, user)
         cut = self._source_guard.record_message(descriptor, lengths, int(not allowed))
         with self.lock:
@@ -285,11 +281,3 @@ class MediaProxy:
                 self.scheduler.count_drop("media_malformed")
             else:
                 self.scheduler.push(push, frames[1:], user, self._now_ns(), connection)
-
-
-def _read_descriptor(frame: zmq.Frame) -> int:
-    """Return the descriptor of a frame's TCP connection, -1 if libzmq does not know it."""
-    try:
-        return int(frame.get(zmq.SRCFD))
-    except zmq.ZMQError:
-        return -1
