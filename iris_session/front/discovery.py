@@ -28,7 +28,7 @@ from iris_session.link.interfaces import (
     public_host,
     reachable,
 )
-from iris_session.link.sockets import host_in_address
+from iris_session.link.sockets import host_in_address, open_listeners
 from iris_session.protocol.codec import encode_beacon, encode_introduction
 from iris_session.protocol.discovery import INTRODUCTION_OFFSET, Beacon, Introduction
 from iris_session.protocol.limits import Drops
@@ -188,19 +188,15 @@ class IntroductionServer:
             listener.close()
 
 
-def open_listeners(hosts: Sequence[str], port: int) -> list[socket.socket]:
+def open_introduction_listeners(hosts: Sequence[str], port: int) -> list[socket.socket]:
     """Open listening sockets on every host with the same port; 0: any free one. Raises `FrontError`."""
-    opened: list[socket.socket] = []
     try:
-        for host in hosts:
-            opened.append(_open_listener(host, port or (opened[0].getsockname()[1] if opened else 0)))
+        return open_listeners(hosts, port, BACKLOG, SEND_BUFFER_BYTES)
     except OSError as error:
-        for listener in opened:
-            listener.close()
         if error.errno == errno.EADDRINUSE:
             raise PortInUseError(port, "introduction") from error
-        raise FrontError(f"cannot listen on {host} port {port} (introduction): {error.strerror or error}") from error
-    return opened
+        text = f"cannot listen on {error.filename} port {port} (introduction): {error.strerror or error}"
+        raise FrontError(text) from error
 
 
 def open_with_introduction(
@@ -214,7 +210,7 @@ def open_with_introduction(
         FrontError: A port is in use, or an address is not one of this machine.
     """
     for attempt in range(MAX_PORT_ATTEMPTS):
-        listeners = open_listeners(hosts, control_port + INTRODUCTION_OFFSET if control_port else 0)
+        listeners = open_introduction_listeners(hosts, control_port + INTRODUCTION_OFFSET if control_port else 0)
         port = listeners[0].getsockname()[1] - INTRODUCTION_OFFSET
         try:
             return open_control(port), listeners
@@ -225,21 +221,6 @@ def open_with_introduction(
             if control_port or not in_use or attempt == MAX_PORT_ATTEMPTS - 1:
                 raise
     raise AssertionError("unreachable")
-
-
-def _open_listener(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-        listener.bind((host, port))
-        listener.listen(BACKLOG)
-        listener.setblocking(False)
-    except BaseException:
-        listener.close()
-        raise
-    return listener
 
 
 # --- registry --------------------------------------------------------------------------------------------------------

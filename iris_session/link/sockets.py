@@ -7,7 +7,7 @@ import resource
 import socket
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import msgspec
@@ -154,6 +154,47 @@ def readable(socket: zmq.Socket[bytes]) -> bool:
 def bound_port(bound: zmq.Socket[bytes]) -> int:
     """Return the TCP port of a bound socket."""
     return int(bound.getsockopt_string(zmq.LAST_ENDPOINT).rsplit(":", 1)[1])
+
+
+def open_listeners(
+    hosts: Sequence[str], port: int, backlog: int, send_buffer_bytes: int = 0, *, only_v6: bool = False
+) -> list[socket.socket]:
+    """Open listening TCP sockets on one port of each host.
+
+    Args:
+        hosts: Addresses of this machine, each once.
+        port: TCP port; 0 takes any free one.
+        backlog: Connections that wait to be accepted.
+        send_buffer_bytes: The system's send buffer of each connection, 0 for the usual one.
+        only_v6: An address of IPv6 takes no connections of IPv4.
+
+    Returns:
+        The sockets, which do not block.
+
+    Raises:
+        OSError: One cannot be opened, that of its `filename`; the others were closed.
+    """
+    opened: list[socket.socket] = []
+    try:
+        for host in hosts:
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            listener = socket.socket(family, socket.SOCK_STREAM)
+            opened.append(listener)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if only_v6 and family == socket.AF_INET6:
+                listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            if send_buffer_bytes:
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, send_buffer_bytes)
+            listener.bind((host, port))
+            listener.listen(backlog)
+            listener.setblocking(False)
+            port = listener.getsockname()[1]
+    except OSError as error:
+        for listener in opened:
+            listener.close()
+        error.filename = host
+        raise
+    return opened
 
 
 def read_peer(frame: zmq.Frame, *, encrypted: bool) -> tuple[int, str]:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from iris_session.link.config import SECOND
+from iris_session.link.sockets import open_listeners
 from iris_session.link.tcp_guard import TcpBounds, TcpConnection, TcpGuard, TcpReasons
 from iris_session.protocol.limits import Drops, KeyedBuckets, find_network
 from iris_session.web.sockets import limit_unsent
@@ -269,20 +270,5 @@ class Listener:
 
 def open_listening_sockets(hosts: Sequence[str], port: int) -> list[socket.socket]:
     """Return listening sockets on one port of each address; port 0 takes any free one. Raises `OSError`."""
-    sockets: list[socket.socket] = []
-    try:
-        for name in dict.fromkeys("127.0.0.1" if host == "localhost" else host for host in hosts):
-            family = socket.AF_INET6 if ":" in name else socket.AF_INET
-            sock = socket.socket(family, socket.SOCK_STREAM)
-            sockets.append(sock)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            if family == socket.AF_INET6:
-                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            sock.bind((name, port))
-            sock.listen(_BACKLOG)
-            port = sock.getsockname()[1]
-    except BaseException:
-        for sock in sockets:
-            sock.close()
-        raise
-    return sockets
+    addresses = dict.fromkeys("127.0.0.1" if host == "localhost" else host for host in hosts)
+    return open_listeners(tuple(addresses), port, _BACKLOG, only_v6=True)

@@ -15,7 +15,7 @@ from iris_session.front.discovery import (
     INTERFACES_PERIOD_NS,
     BeaconSender,
     IntroductionServer,
-    open_listeners,
+    open_introduction_listeners,
     open_with_introduction,
 )
 from iris_session.link.config import FrontError, PortInUseError
@@ -137,7 +137,7 @@ INTRODUCED = Beacon(1, "s1", "lab-1", "live", "10.1.2.3", 7721, 7722, 0, 0, 0, "
 
 @pytest.fixture
 def introducer() -> Iterator[tuple[IntroductionServer, int]]:
-    listeners = open_listeners(["127.0.0.1"], 0)
+    listeners = open_introduction_listeners(["127.0.0.1"], 0)
     made = IntroductionServer(listeners, lambda: Introduction(INTRODUCED, "k" * 40, True, 3))
     yield made, listeners[0].getsockname()[1]
     made.close()
@@ -204,10 +204,10 @@ def test_port_in_use_is_an_error_that_closes_opened_sockets() -> None:
             open_with_introduction([host], port + 1, lambda _: 0)
     with pytest.raises(PortInUseError):
         open_with_introduction([host], port + 1, _in_use)
-    for listener in open_listeners([host], port):  # it was closed again
+    for listener in open_introduction_listeners([host], port):  # it was closed again
         listener.close()
     with pytest.raises(FrontError, match=r"203\.0\.113\.9"):
-        open_listeners(["203.0.113.9"], 0)
+        open_introduction_listeners(["203.0.113.9"], 0)
 
 
 def _in_use(port: int) -> int:

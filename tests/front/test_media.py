@@ -246,28 +246,6 @@ def _send(pusher: zmq.Socket[bytes], data: bytes) -> None:
         return
 
 
-def test_first_frame_of_an_undecided_source_is_not_refused(locked: tuple[Lab, Stage]) -> None:
-    lab, stage = locked
-    stage.publishing = False
-    camera = KeyPair.generate()
-    lab.home.clients.allow_key("cam-1", camera.public, ("camera",))
-    pusher = _pusher(lab, camera)
-    drops = lab.session.process.link.status.drops
-
-    def known() -> bool:
-        _send(pusher, b"camera")
-        nonlocal drops
-        drops = lab.session.process.link.status.drops
-        return "media_source_undecided" in drops
-
-    stage.until(known, "the first frames come before anybody has looked")
-    viewing = lab.allowed("bob", "observer")[1]
-    stage.joined(viewing, "bob")
-    stage.until(lambda: _send(pusher, b"camera") or "depth" in budgets(viewing), "the camera is let in")
-    assert "media_source_refused" not in lab.session.process.link.status.drops
-    pusher.close()
-
-
 def test_pending_media_are_bounded_in_bytes(tmp_path: Path) -> None:
     """No front reads. Large frames are not copied, and count until they were sent."""
     endpoint = f"ipc://{tmp_path}/media"

@@ -30,9 +30,6 @@ class FakeProxy:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.scheduler = MediaScheduler()
-        self.sources: set[str] = set()
-        self.undecided: set[str] = set()
-        self.refused: set[str] = set()
 
     def start(self) -> None: ...
 

@@ -73,9 +73,6 @@ class NoMedia:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.scheduler = MediaScheduler()
-        self.sources: set[str] = set()
-        self.undecided: set[str] = set()
-        self.refused: set[str] = set()
         self.alive = True
 
     def start(self) -> None: ...

@@ -30,8 +30,6 @@ RETRY_MS: Final = 4
 IDLE_MS: Final = 50
 #: Messages read of one socket per pass.
 ROUND: Final = 16
-#: Keys of sources that are not decided about yet, at most.
-MAX_UNDECIDED: Final = 64
 #: When memory is short, frames are dropped for so long.
 PAUSE_NS: Final = 2_000_000_000
 #: Pause after a fault of the proxy: a repeated fault must not use a whole processor.
@@ -48,9 +46,7 @@ class MediaProxy:
     Attributes:
         lock: Protects all attributes below.
         scheduler: Streams, subscriptions and due frames.
-        sources: Keys that may hand in frames. Without encryption the key is empty and always allowed.
-        undecided: Keys that tried to and are not decided about yet.
-        refused: Keys that may not.
+        is_source: Returns whether a key may hand in frames; called by the thread. Without encryption every source may.
 
     Args:
         out: XPUB socket of the subscribers.
@@ -89,9 +85,7 @@ class MediaProxy:
         self._thread = threading.Thread(target=self._run, name="iris-media", daemon=True)
         self.lock = threading.Lock()
         self.scheduler = MediaScheduler()
-        self.sources: set[str] = set()
-        self.undecided: set[str] = set()
-        self.refused: set[str] = set()
+        self.is_source: Callable[[str], bool] = lambda _key: True
 
     @property
     def alive(self) -> bool:
@@ -257,17 +251,12 @@ class MediaProxy:
 
     def _handle_remote_frames(self, frames: list[zmq.Frame], lengths: list[int]) -> None:
         descriptor, user = read_peer(frames[0], encrypted=self._encrypted)
-        with self.lock:
-            allowed = not user or user in self.sources
-            if not allowed:
-                self.scheduler.count_drop("media_source_refused" if user in self.refused else "media_source_undecided")
-                if user not in self.refused and len(self.undecided) < MAX_UNDECIDED:
-                    self.undecided.add(user)
+        allowed = not user or self.is_source(user)
         self._read_connection_events()
         self._source_guard.establish(descriptor, user)
         cut = self._source_guard.record_message(descriptor, lengths, int(not allowed))
         with self.lock:
-            self._count_reasons((cut,))
+            self._count_reasons((cut, "" if allowed else "media_source_refused"))
         if allowed:
             self._push_frames(frames, user, descriptor if self._source_guard.find(descriptor) else None)
 

@@ -44,8 +44,6 @@ DESCRIPTION_BURST: Final = 4
 REFUSED_NS: Final = 3 * SECOND
 #: More than this is unread only of a peer whose key was accepted: before, libzmq takes one command of a frame's size.
 UNAUTHENTICATED_BYTES: Final = 2 * MAX_MEDIA_FRAME_BYTES
-#: Refused keys that are remembered.
-MAX_REFUSED: Final = 256
 #: Sources that a warning names.
 MAX_NAMES: Final = 5
 
@@ -84,17 +82,15 @@ class MediaService:
         self._stats: dict[str, StreamStats] = {}
         self._described: dict[str, StreamBudget] = {}  # as every client gets it, but for class and rate
         self._description_bucket = TokenBucket(DESCRIPTIONS_PER_S, DESCRIPTION_BURST, context.now_ns())
-        self._names: dict[str, str] = {}  # of sources, by key
         self._senders: dict[int, FrontConnection] = {}  # of streams, by number, also of those that are lost
         self._refused: set[tuple[int, str]] = set()  # connection numbers, with the stream that another source has
         self._next_ns = 0
         self._connections_changed = False  # since the last tick
+        proxy.is_source = self._is_source
         proxy.start()
 
     def tick(self, now_ns: int) -> None:
         """Take over which clients are admitted, and update the budgets when they are due."""
-        if self._proxy.undecided:
-            self._decide_sources()
         for flood in self._proxy.pop_floods():
             self._refuse_flooder(flood, now_ns)
         self.sync_clients()
@@ -188,7 +184,7 @@ class MediaService:
             wanted = {number: proxy.scheduler.list_subscriptions(number) for number in self._states}
             tallies = {number: proxy.scheduler.read_counters(number) for number in self._states}
             readers = {number: proxy.scheduler.list_readers(number) for number in self._states}
-        self._decide_sources(again=True)
+        self._stop_lost_sources()
         self._note_senders()
         for reason, count in reasons.items():
             self._drops.count(reason, n=count)
@@ -212,7 +208,7 @@ class MediaService:
     def _name_source(self, facts: StreamStats) -> str:
         """Return the name of the source of a stream: of its key, else of the participant that sends it."""
         sender = self._senders.get(facts.sender)
-        return self._names.get(facts.source, "") or ("" if sender is None else sender.hello.name)
+        return self._find_source_name(facts.source) or ("" if sender is None else sender.hello.name)
 
     def _describe_owner(self, stream: str) -> str:
         """Return who has a stream, for those whose frames are refused."""
@@ -283,20 +279,17 @@ class MediaService:
         text = f"flood from {flood.address}: media ingest, {shown} refused for {seconds} s"
         self._context.guard.report_flood(flood.address, f"media ingest, {shown}", now_ns, warning=text)
 
-    def _decide_sources(self, *, again: bool = False) -> None:
-        """Decide which keys may hand in frames, by the present allow-list: new keys; `again`: all keys."""
+    def _stop_lost_sources(self) -> None:
+        """Remove the streams of keys that may not hand in frames any more."""
         if self._keyring.key is None:
             return
-        proxy = self._proxy
-        with proxy.lock:
-            looked = proxy.undecided | (proxy.sources | proxy.refused if again else set())
-            proxy.undecided = set()
-            names = {mark: name for mark in looked if (name := self._find_source_name(mark)) is not None}
-            proxy.scheduler.stop_sources(looked.intersection(proxy.sources).difference(names))
-            proxy.sources = proxy.sources.difference(looked).union(names)
-            refused = proxy.refused.difference(names).union(looked.difference(names))
-            proxy.refused = refused if len(refused) <= MAX_REFUSED else set()  # many keys: each is asked about anew
-        self._names = {mark: name for mark, name in self._names.items() if mark not in looked} | names
+        lost = {facts.source for facts in self._stats.values() if facts.source and not self._is_source(facts.source)}
+        if lost:
+            with self._proxy.lock:
+                self._proxy.scheduler.stop_sources(lost)
+
+    def _is_source(self, mark: str) -> bool:
+        return self._find_source_name(mark) is not None
 
     def _find_source_name(self, mark: str) -> str | None:
         """Return the name of a key that may hand in frames, `None` for any other."""
