@@ -328,17 +328,3 @@ def test_silent_gateway_disconnects_its_participants(open_session: OpenSession) 
     gateway.send(EStop("from behind"), on_behalf_of="tab1", epoch=2)
     (stop,) = session.wait_entries(EStop)
     assert stop.connection == 2
-
-
-def test_every_headset_is_estimated_although_the_first_is_busy(open_session: OpenSession) -> None:
-    session = open_session(anchors={"table": Pose((1.0, 0.0, 0.8), IDENTITY.q)}, proposal_period_ns=0)
-    clients = [session.client() for _ in range(3)]
-    for i, client in enumerate(clients):
-        client.join(name=f"c{i}")
-
-    def all_estimated() -> bool:
-        for client in clients:  # new observations all the time: every desk is always due
-            client.send(Observation("table", "qr", Pose((0.5, 0.0, -0.2), IDENTITY.q), session.step, 1, session.step))
-        return {e.connection for e in session.entries if isinstance(e.message, AlignmentProposal)} == {1, 2, 3}
-
-    session.pump(all_estimated, "estimates of all")

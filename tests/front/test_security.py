@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from zmq.auth import create_certificates
 
 from iris_session.link.config import SECOND
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import EStop, Heartbeat, Hello, Marker, Pair, RemoveParticipant
+from iris_session.protocol.client_messages import EStop, Hello, Marker, Pair, RemoveParticipant
 from iris_session.protocol.entries import Audit, Join, Lost
 from iris_session.protocol.names import AuditKind, FaultCode, RefusalCode
 from iris_session.protocol.server_messages import Paired, ProtocolFault, Refused
@@ -31,22 +30,6 @@ def test_unknown_key_can_only_pair(lab: Lab) -> None:
     assert [type(e.message) for e in lab.session.entries if not isinstance(e.message, Audit)] == []
     audits = lab.audits(AuditKind.KEY_REFUSED, 3)
     assert {(a.subject, a.address) for a in audits} == {(eve.fingerprint, "127.0.0.1")}
-
-
-def test_unknown_key_gets_no_state(lab: Lab) -> None:
-    ann, client = lab.allowed("ann")
-    subscribers = [lab.session.subscriber(curve=lab.curve(pair)) for pair in (ann, KeyPair.generate())]
-    poses = np.zeros((3, 7))
-
-    def state_comes() -> bool:
-        lab.session.send_state(poses)
-        return bool(subscribers[0].poll(0))
-
-    lab.session.pump(state_comes, "state")
-    lab.audits(AuditKind.KEY_REFUSED)
-    lab.session.send_state(poses)
-    assert not subscribers[1].poll(50)
-    assert client.got(Refused) == []
 
 
 def test_code_pairs_one_key_with_the_roles_of_the_code(lab: Lab) -> None:
@@ -85,33 +68,6 @@ def test_wrong_codes_void_the_code_and_are_audited_with_their_count(lab: Lab) ->
     refused = lab.audits(AuditKind.CODE_REFUSED, 5)
     assert sum(a.count for a in refused) == 5
     assert len(refused) <= 2, "at most once a second"
-
-
-def test_attempts_per_address_are_bounded_for_all_codes(lab: Lab) -> None:
-    """An address that keeps guessing voids two codes, and no further ones."""
-    client = lab.client(KeyPair.generate())
-    n = 0
-    for _ in range(2):
-        lab.home.join_codes.create(lab.server)
-        for _ in range(5):
-            n += 1
-            lab.refused(client, Pair("eve", b"x" * 32), n)
-    code, _ = lab.home.join_codes.create(lab.server)
-    eve = KeyPair.generate()
-    answer = lab.refused(lab.client(eve), Pair("eve", lab.proof(code, eve)))
-    assert (answer.code, answer.message) == (RefusalCode.CODE, "too many wrong codes from this address")
-    assert sum(one.is_open(time.time()) for one in lab.home.join_codes.list_for_server(lab.server.fingerprint)) == 1
-
-
-def test_flood_of_pairing_is_cut_off(lab: Lab) -> None:
-    lab.home.join_codes.create(lab.server)
-    _, ann = lab.allowed("ann")
-    client = lab.client(KeyPair.generate())
-    for _ in range(300):
-        client.send(Pair("eve", b"x" * 32))
-    assert lab.session.wait_drops("pair_rate") > 0
-    ann.send(Heartbeat())
-    lab.session.wait_entries(Heartbeat)
 
 
 def test_unencrypted_sessions_refuse_pairing(session: FrontSession) -> None:
@@ -274,19 +230,6 @@ def test_audits_of_a_flood_are_bounded_and_add_up(lab: Lab) -> None:
     assert len(audits) <= 3, "at most once a second"
     answers = len([m for client in clients for m in client.got(Refused)])
     assert answers <= 40, "answers to unknown keys are bounded"
-
-
-def test_damaged_list_keeps_the_previous_keys(lab: Lab) -> None:
-    _, client = lab.allowed("ann")
-    path = lab.home.path / "clients.json"
-    good = path.read_bytes()
-    path.write_bytes(b"[{")
-    assert lab.session.wait_drops("allow_list_unreadable") >= 1
-    client.send(Marker(1, "still here"))
-    lab.session.wait_entries(Marker)
-    path.write_bytes(good)
-    lab.home.clients.revoke_key("ann")
-    client.wait_for(ProtocolFault)
 
 
 def test_list_may_be_edited_during_the_session(lab: Lab) -> None:

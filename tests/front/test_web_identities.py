@@ -6,7 +6,6 @@ import hashlib
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from iris_session.front.revocation import CHECK_PERIOD_NS
@@ -352,16 +351,6 @@ class TestOwnGateway:
         gateway, eve = Gateway(lab.session, lab.curve(pair), b""), Person("eve")
         eve.secret = os.urandom(16)
         assert gateway.refused(eve, eve.hello("director")).code == RefusalCode.IDENTITY
-
-    def test_gets_state(self, own: tuple[Lab, KeyPair]) -> None:
-        lab, pair = own
-        sub = lab.session.subscriber(curve=lab.curve(pair))
-
-        def comes() -> bool:
-            lab.session.send_state(np.zeros((3, 7)))
-            return bool(sub.poll(0))
-
-        lab.session.pump(comes, "state")
 
 
 class TestDisconnected:
