@@ -240,5 +240,5 @@ def test_a_long_file_shows_how_far_it_was_read(
             shown_progress.show(4, 0)
             shown_progress.show_bytes(5_000_000, 9_000_000)
         shown = capsys.readouterr().err
-        lines = "\ra.rrd: step 3 of 9\ra.rrd: step 4\ra.rrd: read 5 of 9 MB\n"
+        lines = "".join(f"\r\x1b[Ka.rrd: {text}" for text in ("step 3 of 9", "step 4", "read 5 of 9 MB")) + "\n"
         assert shown.endswith(lines) if terminal else shown == ""
