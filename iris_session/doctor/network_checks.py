@@ -153,36 +153,39 @@ def check_tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", port
         ipaddress.ip_address(ip)
     except ValueError:  # the system takes an empty address for this machine's own
         return failed(check, f"{address.host!r} has no address to connect to", "", "type the IP address instead")
-    family = socket.AF_INET6 if ":" in ip else socket.AF_INET
     began = time.monotonic()
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.settimeout(CONNECT_S)
-        try:
-            probe.connect((ip, port))
-        except TimeoutError:
+    try:
+        probe_tcp(ip, port, CONNECT_S)
+    except TimeoutError:
+        return failed(
+            check,
+            f"no answer from {ip} port {port} ({port_name}) within {CONNECT_S:g} s",
+            "packets are dropped: a firewall, the wrong machine, or a network that isolates its clients",
+            f"on the server's machine allow TCP {port} (docs/network.md), and try from that machine itself",
+        )
+    except OSError as error:
+        if error.errno == errno.ECONNREFUSED:
             return failed(
                 check,
-                f"no answer from {ip} port {port} ({port_name}) within {CONNECT_S:g} s",
-                "packets are dropped: a firewall, the wrong machine, or a network that isolates its clients",
-                f"on the server's machine allow TCP {port} (docs/network.md), and try from that machine itself",
+                f"nothing listens at {ip} port {port} ({port_name})",
+                "the machine answers, but no program has this port: no session runs, it has another port, "
+                "or it listens on another address (127.0.0.1 is for its own machine only)",
+                "compare with the address that `iris-session serve` prints; for other machines it needs --interface",
             )
-        except OSError as error:
-            if error.errno == errno.ECONNREFUSED:
-                return failed(
-                    check,
-                    f"nothing listens at {ip} port {port} ({port_name})",
-                    "the machine answers, but no program has this port: no session runs, it has another port, "
-                    "or it listens on another address (127.0.0.1 is for its own machine only)",
-                    "compare with the address that `iris-session serve` prints; for other machines it needs "
-                    "--interface",
-                )
-            if error.errno in _UNREACHABLE:
-                text = f"{ip} cannot be reached ({error.strerror})"
-                why = "no machine of this network has that address, it is switched off, or it is disconnected"
-                advice = "compare with the address that `iris-session serve` prints, and check cable or Wi-Fi"
-                return failed(check, text, why, advice)
-            return failed(check, f"no connection to {ip} port {port} ({port_name}): {error.strerror or error}")
+        if error.errno in _UNREACHABLE:
+            text = f"{ip} cannot be reached ({error.strerror})"
+            why = "no machine of this network has that address, it is switched off, or it is disconnected"
+            advice = "compare with the address that `iris-session serve` prints, and check cable or Wi-Fi"
+            return failed(check, text, why, advice)
+        return failed(check, f"no connection to {ip} port {port} ({port_name}): {error.strerror or error}")
     return ok(check, f"{ip} port {port} ({port_name}) accepts connections ({(time.monotonic() - began) * 1e3:.1f} ms)")
+
+
+def probe_tcp(ip: str, port: int, timeout_s: float) -> None:
+    """Open a TCP connection and close it. Raises `OSError`: refused, unreachable, or no answer in time."""
+    with socket.socket(socket.AF_INET6 if ":" in ip else socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.settimeout(timeout_s)
+        probe.connect((ip, port))
 
 
 def check_introduction(address: Address) -> tuple[Finding, Finding, Introduction | None]:

@@ -1,16 +1,14 @@
-"""`iris-session doctor` must name each planted fault by its check."""
+"""`iris-session doctor` beside real sessions: keys, ports and processes, late ticks, a full disk."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +16,16 @@ import psutil
 import pytest
 
 from iris_session.client import Client
-from iris_session.protocol.codec import encode_introduction
-from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import LateCause
 from iris_session.security import KeyHome, KeyPair
 from tests.e2e.session_process import (
     COMMAND,
-    DEADLINE_S,
     SessionProcess,
     kill_all,
     make_serve_command,
     skip_unless_ci,
     wait_until,
 )
-from tests.slow_scene import write_slow_scene
 
 pytestmark = pytest.mark.e2e
 
@@ -90,78 +84,6 @@ def examine(*arguments: str, expected: set[str], home: Path | None = None) -> Di
     return found
 
 
-@contextlib.contextmanager
-def reserve_two_ports() -> Iterator[tuple[socket.socket, socket.socket]]:
-    """Reserve two adjacent ports: yield their sockets, lower first. Nothing listens on them yet."""
-    for _ in range(1000):
-        with socket.socket() as upper, socket.socket() as lower:
-            upper.bind(("127.0.0.1", 0))
-            try:
-                lower.bind(("127.0.0.1", get_port(upper) - 1))
-            except OSError:
-                continue
-            yield lower, upper
-            return
-    pytest.fail("no two adjacent ports are free")
-
-
-def get_port(one: socket.socket) -> int:
-    return int(one.getsockname()[1])
-
-
-# --- network ---------------------------------------------------------------------------------------------------------
-
-
-def test_no_listener() -> None:
-    with reserve_two_ports() as (_, upper):
-        found = run_doctor(f"127.0.0.1:{get_port(upper)}")
-    found.assert_names("tcp")
-    assert found.status == 1
-    assert found.checks["join"]["state"] == "skipped"
-    assert found.failed() == {"tcp"}
-
-
-@pytest.mark.long
-def test_listener_that_never_answers() -> None:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.listen(16)
-        found = run_doctor(f"127.0.0.1:{listener.getsockname()[1]}")
-    found.assert_names("join")
-    assert found.checks["tcp"]["state"] == "ok"
-
-
-def test_unknown_session_name() -> None:
-    found = run_doctor("--session", "nobody-here")
-    found.assert_names("beacon", "nobody-here")
-    assert found.failed() == {"beacon"}
-
-
-def test_other_protocol_version() -> None:
-    """A session of protocol version 2 introduces itself."""
-    with reserve_two_ports() as (introducing, control):
-        port = get_port(control)
-        beacon = Beacon(2, "s2", "future", "live", "127.0.0.1", port, 0, 0, 0, 0)
-        for listener in (introducing, control):
-            listener.listen(4)
-
-        def introduce() -> None:
-            with contextlib.suppress(OSError):
-                peer, _ = introducing.accept()
-                with peer:
-                    peer.sendall(encode_introduction(Introduction(beacon)))
-
-        thread = threading.Thread(target=introduce, daemon=True)
-        thread.start()
-        found = run_doctor(f"127.0.0.1:{port}")
-        thread.join(5.0)
-    found.assert_names("version", "2")
-    assert found.checks["join"]["state"] == "skipped"
-
-
-# --- keys and roles --------------------------------------------------------------------------------------------------
-
-
 def find_lan_address() -> str:
     """Return an address of this machine that is not loopback: encrypted sessions need one."""
     for addresses in psutil.net_if_addrs().values():
@@ -171,239 +93,37 @@ def find_lan_address() -> str:
     pytest.fail("this machine has no network address but loopback")
 
 
-@pytest.fixture(scope="module")
-def encrypted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionProcess]:
-    """A session on the network, encrypted."""
-    folder = tmp_path_factory.mktemp("encrypted")
-    recording = folder / "session.rrd"
-    server = SessionProcess(folder, recording, make_serve_command("arm", recording, "--host", find_lan_address()))
-    yield server
-    server.stop()
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Path:
-    """A home of keys that the session does not know."""
-    return tmp_path / "home"
-
-
-@pytest.mark.long
-def test_key_that_is_not_on_the_allow_list(encrypted: SessionProcess, home: Path) -> None:
-    found = examine(encrypted.address, home=home, expected={"key"})
-    found.assert_names("key", "iris-session pair")
-
-
-def test_wrong_join_code(encrypted: SessionProcess, home: Path) -> None:
-    found = examine(encrypted.address, "--code", "7KQ2-M4XD-9PTR", home=home, expected={"code"})
-    found.assert_names("code")
-
-
-@pytest.mark.long
-def test_role_that_the_key_does_not_allow(encrypted: SessionProcess, home: Path) -> None:
-    KeyHome().clients.allow_key("looker", KeyHome(home).load_identity().public, ("observer",))
-    found = examine(encrypted.address, "--role", "director", home=home, expected={"role"})
-    found.assert_names("role")
-    well = examine(encrypted.address, home=home, expected=set())
-    assert well.checks["key"]["state"] == "ok"
-
-
-def test_changed_server_key(encrypted: SessionProcess, home: Path) -> None:
-    KeyHome(home).known_servers.pin(encrypted.address, "arm", KeyPair.generate().public)
-    found = examine(encrypted.address, home=home, expected={"server_key"})
-    found.assert_names("server_key", "iris-session keys forget")
-
-
-#: Unique, because the beacons of other tests' sessions are heard, too.
-SESSION_NAME = f"doctor-{os.getpid()}"
-
-
-# --- session and participants ----------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionProcess]:
-    folder = tmp_path_factory.mktemp("plain")
-    recording = folder / "session.rrd"
-    options = ("--name", SESSION_NAME, "--host", "127.0.0.1")
-    server = SessionProcess(folder, recording, make_serve_command(str(write_slow_scene(folder)), recording, *options))
-    yield server
-    server.stop()
-
-
-@contextlib.contextmanager
-def open_clients(server: SessionProcess) -> Iterator[Callable[..., Client]]:
-    clients: list[Client] = []
-
-    def join(name: str, **settings: Any) -> Client:
-        client = Client(server.address, name=name, devices=("desktop", "head"), **settings)
-        clients.append(client)
-        return client.connect(DEADLINE_S).start()
-
-    yield join
-    for client in clients:
-        client.close()
-
-
-def test_healthy_session_passes_and_no_participant_stays(plain: SessionProcess) -> None:
-    found = examine(plain.address, expected=set())
-    assert found.status == int(any(check["state"] == "failed" for check in found.checks.values()))
-    with Client(plain.address, role="observer", alignment="not_needed", name="look") as client:
-        wait_until(
-            lambda: [p.name for p in client.status().participants if p.connected] == ["look"], "no other participant"
-        )
-
-
-def test_session_given_by_name(plain: SessionProcess) -> None:
-    found = examine("--session", SESSION_NAME, expected=set())
-    assert found.document["address"] == plain.address
-    assert found.document["report"]["session_name"] == SESSION_NAME
-
-
-class Forwarder:
-    """Forward one TCP port of 127.0.0.2 to this machine, as a firewall that opens that port only."""
-
-    def __init__(self, port: int) -> None:
-        self._listener = socket.create_server(("127.0.0.2", port))
-        self._port = port
-        self._open: list[socket.socket] = []
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                peer, _ = self._listener.accept()
-                inside = socket.create_connection(("127.0.0.1", self._port))
-                self._open += [peer, inside]
-                for source, sink in ((peer, inside), (inside, peer)):
-                    threading.Thread(target=self._pump, args=(source, sink), daemon=True).start()
-
-    @staticmethod
-    def _pump(source: socket.socket, sink: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while data := source.recv(65536):
-                sink.sendall(data)
-
-    def close(self) -> None:
-        self._listener.shutdown(socket.SHUT_RDWR)
-        for one in (self._listener, *self._open):
-            one.close()
-
-
-@pytest.mark.long
-def test_firewall_that_opens_only_the_control_port(plain: SessionProcess) -> None:
-    port = int(plain.address.rsplit(":", 1)[1])
-    with contextlib.closing(Forwarder(port)):
-        found = examine(f"127.0.0.2:{port}", expected={"state"})
-    found.assert_names("state", "(state)")
-    assert found.checks["join"]["state"] == "ok"
-    assert found.checks["introduction"]["state"] == "warning"
-
-
-def test_missing_alignment_missing_lease_and_stopped_client(plain: SessionProcess) -> None:
-    with open_clients(plain) as join, run_carl(plain) as carl:
-        ann = join("ann", alignment="not_needed")
-        ann.acquire(["left"])
-        bob = join("bob")
-        wait_until(
-            lambda: any(lease.target == "right" and lease.holder for lease in ann.mirror.leases.values()),
-            "carl's robot",
-        )
-        carl.send_signal(signal.SIGSTOP)
-        found = examine(plain.address, expected={"alignment", "clients"})
-        found.assert_names("alignment", "bob")
-        found.assert_names("leases", "bob", "left: ann", "right: carl", state="warning")
-        found.assert_names("clients", "carl")
-        assert found.status == 1
-        bob.close()
-
-
-def test_jumped_tracking_frame_and_late_samples(plain: SessionProcess) -> None:
-    """The alignment of eva is void since its tracking frame jumped; samples of fay arrive two seconds late."""
-    with open_clients(plain) as join:
-        director = join("dora", role="director", alignment="not_needed")
-        eva = join("eva", role="observer")
-        director.alignment.place(eva.participant_id, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
-        wait_until(lambda: eva.alignment.current is not None and eva.alignment.current.kind == "placed", "an alignment")
-        eva.alignment.report_tracking_jump()
-        wait_until(lambda: eva.alignment.current is None or eva.alignment.current.kind == "none", "a void alignment")
-        with sending_late(join("fay", role="observer", alignment="not_needed")):
-            found = run_doctor(plain.address)
-        found.assert_names("alignment", "eva", "lost", "tracking frame", state="warning")
-        found.assert_names("age", "device -> front", "(fay)", state="warning")
-        assert "state -> client" in found.checks["age"]["text"]
-
-
-@contextlib.contextmanager
-def sending_late(client: Client) -> Iterator[None]:
-    """Send samples captured two seconds ago in the background; enter once the status shows their delay."""
-    end = threading.Event()
-
-    def send() -> None:
-        while not end.wait(0.02):
-            client.send_sample(
-                "head", ((0.0, 0.0, 1.5), (1.0, 0.0, 0.0, 0.0)), capture_ns=client.session_now_ns() - 2_000_000_000
-            )
-
-    thread = threading.Thread(target=send)
-    thread.start()
+def test_refused_keys_and_codes_at_an_encrypted_session(tmp_path: Path) -> None:
+    """A key that is not on the list, a wrong code, a role that the key does not allow, a changed key of the server."""
+    home = tmp_path / "home"  # of keys that the session does not know
+    recording = tmp_path / "session.rrd"
+    server = SessionProcess(tmp_path, recording, make_serve_command("arm", recording, "--host", find_lan_address()))
     try:
-        wait_until(lambda: any(p.capture_to_receive for p in client.status().participants), "the delay in the status")
-        yield
+        examine(server.address, home=home, expected={"key"}).assert_names("key", "iris-session pair")
+        examine(server.address, "--code", "7KQ2-M4XD-9PTR", home=home, expected={"code"}).assert_names("code")
+        KeyHome().clients.allow_key("looker", KeyHome(home).load_identity().public, ("observer",))
+        examine(server.address, "--role", "director", home=home, expected={"role"}).assert_names("role")
+        assert examine(server.address, home=home, expected=set()).checks["key"]["state"] == "ok"
+        KeyHome(home).known_servers.pin(server.address, "arm", KeyPair.generate().public)
+        found = examine(server.address, home=home, expected={"server_key"})
+        found.assert_names("server_key", "iris-session keys forget")
     finally:
-        end.set()
-        thread.join()
+        server.stop()
 
 
-CARL = """
-import sys
-from iris_session import Client
-with Client(sys.argv[1], name="carl", alignment="not_needed") as carl:
-    carl.acquire(["right"])
-    carl.sleep(60)
-"""
-
-
-@contextlib.contextmanager
-def run_carl(server: SessionProcess) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a client named carl, which holds the right robot, in a process."""
-    process = subprocess.Popen([sys.executable, "-c", CARL, server.address])
+def test_checks_of_the_server_name_its_ports_and_processes(tmp_path: Path) -> None:
+    recording = tmp_path / "session.rrd"
+    server = SessionProcess(tmp_path, recording, make_serve_command("arm", recording))
     try:
-        yield process
+        found = run_doctor("--server", server.address)
     finally:
-        process.kill()
-        process.wait()
-
-
-def test_emergency_stop(plain: SessionProcess) -> None:
-    with open_clients(plain) as join:
-        director = join("dora", role="director", alignment="not_needed")
-        director.estop("test")
-        wait_until(lambda: director.mirror.estop, "the e-stop")
-        run_doctor(plain.address).assert_names("session", "emergency stop")
-        director.clear_estop()
-
-
-def test_checks_of_the_server(plain: SessionProcess) -> None:
-    found = run_doctor("--server", plain.address)
+        server.stop()
     assert {"scheduling", "processors", "key_home", "ports", "interfaces", "clock_source", "disk"} <= set(found.checks)
     assert found.checks["session"]["state"] == "ok"
     ports = found.checks["ports"]
     assert ports["state"] == "ok", ports
-    assert plain.address.rsplit(":", 1)[1] in ports["text"]
+    assert server.address.rpartition(":")[2] in ports["text"]
     assert "front.main" in ports["text"]
-
-
-def test_suspended_session(plain: SessionProcess) -> None:
-    plain.process.send_signal(signal.SIGSTOP)
-    try:
-        found = run_doctor(plain.address)
-    finally:
-        plain.process.send_signal(signal.SIGCONT)
-    found.assert_names("session")
-    assert {"session", "join"} <= found.failed()
-
-
-# --- the machine of the session --------------------------------------------------------------------------------------
 
 
 OVERLOADED = """
