@@ -1,8 +1,10 @@
-"""Starting, failing, stalling, restarting and ending the front process."""
+"""The front as a process: how it starts, is replaced after a crash or when it hangs, and ends with its parent.
+
+`test_front_supervision.py` has what decides about it.
+"""
 
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import socket
@@ -25,7 +27,6 @@ from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello,
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import FrontRestarted, Join
 from iris_session.protocol.server_messages import ProtocolFault, Snapshot
-from iris_session.protocol.status import DeliveryBudget
 from iris_session.security import KeyHome
 from tests.front.altered_front import DESCRIPTORS, FEW_DESCRIPTORS, run_altered
 from tests.front.process_harness import LONG_NS, ProcessClient, ProcessSession, scene
@@ -70,44 +71,6 @@ def test_port_in_use_error_names_the_port() -> None:
     assert f"port {port} (control)" in str(error.value)
 
 
-def test_networks_are_encrypted_with_a_key_made_on_first_use(tmp_path: Path) -> None:
-    home = tmp_path / "home"
-    config = FrontConfig(host="0.0.0.0", control_port=0, state_port=0, key_home=str(home))
-    marks = []
-    for _ in range(2):
-        process = FrontProcess(config, scene())
-        marks.append(process.start().key_fingerprint)
-        process.close()
-    assert marks[0] == marks[1] == KeyHome(home).load_server_key().fingerprint
-    assert home.stat().st_mode & 0o777 == 0o700
-    assert (home / "server.key_secret").stat().st_mode & 0o777 == 0o600
-    assert KeyHome(home).sessions.read() == []
-
-
-def test_damaged_allow_list_is_an_error_and_unchanged(tmp_path: Path) -> None:
-    home = tmp_path / "home"
-    KeyHome(home).load_server_key()
-    damaged = home / "clients.json"
-    damaged.write_text("[{")
-    damaged.chmod(0o600)
-    with pytest.raises(FrontError, match=r"clients\.json"):
-        FrontProcess(FrontConfig(control_port=0, state_port=0, curve=True, key_home=str(home)), scene()).start()
-    assert damaged.read_text() == "[{"
-
-
-def test_foreign_address_is_an_error(tmp_path: Path) -> None:
-    _certificate(tmp_path, "server")
-    config = FrontConfig(
-        host="203.0.113.9",  # TEST-NET-3, nobody's
-        control_port=0,
-        state_port=0,
-        curve_secret_file=str(tmp_path / "server.key_secret"),
-        curve_clients_dir=str(tmp_path),
-    )
-    with pytest.raises(FrontError, match=r"203\.0\.113\.9"):
-        FrontProcess(config, scene()).start()
-
-
 @pytest.mark.parametrize(
     ("secret_file", "folder", "text"),
     [
@@ -116,27 +79,15 @@ def test_foreign_address_is_an_error(tmp_path: Path) -> None:
         ("server.key", ".", "server.key"),
     ],
 )
-def test_unusable_keys_are_named(tmp_path: Path, secret_file: str, folder: str, text: str) -> None:
-    _certificate(tmp_path, "server")
-    config = FrontConfig(
-        control_port=0,
-        state_port=0,
-        curve_secret_file=str(tmp_path / secret_file),
-        curve_clients_dir=str(tmp_path / folder),
-    )
-    with pytest.raises(FrontError, match=text):
-        FrontProcess(config, scene()).start()
-
-
-def test_restarted_front_is_waited_for() -> None:
-    config = FrontConfig(host=make_loopback_address(), control_port=0, state_port=0)  # no other test takes its ports
-    process = FrontProcess(config, scene())
-    ports = process.start()
-    os.kill(process.pid, signal.SIGKILL)
-    wait(lambda: not process.alive, "end")
-    process.restart()
-    assert process.wait_ready(60.0) == ports
+def test_networks_are_encrypted_with_a_key_made_on_first_use(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    process = FrontProcess(FrontConfig(host="0.0.0.0", control_port=0, state_port=0, key_home=str(home)), scene())
+    mark = process.start().key_fingerprint
     process.close()
+    assert mark == KeyHome(home).load_server_key().fingerprint
+    assert home.stat().st_mode & 0o777 == 0o700
+    assert (home / "server.key_secret").stat().st_mode & 0o777 == 0o600
+    assert KeyHome(home).sessions.read() == []
 
 
 def test_close_ends_the_process_and_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -152,16 +103,6 @@ def test_close_ends_the_process_and_leaves_no_file(monkeypatch: pytest.MonkeyPat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_too_long_for_a_socket_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    folder = tmp_path / ("x" * 100)
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    process = FrontProcess(FrontConfig(control_port=0, state_port=0), scene())
-    process.start()
-    process.close()
-    assert list(folder.iterdir()) == []
-
-
 def test_ipv6(open_process: OpenSession) -> None:
     session = open_process(host="::1")
     assert session.ports.host == "[::1]"
@@ -174,49 +115,44 @@ def test_ipv6(open_process: OpenSession) -> None:
         session.pump(lambda: bool(client.poll(0)), "welcome over IPv6")
 
 
-def test_clients_are_notified_when_the_session_is_closed(process_session: ProcessSession) -> None:
+def test_a_signal_ends_the_front_cleanly(process_session: ProcessSession) -> None:
     session = process_session
     client = session.client()
     client.join()
-    client.wait_for(DeliveryBudget)
-    session.process.close(30.0)
-    assert wait_until_told(client) == ["session_ended"]
-
-
-def test_ctrl_c_in_the_terminal_reaches_only_the_parent(process_session: ProcessSession) -> None:
-    session = process_session
-    assert os.getsid(session.process.pid) == session.process.pid != os.getsid(0)
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_signals_end_the_front_cleanly(process_session: ProcessSession, number: signal.Signals) -> None:
-    session = process_session
-    client = session.client()
-    client.join()
-    os.kill(session.process.pid, number)
+    assert os.getsid(session.process.pid) == session.process.pid != os.getsid(0), "Ctrl-C reaches only the parent"
+    os.kill(session.process.pid, signal.SIGTERM)
     wait(lambda: not session.process.alive, "end of the front")
     assert wait_until_told(client)[-1] == "session_ended"
 
 
-def test_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(process_session: ProcessSession) -> None:
+def test_crashed_front_is_replaced_and_its_successor_knows_what_it_knew(process_session: ProcessSession) -> None:
+    """The same ports, resume tokens, counters and the number of the newest state; and a scene that came meanwhile."""
     session = process_session
     client = session.client()
     token = client.join().resume_token
+    client.socket.send(b"nonsense")
+    assert session.wait_drops("malformed") == 1
+    session.send_state(np.zeros((3, 7)))
     session.once()
     ports = session.process.link.ports
     os.kill(session.process.pid, signal.SIGKILL)
     wait(lambda: not session.process.alive, "crash")
     session.process.restart()
-    session.pump(lambda: session.process.link.ports is not None, "new front")
-    assert session.process.link.ports == ports
+    session.process.set_scene(scene(5))
+    assert session.process.wait_ready(60.0) == ports
     assert session.process.restarts == 1
     session.wait_entries(FrontRestarted)
     client.send(Heartbeat())
     session.pump(lambda: any(f.code == "hello" for f in client.got(ProtocolFault)), "fault from the new front")
     welcome = client.join(resume_token=token)
-    assert welcome.resumed
-    assert welcome.participant_id == "p1"
-    assert welcome.connection_epoch == 2
+    assert (welcome.resumed, welcome.participant_id, welcome.connection_epoch) == (True, "p1", 2)
+    client.socket.send(b"nonsense")
+    session.pump(lambda: session.process.link.status.drops["malformed"] == 2, "sum")
+    session.send_state(np.zeros((5, 7)))
+    client.send(GetSnapshot(1))
+    snapshot = client.wait_for(Snapshot)
+    assert len(snapshot.bodies) == 5
+    assert snapshot.state_seq > 1
 
 
 def test_front_that_cannot_listen_again_says_why(process_session: ProcessSession) -> None:
@@ -238,27 +174,6 @@ def test_front_that_cannot_listen_again_says_why(process_session: ProcessSession
         assert f"port {address[1]}" in session.process.fault
 
 
-def test_failed_start_of_a_front_is_retried(process_session: ProcessSession, monkeypatch: pytest.MonkeyPatch) -> None:
-    session = process_session
-    os.kill(session.process.pid, signal.SIGKILL)
-    wait(lambda: not session.process.alive, "crash")
-    ports = session.process.link.ports
-
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(subprocess, "Popen", refuse)
-        session.process.restart()
-        wait(lambda: not session.process.alive, "failure")
-    with pytest.raises(FrontError, match="Cannot allocate memory"):
-        session.process.restart()
-    assert not session.process.alive
-    session.process.restart()
-    session.pump(lambda: session.process.link.ports is not None, "new front")
-    assert session.process.link.ports == ports
-
-
 def test_hanging_front_is_replaced(process_session: ProcessSession) -> None:
     session = process_session
     client = session.client()
@@ -272,93 +187,6 @@ def test_hanging_front_is_replaced(process_session: ProcessSession) -> None:
     session.pump(lambda: session.process.link.ports is not None, "new front")
     assert gone(hung)
     assert client.join(resume_token=token).resumed
-
-
-def test_stalled_authority_does_not_replace_the_front(process_session: ProcessSession) -> None:
-    session = process_session
-    client = session.client()
-    client.join()
-    os.kill(session.process.pid, signal.SIGSTOP)
-    time.sleep(2.0)  # both stand still, as in a debugger
-    os.kill(session.process.pid, signal.SIGCONT)
-    assert session.process.alive
-    session.once()
-    assert session.process.alive
-
-
-def test_scene_changed_during_a_restart_reaches_the_new_front(process_session: ProcessSession) -> None:
-    session = process_session
-    session.once()
-    os.kill(session.process.pid, signal.SIGKILL)
-    wait(lambda: not session.process.alive, "crash")
-    session.process.restart()
-    session.process.set_scene(scene(5))
-    session.pump(lambda: session.process.link.ports is not None, "new front")
-    client = session.client()
-    client.join()
-    client.send(GetSnapshot(1))
-    assert len(client.wait_for(Snapshot).bodies) == 5
-
-
-def test_drop_counts_survive_a_restart_of_the_front(process_session: ProcessSession) -> None:
-    session = process_session
-    client = session.client()
-    client.join()
-    client.socket.send(b"nonsense")
-    assert session.wait_drops("malformed") == 1
-    os.kill(session.process.pid, signal.SIGKILL)
-    wait(lambda: not session.process.alive, "crash")
-    session.process.restart()
-    assert session.process.link.status.drops["malformed"] == 1
-    client.join()
-    client.socket.send(b"nonsense")
-    session.pump(lambda: session.process.link.status.drops["malformed"] == 2, "sum")
-
-
-def test_new_front_numbers_states_above_its_predecessor(process_session: ProcessSession) -> None:
-    session = process_session
-    poses = np.zeros((3, 7))
-    client = session.client()
-    client.join()
-    session.send_state(poses)
-    client.send(GetSnapshot(1))
-    before = client.wait_for(Snapshot).state_seq
-    assert before == 1
-    os.kill(session.process.pid, signal.SIGKILL)
-    wait(lambda: not session.process.alive, "crash")
-    session.process.restart()
-    session.pump(lambda: session.process.link.ports is not None, "new front")
-    session.send_state(poses)
-    client.join()
-    client.send(GetSnapshot(2))
-    assert client.wait_for(Snapshot, 2).state_seq > before
-
-
-def test_closed_link_ends_the_front(process_session: ProcessSession) -> None:
-    session = process_session
-    client = session.client()
-    client.join()
-    session.process.link.close()
-    wait(lambda: not session.process.alive, "end of the front")
-    assert wait_until_told(client)[-1] == "session_ended"
-
-
-def test_stalled_and_recovered_are_reported_once_each(open_process: OpenSession) -> None:
-    session = open_process(stall_ns=FrontConfig().stall_ns)
-    client = session.client()
-    client.join()
-    client.wait_for(DeliveryBudget)
-
-    def told() -> list[str]:
-        return [fault.code for fault in client.got(ProtocolFault)]
-
-    while not told() or told()[-1] != "stalled":
-        assert client.socket.poll(30_000), "no word about the stall"
-        client.receive()
-    assert client.socket.poll(300) == 0
-    session.pump(lambda: told()[-1] == "recovered", "recovery")
-    stalls = told().count("stalled")  # a machine with nothing to spare may have made others
-    assert told() == ["stalled", "recovered"] * stalls
 
 
 PARENT = """
@@ -377,8 +205,7 @@ while True:
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_front_ends_with_its_parent(number: signal.Signals, tmp_path: Path) -> None:
+def test_front_ends_with_its_parent(tmp_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True, env=environment)
     assert parent.stdout is not None
@@ -390,7 +217,7 @@ def test_front_ends_with_its_parent(number: signal.Signals, tmp_path: Path) -> N
     client.send(encode_client(wrap_message(Hello("operator", "Ann", secret=b"s" * 16))))
     assert client.poll(30_000)
     client.recv()
-    parent.send_signal(number)
+    parent.kill()
     parent.wait()
     parent.stdout.close()
     wait(lambda: gone(pid), "end of the front")

@@ -108,15 +108,23 @@ class SimulatedThreading:
                 self.name = name
 
             def start(self) -> None:
-                step = getattr(getattr(self._target, "__self__", None), "_step_if_idle", None)
-                if step is None:
+                owner = getattr(self._target, "__self__", None)
+                if getattr(self._target, "__name__", "") != "_run_helper":
                     self._target()
                     return
+                step = getattr(owner, "_step_if_idle", None) or owner.poll  # type: ignore[union-attr]
 
                 def poll() -> None:
-                    if not self._target.__self__._closed.is_set():  # type: ignore[attr-defined]
+                    if owner._closed.is_set():  # type: ignore[union-attr]
+                        return
+                    try:
                         step()
-                        simulation_.call_at(simulation_.now_ns + 10_000_000, poll)
+                    except BaseException as error:
+                        if not hasattr(owner, "_fail"):
+                            raise
+                        owner._fail(error)
+                        return
+                    simulation_.call_at(simulation_.now_ns + 10_000_000, poll)
 
                 simulation_.call_at(simulation_.now_ns + 10_000_000, poll)
 
@@ -126,7 +134,15 @@ class SimulatedThreading:
             def is_alive(self) -> bool:
                 return False
 
-        self.Thread = Thread
+        class Event(threading.Event):
+            """Waits in simulated time."""
+
+            def wait(self, timeout: float | None = None) -> bool:
+                if not self.is_set() and timeout is not None:
+                    simulation_.sleep(timeout)
+                return super().wait(0.0 if timeout is not None else None)
+
+        self.Thread, self.Event = Thread, Event
 
     def __getattr__(self, name: str) -> Any:
         return getattr(threading, name)

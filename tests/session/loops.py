@@ -1,13 +1,14 @@
-"""What the tests of user loops share: a loop without processes, and people in it. The helper thread is real, so tests
-wait for what it does."""
+"""What the tests of user loops share: a loop without processes, and people in it. Tests take the steps of the helper
+thread."""
 
 from __future__ import annotations
 
-import time
+import threading
 from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from iris_session.demo.scenes import scene_path
@@ -22,14 +23,6 @@ from tests.session.play import TICK_NS, make_core
 from tests.session.test_stepper import MS, Front, Recorder
 
 
-def wait_for(condition: Callable[[], object]) -> None:
-    """Until it is so; fails after a minute."""
-    until = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.001)
-
-
 class Watch:
     """In place of the processes, which these tests do not need."""
 
@@ -37,8 +30,18 @@ class Watch:
         pass
 
 
+class IdleThread:
+    """In place of the helper thread: tests take its steps."""
+
+    def __init__(self, **_: object) -> None: ...
+
+    def start(self) -> None: ...
+
+    def join(self, timeout: float = 0.0) -> None: ...
+
+
 class Rig:
-    """A user's loop over the demo scene whose clock the test moves; the helper thread is real.
+    """A user's loop over the demo scene whose clock the test moves, without its helper thread: see `idle`.
 
     `policy`: writes the owner's `ctrl` before every tick. `applied`: the `ctrl` of every tick, as physics had it.
     """
@@ -54,7 +57,9 @@ class Rig:
         self.stepper = Stepper(core, self.front, self.recorder, lambda: self.now_ns, MS, 1000 * MS, b"root")
         self.read: list[tuple[int, Entry, bytes]] = []  # step, entry and the plant of that step
         self.stepper.on_entries = self._note
-        self.loop = UserLoop(self.model, self.data, self.stepper, Watch())  # type: ignore[arg-type]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(threading, "Thread", IdleThread)
+            self.loop = UserLoop(self.model, self.data, self.stepper, Watch())  # type: ignore[arg-type]
         self.policy: Callable[[mujoco.MjData], None] = lambda data: None
         self.applied: list[NDArray[np.float64]] = []
 
@@ -86,10 +91,11 @@ class Rig:
             self.round(steps)
 
     def idle(self) -> None:
-        """The user's loop is silent until the helper has taken a step."""
+        """The user's loop is silent until the helper takes a step."""
         steps = self.stepper.step_count
         self.now_ns += 40 * MS
-        wait_for(lambda: self.stepper.step_count > steps)
+        self.loop._step_if_idle()
+        assert self.stepper.step_count == steps + 1
 
 
 class Agent:

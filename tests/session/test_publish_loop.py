@@ -21,7 +21,7 @@ from iris_session.session.draft import Frame, SceneDraft
 from iris_session.session.errors import OwnershipError
 from iris_session.session.publish_loop import REPEAT_NS, PublishedVertices, PublishLoop
 from iris_session.session.stepper import Stepper
-from tests.session.loops import Watch, wait_for
+from tests.session.loops import Watch
 from tests.session.published import CLOTH, UNIT, composed
 from tests.session.test_stepper import MS, Front, Recorder
 
@@ -346,8 +346,7 @@ def test_error_of_the_helper_is_raised_by_the_next_offer(rig: PublishLoopRig) ->
 
     rig.front.poll = broken  # type: ignore[method-assign]
     rig.now_ns += 100 * MS
-    rig.loop.start()
-    wait_for(lambda: rig.loop._error)
+    rig.loop._run_helper()
     with pytest.raises(RuntimeError, match="the link is broken"):
         rig.loop.offer(Frame(rig.now_ns, 1.0, np.zeros((5, 7)), {}))
     rig.loop.close()  # must not raise

@@ -205,11 +205,12 @@ def test_unsuitable_scenes_are_refused_with_a_reason() -> None:
         prepare_scene(core, SharedScenes(False, "test"), bench_scene(), b"too short", None, None)
 
 
+@pytest.mark.usefixtures("simulation")
 def test_load_scene_requires_a_running_session() -> None:
     session = Session(str(scene_path("handover")))
     with pytest.raises(OwnershipError, match="run"):
         session.load_scene(bench_scene())
-    ports = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
+    ports = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, web=False)
     with Session(str(scene_path("handover")), config=ports) as run:
         run.run(seconds=0.01)
         with pytest.raises(ConfigError, match=r"objects\[0\] is 'hammer'"):

@@ -130,12 +130,13 @@ def test_deformables_of_the_next_scene_are_prepared_with_it() -> None:
     assert all(len(mesh.vertices()) == mesh.topology.n_vertices for mesh in scene.deformables)
 
 
+@pytest.mark.usefixtures("simulation")
 def test_sites_and_tendons_are_shared_on_request_or_noted(tmp_path: Path) -> None:
     xml = """<mujoco><worldbody><body name="arm"><joint/><geom size=".1"/><site name="end" pos="0 0 .2"/></body>
     <site name="hook" pos="0 0 1"/></worldbody>
     <tendon><spatial name="rope" width=".01"><site site="end"/><site site="hook"/></spatial></tendon></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
-    plain = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, assets=tmp_path)
+    plain = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, web=False, assets=tmp_path)
     with Session(model, config=plain) as session:
         newest = session.processes.scenes.newest
         assert newest is not None

@@ -17,7 +17,7 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import OwnerListens, StalledGap
 from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import EpisodeChanged, Reply, SceneChanged
-from tests.session.loops import Agent, Rig, wait_for
+from tests.session.loops import Agent, Rig
 from tests.session.play import TICK_NS
 from tests.session.test_session import QUIET
 from tests.session.test_stepper import MS
@@ -187,24 +187,21 @@ def test_at_the_end_driven_robots_rest_and_objects_are_free() -> None:
     assert (rig.data.xfrc_applied[ball] == 0.125).all(), "the owner's forces are back"
 
 
-def test_the_helper_never_steps_while_something_is_read() -> None:
-    model = load_model(scene_path("handover"))
-    with Session(model, mujoco.MjData(model), QUIET) as session:
-        session.begin_tick()
-        stepper = session.stepper
-        wait_for(lambda: stepper.step_count > 2)  # the helper's
-        lock = session._hold_steps()
-        with lock:
-            steps = stepper.step_count
-            reader = threading.Thread(target=session.status)
-            reader.start()
-            reader.join(0.1)
-            assert reader.is_alive(), "status() waits for the lock of the steps"
-            assert stepper.step_count == steps
-        reader.join(10.0)
-        assert session.targets().keys() == {"left", "right"}
+def test_the_helper_never_steps_while_something_is_read(rig: Rig) -> None:
+    rig.rounds(1)
+    helper = threading.Thread(target=rig.loop._step_if_idle)
+    steps = rig.stepper.step_count
+    rig.now_ns += 40 * MS
+    with rig.loop.lock:
+        helper.start()
+        helper.join(0.05)
+        assert helper.is_alive(), "it waits for the lock of the steps"
+        assert rig.stepper.step_count == steps
+    helper.join(10.0)
+    assert rig.stepper.step_count == steps + 1
 
 
+@pytest.mark.usefixtures("simulation")
 def test_reset_before_the_first_tick_has_nothing_to_go_back_from() -> None:
     model = load_model(scene_path("handover"))
     data = mujoco.MjData(model)
@@ -227,7 +224,7 @@ def test_what_stopped_the_helper_is_raised_at_every_tick_and_does_not_fill_the_m
     rig.rounds(1)
     rig.stepper.core.step = broken  # type: ignore[method-assign,assignment]
     rig.now_ns += 40 * MS
-    rig.loop._helper.join(10.0)
+    rig.loop._run_helper()
     depths = set()
     for _ in range(3):
         with pytest.raises(KeyError, match="broken") as caught:
@@ -269,6 +266,7 @@ def _episodes(rig: Rig) -> list[tuple[int, str]]:
     return [(body.number, body.state) for body in bodies if isinstance(body, EpisodeChanged)]
 
 
+@pytest.mark.usefixtures("simulation")
 def test_polling_requests_is_known_to_the_authority_from_then_on() -> None:
     model = load_model(scene_path("handover"))
     data = mujoco.MjData(model)
@@ -286,6 +284,7 @@ def test_polling_requests_is_known_to_the_authority_from_then_on() -> None:
         assert session.status().data_fault == DataFault(("qvel",), pytest.approx(session.clock() * 1e-9, abs=60.0))
 
 
+@pytest.mark.usefixtures("simulation")
 def test_no_state_is_passed_read_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """MuJoCo 3.3 raises `TypeError` for such arrays."""
     original = mujoco.mj_setState
