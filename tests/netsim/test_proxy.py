@@ -1,142 +1,237 @@
-"""The impairment proxy: conditions by seed, no loss on TCP, back-pressure, cut and reset, datagrams; one process."""
+"""The impairment proxy: no loss on TCP, back-pressure, rate, datagrams, in simulated time; and as a process."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
+import random
 import socket
 import struct
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from iris_session.netsim import datagrams, proxy
+from iris_session.netsim.datagrams import DatagramPort
 from iris_session.netsim.process import ImpairmentError, ImpairmentProcess
-from iris_session.netsim.profiles import (
-    DOWN,
-    PROFILES,
-    UP,
-    Direction,
-    LinkConditions,
-    Profile,
-    ProfileError,
-    ProfilePhase,
-    load_profile,
-    make_latency_profile,
-)
+from iris_session.netsim.profiles import UP, Direction, Profile, ProfilePhase
+from iris_session.netsim.proxy import CHUNK, ImpairedLink, _Pipe
 from tests.loopback import make_loopback_address
+from tests.rig.simulation import Simulation
 
-SECOND = 1_000_000_000
 MS = 1_000_000
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0
 #: Addresses of links that no other test uses, and of a roaming client.
 LINK, OTHER_LINK, ROAMED = (make_loopback_address() for _ in range(3))
 
 
-# --- conditions ---
+class Loop:
+    """The proxy's event loop, in simulated time."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self.readers: dict[int, Callable[[], None]] = {}
+        self.writers: dict[int, Callable[[], None]] = {}
+
+    def call_at(self, at_s: float, event: Callable[[], None]) -> Any:
+        timer = SimpleNamespace(is_due=True)
+        timer.cancel = lambda: setattr(timer, "is_due", False)
+        at_ns = -(-round(at_s * 1e10) // 10)
+        self.simulation.call_at(at_ns, lambda: event() if timer.is_due else None)
+        return timer
+
+    def call_later(self, delay_s: float, event: Callable[[], None]) -> Any:
+        return self.call_at(self.simulation.now_ns * 1e-9 + delay_s, event)
+
+    def add_reader(self, descriptor: int, on_readable: Callable[..., None], *arguments: Any) -> None:
+        self.readers[descriptor] = lambda: on_readable(*arguments)
+
+    def remove_reader(self, descriptor: int) -> None:
+        self.readers.pop(descriptor, None)
+
+    def add_writer(self, descriptor: int, on_writable: Callable[[], None]) -> None:
+        self.writers[descriptor] = on_writable
+
+    def remove_writer(self, descriptor: int) -> None:
+        self.writers.pop(descriptor, None)
 
 
-def _series(seed: int, profile: str = "busy-wifi", direction: str = DOWN) -> list[tuple[int, bool]]:
-    conditions = LinkConditions(load_profile(profile), seed)
-    out = []
-    for t in range(0, 60 * SECOND, 10 * MS):
-        conditions.advance(t)
-        out.append((conditions.compute_delay_ns(direction, t), conditions.is_stalled(direction, t)))
-    return out
+class End:
+    """A socket of the proxy: what comes in is read, what goes out is kept with its time."""
+
+    def __init__(self, loop: Loop) -> None:
+        self._loop = loop
+        self.incoming: deque[Any] = deque()
+        self.sent: list[tuple[int, bytes]] = []
+        self.room = 1 << 30
+
+    def feed(self, data: Any) -> None:
+        """Let data come in; the proxy reads as much as it wants."""
+        self.incoming.append(data)
+        self.read()
+
+    def read(self) -> None:
+        while self.incoming and id(self) in self._loop.readers:
+            self._loop.readers[id(self)]()
+
+    def fileno(self) -> int:
+        return id(self)
+
+    def recv(self, size: int) -> bytes:
+        data: bytes = self.incoming.popleft()
+        if data[size:]:
+            self.incoming.appendleft(data[size:])
+        return data[:size]
+
+    def recvfrom(self, size: int) -> tuple[bytes, tuple[str, int]]:
+        return self.incoming.popleft(), ("127.0.0.9", 5000)
+
+    def send(self, data: bytes) -> int:
+        taken = min(len(data), self.room)
+        if not taken:
+            raise BlockingIOError
+        self.room -= taken
+        self.sent.append((self._loop.simulation.now_ns, data[:taken]))
+        return taken
+
+    def shutdown(self, _: int) -> None:
+        self.sent.append((self._loop.simulation.now_ns, b""))
+
+    def bind(self, *_: Any) -> None: ...
+
+    connect = bind
+
+    @property
+    def bytes_sent(self) -> bytes:
+        return b"".join(data for _, data in self.sent)
 
 
-def test_conditions_are_a_function_of_seed_and_time() -> None:
-    assert _series(1) == _series(1)
-    assert _series(1) != _series(2)
-    assert _series(1) != _series(1, direction=UP)
-    conditions, sparse = (LinkConditions(PROFILES["busy-wifi"], 1) for _ in range(2))
-    dense = {
-        t: (conditions.compute_delay_ns(UP, t), conditions.is_stalled(UP, t)) for t in range(0, 20 * SECOND, 5 * MS)
-    }
-    for t in range(0, 20 * SECOND, 500 * MS):  # queried less often, the conditions are the same
-        assert dense[t] == (sparse.compute_delay_ns(UP, t), sparse.is_stalled(UP, t))
+@pytest.fixture
+def loop(monkeypatch: pytest.MonkeyPatch) -> Loop:
+    simulation = Simulation(1)
+    loop = Loop(simulation)
+    monkeypatch.setattr(asyncio, "get_running_loop", lambda: loop)
+    for module in (proxy, datagrams):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic_ns=lambda: simulation.now_ns))
+    return loop
 
 
-def test_profiles_match_their_names() -> None:
-    good, busy = _series(0, "good-wifi"), _series(0)
-    assert 1.8 < sum(d for d, _ in good) / len(good) / MS < 2.2
-    assert max(d for d, _ in good) < 8 * MS
-    assert not any(stalled for _, stalled in good)
-    assert sum(d > 40 * MS for d, _ in busy) > 10
-    assert any(stalled for _, stalled in busy)
-    assert all(d >= 0 for d, _ in busy)
-    assert all(d == 0 for d, _ in _series(0, "none"))
-    blackout = [stalled for _, stalled in _series(0, "blackout")]
-    assert blackout == [1000 <= i < 1500 for i in range(6000)]
+class Lane:
+    """One direction of a TCP connection over a link."""
+
+    def __init__(self, loop: Loop, link: ImpairedLink) -> None:
+        self.source, self.sink = End(loop), End(loop)
+        self.simulation = loop.simulation
+        connection: Any = SimpleNamespace(link=link, on_pipe_ended=lambda: None)
+        self.pipe = _Pipe(connection, UP, self.source, self.sink)  # type: ignore[arg-type]
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds * 1000)):
+            self.simulation.run(self.simulation.now_ns + MS)
+            self.source.read()
 
 
-def test_phases_are_sequential_and_repeat() -> None:
-    profile = Profile(
-        phases=(
-            ProfilePhase(seconds=1.0, delay_ms=1.0),
-            ProfilePhase(seconds=2.0, delay_ms=5.0, at_start="cut", up=Direction(delay_ms=9.0, stalled=True)),
-        ),
-        repeat=True,
-    )
-    conditions = LinkConditions(profile)
-    seen: list[tuple[int, str]] = []
-    for t in range(0, 7 * SECOND, SECOND // 2):
-        conditions.advance(t, lambda how, t=t: seen.append((t, how)))  # type: ignore[misc]
-        late = t % (3 * SECOND) >= SECOND
-        assert conditions.compute_delay_ns(DOWN, t) == (5 if late else 1) * MS
-        assert conditions.compute_delay_ns(UP, t) == (9 if late else 1) * MS
-        assert conditions.is_stalled(UP, t) is late
-        assert not conditions.is_stalled(DOWN, t)
-        assert conditions.find_next_change_ns(t) == t - t % (3 * SECOND) + (3 * SECOND if late else SECOND)
-    assert seen == [(SECOND, "cut"), (4 * SECOND, "cut")]
+def make_link(loop: Loop, **phase: Any) -> ImpairedLink:
+    profile = Profile(phases=(ProfilePhase(**phase),), window_kib=64)
+    return ImpairedLink(LINK, "127.0.0.1", profile, 1)
 
 
-def test_profiles_are_read_from_files(tmp_path: Path) -> None:
-    toml = tmp_path / "lab.toml"
-    toml.write_text(
-        'repeat = true\n[[phases]]\nseconds = 30\ndelay_ms = 5\njitter_ms = 2\nup = {delay_ms = 9}\n'
-        "[[phases]]\nseconds = 2\nstalled = true\n"
-    )  # fmt: skip
-    profile = load_profile(str(toml))
-    assert profile.phases[0].get_direction(UP) == Direction(delay_ms=9.0)
-    assert profile.phases[0].get_direction(DOWN).jitter_ms == 2.0
-    file = tmp_path / "lab.json"
-    file.write_text(json.dumps({"phases": [{"delay_ms": 30}], "window_kib": 1024}))
-    assert load_profile(str(file)) == make_latency_profile(30.0) == load_profile("30ms")
+def test_bytes_arrive_complete_in_order_and_not_early(loop: Loop) -> None:
+    even = Lane(loop, make_link(loop, delay_ms=30.0))
+    begin_ns = loop.simulation.now_ns
+    even.source.feed(b"ping")
+    even.run(0.1)
+    assert even.sink.sent == [(begin_ns + 30 * MS, b"ping")]
+    wild = Lane(loop, make_link(loop, delay_ms=15.0, jitter_ms=10.0, stall_every_s=0.2, stall_s=0.03))
+    payload = random.Random(1).randbytes(400_000)
+    begin_ns = loop.simulation.now_ns
+    for at in range(0, len(payload), 10_000):
+        wild.source.feed(payload[at : at + 10_000])
+        wild.run(0.005)
+    wild.source.feed(b"")
+    wild.run(2.0)
+    assert wild.sink.bytes_sent == payload
+    assert wild.sink.sent[0][0] - begin_ns >= 5 * MS
+    assert wild.sink.sent[-1][1] == b"", "the end arrives last"
+    assert wild.pipe.ended
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("phases = []", "needs a phase"),
-        ("[[phases]]\ndelay = 3", "unknown field `delay`"),
-        ("[[phases]]\ndelay_ms = -1", "delay_ms -1.0"),
-        ("[[phases]]\nloss = 2.0", "loss 2.0"),
-        ('[[phases]]\nat_start = "burn"', "'cut' or 'reset'"),
-        ("repeat = true\n[[phases]]\ndelay_ms = 3", "last phase"),
-        ("window_kib = 1\n[[phases]]", "4 to 16384"),
-        ("[[phases", "lab.toml"),
-    ],
-)
-def test_invalid_profiles_are_rejected_with_reason(tmp_path: Path, text: str, expected: str) -> None:
-    file = tmp_path / "lab.toml"
-    file.write_text(text)
-    with pytest.raises(ProfileError) as error:
-        load_profile(str(file))
-    assert expected in str(error.value)
+def test_stall_holds_the_sender_back_and_loses_nothing(loop: Loop) -> None:
+    link = make_link(loop)
+    path = Lane(loop, link)
+    link.stalled_by_command = True
+    link.update_stalls()
+    payload = random.Random(2).randbytes(1_000_000)
+    path.source.feed(payload)
+    path.run(1.0)
+    assert path.sink.sent == []
+    assert path.pipe.size == link.window
+    assert len(path.source.incoming[0]) == len(payload) - link.window, "the rest stays with the sender"
+    path.sink.room = 300_000  # of the receiver, who reads slowly
+    link.stalled_by_command = False
+    link.update_stalls()
+    path.run(1.0)
+    assert len(path.sink.bytes_sent) == 300_000
+    path.sink.room = 1 << 30
+    loop.writers[path.sink.fileno()]()
+    path.run(1.0)
+    assert path.sink.bytes_sent == payload
+    assert link.bytes[UP] == len(payload)
 
 
-def test_unknown_profile_lists_the_known() -> None:
-    with pytest.raises(ProfileError, match=r"none, lan, .*40ms"):
-        load_profile("nice-wifi")
+def test_rate_is_shared_by_all_connections_of_a_link(loop: Loop) -> None:
+    """2 Mbit/s: 125 kB take half a second over any number of connections."""
+    link = make_link(loop, up=Direction(rate_mbit=2.0))
+    paths = [Lane(loop, link), Lane(loop, link)]
+    begin_ns = loop.simulation.now_ns
+    for path in paths:
+        path.source.feed(bytes(62_500))
+    for _ in range(100):
+        for path in paths:
+            path.run(0.01)
+    assert [len(path.sink.bytes_sent) for path in paths] == [62_500, 62_500]
+    last_ns = max(path.sink.sent[-1][0] for path in paths) - begin_ns
+    assert 500 * MS <= last_ns <= 500 * MS + CHUNK * 8 / 2e6 * 1e9
 
 
-# --- the process ---
+def test_datagrams_are_lost_duplicated_and_reordered(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    def pass_through(seed: int, n: int = 1000) -> list[int]:
+        opened: list[End] = []
+
+        def open_socket(_: str) -> End:
+            opened.append(End(loop))
+            return opened[-1]
+
+        monkeypatch.setattr(datagrams, "_open_socket", open_socket)
+        phase = ProfilePhase(loss=0.2, duplicate=0.2, reorder=0.1, reorder_ms=30.0)
+        port = DatagramPort(ImpairedLink(LINK, "127.0.0.1", Profile(phases=(phase,)), seed), 7720)
+        for number in range(n):
+            opened[0].feed(struct.pack("<I", number))
+            loop.simulation.run(loop.simulation.now_ns + MS // 2)
+        loop.simulation.run(loop.simulation.now_ns + 100 * MS)
+        got = [struct.unpack("<I", data)[0] for _, data in opened[1].sent]
+        assert len(set(got)) + port.lost == n
+        assert len(got) == n - port.lost + port.duplicated
+        return got
+
+    got = pass_through(3)
+    assert len(set(got)) == pytest.approx(800, abs=40)
+    assert len(got) / len(set(got)) == pytest.approx(1.2, abs=0.04)
+    assert got != sorted(got)
+    assert got == pass_through(3), "the fate of each datagram is its seed's and number's"
+    assert got != pass_through(4)
+
+
+# --- the process, with sockets of the system --------------------------------------------------------------------------
 
 
 class Echo:
@@ -147,8 +242,6 @@ class Echo:
         self.port: int = self._listening.getsockname()[1]
         self.ends: list[str] = []
         self.peers: list[str] = []
-        self.reading = threading.Event()
-        self.reading.set()
         threading.Thread(target=self._serve, daemon=True).start()
 
     def _serve(self) -> None:
@@ -163,7 +256,6 @@ class Echo:
     def _echo(self, connection: socket.socket) -> None:
         with connection:
             while True:
-                self.reading.wait()
                 try:
                     data = connection.recv(65536)
                     if not data:
@@ -208,200 +300,81 @@ def _wait_until(condition: Any, what: str) -> None:
         time.sleep(0.005)
 
 
-def _write_profile(tmp_path: Path, **phase: Any) -> str:
-    path = tmp_path / f"profile{len(list(tmp_path.iterdir()))}.json"
-    path.write_text(json.dumps({"phases": [phase], "window_kib": 64}))
-    return str(path)
+def _echo(connection: socket.socket, data: bytes = b"x") -> None:
+    connection.sendall(data)
+    assert _receive(connection, len(data)) == data
 
 
-def test_bytes_arrive_complete_in_order_and_not_early(echo: Echo, tmp_path: Path) -> None:
-    profile = _write_profile(tmp_path, delay_ms=15.0, jitter_ms=10.0, stall_every_s=0.2, stall_s=0.03)
-    constant = _write_profile(tmp_path, delay_ms=30.0)
-    with (
-        ImpairmentProcess({LINK: profile, OTHER_LINK: constant}, [echo.port]) as proxy,
-        _connect(LINK, echo.port) as wild,
-        _connect(OTHER_LINK, echo.port) as even,
-    ):
-        payload = b"".join(struct.pack("<I", i) for i in range(100_000))
-        sender = threading.Thread(target=wild.sendall, args=(payload,))
-        sender.start()
-        assert _receive(wild, len(payload)) == payload
-        sender.join()
-        for _ in range(5):
+@pytest.mark.e2e
+def test_connections_over_a_proxy_are_stalled_cut_reset_and_roam(echo: Echo) -> None:
+    with pytest.raises(ImpairmentError, match=r"127\.0\.0\.1"):
+        ImpairmentProcess({"127.0.0.1": "none"}, [echo.port])
+    with ImpairmentProcess({LINK: "none", OTHER_LINK: "30ms"}, [echo.port]) as proxy:
+        with _connect(LINK, echo.port) as hit, _connect(OTHER_LINK, echo.port) as spared:
+            _echo(hit, random.Random(1).randbytes(400_000))
             begin = time.monotonic()
-            even.sendall(b"ping")
-            assert _receive(even, 4) == b"ping"
-            assert time.monotonic() - begin >= 0.060  # both ways
-        stats = {link["link"]: link for link in proxy.execute("stats")["links"]}
-        assert stats[LINK]["bytes_up"] == stats[LINK]["bytes_down"] == len(payload)
-        assert stats[OTHER_LINK]["bytes_up"] == 20
-        wild.shutdown(socket.SHUT_WR)
-        assert wild.recv(1) == b""  # the end arrives last, in both directions
-        _wait_until(lambda: echo.ends == ["closed"], "the server sees an orderly end")
-
-
-def test_stall_holds_the_sender_back_and_loses_nothing(echo: Echo) -> None:
-    with (
-        ImpairmentProcess({LINK: "none"}, [echo.port]) as proxy,
-        _connect(LINK, echo.port) as connection,
-    ):
-        connection.sendall(b"before")
-        assert _receive(connection, 6) == b"before"
-        proxy.execute("stall")
-        connection.setblocking(False)
-        sent = 0
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                sent += connection.send(b"z" * 65536)
-        held = proxy.execute(f"stats @{LINK}")["links"][0]["held_bytes"]
-        assert 0 < held <= PROFILES["none"].window_kib * 1024
-        assert sent < 32 * 2**20, "a stalled link must not swallow everything"
-        with pytest.raises(BlockingIOError):
-            connection.recv(1)
-        proxy.execute("resume")
-        connection.settimeout(DEADLINE_S)
-        assert _receive(connection, sent) == b"z" * sent
-
-
-def test_rate_is_limited(echo: Echo, tmp_path: Path) -> None:
-    """2 Mbit/s up: 125 kB take half a second over any number of connections."""
-    profile = _write_profile(tmp_path, up={"rate_mbit": 2.0})
-    with (
-        ImpairmentProcess({LINK: profile}, [echo.port]),
-        _connect(LINK, echo.port) as one,
-        _connect(LINK, echo.port) as two,
-    ):
-        begin = time.monotonic()
-        senders = [threading.Thread(target=c.sendall, args=(b"r" * 62_500,)) for c in (one, two)]
-        for sender in senders:
-            sender.start()
-        _receive(one, 62_500)
-        _receive(two, 62_500)
-        assert time.monotonic() - begin >= 0.49
-        for sender in senders:
-            sender.join()
-
-
-@pytest.mark.parametrize(("command", "end"), [("cut", "closed"), ("reset", "reset")])
-def test_cut_and_reset_end_connections(echo: Echo, command: str, end: str) -> None:
-    with ImpairmentProcess({LINK: "none", OTHER_LINK: "none"}, [echo.port]) as proxy:
-        hit, spared = _connect(LINK, echo.port), _connect(OTHER_LINK, echo.port)
-        with hit, spared:
-            for connection in (hit, spared):
-                connection.sendall(b"x")
-                _receive(connection, 1)
-            proxy.execute(f"{command} @{LINK}")
-            if command == "reset":
-                with pytest.raises(ConnectionResetError):
-                    hit.recv(1)
-            else:
-                assert hit.recv(1) == b""
-            _wait_until(lambda: echo.ends == [end], f"the server's end is {end}")
-            spared.sendall(b"y")
-            assert _receive(spared, 1) == b"y"
-            with _connect(LINK, echo.port) as again:  # the link accepts the next connection
-                again.sendall(b"z")
-                assert _receive(again, 1) == b"z"
-
-
-def test_roaming_leaves_the_old_connection_open_at_the_server(echo: Echo) -> None:
-    with (
-        ImpairmentProcess({LINK: "none"}, [echo.port]) as proxy,
-        _connect(LINK, echo.port) as connection,
-    ):
-        connection.sendall(b"x")
-        _receive(connection, 1)
-        proxy.execute(f"roam {ROAMED}")
-        with pytest.raises(ConnectionResetError):
-            connection.recv(1)
+            _echo(spared)
+            assert time.monotonic() - begin >= 0.030
+            proxy.execute(f"stall @{LINK}")
+            hit.sendall(b"later")
+            hit.setblocking(False)
+            _echo(spared)
+            with pytest.raises(BlockingIOError):
+                hit.recv(1)
+            proxy.execute(f"resume @{LINK}")
+            hit.settimeout(DEADLINE_S)
+            assert _receive(hit, 5) == b"later"
+            stats = {link["link"]: link for link in proxy.execute("stats")["links"]}
+            assert (stats[LINK]["bytes_up"], stats[OTHER_LINK]["bytes_up"]) == (400_005, 2)
+            proxy.execute(f"cut @{LINK}")
+            assert hit.recv(1) == b""
+            _wait_until(lambda: echo.ends == ["closed"], "the server sees an orderly end")
+            _echo(spared)
+        _wait_until(lambda: len(echo.ends) == 2, "the other one has ended")
+        with _connect(LINK, echo.port) as hit:  # the link accepts the next connection
+            _echo(hit)
+            proxy.execute(f"reset @{LINK}")
+            with pytest.raises(ConnectionResetError):
+                hit.recv(1)
+            _wait_until(lambda: echo.ends[2:] == ["reset"], "the server sees it, too")
+        with _connect(LINK, echo.port) as left:
+            _echo(left)
+            proxy.execute(f"roam {ROAMED}")
+            with pytest.raises(ConnectionResetError):
+                left.recv(1)
         with _connect(LINK, echo.port) as again:
-            again.sendall(b"z")
-            assert _receive(again, 1) == b"z"
-            assert echo.peers == ["127.0.0.1", ROAMED]
-            assert echo.ends == []
+            _echo(again)
+            assert echo.peers[-1] == ROAMED
+            assert len(echo.ends) == 3, "for the server the old connection is open"
 
 
-def test_connection_without_a_server_is_closed() -> None:
-    with socket.socket() as closed:
+@pytest.mark.e2e
+def test_proxy_forwards_datagrams_refuses_what_it_cannot_do_and_ends_with_its_parent(tmp_path: Path) -> None:
+    with contextlib.ExitStack() as stack:
+        closed = stack.enter_context(socket.socket())
         closed.bind(("127.0.0.1", 0))  # without listening: no other process gets the port
         port = closed.getsockname()[1]
-        with (
-            ImpairmentProcess({LINK: "none"}, [port]),
-            pytest.raises(ConnectionResetError),  # at once, or at first use
-            _connect(LINK, port) as connection,
-        ):
+        server = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        server.bind(("127.0.0.1", port))
+        proxy = stack.enter_context(ImpairmentProcess({LINK: "none"}, [port], udp=[port]))
+        client = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        client.connect((LINK, port))
+        for one in (server, client):
+            one.settimeout(DEADLINE_S)
+        client.send(b"up")
+        data, peer = server.recvfrom(100)
+        server.sendto(b"down", peer)
+        assert (data, client.recv(100)) == (b"up", b"down")
+        with pytest.raises(ConnectionResetError), _connect(LINK, port) as connection:  # at once, or at first use
             connection.recv(1)
-
-
-DATAGRAMS = 150  # they fit into the server's socket, which is read at the end
-
-
-def test_datagrams_are_lost_duplicated_and_reordered(tmp_path: Path) -> None:
-    profile = _write_profile(tmp_path, loss=0.2, duplicate=0.2, reorder=0.1, reorder_ms=30.0)
-
-    def pass_through(seed: int) -> list[int]:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
-            server.bind(("127.0.0.1", 0))
-            port = server.getsockname()[1]
-            with (
-                ImpairmentProcess({LINK: profile}, [], udp=[port], seed=seed) as proxy,
-                socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
-            ):
-                client.connect((LINK, port))
-                for i in range(DATAGRAMS):
-                    client.send(struct.pack("<I", i))
-                    time.sleep(0.0005)  # one by one, as from a sender with a rate
-                server.settimeout(0.5)
-                got: list[int] = []
-                peer: Any = None
-
-                def takes_no_more() -> bool:
-                    nonlocal peer
-                    with contextlib.suppress(TimeoutError):
-                        while True:
-                            data, peer = server.recvfrom(100)
-                            got.append(struct.unpack("<I", data)[0])
-                    lost: int = proxy.execute("stats")["links"][0]["datagrams_lost"]
-                    return len(set(got)) + lost == DATAGRAMS
-
-                _wait_until(takes_no_more, "each datagram has come or is lost")
-                server.sendto(b"down", peer)  # the opposite direction finds its client
-                client.settimeout(0.2)
-                with contextlib.suppress(TimeoutError):  # it may be lost
-                    assert client.recv(100) == b"down"
-                return got
-
-    got = pass_through(3)
-    assert 0.1 < 1.0 - len(set(got)) / DATAGRAMS < 0.3
-    assert 0.1 < (len(got) - len(set(got))) / len(set(got)) < 0.3
-    assert got != sorted(got)
-    assert sorted(got) == sorted(pass_through(3)), "the fate of each datagram is its seed's and number's"
-    assert set(got) != set(pass_through(4))
-
-
-def test_commands_and_errors(echo: Echo, tmp_path: Path) -> None:
-    with ImpairmentProcess({LINK: "none"}, [echo.port]) as proxy:
-        with pytest.raises(ImpairmentError, match="command: stall, resume"):
-            proxy.execute("explode")
-        with pytest.raises(ImpairmentError, match=f"{ROAMED}: .*{LINK}"):
-            proxy.execute(f"stall @{ROAMED}")
-        with pytest.raises(ImpairmentError, match="no profile"):
-            proxy.execute("profile nice-wifi")
-        proxy.execute(f"profile {_write_profile(tmp_path, delay_ms=20.0)}")
-        with _connect(LINK, echo.port) as connection:
-            begin = time.monotonic()
-            connection.sendall(b"x")
-            _receive(connection, 1)
-            assert time.monotonic() - begin >= 0.040
-    with pytest.raises(ImpairmentError, match="no profile 'nice-wifi'"):
-        ImpairmentProcess({LINK: "nice-wifi"}, [echo.port])
-    with pytest.raises(ImpairmentError, match=r"on 127\.0\.0\.1: .*127\.0\.0\.1 only"):
-        ImpairmentProcess({"127.0.0.1": "none"}, [echo.port])
-
-
-def test_proxy_ends_with_its_parent(echo: Echo) -> None:
-    command = [sys.executable, "-m", "iris_session.netsim.process", "--ports", str(echo.port), "--link", LINK]
-    with subprocess.Popen([*command, "--until-eof"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        for command, value in (("explode", "stall"), (f"stall @{ROAMED}", LINK), ("profile nice-wifi", "nice-wifi")):
+            with pytest.raises(ImpairmentError, match=value):
+                proxy.execute(command)
+        proxy.execute("profile 20ms")
+    with pytest.raises(ImpairmentError, match="nice-wifi"):
+        ImpairmentProcess({LINK: "nice-wifi"}, [port])
+    command_line = [sys.executable, "-m", "iris_session.netsim.process", "--ports", str(port), "--link", LINK]
+    with subprocess.Popen([*command_line, "--until-eof"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdin is not None
         assert json.loads(process.stdout.readline())["ready"] == [LINK]

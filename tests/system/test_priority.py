@@ -6,8 +6,8 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -31,13 +31,19 @@ def test_low_priority_call_returns_and_raises() -> None:
 
 def test_named_thread_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has its name a moment after it was started."""
-    monkeypatch.setattr(priority, "NAMED_WITHIN_S", 30.0)
     seen: list[int] = []
-    is_lowered = threading.Event()
+    has_looked, is_named, is_lowered = threading.Event(), threading.Event(), threading.Event()
+
+    def sleep(_: float) -> None:
+        has_looked.set()
+        assert is_named.wait(30.0)
+
+    monkeypatch.setattr(priority, "time", SimpleNamespace(monotonic=lambda: 0.0, sleep=sleep))
 
     def take_name() -> None:
-        time.sleep(0.05)
+        has_looked.wait(30.0)
         Path(f"/proc/self/task/{threading.get_native_id()}/comm").write_text("named late")
+        is_named.set()
         is_lowered.wait(30.0)
         seen.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
 
@@ -89,6 +95,7 @@ print(reached, inside == os.SCHED_RR, os.sched_getscheduler(0) & ~os.SCHED_RESET
 """
 
 
+@pytest.mark.e2e
 def test_tick_priority_is_restored_without_the_capability() -> None:
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_CAPABILITY], capture_output=True, text=True, check=True, timeout=60

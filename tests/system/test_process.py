@@ -45,6 +45,7 @@ def module_traps(tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
+@pytest.mark.e2e
 def test_session_imports_nothing_from_the_working_folder(module_traps: Path) -> None:
     """With its front, recorder and display, started as the installed command is."""
     done = subprocess.run(
@@ -57,6 +58,7 @@ def test_session_imports_nothing_from_the_working_folder(module_traps: Path) -> 
         assert recording.finished
 
 
+@pytest.mark.e2e
 def test_probe_imports_nothing_from_the_working_folder(module_traps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(module_traps)
     done = subprocess.run(
@@ -67,6 +69,7 @@ def test_probe_imports_nothing_from_the_working_folder(module_traps: Path, monke
     assert (done.returncode, done.stdout) == (0, "0\n")
 
 
+@pytest.mark.e2e
 def test_uninstalled_checkout_starts_its_own_modules(tmp_path: Path) -> None:
     checkout, elsewhere = tmp_path / "checkout", tmp_path / "elsewhere"
     package = checkout / "iris_session"
@@ -105,7 +108,8 @@ def module_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("size", [0, 1000, 1_000_000])
+@pytest.mark.e2e
+@pytest.mark.parametrize("size", [0, 1_000_000])
 def test_child_reads_configuration_and_answers_in_lines(module_folder: Path, size: int) -> None:
     (module_folder / "echo_length.py").write_text(
         "import os, stat, sys; print(stat.filemode(os.fstat(0).st_mode), os.fstat(0).st_nlink)\n"
@@ -121,6 +125,7 @@ def test_child_reads_configuration_and_answers_in_lines(module_folder: Path, siz
         assert not child.is_running
 
 
+@pytest.mark.e2e
 def test_silent_child_times_out_and_is_killed(module_folder: Path) -> None:
     (module_folder / "deaf.py").write_text(
         "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(60)"
@@ -134,6 +139,7 @@ def test_silent_child_times_out_and_is_killed(module_folder: Path) -> None:
         assert child.close() == -signal.SIGKILL
 
 
+@pytest.mark.e2e
 def test_child_exits_at_the_end_of_its_input(module_folder: Path) -> None:
     (module_folder / "echo.py").write_text("import sys\nfor line in sys.stdin: print(line.upper(), end='', flush=True)")
     child = ChildProcess("echo", stdout=PIPE)
@@ -143,6 +149,7 @@ def test_child_exits_at_the_end_of_its_input(module_folder: Path) -> None:
     child.close()
 
 
+@pytest.mark.e2e
 def test_what_libraries_print_does_not_reach_who_reads_standard_output() -> None:
     code = (
         "import os, sys\n"

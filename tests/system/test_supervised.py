@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import signal
-import threading
-import time
+from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 
+from iris_session.system import supervised
 from iris_session.system.process import ChildProcess
 from iris_session.system.supervised import HEALTHY_NS, RESTART_DELAYS_NS, SECOND, START_NS, SupervisedProcess
-
-DEADLINE_S = 60.0
 
 
 class Report(msgspec.Struct, frozen=True):
@@ -55,12 +54,29 @@ class Child:
         return 0
 
 
-def wait_for_spawn() -> None:
-    """Wait until no thread starts a process."""
-    deadline = time.monotonic() + DEADLINE_S
-    while any(one.name == "iris-spawn" for one in threading.enumerate()):
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
+class Threads:
+    """In place of the module `threading`: a thread does its work when the test lets it."""
+
+    def __init__(self) -> None:
+        self.started: list[Callable[[], None]] = []
+
+    def run_started(self) -> None:
+        """Let every thread that was started do its work."""
+        while self.started:
+            self.started[0]()
+            self.started.pop(0)
+
+    def Thread(self, target: Callable[[], None], **_: object) -> Any:
+        return SimpleNamespace(
+            start=lambda: self.started.append(target), is_alive=lambda: target in self.started, join=lambda _: None
+        )
+
+
+@pytest.fixture(autouse=True)
+def threads(monkeypatch: pytest.MonkeyPatch) -> Threads:
+    threads = Threads()
+    monkeypatch.setattr(supervised, "threading", threads)
+    return threads
 
 
 class Lab:
@@ -71,11 +87,8 @@ class Lab:
         self.error: Exception | None = None
         self.process = SupervisedProcess("the helper", self._spawn, Report, **options)
         self.now_ns = 0
-        self.may_start = threading.Event()
-        self.may_start.set()
 
     def _spawn(self) -> ChildProcess:
-        assert self.may_start.wait(DEADLINE_S)
         if self.error is not None:
             raise self.error
         self.children.append(Child())
@@ -85,7 +98,7 @@ class Lab:
         """Poll after a while, with whatever thread has started by then at its end."""
         self.now_ns += round(seconds * SECOND)
         found = self.process.poll(self.now_ns)
-        wait_for_spawn()
+        supervised.threading.run_started()  # type: ignore[attr-defined]
         return found + self.process.poll(self.now_ns)
 
 
@@ -246,12 +259,10 @@ def test_a_process_that_never_reports_is_ended() -> None:
     assert quiet.children[0].signals == []
 
 
-def test_a_process_that_starts_while_all_ends_is_closed() -> None:
+def test_a_process_that_starts_while_all_ends_is_closed(threads: Threads) -> None:
     lab = Lab()
-    lab.may_start.clear()
     lab.process.start(0)
     lab.process.close(0.0)
-    lab.may_start.set()
-    wait_for_spawn()
+    threads.run_started()
     assert [child.closed for child in lab.children] == [True]
     assert lab.process.pid == 0
