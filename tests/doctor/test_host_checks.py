@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import socket
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -41,21 +39,6 @@ def test_used_ports_name_their_process() -> None:
     assert found.state == "warning"
     assert f"{port} (control)" in found.text
     assert "python" in found.text or "pytest" in found.text
-
-
-def test_program_in_a_long_path_is_named(tmp_path: Path) -> None:
-    script = tmp_path / ("folder" * 20) / "listen.py"
-    script.parent.mkdir()
-    script.write_text(
-        "import socket\nlistener = socket.create_server(('127.0.0.1', 0))\n"
-        "print(listener.getsockname()[1], flush=True)\ninput()\n"
-    )
-    command = [sys.executable, str(script)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        found = host_checks.check_ports(int(process.stdout.readline()))
-        process.communicate("\n")
-    assert f" listen.py (process {process.pid})" in found.text
 
 
 def test_ports_used_by_a_session_are_ok(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
+import errno
 import socket
-import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import ClassVar
 
 import pytest
@@ -15,50 +14,33 @@ from iris_session.doctor import network_checks
 from iris_session.doctor.findings import failed, ok
 from iris_session.doctor.runner import run_checks
 from iris_session.link.discovery import DiscoveryError, FoundSession
-from iris_session.protocol.codec import encode_introduction
+from iris_session.protocol.codec import decode_introduction, encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import PROTOCOL_VERSION
 
 
-@contextlib.contextmanager
-def serve_bytes(data: bytes) -> Iterator[Address]:
-    """Send `data` to every connection to the port below the address."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.listen(4)
+class Answers:
+    """What answers to requests for introductions, by control port; nothing does at other ports."""
 
-        def answer() -> None:
-            with contextlib.suppress(OSError):
-                connection, _ = listener.accept()
-                with connection:
-                    connection.sendall(data)
+    def __init__(self) -> None:
+        self.by_port: dict[int, bytes] = {}
 
-        thread = threading.Thread(target=answer, daemon=True)
-        thread.start()
-        yield Address("127.0.0.1", listener.getsockname()[1] + 1)
-        thread.join(5.0)
+    def request(self, host: str, control_port: int, timeout_s: float) -> Generator[None, None, Introduction]:
+        yield
+        if control_port not in self.by_port:
+            raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+        return decode_introduction(self.by_port[control_port])
 
 
-@contextlib.contextmanager
-def serve_introduction(times: int = 1) -> Iterator[Address]:
-    """Serve an introduction below the control port, whose address is yielded."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.listen(4)
-        port = listener.getsockname()[1] + 1
-        beacon = Beacon(PROTOCOL_VERSION, "s1", "lab", "live", "127.0.0.1", port, 7722, 0, 0, 0)
+@pytest.fixture
+def answers(monkeypatch: pytest.MonkeyPatch) -> Answers:
+    answers = Answers()
+    monkeypatch.setattr(network_checks, "request_introduction", answers.request)
+    return answers
 
-        def answer() -> None:
-            with contextlib.suppress(OSError):
-                for _ in range(times):
-                    connection, _ = listener.accept()
-                    with connection:
-                        connection.sendall(encode_introduction(Introduction(beacon)))
 
-        thread = threading.Thread(target=answer, daemon=True)
-        thread.start()
-        yield Address("127.0.0.1", port)
-        thread.join(5.0)
+ADDRESS = Address("127.0.0.1", 7721)
+OTHER_PROGRAM = b"SSH-2.0-OpenSSH_9.2p1 Debian\r\n"
 
 
 def introduction(protocol: int = PROTOCOL_VERSION) -> bytes:
@@ -66,87 +48,79 @@ def introduction(protocol: int = PROTOCOL_VERSION) -> bytes:
     return encode_introduction(Introduction(beacon, pairing=True, participants=3))
 
 
-def test_introduction_is_ok() -> None:
-    with serve_bytes(introduction()) as address:
-        introduced, version, message = network_checks.check_introduction(address)
+def test_introduction_is_ok(answers: Answers) -> None:
+    answers.by_port[7721] = introduction()
+    introduced, version, message = network_checks.check_introduction(ADDRESS)
     assert (introduced.state, version.state) == ("ok", "ok")
     assert "'lab' (live), 3 participants" in introduced.text
     assert message is not None
 
 
 @pytest.mark.parametrize(("theirs", "older"), [(PROTOCOL_VERSION + 1, "this machine"), (0, "the session")])
-def test_other_protocol_version_is_reported(theirs: int, older: str) -> None:
-    with serve_bytes(introduction(theirs)) as address:
-        _, version, message = network_checks.check_introduction(address)
+def test_other_protocol_version_is_reported(answers: Answers, theirs: int, older: str) -> None:
+    answers.by_port[7721] = introduction(theirs)
+    _, version, message = network_checks.check_introduction(ADDRESS)
     assert version.failed
     assert f"version {theirs}" in version.text
     assert version.advice.startswith(f"update {older}")
     assert message is None
 
 
-def test_port_base_is_distinguished_from_control_port() -> None:
+def test_port_base_is_distinguished_from_control_port(answers: Answers, monkeypatch: pytest.MonkeyPatch) -> None:
     """`serve --port-base N` is joined at N + 1; the introduction is at N."""
-    with socket.socket() as closed:
-        closed.bind(("127.0.0.1", 0))  # without listening: no other process gets the port
-        assert network_checks.check_port_base(Address("127.0.0.1", closed.getsockname()[1])) is None
-    with serve_bytes(b"SSH-2.0-OpenSSH_9.2\r\n" + bytes(64)) as above:
-        assert network_checks.check_port_base(Address("127.0.0.1", above.port - 1)) is None
-    with serve_introduction() as above:
-        base = Address("127.0.0.1", above.port - 1)
-        found = network_checks.check_port_base(base)
-    assert found is not None
-    assert found.failed
-    assert f"control port is {above}" in found.text
-    assert found.advice == f"use {above}"
-
-
-def test_run_ends_at_port_base(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = Address("127.0.0.1", 7720)
+    assert network_checks.check_port_base(base) is None
+    answers.by_port[7721] = OTHER_PROGRAM
+    assert network_checks.check_port_base(base) is None
+    answers.by_port[7721] = introduction()
     monkeypatch.setattr(network_checks, "LISTEN_S", 0.01)
-    with serve_introduction(times=2) as above:
-        result = run_checks(f"127.0.0.1:{above.port - 1}")
+    monkeypatch.setattr(network_checks, "probe_tcp", lambda *_: None)
+    result = run_checks(str(base))
     found = {one.check: one for one in result.findings}
-    assert found["introduction"].advice == f"use {above}"
+    assert str(ADDRESS) in found["introduction"].text
+    assert found["introduction"].advice == f"use {ADDRESS}"
     assert found["join"].state == "skipped"
     assert not result.ok
 
 
-def test_other_introduction_is_reported() -> None:
-    with serve_bytes(b"SSH-2.0-OpenSSH_9.2p1 Debian\r\n") as address:
-        introduced, version, _ = network_checks.check_introduction(address)
-    assert introduced.state in ("failed", "warning")
+def test_other_introduction_is_reported(answers: Answers) -> None:
+    answers.by_port[7721] = OTHER_PROGRAM
+    introduced, version, _ = network_checks.check_introduction(ADDRESS)
+    assert introduced.failed
     assert version.state == "skipped"
 
 
-def test_closed_port_is_reported() -> None:
-    with socket.socket() as closed:
-        closed.bind(("127.0.0.1", 0))  # without listening: no other process gets the port
-        port = closed.getsockname()[1]
-        found = network_checks.check_tcp(Address("127.0.0.1", port), "127.0.0.1")
-        introduced, _, _ = network_checks.check_introduction(Address("127.0.0.1", port + 1))
-    assert found.failed
-    assert "nothing listens" in found.text
-    assert introduced.state == "warning"
-
-
-def test_open_port_is_ok() -> None:
+def test_closed_and_open_ports_are_distinguished() -> None:
     with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
+        listener.bind(("127.0.0.1", 0))  # without listening: no other process gets the port
+        port = listener.getsockname()[1]
+        found = network_checks.check_tcp(Address("127.0.0.1", port), "127.0.0.1")
+        assert found.failed
+        assert "nothing listens" in found.text
+        introduced, _, _ = network_checks.check_introduction(Address("127.0.0.1", port + 1))
+        assert introduced.state == "warning"
         listener.listen(1)
-        assert network_checks.check_tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1").state == "ok"
+        assert network_checks.check_tcp(Address("127.0.0.1", port), "127.0.0.1").state == "ok"
 
 
-def test_firewall_is_distinguished_from_closed_port(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(network_checks, "CONNECT_S", 0.2)
-    with socket.socket() as listener, contextlib.ExitStack() as stack:
-        listener.bind(("127.0.0.1", 0))
-        listener.listen(0)  # full after one: the system drops the rest
-        for _ in range(3):
-            filling = stack.enter_context(socket.socket())
-            filling.setblocking(False)
-            filling.connect_ex(listener.getsockname())
-        found = network_checks.check_tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1")
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (TimeoutError("timed out"), "firewall"),
+        (OSError(errno.EHOSTUNREACH, "No route to host"), "switched off"),
+        (OSError(errno.EPERM, "Operation not permitted"), ""),
+    ],
+)
+def test_silent_and_unreachable_machines_are_distinguished(
+    monkeypatch: pytest.MonkeyPatch, error: OSError, why: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(network_checks, "probe_tcp", fail)
+    found = network_checks.check_tcp(ADDRESS, "127.0.0.1")
     assert found.failed
-    assert "firewall" in found.why
+    assert why in found.why
 
 
 def test_own_machine_and_networks_are_ok() -> None:

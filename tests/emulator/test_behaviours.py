@@ -18,12 +18,13 @@ def _in_phase(robot: str, phase: str):  # type: ignore[no-untyped-def]
     return lambda rig: rig.behaviours[robot].phase == phase
 
 
+@pytest.mark.long  # without: `tests/rig/test_demos.py`
 @pytest.mark.parametrize(
     ("seed", "thing", "giver", "receiver"),
     [
         (1, "hammer", "left", "right"),
-        pytest.param(2, "hammer", "left", "right", marks=pytest.mark.long),
-        pytest.param(3, "board", "right", "left", marks=pytest.mark.long),
+        (2, "hammer", "left", "right"),
+        (3, "board", "right", "left"),
     ],
 )
 def test_handover_in_mid_air(seed: int, thing: str, giver: str, receiver: str) -> None:
@@ -158,6 +159,7 @@ def test_leaning_object_is_left_alone() -> None:
     assert rig.behaviours["left"].failed.startswith("the hammer ")
 
 
+@pytest.mark.long
 def test_giver_stops_when_no_receiver_comes() -> None:
     rig = Rig({"left": Giver("left", "hammer", "right", patience_s=2.0), "right": Idle("right")}, seed=10)
     rig.run(30.0, until=lambda r: r.behaviours["left"].done)

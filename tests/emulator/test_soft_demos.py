@@ -42,6 +42,7 @@ def test_two_people_stow_soft_bodies_and_recover_dropped_ones() -> None:
     assert left.attempts == 2  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("untraced")
 def test_soft_body_beside_the_box_is_picked_up_again() -> None:
     rig = soft_demo(make_demo("soft"), seed=2)

@@ -77,7 +77,7 @@ def test_tip_moves_by_the_path_of_the_hand_times_the_scale() -> None:
     assert distance(ann.tip(), (start[0], ann.tip()[1], start[2])) < 1e-3
 
 
-@pytest.mark.parametrize("scale", [0.05, 0.3, 5.0])
+@pytest.mark.parametrize("scale", [0.05, 5.0])
 def test_changing_the_scale_while_engaged_does_not_move_the_tip(scale: float) -> None:
     """The hand rests far from where it engaged: the latched offset must not be scaled again."""
     ann = Ann(make_core())

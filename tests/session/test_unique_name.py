@@ -2,72 +2,88 @@
 
 from __future__ import annotations
 
-import contextlib
-import socket
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 
-from iris_session.link.discovery import BeaconListener
-from iris_session.protocol.codec import encode_beacon
-from iris_session.protocol.discovery import Beacon
+from iris_session.link.discovery import DiscoveryError, FoundSession
+from iris_session.session import unique_name
 from iris_session.session.unique_name import LISTEN_S, NameFinder
 
 
-@contextmanager
-def neighbours(*names: str) -> Iterator[NameFinder]:
-    """Return a `NameFinder` on a free port that receives beacons of sessions with these names."""
-    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
-        with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as free:
-            free.bind(("", 0))
-            port = free.getsockname()[1]
-        made = NameFinder(port)
-        for number, name in enumerate(names):
-            beacon = Beacon(1, f"s{number}", name, "live", "127.0.0.1", 7721 + 10 * number, 0, 0, 0, 0)
-            sender.sendto(encode_beacon(beacon), ("127.0.0.1", port))
-        yield made
-        made.close()
+class Network:
+    """Other sessions and the clock.
+
+    Attributes:
+        names: Of the sessions that are heard.
+        waits: What the finder has waited [s].
+        error: Of opening the port.
+    """
+
+    def __init__(self) -> None:
+        self.names: tuple[str, ...] = ()
+        self.now_s = 100.0
+        self.waits: list[float] = []
+        self.error: DiscoveryError | None = None
+
+    def open_listener(self, port: int) -> Network:
+        if self.error is not None:
+            raise self.error
+        return self
+
+    def wait(self, timeout_s: float) -> None:
+        self.waits.append(timeout_s)
+        self.now_s += timeout_s
+
+    def poll_sessions(self) -> list[FoundSession]:
+        where = [(name, f"192.0.2.{n}:7721", f"s{n}") for n, name in enumerate(self.names)]
+        return [FoundSession(name, address, id, "live", "", (address,)) for name, address, id in where]
+
+    def close(self) -> None: ...
 
 
-def test_free_name_is_kept() -> None:
-    with neighbours("other") as near:
-        assert near.find_free_name("lab") == "lab"
-        assert near.notes == []
+@pytest.fixture
+def network(monkeypatch: pytest.MonkeyPatch) -> Network:
+    network = Network()
+    monkeypatch.setattr(unique_name, "BeaconListener", network.open_listener)
+    monkeypatch.setattr(unique_name, "time", SimpleNamespace(monotonic=lambda: network.now_s))
+    return network
 
 
-def test_name_in_use_gets_the_next_free_number() -> None:
-    with neighbours("lab", "lab-2", "lab-4") as near:
-        assert near.find_free_name("lab") == "lab-3"
-        (note,) = near.notes
-        assert "127.0.0.1:7721" in note
-        assert "'lab-3'" in note
+@pytest.mark.parametrize(
+    ("heard", "name", "free"),
+    [
+        (("other",), "lab", "lab"),
+        (("lab", "lab-2", "lab-4"), "lab", "lab-3"),
+        (("x" * 48,), "x" * 48, "x" * 44 + "-2"),
+    ],
+)
+def test_name_in_use_gets_the_next_free_number(network: Network, heard: tuple[str], name: str, free: str) -> None:
+    network.names = heard
+    finder = NameFinder(7720)
+    assert finder.find_free_name(name) == free
+    assert [("192.0.2.0:7721" in note, repr(free) in note) for note in finder.notes] == [(True, True)] * (free != name)
+    finder.close()
 
 
-def test_long_name_stays_within_the_limit() -> None:
-    with neighbours("x" * 48) as near:
-        free = near.find_free_name("x" * 48)
-    assert free == "x" * 44 + "-2"
+def test_a_session_does_not_hear_itself(network: Network) -> None:
+    network.names = ("lab",)
+    assert NameFinder(7720).find_free_name("lab", "s0") == "lab"
 
 
-def test_finder_waits_only_for_the_rest_of_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    with neighbours("lab") as near:
-        time.sleep(LISTEN_S)
-        monkeypatch.setattr(BeaconListener, "wait", lambda self, timeout_s: pytest.fail("waits again"))
-        assert near.find_free_name("lab") == "lab-2"
+def test_finder_waits_only_for_the_rest_of_its_time(network: Network) -> None:
+    finder = NameFinder(7720)
+    network.now_s += 0.2
+    finder.find_free_name("lab")
+    finder.find_free_name("lab")
+    assert network.waits == [pytest.approx(LISTEN_S - 0.2)]
 
 
-def test_finder_without_beacons_keeps_the_name() -> None:
-    near = NameFinder(0)
-    assert near.find_free_name("lab") == "lab"
-    near.close()
-
-
-def test_finder_port_in_use_is_noted_and_keeps_the_name() -> None:
-    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as greedy:
-        greedy.bind(("", 0))
-        near = NameFinder(greedy.getsockname()[1])
-        assert near.find_free_name("lab") == "lab"
-        assert "cannot be found" in near.notes[0]
-        near.close()
+def test_finder_without_beacons_or_a_port_keeps_the_name(network: Network) -> None:
+    network.names = ("lab",)
+    silent = NameFinder(0)
+    assert (silent.find_free_name("lab"), silent.notes) == ("lab", [])
+    network.error = DiscoveryError("port 7720 is in use")
+    finder = NameFinder(7720)
+    assert finder.find_free_name("lab") == "lab"
+    assert "port 7720 is in use" in finder.notes[0]
