@@ -58,10 +58,11 @@ def test_description_and_time_of_sending_are_passed_on() -> None:
     ]
 
 
+@pytest.mark.usefixtures("simulation")
 def test_stream_names_of_deformables_are_reserved() -> None:
     scene = SceneBuilder()
     scene.add_deformable("cloth", [(0, 0, 1), (0, 1, 1), (1, 0, 1)], [(0, 1, 2)])
-    config = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
+    config = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, web=False)
     with ScenePublisher(scene, config) as session:
         with pytest.raises(ValueError, match="'deformable-0'"):
             session.publish_media("deformable-0", b"points")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Callable
 from itertools import pairwise
+
+import pytest
 
 from iris_session.journal.messages import RecorderStatus
 from iris_session.recording import RecordingError
+from iris_session.session import supervision
 from iris_session.session.supervision import (
     HANGING_NS,
     HEALTHY_NS,
@@ -17,6 +17,7 @@ from iris_session.session.supervision import (
     RecorderSupervisor,
     RestartTimer,
 )
+from tests.threads import Threads
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -53,19 +54,14 @@ def test_long_lived_process_is_restarted_at_once() -> None:
 
 
 class Recorder:
-    """A recorder whose disk answers only when `disk` is set."""
+    """A recorder by the test. Its disk is asked only in threads."""
 
     def __init__(self) -> None:
         self.alive = True
-        self.disk = threading.Event()
         self.refused = False
-        self.readers: list[threading.Thread] = []
-        self.closed = threading.Event()
 
     @property
     def failure(self) -> str:
-        self.readers.append(threading.current_thread())
-        assert self.disk.wait(30.0)
         return "the recorder ended (exit status 1): no space left"
 
     def restart(self) -> None:
@@ -75,21 +71,17 @@ class Recorder:
 
     def close(self, timeout_s: float) -> bool:
         self.alive = False
-        self.closed.set()
         return True
 
 
-def _until(look: Callable[[], list[str]]) -> list[str]:
-    """Wait for the first report."""
-    until = time.monotonic() + 30.0
-    while time.monotonic() < until:
-        if told := look():
-            return told
-        time.sleep(0.001)
-    raise AssertionError("nothing was told")
+@pytest.fixture(autouse=True)
+def threads(monkeypatch: pytest.MonkeyPatch) -> Threads:
+    threads = Threads()
+    monkeypatch.setattr(supervision, "threading", threads)
+    return threads
 
 
-def test_dead_recorder_is_replaced_while_the_loop_continues() -> None:
+def test_dead_recorder_is_replaced_while_the_loop_continues(threads: Threads) -> None:
     recorder = Recorder()
     supervisor = RecorderSupervisor(recorder)
     assert supervisor.poll(SECOND, 0) == []
@@ -98,32 +90,35 @@ def test_dead_recorder_is_replaced_while_the_loop_continues() -> None:
         assert supervisor.poll(2 * SECOND + i * 50 * MS, 0) == []
     assert not supervisor.alive
     assert supervisor.restarts == 1
-    recorder.disk.set()
-    (told,) = _until(lambda: supervisor.poll(8 * SECOND, 0))
-    assert "exit status 1" in told
-    assert "no space left" in told
-    assert threading.main_thread() not in recorder.readers
+    threads.run_started()
+    (told,) = supervisor.poll(8 * SECOND, 0)
+    assert recorder.failure in told
     assert supervisor.alive
-    assert "no space left" in supervisor.failure
+    assert supervisor.failure == recorder.failure
     assert supervisor.poll(8 * SECOND + HANGING_NS + MS, 0) == []
     assert supervisor.failure == ""  # its successor writes
 
 
-def test_failed_start_of_a_recorder_is_retried_and_stays_reported() -> None:
+def test_failed_start_of_a_recorder_is_retried_and_stays_reported(threads: Threads) -> None:
     recorder = Recorder()
-    recorder.disk.set()
     recorder.alive, recorder.refused = False, True
     supervisor = RecorderSupervisor(recorder)
-    (told,) = _until(lambda: supervisor.poll(SECOND, 0))
-    assert "no room for its log" in told
+
+    def poll(now_ns: int) -> str:
+        """Return what is announced when the thread that starts now has ended."""
+        assert supervisor.poll(now_ns, 0) == []
+        threads.run_started()
+        (told,) = supervisor.poll(now_ns, 0)
+        return told
+
+    assert "no room for its log" in poll(SECOND)
     assert supervisor.poll(SECOND + 100 * MS, 0) == []
-    (told,) = _until(lambda: supervisor.poll(SECOND + 3 * HANGING_NS, 0))
-    assert "not replaced" in told
+    assert "not replaced" in poll(SECOND + 3 * HANGING_NS)
     assert supervisor.failure
     assert not supervisor.alive
     recorder.refused = False
-    (told,) = _until(lambda: supervisor.poll(SECOND + 9 * HANGING_NS, 0))
-    assert told.endswith("it was replaced")
+    assert "was replaced" in poll(SECOND + 9 * HANGING_NS)
+    assert supervisor.alive
 
 
 def test_hanging_recorder_is_reported_once_and_close_waits_for_the_thread() -> None:
@@ -136,22 +131,19 @@ def test_hanging_recorder_is_reported_once_and_close_waits_for_the_thread() -> N
     recorder.alive = False
     supervisor.poll(3 * SECOND, 0)
     assert not supervisor.hangs
-    recorder.disk.set()
     supervisor.close()
-    assert recorder.alive
-    assert not recorder.closed.is_set(), "it writes what is left"
+    assert recorder.alive, "it writes what is left"
 
 
-def test_close_does_not_wait_for_a_hanging_disk() -> None:
+def test_close_does_not_wait_for_a_hanging_disk(threads: Threads) -> None:
     recorder = Recorder()
     supervisor = RecorderSupervisor(recorder)
     recorder.alive = False
     supervisor.poll(SECOND, 0)
+    threads.are_stuck = True
     supervisor.close(0.05)
-    assert not recorder.alive, "and its disk has not answered yet"
-    recorder.disk.set()
-    assert recorder.closed.wait(30.0), "nobody would look after the successor that is started now"
-    assert not recorder.alive
+    threads.run_started()
+    assert not recorder.alive, "nobody would look after the successor that is started now"
 
 
 def _left(n_bytes: int, *, ended: bool = False) -> RecorderStatus:
@@ -175,7 +167,6 @@ def test_end_of_a_budget_is_announced_before_and_when_it_comes() -> None:
 
 def test_recorder_that_has_used_its_budget_is_not_restarted() -> None:
     recorder = Recorder()
-    recorder.disk.set()
     supervisor = RecorderSupervisor(recorder)
     assert len(supervisor.poll(SECOND, 0, _left(0, ended=True))) == 1
     recorder.alive = False

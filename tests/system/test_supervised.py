@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -13,6 +11,7 @@ import pytest
 from iris_session.system import supervised
 from iris_session.system.process import ChildProcess
 from iris_session.system.supervised import HEALTHY_NS, RESTART_DELAYS_NS, SECOND, START_NS, SupervisedProcess
+from tests.threads import Threads
 
 
 class Report(msgspec.Struct, frozen=True):
@@ -52,24 +51,6 @@ class Child:
     def close(self, *, terminate_s: float = 0.0) -> int:
         self.closed = True
         return 0
-
-
-class Threads:
-    """In place of the module `threading`: a thread does its work when the test lets it."""
-
-    def __init__(self) -> None:
-        self.started: list[Callable[[], None]] = []
-
-    def run_started(self) -> None:
-        """Let every thread that was started do its work."""
-        while self.started:
-            self.started[0]()
-            self.started.pop(0)
-
-    def Thread(self, target: Callable[[], None], **_: object) -> Any:
-        return SimpleNamespace(
-            start=lambda: self.started.append(target), is_alive=lambda: target in self.started, join=lambda _: None
-        )
 
 
 @pytest.fixture(autouse=True)
@@ -260,6 +241,7 @@ def test_a_process_that_never_reports_is_ended() -> None:
 
 
 def test_a_process_that_starts_while_all_ends_is_closed(threads: Threads) -> None:
+    threads.are_stuck = True
     lab = Lab()
     lab.process.start(0)
     lab.process.close(0.0)
