@@ -71,14 +71,6 @@ def test_port_in_use_error_names_the_port() -> None:
     assert f"port {port} (control)" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("secret_file", "folder", "text"),
-    [
-        ("server.key_secret", "missing", "missing"),
-        ("nothing", ".", "nothing"),
-        ("server.key", ".", "server.key"),
-    ],
-)
 def test_networks_are_encrypted_with_a_key_made_on_first_use(tmp_path: Path) -> None:
     home = tmp_path / "home"
     process = FrontProcess(FrontConfig(host="0.0.0.0", control_port=0, state_port=0, key_home=str(home)), scene())

@@ -194,21 +194,21 @@ def test_silent_publisher_has_aging_state_and_a_warning(session: ScenePublisher)
     with Client(session.address, role="observer", name="ann", alignment="not_needed") as ann:
         for i in range(5):
             session.publish(18.0 + 0.1 * i)
-        ann.wait_for(lambda c: c.scene.state is not None and c.scene.state.header.sim_time == 18.4, 30.0)
+        assert ann.wait_for(lambda c: c.scene.state is not None and c.scene.state.header.sim_time == 18.4, 30.0)
         assert ann.scene.state is not None
         shown = ann.scene.state.header
-        ann.wait_for(lambda c: (c.scene.data_age_ns() or 0) > SILENT_NS, 30.0)
+        assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 0) > SILENT_NS, 30.0)
         assert ann.scene.state.header.session_time == shown.session_time
         assert ann.scene.state.header.state_seq > shown.state_seq, "it is sent again, for those who join"
-        ann.wait_for(lambda c: "nothing was published for" in " ".join(c.status(30.0).warnings), 30.0)
+        assert ann.wait_for(lambda c: "nothing was published for" in " ".join(c.status(30.0).warnings), 30.0)
         report = ann.status(30.0)
         way = report.step_to_publish
         assert way is None or way.p99 < 1000.0, "the front is not to blame"
         row = next(row for row in report.participants if row.name == "ann")
         assert row.state_age is None or row.state_age.p99 < 1000.0, "nor her link"
         session.publish(19.0)
-        ann.wait_for(lambda c: not c.status(30.0).warnings, 30.0)
-        ann.wait_for(lambda c: c.scene.state is not None and c.scene.state.header.sim_time == 19.0, 30.0)
+        assert ann.wait_for(lambda c: not c.status(30.0).warnings, 30.0)
+        assert ann.wait_for(lambda c: c.scene.state is not None and c.scene.state.header.sim_time == 19.0, 30.0)
 
 
 def test_several_threads_may_publish(session: ScenePublisher) -> None:
