@@ -104,8 +104,9 @@ def test_refused_keys_and_codes_at_an_encrypted_session(tmp_path: Path) -> None:
         KeyHome().clients.allow_key("looker", KeyHome(home).load_identity().public, ("observer",))
         examine(server.address, "--role", "director", home=home, expected={"role"}).assert_names("role")
         assert examine(server.address, home=home, expected=set()).checks["key"]["state"] == "ok"
-        KeyHome(home).known_servers.pin(server.address, "arm", KeyPair.generate().public)
-        found = examine(server.address, home=home, expected={"server_key"})
+        elsewhere = tmp_path / "elsewhere"
+        KeyHome(elsewhere).known_servers.pin(server.address, "arm", KeyPair.generate().public)
+        found = examine(server.address, home=elsewhere, expected={"server_key"})
         found.assert_names("server_key", "iris-session keys forget")
     finally:
         server.stop()

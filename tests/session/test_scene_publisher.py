@@ -18,20 +18,15 @@ from iris_session import (
     ConfigError,
     OwnershipError,
     PublishError,
-    ResumeError,
     SceneBuilder,
     ScenePublisher,
-    Session,
     SessionConfig,
 )
 from iris_session.protocol.scene import Environment, RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
-from iris_session.recording import Recording
 from iris_session.scene import AssetStore
 from iris_session.session.publish_loop import SILENT_NS
-from iris_session.session.resume import find_note_path
 from iris_session.session.scene_publisher import AHEAD_NS, _check_capture
-from iris_session.session.verification import verify_recording
 from tests.rig.owned import simulate_sessions
 from tests.rig.simulation import Simulation
 
@@ -319,19 +314,3 @@ def test_error_that_stopped_the_session_is_raised_by_later_calls(monkeypatch: py
             with pytest.raises(KeyError, match="broken"):
                 call()
         assert session.scene is before
-
-
-@pytest.mark.e2e
-def test_recording_of_a_publisher_verifies_and_cannot_be_resumed(tmp_path: Path) -> None:
-    path = tmp_path / "session.rrd"
-    with ScenePublisher(scene(), replace(CONFIG, record=path)) as session:
-        session.publish(1.0)
-    assert session.close(), session.recording_fault
-    report = verify_recording(path)
-    assert (report.ok, report.unverified_steps) == (True, 0), report
-    with Recording.open(path) as recording:
-        assert recording.header.recording_class == "open"
-        assert [body.name for body in recording.header.bodies] == ["box"]
-    with pytest.raises(ResumeError, match="'open'"):
-        Session(config=SessionConfig(resume=path))
-    assert not find_note_path(path).exists(), "what nobody can go on from needs none"
