@@ -6,7 +6,7 @@ import dataclasses
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -25,7 +25,7 @@ from iris_session.journal.messages import Batch
 from iris_session.journal.rows import CRASHED, seal_keyframe
 from iris_session.physics import encode_model, load_model
 from iris_session.protocol.client_messages import Marker, MoveAnchor
-from iris_session.protocol.common import Applied, Pose
+from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, SessionResumed, decode_entries
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.server_messages import Gap, StateHeader
@@ -65,6 +65,7 @@ from iris_session.session.stepper import ResumedFrom, Stepper
 from iris_session.session.verification import verify_recording
 from tests.recording.support import write
 from tests.session.play import ANN, TICK_NS, entries, host, make_core, play
+from tests.session.test_stepper import Recorder
 
 STEPS = 100
 KEYFRAMES = (39, 79)
@@ -453,43 +454,11 @@ class Front:
         pass
 
 
-class Journal:
-    """Keeps what a recorder would write."""
-
-    wants_keyframe = False
-
-    def __init__(self) -> None:
-        self.batch = Batch()
-
-    def add_row(self, row: JournalRow) -> None:
-        self.batch.rows.append(row)
-
-    def flush(self) -> None:
-        pass
+class Journal(Recorder):
+    """Keeps what a recorder would write, ready for a file."""
 
     def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
-        self.batch.keyframes.append(seal_keyframe(keyframe, chain))
-
-    def add_state(
-        self,
-        step: int,
-        tick: int,
-        sim_time: float,
-        session_time: int,
-        poses: NDArray[np.float64],
-        applied: Sequence[Applied] = (),
-        robots: bytes = b"",
-    ) -> None:
-        pass
-
-    def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
-        pass
-
-    def add_metric(self, step: int, session_time: int, name: str, value: float) -> None:
-        pass
-
-    def take_gap(self) -> int:
-        return 0
+        self.keyframes.append(seal_keyframe(keyframe, chain))
 
 
 @pytest.fixture
@@ -511,11 +480,11 @@ def gone_on(session: Path) -> tuple[Stepper, Front, Path]:
     for _ in range(40):
         stepper.step(1)
     past.close()
-    return stepper, front, write(past.recording, header, journal.batch)
+    return stepper, front, write(past.recording, header, Batch(rows=journal.rows, keyframes=journal.keyframes))
 
 
 def test_first_entry_is_session_resumed(gone_on: tuple[Stepper, Front, Path]) -> None:
-    stepper, front, _ = gone_on
+    stepper, front, path = gone_on
     step, decision = front.decisions[0]
     assert step == STEPS
     (gap,) = [event.body for event in decision.events if isinstance(event.body, Gap)]
@@ -525,6 +494,12 @@ def test_first_entry_is_session_resumed(gone_on: tuple[Stepper, Front, Path]) ->
     play(before, 0, STEPS)
     assert decision.events[0].event_seq == before.authority.step(LAST_NS + 1, [], 0, before.world.view()).event_seq + 1
     assert stepper.step_count == STEPS + 40
+    with Recording.open(path) as recording:
+        row = next(recording.rows())
+    first, *_ = decode_entries(row.entries)
+    assert first == host(row.now_ns, first.message)
+    assert isinstance(first.message, SessionResumed)
+    assert row.n_ticks == 0
 
 
 def test_participants_keep_leases_and_robots_hold(gone_on: tuple[Stepper, Front, Path]) -> None:
@@ -562,14 +537,3 @@ def test_continuation_of_a_different_recording_fails(gone_on: tuple[Stepper, Fro
     report = verify_recording(path)
     assert not report.ok
     assert "does not continue" in report.problems[0].text
-
-
-def test_first_row_is_journaled(gone_on: tuple[Stepper, Front, Path]) -> None:
-    from iris_session.recording import Recording
-
-    with Recording.open(gone_on[2]) as recording:
-        row = next(recording.rows())
-    first, *_ = decode_entries(row.entries)
-    assert first == host(row.now_ns, first.message)
-    assert isinstance(first.message, SessionResumed)
-    assert row.n_ticks == 0
