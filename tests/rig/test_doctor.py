@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Callable, Generator, Iterator
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import pytest
 
@@ -14,7 +14,6 @@ from iris_session.link.discovery import FoundSession
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import ProtocolVersionError
 from iris_session.protocol.names import PROTOCOL_VERSION
-from tests.rig.front import RigFrontProcess
 from tests.rig.network import RigClientSockets
 from tests.rig.session import ADDRESS, Rig
 from tests.rig.simulation import SECOND
@@ -82,7 +81,7 @@ class Lab:
 class Listener:
     """Hears the beacon of the session."""
 
-    ignored: dict[str, int] = {}  # noqa: RUF012
+    ignored: ClassVar[dict[str, int]] = {}
 
     def __enter__(self) -> Listener:
         return self
@@ -129,10 +128,7 @@ def test_no_listener(lab: Lab) -> None:
 
 
 def test_listener_that_never_answers(lab: Lab) -> None:
-    front = lab.rig.session.processes.front
-    assert isinstance(front, RigFrontProcess)
-    front.front = None  # hangs
-    lab.rig.stop_loop(60.0)
+    lab.rig.suspend_machine(60.0)
     found = lab.examine(failed={"join"})
     found.assert_names("join", f"{join_checks.JOIN_S:g} s")
     assert found.checks["tcp"]["state"] == "ok"
@@ -163,7 +159,7 @@ def test_missing_alignment_missing_lease_and_stopped_client(lab: Lab) -> None:
     ann.acquire(["left"])
     carl.acquire(["right"])
     rig.join("bob", alignment="measured")
-    rig.link_of(carl).stall(60.0)
+    rig.hang(carl, 60.0)
     rig.run(1.0)
     found = lab.examine(failed={"alignment", "clients"})
     found.assert_names("alignment", "bob")
