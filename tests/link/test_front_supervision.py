@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -195,6 +196,12 @@ def test_front_that_does_not_start_is_an_error(front: Supervision, ends: bool) -
     with pytest.raises(FrontError, match="port 1 is in use" if ends else "2 s"):
         front.process.start(timeout_s=2.0)
     assert not front.children[0].is_running
+
+
+@pytest.mark.parametrize(("name", "used"), [("short", None), ("x" * 100, "/tmp")])
+def test_folder_too_long_for_a_socket_is_not_used(monkeypatch: pytest.MonkeyPatch, name: str, used: str | None) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", f"/folder/{name}")
+    assert front_process._find_socket_folder() == used
 
 
 # --- starved or hanging -----------------------------------------------------------------------------------------------
