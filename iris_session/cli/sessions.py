@@ -28,7 +28,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 def run(arguments: argparse.Namespace) -> int:
     """Listen for beacons and print the sessions. Exit status 1 if none was heard."""
     from iris_session.client import find_sessions
-    from iris_session.client.endpoint_resolver import known_fingerprints
+    from iris_session.client.server_trust import known_fingerprints
 
     known = known_fingerprints()
     found = find_sessions(arguments.seconds)

@@ -1,6 +1,6 @@
 """Find sessions: listen for beacons on UDP, and request the introduction of one address over TCP.
 
-Beacons and introductions are public and unauthenticated: `endpoint_resolver` decides what to trust of them.
+Beacons and introductions are public and unauthenticated: `server_trust` decides what to trust of them.
 """
 
 from __future__ import annotations

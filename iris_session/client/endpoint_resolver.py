@@ -2,39 +2,33 @@
 
     name --beacons--> address --introduction--> key --known?--> (join code: pair, store the key) --> hello
 
-Any machine can send beacons and introductions. A key is trusted because it was given (URI, `CurveKeys`), was stored
-before, has proved the join code, or, without any of these, at first sight; then it is stored after the welcome.
-`EndpointResolver` takes these steps, `ServerTrust` decides on keys, `pair_key` pairs, and `SessionJoiner` drives a
+`EndpointResolver` takes these steps: `server_trust` decides on keys, `key_pairing` pairs. `SessionJoiner` drives a
 resolver for a connection and checks which session answers.
 """
 
 from __future__ import annotations
 
-import getpass
-import ipaddress
-import socket
 import time
 from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Final
-
-import zmq
 
 from iris_session.client.address import DEFAULT_CONTROL_PORT, Address
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.discovery import LISTEN_S, open_listener, request_introduction
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
+from iris_session.client.key_pairing import default_key_name, pair_key
+from iris_session.client.server_trust import ServerTrust
 from iris_session.client.sockets import ClientSockets, CurveKeys
+from iris_session.link.config import is_loopback
 from iris_session.link.discovery import FoundSession, is_plausible
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import Pair, wrap_message
-from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.server_messages import Paired, ProtocolFault, Refused, Welcome
-from iris_session.security import KeyHome, KeyPair, KeysError, KnownServer, compute_fingerprint, decode_key
+from iris_session.protocol.server_messages import Welcome
+from iris_session.security import KeyHome, KeysError
 
 LOCAL_ADDRESS: Final = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"
 INTRODUCTION_S: Final = 2.5
@@ -43,18 +37,18 @@ LOOPBACK_INTRODUCTION_S: Final = 1.0
 RETRY_S: Final = 0.2
 #: Between two steps of a resolver: it is short-lived, and waits for different things.
 STEP_NS: Final = 5_000_000
-ANSWER_S: Final = 5.0
-#: Period and duration of repeating a pairing request: a session answers that many clients pair at once, or not at all
-#: while its disk is slow. A client that has paired gets the same answer again.
-PAIR_RETRY_S: Final = 1.0
-PAIR_PATIENCE_S: Final = 20.0
-MAX_NAME: Final = 64  # as `protocol.common.Name`
-MAX_ANSWER_BYTES: Final = 65_536
 
 
 @dataclass(frozen=True, slots=True)
 class ConnectRequest:
-    """Session to connect to: `address` (without name), or the name `session`. `join_code`: to pair where needed."""
+    """Session to connect to: `address` (without name), or the name `session`.
+
+    Attributes:
+        address: Control channel, `None` to find the session by name.
+        session: Name of the session, empty with an address.
+        curve: All keys, or `None` to select them.
+        join_code: Code to pair with where needed, as given or as in the URI; empty without one.
+    """
 
     address: Address | None
     session: str = ""
@@ -66,8 +60,12 @@ class ConnectRequest:
 class Endpoint:
     """Control channel of a session, and the keys for it.
 
-    `session_id`: from the introduction, empty without one. `store`: the key is trusted at first sight and is stored
-    when the session welcomes us.
+    Attributes:
+        address: Control channel.
+        curve: Keys, `None` without encryption.
+        session_id: Id of the session that introduced itself, empty without an introduction.
+        session: Its name, empty where it is not known.
+        store: True if the key is trusted at first sight and is to be stored when the session welcomes us.
     """
 
     address: Address
@@ -83,7 +81,20 @@ class Endpoint:
 
 
 def parse_connect_request(address: str, session: str, curve: CurveKeys | None, join_code: str) -> ConnectRequest:
-    """Check the arguments of `Client`; without any, the session on this machine. Raises `ClientError`."""
+    """Check the arguments of `Client`.
+
+    Args:
+        address: Address or URI; empty without `session`: the session on this machine.
+        session: Name of a session.
+        curve: All keys.
+        join_code: Code as typed.
+
+    Returns:
+        The request.
+
+    Raises:
+        ClientError: An argument is invalid, or contradicts another.
+    """
     if address and session:
         raise ClientError("give an address or the name of a session, not both")
     if curve is not None and (session or join_code):
@@ -93,24 +104,35 @@ def parse_connect_request(address: str, session: str, curve: CurveKeys | None, j
     except ValueError as error:
         raise ClientError(str(error)) from None
     parsed = None if session else Address.parse(LOCAL_ADDRESS if address == "" else address)
-    return ConnectRequest(parsed, session, curve, code)
+    return ConnectRequest(parsed, session, curve, code or ("" if parsed is None else parsed.join_code))
 
 
 class EndpointResolver:
     """Resolve a `ConnectRequest` in steps that never wait, until it succeeds or fails for good.
 
-    `note`: what it waits for. `repair`: the session has refused our key as not paired, so pair although its key is
-    known.
+    Args:
+        request: Session to find.
+        force_pairing: Pair although the session's key is known: the session has refused our key as not paired.
+
+    Attributes:
+        note: What it waits for, in words.
     """
 
-    def __init__(self, request: ConnectRequest, *, repair: bool = False) -> None:
+    def __init__(self, request: ConnectRequest, *, force_pairing: bool = False) -> None:
         self.note = ""
         self._request = request
-        self._repair = repair
+        self._force_pairing = force_pairing
         self._steps = self._resolve()
 
     def step(self) -> Endpoint | None:
-        """Take one step; `None` while there is no result. Raises `ClientError` when there will be none."""
+        """Take one step.
+
+        Returns:
+            The endpoint, `None` while there is no result.
+
+        Raises:
+            ClientError: There will be no result; a subclass says why.
+        """
         try:
             next(self._steps)
         except StopIteration as done:
@@ -186,7 +208,7 @@ class EndpointResolver:
         self, address: Address, found: FoundSession | None, introduction: Introduction | None
     ) -> Generator[None, None, Endpoint | None]:
         """Select the key, and pair where requested; `None`: there is no decision yet."""
-        home, code = KeyHome(), self._request.join_code or address.join_code
+        home, code = KeyHome(), self._request.join_code
         trust = ServerTrust(home, address, found.name if found is not None else "")
         offered = None if introduction is None else introduction.server_key
         key = trust.select_key(offered, loopback=is_loopback(address.host))
@@ -199,7 +221,7 @@ class EndpointResolver:
         if not key:
             return None if key is None else Endpoint(address, None, session_id, name)
         own = home.load_identity()
-        if code and (self._repair or not trust.is_known(key)):
+        if code and (self._force_pairing or not trust.is_known(key)):
             self.note = f"pairing with the session at {address}"
             yield from pair_key(address, key, own, code, default_key_name())
             trust.store(name, key)
@@ -235,14 +257,6 @@ def resolve_blocking(request: ConnectRequest, timeout_s: float) -> Endpoint:
         resolver.close()
 
 
-def is_loopback(host: str) -> bool:
-    """Return whether an address reaches no further than this machine."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def _pause(seconds: float) -> Generator[None, None, None]:
     until = time.monotonic() + seconds
     while time.monotonic() < until:
@@ -255,7 +269,8 @@ def _pause(seconds: float) -> Generator[None, None, None]:
 class SessionJoiner:
     """Resolve the endpoint of one connection, open it, and check that the session that introduced itself answers.
 
-    `address`: `HOST:PORT`, as soon as it is known.
+    Attributes:
+        address: `HOST:PORT`, as soon as it is known; before, the name of the session.
     """
 
     def __init__(self, request: ConnectRequest, connection: ClientConnection, sockets: ClientSockets) -> None:
@@ -273,13 +288,13 @@ class SessionJoiner:
         """True while the endpoint is not known yet."""
         return self._resolver is not None
 
-    def begin(self, *, repair: bool = False) -> None:
-        """Start to resolve the endpoint."""
+    def begin(self, *, force_pairing: bool = False) -> None:
+        """Start to resolve the endpoint; see `EndpointResolver`."""
         self._connection.phase = ConnectionPhase.IDLE
         self._connection.failure = None
         self._endpoint = None
         self._connection.wake_ns = time.monotonic_ns()  # a loop over several clients must call `step` now
-        self._resolver = EndpointResolver(self._request, repair=repair)
+        self._resolver = EndpointResolver(self._request, force_pairing=force_pairing)
 
     def step(self) -> None:
         """Take one step of the resolver, if there is one; with its result, open the connection."""
@@ -317,7 +332,7 @@ class SessionJoiner:
             self._check_welcome(endpoint, connection.welcome)
         elif self._may_pair():
             self._paired_anew = True  # only once: a key that is revoked again stays revoked
-            self.begin(repair=True)
+            self.begin(force_pairing=True)
         elif connection.retryable_refusal is not None:
             return  # a session answers: `connection` sends hello again
         elif connection.phase is ConnectionPhase.WAITING and not endpoint.session_id and self._request.curve is None:
@@ -333,8 +348,7 @@ class SessionJoiner:
     def _may_pair(self) -> bool:
         failure = self._connection.failure
         unpaired = isinstance(failure, RefusedError) and failure.code == RefusalCode.UNPAIRED
-        given = self._request.address
-        return unpaired and not self._paired_anew and bool(self._request.join_code or (given and given.join_code))
+        return unpaired and not self._paired_anew and bool(self._request.join_code)
 
     def _check_welcome(self, endpoint: Endpoint, welcome: Welcome) -> None:
         if endpoint.session_id not in ("", welcome.session_id):
@@ -352,185 +366,3 @@ class SessionJoiner:
     def _fail(self, error: ClientError) -> None:
         self._connection.failure = error
         self._connection.phase = ConnectionPhase.REFUSED
-
-
-# --- keys of known servers --------------------------------------------------------------------------------------------
-
-
-class ServerTrust:
-    """Keys that this user trusts for the session `session` at `address` (empty: not requested by name).
-
-    Nothing is overwritten silently: a key that differs from the trusted one raises an error that names both.
-    """
-
-    def __init__(self, home: KeyHome, address: Address, session: str = "") -> None:
-        self._home = home
-        self._address = address
-        self._session = session
-        self._known = home.known_servers.read()
-
-    @property
-    def stored(self) -> str:
-        """Key (Z85) stored for the address, empty without one."""
-        return next((one.key for one in self._known if one.address == str(self._address)), "")
-
-    def is_known(self, key: str) -> bool:
-        """Return whether this key is stored, for any address: the machine may have moved, or have several."""
-        return any(one.key == key for one in self._known)
-
-    def select_key(self, offered: str | None, *, loopback: bool) -> str | None:
-        """Return the key to use.
-
-        Args:
-            offered: Key (Z85) that the session offers; empty: it does not encrypt; `None`: it did not answer.
-            loopback: The session is on this machine.
-
-        Returns:
-            The key; empty: without encryption, on loopback only; `None`: nothing is known yet.
-
-        Raises:
-            TrustError: The session does not encrypt, or has another key than the trusted one.
-        """
-        given, stored = self._address.server_key, self.stored
-        if given and stored and given != stored:
-            raise self._differs(stored, given, "the key in this URI")
-        pinned = given or stored
-        if offered is None:
-            return pinned or ("" if loopback else None)
-        if not offered and not loopback:
-            raise TrustError(f"the session at {self._address} is not encrypted: over a network it must be")
-        if not offered and not given:
-            return ""  # on this machine different sessions may use the port, with or without a key
-        if pinned and offered != pinned:
-            raise self._differs(pinned, offered, "what answers there")
-        return offered
-
-    def check_name(self, key: str) -> None:
-        """Raise `TrustError` for a name that is known with another key: any machine can use it in a beacon."""
-        named: list[KnownServer] = [one for one in self._known if self._session and one.session == self._session]
-        if named and not self.is_known(key):
-            raise TrustError(
-                f"the session {self._session!r} at {self._address} has another key ({_fingerprint_or_none(key)}) than "
-                f"the one known by that name ({named[-1].fingerprint}): pair with it by a join code, or give its "
-                "address if you trust it"
-            )
-
-    def store(self, session: str, key: str) -> None:
-        """Store `key` for the address. Raises `TrustError` when another one is there."""
-        try:
-            self._home.known_servers.pin(str(self._address), session, key)
-        except KeysError as error:
-            raise TrustError(str(error)) from error
-
-    def _differs(self, trusted: str, other: str, what: str) -> TrustError:
-        return TrustError(
-            f"{self._address} is known with the key {_fingerprint_or_none(trusted)}, but {what} has "
-            f"{_fingerprint_or_none(other)}: another machine answers there, or its keys were made anew; if you know "
-            f"that they were: iris-session keys forget {self._address}"
-        )
-
-
-def _fingerprint_or_none(key: str) -> str:
-    return compute_fingerprint(decode_key(key)) if key else "none"
-
-
-def known_fingerprints() -> frozenset[str]:
-    """Return the fingerprint of every stored key. Raises `TrustError` when the file cannot be read."""
-    try:
-        return frozenset(one.fingerprint for one in KeyHome().known_servers.read())
-    except KeysError as error:
-        raise TrustError(str(error)) from error
-
-
-# --- pairing ----------------------------------------------------------------------------------------------------------
-
-
-def default_key_name() -> str:
-    """Return `USER@HOST`: the name of this user's key on allow-lists."""
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):  # in containers the user may be missing in the system's files
-        user = "user"
-    name = f"{user}@{socket.gethostname()}"
-    return "".join(c for c in name if c.isprintable())[:MAX_NAME]
-
-
-def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: str) -> Generator[None, None, Paired]:
-    """Put a key on the allow-list of a session by a join code that both sides prove to know; yields where it waits.
-
-    Args:
-        address: Address of the session.
-        server_key: Public key of the session, Z85.
-        own: Key pair to be put on the list.
-        code: Join code.
-        name: Name of our key on the list.
-
-    Returns:
-        The session's answer.
-
-    Raises:
-        RefusedError: The code is wrong, used or expired.
-        TrustError: The session could not prove that it knows the code, so it did not issue it.
-        NotConnectedError: No answer.
-    """
-    server_public = decode_key(server_key)
-    try:
-        secret = pairing.stretch_code(code, server_public)
-    except ValueError as error:
-        raise ClientError(str(error)) from None
-    request = Pair(name, pairing.make_client_proof(secret, server_public, own.raw_public), "iris-session")
-    sock: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
-    try:
-        sock.linger = 0
-        sock.setsockopt(zmq.MAXMSGSIZE, MAX_ANSWER_BYTES)
-        sock.setsockopt(zmq.IPV6, int(":" in address.host))
-        sock.curve_serverkey = server_key.encode()
-        sock.curve_publickey = own.public.encode()
-        sock.curve_secretkey = own.secret.encode()
-        sock.connect(f"tcp://{address}")
-        answer = yield from _request_pairing(sock, encode_client(wrap_message(request)), address)
-    finally:
-        sock.close()
-    if not pairing.is_same_proof(answer.proof, pairing.make_server_proof(secret, server_public, own.raw_public)):
-        raise TrustError(
-            f"the session at {address} does not know the join code, so it is not the one that gave it out: "
-            "nothing was stored; check the address and the code"
-        )
-    return answer
-
-
-def _request_pairing(sock: zmq.Socket[bytes], request: bytes, address: Address) -> Generator[None, None, Paired]:
-    """Send the request until there is a final answer. Raises as `pair_key`."""
-    until = time.monotonic() + PAIR_PATIENCE_S
-    while True:
-        sock.send(request)
-        try:
-            return (yield from _receive_answer(sock, address))
-        except RefusedError as refused:
-            if refused.code != RefusalCode.RATE or time.monotonic() > until:
-                raise
-        except TimeoutError as silent:
-            if time.monotonic() > until:
-                raise NotConnectedError(str(silent)) from None
-        yield from _pause(PAIR_RETRY_S)
-
-
-def _receive_answer(sock: zmq.Socket[bytes], address: Address) -> Generator[None, None, Paired]:
-    """Raise `TimeoutError` after `ANSWER_S` without a message, and as `pair_key`."""
-    until = time.monotonic() + ANSWER_S
-    while True:
-        try:
-            message = decode_server(sock.recv_multipart(zmq.NOBLOCK)[0]).message
-        except zmq.Again:
-            if time.monotonic() > until:
-                raise TimeoutError(f"the session at {address} did not answer within {PAIR_PATIENCE_S:g} s") from None
-            yield
-            continue
-        except ProtocolError as error:
-            raise NotConnectedError(f"the answer at {address} is not of a session: {error}") from None
-        if isinstance(message, Paired):
-            return message
-        if isinstance(message, Refused):
-            raise RefusedError(message)
-        if isinstance(message, ProtocolFault):
-            raise RefusedError(Refused(RefusalCode.CODE, message.message))

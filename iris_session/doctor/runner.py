@@ -11,11 +11,11 @@ import msgspec
 import psutil
 
 from iris_session.client.address import Address
-from iris_session.client.endpoint_resolver import is_loopback
 from iris_session.client.errors import ClientError
 from iris_session.doctor import join_checks, network_checks, session_checks
 from iris_session.doctor.findings import OK, Findings, failed, ok
 from iris_session.doctor.host_checks import check_host
+from iris_session.link.config import is_loopback
 from iris_session.link.discovery import FoundSession
 from iris_session.protocol.names import Role
 from iris_session.protocol.status import StatusReport

@@ -38,7 +38,7 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
         return 2
     address = options.address or str(sought.address)
     try:
-        if sought.address is None or sought.join_code or sought.address.join_code:
+        if sought.address is None or sought.join_code:
             # All headsets here use the key of this user, which is paired once. A session that revoked it refuses their
             # `hello`; then they pair again with the same code.
             found = resolve_blocking(sought, options.join_timeout).address

@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 from iris_session.client import AssetStore
-from iris_session.client.asset_workers import AssetFailed, AssetMissing, AssetWorkers, BytesStored, Result
+from iris_session.client.assets import AssetFailed, AssetMissing, AssetWorkers, BytesStored, Result
 from tests.assets.test_store import ADDRESS, DATA
 
 

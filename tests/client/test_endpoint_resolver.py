@@ -13,12 +13,19 @@ import pytest
 import zmq
 
 from iris_session.cli.main import main
-from iris_session.client import Client, ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
+from iris_session.client import (
+    Client,
+    ClientError,
+    NotConnectedError,
+    RefusedError,
+    SessionNameError,
+    TrustError,
+    key_pairing,
+)
 from iris_session.client import endpoint_resolver as meeting_module
-from iris_session.client import endpoint_resolver as resolver_module
 from iris_session.client.address import Address, pairing_uri
 from iris_session.client.discovery import request_introduction
-from iris_session.client.endpoint_resolver import pair_key, parse_connect_request, resolve_blocking
+from iris_session.client.endpoint_resolver import parse_connect_request, resolve_blocking
 from iris_session.protocol import pairing
 from iris_session.protocol.codec import encode_server
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
@@ -212,7 +219,7 @@ def test_session_must_prove_the_code_too(tmp_path: Path) -> None:
 
     thread = threading.Thread(target=say_yes)
     thread.start()
-    steps = pair_key(Address("127.0.0.1", port), server.public, own, "7KQ2-M4XD-9PTR", "ann")
+    steps = key_pairing.pair_key(Address("127.0.0.1", port), server.public, own, "7KQ2-M4XD-9PTR", "ann")
     with pytest.raises(TrustError, match="join code"):
         deque(steps, maxlen=0)
     thread.join()
@@ -221,8 +228,8 @@ def test_session_must_prove_the_code_too(tmp_path: Path) -> None:
 
 def test_busy_pairing_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
     """As when a class puts on its headsets: the code need not be typed again."""
-    monkeypatch.setattr(resolver_module, "PAIR_RETRY_S", 0.01)
-    monkeypatch.setattr(resolver_module, "ANSWER_S", 1.0)
+    monkeypatch.setattr(key_pairing, "PAIR_RETRY_S", 0.01)
+    monkeypatch.setattr(key_pairing, "ANSWER_S", 1.0)
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
     server, own, code = KeyPair.generate(), KeyPair.generate(), "7KQ2-M4XD-9PTR"
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -243,7 +250,7 @@ def test_busy_pairing_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
 
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
-    deque(pair_key(Address("127.0.0.1", port), server.public, own, code, "ann"), maxlen=0)
+    deque(key_pairing.pair_key(Address("127.0.0.1", port), server.public, own, code, "ann"), maxlen=0)
     thread.join()
     assert len(asked) == 4
     assert len(set(asked)) == 1

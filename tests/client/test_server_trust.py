@@ -9,7 +9,7 @@ from zmq.utils import z85
 
 from iris_session.client import TrustError
 from iris_session.client.address import Address
-from iris_session.client.endpoint_resolver import ServerTrust, known_fingerprints
+from iris_session.client.server_trust import ServerTrust, known_fingerprints
 from iris_session.security import KeyHome
 
 A, B = (z85.encode(bytes([first] * 32)).decode() for first in (1, 2))
