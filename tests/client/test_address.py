@@ -62,3 +62,25 @@ def test_invalid_host_is_a_one_line_error(host: str) -> None:
     assert not is_host(host)
     with pytest.raises(ClientError, match="is not HOST:PORT"):
         Address.parse(host)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("127.0.0.1:7000", ("127.0.0.1", 7000)),
+        ("lab.local", ("lab.local", 7721)),
+        ("tcp://lab:1/", ("lab", 1)),
+        ("[::1]:7000", ("::1", 7000)),
+        ("::1", ("::1", 7721)),
+        ("[::1]", ("::1", 7721)),
+    ],
+)
+def test_addresses_are_parsed(text: str, expected: tuple[str, int]) -> None:
+    address = Address.parse(text)
+    assert (address.host, address.port) == expected
+
+
+@pytest.mark.parametrize("text", ["", ":7721", "host:", "host:x", "host:70000", "[]:1"])
+def test_invalid_addresses_are_rejected(text: str) -> None:
+    with pytest.raises(ClientError, match="HOST:PORT"):
+        Address.parse(text)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
@@ -19,22 +20,20 @@ from iris_session.scene.arrays import StoredArray, decode_arrays, encode_arrays
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
-from tests.client.harness import LiveSession
+from tests.client.session import ClientSession
 from tests.scene.models import flexes
-
-DEADLINE_S = 60.0
 
 
 class SharedScene:
-    """A scene of three deformables and sessions that share variants of it."""
+    """A scene of three deformables, and variants of it."""
 
     def __init__(self, folder: Path) -> None:
         self.store = AssetStore(folder)
         self.spec = parse_mujoco(flexes(), self.store).spec
 
-    def start_session(self, parts: list[Deformable]) -> LiveSession:
+    def start_session(self, parts: Iterable[Deformable]) -> ClientSession:
         address, assets = self.store_variant(parts)
-        return LiveSession(asset_root=str(self.store.root), assets=assets, scene_hash=address)
+        return ClientSession(store=self.store, assets=assets, scene_hash=address)
 
     def store_variant(self, parts: Iterable[Deformable], name: str = "scene") -> tuple[str, tuple[str, ...]]:
         """Return the address of a specification with these deformables, and the assets it needs."""
@@ -54,91 +53,90 @@ def shared(tmp_path: Path) -> SharedScene:
     return SharedScene(tmp_path / "store")
 
 
+class Watched:
+    """A session whose deformables rise, and a client that reads them."""
+
+    def __init__(self, shared: SharedScene, session: ClientSession, cache: Path, parts: Sequence[Deformable]) -> None:
+        self.session, self.parts = session, list(parts)
+        self.client = session.make_client(role="observer")
+        self.client.assets.cache = AssetStore(cache)
+        self.client.connect()
+        self.shapes = Deformables(self.client)
+        self.epoch = 1
+        self.faults: set[str] = set()
+        self.moved: set[str] = set()
+        self._rests = {part.stream: shared.rest_state(part) for part in parts}
+        self._height = 0.0
+
+    def step(self) -> None:
+        """Raise all deformables by a millimetre in the present epoch, and note those that moved in the client."""
+        self._height += 0.001
+        for stream, (encoder, rest) in self._rests.items():
+            encoder.reset()
+            frames = encoder.encode(rest + np.array((0.0, 0.0, self._height)))
+            assert frames is not None
+            self.session.publish_media(stream, frames["full"], epoch=self.epoch, encoding=MediaEncoding.DEFORMABLE)
+        self.client.sleep(0.01)
+        self.moved.update(self.shapes.update())
+        self.faults.add(self.shapes.fault)
+
+    def step_until(self, condition: Callable[[], bool]) -> None:
+        for _ in range(500):
+            self.step()
+            if condition():
+                return
+        pytest.fail(f"{self.shapes.fault}: {self.moved}")
+
+    def step_until_moved(self, names: set[str]) -> None:
+        self.moved.clear()
+        self.step_until(lambda: self.moved >= names)
+
+
 @pytest.fixture
-def joined(tmp_path: Path) -> Iterator[list[Client]]:
-    clients: list[Client] = []
-    yield clients
-    for client in clients:
-        client.close()
+def watch(shared: SharedScene, tmp_path: Path) -> Iterator[Callable[..., Watched]]:
+    """Return a function that starts a session with these deformables, and a client."""
+    with contextlib.ExitStack() as stack:
+        yield lambda parts: Watched(shared, stack.enter_context(shared.start_session(parts)), tmp_path / "cache", parts)
 
 
-def watch(live: LiveSession, joined: list[Client], cache: Path) -> tuple[Client, Deformables]:
-    client = Client(live.address, role="observer", alignment="not_needed")
-    client.assets.cache = AssetStore(cache)
-    joined.append(client)
-    return client.connect(DEADLINE_S), Deformables(client)
+@pytest.fixture
+def live(shared: SharedScene, watch: Callable[..., Watched]) -> Watched:
+    return watch(shared.spec.deformables)
 
 
-def test_equal_or_empty_names_have_distinct_keys(shared: SharedScene, joined: list[Client], tmp_path: Path) -> None:
+def test_equal_or_empty_names_have_distinct_keys(shared: SharedScene, watch: Callable[..., Watched]) -> None:
     names = ("", "rope", "rope")
     parts = [msgspec.structs.replace(p, name=n) for p, n in zip(shared.spec.deformables, names, strict=True)]
-    live = shared.start_session(parts)
-    try:
-        client, shapes = watch(live, joined, tmp_path / "cache")
-        rests = {part.stream: shared.rest_state(part) for part in parts}
-
-        def is_complete(_: Client) -> bool:
-            for stream, (encoder, rest) in rests.items():
-                encoder.reset()
-                frames = encoder.encode(rest)
-                assert frames is not None
-                live.front.publish_media(stream, frames, live.now_ns, 1, MediaEncoding.DEFORMABLE)
-            shapes.update()
-            assert not shapes.fault
-            return len(shapes.vertices) == len(parts)
-
-        assert client.wait_for(is_complete, DEADLINE_S), shapes.vertices.keys()
-        assert set(shapes.vertices) == {"flex-0", "flex-1", "flex-2"}
-        assert [len(shapes.vertices[f"flex-{i}"]) for i in range(3)] >= [20, 6, 50]
-    finally:
-        live.close()
+    live = watch(parts)
+    live.step_until(lambda: len(live.shapes.vertices) == len(parts))
+    assert set(live.shapes.vertices) == {"flex-0", "flex-1", "flex-2"}
+    assert [len(live.shapes.vertices[f"flex-{i}"]) for i in range(3)] >= [20, 6, 50]
+    assert live.faults == {""}
 
 
-def test_mesh_data_is_fetched_with_each_deformable(shared: SharedScene, joined: list[Client], tmp_path: Path) -> None:
+def test_mesh_data_is_fetched_with_each_deformable(live: Watched) -> None:
     """Triangles and lines name rows of the vertices; no triangle names the inner vertices of a soft body."""
-    parts = shared.spec.deformables
-    live = shared.start_session(list(parts))
-    try:
-        client, shapes = watch(live, joined, tmp_path / "cache")
-        assert client.wait_for(lambda _: (shapes.update(), shapes.scene_hash)[1] != "", DEADLINE_S), shapes.fault
-        assert {name: mesh.look for name, mesh in shapes.meshes.items()} == {part.name: part for part in parts}
-        rests = {part.name: (part.stream, *shared.rest_state(part)) for part in parts}
-
-        def is_complete(_: Client) -> bool:
-            for stream, encoder, rest in rests.values():
-                encoder.reset()
-                frames = encoder.encode(rest)
-                assert frames is not None
-                live.front.publish_media(stream, frames, live.now_ns, 1, MediaEncoding.DEFORMABLE)
-            shapes.update()
-            return len(shapes.vertices) == len(parts)
-
-        assert client.wait_for(is_complete, DEADLINE_S), shapes.fault
-        cloth, rope, soft = (shapes.meshes[name] for name in ("cloth", "rope", "soft"))
-        assert (cloth.faces.shape, cloth.edges.shape, rope.faces.shape, rope.edges.shape) == (
-            (24, 3),
-            (0, 2),
-            (0, 3),
-            (5, 2),
-        )
-        assert cloth.uv is not None
-        assert (cloth.uv.shape, rope.uv, soft.uv) == ((24, 3, 2), None, None)
-        points = shapes.vertices["rope"][rope.edges]
-        assert np.allclose(np.linalg.norm(points[:, 1] - points[:, 0], axis=1), 0.1, atol=0.002), "its spacing"
-        a, b, c = np.moveaxis(shapes.vertices["cloth"][cloth.faces], 1, 0)
-        assert np.isclose(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, 0.4 * 0.3, atol=0.002), "its area"
-        # 4 x 4 x 4 vertices, 2 x 2 x 2 of them inside
-        drawn = np.flatnonzero(np.isfinite(shapes.vertices["soft"]).all(axis=1))
-        assert shapes.vertices["soft"].shape == (64, 3)
-        assert len(soft.rows) == 56
-        assert drawn.tolist() == soft.rows.tolist() == np.unique(soft.faces).tolist()
-        a, b, c = np.moveaxis(shapes.vertices["soft"][soft.faces].astype(np.float64), 1, 0)
-        assert np.isclose(np.einsum("ij,ij->i", np.cross(a, b), c).sum() / 6, 0.3**3, atol=0.002), "outside is outside"
-        for mesh in shapes.meshes.values():
-            with pytest.raises(ValueError, match="read-only"):
-                mesh.rows[0] = 0
-    finally:
-        live.close()
+    parts, shapes = live.parts, live.shapes
+    live.step_until(lambda: len(shapes.vertices) == len(parts))
+    assert {name: mesh.look for name, mesh in shapes.meshes.items()} == {part.name: part for part in parts}
+    cloth, rope, soft = (shapes.meshes[name] for name in ("cloth", "rope", "soft"))
+    assert (cloth.faces.shape, cloth.edges.shape) == ((24, 3), (0, 2))
+    assert (rope.faces.shape, rope.edges.shape) == ((0, 3), (5, 2))
+    assert cloth.uv is not None
+    assert (cloth.uv.shape, rope.uv, soft.uv) == ((24, 3, 2), None, None)
+    points = shapes.vertices["rope"][rope.edges]
+    assert np.allclose(np.linalg.norm(points[:, 1] - points[:, 0], axis=1), 0.1, atol=0.002), "its spacing"
+    a, b, c = np.moveaxis(shapes.vertices["cloth"][cloth.faces], 1, 0)
+    assert np.isclose(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, 0.4 * 0.3, atol=0.002), "its area"
+    # 4 x 4 x 4 vertices, 2 x 2 x 2 of them inside
+    drawn = np.flatnonzero(np.isfinite(shapes.vertices["soft"]).all(axis=1))
+    assert shapes.vertices["soft"].shape == (64, 3)
+    assert len(soft.rows) == 56
+    assert drawn.tolist() == soft.rows.tolist() == np.unique(soft.faces).tolist()
+    a, b, c = np.moveaxis(shapes.vertices["soft"][soft.faces].astype(np.float64), 1, 0)
+    assert np.isclose(np.einsum("ij,ij->i", np.cross(a, b), c).sum() / 6, 0.3**3, atol=0.002), "outside is outside"
+    for mesh in shapes.meshes.values():
+        assert not mesh.rows.flags.writeable
 
 
 @pytest.mark.parametrize(
@@ -157,62 +155,11 @@ def test_invalid_triangles_are_rejected(tmp_path: Path, name: str, values: np.nd
     arrays = decode_arrays(store.get(part.address), ArrayKind.DEFORMABLE)
     kept = [StoredArray(key, array) for key, array in arrays.items() if key != name]
     bad = encode_arrays(ArrayKind.DEFORMABLE, kept if values is None else [*kept, StoredArray(name, values)])
-    with pytest.raises((AssetDecodeError, ValueError), match=f"{name}|vertices"):
+    with pytest.raises((AssetDecodeError, ValueError), match=f"{name}|vert"):
         _Mesh("cloth", part, memoryview(bad))
 
 
-class LiveDeformables:
-    """A session whose deformables rise, and a client that reads them."""
-
-    def __init__(self, shared: SharedScene, joined: list[Client], cache: Path) -> None:
-        self.parts = list(shared.spec.deformables)
-        self.session = shared.start_session(self.parts)
-        self.client, self.shapes = watch(self.session, joined, cache)
-        self.epoch = 1
-        self.faults: set[str] = set()
-        self._rests = {part.stream: shared.rest_state(part) for part in self.parts}
-        self._height = 0.0
-
-    def step(self) -> list[str]:
-        """Raise all deformables by a millimetre in the present epoch, and return those that moved in the client."""
-        self._height += 0.001
-        for stream, (encoder, rest) in self._rests.items():
-            frames = encoder.encode(rest + np.array((0.0, 0.0, self._height)))
-            assert frames is not None
-            self.session.front.publish_media(stream, frames, self.session.now_ns, self.epoch, MediaEncoding.DEFORMABLE)
-        moved = self.shapes.update()
-        self.faults.add(self.shapes.fault)
-        return moved
-
-    def step_until(self, condition: Callable[[], bool]) -> set[str]:
-        """Step until the condition holds; return what moved meanwhile."""
-        moved: set[str] = set()
-
-        def check(_: Client) -> bool:
-            moved.update(self.step())
-            return condition()
-
-        assert self.client.wait_for(check, DEADLINE_S), (self.shapes.fault, moved)
-        return moved
-
-    def step_until_moved(self, names: set[str]) -> None:
-        moved: set[str] = set()
-
-        def check(_: Client) -> bool:
-            moved.update(self.step())
-            return moved >= names
-
-        assert self.client.wait_for(check, DEADLINE_S), (self.shapes.fault, moved)
-
-
-@pytest.fixture
-def live(shared: SharedScene, joined: list[Client], tmp_path: Path) -> Iterator[LiveDeformables]:
-    live = LiveDeformables(shared, joined, tmp_path / "cache")
-    yield live
-    live.session.close()
-
-
-def test_patch_keeps_unchanged_deformables_subscribed(live: LiveDeformables, shared: SharedScene) -> None:
+def test_patch_keeps_unchanged_deformables_subscribed(live: Watched, shared: SharedScene) -> None:
     first, second, third = deformable_keys(live.parts)
     live.step_until_moved({first, second, third})
     feeds = {part.stream: live.client.media.subscribe(part.stream) for part in live.parts}
@@ -222,6 +169,7 @@ def test_patch_keeps_unchanged_deformables_subscribed(live: LiveDeformables, sha
     address, assets = shared.store_variant([recoloured, renamed], "patched")
     seen_ns = dict(live.shapes.capture_ns)
     live.session.change_scene(address, assets)
+    live.faults.clear()
 
     def patched() -> bool:
         here = live.shapes.scene_hash == address
@@ -240,12 +188,12 @@ def test_patch_keeps_unchanged_deformables_subscribed(live: LiveDeformables, sha
     assert live.faults == {""}
 
 
-def test_deformables_continue_until_a_late_patch_arrives(live: LiveDeformables, shared: SharedScene) -> None:
+def test_deformables_continue_until_a_late_patch_arrives(live: Watched, shared: SharedScene) -> None:
     names = set(deformable_keys(live.parts))
     live.step_until_moved(names)
     address, assets = shared.store_variant(live.parts, "patched")
     live.session.change_scene(address, assets[1:])
-    live.step_until(lambda: "unknown_asset" in live.shapes.fault)
+    live.step_until(lambda: bool(live.shapes.fault))
     live.step_until_moved(names)
     assert live.shapes.scene_hash != address
     live.session.change_scene(address, assets, "")
@@ -254,7 +202,7 @@ def test_deformables_continue_until_a_late_patch_arrives(live: LiveDeformables, 
     assert live.shapes.vertices.keys() == names
 
 
-def test_patches_faster_than_their_assets_interrupt_nothing(live: LiveDeformables, shared: SharedScene) -> None:
+def test_patches_faster_than_their_assets_interrupt_nothing(live: Watched, shared: SharedScene) -> None:
     names = set(deformable_keys(live.parts))
     live.step_until_moved(names)
     for number in range(5):  # none of them is served
@@ -269,14 +217,14 @@ def test_patches_faster_than_their_assets_interrupt_nothing(live: LiveDeformable
     assert live.shapes.fault == ""
 
 
-def test_new_scene_shows_nothing_before_it_is_loaded(live: LiveDeformables, shared: SharedScene) -> None:
+def test_new_scene_shows_nothing_before_it_is_loaded(live: Watched, shared: SharedScene) -> None:
     """Nor frames of the previous scene, in any order of arrival."""
     first, second, third = deformable_keys(live.parts)
     live.step_until_moved({first, second, third})
     address, assets = shared.store_variant(live.parts[:2], "another")
     live.session.change_scene(address, assets[1:], "new_scene")
     live.step_until(lambda: live.client.mirror.synced and live.client.mirror.scene_epoch == 2)
-    live.step_until(lambda: "unknown_asset" in live.shapes.fault)
+    live.step_until(lambda: bool(live.shapes.fault))
     assert (live.shapes.vertices, live.shapes.capture_ns, live.shapes.meshes) == ({}, {}, {})
     assert not live.client.media._feeds
     live.session.change_scene(address, assets, "")
@@ -308,20 +256,18 @@ def test_unique_names_are_kept_as_keys() -> None:
     ids=["fractions", "another length", "too large"],
 )
 def test_invalid_vertex_counts_are_a_fault(
-    shared: SharedScene, joined: list[Client], tmp_path: Path, numbers: np.ndarray
+    shared: SharedScene, watch: Callable[..., Watched], numbers: np.ndarray
 ) -> None:
     good = shared.spec.deformables[0]
     arrays = decode_arrays(shared.store.get(good.address), ArrayKind.DEFORMABLE)
     kept = [StoredArray(name, values) for name, values in arrays.items() if name != "vertex"]
     bad = encode_arrays(ArrayKind.DEFORMABLE, [*kept, StoredArray("vertex", numbers[: max(3, good.vertices)])])
-    live = shared.start_session([good, msgspec.structs.replace(good, address=shared.store.put(bad), bytes=len(bad))])
-    try:
-        client, shapes = watch(live, joined, tmp_path / "cache")
-        assert client.wait_for(lambda _: (shapes.update(), bool(shapes.fault))[1], DEADLINE_S)
-        assert "vertex" in shapes.fault or "vertices" in shapes.fault
-        assert not client.media._feeds, "nothing of it is subscribed to"
-    finally:
-        live.close()
+    live = watch([good])
+    parts = [good, msgspec.structs.replace(good, address=shared.store.put(bad), bytes=len(bad))]
+    live.session.change_scene(*shared.store_variant(parts, "bad"))
+    live.step_until(lambda: bool(live.shapes.fault))
+    assert "vert" in live.shapes.fault
+    assert live.client.media._feeds.keys() <= {good.stream}, "nothing else is subscribed to"
 
 
 def test_small_asset_that_decompresses_large_is_rejected(tmp_path: Path) -> None:
@@ -332,7 +278,7 @@ def test_small_asset_that_decompresses_large_is_rejected(tmp_path: Path) -> None
     padding = StoredArray("padding", np.zeros(MAX_ASSET_BYTES, np.uint8))
     bomb = encode_arrays(ArrayKind.DEFORMABLE, [*(StoredArray(*item) for item in arrays.items()), padding])
     assert len(bomb) < 100_000
-    with pytest.raises(AssetDecodeError, match=f"at most {MAX_ASSET_BYTES}"):
+    with pytest.raises(AssetDecodeError, match=str(MAX_ASSET_BYTES)):
         _Mesh("a", part, memoryview(bomb))
 
 

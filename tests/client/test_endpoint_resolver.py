@@ -1,295 +1,355 @@
-"""From an address, a name or a code to a session that admits the client: against a real front with its own keys."""
+"""Resolving, trusting and pairing without a network: introductions and beacons come from the test."""
 
 from __future__ import annotations
 
-import secrets
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import pytest
 import zmq
 
-from iris_session.cli.main import main
 from iris_session.client import (
-    Client,
     ClientError,
     NotConnectedError,
     RefusedError,
     SessionNameError,
     TrustError,
+    endpoint_resolver,
     key_pairing,
 )
-from iris_session.client import endpoint_resolver as meeting_module
 from iris_session.client.address import Address, pairing_uri
-from iris_session.client.discovery import request_introduction
-from iris_session.client.endpoint_resolver import parse_connect_request, resolve_blocking
+from iris_session.client.core.status import ConnectionPhase
+from iris_session.client.endpoint_resolver import (
+    Endpoint,
+    EndpointResolver,
+    SessionJoiner,
+    parse_connect_request,
+    resolve_blocking,
+)
+from iris_session.link.discovery import FoundSession
 from iris_session.protocol import pairing
 from iris_session.protocol.codec import encode_server
-from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
+from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired, Refused, ServerEnvelope
 from iris_session.security import KeyHome, KeyPair
-from tests.client.harness import LiveSession
-from tests.loopback import make_loopback_address
+from tests.client.core.test_connection import MS, Wire
+
+HOST, PORT = "10.0.0.5", 7721
+ADDRESS = f"{HOST}:{PORT}"
+NAME = "lab-1"
+CODE = "7KQ2-M4XD-9PTR"
+SERVER, OTHER = KeyPair.generate(), KeyPair.generate()
 
 
-class Lab:
-    """A session with keys, and the key home of a new user."""
+class Clock:
+    """In place of the module `time`: every look at it takes a while."""
 
-    def __init__(self, folder: Path) -> None:
-        self.server = KeyHome(folder / "server")
-        self.mine = KeyHome(folder / "mine")
-        self.name = f"lab-{secrets.token_hex(4)}"
-        self.session = LiveSession(
-            host=make_loopback_address(),  # no other test takes its ports between two sessions
-            curve=True,
-            key_home=str(folder / "server"),
-            session_name=self.name,
-            session_id=self.name,
-            beacon_port=DISCOVERY_PORT,
-        )
-        self.address = self.session.address
+    def __init__(self) -> None:
+        self.now_s = 1000.0
 
-    def code(self) -> str:
-        return self.server.join_codes.create(self.server.load_server_key())[0]
+    def monotonic(self) -> float:
+        self.now_s += 0.05
+        return self.now_s
 
-    def join(self, address: str = "", **options: str) -> Client:
-        client = Client(address, name="ann", **options)  # type: ignore[arg-type]
-        try:
-            return client.connect(30.0)
-        finally:
-            if not client.ready:
-                client.close()
+    def monotonic_ns(self) -> int:
+        return round(self.monotonic() * 1e9)
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+class Network:
+    """What a client hears: introductions by address, beacons; and what it asks.
+
+    Attributes:
+        introductions: Answers by address; without one the connection is refused.
+        heard: Sessions whose beacons are heard.
+        code: The join code that the session accepts, empty for none.
+        paired: Own keys that have paired.
+    """
+
+    def __init__(self) -> None:
+        beacon = Beacon(1, "s1", NAME, "live", HOST, PORT, PORT + 1, 0, 0, 0, "mark")
+        self.introductions: dict[str, Introduction] = {ADDRESS: Introduction(beacon, SERVER.public)}
+        self.heard = [FoundSession(NAME, ADDRESS, "s1", "live", "mark", (ADDRESS,))]
+        self.code = ""
+        self.paired: list[str] = []
+
+    def request_introduction(self, host: str, port: int, _: float) -> Generator[None, None, Introduction]:
+        yield
+        if f"{host}:{port}" not in self.introductions:
+            raise ConnectionRefusedError(111, "refused")
+        return self.introductions[f"{host}:{port}"]
+
+    def change_introduction(self, change: Callable[[Beacon], Beacon], key: str = SERVER.public) -> None:
+        self.introductions[ADDRESS] = Introduction(change(self.introductions[ADDRESS].beacon), key)
+
+    def open_listener(self) -> Network:
+        return self
+
+    def __enter__(self) -> Network:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def poll_sessions(self) -> list[FoundSession]:
+        return self.heard
+
+    def pair_key(self, _address: Address, _key: str, own: KeyPair, code: str, _: str) -> Generator[None, None, None]:
+        yield
+        if code != pairing.normalise_code(self.code or "0000-0000-0000"):
+            raise RefusedError(Refused(RefusalCode.CODE, "wrong"))
+        self.code = ""
+        self.paired.append(own.public)
 
 
 @pytest.fixture
-def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "mine"))
-    lab = Lab(tmp_path)
-    yield lab
-    lab.session.close()
+def network(monkeypatch: pytest.MonkeyPatch) -> Network:
+    network = Network()
+    for name in ("request_introduction", "open_listener", "pair_key"):
+        monkeypatch.setattr(endpoint_resolver, name, getattr(network, name))
+    monkeypatch.setattr(endpoint_resolver, "time", Clock())
+    return network
 
 
-def test_code_is_needed_once(lab: Lab) -> None:
-    with pytest.raises(RefusedError, match="iris-session pair") as refused:
-        lab.join(lab.address)
-    assert refused.value.code == RefusalCode.UNPAIRED
-    code = lab.code()
-    lab.join(lab.address, join_code=code.lower()).close()
-    (stored,) = lab.mine.known_servers.read()
-    assert (stored.address, stored.session, stored.key) == (lab.address, lab.name, lab.server.load_server_key().public)
-    assert [entry.key for entry in lab.server.clients.read().values()] == [lab.mine.load_identity().public]
-    lab.join(lab.address).close()
-    lab.join(lab.address, join_code=code).close()  # the same command again: its code is ignored now
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    return KeyHome()
 
 
-def test_uri_is_complete_and_a_name_resolves(lab: Lab) -> None:
-    host = Address.parse(lab.address)
-    lab.join(pairing_uri(host.host, host.port, lab.server.load_server_key().public, lab.code(), lab.name)).close()
-    client = lab.join(session=lab.name)
-    assert client.address == lab.address
-    client.close()
+def resolve(address: str = "", session: str = "", code: str = "", *, force_pairing: bool = False) -> Endpoint:
+    request = parse_connect_request(address, session, None, code)
+    resolver = EndpointResolver(request, force_pairing=force_pairing)
+    for _ in range(100):
+        endpoint = resolver.step()
+        if endpoint is not None:
+            return endpoint
+    resolver.close()
+    raise NotConnectedError(resolver.note)
 
 
-def test_revoked_key_pairs_again_with_a_new_code_only(lab: Lab) -> None:
-    lab.join(lab.address, join_code=lab.code()).close()
-    lab.server.clients.revoke_key(lab.mine.load_identity().fingerprint)
-    with pytest.raises(RefusedError) as refused:
-        lab.join(lab.address)
-    assert refused.value.code == RefusalCode.UNPAIRED
-    lab.join(lab.address, join_code=lab.code()).close()
+def test_code_is_needed_once(network: Network, home: KeyHome) -> None:
+    first = resolve(ADDRESS)
+    assert (first.session_id, first.session, first.store) == ("s1", NAME, True)
+    assert first.curve is not None
+    assert first.curve.server_public == SERVER.public.encode()
+    assert home.known_servers.read() == [], "not before the session has welcomed us"
+    network.code = CODE
+    resolve(ADDRESS, code=CODE.lower())
+    (stored,) = home.known_servers.read()
+    assert (stored.address, stored.session, stored.key) == (ADDRESS, NAME, SERVER.public)
+    assert network.paired == [home.load_identity().public]
+    resolve(ADDRESS)
+    resolve(ADDRESS, code=CODE)  # the same command again: its code is ignored now
+    assert len(network.paired) == 1
+    network.code = CODE
+    resolve(ADDRESS, code=CODE, force_pairing=True)
+    assert len(network.paired) == 2
+
+
+def test_uri_is_complete_and_a_name_resolves(network: Network, home: KeyHome) -> None:
+    network.code = CODE
+    resolve(pairing_uri(HOST, PORT, SERVER.public, CODE, NAME))
+    assert len(network.paired) == 1
+    found = resolve(session=NAME)
+    assert (str(found.address), found.store) == (ADDRESS, False)
+
+
+def test_wrong_code_stores_nothing(network: Network, home: KeyHome) -> None:
+    with pytest.raises(RefusedError):
+        resolve(ADDRESS, code=CODE)
+    assert home.known_servers.read() == []
+
+
+def test_changed_server_key_is_an_error(network: Network, home: KeyHome) -> None:
+    home.known_servers.pin(ADDRESS, NAME, OTHER.public)
+    for options in ({"address": ADDRESS}, {"address": ADDRESS, "code": CODE}, {"session": NAME}):
+        with pytest.raises(TrustError):
+            resolve(**options)
+    assert [one.key for one in home.known_servers.read()] == [OTHER.public]
+    home.known_servers.remove(ADDRESS)
+    with pytest.raises(TrustError):
+        resolve(pairing_uri(HOST, PORT, OTHER.public, CODE))
+
+
+def test_unknown_key_under_a_known_name_needs_a_code(network: Network, home: KeyHome) -> None:
+    home.known_servers.pin("10.0.0.7:7721", NAME, OTHER.public)
+    with pytest.raises(TrustError):
+        resolve(session=NAME)
+    network.code = CODE
+    resolve(session=NAME, code=CODE)
+
+
+def test_names_must_be_unique_and_unknown_ones_list_what_is_heard(network: Network, home: KeyHome) -> None:
+    with pytest.raises(NotConnectedError, match=rf"'no-such'.*{NAME} \({ADDRESS}\)"):
+        resolve(session="no-such")
+    with pytest.raises(NotConnectedError, match="no-such"):
+        resolve_blocking(parse_connect_request("", "no-such", None, ""), 1.0)
+    network.heard.append(FoundSession(NAME, "10.0.0.6:7721", "s2", "live", "", ("10.0.0.6:7721",)))
+    with pytest.raises(SessionNameError) as error:
+        resolve(session=NAME)
+    assert ADDRESS in str(error.value)
+    assert "10.0.0.6:7721" in str(error.value)
+
+
+def test_introduction_of_another_session_is_no_answer(network: Network, home: KeyHome) -> None:
+    network.change_introduction(lambda beacon: msgspec.structs.replace(beacon, session_id="other"))
+    with pytest.raises(SessionNameError):
+        resolve(session=NAME)
+    home.known_servers.pin(ADDRESS, NAME, SERVER.public)
+    network.change_introduction(lambda beacon: msgspec.structs.replace(beacon, control=PORT + 1), OTHER.public)
+    endpoint = resolve(ADDRESS)
+    assert endpoint.curve is not None
+    assert (endpoint.session_id, endpoint.curve.server_public) == ("", SERVER.public.encode()), "by the stored key"
+
+
+def test_unknown_session_is_awaited_and_a_local_one_needs_no_keys(network: Network, home: KeyHome) -> None:
+    introduction = network.introductions.pop(ADDRESS)
+    with pytest.raises(NotConnectedError, match=str(PORT - 1)):
+        resolve(ADDRESS)
+    resolver = EndpointResolver(parse_connect_request(ADDRESS, "", None, ""))
+    assert all(resolver.step() is None for _ in range(20))
+    network.introductions[ADDRESS] = introduction
+    assert any(resolver.step() is not None for _ in range(20))
+    (local,) = {resolve(), resolve("127.0.0.1", code=CODE)}
+    assert (str(local.address), local.curve, local.store) == ("127.0.0.1:7721", None, False)
+    assert network.paired == []
+
+
+@pytest.mark.parametrize(
+    "arguments", [("127.0.0.1:1", "lab", None, ""), ("", "lab", object(), ""), (ADDRESS, "", None, "ABC")]
+)
+def test_contradicting_arguments_are_rejected(arguments: Any) -> None:
+    with pytest.raises(ClientError):
+        parse_connect_request(*arguments)
+
+
+# --- joining ----------------------------------------------------------------------------------------------------------
+
+
+class Joining:
+    """A joiner with a connection whose messages come from the test."""
+
+    def __init__(self, address: str, code: str = "") -> None:
+        self.wire = Wire()
+        self.connection = self.wire.connection
+        self.targets: list[tuple[str, int, Any]] = []
+        sockets: Any = SimpleNamespace(set_target=lambda *target: self.targets.append(target))
+        self.joiner = SessionJoiner(parse_connect_request(address, "", None, code), self.connection, sockets)
+        self.joiner.begin()
+        self.resolve()
+
+    def resolve(self) -> None:
+        for _ in range(50):
+            self.joiner.step()
+            if not self.joiner.is_resolving:
+                return
+        raise AssertionError(self.joiner.describe_failure("now"))
+
+    def refuse(self, code: str) -> None:
+        self.wire.receive(Refused(code, "no"), MS)
+        self.joiner.check_answer()
+
+
+def test_welcome_of_the_introduced_session_stores_its_key(network: Network, home: KeyHome) -> None:
+    joining = Joining(ADDRESS)
+    assert [target[:2] for target in joining.targets] == [(HOST, PORT)]
+    assert (joining.joiner.address, joining.connection.phase) == (ADDRESS, ConnectionPhase.JOINING)
+    joining.wire.welcome(MS)
+    joining.joiner.check_answer()
+    assert joining.connection.failure is None
+    assert [one.key for one in home.known_servers.read()] == [SERVER.public]
+
+
+def test_welcome_of_another_session_is_an_error(network: Network, home: KeyHome) -> None:
+    joining = Joining(ADDRESS)
+    joining.wire.welcome(MS, session="s2")
+    joining.joiner.check_answer()
+    assert isinstance(joining.connection.failure, SessionNameError)
+    assert joining.connection.phase is ConnectionPhase.REFUSED
+    assert home.known_servers.read() == []
 
 
 @pytest.mark.parametrize("form", ["code", "uri"])
-def test_emulated_headsets_pair_again_after_a_revocation(
-    lab: Lab, form: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lab.join(lab.address, join_code=lab.code()).close()
-    lab.server.clients.revoke_key(lab.mine.load_identity().fingerprint)
-    host = Address.parse(lab.address)
-    uri = pairing_uri(host.host, host.port, lab.server.load_server_key().public, lab.code(), lab.name)
-    where = [lab.address, "--code", lab.code()] if form == "code" else [uri]
-    options = ["--behaviour", "observer", "--count", "2", "--seconds", "5", "--join-timeout", "30"]
-    assert main(["emulate", *where, *options]) == 0, capsys.readouterr()
-    assert [one.key for one in lab.server.clients.read().values()] == [lab.mine.load_identity().public]
+def test_revoked_key_pairs_again_once(network: Network, home: KeyHome, form: str) -> None:
+    home.known_servers.pin(ADDRESS, NAME, SERVER.public)
+    network.code = CODE
+    uri = pairing_uri(HOST, PORT, SERVER.public, CODE)
+    joining = Joining(ADDRESS, CODE) if form == "code" else Joining(uri)
+    assert network.paired == []
+    joining.refuse(RefusalCode.UNPAIRED)
+    assert joining.joiner.is_resolving
+    joining.resolve()
+    assert len(network.paired) == 1
+    joining.refuse(RefusalCode.UNPAIRED)
+    assert not joining.joiner.is_resolving
+    assert joining.connection.phase is ConnectionPhase.REFUSED
 
 
-def test_wrong_code_stores_nothing(lab: Lab) -> None:
-    lab.code()
-    with pytest.raises(RefusedError) as refused:
-        lab.join(lab.address, join_code="0000-0000-0000")
-    assert refused.value.code == RefusalCode.CODE
-    assert lab.mine.known_servers.read() == []
-    with pytest.raises(ClientError, match="join code"):
-        Client(lab.address, join_code="ABC")
+def test_refusal_without_a_code_is_final(network: Network, home: KeyHome) -> None:
+    joining = Joining(ADDRESS)
+    joining.refuse(RefusalCode.UNPAIRED)
+    assert isinstance(joining.connection.failure, RefusedError)
+    assert not joining.joiner.is_resolving
 
 
-def test_changed_server_key_is_an_error(lab: Lab) -> None:
-    other = KeyPair.generate().public
-    lab.mine.known_servers.pin(lab.address, lab.name, other)
-    for options in ({}, {"join_code": lab.code()}):
-        with pytest.raises(TrustError, match="keys forget"):
-            lab.join(lab.address, **options)
-    with pytest.raises(TrustError, match="keys forget"):
-        lab.join(session=lab.name)
-    assert [one.key for one in lab.mine.known_servers.read()] == [other]
-    lab.mine.known_servers.remove(lab.address)
-    host = Address.parse(lab.address)
-    with pytest.raises(TrustError, match="with the key"):
-        lab.join(pairing_uri(host.host, host.port, other, lab.code()))
+# --- pairing over a socket --------------------------------------------------------------------------------------------
 
 
-def test_unknown_key_under_a_known_name_needs_a_code(lab: Lab) -> None:
-    lab.mine.known_servers.pin("10.0.0.7:7721", lab.name, KeyPair.generate().public)
-    with pytest.raises(TrustError, match="another key"):
-        lab.join(session=lab.name)
-    lab.join(session=lab.name, join_code=lab.code()).close()
-
-
-def test_two_sessions_of_one_name_need_an_address(lab: Lab) -> None:
-    twin = LiveSession(session_name=lab.name, session_id=f"twin of {lab.name}", beacon_port=DISCOVERY_PORT)
-    try:
-        with pytest.raises(SessionNameError) as error:
-            lab.join(session=lab.name)
-        assert lab.address in str(error.value)
-        assert twin.address in str(error.value)
-    finally:
-        twin.close()
-
-
-def test_unknown_name_lists_the_sessions_heard(lab: Lab) -> None:
-    with pytest.raises(NotConnectedError, match=rf"'no-such'.*{lab.name} \({lab.address}\)"):
-        resolve_blocking(parse_connect_request("", "no-such", None, ""), 2.0)
-    client = Client(session="no-such")
-    with pytest.raises(NotConnectedError, match="was not heard"):
-        client.connect(0.3)
-    client.close()
-
-
-Ask = Callable[[str, int, float], Generator[None, None, Introduction]]
-
-
-def introduce_as(change: Callable[[Introduction], Introduction]) -> Ask:
-    """Return an `ask_introduction` with another answer, as of another program below the control port."""
-
-    def ask(host: str, port: int, timeout_s: float) -> Generator[None, None, Introduction]:
-        return change((yield from request_introduction(host, port, timeout_s)))
-
-    return ask
-
-
-def test_admitting_session_must_be_the_introduced_one(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    lab.join(lab.address, join_code=lab.code()).close()
-
-    def other_id(message: Introduction) -> Introduction:
-        return msgspec.structs.replace(message, beacon=msgspec.structs.replace(message.beacon, session_id="other"))
-
-    monkeypatch.setattr(meeting_module, "request_introduction", introduce_as(other_id))
-    with pytest.raises(SessionNameError, match="another introduced itself"):
-        lab.join(lab.address)
-    with pytest.raises(SessionNameError, match="heard there"):
-        lab.join(session=lab.name)
-
-
-def test_introduction_for_another_port_is_ignored(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    lab.join(lab.address, join_code=lab.code()).close()
-
-    def other_port(message: Introduction) -> Introduction:
-        beacon = msgspec.structs.replace(message.beacon, control=message.beacon.control + 1, session_id="other")
-        return Introduction(beacon, KeyPair.generate().public)
-
-    monkeypatch.setattr(meeting_module, "request_introduction", introduce_as(other_port))
-    lab.join(lab.address).close()  # by the stored key
-
-
-def test_session_must_prove_the_code_too(tmp_path: Path) -> None:
-    server, own = KeyPair.generate(), KeyPair.generate()
+@pytest.fixture
+def router(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[zmq.Socket[bytes], Address]]:
+    """The control socket of a session, with its address."""
+    monkeypatch.setattr(key_pairing, "PAIR_RETRY_S", 0.001)
+    monkeypatch.setattr(key_pairing, "ANSWER_S", 0.2)
+    monkeypatch.setattr(pairing, "ITERATIONS", 1)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    impostor = context.socket(zmq.ROUTER)
-    impostor.curve_server = True
-    impostor.curve_publickey, impostor.curve_secretkey = server.public.encode(), server.secret.encode()
-    port = impostor.bind_to_random_port("tcp://127.0.0.1")
-
-    def say_yes() -> None:
-        route, _ = impostor.recv_multipart()
-        impostor.send_multipart([route, encode_server(ServerEnvelope(1, 0, Paired(bytes(32))))])
-
-    thread = threading.Thread(target=say_yes)
-    thread.start()
-    steps = key_pairing.pair_key(Address("127.0.0.1", port), server.public, own, "7KQ2-M4XD-9PTR", "ann")
-    with pytest.raises(TrustError, match="join code"):
-        deque(steps, maxlen=0)
-    thread.join()
+    router = context.socket(zmq.ROUTER)
+    router.curve_server = True
+    router.curve_publickey, router.curve_secretkey = SERVER.public.encode(), SERVER.secret.encode()
+    yield router, Address("127.0.0.1", router.bind_to_random_port("tcp://127.0.0.1"))
     context.destroy(linger=0)
 
 
-def test_busy_pairing_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As when a class puts on its headsets: the code need not be typed again."""
-    monkeypatch.setattr(key_pairing, "PAIR_RETRY_S", 0.01)
-    monkeypatch.setattr(key_pairing, "ANSWER_S", 1.0)
-    monkeypatch.setattr(pairing, "ITERATIONS", 1)
-    server, own, code = KeyPair.generate(), KeyPair.generate(), "7KQ2-M4XD-9PTR"
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    session = context.socket(zmq.ROUTER)
-    session.curve_server = True
-    session.curve_publickey, session.curve_secretkey = server.public.encode(), server.secret.encode()
-    port = session.bind_to_random_port("tcp://127.0.0.1")
-    proof = pairing.make_server_proof(pairing.stretch_code(code, server.raw_public), server.raw_public, own.raw_public)
-    busy, yes = Refused(RefusalCode.RATE, "many pair at once", "try again in a second"), Paired(proof)
-    asked: list[bytes] = []
+def pair(router: zmq.Socket[bytes], address: Address, own: KeyPair, *answers: Paired | Refused | None) -> list[bytes]:
+    """Pair with a session that gives these answers, `None` for silence; return the requests."""
+    requests: list[bytes] = []
 
     def answer() -> None:
-        for message in (busy, None, busy, yes):
-            route, request = session.recv_multipart()
-            asked.append(request)
+        for message in answers:
+            route, request = router.recv_multipart()
+            requests.append(request)
             if message is not None:
-                session.send_multipart([route, encode_server(ServerEnvelope(1, 0, message))])
+                router.send_multipart([route, encode_server(ServerEnvelope(1, 0, message))])
 
-    thread = threading.Thread(target=answer, daemon=True)
+    thread = threading.Thread(target=answer)
     thread.start()
-    deque(key_pairing.pair_key(Address("127.0.0.1", port), server.public, own, code, "ann"), maxlen=0)
-    thread.join()
-    assert len(asked) == 4
-    assert len(set(asked)) == 1
-    context.destroy(linger=0)
-
-
-def test_local_session_needs_no_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "mine"))
-    plain = LiveSession()
     try:
-        with Client(plain.address, name="ann", join_code="7KQ2-M4XD-9PTR"):
-            pass
+        deque(key_pairing.pair_key(address, SERVER.public, own, CODE, "ann"), maxlen=0)
     finally:
-        plain.close()
-    assert not (tmp_path / "mine").exists()
+        thread.join()
+    return requests
 
 
-def test_client_may_start_before_its_session(lab: Lab) -> None:
-    lab.join(lab.address, join_code=lab.code()).close()
-    port = Address.parse(lab.address).port
-    lab.session.close()
-    client = Client(lab.address, name="ann")
-    try:
-        client.open()
-        client.wait_for(lambda c: False, 0.5)
-        assert not client.ready
-        lab.session = LiveSession(
-            host=Address.parse(lab.address).host,
-            curve=True,
-            key_home=str(lab.server.path),
-            control_port=port,
-            session_name="later",
-            session_id="s2",
-        )
-        assert client.wait_for(lambda c: c.ready)
-    finally:
-        client.close()
+def test_session_must_prove_the_code_too(router: tuple[zmq.Socket[bytes], Address]) -> None:
+    with pytest.raises(TrustError):
+        pair(*router, KeyPair.generate(), Paired(bytes(32)))
+    with pytest.raises(RefusedError):
+        pair(*router, KeyPair.generate(), Refused(RefusalCode.CODE, "used"))
 
 
-def test_contradicting_arguments_are_rejected() -> None:
-    with pytest.raises(ClientError, match="not both"):
-        Client("127.0.0.1:1", session="lab")
+def test_busy_pairing_is_retried(router: tuple[zmq.Socket[bytes], Address]) -> None:
+    """As when a class puts on its headsets: the code need not be typed again."""
+    own = KeyPair.generate()
+    secret = pairing.stretch_code(CODE, SERVER.raw_public)
+    proof = pairing.make_server_proof(secret, SERVER.raw_public, own.raw_public)
+    busy = Refused(RefusalCode.RATE, "many pair at once", "try again in a second")
+    requests = pair(*router, own, busy, None, busy, Paired(proof))
+    assert len(requests) == 4
+    assert len(set(requests)) == 1

@@ -1,144 +1,111 @@
-"""Media of a client: subscriptions, drops, sources, and misuse."""
+"""Media of a client: subscriptions, drops, sources, and misuse. Levels and budgets are decided in the front."""
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import zmq
 
 from iris_session.client import Client, InvalidMessageError, NotConnectedError
 from iris_session.client.sockets import ClientSockets
-from tests.client.harness import LiveSession
+from iris_session.protocol.media import StreamBudget
+from iris_session.protocol.names import BudgetClass
+from iris_session.protocol.status import ClientReport, DeliveryBudget
+from tests.client.session import ClientSession
 
-DEADLINE_S = 30.0
-
-
-@pytest.fixture
-def cloud(session: LiveSession) -> Iterator[threading.Event]:
-    """The session publishes `cloud` until this is set."""
-    stop = threading.Event()
-
-    def publish() -> None:
-        while not stop.wait(0.01):
-            session.front.publish_media("cloud", b"points", session.now_ns, 1, "bytes")
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    yield stop
-    stop.set()
-    thread.join()
+Join = Callable[..., Client]
 
 
-@pytest.mark.usefixtures("cloud")
-def test_newest_frame_is_delivered_once(join: Callable[..., Client]) -> None:
+def test_newest_frame_is_delivered_once(session: ClientSession, join: Join) -> None:
     ann = join()
-    assert ann.wait_for(lambda one: one.clock_error_ns() < 20_000_000, DEADLINE_S)
     feed = ann.media.subscribe("cloud")
     assert ann.media.subscribe("cloud") is feed
-    assert ann.wait_for(lambda _: feed.received >= 3, DEADLINE_S)
+    ann.sleep(0.1)
+    for data in (b"old", b"points"):
+        session.publish_media("cloud", data)
+    ann.poll()
     frame = feed.pop_newest()
     assert frame is not None
-    assert (frame.data, frame.header.stream, feed.budget_class) == (b"points", "cloud", "full")
+    assert (frame.data, frame.header.stream, feed.budget_class) == (b"points", "cloud", BudgetClass.FULL)
+    assert (feed.received, feed.superseded) == (2, 1)
     assert frame is feed.newest
-    assert -20_000_000 < frame.age_ns < DEADLINE_S * 1e9  # negative only by the error of the clock
+    assert abs(frame.age_ns) < ann.clock_error_ns()
     assert feed.pop_newest() is None
-    assert ann.wait_for(lambda _: feed.pop_newest() is not None, DEADLINE_S)
-    assert ann.wait_for(lambda one: bool(one.media.delivery and one.media.delivery.streams), DEADLINE_S)
+    session.publish_media("other", b"")
+    session.publish_media("cloud", b"next")
+    ann.poll()
+    assert (feed.received, feed.pop_newest() is feed.newest) == (3, True)
     ann.media.unsubscribe("cloud")
     assert ann.media.subscribe("cloud") is not feed
 
 
-@pytest.mark.usefixtures("cloud")
-def test_only_the_polling_thread_uses_the_socket(join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_subscriptions_survive_a_restart_of_the_front(session: ClientSession, join: Join) -> None:
     ann = join()
-    touched: list[tuple[str, threading.Thread]] = []
-    sockets = ann._sockets
-    real = {name: getattr(sockets, name) for name in ("subscribe_media", "unsubscribe_media")}
+    feed = ann.media.subscribe("cloud")
+    ann.sleep(0.1)
+    before = session.sockets_of(ann).topics.copy()
+    session.kill_front()
+    assert ann.wait_for(lambda c: not c.ready)
+    assert ann.wait_for(lambda c: c.ready)
+    ann.sleep(0.1)
+    after = session.sockets_of(ann).topics
+    assert len(before) == len(after) == 1
+    assert before != after, "topics name the connection"
+    session.publish_media("cloud", b"points")
+    ann.poll()
+    assert feed.received == 1
 
-    def watched(name: str) -> Callable[..., None]:
-        def call(*arguments: object) -> None:
-            touched.append((name, threading.current_thread()))
-            real[name](*arguments)
 
-        return call
-
-    for name in real:
-        monkeypatch.setattr(sockets, name, watched(name))
-    ann.start()
+def test_budget_of_the_session_and_limit_of_the_client_are_reported(session: ClientSession, join: Join) -> None:
+    session.budget = DeliveryBudget(BudgetClass.HALF, reason="client", streams=(StreamBudget("cloud", "quarter"),))
+    ann = join()
     cloud, depth = ann.media.subscribe("cloud"), ann.media.subscribe("depth")
-    assert ann.wait_for(lambda _: cloud.received >= 1, DEADLINE_S)
-    assert ann.wait_for(lambda one: "depth" in one.media._subscribed, DEADLINE_S)  # else there is nothing to end
-    ann.media.unsubscribe("depth")
-    assert ann.wait_for(lambda _: "unsubscribe_media" in dict(touched), DEADLINE_S)
-    assert {thread for _, thread in touched} == {ann._loop._thread}
-    assert depth.newest is None
+    ann.sleep(0.1)
+    assert (cloud.budget_class, depth.budget_class) == (BudgetClass.QUARTER, BudgetClass.HALF)
+    assert ann.media.delivery == session.budget
+    ann.media.limit_mbit_per_s = 0.5
+    ann.media.extend_report(ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0), session.simulation.now_ns)
+    for _ in range(3):
+        session.publish_media("cloud", bytes(1000), capture_ns=session.now_ns - 30_000_000)
+        ann.poll()
+    report = ann.media.extend_report(ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0), session.simulation.now_ns)
+    assert report.media_limit_mbit_per_s == 0.5
+    assert report.media_age_ms == pytest.approx(30.0, abs=ann.clock_error_ns() * 1e-6)
+    assert report.media_bytes_per_s > 3000.0
 
 
-@pytest.mark.usefixtures("cloud")
-def test_subscriptions_survive_a_restart_of_the_front(session: LiveSession, join: Callable[..., Client]) -> None:
-    ann = join()
-    feed = ann.media.subscribe("cloud")
-    assert ann.wait_for(lambda _: feed.received >= 1, DEADLINE_S)
-    generation, newest = ann.connection.generation, feed.newest
-    assert newest is not None
-    session.front._process.kill()  # type: ignore[union-attr]
-    assert ann.wait_for(lambda one: one.connection.generation > generation and one.ready, DEADLINE_S)
-    received = feed.received
-    assert ann.wait_for(lambda _: feed.received > received, DEADLINE_S)
-    assert feed.newest is not None
-    assert feed.newest.header.seq > newest.header.seq
-
-
-@pytest.mark.usefixtures("cloud")
-def test_level_limit_of_the_client_applies(join: Callable[..., Client]) -> None:
-    ann = join()
-    feed = ann.media.subscribe("cloud")
-    assert ann.wait_for(lambda _: feed.received >= 1, DEADLINE_S)
-    ann.media.limit_mbit_per_s = 0.0001
-    assert ann.wait_for(lambda _: feed.budget_class == "none", DEADLINE_S)
-    assert ann.media.delivery is not None
-    assert "client" in ann.media.delivery.reason
-
-
-def test_invalid_stream_names_are_rejected(join: Callable[..., Client]) -> None:
-    ann = join(connect=False)
+def test_invalid_stream_names_are_rejected(session: ClientSession) -> None:
+    ann = session.make_client()
     for name in ("", "a/b", "-a", "x" * 49, "ä"):
-        with pytest.raises(InvalidMessageError, match="media stream"):
+        with pytest.raises(InvalidMessageError):
             ann.media.subscribe(name)
     with pytest.raises(NotConnectedError):
         ann.media.publish("cloud", b"")
     ann.connect()
-    with pytest.raises(InvalidMessageError, match="has class 'full'"):
+    with pytest.raises(InvalidMessageError, match="full"):
         ann.media.publish("cloud", {"half": b""})
 
 
-def test_source_publishes_frames(join: Callable[..., Client]) -> None:
-    camera, ann = join("cam", role="camera"), join("ann")
-    feed = ann.media.subscribe("depth")
-
-    def comes(_: Client) -> bool:
-        camera.media.publish("depth", {"full": b"all", "half": b"less"}, capture_ns=5)
-        camera.poll()
-        return feed.received > 0
-
-    assert ann.wait_for(comes, DEADLINE_S)
-    assert feed.newest is not None
-    assert (feed.newest.data, feed.newest.header.capture_ns) == (b"all", 5)
+def test_source_publishes_frames(session: ClientSession, join: Join) -> None:
+    camera = join("cam", role="camera")
+    assert camera.media.publish("depth", {"full": b"all", "half": b"less"}, capture_ns=5)
+    ((stream, frames),) = session.sockets_of(camera).published
+    assert (stream, frames[1:]) == ("depth", [b"all", b"less"])
 
 
-@pytest.mark.usefixtures("cloud")
-def test_frames_of_an_unsubscribed_stream_are_late_and_not_malformed(join: Callable[..., Client]) -> None:
+def test_frames_of_an_unsubscribed_stream_are_late_and_not_malformed(session: ClientSession, join: Join) -> None:
     ann = join()
-    feed = ann.media.subscribe("cloud")
-    assert ann.wait_for(lambda _: feed.received >= 3, DEADLINE_S)
-    assert ann._sockets._media is not None
-    assert ann._sockets._media.poll(30_000)  # one has arrived already
+    ann.media.subscribe("cloud")
+    ann.sleep(0.1)
+    session.publish_media("cloud", b"points")
     ann.media.unsubscribe("cloud")
-    assert ann.wait_for(lambda one: one.media.late > 0, DEADLINE_S)
-    assert ann.media.malformed == 0
+    ann.poll()
+    assert (ann.media.late, ann.media.malformed) == (1, 0)
+    session.sockets_of(ann)._media += [[b"topic", b"\xc1", b""], [b"topic"]]
+    ann.poll()
+    assert (ann.media.late, ann.media.malformed) == (1, 2)
 
 
 @pytest.mark.parametrize("streams", [1, 8])
@@ -152,7 +119,7 @@ def test_source_queues_two_frames_of_each_stream(streams: int) -> None:
         sockets = ClientSockets()
         sockets.set_target("127.0.0.1", 0, None)
         frame = bytes(4 << 20)  # more than the system buffers
-        deadline = time.monotonic() + DEADLINE_S
+        deadline = time.monotonic() + 30.0
         while not sockets.send_media(port, "0", [frame]):
             assert time.monotonic() < deadline
         taken = [sockets.send_media(port, str(i % streams), [frame]) for i in range(2 * streams + 16)]

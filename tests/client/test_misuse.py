@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -20,8 +17,7 @@ from iris_session.protocol.codec import decode_client
 from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.names import FaultCode, SampleKind
 from iris_session.protocol.server_messages import ProtocolFault
-from tests.client.conftest import DEADLINE_S
-from tests.client.harness import LiveSession
+from tests.client.session import ClientSession
 
 Join = Callable[..., Client]
 HERE: PoseTuple = ((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
@@ -40,60 +36,59 @@ def test_any_estop_reason_fits_the_protocol(reason: object) -> None:
 
 
 def assert_no_faults(client: Client) -> None:
-    """Check that the front found no fault; stalls are of a busy machine."""
-    assert client.connection.counters.faults.keys() <= {FaultCode.STALLED, FaultCode.RECOVERED}
+    """Check that the front found no fault."""
+    assert client.connection.counters.faults == {}
 
 
-def test_estop_with_a_numeric_reason_stops(session: LiveSession, join: Join) -> None:
+def test_estop_with_a_numeric_reason_stops(session: ClientSession, join: Join) -> None:
     ann = join()
     ann.estop(5)
     assert ann.wait_for(lambda c: c.mirror.estop)
     assert_no_faults(ann)
 
 
-def test_invalid_requests_raise_at_once_and_name_the_field(session: LiveSession, join: Join) -> None:
+def test_invalid_requests_raise_at_once_and_name_the_field(session: ClientSession, join: Join) -> None:
     ann = join(role="director")
     calls: list[tuple[str, Callable[[], object]]] = [
-        (r"robots: .*names", lambda: ann.acquire([5])),  # type: ignore[list-item]
-        (r"robots: .*names", lambda: ann.acquire(5)),  # type: ignore[arg-type]
-        (r"ticks: .*int", lambda: ann.control("step", "ten")),  # type: ignore[arg-type]
-        (r"ticks: .*>= 0", lambda: ann.control("step", -1)),
-        (r"text: .*512", lambda: ann.marker("x" * 600)),
-        (r"robots\[0\]: .*64", lambda: ann.acquire(["x" * 65])),
-        (r"release: .*names", lambda: ann.release(["left"])),  # type: ignore[arg-type]
-        (r"Marker.*text: .*surrog|Marker.*text: str", lambda: ann.marker("\ud800")),
-        (r"T_world_tracking: .*\(x, y, z\)", lambda: ann.alignment.place("p1", (1.0, 2.0))),  # type: ignore[arg-type]
+        ("robots", lambda: ann.acquire([5])),  # type: ignore[list-item]
+        ("robots", lambda: ann.acquire(5)),  # type: ignore[arg-type]
+        ("ticks", lambda: ann.control("step", "ten")),  # type: ignore[arg-type]
+        ("ticks", lambda: ann.control("step", -1)),
+        ("text", lambda: ann.marker("x" * 600)),
+        (r"robots\[0\]", lambda: ann.acquire(["x" * 65])),
+        ("release", lambda: ann.release(["left"])),  # type: ignore[arg-type]
+        ("text", lambda: ann.marker("\ud800")),
+        ("T_world_tracking", lambda: ann.alignment.place("p1", (1.0, 2.0))),  # type: ignore[arg-type]
     ]
-    sent = ann.connection.counters.sent
-    started = time.monotonic()
-    for text, call in calls:
-        with pytest.raises(InvalidMessageError, match=text) as raised:
+    sent, began_ns = ann.connection.counters.sent, session.now_ns
+    for field, call in calls:
+        with pytest.raises(InvalidMessageError, match=field) as raised:
             call()
         assert isinstance(raised.value, ClientError)
         assert isinstance(raised.value, ValueError)
         assert "\n" not in str(raised.value)
-    assert time.monotonic() - started < 0.8 * DEADLINE_S  # none of them waited for its timeout
-    assert ann.connection.counters.sent - sent < len(calls)
+    assert session.now_ns == began_ns, "none of them waited"
+    assert ann.connection.counters.sent == sent
     assert ann.acquire("left")[0].target == "left"
 
 
-def test_invalid_samples_raise_at_once_and_name_the_field(session: LiveSession, join: Join) -> None:
+def test_invalid_samples_raise_at_once_and_name_the_field(session: ClientSession, join: Join) -> None:
     ann = join(devices="target")
     assert ann.connection.hello.devices == ("target",)
     bad: list[tuple[str, tuple[object, ...], dict[str, object]]] = [
-        ("gripper: .*float", ("target", HERE), {"gripper": "closed"}),
-        (r"pose: expected \(\(x, y, z\), \(w, x, y, z\)\), got str", ("target", "up"), {}),
-        ("pose: expected .*length 7", ("target", [1, 2, 3, 1, 0, 0, 0]), {}),
-        (r"pose: expected .*shape \(7,\)", ("target", np.zeros(7)), {}),
-        ("pose: expected", ("target", ((1, 2), (1, 0, 0, 0))), {}),
-        ("pose: expected", ("target", ((1, 2, None), (1, 0, 0, 0))), {}),
-        ("twist: expected 6 numbers.*length 3", ("target",), {"twist": (1, 2, 3)}),
-        ("q: expected numbers", ("joints",), {"q": ["a"]}),
-        ("q: expected numbers", ("joints",), {"q": 5}),
-        ("clutch: .*bool", ("target", HERE), {"clutch": "yes"}),
+        ("gripper", ("target", HERE), {"gripper": "closed"}),
+        ("pose", ("target", "up"), {}),
+        ("pose", ("target", [1, 2, 3, 1, 0, 0, 0]), {}),
+        ("pose", ("target", np.zeros(7)), {}),
+        ("pose", ("target", ((1, 2), (1, 0, 0, 0))), {}),
+        ("pose", ("target", ((1, 2, None), (1, 0, 0, 0))), {}),
+        ("twist", ("target",), {"twist": (1, 2, 3)}),
+        ("q", ("joints",), {"q": ["a"]}),
+        ("q", ("joints",), {"q": 5}),
+        ("clutch", ("target", HERE), {"clutch": "yes"}),
         ("device", (5, HERE), {}),
-        ("robots: no robot 'lift'.*left, right", ("target", HERE), {"robots": "lift"}),
-        ("objects: no object 'axe'.*hammer", ("target", HERE), {"objects": ["axe"]}),
+        ("robots: .*lift.*left, right", ("target", HERE), {"robots": "lift"}),
+        ("objects: .*axe.*hammer", ("target", HERE), {"objects": ["axe"]}),
     ]
     for text, arguments, fields in bad:
         with pytest.raises(InvalidMessageError, match=text) as raised:
@@ -104,7 +99,7 @@ def test_invalid_samples_raise_at_once_and_name_the_field(session: LiveSession, 
     assert_no_faults(ann)
 
 
-def test_arrays_and_numpy_scalars_are_accepted(session: LiveSession, join: Join) -> None:
+def test_arrays_and_numpy_scalars_are_accepted(session: ClientSession, join: Join) -> None:
     ann = join(devices=("target", "joints"))
     p, q = np.array([0.1, 0.2, 0.3], dtype=np.float32), np.array([1, 0, 0, 0])
     assert ann.send_sample("target", (p, q), clutch=np.bool_(True), gripper=np.float32(0.5), buttons=np.int64(3))
@@ -113,16 +108,15 @@ def test_arrays_and_numpy_scalars_are_accepted(session: LiveSession, join: Join)
     assert (sample.q, sample.qd) == ((0.5, 1.0), (0.0, 0.0))
     assert ann.make_sample("target", twist=np.arange(6)).twist == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
     ann.alignment.observe("table", (p, q))
-    assert ann.wait_for(lambda c: len(session.messages_of(Sample)) == 2)
-    taken = session.messages_of(Sample)[0].message
-    assert isinstance(taken, Sample)
+    assert ann.wait_for(lambda c: bool(session.messages_of(Sample)))
+    taken = session.messages_of(Sample)[0]
     assert taken.pose is not None
     assert taken.pose.p == pytest.approx(HERE[0])
     assert (taken.clutch, taken.gripper, taken.buttons) == (True, 0.5, 3)
     assert_no_faults(ann)
 
 
-def test_kind_of_sample_follows_from_its_arguments(session: LiveSession, join: Join) -> None:
+def test_kind_of_sample_follows_from_its_arguments(session: ClientSession, join: Join) -> None:
     ann = join()
     assert ann.make_sample("target", HERE).kind == SampleKind.POSE
     assert ann.make_sample("joints", q=(1.0,)).kind == SampleKind.JOINTS
@@ -131,7 +125,7 @@ def test_kind_of_sample_follows_from_its_arguments(session: LiveSession, join: J
     assert ann.make_sample("target", HERE, q=(1.0,), kind=SampleKind.POSE).kind == SampleKind.POSE
 
 
-def test_single_name_and_foreign_robots(session: LiveSession, join: Join) -> None:
+def test_single_name_and_foreign_robots(session: ClientSession, join: Join) -> None:
     ann = join()
     assert ann.make_sample("target", HERE, robots="left").targets == ()
     assert ann.counters()["control"]["samples_without_lease"] == 1
@@ -142,76 +136,61 @@ def test_single_name_and_foreign_robots(session: LiveSession, join: Join) -> Non
     assert to_names("robots", (n for n in ("a", "b"))) == ("a", "b")
 
 
-def test_fault_ends_the_wait_for_an_answer(session: LiveSession, join: Join) -> None:
+def test_fault_ends_the_wait_for_an_answer(session: ClientSession, join: Join) -> None:
     ann = join()
-    session.pause_steps(True)  # no answer arrives
+    session.paused = True  # no answer arrives
     ann.connection.last_protocol_fault = ProtocolFault(FaultCode.MALFORMED, "an older one")
-    sent: list[bool] = []
-
-    def send_fault(_: Client) -> bool:
-        if not sent:
-            sent.append(True)
-            ann.connection._process_fault(
-                ProtocolFault(FaultCode.MALFORMED, "acquire: robots is wrong"), time.monotonic_ns()
-            )
-        return False
-
-    polling, ann.poll = ann.poll, lambda timeout_s=0.0: send_fault(ann) or polling(min(timeout_s, 0.01))  # type: ignore[method-assign]
+    fault = ProtocolFault(FaultCode.MALFORMED, "acquire: robots is wrong")
+    at_ns = session.simulation.now_ns + 100_000_000
+    send = session.sockets_of(ann).send_to_client
+    session.simulation.call_at(at_ns, lambda: send(fault, ann.connection.connection_epoch))
     with pytest.raises(InvalidMessageError, match="acquire: robots"):
         ann.request(Acquire(0, ("left",)), timeout_s=30.0)
-    session.pause_steps(False)
+    assert session.simulation.now_ns < at_ns + 10_000_000
 
 
-def test_stalled_or_dead_session_is_visible(session: LiveSession, join: Join) -> None:
+def test_stalled_or_dead_session_is_visible(session: ClientSession, join: Join) -> None:
+    assert session.make_client().scene.data_age_ns() is None, "before the first state"
     ann = join(role="agent", devices="target")
     ann.acquire("left")
     assert ann.wait_for(lambda c: c.scene.state is not None and "left" in c.feedback)
-    assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 0) < 100_000_000)
-    session.pause_steps(True)
-    assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 0) > 400_000_000)
+    assert (ann.scene.data_age_ns() or 0) < 100_000_000
+    session.paused = True
+    ann.sleep(0.4)
+    assert (ann.scene.data_age_ns() or 0) > 350_000_000
     assert ann.ready
-    os.kill(session.front.pid, signal.SIGKILL)
+    session.kill_front()
     assert ann.wait_for(lambda c: not c.ready)
     assert ann.feedback == {}
     before = ann.scene.data_age_ns()
-    assert before is not None
     ann.sleep(0.05)
-    assert (ann.scene.data_age_ns() or 0) >= before + 50_000_000
-    session.pause_steps(False)
+    assert (ann.scene.data_age_ns() or 0) >= (before or 0) + 49_000_000
+    session.paused = False
     assert ann.wait_for(lambda c: c.ready and "left" in c.feedback)
-    assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 10**9) < 200_000_000)
+    assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 10**9) < 100_000_000)
 
 
-def test_age_is_undefined_before_the_first_state(session: LiveSession, join: Join) -> None:
-    assert join(connect=False).scene.data_age_ns() is None
-
-
-@pytest.mark.parametrize("threaded", [False, True])
-def test_sleep_polls_for_the_whole_time(session: LiveSession, join: Join, threaded: bool) -> None:
+def test_sleep_polls_for_the_whole_time(session: ClientSession, join: Join) -> None:
     states: list[object] = []
     ann = join(on_state=states.append)
-    ann.start() if threaded else None
-    assert ann.wait_for(lambda c: c.scene.state is not None)
-    states.clear()
-    started = time.monotonic()
+    began_ns = session.now_ns
     ann.sleep(0.3)
-    assert time.monotonic() - started >= 0.3
-    assert len(states) >= 2
+    assert session.now_ns - began_ns == pytest.approx(0.3e9, abs=5e6)
+    assert len(states) >= 10
     ann.sleep(-1.0)
 
 
-def test_denials_have_a_readable_text(session: LiveSession, join: Join) -> None:
+def test_denials_have_a_readable_text(session: ClientSession, join: Join) -> None:
     ann, bob = join(), join("bob")
     ann.acquire("left")
     assert bob.wait_for(lambda c: c.mirror.leases["left"].holder == ann.participant_id)
     with pytest.raises(DeniedError) as held:
         bob.acquire("left")
-    assert str(held.value).startswith("denied (held): left is held by ann; ask the holder to release it")
-    assert str(held.value).count("ann") == 1
+    assert (held.value.denial.reason, held.value.denial.holder) == ("held", ann.participant_id)
+    assert str(held.value).count("ann") == 1, "by name"
     with pytest.raises(DeniedError) as not_ours:
         bob.release("left")
-    assert str(not_ours.value).startswith("denied (not_holder): ")
-    assert not_ours.value.denial.holder == ann.participant_id
+    assert (not_ours.value.denial.reason, not_ours.value.denial.holder) == ("not_holder", ann.participant_id)
     assert str(DeniedError(Denial("role", "no"))) == "denied (role): no"
 
 

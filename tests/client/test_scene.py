@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 from collections.abc import Callable
 
 import pytest
@@ -11,14 +12,15 @@ import pytest
 from iris_session.client import Client, SceneState, SessionMirror
 from iris_session.client.deformables import Deformables
 from iris_session.protocol.server_messages import Event, SceneChanged, Snapshot
-from tests.client.harness import BODIES, LiveSession, scene
+from tests.client.session import BODIES, ClientSession, make_scene
+from tests.client.threads import ThreadedClient
 
 ORDERS = list(itertools.permutations(BODIES))[1:]
-#: `LiveSession` places them there from its second scene on.
-Y = {body.name: float(body.id) for body in scene().bodies}
+#: `ClientSession` places them there from its second scene on.
+Y = {body.name: float(body.id) for body in make_scene().bodies}
 
 
-def test_poses_by_name_never_belong_to_another_body(session: LiveSession, join: Callable[..., Client]) -> None:
+def test_poses_by_name_never_belong_to_another_body(session: ClientSession, join: Callable[..., Client]) -> None:
     client = join()
     wrong: list[tuple[str, float, int, int]] = []
     seen: list[int] = []  # epochs in which all were present
@@ -26,7 +28,7 @@ def test_poses_by_name_never_belong_to_another_body(session: LiveSession, join: 
     def record() -> None:
         poses = {name: client.scene.body_pose(name) for name in BODIES}
         state = client.scene.state
-        if state is None or session._shown.bodies == scene().bodies:
+        if state is None or session.scene.bodies == make_scene().bodies:
             return
         found = {name: pose[0][1] for name, pose in poses.items() if pose is not None}
         epoch = state.header.scene_epoch
@@ -46,7 +48,7 @@ def test_poses_by_name_never_belong_to_another_body(session: LiveSession, join: 
             record()
             return bool(seen) and seen[-1] == epoch
 
-        assert client.wait_for(shown, 30.0), (epoch, seen[-1:], client.mirror.synced)
+        assert client.wait_for(shown), (epoch, seen[-1:], client.mirror.synced)
         assert [body.name for body in client.mirror.bodies] == list(order)
     assert wrong == []
     tip = client.scene.tip_pose("left")
@@ -55,7 +57,7 @@ def test_poses_by_name_never_belong_to_another_body(session: LiveSession, join: 
 
 
 def test_bodies_keep_their_poses_after_a_reset_until_the_next_state(
-    session: LiveSession, join: Callable[..., Client]
+    session: ClientSession, join: Callable[..., Client]
 ) -> None:
     client = join()
     assert client.wait_for(lambda c: c.scene.state is not None)
@@ -66,11 +68,11 @@ def test_bodies_keep_their_poses_after_a_reset_until_the_next_state(
         state = client.scene.state
         return state is not None and state.header.scene_epoch == client.mirror.scene_epoch == 2
 
-    assert client.wait_for(both, 30.0)
+    assert client.wait_for(both)
 
 
 class Slow(SessionMirror):
-    """Yields to another thread whenever the hash is read."""
+    """Lets another thread run whenever the hash is read."""
 
     meanwhile: Callable[[], None] | None = None
     _hash = ""
@@ -79,9 +81,8 @@ class Slow(SessionMirror):
     def scene_hash(self) -> str:  # type: ignore[override]
         seen, meanwhile, self.meanwhile = self._hash, self.meanwhile, None
         if meanwhile is not None:
-            thread = threading.Thread(target=meanwhile, daemon=True)
-            thread.start()
-            thread.join(0.2)
+            threading.Thread(target=meanwhile, daemon=True).start()
+            time.sleep(0.02)
         return seen
 
     @scene_hash.setter
@@ -89,25 +90,24 @@ class Slow(SessionMirror):
         self._hash = scene_hash
 
 
-def test_hash_and_epoch_of_a_scene_are_consistent_in_any_thread(
-    session: LiveSession, join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    client = join()
-    mirror, changed = Slow(), threading.Event()
-    mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "first", 0, 0.0, 0, (), ()))
-    client.connection.mirror = mirror
+def test_hash_and_epoch_of_a_scene_are_consistent_in_any_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ThreadedClient() as ann:
+        client = ann.client
+        mirror, changed = Slow(), threading.Event()
+        mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "first", 0, 0.0, 0, (), ()))
+        client.connection.mirror = mirror
 
-    def hear() -> None:
-        with client._lock:  # as `poll` does
-            mirror.apply_event(Event(1, 0, 0, SceneChanged(2, 0, "new_scene")))
-            mirror.apply_snapshot(Snapshot(0, 1, 2, 0, "second", 0, 0.0, 0, (), ()))
-        changed.set()
+        def hear() -> None:
+            with client._lock:  # as `poll` does
+                mirror.apply_event(Event(1, 0, 0, SceneChanged(2, 0, "new_scene")))
+                mirror.apply_snapshot(Snapshot(0, 1, 2, 0, "second", 0, 0.0, 0, (), ()))
+            changed.set()
 
-    followed: list[tuple[str, int]] = []
-    shapes = Deformables(client)
-    monkeypatch.setattr(shapes, "_follow", lambda scene_hash, epoch: followed.append((scene_hash, epoch[1])))
-    mirror.meanwhile = hear
-    shapes.update()
-    assert changed.wait(30.0)
-    shapes.update()
-    assert followed == [("first", 1), ("second", 2)]
+        followed: list[tuple[str, int]] = []
+        shapes = Deformables(client)
+        monkeypatch.setattr(shapes, "_follow", lambda scene_hash, epoch: followed.append((scene_hash, epoch[1])))
+        mirror.meanwhile = hear
+        shapes.update()
+        assert changed.wait(30.0)
+        shapes.update()
+        assert followed == [("first", 1), ("second", 2)]

@@ -14,7 +14,6 @@ from iris_session.client.deformables import Deformables
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.protocol.names import ArrayKind
 from iris_session.protocol.scene import SceneSpec, decode_scene, list_assets
-from iris_session.recording import Recording
 from iris_session.scene import decode_arrays, decode_mesh
 from tests.e2e.scenario import Scenario
 from tests.e2e.session_process import SessionProcess
@@ -92,24 +91,3 @@ def test_client_has_specification_meshes_and_moving_deformables(scenario: Scenar
     lowest = [min(z for _, _, z in row) for row in rows if row is not None]
     assert max(lowest) == pytest.approx(1.5)
     assert min(lowest) < 1.2, "the recording shows the same"
-
-
-@pytest.mark.long
-def test_cached_assets_are_not_fetched_again_and_a_new_front_serves_them(scenario: Scenario, tmp_path: Path) -> None:
-    ann, bob = scenario.join("ann", role="observer"), scenario.join("bob", role="observer")
-    spec = fetch_all(scenario, ann, tmp_path / "cache")
-    bob.assets.cache = AssetStore(tmp_path / "cache")
-    again = bob.assets.fetch([bob.mirror.scene_hash, *list_assets(spec)])
-    scenario.run_until(lambda: again.done, "everything is cached")
-    assert (again.bytes_received, again.cached) == (0, len(again.addresses))
-    scenario.server.children()["front.main"].kill()
-    scenario.run_until(lambda: not ann.ready, "ann has disconnected")
-    scenario.run_until(lambda: ann.ready and bob.ready, "both have joined the new front")
-    bob.assets.cache = AssetStore(tmp_path / "other")
-    late = bob.assets.fetch(list_assets(spec))
-    scenario.run_until(lambda: late.done, "the new front serves the scene")
-    late.check()
-    assert late.bytes_received == late.bytes_total
-    assert scenario.server.finish()["ok"]
-    with Recording.open(scenario.server.recording) as recording:
-        assert recording.header.bodies == ann.mirror.bodies

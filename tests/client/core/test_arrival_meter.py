@@ -17,7 +17,7 @@ from iris_session.client.identity import Identity
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.protocol.status import ClientReport
-from tests.client.harness import LiveSession
+from tests.client.session import ClientSession
 
 MS = 1_000_000
 
@@ -103,29 +103,17 @@ def test_memory_is_bounded(connection: ClientConnection) -> None:
     assert report.delivered == 3 * MAX_AGES
 
 
-def test_status_of_a_session(session: LiveSession, join: Callable[..., Client]) -> None:
+def test_status_of_a_session(session: ClientSession, join: Callable[..., Client]) -> None:
     client = join("ann")
     report = client.status()
-    assert report.session_id == "s1"
-    assert report.connections == 1
-    client.start()
+    assert (report.session_id, report.connections) == ("s1", 1)
     assert client.status().session_time > report.session_time
-
-
-def test_status_while_the_session_stalls(session: LiveSession, join: Callable[..., Client]) -> None:
-    join("bob")
-    session.pause_steps(True)
-    client = join("ann", connect=False)
-    client.open()
-    report = client.status()
-    assert not client.ready
+    session.paused = True
+    late = session.make_client("bob")
+    late.open()
+    report = late.status()
+    assert not late.ready
     assert report.authority_silent_ns > 0
-
-
-def test_status_without_a_session() -> None:
-    client = Client("127.0.0.1:1", role="observer")
-    try:
-        with pytest.raises(NotConnectedError):
-            client.status(0.2)
-    finally:
-        client.close()
+    unopened = session.make_client()
+    with pytest.raises(NotConnectedError):
+        unopened.status(0.2)
