@@ -55,12 +55,8 @@ MAX_OVERFILL: Final = 2
 STALE_PART_S: Final = 7 * 86_400.0
 #: The folder is scanned after so many bytes were written, since other processes write to it too.
 SCAN_EVERY_BYTES: Final = 64 << 20
-#: Files that `ServedAssets` maps at once. Chunks on their way to a reader keep their file mapped until they have left.
-MAX_MAPPED_FILES: Final = 256
 
 _PART: Final = re.compile(r"([0-9a-f]{64})(\.\w[\w-]*)?\.part")
-#: A file that one process of an earlier version wrote.
-_OLD_PART: Final = re.compile(r"tmp\w+\.part")
 #: Of a hold: its note before it has its name, and a lock, which is of no use without the note.
 _HALF_MADE_HOLD: Final = re.compile(r"(tmp\w+\.new)(\.hold\.lock)?")
 #: Neither a link nor a pipe that another user put into the folder may be followed or waited for.
@@ -154,7 +150,13 @@ class AssetStore:
     # --- reading ------------------------------------------------------------------------------------------------------
 
     def path(self, address: str) -> Path:
-        """Return the path of an asset, present or not.
+        """Build the path of an asset, present or not.
+
+        Args:
+            address: Content hash, 64 lower-case hex digits.
+
+        Returns:
+            The path.
 
         Raises:
             ValueError: `address` is not 64 lower-case hex digits.
@@ -167,7 +169,13 @@ class AssetStore:
         return isinstance(address, str) and is_address(address) and _find_status(self.path(address)) is not None
 
     def size(self, address: str) -> int:
-        """Return the size of an asset [bytes].
+        """Look up the size of an asset.
+
+        Args:
+            address: Content hash, 64 lower-case hex digits.
+
+        Returns:
+            The size [bytes].
 
         Raises:
             AssetMissingError: The store does not have it.
@@ -178,7 +186,13 @@ class AssetStore:
         return status.st_size
 
     def get(self, address: str) -> bytes:
-        """Return the verified bytes of an asset. A damaged file is removed.
+        """Read an asset and check its hash. A damaged file is removed.
+
+        Args:
+            address: Content hash, 64 lower-case hex digits.
+
+        Returns:
+            Its bytes.
 
         Raises:
             AssetMissingError: The store does not have it, or its file was damaged.
@@ -194,9 +208,13 @@ class AssetStore:
         return bytes(view)
 
     def find(self, address: str) -> memoryview | None:
-        """Return the verified bytes of an asset, mapped, and mark it as used; `None` without it.
+        """Find an asset, check its hash, and mark it as used. A damaged file is removed.
 
-        A damaged file is removed.
+        Args:
+            address: Content hash, 64 lower-case hex digits.
+
+        Returns:
+            Its bytes, mapped; `None` without it.
 
         Raises:
             AssetStoreError: The folder cannot be used.
@@ -212,7 +230,13 @@ class AssetStore:
         return view
 
     def view(self, address: str) -> memoryview:
-        """Return the bytes of an asset, mapped and not hashed again.
+        """Map an asset, without checking its hash again.
+
+        Args:
+            address: Content hash, 64 lower-case hex digits.
+
+        Returns:
+            Its bytes.
 
         Raises:
             AssetMissingError: The store does not have it.
@@ -223,7 +247,13 @@ class AssetStore:
             raise self._missing_error(address) from error
 
     def open_file(self, address: str) -> tuple[BinaryIO, int]:
-        """Open an asset to be read in pieces, not hashed. Return its file, to be closed by the caller, and its size.
+        """Open an asset to be read in pieces, without checking its hash.
+
+        Args:
+            address: Content hash, 64 lower-case hex digits.
+
+        Returns:
+            Its file, to be closed by the caller, and its size [bytes].
 
         Raises:
             OSError: The store does not have it, or its file cannot be read.
@@ -235,7 +265,13 @@ class AssetStore:
     # --- writing ------------------------------------------------------------------------------------------------------
 
     def put(self, data: bytes | bytearray | memoryview) -> str:
-        """Store bytes and return their address. Costs one hash when the store has them already.
+        """Store bytes. Costs one hash when the store has them already.
+
+        Args:
+            data: The bytes.
+
+        Returns:
+            Their address.
 
         Raises:
             OSError: The folder cannot be written.
@@ -247,7 +283,13 @@ class AssetStore:
         return address
 
     def open_part(self, address: str) -> AssetPart:
-        """Return the part of an asset to write to; it may have bytes of an earlier download.
+        """Open a part of an asset to write to; it may have bytes of an earlier download.
+
+        Args:
+            address: Content hash, 64 lower-case hex digits.
+
+        Returns:
+            The part.
 
         Raises:
             AssetStoreError: The folder cannot be used.
@@ -263,7 +305,14 @@ class AssetStore:
             raise self._unusable_error(error) from error
 
     def read_index(self, key: str) -> bytes | None:
-        """Return the note stored under `key`, a SHA-256 in hex, and mark it as used; `None` without one."""
+        """Read a note and mark it as used.
+
+        Args:
+            key: A SHA-256 in hex.
+
+        Returns:
+            The note stored under `key`, `None` without one.
+        """
         path = self._index_path(key)
         try:
             note = bytes(map_file(path)[0])
@@ -273,7 +322,11 @@ class AssetStore:
         return note
 
     def write_index(self, key: str, note: bytes) -> None:
-        """Store a note under `key`, a SHA-256 in hex.
+        """Store a note.
+
+        Args:
+            key: A SHA-256 in hex.
+            note: Bytes to be read by `read_index`.
 
         Raises:
             OSError: The folder cannot be written.
@@ -285,26 +338,52 @@ class AssetStore:
     def hold(self, addresses: Iterable[str]) -> Hold:
         """Keep assets from being removed by any process, for as long as a scene is shared.
 
+        Args:
+            addresses: Content hashes of the assets.
+
+        Returns:
+            The hold, to be released; it ends with this process at the latest.
+
         Raises:
             OSError: The folder cannot be written, or its file system has no locks.
         """
         return Hold(self.root / _HOLDS, addresses)
 
     def mark_used(self, address: str, size: int) -> bool:
-        """Mark an asset as used now. False without it, and when it has another size: a crash truncated it."""
+        """Mark an asset as used now.
+
+        Args:
+            address: Content hash.
+            size: Its size [bytes].
+
+        Returns:
+            False without it, and when it has another size: a crash truncated it.
+        """
         path = self.path(address)
         status = _find_status(path)
         return status is not None and status.st_size == size and _touch(path)
 
     def last_used_ns(self, address: str) -> int:
-        """Return when an asset was last used [ns since 1970], for `discard`; 0 without it."""
+        """Look up when an asset was last used, for `discard`.
+
+        Args:
+            address: Content hash.
+
+        Returns:
+            The time [ns since 1970], 0 without it.
+        """
         status = _find_status(self.path(address))
         return 0 if status is None else status.st_mtime_ns
 
     def discard(self, address: str, last_used_ns: int) -> bool:
-        """Remove an asset that is of no more use, and return whether it was removed.
+        """Remove an asset that is of no more use.
 
-        It stays when a process holds it, or has used it after `last_used_ns`.
+        Args:
+            address: Content hash.
+            last_used_ns: When it was last used, as far as the caller knows.
+
+        Returns:
+            False: it stays, because a process holds it or has used it after `last_used_ns`.
         """
         path = self.path(address)
         status = _find_status(path)
@@ -316,13 +395,20 @@ class AssetStore:
         return False
 
     def trim(self) -> int:
-        """Remove stale parts, and files beyond `max_bytes`. Return the bytes that remain."""
+        """Remove stale parts, and files beyond `max_bytes`.
+
+        Returns:
+            Size of the files that remain [bytes].
+        """
         self._scan(0)
         with self._lock:
             return self._total
 
     def reserve(self, n_bytes: int) -> None:
         """Make room for a download, which has its bytes written to an `AssetPart` next.
+
+        Args:
+            n_bytes: Number of bytes.
 
         Raises:
             AssetStoreError: `MAX_OVERFILL * max_bytes` are in use already.
@@ -414,8 +500,7 @@ class AssetStore:
         for entry, status in self._iterate_files():
             age_s = now - status.st_mtime
             part = _PART.fullmatch(entry.name)
-            is_private = bool(part[2]) if part else not is_address(entry.name)
-            if (part or is_private) and age_s > (GRACE_S if is_private else STALE_PART_S) and _remove_part(entry.path):
+            if part and age_s > (GRACE_S if part[2] else STALE_PART_S) and _remove_part(entry.path):
                 continue
             files.append((status.st_mtime, status.st_size, entry))
         total = n_bytes + sum(size for _, size, _ in files)
@@ -444,9 +529,8 @@ class AssetStore:
             for sub in _list_entries(folder):
                 if len(sub.name) == 2 and sub.is_dir(follow_symlinks=False):
                     for entry in _list_entries(sub.path):
-                        in_place = is_address(entry.name) or _PART.fullmatch(entry.name)
-                        ours = entry.name[:2] == sub.name if in_place else _OLD_PART.fullmatch(entry.name)
-                        if ours and entry.is_file(follow_symlinks=False):
+                        ours = is_address(entry.name) or _PART.fullmatch(entry.name)
+                        if ours and entry.name[:2] == sub.name and entry.is_file(follow_symlinks=False):
                             with contextlib.suppress(FileNotFoundError):  # removed by another process meanwhile
                                 yield entry, entry.stat(follow_symlinks=False)
 
@@ -554,53 +638,6 @@ class AssetPart:
                 self._path.unlink()  # raises for one that was finished
                 self._store._uncount(self.offset)
         self._file.close()
-
-
-class ServedAssets:
-    """Assets that a session serves, mapped: every reader is sent the same pages. Belongs to one thread.
-
-    Assets are looked up in a table by address: no path is ever made of what a client sends.
-    """
-
-    def __init__(self) -> None:
-        self._roots: dict[str, str] = {}
-        self._mapped: dict[str, memoryview] = {}
-
-    def serve(self, stores: Iterable[tuple[str, Iterable[str]]]) -> None:
-        """Serve these assets and no others from now on.
-
-        Args:
-            stores: Roots of stores, with addresses in each.
-        """
-        self._roots = {address: root for root, addresses in stores for address in addresses if is_address(address)}
-        for address in [address for address in self._mapped if address not in self._roots]:
-            del self._mapped[address]
-
-    def size(self, address: str) -> int | None:
-        """Return the size of an asset [bytes]; `None` when it is not served, or its file cannot be read."""
-        view = self._view(address)
-        return None if view is None else len(view)
-
-    def chunk(self, address: str, offset: int, length: int) -> memoryview | None:
-        """Return bytes of an asset; `None` as in `size`, or when it ends before `offset + length`."""
-        view = self._view(address)
-        return None if view is None or offset + length > len(view) else view[offset : offset + length]
-
-    def _view(self, address: str) -> memoryview | None:
-        view = self._mapped.get(address)
-        if view is not None:
-            return view
-        root = self._roots.get(address)
-        if root is None:
-            return None
-        try:
-            view, _ = map_file(Path(root) / address[:2] / address)
-        except OSError:
-            return None
-        while len(self._mapped) >= MAX_MAPPED_FILES:
-            del self._mapped[next(iter(self._mapped))]
-        self._mapped[address] = view
-        return view
 
 
 def map_file(path: Path) -> tuple[memoryview, os.stat_result]:
