@@ -17,6 +17,7 @@ from typing import Any, Final, Self
 from iris_session.client.alignment import ClientAlignment
 from iris_session.client.arguments import PoseLike, to_names, to_numbers, to_pose, to_python_scalar, to_text
 from iris_session.client.assets import ClientAssets
+from iris_session.client.core.arrival_meter import ArrivalMeter
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.outbox import encode_checked
 from iris_session.client.core.samples import SampleBuilder
@@ -165,10 +166,11 @@ class Client:
         self._requests = ClientRequests(self, self._lock)
         self._joiner = SessionJoiner(request, self.connection, self._sockets)
         self.scene = ClientScene(self.connection, self._lock)
-        self.media = ClientMedia(self.connection, self._sockets, self._lock, lambda: self._loop.polls_here)
+        arrivals = ArrivalMeter()
+        self.media = ClientMedia(self.connection, self._sockets, self._lock, lambda: self._loop.polls_here, arrivals)
         self.assets = ClientAssets(self.connection, self._sockets, self._lock)
         self.alignment = ClientAlignment(self)
-        self._loop = ClientLoop(self, self._sockets, self._joiner, self._lock)
+        self._loop = ClientLoop(self, self._sockets, self._joiner, self._lock, arrivals)
 
     # --- life ---------------------------------------------------------------------------------------------------------
 

@@ -139,15 +139,16 @@ class Deformables:
     After a patch of the scene they continue unchanged until the new specification has arrived; deformables that are
     equal in both continue after it.
 
+    Args:
+        client: A client.
+
     Attributes:
         vertices: Positions (n, 3) [m] in the world frame, by name of the deformable, numbered as in the model. Vertices
             inside of a soft body are not transferred: their rows are NaN, `meshes[name].rows` lists the others. A
             deformable without a unique name has the name of its stream as key.
         capture_ns: Session time of `vertices` [ns], by the same names. Deformables at rest are sent once a second, so
             their time may be that old.
-        meshes: Triangles, lines and looks, by the same names; present before the first vertices.
         scene_hash: Content hash of the scene that they belong to.
-        fault: Reason why a deformable cannot be shown; empty without a fault.
     """
 
     def __init__(self, client: Client) -> None:
@@ -166,10 +167,12 @@ class Deformables:
 
     @property
     def meshes(self) -> Mapping[str, DeformableMesh]:
+        """Triangles, lines and looks by name; empty while another scene is being fetched."""
         return {} if self._parked else {mesh.key: mesh.shape for mesh in self._meshes}
 
     @property
     def fault(self) -> str:
+        """Reason why a deformable cannot be shown; empty without a fault."""
         return self._fault or next((mesh.fault for mesh in self._meshes if mesh.fault), "")
 
     def update(self) -> list[str]:

@@ -24,6 +24,9 @@ class ClientGroup:
         group = ClientGroup(clients)
         while running:
             group.poll(0.1)
+
+    Args:
+        clients: Clients without a thread of their own.
     """
 
     def __init__(self, clients: Sequence[Client]) -> None:

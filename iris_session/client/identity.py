@@ -29,7 +29,7 @@ class _Stored(msgspec.Struct, frozen=True):
 class Identity:
     """Identity of a client: a secret and the resume token of its last session.
 
-    Attributes:
+    Args:
         secret: `SECRET_BYTES` random bytes.
         resume_token: Token of the last `Welcome`; single use.
         path: File that every change is written to at once, readable by its owner only; `None`: in memory.
@@ -48,7 +48,11 @@ class Identity:
 
     @classmethod
     def in_memory(cls) -> Identity:
-        """Create a new identity that ends with the process."""
+        """Create an identity that ends with the process.
+
+        Returns:
+            The identity.
+        """
         return cls(secrets.token_bytes(SECRET_BYTES))
 
     @classmethod

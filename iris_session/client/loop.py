@@ -52,7 +52,12 @@ class ClientLoop:
     """
 
     def __init__(
-        self, client: LoopClient, sockets: ClientSockets, joiner: SessionJoiner, lock: threading.RLock
+        self,
+        client: LoopClient,
+        sockets: ClientSockets,
+        joiner: SessionJoiner,
+        lock: threading.RLock,
+        arrivals: ArrivalMeter,
     ) -> None:
         self.feedback: dict[str, Feedback] = {}
         self.changed = threading.Condition(lock)
@@ -62,7 +67,7 @@ class ClientLoop:
         self._sockets = sockets
         self._joiner = joiner
         self._lock = lock
-        self._arrivals = ArrivalMeter()
+        self._arrivals = arrivals
         self._generation = 0
         self._just_progressed = False
         self._thread: threading.Thread | None = None
@@ -196,9 +201,10 @@ class ClientLoop:
                 connection.handle_disconnect(time.monotonic_ns())
             self._joiner.check_answer()
             connection.tick(time.monotonic_ns())
-            report = self._arrivals.poll_report(connection, time.monotonic_ns())
+            limit = client.media.limit_mbit_per_s
+            report = self._arrivals.poll_report(connection, time.monotonic_ns(), limit)
             if report is not None:
-                connection.send(client.media.extend_report(report, time.monotonic_ns()))
+                connection.send(report)
             self.send_pending()
             progressed |= client.media.poll()
             progressed |= client.assets.poll()

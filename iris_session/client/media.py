@@ -5,11 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Final
 
-import msgspec
-
-from iris_session.client.core.arrival_meter import PERIOD_NS
+from iris_session.client.core.arrival_meter import ArrivalMeter
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.client.feeds import CloudFeed, MediaFeed, MediaFrame
@@ -18,10 +15,7 @@ from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.media import StreamInfo, describe_bad_stream_name, is_stream_name, make_topic
 from iris_session.protocol.names import MediaEncoding
-from iris_session.protocol.status import ClientReport, DeliveryBudget, compute_quantiles
-
-#: Ages of frames kept between two reports: more than come in a second.
-MAX_AGES: Final = 256
+from iris_session.protocol.status import DeliveryBudget
 
 
 class ClientMedia:
@@ -39,6 +33,7 @@ class ClientMedia:
         sockets: ClientSockets,
         lock: threading.RLock,
         may_use_sockets: Callable[[], bool],
+        arrivals: ArrivalMeter,
     ) -> None:
         self.limit_mbit_per_s = 0.0
         self.malformed = 0
@@ -47,13 +42,11 @@ class ClientMedia:
         self._sockets = sockets
         self._lock = lock
         self._may_use_sockets = may_use_sockets
+        self._arrivals = arrivals
         self._feeds: dict[str, MediaFeed] = {}
         self._clouds: dict[str, CloudFeed] = {}
         self._generation = -1
         self._subscribed: set[str] = set()
-        self._bytes = 0
-        self._ages: list[int] = []
-        self._since_ns = 0
 
     def subscribe(self, stream: str) -> MediaFeed:
         """Subscribe to a media stream; one that does not exist yet comes when it does.
@@ -170,19 +163,6 @@ class ClientMedia:
         self._subscribe()
         return self._drain()
 
-    def extend_report(self, report: ClientReport, now_ns: int) -> ClientReport:
-        """Return `report` with the media that came since the one before."""
-        ages = compute_quantiles(self._ages)
-        elapsed_ns, self._since_ns = max(PERIOD_NS, now_ns - self._since_ns), now_ns
-        received, self._bytes = self._bytes, 0
-        self._ages.clear()
-        return msgspec.structs.replace(
-            report,
-            media_bytes_per_s=received / elapsed_ns * 1e9,
-            media_age_ms=0.0 if ages is None else ages.p50,
-            media_limit_mbit_per_s=self.limit_mbit_per_s,
-        )
-
     def _session_now_ns(self) -> int:
         return self._connection.clock.session_ns(time.monotonic_ns())
 
@@ -230,9 +210,7 @@ class ClientMedia:
             feed.received += 1
             feed.dropped = header.dropped
             feed.newest = MediaFrame(header, data, self._session_now_ns() - header.capture_ns)
-            self._bytes += sum(map(len, frames))
-            if len(self._ages) < MAX_AGES:
-                self._ages.append(feed.newest.age_ns)
+            self._arrivals.record_media(sum(map(len, frames)), feed.newest.age_ns)
         return bool(messages)
 
 

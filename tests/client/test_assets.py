@@ -103,6 +103,7 @@ def test_killed_front_costs_no_byte_twice(shared: Shared) -> None:
     finish(client, fetch)
     assert 0 < killed[0] < shared.bytes
     assert client.connection.counters.reconnects == 1
+    assert shared.channel_of(client).opened == 2, "requests of the connection before are lost"
     assert read_all(fetch) == shared.data
     assert fetch.bytes_received == shared.bytes
 

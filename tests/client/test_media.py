@@ -58,7 +58,9 @@ def test_subscriptions_survive_a_restart_of_the_front(session: ClientSession, jo
     assert feed.received == 1
 
 
-def test_budget_of_the_session_and_limit_of_the_client_are_reported(session: ClientSession, join: Join) -> None:
+def test_budget_of_the_session_and_limit_of_the_client_are_reported(
+    session: ClientSession, join: Join, monkeypatch: pytest.MonkeyPatch
+) -> None:
     session.budget = DeliveryBudget(BudgetClass.HALF, reason="client", streams=(StreamBudget("cloud", "quarter"),))
     ann = join()
     cloud, depth = ann.media.subscribe("cloud"), ann.media.subscribe("depth")
@@ -66,14 +68,19 @@ def test_budget_of_the_session_and_limit_of_the_client_are_reported(session: Cli
     assert (cloud.budget_class, depth.budget_class) == (BudgetClass.QUARTER, BudgetClass.HALF)
     assert ann.media.delivery == session.budget
     ann.media.limit_mbit_per_s = 0.5
-    ann.media.extend_report(ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0), session.simulation.now_ns)
+    ann.sleep(1.0 - session.now_ns % 1e9 * 1e-9)
+    reports: list[ClientReport] = []
+    send = ann.connection.send
+    monkeypatch.setattr(ann.connection, "send", lambda message: (reports.append(message), send(message))[1])
     for _ in range(3):
         session.publish_media("cloud", bytes(1000), capture_ns=session.now_ns - 30_000_000)
-        ann.poll()
-    report = ann.media.extend_report(ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0), session.simulation.now_ns)
+        ann.sleep(0.3)
+    ann.sleep(1.5)
+    report = max(reports, key=lambda one: one.media_bytes_per_s)
     assert report.media_limit_mbit_per_s == 0.5
     assert report.media_age_ms == pytest.approx(30.0, abs=ann.clock_error_ns() * 1e-6)
-    assert report.media_bytes_per_s > 3000.0
+    assert 1000.0 < report.media_bytes_per_s < 3300.0
+    assert reports[-1].media_bytes_per_s == 0.0
 
 
 def test_invalid_stream_names_are_rejected(session: ClientSession) -> None:

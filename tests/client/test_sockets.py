@@ -10,7 +10,6 @@ import zmq
 
 from iris_session.client import sockets
 from iris_session.security import KeyPair
-from iris_session.web import gateway
 
 #: Threads of libzmq with a lower priority (proc_pid_stat(5), field 19); they set their names a moment after starting.
 CODE = """
@@ -53,11 +52,9 @@ def test_asset_thread_has_a_lower_priority_in_every_process() -> None:
 
 
 @pytest.mark.parametrize(("host", "ipv6"), [("10.0.0.1", 0), ("::1", 1), ("fe80::1%eth0", 1)])
-def test_sockets_of_clients_and_gateways_have_the_same_settings(host: str, ipv6: int) -> None:
+def test_sockets_to_a_session_have_the_same_settings(host: str, ipv6: int) -> None:
     session, own = KeyPair.generate(), KeyPair.generate()
     curve = sockets.CurveKeys(session.public.encode(), own.public.encode(), own.secret.encode())
-    assert vars(gateway)["open_socket"] is sockets.open_socket, "one definition"
-    assert vars(gateway)["CurveKeys"] is sockets.CurveKeys
     with zmq.Context() as context, sockets.open_socket(context, zmq.DEALER, host, curve) as sock:
         assert sock.getsockopt(zmq.IPV6) == ipv6
         assert sock.getsockopt(zmq.MAXMSGSIZE) == sockets.MAX_MESSAGE_BYTES

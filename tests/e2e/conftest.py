@@ -12,7 +12,8 @@ from typing import Any, Final
 
 import pytest
 
-from tests.client.harness import let_clients_wait
+from iris_session.client import Client
+from iris_session.client import client as client_module
 from tests.e2e.browser import Browser, Page, printed_address, require_browser
 from tests.e2e.scenario import Hand, Scenario
 from tests.e2e.session_process import (
@@ -47,7 +48,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(autouse=True)
 def _wait_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let clients wait for answers as long as the tests do: a busy machine may stop a process for seconds."""
-    let_clients_wait(monkeypatch, DEADLINE_S)
+    monkeypatch.setattr(client_module, "DEFAULT_TIMEOUT_S", DEADLINE_S)
+    for waiting in (Client.connect, Client.wait_for, Client.status, Client.request):
+        monkeypatch.setattr(waiting, "__defaults__", (DEADLINE_S,))
 
 
 @pytest.fixture

@@ -35,8 +35,11 @@ PRESENCE_WAITING: Final = 8  # presence messages that may wait to be decoded; de
 class SceneState:
     """The newest decoded state.
 
-    `poses`: (n, 7) float64, world frame, `x y z qw qx qy qz`, in the order of `Snapshot.bodies`, read only.
-    `received_ns`: session time when it was handed to the application; `age_ns`: that minus the end of its tick.
+    Attributes:
+        header: Numbers, times and applied samples of its frame.
+        poses: (n, 7) float64, world frame, `x y z qw qx qy qz` [m], in the order of `Snapshot.bodies`; read-only.
+        received_ns: Session time when it was handed to the application [ns].
+        age_ns: That minus the end of its tick [ns].
     """
 
     header: StateHeader
