@@ -152,7 +152,6 @@ class ClientMedia:
         if self._generation != self._connection.generation:
             self._generation = self._connection.generation
             self._sockets.close_media()
-            self._subscribed.clear()
             self._connection.latest.pop(DeliveryBudget, None)
         budget = self.delivery
         if budget is None or not self._connection.is_joined:

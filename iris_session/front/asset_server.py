@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import zmq
 
 from iris_session.assets.chunk_scheduler import ADVICE, ChunkReader, ChunkScheduler
-from iris_session.assets.served import ServedAssets
+from iris_session.assets.store import ServedAssets
 from iris_session.link.config import MILLISECOND, FrontConfig
 from iris_session.link.sockets import open_assets, read_peer, readable, watch_tcp
 from iris_session.link.tcp_guard import PendingConnection, TcpGuard

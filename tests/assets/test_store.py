@@ -16,8 +16,7 @@ import pytest
 from filelock import FileLock, Timeout
 
 from iris_session.assets.errors import AssetMissingError, AssetStoreError
-from iris_session.assets.served import MAX_MAPPED_FILES, ServedAssets
-from iris_session.assets.store import GRACE_S, AssetStore, default_root
+from iris_session.assets.store import GRACE_S, MAX_MAPPED_FILES, AssetStore, ServedAssets, default_root
 from tests.front.asset_rig import put
 
 DATA = os.urandom(100_000)

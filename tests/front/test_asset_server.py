@@ -14,7 +14,7 @@ import psutil
 import pytest
 import zmq
 
-from iris_session.assets.served import ServedAssets
+from iris_session.assets.store import ServedAssets
 from iris_session.front.asset_server import AssetAccess, AssetServer, AssetSockets, open_asset_sockets
 from iris_session.link import FrontConfig
 from iris_session.link.sockets import bound_port
