@@ -1,6 +1,6 @@
-"""A live session for client tests: real front process and real authority, with a world of plain values.
+"""A live session for tests of emulated headsets: real front process and real authority, with a world of plain values.
 
-The authority's loop runs in a thread, so that blocking calls of the client can be tested as they are used.
+The authority's loop runs in a thread.
 """
 
 from __future__ import annotations
@@ -11,15 +11,12 @@ from collections import deque
 
 import msgspec
 import numpy as np
-import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.client import Client
-from iris_session.client import client as client_module
 from iris_session.link import FrontConfig, FrontProcess, SceneInfo
-from iris_session.protocol.client_messages import Control, Sample
+from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.protocol.entries import HOST, Entry, Lost, SceneLoaded, ScenePatched
+from iris_session.protocol.entries import HOST, Entry
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo, StateHeader
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import FixedView
@@ -39,13 +36,6 @@ def scene() -> SceneInfo:
     poses = np.zeros((len(BODIES), 7))
     poses[:, 3] = 1.0
     return SceneInfo("hash", robots, bodies, poses.tobytes())
-
-
-def let_clients_wait(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    """Let clients wait so long by default: a busy machine may stop a process for seconds."""
-    monkeypatch.setattr(client_module, "DEFAULT_TIMEOUT_S", seconds)
-    for waiting in (Client.connect, Client.wait_for, Client.status, Client.request):
-        monkeypatch.setattr(waiting, "__defaults__", (seconds,))
 
 
 class LiveSession:
@@ -82,10 +72,7 @@ class LiveSession:
         self.entries: list[Entry] = []
         self.commands: dict[str, str] = {}
         self.poses = np.zeros((len(BODIES), 7))
-        self._y = np.zeros(len(BODIES))
         self._inject: deque[Entry] = deque()  # other threads append
-        self._shown = shown
-        self._shows: deque[tuple[SceneInfo, str]] = deque()  # other threads append
         self._scene_epoch = 1
         self._paused = threading.Event()
         self._stop = threading.Event()
@@ -105,30 +92,9 @@ class LiveSession:
         joined = next(entry for entry in self.entries if isinstance(entry.message, Sample))
         self._inject.append(Entry(joined.connection, joined.connection, self.now_ns, message))  # type: ignore[arg-type]
 
-    def change_scene(self, scene_hash: str, assets: tuple[str, ...], cause: str = "patch") -> None:
-        """Change the look of the scene, load another one (`new_scene`), or change the served assets (empty cause)."""
-        self._shown = msgspec.structs.replace(self._shown, scene_hash=scene_hash, assets=assets)
-        self._shows.append((self._shown, cause))
-
-    def load_reordered(self, *names: str) -> None:
-        """Load a scene with the same bodies in another order. From the first call on, their y identifies them."""
-        known = {body.name: body for body in scene().bodies}
-        self._shown = msgspec.structs.replace(self._shown, bodies=tuple(known[name] for name in names))
-        self._shows.append((self._shown, "new_scene"))
-
-    def reset(self) -> None:
-        self.submit(Control(0, "reset"))
-
     def pause_steps(self, paused: bool) -> None:
         """Stop the whole authority, as a user's script in a debugger does."""
         (self._paused.set if paused else self._paused.clear)()
-
-    def wait_lost(self, participant: str, timeout_s: float = 30.0) -> None:
-        """Wait until the session has disconnected a silent participant."""
-        deadline = time.monotonic() + timeout_s
-        while not self.messages_of(Lost):
-            assert time.monotonic() < deadline, f"{participant} was not lost within {timeout_s} s"
-            time.sleep(0.05)
 
     def messages_of(self, kind: type) -> list[Entry]:
         return [entry for entry in self.entries if isinstance(entry.message, kind)]
@@ -140,14 +106,6 @@ class LiveSession:
                 continue
             if not self.front.alive:
                 self.front.restart()
-            while self._shows:
-                shown, cause = self._shows.popleft()
-                self.front.set_scene(shown)
-                if cause == "patch":
-                    self.submit(ScenePatched((), shown.scene_hash))
-                elif cause:
-                    self.submit(SceneLoaded(shown.scene_hash, self.specs, OBJECTS))
-                    self._y = np.array([body.id for body in shown.bodies], np.float64)
             inject = [self._inject.popleft() for _ in range(len(self._inject))]
             entries = [*inject, *self.front.link.poll()]
             self.entries += entries
@@ -160,7 +118,6 @@ class LiveSession:
             if now >= next_state:
                 next_state = now + 15_000_000
                 self.poses[:] = (0.1 * now / 1e9, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-                self.poses[:, 1] = self._y
                 self.front.link.send_state(
                     StateHeader(decision.scene_epoch, 0, step, now / 1e9, self.now_ns, 0, 0, 0), self.poses.copy()
                 )

@@ -13,11 +13,12 @@ from typing import Any
 import pytest
 
 from iris_session.client import AssetError, AssetFetch, AssetStore, Client, InvalidMessageError, NotConnectedError
+from iris_session.client.assets import AssetFailed, AssetMissing, BytesStored
 from iris_session.client.core import asset_loader
 from iris_session.protocol.assets import AssetRequest
 from iris_session.protocol.names import AssetRefusal
 from tests.assets.test_store import store_part
-from tests.client.session import ClientSession, MemoryAssets, make_chunk
+from tests.client.session import ClientSession, InlineWorkers, MemoryAssets, make_chunk
 from tests.client.threads import ThreadedClient
 
 MIB = 1 << 20
@@ -329,6 +330,16 @@ def test_decode_function_may_use_the_client_until_it_is_closed(threaded: Threade
     assert not closing.is_alive()
     assert fetch.failed[ASSET].reason == "closed"
     assert seen == [(5, {})]
+
+
+def test_bytes_that_cannot_be_stored_are_released_before_the_failure_is_reported(tmp_path: Path) -> None:
+    workers = InlineWorkers(AssetStore(tmp_path, max_bytes=1), lambda: None)
+    workers.look_up(ASSET, ())
+    workers.write(ASSET, memoryview(bytes(1000)))  # more than twice the cache limit
+    missing, stored, failed = workers.poll_results()
+    assert (missing, stored) == (AssetMissing(ASSET, 0), BytesStored(1000))
+    assert isinstance(failed, AssetFailed)
+    workers.close()
 
 
 # --- results ----------------------------------------------------------------------------------------------------------

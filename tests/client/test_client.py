@@ -74,6 +74,17 @@ def test_state_is_fresh_decoded_and_aged_at_delivery(join: Join) -> None:
     assert ann.scene.body_pose("nothing") is None
 
 
+def test_state_that_has_become_old_while_it_was_decoded_is_not_passed_on(
+    join: Join, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states: list[SceneState] = []
+    ann = join(on_state=states.append)
+    monkeypatch.setattr(ann.connection.stream, "check_fresh", lambda _: False)
+    states.clear()
+    ann.sleep(0.1)
+    assert states == []
+
+
 def test_leases_pass_between_two_participants(join: Join) -> None:
     events: list[Event] = []
     ann, bob = join(on_event=events.append), join("bob")

@@ -13,7 +13,7 @@ from anchors.pose import compose
 from iris_session.assets.store import AssetStore
 from iris_session.client import Client
 from iris_session.client.deformables import Deformables
-from iris_session.protocol.scene import decode_scene, list_assets
+from iris_session.protocol.scene import decode_scene
 from iris_session.protocol.server_messages import SceneChanged
 from iris_session.recording import Recording
 from iris_session.scene import decode_mesh
@@ -113,9 +113,6 @@ def test_observers_receive_poses_and_vertices_of_a_world_without_mujoco(scenario
     scenario.run_until(lambda: fetch.done, "the specification was received")
     spec = decode_scene(fetch.read(composed.scene_hash))
     assert spec == composed.spec
-    rest = client.assets.fetch(list_assets(spec))
-    scenario.run_until(lambda: rest.done, "its assets were received")
-    rest.check()
     assert tuple(body.name for body in client.mirror.bodies) == publisher_program.NAMES
     assert {body.id: body.name for body in spec.bodies if body.moving} == {b.id: b.name for b in client.mirror.bodies}
 
