@@ -41,6 +41,7 @@ from iris_session.protocol.names import (
     Role,
 )
 from iris_session.protocol.server_messages import AlignmentAlarmed, AlignmentRun, Event, Handover, Notice, Reply
+from iris_session.protocol.status import compute_quantiles
 
 #: Hand at rest, in a frame at the eye that is level and looks where the head looks [m]: right, low, in front.
 HAND_AT_REST: Final[Vec3] = (0.40, -0.15, -0.30)
@@ -87,7 +88,7 @@ class EmulatedOperator:
         self._uplink: DelayLine[tuple[tuple[Sample, ...], Observation | None]]
         self._uplink = DelayLine(spec.model.link, self.headset.rng)
         self._frame: list[Sample] = []
-        self._ages_ms: deque[float] = deque(maxlen=AGES_KEPT)
+        self._ages_ns: deque[int] = deque(maxlen=AGES_KEPT)
         self.started_ns = start_ns
         self._joined_ns = 0
         self._lost_ns = 0  # when the connection was lost, 0 while there is one
@@ -180,10 +181,9 @@ class EmulatedOperator:
         """Fill in the fields that are computed at the end, and return the report."""
         report, client = self.report, self.client
         self._update_errors(self._now_ns)
-        ages = sorted(self._ages_ms)
-        if ages:
-            report.age_ms_p50 = ages[len(ages) // 2]
-            report.age_ms_p99 = ages[min(len(ages) - 1, int(0.99 * len(ages)))]
+        ages = compute_quantiles(self._ages_ns)
+        if ages is not None:
+            report.age_ms_p50, report.age_ms_p99 = ages.p50, ages.p99
         report.participant = client.participant_id
         welcome = client.connection.welcome
         if welcome is not None:
@@ -406,7 +406,7 @@ class EmulatedOperator:
 
     def _on_state(self, state: SceneState) -> None:
         self.report.frames += 1
-        self._ages_ms.append(state.age_ns / 1e6)
+        self._ages_ns.append(state.age_ns)
         self.display.add_state(state)
 
     def _on_event(self, event: Event) -> None:
