@@ -6,6 +6,7 @@ import errno
 import fcntl
 import hashlib
 import os
+import random
 import resource
 import time
 from collections.abc import Iterator
@@ -19,7 +20,8 @@ from iris_session.assets.errors import AssetMissingError, AssetStoreError
 from iris_session.assets.store import GRACE_S, MAX_MAPPED_FILES, AssetStore, ServedAssets, default_root
 from tests.front.asset_rig import put
 
-DATA = os.urandom(100_000)
+#: Ends with another byte than the wrong copies below.
+DATA = random.Random(1).randbytes(99_999) + b"!"
 ADDRESS = hashlib.sha256(DATA).hexdigest()
 
 
