@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -40,7 +41,8 @@ class Echo(Plugin):
 ECHO = "tests.bench.test_plugins:Echo"
 
 
-def test_calls_are_answered_in_their_order_and_failures_are_named() -> None:
+def test_calls_are_answered_in_their_order_and_failures_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))  # the process imports this module
     with PluginProcess(ECHO, EchoJob("ha")) as worker:
         worker.send("repeat", 2)
         worker.send("repeat", 1)
