@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from iris_session.demo.scenes import n_arms_scene, scene_path
     from iris_session.physics import load_model, load_robots_toml
     from iris_session.protocol.common import Pose
+    from iris_session.protocol.errors import IrisError
     from iris_session.protocol.media import StreamCamera, StreamInfo
     from iris_session.protocol.names import HoldReason
     from iris_session.protocol.scene import (
@@ -111,6 +112,7 @@ _PUBLIC: Final = {
     "iris_session.assets.store": ("AssetStore",),
     "iris_session.assets.errors": ("AssetStoreError", "AssetMissingError"),
     "iris_session.protocol.common": ("Pose",),
+    "iris_session.protocol.errors": ("IrisError",),
     "iris_session.protocol.media": ("StreamInfo", "StreamCamera"),
     "iris_session.protocol.scene": (
         "Geometry",
@@ -161,6 +163,7 @@ __all__ = [
     "ControlConfig",
     "RobotSpec",
     "ObjectSpec",
+    "IrisError",
     "SessionError",
     "ConfigError",
     "StartError",

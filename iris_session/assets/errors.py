@@ -6,8 +6,10 @@ AssetStoreError            an `OSError`: the folder cannot be used, or is full (
 
 from __future__ import annotations
 
+from iris_session.protocol.errors import IrisError
 
-class AssetStoreError(OSError):
+
+class AssetStoreError(IrisError, OSError):
     """A store cannot read or keep assets.
 
     Attributes:

@@ -17,6 +17,8 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
+from iris_session.protocol.errors import IrisError
+
 VERSION: Final = 1
 #: Parameter `bars` of a benchmark over an impaired link.
 NO_BARS: Final = "none: the figures include the link"
@@ -34,7 +36,7 @@ _OPERATORS: Final = {
 }
 
 
-class BenchError(Exception):
+class BenchError(IrisError):
     """The benchmark has no result. The text is one line for the user."""
 
 

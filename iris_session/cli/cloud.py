@@ -20,11 +20,11 @@ from iris_session.cli.common import (
     add_address_options,
     add_json_option,
     check_session_reachable,
-    list_expected_errors,
     parse_seconds,
     print_json,
     to_printable,
 )
+from iris_session.protocol.errors import IrisError
 from iris_session.protocol.names import MediaEncoding
 
 if TYPE_CHECKING:
@@ -177,10 +177,9 @@ def _name_unexpected_error(settings: CloudSettings) -> Iterator[None]:
     """Turn an unexpected error into one line: of a driver, or a package that reads recordings."""
     from iris_session.system.log import LEVEL_VARIABLE, describe_error
 
-    expected: tuple[type[Exception], ...] = (CommandError, ImportError, *list_expected_errors())
     try:
         yield
-    except expected:
+    except (CommandError, ImportError, IrisError):
         raise
     except Exception as error:
         log.debug("the cameras of %r end", settings.stream, exc_info=True)

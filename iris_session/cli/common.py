@@ -63,39 +63,6 @@ def ending_as_interrupts() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def list_expected_errors() -> tuple[type[Exception], ...]:
-    """Return the errors whose text is meant for the user. Any other error is a defect and keeps its traceback."""
-    from iris_session.assets.errors import AssetStoreError
-    from iris_session.client import ClientError
-    from iris_session.cloud.camera_file import CameraFileError
-    from iris_session.cloud.frames import SourceError
-    from iris_session.control import ControlError
-    from iris_session.link import FrontError
-    from iris_session.netsim.process import ImpairmentError
-    from iris_session.netsim.profiles import ProfileError
-    from iris_session.physics import PhysicsError
-    from iris_session.recording import RecordingError
-    from iris_session.scene import SceneBuildError
-    from iris_session.security import KeysError
-    from iris_session.session.errors import SessionError
-
-    return (
-        SessionError,
-        SceneBuildError,
-        AssetStoreError,
-        PhysicsError,
-        ControlError,
-        FrontError,
-        RecordingError,
-        ClientError,
-        CameraFileError,
-        SourceError,
-        ImpairmentError,
-        ProfileError,
-        KeysError,
-    )
-
-
 def parse_number(text: str, is_valid: Callable[[float], bool], wanted: str) -> float:
     """Parse the number of an option.
 

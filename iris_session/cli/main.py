@@ -31,7 +31,8 @@ from iris_session.cli import (
     view,
     web,
 )
-from iris_session.cli.common import CommandError, join_negative_poses, list_expected_errors, to_printable
+from iris_session.cli.common import CommandError, join_negative_poses, to_printable
+from iris_session.protocol.errors import IrisError
 from iris_session.system.extras import describe_import_error
 from iris_session.system.log import LEVEL_VARIABLE, configure_logging
 
@@ -124,7 +125,7 @@ def _run_command(argv: list[str] | None) -> int:
             raise
         print(f"iris-session: {text}", file=sys.stderr)
         return 2
-    except list_expected_errors() as error:
+    except IrisError as error:
         lines = f"iris-session: {error}{_format_option_hint(error)}".split("\n")
         print("\n".join(map(to_printable, lines)), file=sys.stderr)  # what a file holds may be in it
         toml = getattr(error, "toml", "")  # of `AmbiguousModelError`

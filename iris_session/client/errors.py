@@ -20,10 +20,11 @@ from __future__ import annotations
 
 from iris_session.assets.errors import AssetStoreError
 from iris_session.protocol.common import Denial
+from iris_session.protocol.errors import IrisError
 from iris_session.protocol.server_messages import Refused
 
 
-class ClientError(Exception):
+class ClientError(IrisError):
     """Base of all errors of the client."""
 
 

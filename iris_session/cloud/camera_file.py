@@ -28,6 +28,7 @@ from msgspec import Meta
 from anchors.camera import CameraModel, parse_camera, pose_to_matrix
 from anchors.pose import quat_normalize
 from iris_session.protocol.common import Name, Quat, Text, Vec3
+from iris_session.protocol.errors import IrisError
 from iris_session.protocol.media import MAX_IMAGE_SIZE, MAX_STREAMS, describe_bad_stream_name, is_stream_name
 
 SourceName = Literal["folder", "mujoco", "rerun", "mcap", "realsense", "orbbec"]
@@ -51,7 +52,7 @@ _MISSING: Final = {
 }
 
 
-class CameraFileError(ValueError):
+class CameraFileError(IrisError, ValueError):
     """A camera file, or one that it names, cannot be used. The message is one line.
 
     Attributes:

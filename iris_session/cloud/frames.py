@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from anchors.camera import CameraModel
+from iris_session.protocol.errors import IrisError
 
 
-class SourceError(Exception):
+class SourceError(IrisError):
     """A source cannot be opened, or gives no more frames. The message is one line for people."""
 
 

@@ -10,6 +10,7 @@ from typing import Final
 import msgspec
 
 from iris_session.protocol.common import Vec3
+from iris_session.protocol.errors import IrisError
 
 OUTPUT_CTRL: Final = "ctrl"
 OUTPUT_TARGETS: Final = "targets"
@@ -44,7 +45,7 @@ _POSITIVE: Final = (
 )
 
 
-class ControlError(ValueError):
+class ControlError(IrisError, ValueError):
     """A robot, object or configuration that control cannot drive as described. One line that says what would be
     right.
     """

@@ -9,8 +9,10 @@ RecordingError
 
 from __future__ import annotations
 
+from iris_session.protocol.errors import IrisError
 
-class RecordingError(Exception):
+
+class RecordingError(IrisError):
     """Base of all errors of recordings."""
 
 

@@ -11,6 +11,7 @@ from typing import Final
 import msgspec
 
 from iris_session.protocol.common import Name, Pose, Vec3
+from iris_session.protocol.errors import IrisError
 from iris_session.protocol.limits import KeyLimits
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
 
@@ -228,7 +229,7 @@ class FrontStart(msgspec.Struct, frozen=True):
     handback: bytes = b""
 
 
-class FrontError(Exception):
+class FrontError(IrisError):
     """The front cannot run. The message is one line that says what to do."""
 
 

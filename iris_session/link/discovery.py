@@ -16,7 +16,7 @@ from typing import Final, Self
 
 from iris_session.protocol.codec import decode_beacon
 from iris_session.protocol.discovery import DISCOVERY_PORT, Beacon
-from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
+from iris_session.protocol.errors import IrisError, ProtocolError, ProtocolVersionError
 from iris_session.protocol.limits import MAX_BEACON_BYTES
 
 #: Sessions remembered, and addresses of one session: any host can send beacons.
@@ -30,7 +30,7 @@ _SCOPE: Final = re.compile(r"[A-Za-z0-9._-]{1,32}")
 MAX_NAME: Final = 253
 
 
-class DiscoveryError(Exception):
+class DiscoveryError(IrisError):
     """Beacons cannot be received. The message is one line that says what to do."""
 
 

@@ -25,6 +25,7 @@ from typing import Any, Final, Self
 
 from iris_session.netsim.profiles import Profile, ProfileError, load_profile
 from iris_session.netsim.proxy import ImpairedLink
+from iris_session.protocol.errors import IrisError
 from iris_session.system.process import PIPE, ChildProcess
 
 ANSWER_TIMEOUT_S: Final = 10.0
@@ -37,7 +38,7 @@ def make_link_address(number: int) -> str:
     return f"127.0.1.{number + 1}"
 
 
-class ImpairmentError(Exception):
+class ImpairmentError(IrisError):
     """The proxy cannot run. The message is one line that says why."""
 
 

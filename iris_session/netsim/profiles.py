@@ -20,6 +20,8 @@ from typing import Final
 
 import msgspec
 
+from iris_session.protocol.errors import IrisError
+
 UP: Final = "up"  # from clients to the session
 DOWN: Final = "down"
 DIRECTIONS: Final = (UP, DOWN)
@@ -30,7 +32,7 @@ _MASK: Final = 2**64 - 1
 _NORMAL: Final = NormalDist()
 
 
-class ProfileError(ValueError):
+class ProfileError(IrisError, ValueError):
     """The profile is invalid. The message is one line that says what would be right."""
 
 

@@ -16,8 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from iris_session.protocol.errors import IrisError
 
-class PhysicsError(Exception):
+
+class PhysicsError(IrisError):
     """Base of every error of this room."""
 
 

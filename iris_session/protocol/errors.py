@@ -1,10 +1,32 @@
-"""Errors in the bytes of a peer. Each text names the fault and what would have been right.
+"""The root of all errors of the package, and errors in the bytes of a peer.
 
-ProtocolError                base; `code` (a `RefusalCode`) goes into `Refused` or `ProtocolFault` with the text
-|-- MalformedError           not MessagePack, or not a message of the schema (unknown type, missing or wrong field)
-|-- ProtocolVersionError     another protocol version; `version` is the peer's
-|-- TooLargeError            more bytes than the limit of its type
-`-- RateError                more messages of a type than its rate allows
+Each text is one line: what is wrong, the value, and what would be right.
+
+IrisError
+|-- SessionError             of a session that the program owns (`session.errors`)
+|-- ClientError              of a client: no session, a refusal, a denial (`client.errors`)
+|-- PhysicsError             a model or robots file that cannot be used (`physics.errors`)
+|-- ControlError             robots that cannot be driven (`control.config`)
+|-- SceneBuildError          a scene or file that cannot be composed (`scene.errors`)
+|-- SceneError               an operation that does not fit a scene (`protocol.scene`)
+|-- AssetStoreError          the store of assets (`assets.errors`)
+|-- RecordingError           a recording that cannot be read or written (`journal.errors`)
+|-- StreamError              bytes of a stream that cannot be decoded (`streams.errors`)
+|-- FrontError               the process with the sockets cannot start (`link.config`)
+|-- DiscoveryError           beacons cannot be received (`link.discovery`)
+|-- KeysError                keys and allow-lists (`security`)
+|-- SourceError              a depth camera (`cloud.frames`)
+|-- CameraFileError          a camera file (`cloud.camera_file`)
+|-- ProfileError             a profile of a link (`netsim.profiles`)
+|-- ImpairmentError          an impaired link cannot start (`netsim.process`)
+|-- BenchError               a benchmark without a result (`bench.report`)
+`-- ProtocolError            bytes of a peer; `code` (a `RefusalCode`) goes into `Refused` or `ProtocolFault`
+    |-- MalformedError           not MessagePack, or not a message of the schema (unknown type, missing or wrong field)
+    |-- ProtocolVersionError     another protocol version; `version` is the peer's
+    |-- TooLargeError            more bytes than the limit of its type
+    `-- RateError                more messages of a type than its rate allows
+
+The package `anchors` is usable alone; its errors are `ValueError`s of its own.
 """
 
 from __future__ import annotations
@@ -17,8 +39,12 @@ from iris_session.protocol.names import PROTOCOL_VERSION, RefusalCode
 MAX_ERROR_TEXT = 400
 
 
-class ProtocolError(Exception):
-    """Base of all errors of this module. `str(error)` has at most `MAX_ERROR_TEXT` characters: fit for the peer."""
+class IrisError(Exception):
+    """Base of every error that iris-session raises for its user. Any other error is a defect."""
+
+
+class ProtocolError(IrisError):
+    """Base of errors in the bytes of a peer. `str(error)` has at most `MAX_ERROR_TEXT` characters: fit for the peer."""
 
     code: ClassVar[str]
 

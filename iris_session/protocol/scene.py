@@ -19,6 +19,7 @@ import msgspec
 
 from iris_session.protocol.codec import Bytes, make_decoder
 from iris_session.protocol.common import Count, Name, Pose, Text, Vec3
+from iris_session.protocol.errors import IrisError
 from iris_session.protocol.names import SCENE_VERSION, AssetEncoding, Follow, TextureRole
 
 #: SHA-256 of the bytes of an asset, as 64 hex digits.
@@ -347,7 +348,7 @@ class SceneSpec(msgspec.Struct, frozen=True):
     totals: Totals = Totals()
 
 
-class SceneError(ValueError):
+class SceneError(IrisError, ValueError):
     """The bytes are not a scene specification that this package reads."""
 
 

@@ -6,8 +6,10 @@ SceneBuildError           base
 
 from __future__ import annotations
 
+from iris_session.protocol.errors import IrisError
 
-class SceneBuildError(Exception):
+
+class SceneBuildError(IrisError):
     """A scene cannot be built, read or written as asked. Base of the errors of this package."""
 
 

@@ -15,6 +15,7 @@ from typing import Final, TypeVar
 import msgspec
 from filelock import FileLock, Timeout
 
+from iris_session.protocol.errors import IrisError
 from iris_session.system.files import write_atomic
 
 LOCK: Final = "lock"
@@ -25,7 +26,7 @@ MAX_FILE_BYTES: Final = 4_000_000
 T = TypeVar("T")
 
 
-class KeysError(Exception):
+class KeysError(IrisError):
     """The key home cannot be used. The message is one line that says what to do."""
 
 

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import reprlib
 
+from iris_session.protocol.errors import IrisError
 
-class SessionError(Exception):
+
+class SessionError(IrisError):
     """Base of all errors that a session raises to its owner."""
 
 
