@@ -243,7 +243,7 @@ def _run_session(
     if keep_poses:
         session.stepper.on_state = lambda header, poses: _store_poses(truth, header, poses)
     session.stepper.on_entries = lambda entries: _store_receipts(received, entries)
-    connections, names = dict(session.stepper.ledger.connections), session.stepper.ledger.names_by_id()
+    connections, names = dict(session.stepper.view.connections), session.stepper.view.names_by_id()
     begin = session.clock() + round(WARM_UP_S * 1e9)
     end = begin + round(seconds * 1e9)
     for worker in workers:
@@ -265,7 +265,7 @@ def _run_session(
     received = {key: [s for s in samples if begin <= s[1] < end] for key, samples in received.items()}
     logs = {name: log for worker in workers for name, log in worker.read_logs().items()}
     status = session.status()
-    ledger = session.stepper.ledger
+    view = session.stepper.view
     return Measurement(
         seconds,
         stats,
@@ -274,7 +274,7 @@ def _run_session(
         status.scheduling,
         truth,
         received,
-        {"/".join(key): count for key, count in ledger.rejected.items()},
+        {"/".join(key): count for key, count in view.rejected.items()},
         {names[p]: c for p, c in connections.items()},
         status.drops,
         meter.late_causes,

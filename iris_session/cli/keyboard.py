@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from iris_session.session.owner import Owner
+    from iris_session.session.session_base import SessionBase
 
 #: Time until a terminal is looked at again while another program has it [s].
 BACKGROUND_S: Final = 0.5
@@ -30,7 +30,7 @@ class KeyBinding:
         self.act = act
 
 
-def bind_session_keys(session: Owner) -> dict[str, KeyBinding]:
+def bind_session_keys(session: SessionBase) -> dict[str, KeyBinding]:
     """Return the keys of a session: space for the e-stop, `c` to clear it, `p` to pause and resume where it can."""
     from iris_session.session.session import Session
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from iris_session.protocol.server_messages import Event
-    from iris_session.session.owner import Owner
+    from iris_session.session.session_base import SessionBase
 
 #: Refresh of the display [s].
 REFRESH_S: Final = 0.5
@@ -94,7 +94,7 @@ class TerminalView:
     for which the display was too slow.
     """
 
-    def __init__(self, session: Owner, out: TextIO, title: str, footer: str = "") -> None:
+    def __init__(self, session: SessionBase, out: TextIO, title: str, footer: str = "") -> None:
         self._session = session
         self._out = out
         self._title = title

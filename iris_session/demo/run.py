@@ -29,8 +29,8 @@ from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.protocol.client_messages import Episode
 from iris_session.protocol.names import EpisodeAction, StreamFault
 from iris_session.session.config import SessionConfig
-from iris_session.session.ledger import HandoverStatus
 from iris_session.session.session import Session
+from iris_session.session.session_view import HandoverStatus
 from iris_session.session.verification import verify_recording
 from iris_session.system.extras import require_package
 from iris_session.system.process import DEVNULL, PIPE, ChildProcess

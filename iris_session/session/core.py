@@ -204,7 +204,7 @@ class SessionCore:
         owner_ctrl = self.world.ctrl.copy()
         self.controller.write_rest(self.world.data)
         if self.sharing is not None:
-            self.sharing.keep_owned(self.world.ctrl, owner_ctrl)
+            self.sharing.restore_owner_ctrl(self.world.ctrl, owner_ctrl)
 
     def _tick(self) -> bool:
         """Advance physics by a tick; False when the state is no longer finite: physics stands still until a reset."""

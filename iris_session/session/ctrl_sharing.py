@@ -136,7 +136,7 @@ class CtrlSharing:
             r.written = value.tolist() if r.share else []
             ctrl[out.actuators] = value
 
-    def keep_owned(self, ctrl: Floats, owner: Floats) -> None:
+    def restore_owner_ctrl(self, ctrl: Floats, owner: Floats) -> None:
         """Put the owner's `ctrl` back where it counts alone, in place; what control drives stays as it is."""
         for out, r in zip(self._outputs, self._robots, strict=True):
             if not r.share:

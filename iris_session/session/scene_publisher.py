@@ -33,9 +33,9 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.core import make_session_core
 from iris_session.session.draft import SceneDraft
 from iris_session.session.errors import ConfigError, OwnershipError, PublishError, StartError
-from iris_session.session.owner import Owner
 from iris_session.session.processes import PublishedScene, SessionProcesses
 from iris_session.session.publish_loop import PublishedVertices, PublishLoop
+from iris_session.session.session_base import SessionBase
 from iris_session.session.stepper import NextPatch, make_session_clock
 
 #: Period at which `run` calls `until` [s].
@@ -50,7 +50,7 @@ _NOT_DRIVEN: Final = (
 )
 
 
-class ScenePublisher(Owner):
+class ScenePublisher(SessionBase):
     """A shared session over a scene of a `SceneBuilder`, whose poses and vertices your program publishes.
 
     `set_pose`, `set_poses`, `set_joints`, `set_vertices` and `publish` may be called from any thread: a `publish` sends

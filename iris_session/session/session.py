@@ -43,10 +43,10 @@ from iris_session.session.attachment import Attachment, find_simulation
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots, check_timestep
 from iris_session.session.core import SessionCore, make_session_core, read_plant_state
 from iris_session.session.errors import ConfigError, OwnershipError
-from iris_session.session.owner import Owner
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.resume import prepare_session
 from iris_session.session.scene_change import adopt_timestep, prepare_scene
+from iris_session.session.session_base import SessionBase
 from iris_session.session.status import DataFault
 from iris_session.session.stepper import (
     MAX_HOST_ENTRIES,
@@ -71,7 +71,7 @@ OVERRUN_LOG_PERIOD_NS: Final = 10_000_000_000
 _log = logging.getLogger(__name__)
 
 
-class Session(Owner):
+class Session(SessionBase):
     """A shared session over one MuJoCo model.
 
     With `config.resume`, model, state, robots and objects come from the recording.

@@ -26,7 +26,7 @@ from iris_session.protocol.status import (
     StatusReport,
     StopReport,
 )
-from iris_session.session.ledger import HandoverStatus
+from iris_session.session.session_view import HandoverStatus
 from iris_session.session.stepper import Stepper
 from iris_session.session.tick_times import TickTimes
 
@@ -133,18 +133,18 @@ def make_session_status(
             "p99_ms": stats.p99_ns * 1e-6,
             "max_ms": stats.max_ns * 1e-6,
         }
-    core, ledger, decision = stepper.core, stepper.ledger, stepper.last.decision
-    view = core.world.view()
+    core, view, decision = stepper.core, stepper.view, stepper.last.decision
+    world = core.world.view()
     return SessionStatus(
         now_ns * 1e-9,
-        view.tick,
-        view.sim_time,
+        world.tick,
+        world.sim_time,
         decision.paused,
         decision.estop,
-        ledger.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
-        tuple(ledger.handovers),
+        view.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
+        tuple(view.handovers),
         lateness,
-        ledger.compute_input_to_ctrl_ms(),
+        view.compute_input_to_ctrl_ms(),
         drops,
         restarts,
         scheduling,
@@ -208,7 +208,7 @@ class StatusReporter:
             load=os.getloadavg()[0],
             cpus=os.cpu_count() or 1,
             memory_bytes=measure_memory_bytes(),
-            participants=stepper.ledger.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
+            participants=stepper.view.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
             robots=make_robot_reports(stepper),
             recorder=processes.recorder,
             drops=processes.drops,
@@ -235,12 +235,12 @@ def make_anchor_reports(poses: Mapping[str, Pose], sizes: Mapping[str, float]) -
 
 def make_robot_reports(stepper: Stepper) -> tuple[RobotReport, ...]:
     """Return for each robot its holder, its state, and the time that its samples waited for their step."""
-    ledger = stepper.ledger
-    names = ledger.names_by_id()
+    view = stepper.view
+    names = view.names_by_id()
     commands = {c.robot: c for c in stepper.last.decision.commands} if stepper.last is not None else {}
     rows = []
     for spec in stepper.core.scene.robots:
-        lease, command = ledger.mirror.leases.get(spec.name), commands.get(spec.name)
+        lease, command = view.mirror.leases.get(spec.name), commands.get(spec.name)
         holder = "" if lease is None else lease.holder
         rows.append(
             RobotReport(
@@ -250,7 +250,7 @@ def make_robot_reports(stepper: Stepper) -> tuple[RobotReport, ...]:
                 names.get(holder, ""),
                 "" if command is None else command.kind,
                 "" if command is None else command.hold_reason,
-                ledger.receive_to_step_quantiles(spec.name),
+                view.receive_to_step_quantiles(spec.name),
                 () if lease is None else lease.queue,
             )
         )

@@ -40,7 +40,7 @@ from iris_session.protocol.steps import Decision
 from iris_session.session.core import Plant, SessionCore, StepOutcome, ignore_lap
 from iris_session.session.deformables import DeformableSourceMesh
 from iris_session.session.errors import OwnershipError
-from iris_session.session.ledger import SessionLedger
+from iris_session.session.session_view import SessionView
 from iris_session.session.shared_scene import Shown
 
 #: Pending host entries; a script that posts more in one step gets an error.
@@ -168,7 +168,7 @@ class Stepper:
 
     Attributes:
         last: Outcome of the newest step.
-        ledger: Participants, leases and events so far.
+        view: Participants, leases and events so far.
         requests: What participants ask of the owner of a user loop, oldest first.
         lateness_ns: Worst lateness of a tick since the last published state, set by the pacing loop.
         on_scene: Called with a scene or patch before the step that loads it.
@@ -207,7 +207,7 @@ class Stepper:
         self._next_keyframe_ns = 0
         self._lost_rows = self._next_gap_log_ns = 0
         self._chain = chain
-        self.ledger = SessionLedger()
+        self.view = SessionView()
         self.requests: deque[OwnerRequest] = deque(maxlen=MAX_REQUESTS)
         self.lateness_ns = 0
         self.on_publish: list[Callable[[int, int, int], None]] = []
@@ -302,7 +302,7 @@ class Stepper:
         self._newest_step = self.step_count
         if publish:
             self.publish(end_ns)
-        self.ledger.apply_step(outcome.decision, outcome.status)
+        self.view.apply_step(outcome.decision, outcome.status)
         for outgoing in outcome.decision.outgoing:  # replies to requests of the owner, which does not wait for them
             denial = outgoing.message.denial if isinstance(outgoing.message, Reply) else None
             if outgoing.connection == HOST and denial is not None:
@@ -320,7 +320,7 @@ class Stepper:
         entries = self.front.poll()
         host: list[Entry] = []
         if self.last is None and self._resumed_from is not None:
-            # The ledger is empty: it gets the participants by a snapshot, as a client does.
+            # The view is empty: it gets the participants by a snapshot, as a client does.
             past = self._resumed_from
             begin = (SessionResumed(now_ns - past.now_ns, dict(past.anchors)), GetSnapshot())
             host += [Entry(HOST, HOST, now_ns, message) for message in begin]
@@ -346,7 +346,7 @@ class Stepper:
             if self.recorder is not None:
                 robots = label_robots(scene.plant.scene.robots, scene.plant.world)
                 self.recorder.send_scene(scene.model_hash, scene.packed_model, bodies, *assets, robots)
-            messages = (scene.plant.scene, GetSnapshot())  # the ledger gets the new leases as a client does
+            messages = (scene.plant.scene, GetSnapshot())  # the view gets the new leases as a client does
         for callback in self.on_scene:
             callback(scene)
         return messages

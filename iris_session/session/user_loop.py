@@ -76,7 +76,7 @@ _FIELDS: Final = {
 Floats = NDArray[np.float64]
 
 
-class _Lent:
+class _BorrowedArray:
     """Elements of an array of the user's data that the session writes for now, and the owner's values of them."""
 
     def __init__(self, array: NDArray[np.float64]) -> None:
@@ -157,7 +157,7 @@ class UserLoop:
             spec.name: np.array([model.jnt_qposadr[model.joint(name).id] for name in spec.joints], np.intp)
             for spec in scene.robots
         }
-        self._ctrl, self._forces = _Lent(data.ctrl), _Lent(data.xfrc_applied)
+        self._ctrl, self._forces = _BorrowedArray(data.ctrl), _BorrowedArray(data.xfrc_applied)
         self._ctrl_at = mujoco.mj_stateSize(model, STATE & (_CTRL - 1))
         self._forces_at = mujoco.mj_stateSize(model, STATE & (_XFRC - 1))
         self._left: dict[str, Floats] = {}  # joints of driven robots after the newest round in which time passed
@@ -258,7 +258,7 @@ class UserLoop:
             if (self._ctrl.indices.size or self._forces.indices.size) and self._read_plant():
                 self._stepper.core.write_rest_controls(self._plant)
                 self._write_controls()
-            self._ctrl = _Lent(self._data.ctrl)
+            self._ctrl = _BorrowedArray(self._data.ctrl)
 
     def list_warnings(self) -> tuple[str, ...]:
         """Return what the owner should know, one line each."""

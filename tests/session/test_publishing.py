@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from iris_session import SceneBuilder, ScenePublisher, SessionConfig, StreamInfo
-from iris_session.session.owner import Owner
+from iris_session.session.session_base import SessionBase
 
 
-class Closing(Owner):
+class Closing(SessionBase):
     """A session whose front has ended, and whose recorder has not."""
 
     clock = staticmethod(lambda: 0)
@@ -50,8 +50,8 @@ class Publishing(Closing):
 
 def test_description_and_time_of_sending_are_passed_on() -> None:
     session, info = Publishing(), StreamInfo("The room", hz=30.0)
-    assert Owner.publish_media(session, "room", b"points", capture_ns=7, encoding="cloud", info=info)
-    assert Owner.publish_media(session, "room", {}, info=info)
+    assert SessionBase.publish_media(session, "room", b"points", capture_ns=7, encoding="cloud", info=info)
+    assert SessionBase.publish_media(session, "room", {}, info=info)
     assert session.given == [
         (("room", b"points", 7, 0, "cloud"), {"info": info, "sent_ns": 500}),
         (("room", {}, 500, 0, "bytes"), {"info": info, "sent_ns": 500}),

@@ -504,10 +504,10 @@ def test_first_entry_is_session_resumed(gone_on: tuple[Stepper, Front, Path]) ->
 
 def test_participants_keep_leases_and_robots_hold(gone_on: tuple[Stepper, Front, Path]) -> None:
     stepper, front, _ = gone_on
-    lease = stepper.ledger.mirror.leases["left"]
+    lease = stepper.view.mirror.leases["left"]
     assert lease.holder == "p1"
     assert lease.expires_ns > LAST_NS + 5_000_000_000, "the grace period begins anew"
-    (ann,) = stepper.ledger.make_participant_reports(0)
+    (ann,) = stepper.view.make_participant_reports(0)
     assert (ann.name, ann.connected, ann.holds) == ("ann", False, ("left",))
     assert all(command.kind == CommandKind.HOLD for _, decision in front.decisions for command in decision.commands)
     assert stepper.core.world.view().tick == STEPS + 39, "the first step has no tick: it may be paused"

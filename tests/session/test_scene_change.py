@@ -179,10 +179,10 @@ def test_stepper_sends_the_scene_before_the_step() -> None:
     assert seen == [rows]
     first = decode_entries(rig.recorder.rows[rows].entries)[0].message
     assert first == scene.plant.scene
-    events = [e.body for e in rig.stepper.ledger.recent if isinstance(e.body, SceneChanged)]
+    events = [e.body for e in rig.stepper.view.recent if isinstance(e.body, SceneChanged)]
     assert events == [SceneChanged(2, 0, "new_scene", tick_period_ns=TICK_NS)]
-    assert rig.stepper.ledger.mirror.synced
-    assert set(rig.stepper.ledger.mirror.leases) == {"left", "right", "object1", "object2", "object3"}
+    assert rig.stepper.view.mirror.synced
+    assert set(rig.stepper.view.mirror.leases) == {"left", "right", "object1", "object2", "object3"}
     assert rig.front.n_bodies == len(scene.plant.world.bodies)
 
 

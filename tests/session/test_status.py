@@ -18,8 +18,8 @@ from iris_session.protocol.server_messages import Event, Handover, ParticipantLe
 from iris_session.protocol.status import AnchorReport, ParticipantReport, RecorderReport
 from iris_session.protocol.steps import Admitted, Decision
 from iris_session.session.config import SessionConfig
-from iris_session.session.ledger import MAX_HANDOVERS, SessionLedger
 from iris_session.session.processes import SessionProcesses
+from iris_session.session.session_view import MAX_HANDOVERS, SessionView
 from iris_session.session.status import (
     PATIENCE_NS,
     PERIOD_NS,
@@ -50,7 +50,7 @@ class Session:
         self.stepper.step(1)
 
     def people(self) -> dict[str, ParticipantReport]:
-        return {row.name: row for row in self.stepper.ledger.make_participant_reports(self.now_ns)}
+        return {row.name: row for row in self.stepper.view.make_participant_reports(self.now_ns)}
 
 
 @pytest.fixture
@@ -63,21 +63,21 @@ def bob(now_ns: int) -> Entry:
 
 
 def test_handovers_of_the_status_are_bounded() -> None:
-    ledger = SessionLedger()
+    view = SessionView()
     for n in range(MAX_HANDOVERS + 5):
         handed = Handover(f"object{n}", "left", "right", "p1", "p2", 1)
-        ledger.apply_step(Decision(commands=(), events=(Event(n + 1, n, n, handed),)), ())
-    assert len(ledger.handovers) == MAX_HANDOVERS
-    assert ledger.handovers[-1].object == f"object{MAX_HANDOVERS + 4}"
+        view.apply_step(Decision(commands=(), events=(Event(n + 1, n, n, handed),)), ())
+    assert len(view.handovers) == MAX_HANDOVERS
+    assert view.handovers[-1].object == f"object{MAX_HANDOVERS + 4}"
 
 
 def test_connections_of_a_session_are_the_newest_of_those_who_are_in_it() -> None:
-    ledger = SessionLedger()
+    view = SessionView()
     for connection in range(1, 6):
-        ledger.apply_step(Decision(commands=(), admitted=(Admitted(connection, "p1", "operator", connection > 1),)), ())
-    assert ledger.connections == {"p1": 5}
-    ledger.apply_step(Decision(commands=(), events=(Event(1, 1, 1, ParticipantLeft("p1", "bye")),)), ())
-    assert ledger.connections == {}
+        view.apply_step(Decision(commands=(), admitted=(Admitted(connection, "p1", "operator", connection > 1),)), ())
+    assert view.connections == {"p1": 5}
+    view.apply_step(Decision(commands=(), events=(Event(1, 1, 1, ParticipantLeft("p1", "bye")),)), ())
+    assert view.connections == {}
 
 
 def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
@@ -101,11 +101,11 @@ def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
 
 def test_participants_that_left_are_removed(session: Session) -> None:
     session.step(bob(TICK_NS))
-    session.stepper.ledger.rejected[session.people()["bob"].id, "head", "stale"] = 3
+    session.stepper.view.rejected[session.people()["bob"].id, "head", "stale"] = 3
     assert session.people()["bob"].rejected == {"stale": 3}
     session.step(Entry(BOB, BOB, session.now_ns, Bye()))
     assert session.people() == {}
-    assert session.stepper.ledger.rejected == {}
+    assert session.stepper.view.rejected == {}
 
 
 def test_report_lists_robots_and_holders(session: Session) -> None:
@@ -145,7 +145,7 @@ def test_alignments_anchors_and_cross_checks_are_in_the_report(session: Session)
     row = session.people()["bob"]
     session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
     reports = session.stepper.core.authority.build_alignment_reports()
-    (told,) = [r for r in session.stepper.ledger.make_participant_reports(session.now_ns, reports) if r.id == row.id]
+    (told,) = [r for r in session.stepper.view.make_participant_reports(session.now_ns, reports) if r.id == row.id]
     assert told.alignment_report is not None
     assert (told.alignment_report.version, told.alignment_report.running) == (1, True)
     assert make_anchor_reports({"table": IDENTITY, "door": IDENTITY}, {"table": 0.16}) == (

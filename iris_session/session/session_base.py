@@ -1,4 +1,4 @@
-"""`Owner`: operations of the program that embeds a session, common to all ways in which its world advances.
+"""`SessionBase`: operations of the program that embeds a session, common to all ways in which its world advances.
 
 `Session` (a MuJoCo scene) and `ScenePublisher` (any other world) add how the world advances.
 """
@@ -30,7 +30,7 @@ from iris_session.session.status import DataFault, SessionStatus, make_session_s
 from iris_session.session.stepper import MAX_PENDING_SCENES, NextPatch, OwnerRequest, Stepper
 
 
-class Owner:
+class SessionBase:
     """Base of `Session` and `ScenePublisher`: one session, as seen by the process that owns it."""
 
     config: SessionConfig
@@ -245,7 +245,7 @@ class Owner:
             At most 200 events, oldest first; the recording has them all.
         """
         with self._hold_steps():
-            return [] if self._stepper is None else list(self._stepper.ledger.recent)
+            return [] if self._stepper is None else list(self._stepper.view.recent)
 
     @property
     def scene(self) -> SceneSpec | None:

@@ -1,4 +1,4 @@
-"""`SessionLedger`: participants of a session, their leases and recent events, from the authority's own decisions.
+"""`SessionView`: participants of a session, their leases and recent events, from the authority's own decisions.
 
 It needs no snapshot and no query of the pure core. `status` makes reports for users and clients from it.
 """
@@ -46,7 +46,7 @@ class HandoverStatus(msgspec.Struct, frozen=True):
     duration_s: float
 
 
-class SessionLedger:
+class SessionView:
     """Roster, leases and handovers of a session, from the authority's decisions.
 
     Attributes:
