@@ -109,6 +109,7 @@ def test_unsupported_methods_of_a_publisher_raise(wrong: Callable[[ScenePublishe
 
 
 def test_invalid_times_raise_and_change_nothing(session: ScenePublisher) -> None:
+    session.run(seconds=0.1)
     session.publish(13.0)
     session.run(until=lambda: session.status().sim_time == 13.0, seconds=30.0)
     before = session.status().sim_time
