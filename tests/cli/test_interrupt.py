@@ -29,7 +29,6 @@ sys.exit(run_command())
     [
         ("iris_session.cli.main", ("keys", "list")),
         ("mujoco", ("serve", "handover")),
-        ("iris_session.physics", ("keys", "list")),  # the list cannot be read: imported to tell errors apart
     ],
 )
 def test_interrupt_during_imports_is_no_traceback(module: str, command: tuple[str, ...], tmp_path: Path) -> None:
