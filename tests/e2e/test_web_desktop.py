@@ -174,6 +174,23 @@ def drive_forward(page: Page, tip: Tip, distance: float) -> NDArray[np.float64]:
     return begin
 
 
+def test_keys_drive_the_robot_while_the_dead_man_is_pressed(scenario: Scenario, driver: Page) -> None:
+    """How fast and how far is in the test after this one."""
+    tip = Tip(scenario)
+    begin = tip.place
+    driver.hold("w")
+    tip.watch_for(0.5)
+    assert np.linalg.norm(tip.place - begin) < REST_M
+    driver.let_go("w")
+    begin = drive_forward(driver, tip, 0.03)
+    assert tip.place[1] - begin[1] > 0.02
+    driver.let_go("w")
+    driver.let_go("Shift")
+    driver.wait("document.querySelector('.drive .why').textContent.startsWith('Held. Hold left Shift')")
+    assert driver.errors == []
+
+
+@pytest.mark.long
 def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
     tip = Tip(scenario)
     begin = tip.place
