@@ -165,8 +165,6 @@ def test_capture_time_slightly_ahead_is_clamped_to_now() -> None:
 
 
 def test_reset_during_publish_comes_with_the_next_state(session: ScenePublisher) -> None:
-    before = kinds(session).count(SceneChanged)
-
     class Now(float):
         """A time during whose comparison another thread value `reset`."""
 
@@ -177,6 +175,8 @@ def test_reset_during_publish_comes_with_the_next_state(session: ScenePublisher)
             return float.__gt__(self, other)  # type: ignore[arg-type, operator]
 
     session.publish(16.0)
+    session.run(until=lambda: session.status().sim_time == 16.0, seconds=30.0)
+    before = kinds(session).count(SceneChanged)
     session._time_s = Now(16.0)
     session.publish(16.5)
     session.run(until=lambda: session._anew, seconds=30.0)
