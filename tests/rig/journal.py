@@ -58,6 +58,7 @@ class Journal:
             first_keyframe: Begin at this keyframe instead of at the begin of the session.
         """
         if not self.keyframes:
+            assert not self.rows, "steps without the keyframe before the first of them"
             return 0  # the session ended before its first step
         core = SessionCore(decode_model(self._model), self._config, lambda name: decode_model(self._models[name]))
         keyframe = self.keyframes[first_keyframe]
