@@ -111,8 +111,6 @@ def _run_command(argv: list[str] | None) -> int:
             session_log.setLevel(logging.ERROR)
         status: int = arguments.run(arguments)
         sys.stdout.flush()  # a closed pipe is noticed here, not when the interpreter ends
-    except SystemExit:  # of `--help` and of unusable options: the lists below import much
-        raise
     except BrokenPipeError:  # the reader of the pipe has closed it (`| head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has nowhere to go
         return 1

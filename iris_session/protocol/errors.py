@@ -26,7 +26,7 @@ IrisError
     |-- TooLargeError            more bytes than the limit of its type
     `-- RateError                more messages of a type than its rate allows
 
-The package `anchors` is usable alone; its errors are `ValueError`s of its own.
+The package `anchors` is usable alone, so its errors are its own.
 """
 
 from __future__ import annotations
