@@ -16,10 +16,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
-import msgspec
-
 from iris_session.cli.common import to_printable
 from iris_session.system.process import ChildProcess
+from iris_session.viewer.narration import DEBUG, EventNarration
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -31,59 +30,11 @@ if TYPE_CHECKING:
 REFRESH_S: Final = 0.5
 #: Longest wait for the display at the end of the session [s].
 END_S: Final = 3.0
-#: Frequent events that are of little use on a screen.
-HIDDEN_EVENTS: Final = frozenset({"engagement_changed", "samples_rejected"})
 
 
-def round_floats(value: Any) -> Any:
-    """Round floats, also within lists, to four digits; values below 1e-4 become 0."""
-    if isinstance(value, float):
-        return float(f"{value:.4g}") if abs(value) >= 1e-4 else 0.0
-    return [round_floats(one) for one in value] if isinstance(value, list | tuple) else value
-
-
-class EventFilter:
-    """Select the events that are worth a line on the screen. The recording has all events."""
-
-    def __init__(self) -> None:
-        self._agreed: dict[
-            tuple[str, str], bool
-        ] = {}  # by pair of headsets: whether the last cross-check was as expected
-
-    def __call__(self, event: Event) -> bool:
-        from iris_session.doctor.headset_checks import MAX_ERROR_RATIO
-        from iris_session.protocol.server_messages import HeadsetsCompared, ParticipantLeft
-
-        body = event.body
-        if isinstance(body, HeadsetsCompared):  # every five seconds for every pair
-            pair = (min(body.a, body.b), max(body.a, body.b))
-            agreed = body.error_m <= MAX_ERROR_RATIO * body.expected_p95_m
-            changed = self._agreed.get(pair) is not agreed
-            self._agreed[pair] = agreed
-            return changed
-        if isinstance(body, ParticipantLeft) and not body.grace:
-            self._agreed = {pair: agreed for pair, agreed in self._agreed.items() if body.participant not in pair}
-        return body.__struct_config__.tag not in HIDDEN_EVENTS
-
-
-def format_event(event: Event) -> str:
-    """Return one event as one line of printable text."""
-    body = msgspec.to_builtins(event.body)
-    kind = body.pop("event")
-    info = body.pop("participant", None)
-    if isinstance(info, dict):
-        body = {"participant": info["id"], "name": info["name"], "role": info["role"], **body}
-    elif info:
-        body = {"participant": info, **body}
-    if isinstance(body.get("alignment"), dict):
-        alignment = body.pop("alignment")
-        body["kind"] = alignment["kind"]
-        stated = alignment["kind"] == "measured" and not alignment.get("offset")
-        body["error_mm"] = round(alignment["error_at_robot_m"] * 1e3, 1) if stated else "-"
-    if isinstance(body.get("lease"), dict):
-        lease = body.pop("lease")
-        body = {"target": lease["target"], "holder": lease["holder"] or "-", **body}
-    text = " ".join(f"{key}={round_floats(value)}" for key, value in body.items() if value not in ("", None))
+def format_event(event: Event, text: str) -> str:
+    """Return one event, told by `text`, as one line of printable text."""
+    kind = event.body.__struct_config__.tag
     return to_printable(f"{event.session_time * 1e-9:8.2f} s  {kind:20s} {text}")
 
 
@@ -101,7 +52,7 @@ class TerminalView:
         self._footer = footer
         self._next_s = 0.0
         self._seen = 0
-        self._noteworthy = EventFilter()
+        self._narration = EventNarration()
         self._pipe = -1
         self._pending = b""  # rest of a refresh that did not fit into the pipe: it is sent before the next
         self.skipped = 0
@@ -134,7 +85,8 @@ class TerminalView:
             self.skipped += 1
             return
         fresh = [e for e in self._session.recent_events() if e.event_seq > self._seen]
-        lines = [format_event(e) for e in fresh if self._noteworthy(e)]
+        told = [(event, self._narration.add(event).line) for event in fresh]
+        lines = [format_event(event, line.text) for event, line in told if line.level != DEBUG]
         status = self._session.status().as_dict()
         status["handovers"] = len(status.get("handovers", ()))  # the list grows with the session
         self._pending = json.dumps({"status": status, "events": lines}).encode() + b"\n"

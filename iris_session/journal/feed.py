@@ -112,7 +112,8 @@ class RecorderFeed:
         self._lost = False
         self._complete = False
         self._window_limit = window_bytes
-        self._backlog = Backlog(backlog_bytes)
+        self._backlog_limit = backlog_bytes
+        self._backlog: deque[tuple[bytes, int, int]] = deque()  # batches, and numbers of rows and of others in them
         self._context = zmq.Context(io_threads=1)
         self._socket = self._context.socket(zmq.DEALER)
         # Unlimited marks: the window is the bound, and a refused send would be a second one to account for.
@@ -292,7 +293,7 @@ class RecorderFeed:
         batch = self._batch
         lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
         lists += (batch.scenes, batch.assets, batch.holds)
-        if self._backlog.bytes > JOURNAL_SHARE * self._backlog.limit_bytes:
+        if self.stats.waiting_bytes > JOURNAL_SHARE * self._backlog_limit:
             self._leave_out_picture(batch)
         if batch.rows or any(lists):
             self._batch = Batch(dropped_rows=self.stats.dropped_rows)
@@ -337,7 +338,7 @@ class RecorderFeed:
         self._complete = not self._window and not self._backlog
         if self._backlog:
             why = "the session ended before the recorder could take it all"
-            self._drop(self._backlog.rows, self._backlog.others, why)
+            self._drop(sum(rows for _, rows, _ in self._backlog), sum(others for *_, others in self._backlog), why)
             self._backlog.clear()
         if self._vertices is not None:
             self._vertices.close(0)
@@ -361,9 +362,12 @@ class RecorderFeed:
     def _enqueue(self, body: bytes, rows: int, others: int) -> None:
         if not self._backlog and self.stats.window_bytes < self._window_limit:  # a large model may exceed it
             self._send_batch(body)
-        elif not self._backlog.push(body, rows, others):
-            limit = self._backlog.limit_bytes >> 20
+        elif self.stats.waiting_bytes + len(body) > self._backlog_limit:
+            limit = self._backlog_limit >> 20
             self._drop(rows, others, f"the recorder is behind, and {limit} MiB wait for it, the limit")
+        else:
+            self._backlog.append((body, rows, others))
+            self.stats.waiting_bytes += len(body)
 
     def _drop(self, rows: int, others: int, why: str) -> None:
         self.stats.dropped_rows += rows
@@ -392,8 +396,10 @@ class RecorderFeed:
         for _ in range(BACKLOG_BATCHES):
             if not self._backlog or self.stats.window_bytes >= self._window_limit:
                 break
-            self._send_batch(self._backlog.pop())
-        self.stats.waiting_batches, self.stats.waiting_bytes = len(self._backlog), self._backlog.bytes
+            body, _, _ = self._backlog.popleft()
+            self.stats.waiting_bytes -= len(body)
+            self._send_batch(body)
+        self.stats.waiting_batches = len(self._backlog)
 
     def _process_status(self, status: RecorderStatus) -> None:
         self.stats.recorder = status
@@ -419,47 +425,8 @@ class RecorderFeed:
         """Discard what waits, and all that comes: the recorder has closed the last file."""
         self._ended, self._lost, self._gap_rows, self.silence_ns = True, False, 0, 0
         self._window.clear()
-        self.stats.window_bytes = 0
         self._backlog.clear()
-
-
-class Backlog:
-    """Batches that wait for the recorder, first in, first out, at most `limit_bytes`.
-
-    `bytes`, `rows`, `others`: size of them all, and number of journal rows and other items in them.
-    """
-
-    def __init__(self, limit_bytes: int) -> None:
-        self.limit_bytes = limit_bytes
-        self._batches: deque[tuple[bytes, int, int]] = deque()
-        self.bytes = self.rows = self.others = 0
-
-    def __len__(self) -> int:
-        return len(self._batches)
-
-    def push(self, body: bytes, rows: int, others: int) -> bool:
-        """Append a batch of `rows` journal rows and `others` other items; false if there is no room for it."""
-        if self.bytes + len(body) > self.limit_bytes:
-            return False
-        self._batches.append((body, rows, others))
-        self._count(len(body), rows, others)
-        return True
-
-    def pop(self) -> bytes:
-        """Remove and return the oldest batch. Raises `IndexError` if there is none."""
-        body, rows, others = self._batches.popleft()
-        self._count(-len(body), -rows, -others)
-        return body
-
-    def clear(self) -> None:
-        """Remove all batches."""
-        self._batches.clear()
-        self.bytes = self.rows = self.others = 0
-
-    def _count(self, n_bytes: int, rows: int, others: int) -> None:
-        self.bytes += n_bytes
-        self.rows += rows
-        self.others += others
+        self.stats.window_bytes = self.stats.waiting_bytes = 0
 
 
 #: Minimum time between frames of one deformable: 20 a second look smooth, if all deformables together fit.

@@ -31,8 +31,6 @@ _T = TypeVar("_T")
 #: Maximum number of lines in `damage`: a file may be damaged in any number of places.
 MOST_DAMAGE: Final = 200
 MORE_DAMAGE: Final = "and more of it is damaged than is listed here"
-#: Messages at the end of a file among which a recorder's last mark is: it, the end of the journal, and the end message.
-LAST_MESSAGES: Final = 8
 #: Upper bound of the items that a new part repeats: the content of the feed's window, minutes of rows.
 REPEATED_ITEMS: Final = 200_000
 
@@ -44,7 +42,6 @@ class RecordingParts:
 
     Attributes:
         readable: Files that the parts are read from: a temporary copy of a damaged part.
-        rewritten: Those of `readable` that Rerun's tools have written.
     """
 
     def __init__(self, files: Sequence[str]) -> None:
@@ -57,7 +54,6 @@ class RecordingParts:
         self.files: list[str] = []
         self.unreadable_files: list[str] = []
         self.readable: list[str] = []
-        self.rewritten: set[str] = set()
         self.damage: list[str] = []
         self.missing: list[str] = []
         self.notes: list[str] = []
@@ -85,25 +81,19 @@ class RecordingParts:
     def iterate_unique(
         self, entities: str | Sequence[str], decode: Callable[[Any], Iterator[_T]], key: Callable[[_T], Hashable]
     ) -> Iterator[_T]:
-        """Yield the items of all parts; what a part repeats from the end of the previous one counts once.
-
-        A file that Rerun's tools have rewritten may hold several parts: in it, every repeated item counts once.
+        """Yield the items of all parts, each once: a part repeats the end of the one before, and a file that Rerun's
+        tools have written may hold several parts.
         """
-        before: frozenset[Hashable] = frozenset()
-        tail: deque[Hashable] = deque(maxlen=REPEATED_ITEMS)
-        seen: set[Hashable] = set()  # those keys in `tail` that came from a rewritten file
-        part = 0
-        for i, item in self.iterate(entities, decode):
-            if i != part:
-                part, before = i, frozenset(tail)
+        newest: deque[Hashable] = deque()
+        seen: set[Hashable] = set()
+        for _, item in self.iterate(entities, decode):
             name = key(item)
-            if name in before or name in seen:
+            if name in seen:
                 continue
-            if self.readable[i] in self.rewritten:
-                if len(tail) == REPEATED_ITEMS:
-                    seen.discard(tail[0])
-                seen.add(name)
-            tail.append(name)
+            if len(newest) == REPEATED_ITEMS:
+                seen.discard(newest.popleft())
+            seen.add(name)
+            newest.append(name)
             yield item
 
     def iterate(self, entities: str | Sequence[str], decode: Callable[[Any], Iterator[_T]]) -> Iterator[tuple[int, _T]]:
@@ -147,25 +137,10 @@ class RecordingParts:
         except OSError as error:
             self._record_damage(f"{path} cannot be read: {error.strerror or error}")
             return
-        if found.indexed and not (whole and self._is_of_recorder(path, found)):
-            self.rewritten.add(readable)
-            if whole and (n := rrd_file.count_recordings(path, found)) > 1:
-                several.append((os.path.basename(path), n))
+        if found.indexed and whole and (n := rrd_file.count_recordings(path, found)) > 1:
+            several.append((os.path.basename(path), n))
         self.readable.append(readable)
         self.files.append(path)
-
-    def _is_of_recorder(self, path: str, found: rrd_file.Scan) -> bool:
-        """Return whether a readable file with an index is a recorder's: one of its last marks is where it says."""
-        last = found.messages[-LAST_MESSAGES:]
-        infos = [m for m in found.messages[:-LAST_MESSAGES] if m.kind == rrd_file.KIND_STORE_INFO]
-        with self._copying(path) as copy:
-            rrd_file.copy_messages(path, [*infos, *(m for m in last if m.kind != rrd_file.KIND_END)], copy)
-        places = {m.offset for m in last}
-        with suppress(*UNREADABLE, NotARecordingError):
-            for chunk in rrd_file.read_chunks(copy, paths.MARKS):
-                if any(mark.end in places for mark in batches.decode_marks(chunk.to_record_batch())):
-                    return True
-        return False
 
     def _copy_start(self, path: str, n_bytes: int) -> str:
         """Copy the whole messages of a part that is being written: they stay the same while it is read."""

@@ -27,7 +27,6 @@ from iris_session.rrd import batches, paths
 from iris_session.rrd import file as rrd_file
 from iris_session.rrd.assets import AssetCollector, AssetFault, AssetJoiner, AssetPiece, RecordedScene
 from iris_session.rrd.batches import (
-    DrawnVertices,
     FrameTime,
     RawSample,
     RecordedCloud,
@@ -40,24 +39,12 @@ from iris_session.rrd.batches import (
 from iris_session.system.extras import require_package
 
 #: Items of `Recording.outline`.
-OutlineItem = (
-    Event
-    | DenialRecord
-    | RowTimes
-    | FrameTime
-    | RecordedStream
-    | DrawnVertices
-    | RecordedScene
-    | AssetPiece
-    | AssetFault
-)
+OutlineItem = Event | DenialRecord | RowTimes | FrameTime | RecordedStream | RecordedScene | AssetPiece | AssetFault
 _Frame = TypeVar("_Frame", RecordedCloud, RecordedImage)
-#: Entities of the picture that are fixed to the world, deformables among them, in the first scenes of a part.
-_DRAWN: Final = tuple(f"{paths.SCENE}/{n}/world/**" for n in range(1, 17))
 _ASSETS: Final = (paths.ASSET_SCENES, paths.ASSETS, paths.ASSET_FAULTS)
 _OUTLINE: Final = (
     *_ASSETS,
-    *(paths.EVENTS, paths.DENIALS, paths.ROWS, *_DRAWN),
+    *(paths.EVENTS, paths.DENIALS, paths.ROWS),
     *(f"{folder}/**" for folder in (paths.CLOUDS, paths.PICTURES, paths.STREAMS)),
 )
 
@@ -78,8 +65,7 @@ class Recording:
         samples_left_out: Number of raw messages of clients that the recorder did not write, of parts that were closed:
             the disk was slow or nearly full, or the budget nearly used up. Those that the front left out before are
             only in the session's status. The journal has what the session used of them.
-        all_closed: Every part was closed by its recorder, so that nothing can be missing within. Not known of a copy by
-            Rerun's tools, which may be of parts that were not.
+        all_closed: Every part was closed by its recorder, so that nothing can be missing within.
         damage: One line per place that could not be read, at most `MOST_DAMAGE`. Reading on may add lines.
         missing: One line per missing part, or range of parts.
         notes: One line per empty part and per file that holds more than one recording.
@@ -101,8 +87,7 @@ class Recording:
             raise
         self.end = ends.get(len(self.files) - 1)
         self.samples_left_out = sum(end.samples_left_out for end in ends.values())
-        copied = parts.rewritten and not self.damage  # a damaged file of a recorder counts as rewritten, too
-        self.all_closed = len(ends) == len(self.files) and not copied
+        self.all_closed = len(ends) == len(self.files)
         if self.end is not None and self.end.reason:
             self.notes.append(f"{self.end.reason[:200]}; the session may have gone on")
 
@@ -329,7 +314,7 @@ class Recording:
 
     def _media(self, folder: str, stream: str, decode: Callable[[Any], Iterator[_Frame]]) -> Iterator[_Frame]:
         entity = f"{folder}/{stream or '**'}"
-        return self._parts.iterate_unique(entity, decode, lambda frame: (frame.stream, frame.seq))
+        return self._parts.iterate_unique(entity, decode, lambda frame: (frame.stream, frame.seq, frame.capture_ns))
 
     def metrics(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Return the plotted values by name.
@@ -353,9 +338,8 @@ class Recording:
 
         Returns:
             Iterator over events and denials, each once; times of the rows of the journal, where steps that two parts
-            hold come twice; numbers and times of the frames of clouds and pictures, each once; their descriptions; how
-            often the vertices of elements of the picture are in the files; and scenes, pieces of assets, and assets
-            that could not be recorded. Those of one kind are in order.
+            hold come twice; numbers and times of the frames of clouds and pictures, each once; their descriptions; and
+            scenes, pieces of assets, and assets that could not be recorded. Those of one kind are in order.
 
         Raises:
             NotARecordingError: A file can no longer be read.
@@ -427,13 +411,12 @@ def _outline_decoder() -> Callable[[Any], Iterator[tuple[Hashable, Any]]]:
         elif entity.startswith(paths.STREAMS + "/"):
             yield from (((entity, one.session_time, one.info is None), one) for one in batches.decode_streams(batch))
         elif entity.startswith((paths.CLOUDS + "/", paths.PICTURES + "/")):
-            yield from (((entity, one.seq), one) for one in batches.decode_frame_times(batch))
+            frames = batches.decode_frame_times(batch)
+            yield from (((entity, one.seq, one.capture_ns), one) for one in frames)
         elif entity in _DECODE_ASSETS:
             rows = batch.column(batches.ROW_ID).to_pylist()
             yield from (((entity, row), one) for row, one in zip(rows, _DECODE_ASSETS[entity](batch), strict=True))
         else:
-            first = batch.column(batches.ROW_ID)[0].as_py()
-            read = batches.decode_row_times if entity == paths.ROWS else batches.decode_drawn_vertices
-            yield (entity, first), read(batch)
+            yield (entity, batch.column(batches.ROW_ID)[0].as_py()), batches.decode_row_times(batch)
 
     return decode

@@ -6,7 +6,6 @@ rejected them: poses in the sender's own tracking frame.
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
@@ -31,6 +30,12 @@ ID_FIELDS: Final = frozenset(
 #: Fields with several.
 ID_LIST_FIELDS: Final = frozenset(("previous_holders", "sub_holders", "queue"))
 _decode = msgspec.msgpack.Decoder(Sample | Observation).decode
+#: One sample: the fields of `DeviceSamples` with as many numbers in every sample.
+_ROW: Final = [
+    *((name, np.int64) for name in ("receive_ns", "capture_ns", "seq")),
+    *((name, np.bool_) for name in ("tracked", "worn", "clutch")),
+    *(("gripper", np.float64), ("buttons", np.int64), ("poses", np.float64, (7,)), ("twists", np.float64, (6,))),
+]
 
 
 def read_names(recording: Recording) -> dict[str, str]:
@@ -170,46 +175,29 @@ def read_device_samples(recording: Recording, participant: str, device: str) -> 
         RecordingError: There are none; the message lists the devices that have some.
         NotARecordingError: A file can no longer be read.
     """
-    builder, others = _SamplesBuilder(), dict[str, None]()
-    for one in iterate_samples(recording):
-        if participant in (one.participant, one.name) and one.sample.device == device:
-            builder.add(one)
-        else:
-            others.setdefault(f"{one.name or 'unknown'} {one.sample.device}")
-    if not builder.times:
+    others: dict[str, None] = {}
+    joints: list[tuple[float, ...]] = []
+    hand_joints: list[tuple[float, ...]] = []
+
+    def read() -> Iterator[tuple[Any, ...]]:
+        for one in iterate_samples(recording):
+            sample = one.sample
+            if participant not in (one.participant, one.name) or sample.device != device:
+                others.setdefault(f"{one.name or 'unknown'} {sample.device}")
+                continue
+            joints.append(sample.q)
+            hand_joints.append(sample.hand_joints)
+            gripper, *numbers = list_numbers(sample)
+            flags = sample.tracked, sample.worn, sample.clutch
+            head = one.receive_ns, sample.capture_ns, sample.seq, *flags, gripper, sample.buttons
+            yield *head, numbers[:7], numbers[7:]
+
+    rows = np.fromiter(read(), _ROW)
+    if not len(rows):
         listed = ", ".join(others) or "none"
         raise RecordingError(f"there are no samples of {participant!r} {device!r}. Samples: {listed}")
-    return builder.build()
-
-
-class _SamplesBuilder:
-    """Columns of samples while they are read."""
-
-    def __init__(self) -> None:
-        self.times = array("q")  # receipt, capture, number, buttons
-        self._flags = array("b")  # tracked, worn, clutch
-        self._numbers = array("d")  # gripper, pose, twist
-        self._lists: tuple[list[tuple[float, ...]], ...] = ([], [])  # joints, hand joints
-
-    def add(self, one: DecodedSample) -> None:
-        """Add one sample."""
-        sample = one.sample
-        self.times.extend((one.receive_ns, sample.capture_ns, sample.seq, sample.buttons))
-        self._flags.extend((sample.tracked, sample.worn, sample.clutch))
-        self._numbers.extend(list_numbers(sample))
-        for rows, row in zip(self._lists, (sample.q, sample.hand_joints), strict=True):
-            rows.append(row)
-
-    def build(self) -> DeviceSamples:
-        """Return the columns."""
-        receive_ns, capture_ns, seq, buttons = np.array(self.times, np.int64).reshape(-1, 4).T.copy()
-        tracked, worn, clutch = np.array(self._flags, np.bool_).reshape(-1, 3).T.copy()
-        numbers = np.array(self._numbers, np.float64).reshape(-1, 14)
-        q, hand_joints = map(_pad, self._lists)
-        return DeviceSamples(
-            *(receive_ns, capture_ns, seq, tracked, worn, clutch, numbers[:, 0].copy(), buttons),
-            *(numbers[:, 1:8].copy(), numbers[:, 8:].copy(), q, hand_joints),
-        )
+    columns = (rows[name].copy() for name in DeviceSamples._fields[: len(_ROW)])
+    return DeviceSamples(*columns, _pad(joints), _pad(hand_joints))
 
 
 _NO_POSE: Final = (np.nan,) * 7

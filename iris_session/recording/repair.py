@@ -14,7 +14,7 @@ import msgspec
 
 from iris_session.journal.errors import RecorderError
 from iris_session.recording.reader import Recording
-from iris_session.recording.summary import SummaryBuilder
+from iris_session.recording.summary import build_summary
 from iris_session.rrd import file as rrd_file
 from iris_session.rrd import paths
 from iris_session.rrd.rerun_tool import INDEX, rewrite
@@ -82,20 +82,14 @@ def repair(
             raise RecorderError(f"{recording.files[0]} is being written: repair it afterwards")
         target = Path(output)
         _check_output(target, [*recording.files, *recording.unreadable_files], overwrite=overwrite)
-        damaged = [*recording.damage]
-        is_prefix = not damaged and len(recording.files) == 1
+        is_prefix = not recording.damage and len(recording.files) == 1
         try:
             with Replacement(target, permissions=None) as replacement:
                 options = () if is_prefix else _WITHOUT_MARKS
                 rewrite(INDEX, recording.readable_files, replacement.file, options=options, progress=progress)
         except OSError as error:
             raise RecorderError(f"{target} cannot be written: {error.strerror or error}") from error
-        builder = SummaryBuilder(recording.header.begins_after, resumed=recording.header.continues is not None)
-        for item in recording.outline():
-            builder.add(item)
-        changed = recording.changed_spans()
-        lost = builder.assets.list_problems(finished=recording.all_closed)
-        damage = (*recording.missing, *recording.damage, *builder.list_gaps(recording.end), *changed, *lost)
+        builder, damage = build_summary(recording)
         lost_bytes = sum(map(_count_lost_bytes, recording.files, recording.readable_files))
         lost_bytes += sum(map(os.path.getsize, recording.unreadable_files))
         lost_steps, lost_s = builder.count_lost_steps(recording.end)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -41,12 +40,11 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.recording.reader import Recording
 from iris_session.rrd.assets import AssetCollector, AssetFault, AssetPiece, AssetsSummary, RecordedScene
-from iris_session.rrd.batches import DrawnVertices, FrameTime, RecordedStream, RowTimes
+from iris_session.rrd.batches import FrameTime, RecordedStream, RowTimes
 
 #: Maximum number of lines about missing steps, and about missing events: a file may have any number of gaps.
 MOST_GAPS: Final = 100
 _RUNNING: Final = "running"
-_WORLD_ELEMENT: Final = re.compile(r"/scene/\d+/world/(?P<name>.+)", re.DOTALL)
 
 
 class AlignmentSummary(msgspec.Struct, frozen=True):
@@ -166,8 +164,8 @@ class RecordingSummary(msgspec.Struct, frozen=True):
     not the end of the session, empty if it is. `files`: the parts that were read; `bytes`: of them. `recording_class`:
     `closed` or `open`. `created_utc`: when the recording began. `begin_s`: session time of the first step;
     `duration_s`: to the last step or event. `continues`: file that a resumed session continues. `deformables`: those
-    that moved. `scene_changes`: resets among them. `damage`: one line per place that is damaged or missing. `notes`:
-    what else is unusual.
+    of its scenes, if their assets are recorded. `scene_changes`: resets among them. `damage`: one line per place that
+    is damaged or missing. `notes`: what else is unusual.
     """
 
     path: str
@@ -215,16 +213,8 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
     Raises:
         NotARecordingError: A file can no longer be read.
     """
-    header, end = recording.header, recording.end
-    builder = SummaryBuilder(header.begins_after, resumed=header.continues is not None)
-    total = 0 if end is None else max(0, end.step - header.begins_after)
-    for item in recording.outline():
-        builder.add(item)
-        if progress is not None and isinstance(item, RowTimes):
-            progress(builder.steps, total)
-    changed = recording.changed_spans()
-    lost = builder.assets.list_problems(finished=recording.all_closed)
-    damage = (*recording.missing, *recording.damage, *builder.list_gaps(end), *changed, *lost)
+    header = recording.header
+    builder, damage = build_summary(recording, progress)
     past = header.continues
     return RecordingSummary(
         path=recording.files[0],
@@ -244,7 +234,7 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
         continues="" if past is None else f"{past.file} after step {past.step}",
         robots=tuple(robot.name for robot in header.robots),
         objects=tuple(one.name for one in header.objects),
-        deformables=builder.list_deformables(len(recording.files)),
+        deformables=tuple(builder.assets.deformables),
         bodies=len(header.bodies),
         people=builder.list_people(),
         episodes=builder.list_episodes(),
@@ -258,6 +248,22 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
         notes=tuple(recording.notes),
         assets=builder.assets.summarise(),
     )
+
+
+def build_summary(
+    recording: Recording, progress: Callable[[int, int], None] | None = None
+) -> tuple[SummaryBuilder, tuple[str, ...]]:
+    """Return the parts of a summary, and what is damaged or missing. Arguments and errors as for `summarise`."""
+    header, end = recording.header, recording.end
+    builder = SummaryBuilder(header.begins_after, resumed=header.continues is not None)
+    total = 0 if end is None else max(0, end.step - header.begins_after)
+    for item in recording.outline():
+        builder.add(item)
+        if progress is not None and isinstance(item, RowTimes):
+            progress(builder.steps, total)
+    changed = recording.changed_spans()
+    lost = builder.assets.list_problems(finished=recording.all_closed)
+    return builder, (*recording.missing, *recording.damage, *builder.list_gaps(end), *changed, *lost)
 
 
 def _read_size(file: str) -> int:
@@ -350,7 +356,6 @@ class SummaryBuilder:
         self._holders: dict[str, dict[str, int]] = {}  # by robot: since when, by participant
         self._episodes: dict[int, tuple[EpisodeChanged, int, int | None]] = {}  # newest event, start, end
         self._streams: dict[str, _Stream] = {}
-        self._vertices: Counter[str] = Counter()
         self._unattributed: dict[tuple[str, str], int] = {}  # rejected samples of connections that had not joined
         self._denials: Counter[str] = Counter()
         self._gaps: list[Gap] = []
@@ -367,8 +372,6 @@ class SummaryBuilder:
             self._add_frame(item)
         elif isinstance(item, RecordedStream):
             self._describe_stream(item)
-        elif isinstance(item, DrawnVertices):
-            self._vertices[item.entity] += item.n
         elif isinstance(item, RecordedScene | AssetPiece | AssetFault):
             self.assets.add(item)
 
@@ -590,14 +593,6 @@ class SummaryBuilder:
             )
             for name, one in sorted(self._streams.items())
         )
-
-    def list_deformables(self, parts: int = 1) -> tuple[str, ...]:
-        """Return the elements whose vertices are drawn more often than every part draws a fixed mesh, and every patch
-        may draw it again.
-        """
-        redrawn = parts * (1 + sum(one.cause == "patch" for one in self.scene_changes))
-        found = (_WORLD_ELEMENT.fullmatch(entity) for entity, n in self._vertices.items() if n > redrawn)
-        return tuple(dict.fromkeys(re.sub(r"\\(.)", r"\1", one["name"]) for one in found if one))
 
     def make_drops(self, samples_left_out: int = 0) -> DropSummary:
         """Return what was dropped and denied."""

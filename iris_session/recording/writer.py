@@ -45,8 +45,7 @@ from iris_session.rrd.stream import (
     sequence_index,
 )
 from iris_session.viewer.drawing import SessionDrawing
-from iris_session.viewer.event_layer import NarratedEvent
-from iris_session.viewer.narration import WARN, describe_session
+from iris_session.viewer.narration import WARN, NarratedEvent, describe_session
 from iris_session.viewer.timelines import MomentTable, to_time_columns
 
 _encode = msgspec.msgpack.Encoder().encode
@@ -153,7 +152,8 @@ class RrdWriter:
         self._write_rows(batch.rows)
         self._write_keyframes(batch.keyframes)
         events = self._drawing.events
-        narrated = [events.narrate(event) for event in batch.events]  # names and roles are known when people appear
+        narration = self._drawing.narration
+        narrated = [narration.add(event) for event in batch.events]  # names and roles are known when people appear
         for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
             self._write_states(list(states))
         self._write_events(batch.events, narrated)

@@ -11,8 +11,8 @@ import os
 import re
 import shutil
 import tempfile
-from array import array
 from collections.abc import Callable, Sequence
+from itertools import repeat
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, NamedTuple, Protocol, Self
@@ -24,7 +24,7 @@ from iris_session.protocol.client_messages import Sample
 from iris_session.recording import RecordingError
 from iris_session.recording.records import iterate_samples, list_event_records, list_numbers, read_names
 from iris_session.replay.plant_reader import CTRL, POSE, PlantReader, Quantity, read_steps
-from iris_session.replay.recorded_session import OBJECT, ROBOT, SessionRecording, find_command
+from iris_session.replay.recorded_session import OBJECT, ROBOT, SessionRecording, describe_command
 from iris_session.replay.simulation import Replay, ReplayedStep, StepSelector
 
 CSV: Final = "csv"
@@ -48,10 +48,11 @@ SAY_ROWS: Final = 20_000
 MAX_STEM: Final = 80
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.-]+")
 
-_INT: Final = "q"
-_FLOAT: Final = "d"
-_BOOL: Final = "b"
+_INT: Final = "int"
+_FLOAT: Final = "float"
+_BOOL: Final = "bool"
 _TEXT: Final = ""
+_DTYPES: Final[dict[str, Any]] = {_INT: np.int64, _FLOAT: np.float64, _BOOL: np.bool_}
 
 
 class ExportError(RecordingError):
@@ -81,7 +82,7 @@ class ExportReport(msgspec.Struct, frozen=True):
 class Column(NamedTuple):
     """A column, or several that are one array of an npz file. `names`: those of several, in the order of the array.
 
-    `kind`: type code of `array.array`; `b` for truth values, empty for texts.
+    `kind`: of its values, empty for texts.
     """
 
     key: str
@@ -178,36 +179,28 @@ class _Table:
         self.kind, self.name, self.path, self.columns = kind, name, path, tuple(columns)
         self.rows = 0
         self._sink: _Sink = _NpzSink(path, columns) if to == NPZ else _ArrowSink(path, columns, is_csv=to == CSV)
-        self._waiting = 0
-        self._buffers = self._make_buffers()
-
-    def _make_buffers(self) -> list[Any]:
-        return [array(column.kind) if column.kind else [] for column in self.columns]
+        self._rows: list[Sequence[Any]] = []
 
     def add(self, values: Sequence[Any]) -> None:
         """Add a row: a value per column, a sequence for a column with names."""
-        for column, buffer, value in zip(self.columns, self._buffers, values, strict=True):
-            if column.names:
-                buffer.extend(value)
-            else:
-                buffer.append(value)
         self.rows += 1
-        self._waiting += 1
-        if self._waiting == CHUNK_ROWS:
+        self._rows.append(values)
+        if len(self._rows) == CHUNK_ROWS:
             self._flush()
 
     def _flush(self) -> None:
-        dtypes = {_INT: np.int64, _FLOAT: np.float64, _BOOL: np.bool_}
         columns = []
-        for column, buffer in zip(self.columns, self._buffers, strict=True):
-            values = np.array(buffer, dtypes[column.kind]) if column.kind else buffer
-            columns.append(values.reshape(-1, len(column.names)) if column.names else values)
+        for column, values in zip(
+            self.columns, zip(*self._rows, strict=True) if self._rows else repeat(()), strict=False
+        ):
+            shape = (len(self._rows), len(column.names)) if column.names else -1
+            columns.append(np.array(values, _DTYPES[column.kind]).reshape(shape) if column.kind else list(values))
         self._sink.write(columns)
-        self._waiting, self._buffers = 0, self._make_buffers()
+        self._rows.clear()
 
     def close(self) -> ExportedTable:
         """Write the rest, and finish the file."""
-        if self._waiting or not self.rows:
+        if self._rows or not self.rows:
             self._flush()
         self._sink.close()
         n = sum(len(column.list_names()) for column in self.columns)
@@ -380,15 +373,9 @@ class _StepWriter:
 
     def _describe(self, step: ReplayedStep, robot: str) -> tuple[Any, ...]:
         """Return the values of `_COMMAND`."""
-        command = find_command(step, robot)
-        participants = [source.participant for source in command.sources]
-        return (
-            *(command.kind, command.hold_reason, ",".join(participants)),
-            ", ".join(self._people.get(one, "") for one in participants),
-            ",".join(source.device for source in command.sources),
-            np.nan if command.gripper is None else command.gripper,
-            command.scale,
-        )
+        kind, reason, participants, devices, gripper, scale = describe_command(step, robot)
+        names = ", ".join(self._people.get(one, "") for one in participants.split(",") if one)
+        return kind, reason, participants, names, devices, gripper, scale
 
 
 # --- samples, events --------------------------------------------------------------------------------------------------

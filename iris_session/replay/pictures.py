@@ -27,7 +27,7 @@ from iris_session.recording import Recording, RecordingError
 from iris_session.replay.simulation import Replay
 from iris_session.rrd.batches import RowTimes
 from iris_session.session.core import SessionCore
-from iris_session.viewer.narration import EventNarration
+from iris_session.viewer.narration import find_colour
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -36,14 +36,14 @@ Floats = NDArray[np.float64]
 EYE: Final = (0.25, -1.75, 0.95)
 #: Share of the picture's height and width that the bodies take at most.
 FILLED: Final = 0.9
-#: The least half size of what is shown [m].
+#: The least radius of a body that is shown [m].
 MIN_HALF_M: Final = 0.1
 #: Moments at which the places of bodies are read for it, and poses in all.
 MOMENTS: Final = 500
 MOST_POSES: Final = 20_000
 #: Geoms besides those of the model: marks of MuJoCo, added visuals, people.
 MORE_GEOMS: Final = 10_000
-#: Half side of a box around a head or a hand [m].
+#: Radius of a ball around a head or a hand [m].
 PERSON_M: Final = 0.12
 #: Presence older than this is not drawn: its device is not tracked any more [ns].
 PRESENCE_NS: Final = 250_000_000
@@ -55,8 +55,6 @@ _SHAPES: Final = {
     kind: getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
     for kind in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 }
-#: Signs of the corners of a box, shape (8, 3).
-_CORNERS: Final = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _VISOR: Final = (0.10, 0.10, 0.12)
 #: Shapes of a head (x forward) and of a hand: half extents [m], offset in the device's frame [m], whether a visor.
 _HEAD: Final = (
@@ -270,38 +268,42 @@ class RecordingPictures:
 class _SceneBounds:
     """Places of the moving bodies of a scene in a span of time.
 
-    `poses`: in the world at each moment, shape (n, 7), `x y z qw qx qy qz`, [m]. Without any: where they are now.
-    `people`: corners of boxes around heads and hands, each of shape (8, 3) [m].
+    `positions`: of the bodies in the world at each moment, shape (n, 3) [m]. Without any: where they are now. `people`:
+    positions of heads and hands [m].
     """
 
     def __init__(self, bodies: Sequence[BodyInfo]) -> None:
         self.rows = [i for i, body in enumerate(bodies) if body.moving]
         self.ids = [bodies[i].id for i in self.rows]
-        self.poses: list[Floats] = []
-        self.people: list[Floats] = []
+        self.positions: list[Floats] = []
+        self.people: list[Sequence[float]] = []
 
     def make_camera(self, core: SessionCore, aspect: float) -> mujoco.MjvCamera:
         """Return a camera that sees all of it in a picture of that `aspect`, width by height."""
         camera = mujoco.MjvCamera()
         model, data = core.world.model, core.world.data
         mujoco.mjv_defaultFreeCamera(model, camera)
-        poses = np.array(self.poses or [np.hstack([data.xpos[self.ids], data.xquat[self.ids]])])
-        corners = np.array([_list_corners(model, body) for body in self.ids]).reshape(1, -1, 8, 3)
-        at = (poses[..., None, :3] + _rotate(poses[..., None, 3:], corners)).reshape(-1, 3)
-        at = np.vstack([at, *self.people, *([data.flexvert_xpos] if model.nflex else ())])
-        at = at[np.isfinite(at).all(axis=1)]
+        positions = self.positions or [data.xpos[self.ids]]
+        radii = np.tile([_measure_radius(model, body) for body in self.ids], len(positions))
+        people = np.array(self.people).reshape(-1, 3)
+        vertices = data.flexvert_xpos.reshape(-1, 3)
+        at = np.vstack([*positions, people, vertices])
+        radii = np.concatenate([radii, np.full(len(people), PERSON_M), np.zeros(len(vertices))])
+        known = np.isfinite(at).all(axis=1)
+        at, radii = at[known], np.maximum(radii[known], MIN_HALF_M)
         if not len(at):
             return camera
-        low, high = _limit(at)
-        centre = (low + high) / 2.0
-        at = np.vstack([np.clip(at, low, high), centre + MIN_HALF_M * _CORNERS])
+        near, far = np.percentile(at, (5.0, 95.0), axis=0)  # bodies may have fallen off, and be far away
+        reach = max(2.0 * float(np.linalg.norm(far - near)), 10.0 * MIN_HALF_M)
+        at = np.clip(at, near - reach, far + reach)
+        centre = (at.min(axis=0) + at.max(axis=0)) / 2.0
         forward = -np.array(EYE) / np.linalg.norm(EYE)
         right = np.cross(forward, (0.0, 0.0, 1.0))
         right /= np.linalg.norm(right)
         axes = np.array([right, np.cross(right, forward), forward])
-        seen = (at - centre) @ axes.T  # to the right, upward, away
+        x, y, depth = axes @ (at - centre).T  # to the right, upward, away
         slope = math.tan(math.radians(model.vis.global_.fovy) / 2.0) * FILLED
-        needed = np.maximum(np.abs(seen[:, 0]) / aspect, np.abs(seen[:, 1])) / slope - seen[:, 2]
+        needed = np.maximum((np.abs(x) + radii) / aspect, np.abs(y) + radii) / slope - depth
         camera.lookat, camera.distance = centre, float(needed.max())
         camera.azimuth = math.degrees(math.atan2(forward[1], forward[0]))
         camera.elevation = math.degrees(math.asin(forward[2]))
@@ -309,36 +311,12 @@ class _SceneBounds:
         return camera
 
 
-def _limit(at: Floats) -> tuple[Floats, Floats]:
-    """Return the low and the high corner of a box around points, but for those far away, of bodies that fell off."""
-    near, far = np.percentile(at, (5.0, 95.0), axis=0)
-    reach = max(2.0 * float(np.linalg.norm(far - near)), 10.0 * MIN_HALF_M)
-    return np.maximum(at.min(axis=0), near - reach), np.minimum(at.max(axis=0), far + reach)
-
-
-def _list_corners(model: mujoco.MjModel, body: int) -> Floats:
-    """Return the corners of a box around the shown geoms of a body, in its frame, shape (8, 3) [m]."""
-    first = int(model.body_geomadr[body])
-    geoms = [
-        g
-        for g in range(first, first + int(model.body_geomnum[body]))
-        if model.geom_group[g] < 3 and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE
-    ]
-    if not geoms:
-        return np.zeros((8, 3))
-    boxes = model.geom_aabb[geoms]  # centre and half sides, in the frame of the geom
-    corners = boxes[:, None, :3] + boxes[:, None, 3:] * _CORNERS
-    at = model.geom_pos[geoms][:, None] + _rotate(model.geom_quat[geoms][:, None], corners)
-    low, high = at.min(axis=(0, 1)), at.max(axis=(0, 1))
-    found: Floats = (low + high) / 2.0 + (high - low) / 2.0 * _CORNERS
-    return found
-
-
-def _rotate(q: Floats, p: Floats) -> Floats:
-    """Rotate points (..., 3) by unit quaternions (..., 4)."""
-    twice = 2.0 * np.cross(q[..., 1:], p)
-    rotated: Floats = p + q[..., :1] * twice + np.cross(q[..., 1:], twice)
-    return rotated
+def _measure_radius(model: mujoco.MjModel, body: int) -> float:
+    """Return the radius of a ball around the origin of a body that holds its shown geoms [m]."""
+    geoms = np.arange(model.body_geomnum[body]) + model.body_geomadr[body]
+    geoms = geoms[model.geom_group[geoms] < 3]
+    reach = np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]
+    return float(reach.max(initial=0.0))
 
 
 def _read_reach(
@@ -355,8 +333,8 @@ def _read_reach(
             bodies, due_ns = state.bodies, max(begin_ns, state.session_time)
         if state.session_time >= due_ns and len(state.poses) == len(bodies):  # a file may hold any number
             reach = found.setdefault(bodies, _SceneBounds(bodies))
-            reach.poses.append(state.poses[reach.rows])
-            reach.people += [np.array(one.pose.p) + PERSON_M * _CORNERS for one in state.presence if with_people]
+            reach.positions.append(state.poses[reach.rows, :3])
+            reach.people += [one.pose.p for one in state.presence if with_people]
             moments = max(1, min(MOMENTS, MOST_POSES // max(1, len(reach.rows))))
             due_ns = state.session_time + (end_ns - begin_ns) // moments
     return found
@@ -520,7 +498,6 @@ class _PeopleTrack:
         self._states = recording.states()
         self._ahead = next(self._states, None)
         self._newest: dict[tuple[str, str], PresenceItem] = {}
-        self._story = EventNarration()
 
     def advance(self, time_ns: int) -> list[_AvatarMarker]:
         """Return the heads and hands at `time_ns`."""
@@ -528,4 +505,4 @@ class _PeopleTrack:
             self._newest.update({(item.participant, item.device): item for item in self._ahead.presence})
             self._ahead = next(self._states, None)
         shown = [item for item in self._newest.values() if item.capture_ns > time_ns - PRESENCE_NS]
-        return [_AvatarMarker(one, tuple(c / 255.0 for c in self._story.find_colour(one.participant))) for one in shown]
+        return [_AvatarMarker(one, tuple(c / 255.0 for c in find_colour(one.participant))) for one in shown]

@@ -11,15 +11,14 @@ from __future__ import annotations
 
 import sys
 import warnings
-from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.physics import UnknownNameError
-from iris_session.protocol.steps import Command
 from iris_session.recording import Recording as RecordedFile
 from iris_session.recording import RecordingError
 from iris_session.recording.records import DeviceSamples, list_event_records, read_device_samples
@@ -258,20 +257,18 @@ class SessionRecording(RecordedFile):
             raise UnknownNameError(kind, name, known)
 
     def _read_series(self, target: str, name: str, kind: str, hz: float | None) -> TimeSeries:
-        builder = _SeriesBuilder()
-        for step, reader in self._read_steps(target, name, hz):
+        def find(reader: PlantReader) -> Quantity:
             found = (reader.robots if target == ROBOT else reader.objects)[name]
             if kind not in found:
                 raise RecordingError(f"{target} {name!r} has no {kind}: it has {', '.join(found)}")
-            builder.add(step, reader, found[kind])
-        return TimeSeries(*builder.build())
+            return found[kind]
+
+        return TimeSeries(*_collect(self._read_steps(target, name, hz), find))
 
     def _read_commands(self, name: str, hz: float | None) -> CommandSeries:
-        builder, columns = _SeriesBuilder(), _CommandColumns()
-        for step, reader in self._read_steps(ROBOT, name, hz, with_control=True):
-            if builder.add(step, reader, reader.ctrl[name]):
-                columns.add(find_command(step, name))
-        return CommandSeries(*builder.build(), *columns.build())
+        steps = self._read_steps(ROBOT, name, hz, with_control=True)
+        columns = _collect(steps, lambda reader: reader.ctrl[name], _COMMAND, lambda step: describe_command(step, name))
+        return CommandSeries(*columns)
 
     def _read_steps(
         self, target: str, name: str, hz: float | None, *, with_control: bool = False
@@ -288,65 +285,51 @@ class SessionRecording(RecordedFile):
         if name not in known:
             raise UnknownNameError(target, name, known)
         if replay.left_out:
-            warnings.warn(f"{self.files[0]}: {replay.describe_left_out()}", stacklevel=5)
+            warnings.warn(f"{self.files[0]}: {replay.describe_left_out()}", stacklevel=7)
 
 
-class _SeriesBuilder:
-    """Rows of a series while they are read. The first one decides the names of its columns."""
-
-    def __init__(self) -> None:
-        self._names: tuple[str, ...] | None = None
-        self._steps, self._times = array("q"), array("q")
-        self._sim_times, self._values = array("d"), array("d")
-
-    def add(self, step: ReplayedStep, reader: PlantReader, quantity: Quantity) -> bool:
-        """Add a row. Return False if it has other columns: a robot of another scene that has the same name."""
-        if self._names is None:
-            self._names = quantity.names
-        if quantity.names != self._names:
-            return False
-        self._steps.append(step.step)
-        self._times.append(step.session_time)
-        self._sim_times.append(reader.world.view().sim_time)
-        self._values.extend(quantity.read())
-        return True
-
-    def build(self) -> tuple[tuple[str, ...], Any, Any, Any, Any]:
-        """Return the first five fields of a series."""
-        names = self._names or ()
-        values = np.array(self._values, np.float64).reshape(len(self._steps), len(names))
-        times = np.array(self._steps, np.int64), np.array(self._times, np.int64), np.array(self._sim_times, np.float64)
-        return names, *times, values
+_HEAD: Final = (("step", np.int64), ("session_time_ns", np.int64), ("sim_time_s", np.float64))
+#: Types of what `describe_command` returns.
+_COMMAND: Final = (
+    *((key, np.object_) for key in ("kind", "hold_reason", "participants", "devices")),
+    *((key, np.float64) for key in ("gripper", "scale")),
+)
 
 
-class _CommandColumns:
-    """Columns of commands while they are read."""
+def _collect(
+    steps: Iterator[tuple[ReplayedStep, PlantReader]],
+    find: Callable[[PlantReader], Quantity],
+    types: Sequence[tuple[str, Any]] = (),
+    describe: Callable[[ReplayedStep], tuple[Any, ...]] = lambda step: (),
+) -> tuple[Any, ...]:
+    """Return the columns of a series: names, step, times, values of a quantity, and those that `describe` adds.
 
-    def __init__(self) -> None:
-        self._texts: tuple[list[str], ...] = ([], [], [], [])
-        self._numbers = array("d")  # gripper, scale
-
-    def add(self, command: Command) -> None:
-        """Add the command of a step."""
-        sources = command.sources
-        texts = (
-            *(command.kind, command.hold_reason),
-            *(",".join(one.participant for one in sources), ",".join(one.device for one in sources)),
-        )
-        for column, text in zip(self._texts, texts, strict=True):
-            column.append(sys.intern(text))  # few different ones in any number of rows
-        self._numbers.extend((np.nan if command.gripper is None else command.gripper, command.scale))
-
-    def build(self) -> tuple[Any, ...]:
-        """Return the fields of a `CommandSeries` behind the first five."""
-        gripper, scale = np.array(self._numbers, np.float64).reshape(-1, 2).T.copy()
-        return *(np.array(texts, object) for texts in self._texts), gripper, scale
+    The first row decides the names. Rows with others, of a robot of another scene that has the same name, are left out.
+    """
+    first = next(steps, None)
+    names = () if first is None else find(first[1]).names
+    rows = (
+        (step.step, step.session_time, reader.world.view().sim_time, quantity.read(), *describe(step))
+        for step, reader in (() if first is None else chain((first,), steps))
+        if (quantity := find(reader)).names == names
+    )
+    table = np.fromiter(rows, [*_HEAD, ("values", np.float64, (len(names),)), *types])
+    return names, *(table[name].copy() for name in table.dtype.names or ())
 
 
-def find_command(step: ReplayedStep, robot: str) -> Command:
-    """Return the command of a robot in a step that was taken with control."""
+def describe_command(step: ReplayedStep, robot: str) -> tuple[str, str, str, str, float, float]:
+    """Return the command of a robot in a step that was taken with control: kind, reason to hold, ids of participants
+    and their devices with commas between, gripper (NaN: unchanged), scale.
+    """
     assert step.outcome is not None
-    return next(command for command in step.outcome.decision.commands if command.robot == robot)
+    command = next(one for one in step.outcome.decision.commands if one.robot == robot)
+    texts = (
+        *(command.kind, command.hold_reason, ",".join(one.participant for one in command.sources)),
+        ",".join(one.device for one in command.sources),
+    )
+    kind, reason, participants, devices = map(sys.intern, texts)  # few different ones in any number of rows
+    gripper = np.nan if command.gripper is None else command.gripper
+    return kind, reason, participants, devices, gripper, command.scale
 
 
 #: The name under which it is public.

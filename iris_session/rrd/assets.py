@@ -12,11 +12,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -40,9 +38,6 @@ PIECE_BYTES: Final = 512 << 10
 #: Time between the specifications of two patches [ns]: of patches in between, the last is recorded. The picture has
 #: all of them, and the journal.
 PATCH_PERIOD_NS: Final = 1_000_000_000
-#: Upper bound of what waits: scenes, and assets of them.
-MOST_SCENES: Final = 256
-MOST_QUEUED: Final = 1 << 16
 SCENES_FILE: Final = "scenes.json"
 #: Nothing is removed from a folder to make room.
 _NO_LIMIT: Final = 1 << 62
@@ -175,7 +170,10 @@ class AssetJoiner:
 
 
 class AssetCollector:
-    """Compares the assets of a recording with what its scenes need. Takes items in any order but that of pieces."""
+    """Compares the assets of a recording with what its scenes need. Takes items in any order but that of pieces.
+
+    `deformables`: names of those of all scenes whose specifications are there.
+    """
 
     def __init__(self) -> None:
         self._joiner = AssetJoiner()
@@ -183,6 +181,7 @@ class AssetCollector:
         self._changes: set[RecordedScene] = set()
         self._names: dict[str, dict[str, str]] = {SCENE: {}, ALL: {}}
         self._faults: dict[str, str] = {}
+        self.deformables: dict[str, None] = {}
 
     def add(self, item: RecordedScene | AssetPiece | AssetFault) -> None:
         """Add an item of the recording. A part that repeats an item of the one before changes nothing."""
@@ -204,6 +203,7 @@ class AssetCollector:
             spec = decode_scene(data)
         except SceneError:  # its hash is right, so it was so in the session too: of another version
             return
+        self.deformables.update((one.name or one.stream, None) for one in spec.deformables)
         for recorded, names in self._names.items():
             names.update(list_recorded_assets(spec, recorded))
 
@@ -275,28 +275,6 @@ class AssetRows(NamedTuple):
     faults: list[AssetFault]
 
 
-@dataclass
-class _Waiting:
-    """A scene whose specification is not written yet."""
-
-    scene: SceneAssets
-    is_patch: bool
-
-
-@dataclass
-class _Reading:
-    """An asset that is being read."""
-
-    address: str
-    root: str
-    file: BinaryIO
-    total: int
-    is_scene: bool
-    offset: int = 0
-    digest: Any = field(default_factory=hashlib.sha256)
-    parts: list[bytes] = field(default_factory=list)  # of a specification
-
-
 class AssetQueue:
     """Assets of the scenes of a session that are not in the file yet.
 
@@ -314,26 +292,24 @@ class AssetQueue:
         self.is_ending = False
         self._recorded = recorded
         self._room_bytes = limit_bytes
-        self._scenes: deque[_Waiting] = deque()
+        self._scenes: deque[tuple[SceneAssets, bool]] = deque()  # and whether it is a patch
         self._due_ns = 0
-        self._wanted: deque[tuple[str, str]] = deque()  # roots and addresses
+        self._wanted: deque[tuple[str, str, bool]] = deque()  # roots, addresses, and whether it is a specification
         self._known: set[str] = set()
-        self._reading: _Reading | None = None
+        self._pieces: Iterator[AssetPiece] | None = None  # of the first wanted one, while it is being read
+        self._left_bytes = 0  # of the present read
 
     def __bool__(self) -> bool:
         """Return whether something waits to be written."""
-        return bool(self._scenes or self._wanted or self._reading)
+        return bool(self._scenes or self._wanted)
 
     def add_scene(self, scene: SceneAssets, *, is_patch: bool) -> None:
         """Add a scene, or a patched one, which replaces a patched one that still waits."""
         if not (scene.root and is_address(scene.scene_hash)):
             return  # no assets are shared
-        if is_patch and self._scenes and self._scenes[-1].is_patch:
+        if is_patch and self._scenes and self._scenes[-1][1]:
             self._scenes.pop()
-        if len(self._scenes) >= MOST_SCENES:
-            self._scenes.popleft()
-            self.left_out += 1
-        self._scenes.append(_Waiting(scene, is_patch))
+        self._scenes.append((scene, is_patch))
 
     def read(self, now_ns: int, max_bytes: int) -> AssetRows:
         """Return the next rows.
@@ -343,114 +319,87 @@ class AssetQueue:
             max_bytes: Bytes of assets in them.
         """
         rows = AssetRows([], [], [])
-        left = max_bytes
-        while left > 0 and (self._reading is not None or self._open_next(now_ns, rows)):
-            left -= self._read_piece(min(left, PIECE_BYTES), rows)
+        self._left_bytes = max_bytes
+        while self._left_bytes > 0:
+            if self._pieces is None:
+                self._take_scenes(now_ns, rows)
+                if not self._wanted:
+                    break
+                self._pieces = self._read_asset(*self._wanted[0])
+            piece, why = None, ""
+            try:
+                piece = next(self._pieces, None)
+            except OSError as error:
+                why = f"it cannot be read: {error.strerror or error}"
+            except (ValueError, SceneError) as error:
+                why = str(error)
+            if piece is not None:
+                rows.pieces.append(piece)
+                self._left_bytes -= max(1, len(piece.data))
+                continue
+            _, address, _ = self._wanted.popleft()
+            self._pieces = None
+            if why:
+                rows.faults.append(AssetFault(address, why))
         self.left_out += len(rows.faults)
         return rows
 
     def close(self, why: str) -> AssetRows:
         """Give up what waits. Return rows that say so."""
-        rows = AssetRows([], [], [])
-        if self._reading is not None:
-            rows.faults.append(AssetFault(self._reading.address, why))
-            self._end_reading()
-        for waiting in self._scenes:
-            scene = waiting.scene
-            rows.scenes.append(RecordedScene(scene.step, scene.session_time, scene.scene_hash, self._recorded))
-            if self._recorded != NONE and scene.scene_hash not in self._known:
-                rows.faults.append(AssetFault(scene.scene_hash, why))
-        rows.faults.extend(AssetFault(address, why) for _, address in self._wanted)
+        scenes = [scene for scene, _ in self._scenes]
+        addresses = [address for _, address, _ in self._wanted]
+        if self._recorded != NONE:
+            addresses += [scene.scene_hash for scene in scenes if scene.scene_hash not in self._known]
         self._scenes.clear()
         self._wanted.clear()
-        self.left_out += len(rows.faults)
-        return rows
+        self._pieces = None
+        self.left_out += len(addresses)
+        faults = [AssetFault(address, why) for address in addresses]
+        return AssetRows([self._to_recorded(scene) for scene in scenes], [], faults)
 
-    def _open_next(self, now_ns: int, rows: AssetRows) -> bool:
-        """Begin with the next asset, a specification before all others: it may be replaced in the store soon."""
-        while self._scenes and (self.is_ending or now_ns >= self._due_ns or not self._scenes[0].is_patch):
-            scene = self._scenes.popleft().scene
+    def _to_recorded(self, scene: SceneAssets) -> RecordedScene:
+        return RecordedScene(scene.step, scene.session_time, scene.scene_hash, self._recorded)
+
+    def _take_scenes(self, now_ns: int, rows: AssetRows) -> None:
+        """Take scenes up to one with a new specification, which precedes all else: it may be replaced in the store."""
+        while self._scenes and (self.is_ending or now_ns >= self._due_ns or not self._scenes[0][1]):
+            scene, _ = self._scenes.popleft()
             self._due_ns = now_ns + PATCH_PERIOD_NS
-            rows.scenes.append(RecordedScene(scene.step, scene.session_time, scene.scene_hash, self._recorded))
-            known = scene.scene_hash in self._known
-            self._known.add(scene.scene_hash)
-            if self._recorded != NONE and not known and self._open(scene.root, scene.scene_hash, rows, is_scene=True):
-                return True
-        while self._wanted:
-            if self._open(*self._wanted.popleft(), rows, is_scene=False):
-                return True
-        return False
+            rows.scenes.append(self._to_recorded(scene))
+            if self._recorded != NONE and scene.scene_hash not in self._known:
+                self._known.add(scene.scene_hash)
+                self._wanted.appendleft((scene.root, scene.scene_hash, True))
+                return
 
-    def _open(self, root: str, address: str, rows: AssetRows, *, is_scene: bool) -> bool:
-        try:
-            file, total = AssetStore(root).open_file(address)
-        except (OSError, ValueError) as error:
-            rows.faults.append(AssetFault(address, f"it cannot be read: {getattr(error, 'strerror', None) or error}"))
-            return False
-        most = MAX_SCENE_BYTES if is_scene else MAX_ASSET_BYTES
-        if total > most:
-            why = f"it has {total} bytes, at most {most} are read"
-        elif self._room_bytes is not None and total > self._room_bytes:
-            why = "the budget of the recording has no room for it"
-        else:
-            self._reading = _Reading(address, root, file, total, is_scene)
-            return True
-        file.close()
-        rows.faults.append(AssetFault(address, why))
-        return False
+    def _read_asset(self, root: str, address: str, is_scene: bool) -> Iterator[AssetPiece]:
+        """Yield the pieces of an asset; want those that a specification names.
 
-    def _read_piece(self, n_bytes: int, rows: AssetRows) -> int:
-        """Read the next piece. Return its bytes, at least 1."""
-        one = self._reading
-        assert one is not None
-        n_bytes = min(n_bytes, one.total - one.offset)
-        data, why = b"", "its file is shorter than it was"
-        try:
-            data = one.file.read(n_bytes)
-        except OSError as error:
-            why = error.strerror or str(error)
-        if len(data) < n_bytes:
-            rows.faults.append(AssetFault(one.address, f"it cannot be read: {why}"))
-            self._end_reading()
-            return 1
-        rows.pieces.append(AssetPiece(one.address, one.offset, one.total, one.is_scene, data))
-        one.offset += len(data)
-        one.digest.update(data)
-        if one.is_scene:
-            one.parts.append(data)
-        if self._room_bytes is not None:
-            self._room_bytes -= len(data)
-        if one.offset == one.total:
-            self._finish(one, rows)
-        return max(1, len(data))
-
-    def _finish(self, one: _Reading, rows: AssetRows) -> None:
-        """Check an asset that was read, and add the assets that a specification names."""
-        self._end_reading()
-        if one.digest.hexdigest() != one.address:
-            rows.faults.append(AssetFault(one.address, "it was damaged in the store"))
-            return
-        if not one.is_scene:
-            return
-        try:
-            spec = decode_scene(b"".join(one.parts))
-        except SceneError as error:
-            rows.faults.append(AssetFault(one.address, str(error)))
-            return
-        for address in list_recorded_assets(spec, self._recorded):
-            if address in self._known:
-                continue
-            if len(self._wanted) >= MOST_QUEUED:
-                rows.faults.append(AssetFault(address, "too many assets"))
-                continue
-            self._known.add(address)
-            self._wanted.append((one.root, address))
-
-    def _end_reading(self) -> None:
-        if self._reading is not None:
-            with suppress(OSError):
-                self._reading.file.close()
-        self._reading = None
+        Raises `OSError`, and `ValueError` or `SceneError` with a text that says why it is not recorded.
+        """
+        file, total = AssetStore(root).open_file(address)
+        with file:
+            most = MAX_SCENE_BYTES if is_scene else MAX_ASSET_BYTES
+            if total > most:
+                raise ValueError(f"it has {total} bytes, at most {most} are read")
+            if self._room_bytes is not None:
+                if total > self._room_bytes:
+                    raise ValueError("the budget of the recording has no room for it")
+                self._room_bytes -= total
+            digest, parts, offset = hashlib.sha256(), list[bytes](), 0
+            while not offset or offset < total:
+                data = file.read(min(self._left_bytes, PIECE_BYTES, total - offset))
+                if total and not data:
+                    raise OSError("its file is shorter than it was")
+                yield AssetPiece(address, offset, total, is_scene, data)
+                digest.update(data)
+                parts += [data] if is_scene else []
+                offset += max(1, len(data))
+        if digest.hexdigest() != address:
+            raise ValueError("it was damaged in the store")
+        for other in list_recorded_assets(decode_scene(b"".join(parts)), self._recorded) if is_scene else ():
+            if other not in self._known:
+                self._known.add(other)
+                self._wanted.append((root, other, False))
 
 
 # --- export into a folder ---------------------------------------------------------------------------------------------

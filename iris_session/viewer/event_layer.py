@@ -6,20 +6,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import rerun as rr
 
 from iris_session.journal.messages import DenialRecord, HoldRecord, MetricRecord
 from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import (
-    AlignmentChanged,
     AnchorMoved,
     Event,
-    ParticipantChanged,
-    ParticipantJoined,
     ParticipantLeft,
-    SamplesRejected,
     SceneChanged,
 )
 from iris_session.rrd import paths
@@ -28,30 +24,17 @@ from iris_session.viewer.narration import (
     EventNarration,
     LaneChange,
     LogLine,
+    NarratedEvent,
     Rgb,
-    StatedErrors,
     describe_denial,
 )
 from iris_session.viewer.participant_layer import AnchorLayer, ParticipantLayer
-from iris_session.viewer.plots import ALIGNMENT, INPUT_TO_STEP, REJECTED, STATE_AGE, MetricPlots
+from iris_session.viewer.plots import INPUT_TO_STEP, STATE_AGE, MetricPlots
 from iris_session.viewer.scene_layer import escape_entity_part
 from iris_session.viewer.timelines import Moment, MomentTable
 
 #: Maximum number of lanes whose colours are known to be in the file: participants that come and go have one each.
 MAX_LANES: Final = 4096
-#: Events after which the alignment or the rejected samples of a participant may be others.
-_PERSONAL: Final = (AlignmentChanged, ParticipantJoined, ParticipantChanged, ParticipantLeft, SamplesRejected)
-
-
-class NarratedEvent(NamedTuple):
-    """An event as the viewer shows it, and what is then in force of its participant, if it has one, and of all."""
-
-    line: LogLine
-    changes: list[LaneChange]
-    participant: str
-    errors: StatedErrors | None
-    rejected: int
-    worst_at_anchor_m: float
 
 
 class EventLayer:
@@ -75,25 +58,18 @@ class EventLayer:
         self._lanes: dict[str, list[tuple[Moment, LaneChange]]] = {}
         self._lane_colours: dict[str, dict[str, Rgb]] = {}
 
-    def narrate(self, event: Event) -> NarratedEvent:
-        """Return what an event means. Events must come in order."""
-        line, changes = self._narration.add(event)
-        body: Any = event.body
-        participant = ""
-        if isinstance(body, _PERSONAL):
-            participant = body.participant if isinstance(body.participant, str) else body.participant.id
-        errors, rejected = self._narration.errors.get(participant), self._narration.rejected.get(participant, 0)
-        worst_m = max((one.at_anchor_m for one in self._narration.errors.values()), default=0.0)
-        return NarratedEvent(line, changes, participant, errors, rejected, worst_m)
-
     def draw_events(self, events: Sequence[Event], narrated: Sequence[NarratedEvent]) -> list[Any]:
         """Show what events change. Return the columns of their log lines."""
         changes = []
         for event, one in zip(events, narrated, strict=True):
-            changes += [(event.step, event.session_time, change) for change in one.changes]
+            changes += [(event.step, event.session_time, change) for change in one.lanes]
             moment = self._moments.find(event.step, event.session_time)
-            if one.participant:
-                self._plot_person(moment, one)
+            for kind, participant, value in one.plots:
+                if value is None:
+                    self._metrics.end(kind, participant, moment)
+                else:
+                    self._metrics.add(kind, participant, value, moment)
+            if one.plots:
                 self._anchors.set_error(one.worst_at_anchor_m, self._find_anchor_moment(moment))
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._participants.remove(event.body.participant, moment)
@@ -153,17 +129,6 @@ class EventLayer:
             times = self._moments.spread(entity, [moment for moment, _ in rows])
             columns = rr.StateChange.columns(state=[change.state for _, change in rows])
             rr.send_columns(entity, times, [*columns], recording=self._rec, strict=True)
-
-    def _plot_person(self, moment: Moment, narrated: NarratedEvent) -> None:
-        """Plot the stated error and the rejected samples of the participant of an event."""
-        if narrated.errors is not None:
-            self._metrics.add(ALIGNMENT, narrated.participant, narrated.errors.at_robot_m * 1e3, moment)
-        else:
-            self._metrics.end(ALIGNMENT, narrated.participant, moment)
-        if narrated.rejected:
-            self._metrics.add(REJECTED, narrated.participant, narrated.rejected, moment)
-        else:
-            self._metrics.end(REJECTED, narrated.participant, moment)
 
     def _find_anchor_moment(self, moment: Moment) -> Moment:
         """Return the moment of an event that may change anchors; no two are equal."""

@@ -6,6 +6,7 @@ the reason why it holds, the alignment of a participant, who has an object, e-st
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any, Final, NamedTuple
 
@@ -48,6 +49,11 @@ from iris_session.protocol.server_messages import (
 )
 
 Rgb = tuple[int, int, int]
+#: Kinds of plots of participants: stated error of the alignment at the robot [mm], samples rejected since joining.
+ALIGNMENT: Final = "alignment_mm"
+REJECTED: Final = "rejected_samples"
+#: Headsets disagree if they see a sheet apart by more than this multiple of the expected error.
+MAX_ERROR_RATIO: Final = 2.0
 DEBUG: Final = "DEBUG"
 INFO: Final = "INFO"
 WARN: Final = "WARN"
@@ -117,11 +123,17 @@ class LaneChange(NamedTuple):
     colours: Mapping[str, Rgb]
 
 
-class StatedErrors(NamedTuple):
-    """Errors of a measured alignment, 95 % of them below these [m]: at the anchor, and at the robot."""
+class NarratedEvent(NamedTuple):
+    """An event as people read it, and what it changes.
 
-    at_anchor_m: float
-    at_robot_m: float
+    `plots`: values by kind of plot and participant; `None`: there is none any more. `worst_at_anchor_m`: largest stated
+    error at an anchor of the alignments in force after it [m].
+    """
+
+    line: LogLine
+    lanes: list[LaneChange]
+    plots: list[tuple[str, str, float | None]]
+    worst_at_anchor_m: float
 
 
 class Person(NamedTuple):
@@ -136,7 +148,6 @@ class EventNarration:
     """State of a session as far as its events tell it. Give it every event, in order.
 
     `is_first`: the file is no later part of a recording, in whose lanes something may be in force from the start.
-    `errors`: stated errors of the alignments in force, by participant. `rejected`: samples rejected since joining.
     `roles`: of everyone so far, by name. `handovers`, `episodes`: numbers so far.
     """
 
@@ -147,17 +158,19 @@ class EventNarration:
         self._lanes: dict[tuple[str, ...], str] = {}  # those in which something is in force
         self._colours: dict[tuple[str, ...], dict[str, Rgb]] = {}  # of lanes of participants
         self._changes: list[LaneChange] = []
-        self.errors: dict[str, StatedErrors] = {}
-        self.rejected: dict[str, int] = {}
+        self._plots: list[tuple[str, str, float | None]] = []
+        self._errors_m: dict[str, float] = {}  # stated errors at the anchor, by participant
+        self._agreed: dict[tuple[str, str], bool] = {}  # whether the last check of two headsets was as expected
         self.roles: dict[str, str] = {}
         self.handovers = 0
         self._episodes: set[int] = set()
-        self._rejected: dict[tuple[str, str, str], int] = {}
+        self._rejected: dict[str, Counter[tuple[str, str]]] = {}  # since joining, by participant
 
-    def add(self, event: Event) -> tuple[LogLine, list[LaneChange]]:
-        """Return the line of an event, and the lanes that it changes."""
-        self._changes = []
-        return self._describe(event.body), self._changes
+    def add(self, event: Event) -> NarratedEvent:
+        """Return what an event means."""
+        self._changes, self._plots = [], []
+        line = self._describe(event.body)
+        return NarratedEvent(line, self._changes, self._plots, max(self._errors_m.values(), default=0.0))
 
     def add_hold(self, robot: str, reason: str) -> list[LaneChange]:
         """Return the change of the lane of a robot that holds for `reason` from now on, or moves (empty)."""
@@ -177,11 +190,6 @@ class EventNarration:
     def find_person(self, participant: str) -> Person:
         """Return a participant; of one that is not known, the id is the name."""
         return self._people.get(participant) or Person("the session" if participant in ("", "host") else participant)
-
-    def find_colour(self, participant: str) -> Rgb:
-        """Return the colour of a participant: ids are `p1`, `p2`, ... in the order of joining."""
-        number = participant[1:]
-        return PALETTE[(int(number) - 1 if number.isdecimal() else len(participant)) % len(PALETTE)]
 
     def _name(self, participant: str) -> str:
         return self.find_person(participant).name
@@ -216,15 +224,18 @@ class EventNarration:
         state = state.format(" + ".join(self._name(one) for one in people))
         colours = self._colours.setdefault(lane, {})
         if len(colours) < MAX_COLOURS:
-            colours[state] = self.find_colour(people[0])
+            colours[state] = find_colour(people[0])
         self._set(lane, state, dict(colours))
 
     def _set_alignment(self, participant: str, alignment: Alignment | None) -> None:
         kind = AlignmentKind.NONE if alignment is None else alignment.kind
         state = "" if kind == AlignmentKind.NONE else kind
-        self.errors.pop(participant, None)
+        self._errors_m.pop(participant, None)
+        error_mm = None
         if alignment is not None and kind == AlignmentKind.MEASURED and not alignment.offset:
-            self.errors[participant] = StatedErrors(alignment.error_at_anchor_m, alignment.error_at_robot_m)
+            self._errors_m[participant] = alignment.error_at_anchor_m
+            error_mm = alignment.error_at_robot_m * 1e3
+        self._plots.append((ALIGNMENT, participant, error_mm))
         self._set(("alignment", self._name(participant)), state, _ALIGNMENT)
 
     def _describe(self, body: EventKind) -> LogLine:
@@ -239,7 +250,9 @@ class EventNarration:
                 if grace:
                     return LogLine(WARN, f"{self._name(who)} is disconnected ({reason})")
                 self._set_alignment(who, None)
-                self._forget_rejected(who)
+                self._rejected.pop(who, None)
+                self._plots.append((REJECTED, who, None))
+                self._agreed = {pair: agreed for pair, agreed in self._agreed.items() if who not in pair}
                 return LogLine(INFO, f"{self._name(who)} leaves ({reason})")
             case LeaseChanged():
                 return self._describe_lease(body)
@@ -315,11 +328,15 @@ class EventNarration:
                     return LogLine(WARN, f"{tip} is not calibrated: {advice}")
                 return LogLine(INFO, f"{tip} is calibrated to {error_m * 1e3:.1f} mm")
             case HeadsetsCompared(a=a, b=b, anchor_id=anchor, error_m=error_m, expected_p95_m=expected_m):
+                pair, agree = (min(a, b), max(a, b)), error_m <= MAX_ERROR_RATIO * expected_m
+                level = DEBUG if self._agreed.get(pair) is agree else INFO  # every five seconds for every pair
+                self._agreed[pair] = agree
                 text = f"{self._name(a)} and {self._name(b)} see {anchor} {error_m * 1e3:.1f} mm apart"
-                return LogLine(DEBUG, f"{text}, 95 % of such pairs are below {expected_m * 1e3:.1f} mm")
+                return LogLine(level, f"{text}, 95 % of such pairs are below {expected_m * 1e3:.1f} mm")
             case SamplesRejected(participant=who, device=device, reason=reason, count=count):
-                self.rejected[who] = self.rejected.get(who, 0) + count - self._rejected.get((who, device, reason), 0)
-                self._rejected[who, device, reason] = count
+                rejected = self._rejected.setdefault(who, Counter())
+                rejected[device, reason] = count
+                self._plots.append((REJECTED, who, rejected.total()))
                 text = f"{self._name(who)}'s {_to_device(device)}: {count} samples rejected ({_to_words(reason)})"
                 return LogLine(DEBUG, text)
             case MarkerAdded(participant=who, text=text):
@@ -336,11 +353,6 @@ class EventNarration:
             case _:
                 fields = msgspec.to_builtins(body)
                 return LogLine(INFO, f"{_to_words(fields.pop('event'))}: {_join_fields(fields)}")
-
-    def _forget_rejected(self, participant: str) -> None:
-        self.rejected.pop(participant, None)
-        for key in [key for key in self._rejected if key[0] == participant]:
-            del self._rejected[key]
 
     def _describe_change(self, info: ParticipantInfo) -> LogLine:
         before = self._people.get(info.id, Person(info.name, info.role, info.worn))
@@ -402,6 +414,12 @@ def _to_device(device: str) -> str:
 
 def _join_fields(fields: dict[str, Any]) -> str:
     return " ".join(f"{name}={value}" for name, value in fields.items() if value not in ("", None, [], ()))
+
+
+def find_colour(participant: str) -> Rgb:
+    """Return the colour of a participant: ids are `p1`, `p2`, ... in the order of joining."""
+    number = participant[1:]
+    return PALETTE[(int(number) - 1 if number.isdecimal() else len(participant)) % len(PALETTE)]
 
 
 # --- other texts for the viewer --------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import PresenceItem
 from iris_session.rrd import paths
-from iris_session.viewer.narration import FREE, EventNarration, Rgb
+from iris_session.viewer.narration import FREE, EventNarration, Rgb, find_colour
 from iris_session.viewer.scene_layer import escape_entity_part
 from iris_session.viewer.timelines import Moment, set_moment
 
@@ -120,7 +120,7 @@ class ParticipantLayer:
 
     def _draw_device(self, key: _Key, label: str, moment: Moment) -> None:
         """Draw a box for a head, with an arrow in the direction of view, and a ball for a hand."""
-        colours = [self._narration.find_colour(key[0])]
+        colours = [find_colour(key[0])]
         solid = rr.components.FillMode.Solid
         set_moment(self._rec, moment)
         if key[1] == Device.HEAD:

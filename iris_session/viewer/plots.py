@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from iris_session.journal.messages import RobotLabels, StateFrame
 from iris_session.rrd import paths
-from iris_session.viewer.narration import EventNarration
+from iris_session.viewer.narration import ALIGNMENT, REJECTED, EventNarration, find_colour
 from iris_session.viewer.scene_layer import escape_entity_part
 from iris_session.viewer.timelines import Moment, to_time_columns
 
@@ -35,9 +35,7 @@ class MetricKind(NamedTuple):
 
 
 INPUT_TO_STEP: Final = "input_to_step_ms"
-ALIGNMENT: Final = "alignment_mm"
 STATE_AGE: Final = "state_age_ms"
-REJECTED: Final = "rejected_samples"
 #: By the first part of the name of a metric; what is in no kind has no view.
 KINDS: Final = {
     INPUT_TO_STEP: MetricKind("Delays [ms]", "input to step, {} [ms]"),
@@ -104,7 +102,7 @@ class MetricPlots:
         if known is None:
             return
         name = self._narration.find_person(subject).name if known.of_people else subject
-        colours = [self._narration.find_colour(subject)] if known.of_people else None
+        colours = [find_colour(subject)] if known.of_people else None
         steps = rr.components.InterpolationMode.StepAfter if kind in HELD else None
         series = rr.SeriesLines(names=[known.label.format(name)], colors=colours, interpolation_mode=steps)
         self._rec.log(entity, series, static=True, strict=True)

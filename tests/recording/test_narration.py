@@ -41,7 +41,14 @@ from iris_session.protocol.server_messages import (
     SceneChanged,
     TipCalibrated,
 )
-from iris_session.viewer.narration import PALETTE, EventNarration, LogLine, describe_denial, describe_session
+from iris_session.viewer.narration import (
+    PALETTE,
+    EventNarration,
+    LogLine,
+    describe_denial,
+    describe_session,
+    find_colour,
+)
 from tests.recording.support import make_header
 
 POSE = Pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
@@ -60,7 +67,7 @@ def ann_and_bob() -> EventNarration:
 
 
 def narrate(narration: EventNarration, *bodies: EventKind) -> list[LogLine]:
-    return [narration.add(Event(i, i, i, body))[0] for i, body in enumerate(bodies)]
+    return [narration.add(Event(i, i, i, body)).line for i, body in enumerate(bodies)]
 
 
 def test_events_are_sentences_with_names() -> None:
@@ -97,7 +104,6 @@ def test_frequent_events_are_for_debugging() -> None:
     lines = narrate(
         ann_and_bob(),
         SamplesRejected("p1", "controller/left", "lease_version", 3),
-        HeadsetsCompared("p1", "p2", "table", 0.0014, 0.01, 0.003, (0.0, 0.0, 0.0), 9),
         EngagementChanged("left", "p1", True),
         EngagementChanged("left", "p1", False, "clutch_open"),
     )
@@ -108,6 +114,19 @@ def test_frequent_events_are_for_debugging() -> None:
     assert (line.level, line.text.count("ann"), "left" in line.text, "right" in line.text) == ("INFO", 2, True, True)
     faults = narrate(ann_and_bob(), Gap("recording", 7, 12), EngagementChanged("left", "p1", False, "stale"))
     assert [line.level for line in faults] == ["ERROR", "INFO"]
+
+
+def test_checks_of_two_headsets_are_told_when_they_change() -> None:
+    narration = ann_and_bob()
+
+    def check(error_m: float, a: str = "p1", b: str = "p2") -> str:
+        compared = HeadsetsCompared(a, b, "table", error_m, 0.0, 0.006, (0.0, 0.0, 0.0), 40)
+        return narrate(narration, compared)[0].level
+
+    assert [check(0.001), check(0.005), check(0.011, "p2", "p1")] == ["INFO", "DEBUG", "DEBUG"]
+    assert [check(0.02), check(0.03), check(0.004)] == ["INFO", "DEBUG", "INFO"]
+    narrate(narration, ParticipantLeft("p2", "bye"))
+    assert check(0.001) == "INFO", "somebody new has the name"
 
 
 def test_every_kind_of_event_has_a_line_without_ids() -> None:
@@ -148,7 +167,7 @@ def test_every_kind_of_event_has_a_line_without_ids() -> None:
 
 def changes(narration: EventNarration, *bodies: EventKind) -> list[tuple[str, str]]:
     """Return the changed lanes and their new states."""
-    found = [change for body in bodies for change in narration.add(Event(1, 1, 1, body))[1]]
+    found = [change for body in bodies for change in narration.add(Event(1, 1, 1, body)).lanes]
     return [("/".join(change.lane), change.state) for change in found]
 
 
@@ -200,12 +219,11 @@ def test_lanes_of_a_later_part_end_what_began_before_it() -> None:
 
 
 def test_colours_follow_the_order_of_joining() -> None:
-    narration = EventNarration()
-    (change,) = narration.add(Event(1, 1, 1, lease("left", "p2")))[1]
-    assert change.colours == {"p2": narration.find_colour("p2")}
-    assert len({narration.find_colour(f"p{i}") for i in range(1, 8)}) == 7
-    assert narration.find_colour("p8") == narration.find_colour("p1")
-    assert narration.find_colour("host") == narration.find_colour("host")
+    (change,) = EventNarration().add(Event(1, 1, 1, lease("left", "p2"))).lanes
+    assert change.colours == {"p2": find_colour("p2")}
+    assert len({find_colour(f"p{i}") for i in range(1, 8)}) == 7
+    assert find_colour("p8") == find_colour("p1")
+    assert find_colour("host") == find_colour("host")
 
 
 def test_colours_are_those_of_the_page() -> None:
