@@ -5,8 +5,7 @@ first of them, the window, are sent, the others wait in the backlog. A restarted
 not acknowledged. Rows are dropped only if the backlog is full, states and metrics before: they are counted and reported
 by `take_gap`. No step waits for a disk, so nothing here is kept on one.
 
-Vertices of deformables are for the picture only. They have a socket of their own and are not stored: frames that do not
-fit into its queue are dropped and counted, so they cost the journal nothing.
+Vertices of deformables are for the picture only: while batches wait they are dropped and counted.
 """
 
 from __future__ import annotations
@@ -67,8 +66,6 @@ SILENCE_S: Final = 3.0
 BATCH_ITEMS: Final = 4096
 #: Maximum number of participants whose names a later recorder gets; batches that it gets again are about past ones too.
 PEOPLE: Final = 256
-#: Maximum number of vertex frames in transit. The recorder receives them thirty times a second.
-VERTEX_FRAMES: Final = 32
 
 
 class FeedStats(msgspec.Struct):
@@ -98,7 +95,7 @@ class RecorderFeed:
     """One feed per session, used from the thread that takes the steps. No clock, no threads.
 
     Call `row` once per step (it flushes by itself), `keyframe` every few seconds and whenever `wants_keyframe`.
-    `endpoint`: where the recorder process listens, see `RecorderProcess.feed_endpoint`; `vertices_endpoint`: the same.
+    `endpoint`: where the recorder process listens, see `RecorderProcess.feed_endpoint`.
     """
 
     def __init__(
@@ -106,7 +103,6 @@ class RecorderFeed:
         endpoint: str,
         window_bytes: int = WINDOW_BYTES,
         backlog_bytes: int = BACKLOG_BYTES,
-        vertices_endpoint: str = "",
     ) -> None:
         self.stats = FeedStats()
         self._lost = False
@@ -121,12 +117,6 @@ class RecorderFeed:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
         self._socket.connect(endpoint)
-        self._vertices = self._context.socket(zmq.PUSH) if vertices_endpoint else None
-        if self._vertices is not None:
-            self._vertices.setsockopt(zmq.SNDHWM, VERTEX_FRAMES)
-            self._vertices.setsockopt(zmq.LINGER, 0)
-            self._vertices.setsockopt(zmq.RECONNECT_IVL, 50)
-            self._vertices.connect(vertices_endpoint)
         self._vertex_limit = VertexRateLimit()
         self._header = b""
         self._scene = Batch()  # the newest `SceneModel`, and the assets of the picture
@@ -262,21 +252,17 @@ class RecorderFeed:
         """Add a scalar, plotted as `/metrics/<name>`."""
         self._add(self._batch.metrics, MetricRecord(step, session_time, name, float(value)))
 
-    def send_vertices(self, stream: str, frame: bytes, session_time: int) -> None:
-        """Send a frame (level `full`) of a deformable as published with the state of `session_time`, for the picture.
+    def add_vertices(self, stream: str, frame: bytes, session_time: int) -> None:
+        """Add a frame (level `full`) of a deformable as published with the state of `session_time`, for the picture.
 
-        Frames beyond `VertexRateLimit` are left out, and frames that do not fit into the queue are dropped.
+        Frames beyond `VertexRateLimit` are left out.
         """
-        if (
-            self._ended
-            or self._vertices is None
-            or not self._vertex_limit.admit_frame(stream, read_header(frame).n_vertices, session_time)
-        ):
+        if not self._vertex_limit.admit_frame(stream, read_header(frame).n_vertices, session_time):
             return
-        try:
-            self._vertices.send(messages.encode_vertices(VertexFrame(stream, session_time, frame)), zmq.NOBLOCK)
-        except zmq.Again:
+        if self._backlog:
             self.stats.dropped_vertices += 1
+        else:
+            self._add(self._batch.vertices, VertexFrame(stream, session_time, frame))
 
     def take_gap(self) -> int:
         """Return the rows dropped since the last call: journal them as `Entry(RecordingGap(rows))` and add a
@@ -292,7 +278,7 @@ class RecorderFeed:
             return
         batch = self._batch
         lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
-        lists += (batch.scenes, batch.assets, batch.holds)
+        lists += (batch.scenes, batch.assets, batch.holds, batch.vertices)
         if self.stats.waiting_bytes > JOURNAL_SHARE * self._backlog_limit:
             self._leave_out_picture(batch)
         if batch.rows or any(lists):
@@ -340,8 +326,6 @@ class RecorderFeed:
             why = "the session ended before the recorder could take it all"
             self._drop(sum(rows for _, rows, _ in self._backlog), sum(others for *_, others in self._backlog), why)
             self._backlog.clear()
-        if self._vertices is not None:
-            self._vertices.close(0)
         self._socket.close(0)
         self._context.term()
         return self._complete

@@ -5,8 +5,7 @@ loaded last, if any, and the location of its assets; or `BATCH` with its own num
 authority: `RecorderStatus`. The feed keeps every batch until a status confirms that it is in the file; a new recorder
 process requests the header (`expecting` -1) and receives everything that is not confirmed.
 
-Vertices (`VertexFrame`, for the picture only) have a socket of their own, which drops frames when it is full. So have
-point clouds and pictures of cameras; the messages are in `front.media.recorder`.
+Point clouds and pictures of cameras have a socket of their own; the messages are in `front.media.recorder`.
 """
 
 from __future__ import annotations
@@ -29,11 +28,10 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     """Configuration of the recorder process.
 
     `path`: the recording; `part`: number of the file to write, which must not exist. Endpoints: `ipc://` sockets that
-    the recorder binds; without `vertices_endpoint` deformables are drawn at rest, without `media_endpoint` no point
-    clouds and pictures are recorded. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: id of the parent
-    process; the recorder ends after it, once the file is finished. `record_assets`: see `rrd/assets.py`.
-    `budget_bytes`: see `budget.py`. `journal_only`: an error in the picture has ended the recorder before, and would
-    come again: of batches only what verification needs is written, and no media.
+    the recorder binds; without `media_endpoint` no point clouds and pictures are recorded. `origin_ns`: session time
+    zero on CLOCK_MONOTONIC. `parent`: id of the parent process; the recorder ends after it, once the file is finished.
+    `record_assets`: see `rrd/assets.py`. `budget_bytes`: see `budget.py`. `journal_only`: an error in the picture has
+    ended the recorder before, and would come again: of batches only what verification needs is written, and no media.
     """
 
     path: str
@@ -43,7 +41,6 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     samples_endpoint: str
     origin_ns: int
     parent: int
-    vertices_endpoint: str = ""
     media_endpoint: str = ""
     record_assets: str = "none"
     budget_bytes: int = 0
@@ -193,6 +190,7 @@ class Batch(msgspec.Struct, array_like=True):
     assets: list[SceneAssets] = []
     holds: list[HoldRecord] = []
     people: list[ParticipantInfo] = []
+    vertices: list[VertexFrame] = []
 
 
 class _Essence(msgspec.Struct, array_like=True):
@@ -215,8 +213,8 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     `written`: newest batch that is in the file, -1 for none. `bytes`: size of the file. `cpu_ns`: processor time of the
     recorder so far. `lag_ns`: age of the newest row when it was written. `samples`: number of raw messages received.
     `samples_refused`: number of invalid messages of the front, and of batches of which only the journal could be read.
-    `vertices_refused`: number of vertex frames that are not in the picture, because the queue was full, they do not
-    decode, or are of another scene. `fault`: one line if the file can no longer be written; the process then ends.
+    `vertices_refused`: number of vertex frames that are not in the picture: they do not decode or are of another scene.
+    `fault`: one line if the file can no longer be written; the process then ends.
     `disk_free`: free bytes on its disk, at least 1; 0 if unknown. `samples_left_out`: raw messages that are not in the
     file, because time and room of the disk were left to the journal. `media_refused`: frames of point clouds and
     pictures that do not decode. `assets_left_out`: assets of the scenes that are not in the file. `budget`,
@@ -243,18 +241,12 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     ended: bool = False
 
 
-encode_batch = msgspec.msgpack.Encoder().encode
+encode_batch = encode_scene = encode_header = encode_header_copy = encode_status = msgspec.msgpack.Encoder().encode
 decode_batch = make_decoder(Batch)
 _decode_essence = make_decoder(_Essence)
-encode_scene = msgspec.msgpack.Encoder().encode
 decode_scene = make_decoder(SceneModel)
-encode_vertices = msgspec.msgpack.Encoder().encode
-decode_vertices = make_decoder(VertexFrame)
-encode_header = msgspec.msgpack.Encoder().encode
 decode_header = make_decoder(SessionHeader)
-encode_header_copy = msgspec.msgpack.Encoder().encode
 decode_header_copy = make_decoder(HeaderCopy)
-encode_status = msgspec.msgpack.Encoder().encode
 decode_status = make_decoder(RecorderStatus)
 
 

@@ -7,7 +7,7 @@ Rerun is imported only where files are written or read, so that the authority st
 """
 
 from iris_session.journal.errors import NotARecordingError, RecorderError, RecordingError
-from iris_session.journal.feed import FeedStats, RecorderFeed
+from iris_session.journal.feed import RecorderFeed
 from iris_session.journal.rows import (
     CLOSED,
     OPEN,
@@ -22,7 +22,7 @@ from iris_session.journal.rows import (
     pack_model,
     unpack_model,
 )
-from iris_session.journal.verification import Core, Problem, VerifyReport
+from iris_session.journal.verification import Problem, VerifyReport
 from iris_session.recording.lock import RecordingInUseError, RecordingLock
 from iris_session.recording.observations import (
     AlignmentHistory,
@@ -36,8 +36,7 @@ from iris_session.recording.reader import Recording
 from iris_session.recording.summary import RecordingSummary, summarise
 from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import verify
-from iris_session.rrd.assets import RecordedScene
-from iris_session.rrd.batches import RawSample, RecordedCloud, RecordedImage, RecordedState, RecordedStream
+from iris_session.rrd.batches import RecordedImage, RecordedState, RecordedStream
 
 __all__ = [
     # write a recording
@@ -55,15 +54,11 @@ __all__ = [
     "unpack_model",
     "RecorderProcess",
     "RecorderFeed",
-    "FeedStats",
     # read a recording
     "Recording",
     "RecordedState",
     "RecordedStream",
-    "RawSample",
-    "RecordedCloud",
     "RecordedImage",
-    "RecordedScene",
     "read_alignment_history",
     "AlignmentHistory",
     "RecordedObservation",
@@ -75,7 +70,6 @@ __all__ = [
     "verify",
     "VerifyReport",
     "Problem",
-    "Core",
     # errors
     "RecordingError",
     "RecorderError",

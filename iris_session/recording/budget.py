@@ -1,6 +1,6 @@
 """Budget of a recording: the bytes that its files may take together, and what is left out as it gets used up.
 
-It is used like a small disk. First raw samples, vertices, media and assets are left out, and counted; the journal goes
+It is used like a small disk. First raw samples, media and assets are left out, and counted; the journal goes
 on until the budget is used up. Then the file is closed, and the session goes on without a recording.
 """
 

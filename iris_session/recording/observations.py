@@ -8,12 +8,13 @@ A step is identified by its session time, which strictly grows: rows of the jour
 from __future__ import annotations
 
 from array import array
-from bisect import bisect_left, bisect_right, insort
-from collections.abc import Callable, Iterable
+from bisect import bisect_right, insort
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import msgspec
+import numpy as np
 
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.codec import BAD_BYTES
@@ -132,38 +133,6 @@ class _StepEntries:
 
     joins: list[tuple[int, Join]] = field(default_factory=list)
     jumps: list[tuple[int, AlignmentAlarm]] = field(default_factory=list)
-
-
-class _Heads:
-    """Positions of one head over time."""
-
-    def __init__(self) -> None:
-        self._times, self._places = array("q"), array("d")
-        self._order: list[int] | None = None
-
-    def add(self, capture_ns: int, p: Vec3) -> None:
-        self._times.append(capture_ns)
-        self._places.extend(p)
-
-    def sort(self) -> None:
-        """Sort by time: clocks are slewed, and messages overtake each other."""
-        order = sorted(range(len(self._times)), key=self._times.__getitem__)
-        places = self._places
-        self._times = array("q", [self._times[i] for i in order])
-        self._places = array("d", [c for i in order for c in places[3 * i : 3 * i + 3]])
-
-    def find_nearest(self, capture_ns: int) -> Vec3 | None:
-        """Return the position nearest in time; None if it is further than `NEAR_NS`."""
-        i = bisect_left(self._times, capture_ns)
-        near = min(
-            (k for k in (i - 1, i) if 0 <= k < len(self._times)),
-            key=lambda k: abs(self._times[k] - capture_ns),
-            default=-1,
-        )
-        if near < 0 or abs(self._times[near] - capture_ns) > NEAR_NS:
-            return None
-        x, y, z = self._places[3 * near : 3 * near + 3]
-        return x, y, z
 
 
 def read_alignment_history(
@@ -310,7 +279,7 @@ def _end_period(participant: str, now_ns: int, present: dict[str, AlignmentPerio
 
 def _read_messages(recording: Recording, roster: _Roster, found: AlignmentHistory, say: Callable[[int], None]) -> None:
     """Add the observations to `found`, each with the head position nearest in time."""
-    heads: dict[TrackingFrame, _Heads] = {}
+    heads: dict[TrackingFrame, array[float]] = {}
     seen: dict[TrackingFrame, list[Observation]] = {}
     for done, raw in enumerate(recording.samples()):
         if done % TOLD_EVERY == 0:
@@ -329,13 +298,20 @@ def _read_messages(recording: Recording, roster: _Roster, found: AlignmentHistor
         if isinstance(message, Observation):
             seen.setdefault(frame, []).append(message)
         elif message.device == Device.HEAD and message.pose is not None and message.tracked:
-            heads.setdefault(frame, _Heads()).add(message.capture_ns, message.pose.p)
+            heads.setdefault(frame, array("d")).extend((message.capture_ns, *message.pose.p))
     for frame, observations in sorted(seen.items()):
-        found.observations[frame] = _with_heads(observations, heads.get(frame))
+        found.observations[frame] = _with_heads(observations, heads.get(frame, array("d")))
 
 
-def _with_heads(observations: Iterable[Observation], heads: _Heads | None) -> list[RecordedObservation]:
-    if heads is not None:
-        heads.sort()
-    ordered = sorted(observations, key=lambda one: one.capture_ns)
-    return [RecordedObservation(one, None if heads is None else heads.find_nearest(one.capture_ns)) for one in ordered]
+def _with_heads(observations: list[Observation], heads: array[float]) -> list[RecordedObservation]:
+    """Return the observations in order of capture. `heads`: time [ns] and position of the head [m], in any order."""
+    observations.sort(key=lambda one: one.capture_ns)
+    rows = np.array(heads).reshape(-1, 4)
+    rows = rows[np.argsort(rows[:, 0])]  # clocks are slewed, and messages overtake each other
+    found: list[RecordedObservation] = []
+    for one in observations:
+        after = int(np.searchsorted(rows[:, 0], one.capture_ns))
+        near = [row for row in rows[max(0, after - 1) : after + 1].tolist() if abs(row[0] - one.capture_ns) <= NEAR_NS]
+        nearest = min(near, key=lambda row: abs(row[0] - one.capture_ns), default=None)
+        found.append(RecordedObservation(one, None if nearest is None else (nearest[1], nearest[2], nearest[3])))
+    return found

@@ -23,7 +23,7 @@ from iris_session.journal.rows import FORMAT, VERIFIERS, SessionHeader, blob_roo
 from iris_session.recording.lock import is_being_written
 from iris_session.rrd import batches, paths
 from iris_session.rrd import file as rrd_file
-from iris_session.rrd.batches import UNREADABLE, count_joined_rows, get_entity, group_spans, join_pieces
+from iris_session.rrd.batches import UNREADABLE, get_entity, group_spans, join_pieces
 from iris_session.rrd.rerun_tool import is_readable
 from iris_session.rrd.salvage import salvage
 
@@ -59,17 +59,13 @@ class RecordingParts:
         self.notes: list[str] = []
         self.cuts: list[str] = []
         self.is_being_written = is_being_written(paths.split_part(files[0])[0])
-        several: list[tuple[str, int]] = []  # files with more than one recording in them
         try:
             for path in files:
-                self._add_part(path, several)
+                self._add_part(path)
             self.header, self.root = self._read_header(files[0])
         except BaseException:
             self.close()
             raise
-        one = f"session {self.header.session_name!r} of {self.header.created_utc or 'an unknown day'}"
-        for name, n in several:
-            self.notes.append(f"{name} holds {n} recordings: only {one} is read; make a file of each of the others")
         self._find_missing(files)
 
     def close(self) -> None:
@@ -106,8 +102,8 @@ class RecordingParts:
                 self._record_damage(f"{place} holds something damaged, which is left out: {_format_error(error)}")
 
     def count_rows(self, entity: str) -> int:
-        """Return the number of rows of an entity; repeated rows count again."""
-        return sum(count_joined_rows(pieces) for _, pieces in self._iterate_spans(entity))
+        """Return the number of rows of an entity; those that are repeated or split by Rerun's tools count again."""
+        return sum(piece.num_rows for _, pieces in self._iterate_spans(entity) for piece in pieces)
 
     def _iterate_spans(self, entities: str | Sequence[str]) -> Iterator[tuple[int, list[Any]]]:
         """Yield part number (from 0) and the record batches of some rows of one entity, over all parts in order."""
@@ -115,7 +111,7 @@ class RecordingParts:
             for pieces in group_spans(chunk.to_record_batch() for chunk in rrd_file.read_chunks(path, entities)):
                 yield i, pieces
 
-    def _add_part(self, path: str, several: list[tuple[str, int]]) -> None:
+    def _add_part(self, path: str) -> None:
         """Add a part, if readable. A part without content (its recorder ended before the first write) is only noted."""
         try:
             found = rrd_file.scan_file(path) if os.path.getsize(path) else None
@@ -137,8 +133,6 @@ class RecordingParts:
         except OSError as error:
             self._record_damage(f"{path} cannot be read: {error.strerror or error}")
             return
-        if found.indexed and whole and (n := rrd_file.count_recordings(path, found)) > 1:
-            several.append((os.path.basename(path), n))
         self.readable.append(readable)
         self.files.append(path)
 

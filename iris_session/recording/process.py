@@ -2,7 +2,7 @@
 
 Receives batches from the authority and raw samples from the front, and writes them into one Rerun file about seven
 times a second, so that killing any process loses at most 0.25 s. The journal comes first: raw samples are left out, and
-counted, while the disk is slow or nearly full, and vertices and media when time is short. Prints `ready` or
+counted, while the disk is slow or nearly full, and media when time is short. Prints `ready` or
 `failed: <one line>` on standard output. Ends on SIGTERM, or when its parent process has ended, after writing everything
 that was received, and when the budget of the recording is used up; SIGINT is left to the parent.
 """
@@ -34,7 +34,6 @@ from iris_session.journal.messages import (
     decode_batch,
     decode_header,
     decode_journal,
-    decode_vertices,
     encode_status,
 )
 from iris_session.journal.rows import SessionHeader
@@ -58,28 +57,20 @@ STATUS_S: Final = 0.5
 DRAIN_MESSAGES: Final = 4096
 #: Maximum number of batches of raw samples per drain (64 KiB each).
 DRAIN_SAMPLES: Final = 64
-#: Maximum number of vertex frames per drain.
-DRAIN_VERTICES: Final = 32
 #: Maximum number of point clouds and pictures per drain, so sixty a second.
 DRAIN_MEDIA: Final = 2
 #: After SIGTERM or the end of the parent: without a message for this long, everything was received.
 QUIET_S: Final = 0.1
 FINISH_S: Final = 10.0
-#: An orphaned recorder whose file does not grow for this long exits: a write to a hung disk never returns.
-ORPHAN_S: Final = 20.0
 #: Exit statuses. An error that nothing catches is 1 (`supervise.CRASHED`).
 NOT_BEGUN: Final = 2
 NOT_WRITTEN: Final = 3
-ORPHANED: Final = 4
 MIN_FREE_BYTES: Final = 16 << 20
-#: Free bytes that are left to the journal: hours of it. Below, raw samples and vertices are left out.
+#: Free bytes that are left to the journal: hours of it. Below, raw samples and media are left out.
 JOURNAL_RESERVE_BYTES: Final = 256 << 20
 #: A write that takes longer shows a disk that cannot keep up: raw samples are left out until one is shorter. Drawing a
 #: scene or a busy processor makes a flush long, but not this.
 SLOW_WRITE_S: Final = 0.3
-#: Bytes written to test a new file. A file begins with about 22 KB, mostly the blueprint.
-TRIAL_BYTES: Final = 128 << 10
-
 #: Bytes of assets in a write: at most, at least, and what the disk takes in `ASSETS_S`.
 MAX_ASSETS_BYTES: Final = 1 << 20
 MIN_ASSETS_BYTES: Final = 64 << 10
@@ -104,8 +95,6 @@ class RecorderLoop:
         self._context = zmq.Context(io_threads=1)
         self._feed = self._bind(zmq.DEALER, config.feed_endpoint)
         self._front = self._bind(zmq.PULL, config.samples_endpoint, DRAIN_SAMPLES)
-        vertices = config.vertices_endpoint
-        self._vertices = self._bind(zmq.PULL, vertices, DRAIN_VERTICES) if vertices else None
         self._media = self._bind(zmq.PULL, config.media_endpoint, DRAIN_MEDIA) if config.media_endpoint else None
         self._budget = RecordingBudget(config.budget_bytes, config.path, config.part)
         self._begin_part()
@@ -130,7 +119,6 @@ class RecorderLoop:
 
     def run(self) -> int:
         """Record until stopped. Return the exit status of the process."""
-        threading.Thread(target=self._give_up_as_orphan, name="orphan", daemon=True).start()
         try:
             self._send_status(-1)
             self._loop()
@@ -161,28 +149,14 @@ class RecorderLoop:
         until = time.monotonic() + ASSETS_AT_END_S
         self._writer.assets.is_ending = True
         while self._writer.assets and time.monotonic() < until and not self._is_used_up and not self._is_short:
-            before = self._writer.size
+            before = self._writer.stream.size
             self._writer.write_assets(MAX_ASSETS_BYTES)
-            if self._writer.size == before:
+            if self._writer.stream.size == before:
                 break  # there was no step
         reason = describe_used_budget(self._budget.total_bytes) if self._is_used_up else ""
         is_abrupt = not self._stopping and os.getppid() != self._config.parent
         self._writer.close(reason=reason, samples_left_out=self._samples_left_out, is_abrupt=is_abrupt)
         self._ended = self._is_used_up
-
-    def _give_up_as_orphan(self) -> None:
-        """Exit the process when its parent has ended and the file cannot be written (runs in a thread)."""
-        size, since = -1, time.monotonic()
-        while True:
-            time.sleep(SYNC_S)
-            try:
-                now = os.stat(self._writer.path).st_size
-            except OSError:
-                now = size
-            if now != size or os.getppid() == self._config.parent:
-                size, since = now, time.monotonic()
-            elif time.monotonic() - since > ORPHAN_S:
-                os._exit(ORPHANED)
 
     def _remove(self) -> None:
         """Remove file and folder of a session that never began (its port was in use)."""
@@ -230,7 +204,7 @@ class RecorderLoop:
             if now >= flush_at:
                 flush_at = now + FLUSH_S
                 self._flush()
-                self._write_s = self._writer.write_s
+                self._write_s = self._writer.stream.write_s
                 self._syncer.check()
                 self._write_assets()
                 self._lag_ns = time.monotonic_ns() - self._config.origin_ns - self._newest_ns
@@ -256,9 +230,9 @@ class RecorderLoop:
         """Write assets after the journal, as many as the disk takes in a moment: no row waits for them longer."""
         if not self._writer.assets or self._is_short:
             return
-        began, before = time.monotonic(), self._writer.size
+        began, before = time.monotonic(), self._writer.stream.size
         self._writer.write_assets(self._assets_bytes)
-        bytes_per_s = (self._writer.size - before) / max(1e-6, time.monotonic() - began)
+        bytes_per_s = (self._writer.stream.size - before) / max(1e-6, time.monotonic() - began)
         self._assets_bytes = max(MIN_ASSETS_BYTES, min(MAX_ASSETS_BYTES, round(bytes_per_s * ASSETS_S)))
 
     def _drain(self) -> int:
@@ -275,8 +249,7 @@ class RecorderLoop:
             m += 1
             self._process_samples(data)
         if n < DRAIN_MESSAGES and m < DRAIN_SAMPLES and not (self._is_short or self._config.journal_only):
-            # Else behind with more important data: vertices and media are dropped at their source.
-            self._drain_vertices()
+            # Else behind with more important data: media are dropped at their source.
             self._drain_media()
         return n + m
 
@@ -286,17 +259,6 @@ class RecorderLoop:
         if self._write_s > SLOW_WRITE_S or 0 < self._disk_free < JOURNAL_RESERVE_BYTES:
             return True
         return self._budget.is_short(self._writer.size_with_index)
-
-    def _drain_vertices(self) -> None:
-        if self._vertices is None:
-            return
-        for _ in range(DRAIN_VERTICES):
-            try:
-                self._writer.add_vertices(decode_vertices(self._vertices.recv(zmq.NOBLOCK)))
-            except zmq.Again:
-                return
-            except msgspec.DecodeError:
-                self._refused += 1
 
     def _drain_media(self) -> None:
         if self._media is None:
@@ -373,16 +335,16 @@ class RecorderLoop:
             self._instance,
             self._expecting,
             written,
-            self._writer.size,
+            self._writer.stream.size,
             time.process_time_ns(),
             self._lag_ns,
             self._samples,
             self._refused,
             self._fault,
             self._disk_free,
-            self._writer.vertices_refused,
+            self._writer.drawing.vertices_refused,
             self._samples_left_out,
-            self._writer.media_refused,
+            self._writer.drawing.media_refused,
             self._writer.assets.left_out,
             self._budget.total_bytes,
             self._budget.count_left(self._writer.size_with_index),
@@ -447,7 +409,7 @@ def claim_file(path: Path) -> bool:
     made_folder = not os.path.exists(path.parent)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _try_to_write(path)
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))
         free = os.statvfs(path.parent)
     except OSError as error:
         raise RecorderError(f"cannot record to {path}: {error.strerror or error}") from error
@@ -455,21 +417,6 @@ def claim_file(path: Path) -> bool:
         path.unlink(missing_ok=True)
         raise RecorderError(f"cannot record to {path}: less than {MIN_FREE_BYTES >> 20} MiB of the disk are free")
     return made_folder
-
-
-def _try_to_write(path: Path) -> None:
-    """Create the empty file after a trial write of `TRIAL_BYTES`, so that errors appear before the session begins."""
-    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-    try:
-        left = bytes(TRIAL_BYTES)
-        while left:
-            left = left[os.write(fd, left) :]
-        os.ftruncate(fd, 0)
-    except OSError:
-        path.unlink(missing_ok=True)
-        raise
-    finally:
-        os.close(fd)
 
 
 def get_free_bytes(path: Path) -> int:

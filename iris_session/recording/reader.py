@@ -68,7 +68,7 @@ class Recording:
         all_closed: Every part was closed by its recorder, so that nothing can be missing within.
         damage: One line per place that could not be read, at most `MOST_DAMAGE`. Reading on may add lines.
         missing: One line per missing part, or range of parts.
-        notes: One line per empty part and per file that holds more than one recording.
+        notes: One line per empty part.
         cuts: One line per part that ends in the middle of a write, as a kill leaves it.
         is_being_written: A process was writing the recording when it was opened. What it has written so far is read,
             from a copy.

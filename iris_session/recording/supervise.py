@@ -50,7 +50,6 @@ class RecorderProcess:
         self._folder = tempfile.mkdtemp(prefix="iris-rec-", dir=None if short else "/tmp")
         self.feed_endpoint = f"ipc://{self._folder}/feed"
         self.samples_endpoint = f"ipc://{self._folder}/samples"
-        self.vertices_endpoint = f"ipc://{self._folder}/vertices"
         self.media_endpoint = f"ipc://{self._folder}/media"
         self._log = Path(self._folder) / "recorder.log"
         self._recording_id = uuid.uuid4().hex
@@ -144,7 +143,6 @@ class RecorderProcess:
             self.samples_endpoint,
             self._origin_ns,
             os.getpid(),
-            self.vertices_endpoint,
             self.media_endpoint,
             self._record_assets,
             self._budget_bytes,

@@ -25,7 +25,6 @@ from iris_session.journal.messages import (
     SceneAssets,
     SceneModel,
     StateFrame,
-    VertexFrame,
     encode_header,
     encode_header_copy,
     encode_scene,
@@ -54,22 +53,24 @@ _encode = msgspec.msgpack.Encoder().encode
 class RrdWriter:
     """Writer of one file.
 
-    `add`, `add_sample`, `add_vertices` and `add_media` only collect; `flush` writes and returns when the operating
+    `add`, `add_sample` and `add_media` only collect; `flush` writes and returns when the operating
     system has the bytes.
 
     Attributes:
         path: The file.
+        stream: Its bytes.
+        drawing: What the viewer shows.
         assets: What `write_assets` writes.
     """
 
     def __init__(self, path: str | Path, recording_id: str, assets: AssetQueue | None = None) -> None:
         self.path = str(path)
         self.assets = AssetQueue() if assets is None else assets
-        self._stream = RrdStream(self.path, paths.APPLICATION, recording_id)
-        self._rec = self._stream.recording
+        self.stream = RrdStream(self.path, paths.APPLICATION, recording_id)
+        self._rec = self.stream.recording
         self._rec.set_log_time_enabled(False)
         self._moments = MomentTable()
-        self._drawing = SessionDrawing(self._rec, self._moments, is_first=paths.split_part(self.path)[1] == 1)
+        self.drawing = SessionDrawing(self._rec, self._moments, is_first=paths.split_part(self.path)[1] == 1)
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
         self._reports: list[tuple[str, int, float]] = []
@@ -81,29 +82,9 @@ class RrdWriter:
         self._has_scene = False  # the assets of a scene were given
 
     @property
-    def size(self) -> int:
-        """Bytes in the file so far."""
-        return self._stream.size
-
-    @property
     def size_with_index(self) -> int:
         """Bytes that the file would have if it was closed now and got its index."""
-        return self._stream.size + self._stream.messages * INDEX_BYTES
-
-    @property
-    def write_s(self) -> float:
-        """Time that the system took for the bytes of the last write [s], without that to encode them."""
-        return self._stream.write_s
-
-    @property
-    def vertices_refused(self) -> int:
-        """Number of vertex frames that are not in the picture."""
-        return self._drawing.vertices_refused
-
-    @property
-    def media_refused(self) -> int:
-        """Number of frames of point clouds and pictures that do not decode."""
-        return self._drawing.media_refused
+        return self.stream.size + self.stream.messages * INDEX_BYTES
 
     def write_header(self, header: SessionHeader) -> None:
         """Write the header and the scene. Must be called before the first flush with data."""
@@ -115,7 +96,7 @@ class RrdWriter:
         self._header = header
         self._moments.origin_utc_ns = header.origin_utc_ns
         self._log_static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
-        self._drawing.begin(header)
+        self.drawing.begin(header)
 
     def add(self, batch: Batch) -> None:
         """Collect one batch of the authority. States of one flush are of one scene."""
@@ -123,8 +104,8 @@ class RrdWriter:
             self.flush()
             self._write_scenes(batch.scenes, batch.assets)
         pending = self._pending
-        self._drawing.narration.add_people(batch.people)
-        for name in ("rows", "states", "events", "denials", "metrics", "keyframes", "holds"):
+        self.drawing.narration.add_people(batch.people)
+        for name in ("rows", "states", "events", "denials", "metrics", "keyframes", "holds", "vertices"):
             getattr(pending, name).extend(getattr(batch, name))
 
     def add_sample(self, connection: int, receive_ns: int, data: bytes) -> None:
@@ -134,10 +115,6 @@ class RrdWriter:
     def add_report(self, participant: str, receive_ns: int, age_ms: float) -> None:
         """Collect a report of a client: the age [ms] below which 99 % of the states of a second reached it."""
         self._reports.append((participant, receive_ns, age_ms))
-
-    def add_vertices(self, frame: VertexFrame) -> None:
-        """Collect a frame of a deformable. If too many are pending, the oldest is dropped."""
-        self._drawing.add_vertices(frame)
 
     def add_media(self, message: Sequence[bytes]) -> None:
         """Collect a message about a stream of clouds or pictures, as `MediaDrawer.draw` takes it."""
@@ -151,8 +128,8 @@ class RrdWriter:
         media, self._media = self._media, []
         self._write_rows(batch.rows)
         self._write_keyframes(batch.keyframes)
-        events = self._drawing.events
-        narration = self._drawing.narration
+        events = self.drawing.events
+        narration = self.drawing.narration
         narrated = [narration.add(event) for event in batch.events]  # names and roles are known when people appear
         for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
             self._write_states(list(states))
@@ -161,9 +138,10 @@ class RrdWriter:
         self._write_denials(batch.denials)
         events.add_metrics(batch.metrics)
         events.add_state_ages(reports)
-        self._drawing.write()
+        self.drawing.write()
+        self.drawing.draw_vertices(batch.vertices)
         self._write_samples(samples)
-        self._drawing.draw_media(media)
+        self.drawing.draw_media(media)
         self._write_stream(timeout_s)
         if batch.keyframes:
             self._write_mark()
@@ -195,20 +173,20 @@ class RrdWriter:
         text = reason or (ABRUPT if is_abrupt else "")
         if text:
             self._rec.log(f"{paths.EVENTS}/recorder", rr.TextLog(text, level=WARN), strict=True)
-        self._drawing.close()
+        self.drawing.close()
         self._describe_result()
         self.flush(timeout_s)
         self._write_mark()
         mark = EndMark(*self._newest_row, reason, samples_left_out, is_abrupt)
         self._log_static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
         try:
-            self._stream.close(timeout_s)
+            self.stream.close(timeout_s)
         except (RuntimeError, ValueError, OSError) as error:
             raise self._to_error(error) from error
 
     def _write_stream(self, timeout_s: float) -> None:
         try:
-            self._stream.write(timeout_s)
+            self.stream.write(timeout_s)
         except (RuntimeError, ValueError, OSError) as error:
             raise self._to_error(error) from error
 
@@ -218,7 +196,7 @@ class RrdWriter:
 
     def _describe_result(self) -> None:
         """Say what the session was, in the text and as properties: those of a folder of files are a table."""
-        header, narration = self._header, self._drawing.narration
+        header, narration = self._header, self.drawing.narration
         if header is None:
             return
         duration_s = 0.0 if self._begins_ns is None else (self._newest_ns - self._begins_ns) * 1e-9
@@ -242,7 +220,7 @@ class RrdWriter:
 
     def _write_mark(self) -> None:
         times = [sequence_index(paths.STEP, [self._newest_row[0]])]
-        self._send_columns(paths.MARKS, times, [bytes_column("mark", [_encode(self._stream.mark())])])
+        self._send_columns(paths.MARKS, times, [bytes_column("mark", [_encode(self.stream.mark())])])
 
     def _write_rows(self, rows: Sequence[JournalRow]) -> None:
         if not rows:
@@ -279,7 +257,7 @@ class RrdWriter:
             times = [sequence_index(paths.STEP, [s.step for s in scenes])]
             blobs = [seal_blob(encode_scene(scene)) for scene in scenes]
             self._send_columns(paths.MODELS, times, [bytes_column("scene", blobs)])
-        self._drawing.change_scene(scenes, assets)
+        self.drawing.change_scene(scenes, assets)
         for one in assets:
             self.assets.add_scene(one, is_patch=not scenes and self._has_scene)
             self._has_scene = True
@@ -295,20 +273,20 @@ class RrdWriter:
             bytes_column("presence", [_encode(s.presence) for s in states]),
             bytes_column("applied", [_encode(s.applied) for s in states]),
         ]
-        times = np.array(self._drawing.find_moments(states), np.int64).T
+        times = np.array(self.drawing.find_moments(states), np.int64).T
         self._send_columns(paths.STATE, to_time_columns(times), columns)
-        self._drawing.draw_states(states, poses, self._begins_ns)
+        self.drawing.draw_states(states, poses, self._begins_ns)
 
     def _write_events(self, events: list[Event], narrated: Sequence[NarratedEvent]) -> None:
         if events:
-            columns = self._drawing.events.draw_events(events, narrated)
+            columns = self.drawing.events.draw_events(events, narrated)
             columns.append(bytes_column("event", [_encode(event) for event in events]))
             times = self._moments.to_times(paths.EVENTS, [(e.step, e.session_time) for e in events])
             self._send_columns(paths.EVENTS, times, columns)
 
     def _write_denials(self, denials: list[DenialRecord]) -> None:
         if denials:
-            columns = self._drawing.events.draw_denials(denials)
+            columns = self.drawing.events.draw_denials(denials)
             columns.append(bytes_column("denial", [_encode(record) for record in denials]))
             times = self._moments.to_times(paths.DENIALS, [(d.step, d.session_time) for d in denials])
             self._send_columns(paths.DENIALS, times, columns)

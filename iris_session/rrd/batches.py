@@ -412,7 +412,7 @@ def join_pieces(pieces: list[Any]) -> Any:
     """
     import pyarrow as pa  # type: ignore[import-untyped]
 
-    if _is_whole(pieces):
+    if len(pieces) == 1 and _is_ascending(pieces[0]):  # as a recorder writes them
         return pieces[0]
     ids = _list_row_ids(pieces)
     fields = {field.name: field for piece in pieces for field in piece.schema}
@@ -423,19 +423,9 @@ def join_pieces(pieces: list[Any]) -> Any:
     return pa.RecordBatch.from_arrays(columns, schema=schema)
 
 
-def count_joined_rows(pieces: list[Any]) -> int:
-    """Return the number of rows that `join_pieces` would return."""
-    return pieces[0].num_rows if _is_whole(pieces) else len(_list_row_ids(pieces))
-
-
 def get_entity(batch: Any) -> str:
     """Return the entity path of the rows."""
     return str(batch.schema.metadata[_ENTITY].decode())
-
-
-def _is_whole(pieces: list[Any]) -> bool:
-    """Return whether it is one piece with every row once, as a recorder writes them."""
-    return len(pieces) == 1 and _is_ascending(pieces[0])
 
 
 def _is_ascending(batch: Any) -> bool:

@@ -251,13 +251,6 @@ def find_store_id(message: bytes, store: int) -> bytes:
     return head[at + 4 : at + 4 + head[at + 3]] if 0 <= at < len(head) - 3 else b""
 
 
-def count_recordings(path: str | Path, found: Scan) -> int:
-    """Return the number of recordings in a file."""
-    with open(path, "rb") as file:
-        infos = [read_message(file, message) for message in found.messages if message.kind == KIND_STORE_INFO]
-    return len({find_store_id(info, RECORDING) for info in infos} - {b""})
-
-
 def read_message(file: BinaryIO, message: RrdMessage) -> bytes:
     """Return head and body of a message of an open file."""
     file.seek(message.offset)

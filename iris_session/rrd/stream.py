@@ -116,17 +116,9 @@ def bytes_column(name: str, values: Iterable[bytes]) -> ArrowColumn:
     return scalar_column(name, list(values), pa.binary())
 
 
-def list_column(name: str, values: Sequence[Sequence[int]], kind: Any) -> ArrowColumn:
-    """Return a column of a list of integers per row."""
-    flat = [item for row in values for item in row]
-    offsets = np.zeros(len(values) + 1, np.int32)
-    np.cumsum([len(row) for row in values], out=offsets[1:])
-    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat, kind)))
-
-
-def text_list_column(name: str, values: Sequence[str]) -> ArrowColumn:
-    """Return a column of one row with a list of texts."""
-    return ArrowColumn(name, pa.array([list(values)], pa.list_(pa.string())))
+def list_column(name: str, values: Sequence[Sequence[Any]], kind: Any) -> ArrowColumn:
+    """Return a column of a list of values of Arrow type `kind` per row."""
+    return ArrowColumn(name, pa.array(values, pa.list_(kind)))
 
 
 def matrix_column(name: str, values: NDArray[np.floating[Any]]) -> ArrowColumn:

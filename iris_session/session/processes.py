@@ -158,7 +158,7 @@ class SessionProcesses:
                 self.recorder.start()
                 self.supervisor = RecorderSupervisor(self.recorder)
                 self.reporter.warning_sources.append(self.supervisor.budget.list_warnings)
-                self.feed = RecorderFeed(self.recorder.feed_endpoint, vertices_endpoint=self.recorder.vertices_endpoint)
+                self.feed = RecorderFeed(self.recorder.feed_endpoint)
                 self._in_use = RecordingLock(self.recording, shared=True)
                 if not self._core.config.authority.user_owned_loop:  # others cannot be resumed
                     self._note_writer = ResumeNoteWriter(find_note_path(self.recording))
@@ -287,7 +287,7 @@ class SessionProcesses:
         self, stream: str, frames: dict[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
     ) -> bool:
         if self.feed is not None:
-            self.feed.send_vertices(stream, frames[BudgetClass.FULL], capture_ns)
+            self.feed.add_vertices(stream, frames[BudgetClass.FULL], capture_ns)
         return self.front is not None and self.front.publish_media(stream, frames, capture_ns, scene_epoch, encoding)
 
     def _follow_scene(self, scene: NextScene | NextPatch) -> None:

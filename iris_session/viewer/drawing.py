@@ -7,11 +7,11 @@ rows of an entity have one time, so that Rerun's dataframes have them all. Nothi
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa  # type: ignore[import-untyped]
 import rerun as rr
 from numpy.typing import NDArray
 
@@ -21,7 +21,7 @@ from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import RobotSpec
 from iris_session.rrd import paths
-from iris_session.rrd.stream import text_list_column
+from iris_session.rrd.stream import list_column
 from iris_session.streams.errors import StreamError
 from iris_session.viewer.blueprint import build_blueprint, place_eye
 from iris_session.viewer.event_layer import EventLayer
@@ -37,8 +37,6 @@ from iris_session.viewer.timelines import Moment, MomentTable, to_time_columns
 COLLECT_NS: Final = 4_000_000_000
 #: Difference of a pose from the one drawn that is not seen, [m] and in the quaternion: bodies at rest jitter by less.
 UNSEEN: Final = np.array([2e-5] * 3 + [5e-5] * 4)
-#: Maximum number of pending vertex frames whose states are not in the file yet.
-MAX_PENDING_VERTICES: Final = 256
 #: Largest simulated time that is shown [s], 285 years: it has 63 bits of nanoseconds, and a user's loop may count it in
 #: any unit. The exact one is in `/state`.
 LONGEST_S: Final = 9e9
@@ -66,7 +64,6 @@ class SessionDrawing:
         self._participants = ParticipantLayer(recording, self.narration, is_first=is_first)
         self.events = EventLayer(recording, moments, self.narration, self._participants, self._anchors)
         self.vertices_refused = self.media_refused = 0
-        self._vertices: deque[VertexFrame] = deque()
         self._last_step = -2  # newest step with a state of the previous scene; the initial state has step -1
         self._bodies: tuple[BodyInfo, ...] = ()
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
@@ -127,13 +124,6 @@ class SessionDrawing:
             self.events.add_latencies(state.applied, state.step, state.session_time)
         self._plots.add(states, times)
 
-    def add_vertices(self, frame: VertexFrame) -> None:
-        """Collect a frame of a deformable. If too many are pending, the oldest is dropped."""
-        if len(self._vertices) >= MAX_PENDING_VERTICES:
-            self._vertices.popleft()
-            self.vertices_refused += 1
-        self._vertices.append(frame)
-
     def draw_media(self, messages: Sequence[Sequence[bytes]]) -> None:
         """Draw clouds and pictures; a stream of pictures that is new gets a view."""
         views = len(self._media.pictures)
@@ -146,12 +136,11 @@ class SessionDrawing:
             self._send_blueprint()
 
     def write(self) -> None:
-        """Write lanes and vertices, and motion and plots when they are due."""
+        """Write lanes, and motion and plots when they are due."""
         self.events.write_lanes()
         if self._moments.known and self._moments.newest.session_ns >= self._collected_due_ns:
             self._collected_due_ns = self._moments.newest.session_ns + COLLECT_NS
             self._write_collected()
-        self._write_vertices()
 
     def close(self) -> None:
         """Write the rest. Without a state the scene is drawn nevertheless."""
@@ -182,7 +171,7 @@ class SessionDrawing:
         if not self._scene.draw(moment):
             return times
         entities = [self._scene.find_entity(body.name) if body.moving else "" for body in self._bodies]
-        columns: list[Any] = [text_list_column("bodies", entities)]
+        columns: list[Any] = [list_column("bodies", [entities], pa.string())]
         time_columns = to_time_columns(np.array([moment], np.int64).T)
         rr.send_columns(paths.STATE_ENTITIES, time_columns, columns, recording=self._rec, strict=True)
         seen = times.copy()
@@ -220,13 +209,12 @@ class SessionDrawing:
         frame = np.array([row.state for row in devices], np.intp)
         self._motion.add(entities, which, times[:, frame], np.array([row.pose for row in devices], np.float64))
 
-    def _write_vertices(self) -> None:
-        """Write vertices whose states are in the file. Frames of another scene than the drawn one are refused."""
+    def draw_vertices(self, frames: Sequence[VertexFrame]) -> None:
+        """Draw frames of deformables, after their states. Those of another scene than the drawn one are refused."""
         known = self._moments.known
         times = [moment.session_ns for moment in known]
         rows: dict[str, list[tuple[Moment, Any]]] = {}
-        while self._vertices and times and self._vertices[0].session_time <= times[-1]:
-            frame = self._vertices.popleft()
+        for frame in frames:
             at = bisect_right(times, frame.session_time) - 1
             deformable = self._scene.deformables.get(frame.stream)
             if deformable is None:  # hidden, or reported as not drawn

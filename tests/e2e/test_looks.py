@@ -106,7 +106,9 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sessions]:
         resumed = killed.server.folder / "session.resume2.rrd"
         command = [*COMMAND, "serve", "--resume", str(killed.server.folder)]
         servers.append(SessionProcess(killed.server.folder, resumed, command))
-        killed.run_until(lambda: killed.clients[0].ready and "participant_joined   ann" in servers[-1].output, "ann is back")
+        killed.run_until(
+            lambda: killed.clients[0].ready and "participant_joined   ann" in servers[-1].output, "ann is back"
+        )
         killed.run_for(1.0)
         servers[-1].finish()
         for path in (servers[0].recording, resumed):

@@ -169,7 +169,7 @@ def recorder(path: Path) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
     feed: RecorderFeed | None = None
     try:
         process.start()
-        feed = RecorderFeed(process.feed_endpoint, vertices_endpoint=process.vertices_endpoint)
+        feed = RecorderFeed(process.feed_endpoint)
         yield process, feed
     finally:
         if feed is not None:
@@ -216,7 +216,7 @@ class LoopRecorder:
             return
         self.loop._syncer.stop()
         self.loop._context.destroy(linger=0)
-        stream: Any = self.loop._writer._stream
+        stream: Any = self.loop._writer.stream
         stream._file.close()
         stream.recording.disconnect()
         assert self.loop._lock is not None

@@ -20,7 +20,6 @@ from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.viewer.deformables import CHECKERS, DARK, DrawnDeformable, build_checker
-from iris_session.viewer.drawing import MAX_PENDING_VERTICES
 from tests.recording.support import column, read
 from tests.recording.test_writer import frame
 from tests.scene.models import flexes
@@ -51,11 +50,13 @@ class World:
         return self.data.flexvert_xpos[self.meshes[index].vertices].copy()
 
     def publish(self, step: int, index: int, vertices: np.ndarray) -> None:
-        """Send vertices, then their state: over two sockets, so either may arrive first."""
         self.encoders[index].reset()
         frames = self.encoders[index].encode(vertices)
         assert frames is not None
-        self.writer.add_vertices(VertexFrame(f"flex-{index}", step * 2_000_000 + 7, frames["full"]))
+        self.add(VertexFrame(f"flex-{index}", step * 2_000_000 + 7, frames["full"]))
+
+    def add(self, frame: VertexFrame) -> None:
+        self.writer.add(Batch(vertices=[frame]))
 
     def state(self, step: int) -> None:
         self.writer.add(Batch(states=[frame(step, np.zeros((0, 7)))]))
@@ -98,7 +99,7 @@ def test_topology_is_written_once_and_vertices_as_they_move(world: World) -> Non
         assert np.linalg.norm(np.array(positions[step]) - expected, axis=1).max() <= BOUND_M + 1e-6
     times = [value.value for batch in cloth for value in batch.column("session_time")]
     assert sorted(times) == [7, 16_000_007, 32_000_007]
-    assert world.writer.vertices_refused == 0
+    assert world.writer.drawing.vertices_refused == 0
 
 
 def test_non_finite_vertices_are_finite_in_the_file(world: World) -> None:
@@ -154,40 +155,31 @@ def test_flexes_of_the_model_are_used_without_a_specification(world: World) -> N
 
 
 def test_vertices_of_the_previous_scene_are_rejected(world: World) -> None:
-    """They may arrive late; vertices of the next scene wait for its states."""
     vertices = world.vertices(0)
     world.state(0)
     hash_ = compute_scene_hash(bytes(encode_model(world.model)))
     scene = SceneModel(8, 16_000_007, hash_, world.packed, (BodyInfo(1, "cup", moving=True),))
-    world.publish(16, 0, vertices + 0.2)
     world.writer.add(Batch(scenes=[scene], assets=[world.assets]))
     world.publish(0, 0, vertices + 0.1)
+    world.publish(16, 0, vertices + 0.2)
     world.state(16)
     found = world.read()
     assert list(told(found[CLOTH], "Mesh3D:vertex_positions")) == [0]
     assert sorted(told(found[CLOTH.replace("/1/", "/2/")], "Mesh3D:vertex_positions")) == [8, 16]
-    assert world.writer.vertices_refused == 1
+    assert world.writer.drawing.vertices_refused == 1
 
 
 def test_invalid_frames_are_rejected_and_counted(world: World) -> None:
     world.state(0)
     for data in (b"", b"\1" * 200):
-        world.writer.add_vertices(VertexFrame("flex-0", 7, data))
-    world.writer.add_vertices(VertexFrame("nobody", 7, b""))
+        world.add(VertexFrame("flex-0", 7, data))
+    world.add(VertexFrame("nobody", 7, b""))
     frames = world.encoders[1].encode(world.vertices(1))
     assert frames is not None
-    world.writer.add_vertices(VertexFrame("flex-0", 7, frames["full"]))  # of another mesh
+    world.add(VertexFrame("flex-0", 7, frames["full"]))  # of another mesh
     found = world.read()
     assert len(told(found[CLOTH], "Mesh3D:vertex_positions")) == 1
-    assert world.writer.vertices_refused == 3
-
-
-def test_vertices_without_states_are_bounded(world: World) -> None:
-    world.state(0)
-    for i in range(MAX_PENDING_VERTICES + 5):
-        world.writer.add_vertices(VertexFrame("flex-0", 8_000_000 + i, b""))
-    assert world.writer.vertices_refused == 5
-    assert len(told(world.read()[CLOTH], "Mesh3D:vertex_positions")) == 1
+    assert world.writer.drawing.vertices_refused == 3
 
 
 def test_surfaces_without_a_texture_have_a_checker_pattern() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.journal.feed import BATCH_ITEMS, BATCH_ROWS, JOURNAL_SHARE, PEOPLE, VERTEX_FRAMES
+from iris_session.journal.feed import BATCH_ITEMS, BATCH_ROWS, JOURNAL_SHARE, PEOPLE
 from iris_session.journal.messages import (
     BATCH,
     FRAME,
@@ -23,7 +23,6 @@ from iris_session.journal.messages import (
     SceneModel,
     decode_batch,
     decode_header,
-    decode_vertices,
     encode_status,
 )
 from iris_session.journal.rows import check_keyframe
@@ -408,45 +407,25 @@ def square() -> bytes:
     return frames["full"]
 
 
-def test_vertices_have_their_own_socket_and_rate(played, tmp_path: Path, square: bytes) -> None:  # type: ignore[no-untyped-def]
+def test_vertices_have_a_rate_and_are_dropped_while_batches_wait(played, square: bytes) -> None:  # type: ignore[no-untyped-def]
     recorder, endpoint = played
-    vertices = recorder.context.socket(zmq.PULL)
-    vertices.bind(f"ipc://{tmp_path}/v")
-    feed = RecorderFeed(endpoint, vertices_endpoint=f"ipc://{tmp_path}/v")
+    feed = RecorderFeed(endpoint, window_bytes=1)
     feed.send_header(make_header())
     for now_ns in (0, 20_000_000, 50_000_000):
-        feed.send_vertices("flex-0", square, now_ns)
-    feed.send_vertices("flex-1", square, 50_000_000)
-    taken = []
-    while len(taken) < 3:
-        assert vertices.poll(30_000)
-        taken.append(decode_vertices(vertices.recv()))
-    assert [(frame.stream, frame.session_time, frame.frame) for frame in taken] == [
-        ("flex-0", 0, square),
-        ("flex-0", 50_000_000, square),
-        ("flex-1", 50_000_000, square),
-    ]
+        feed.add_vertices("flex-0", square, now_ns)
+    feed.add_vertices("flex-1", square, 50_000_000)
     recorder.say(feed, 1, -1, -1)  # has seen none of them
-    feed.send_vertices("flex-0", square, 60_000_000)
-    assert vertices.poll(30_000)
-    vertices.close()
-    feed.close(0.0)
-
-
-def test_unread_vertices_are_dropped_and_counted_and_the_journal_continues(
-    played,  # type: ignore[no-untyped-def]
-    tmp_path: Path,
-    square: bytes,
-) -> None:
-    recorder, endpoint = played
-    feed = RecorderFeed(endpoint, vertices_endpoint=f"ipc://{tmp_path}/unread")
-    feed.send_header(make_header())
-    for i in range(VERTEX_FRAMES + 7):
-        feed.send_vertices("flex-0", square, i * 50_000_000)
-    assert (feed.stats.dropped_vertices, feed.stats.window_bytes) == (7, 0)
-    recorder.say(feed, 1, -1, -1)
+    feed.add_vertices("flex-0", square, 60_000_000)
+    feed.flush()
     steps(feed, 0, BATCH_ROWS)
-    assert numbers(decode_batch(recorder.take(2)[1][2])) == list(range(BATCH_ROWS))
+    feed.add_vertices("flex-0", square, 200_000_000)
+    assert (feed.stats.waiting_batches, feed.stats.dropped_vertices) == (2, 1)
+    vertices = [one for _, _, body in recorder.take(2)[1:] for one in decode_batch(body).vertices]
+    assert [(one.stream, one.session_time) for one in vertices] == [
+        ("flex-0", 0),
+        ("flex-0", 50_000_000),
+        ("flex-1", 50_000_000),
+    ]
     feed.close(0.0)
 
 

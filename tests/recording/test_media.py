@@ -56,7 +56,7 @@ def test_clouds_are_read_back_exactly(writer: RrdWriter) -> None:
         writer.add_media(message("room-1.a", frame, seq, 100 + seq))
     writer.add_media(message("other", make_frame(3)))
     writer.close()
-    assert writer.media_refused == 0
+    assert writer.drawing.media_refused == 0
     with Recording.open(writer.path) as recording:
         found = list(recording.clouds("room-1.a"))
         assert [(one.seq, one.capture_ns, one.received_ns) for one in found] == [
@@ -125,7 +125,7 @@ def test_frames_that_do_not_decode_are_counted(writer: RrdWriter) -> None:
         writer.add_media(bad)
     writer.add_media(message("room", good))
     writer.close()
-    assert writer.media_refused == len(refused)
+    assert writer.drawing.media_refused == len(refused)
     with Recording.open(writer.path) as recording:
         assert len(list(recording.clouds())) == 1
         assert list(recording.pictures()) == []
@@ -137,7 +137,7 @@ def test_views_of_pictures_are_bounded(writer: RrdWriter) -> None:
         writer.add_media(message(f"s{i}", JPEG, encoding="jpeg"))
         writer.flush()
     writer.close()
-    assert len(writer._drawing._media.pictures) == MAX_STREAMS
+    assert len(writer.drawing._media.pictures) == MAX_STREAMS
     with Recording.open(writer.path) as recording:
         assert len(list(recording.pictures())) == MAX_STREAMS + 5
 
@@ -165,7 +165,7 @@ def test_streams_say_what_they_are_until_they_end(writer: RrdWriter) -> None:
     writer.add_media(message("room", None, 2, 400))
     writer.add_media(message("room-front", None, 2, 500, "jpeg"))
     writer.close()
-    assert writer.media_refused == 0
+    assert writer.drawing.media_refused == 0
     with Recording.open(writer.path) as recording:
         assert list(recording.streams("room")) == [
             RecordedStream("room", 100, "cloud", room),
@@ -192,7 +192,6 @@ def test_the_recorder_reads_media_only_while_nothing_more_important_waits(tmp_pa
         f"ipc://{tmp_path}/s",
         0,
         os.getpid(),
-        "",
         endpoint,
     )
     loop = process_module.RecorderLoop(config)

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -72,7 +71,6 @@ def contents(path: Path) -> dict[str, Any]:
         return {
             "header": recording.header,
             "end": recording.end,
-            "counts": (recording.count_rows(), recording.count_samples()),
             "rows": list(recording.rows()),
             "later": [row.step for row in recording.rows(after=77)],
             "keyframes": list(recording.keyframes()),
@@ -180,25 +178,3 @@ def test_parts_may_be_optimized_separately_or_merged(
         assert report.ok, report.line()
         assert (report.steps, report.keyframes, report.finished) == (STEPS, 5, True)
     assert [report.parts for report in reports] == [2, 1, 1]
-
-
-def test_file_with_several_recordings_gets_a_note(tmp_path: Path) -> None:
-    header, batch = journal(60)
-    first = write(tmp_path / "a.rrd", header, batch)
-    second = tmp_path / "b.rrd"
-    writer = RrdWriter(second, "another id")
-    other = msgspec.structs.replace(header, session_name="the other")
-    writer.write_header(other)
-    writer.add(Batch(denials=[DenialRecord(1, 7, 3, Denial("held", "it is held"))]))
-    writer.close()
-    merged = optimize(tmp_path / "one.rrd", first, second)
-    with Recording.open(merged) as recording:
-        found = (len(list(recording.rows())), len(list(recording.denials())))
-    assert found in ((60, 0), (0, 1)), "nothing of the other"
-    report = verify(merged, SmallCore)
-    read = header if found == (60, 0) else other
-    one = f"session {read.session_name!r} of {read.created_utc or 'an unknown day'}"
-    (note,) = report.notes
-    assert note.startswith("one.rrd holds 2 recordings")
-    assert one in note
-    assert report.notes[0] in report.line()

@@ -208,8 +208,7 @@ def test_no_part_is_begun_while_another_session_continues_the_recording(
     mine.release()
 
 
-def test_session_that_never_began_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RecorderLoop, "_give_up_as_orphan", lambda _: None)
+def test_session_that_never_began_leaves_no_file(tmp_path: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="iris-") as sockets:
         path = tmp_path / "new" / "session.rrd"
         config = RecorderConfig(str(path), 1, "r", f"ipc://{sockets}/f", f"ipc://{sockets}/s", 0, os.getppid())
@@ -230,7 +229,7 @@ def test_file_that_is_removed_or_cannot_be_written_is_an_error(one: LoopRecorder
     def refuse(_: object) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    stream: Any = one.loop._writer._stream
+    stream: Any = one.loop._writer.stream
     stream._file = SimpleNamespace(write=refuse, close=stream._file.close, fileno=stream._file.fileno)
     one.loop._writer.add_sample(1, 5, b"x")
     with pytest.raises(WriteError, match=str(one.path)):
@@ -286,7 +285,7 @@ def test_assets_are_written_as_the_disk_takes_them(
         nonlocal now_s
         asked.append(max_bytes)
         now_s += max_bytes / bytes_per_s
-        loop._writer._stream.size += max_bytes
+        loop._writer.stream.size += max_bytes
 
     monkeypatch.setattr(loop._writer, "write_assets", write)
     for rate in (5e6, 5e6, 1e3, 1e3, 1e12, 1e12):

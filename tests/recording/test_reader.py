@@ -273,7 +273,7 @@ def test_undecodable_content_is_one_line_with_its_place(tmp_path: Path) -> None:
     for entity, column in PLACES.items():
         writer._send_columns(entity, times, [bytes_column(column, [b"\xc1 nothing"])])
     writer.flush()
-    writer._stream.close(10.0)
+    writer.stream.close(10.0)
     report = verify(path, SmallCore)
     assert (report.ok, report.steps) == (False, 60)
     for entity in PLACES:

@@ -45,7 +45,7 @@ def test_failed_write_leaves_no_partial_message(tmp_path: Path) -> None:
     writer.add(batch)
     writer.flush()
     size = path.stat().st_size
-    writer._stream._file = _FullDisk(writer._stream._file)
+    writer.stream._file = _FullDisk(writer.stream._file)
     writer.add(metrics(1))
     with pytest.raises(WriteError, match=r"w\.rrd.*No space left"):
         writer.flush()
