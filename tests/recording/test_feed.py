@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.journal.feed import BATCH_ITEMS, BATCH_ROWS, JOURNAL_SHARE, PEOPLE
+from iris_session.journal.feed import BATCH_ROWS, JOURNAL_SHARE
 from iris_session.journal.messages import (
     BATCH,
     FRAME,
@@ -298,22 +297,6 @@ def test_changed_reasons_to_hold_are_sent_once(feed: RecorderFeed, played) -> No
     ]
 
 
-def test_reasons_to_hold_that_were_left_out_are_sent_again(played) -> None:  # type: ignore[no-untyped-def]
-    """Else a lane of the picture would show the reason before for as long as the robot holds."""
-    _, endpoint = played
-    feed = RecorderFeed(endpoint, window_bytes=2000, backlog_bytes=60_000)
-    feed.send_header(make_header())
-    held = Decision(commands=(Command("left", "hold", "stale"),))
-    feed.add_decision(0, 0, Decision(commands=(Command("left", "hold", "no_sample"),)))
-    feed.flush()
-    feed.add_decision(1, 10, held)
-    assert len(feed._batch.holds) == 1
-    feed._leave_out_picture(feed._batch)
-    feed.add_decision(2, 20, held)
-    assert [(one.step, one.reason) for one in feed._batch.holds] == [(2, "stale")]
-    feed.close(0.0)
-
-
 def test_recorder_that_starts_later_knows_participants_by_name(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     ann, bob, eve = (
         ParticipantInfo(f"p{i}", name, "operator", True) for i, name in ((1, "ann"), (2, "bob"), (3, "eve"))
@@ -330,31 +313,6 @@ def test_recorder_that_starts_later_knows_participants_by_name(feed: RecorderFee
     played[0].take(1)
     people = decode_batch(played[0].more[0]).people
     assert [(one.id, one.name) for one in people] == [("p1", "ann"), ("p2", "rob"), ("p3", "eve")]
-    some = [ParticipantInfo(f"p{i}", "bot", "agent", True) for i in range(4, 6 + PEOPLE)]
-    feed.add_decision(
-        1, 1, Decision(commands=(), events=tuple(Event(i, 1, 1, ParticipantJoined(p)) for i, p in enumerate(some)))
-    )
-    assert len(feed._people) == PEOPLE
-
-
-def test_a_model_larger_than_the_window_is_sent(played) -> None:  # type: ignore[no-untyped-def]
-    recorder, endpoint = played
-    feed = RecorderFeed(endpoint, window_bytes=1 << 20, backlog_bytes=1 << 20)
-    feed.send_header(make_header())
-    recorder.say(feed, 1, -1, -1)
-    steps(feed, 0, 10)
-    feed.send_scene("hash", os.urandom(2 << 20), ())
-    assert (feed.stats.waiting_batches, feed.stats.batches) == (0, 2)
-    steps(feed, 10, 10)
-    assert feed.stats.waiting_batches == 1
-    assert [number for _, number, _ in recorder.take(3)] == [0, 0, 1]
-    feed.close(0.0)
-
-
-def test_lists_are_bounded_without_steps(feed: RecorderFeed) -> None:
-    for i in range(BATCH_ITEMS + 10):
-        feed.add_metric(i, i, "m", i)
-    assert feed.stats.dropped_items == 10
 
 
 def test_simulated_time_goes_on_over_resets(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]

@@ -5,27 +5,22 @@ from __future__ import annotations
 import signal
 import socket
 import subprocess
-import sys
-import time
 import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from iris_session.journal.messages import Batch, StateFrame
 from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import PresenceItem
-from iris_session.recording import NotARecordingError, live_feed
+from iris_session.recording import NotARecordingError
 from iris_session.recording.live_feed import LiveFeed, MessageTail
-from iris_session.recording.lock import RecordingLock
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.file import KIND_END, read_message, scan_file
 from iris_session.rrd.rerun_tool import find_rerun, make_environment
-from iris_session.system.process import ChildProcess
 from tests.loopback import make_loopback_address
 from tests.recording.support import column, journal, make_header, read, wait_until, write
 
@@ -160,46 +155,3 @@ def steps_moved(path: Path) -> list[int]:
         return sorted(set(column([b for b in batches if "Transform3D:translation" in b.schema.names], "step")))
     except (OSError, LookupError, ValueError, RuntimeError):
         return []
-
-
-@pytest.mark.e2e
-@pytest.mark.long
-def test_viewer_that_stands_still_makes_only_the_feed_wait(closed: Path, tmp_path: Path) -> None:
-    got, path = tmp_path / "got.rrd", tmp_path / "session.rrd"
-    data = closed.read_bytes()
-    half = scan_file(closed).messages[20].offset
-    path.write_bytes(data[:half])
-    lock = RecordingLock(path, shared=True)
-    with receiver(got) as (server, url):
-        feed = ChildProcess("iris_session.recording.live_feed", [str(path), url], environment={"RUST_LOG": "off"})
-        with feed:
-            wait_until(lambda: bool(steps_received(got)))
-            server.send_signal(signal.SIGSTOP)
-            with open(path, "ab") as file:
-                file.write(data[half:])
-            time.sleep(live_feed.SEND_S)
-            assert feed.is_running
-            server.send_signal(signal.SIGCONT)
-            wait_until(lambda: steps_received(got) == list(range(STEPS)))
-            assert feed.is_running, "the session still runs"
-            lock.release()
-            assert feed.wait(60.0) == 0
-
-
-@pytest.mark.e2e
-@pytest.mark.long
-def test_feed_ends_with_its_parent_whatever_the_viewer_does(closed: Path) -> None:
-    program = (
-        "import sys; from iris_session.system.process import ChildProcess\n"
-        "child = ChildProcess('iris_session.recording.live_feed', sys.argv[1:], environment={'RUST_LOG': 'off'})\n"
-        "print(child.pid, flush=True); sys.stdin.read()"
-    )
-    command = [sys.executable, "-c", program, str(closed), "rerun+http://127.0.0.1:1/proxy"]
-    parent = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    feed = psutil.Process(int(parent.stdout.readline()))
-    wait_until(lambda: feed.num_threads() > 3)  # Rerun's client has begun to send, to nothing
-    parent.kill()
-    parent.communicate()
-    psutil.wait_procs([feed], 60.0)
-    assert not feed.is_running() or feed.status() == psutil.STATUS_ZOMBIE

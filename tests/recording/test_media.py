@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import msgspec
@@ -10,15 +9,14 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.journal.messages import RecorderConfig
 from iris_session.journal.rows import SessionHeader
 from iris_session.protocol.codec import encode_media_header
-from iris_session.protocol.media import MAX_STREAMS, MediaHeader, StreamCamera, StreamInfo
+from iris_session.protocol.media import MediaHeader, StreamCamera, StreamInfo
 from iris_session.recording import RecordedImage, RecordedStream, Recording
 from iris_session.recording import process as process_module
 from iris_session.recording.writer import RrdWriter
 from iris_session.streams.cloud import decode_cloud, encode_cloud
-from tests.recording.support import column, read
+from tests.recording.support import column, loop_recorder, read
 
 #: Start of image, and a start of frame of 2 x 3 pixels.
 JPEG = b"\xff\xd8\xff\xc0\x00\x11\x08\x00\x02\x00\x03 and the rest"
@@ -131,17 +129,6 @@ def test_frames_that_do_not_decode_are_counted(writer: RrdWriter) -> None:
         assert list(recording.pictures()) == []
 
 
-def test_views_of_pictures_are_bounded(writer: RrdWriter) -> None:
-    """Their number, and so the blueprints, of which each has 20 KB."""
-    for i in range(MAX_STREAMS + 5):
-        writer.add_media(message(f"s{i}", JPEG, encoding="jpeg"))
-        writer.flush()
-    writer.close()
-    assert len(writer.drawing._media.pictures) == MAX_STREAMS
-    with Recording.open(writer.path) as recording:
-        assert len(list(recording.pictures())) == MAX_STREAMS + 5
-
-
 def test_what_a_new_part_repeats_counts_once(tmp_path: Path) -> None:
     for part, seqs in (("session.rrd", (1, 2)), ("session.part2.rrd", (2, 3))):
         writer = RrdWriter(tmp_path / part, "id")
@@ -184,19 +171,13 @@ def test_streams_say_what_they_are_until_they_end(writer: RrdWriter) -> None:
 
 def test_the_recorder_reads_media_only_while_nothing_more_important_waits(tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/m"
-    config = RecorderConfig(
-        str(tmp_path / "session.rrd"),
-        1,
-        "r",
-        f"ipc://{tmp_path}/f",
-        f"ipc://{tmp_path}/s",
-        0,
-        os.getpid(),
-        endpoint,
-    )
-    loop = process_module.RecorderLoop(config)
-    assert loop._media is not None
-    with zmq.Context() as context, context.socket(zmq.PUSH) as front:
+    with (
+        loop_recorder(media_endpoint=endpoint) as one,
+        zmq.Context() as context,
+        context.socket(zmq.PUSH) as front,
+    ):
+        loop = one.loop
+        assert loop._media is not None
         front.connect(endpoint)
         front.send_multipart(message("room", make_frame(5)))
         assert loop._media.poll(20_000)
@@ -206,6 +187,3 @@ def test_the_recorder_reads_media_only_while_nothing_more_important_waits(tmp_pa
         loop._write_s = 0.0
         loop._drain()
         assert len(loop._writer._media) == 1
-    loop._syncer.stop()
-    loop._writer.close()
-    loop._context.destroy(linger=0)

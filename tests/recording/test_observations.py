@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 
 from anchors.pose import PoseTuple, distance
-from iris_session.protocol.common import IDENTITY, Alignment, Pose
+from iris_session.protocol.common import IDENTITY, Alignment
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
-    AnchorMoved,
     ParticipantChanged,
     ParticipantInfo,
     ParticipantLeft,
@@ -94,16 +93,6 @@ def test_jump_begins_a_tracking_frame(played: Played, tmp_path: Path) -> None:
     assert [one.frame for one in found.in_force] == [TrackingFrame("p1", 1, 0, 1)]
 
 
-def test_resumed_participant_with_another_name_is_the_same(played: Played, tmp_path: Path) -> None:
-    played.join(1, "p1", "ann", run="run:a")
-    played.look(1, "table", TABLE, HERE, 1, n=2)
-    played.join(2, "p1", "anna", run="run:a")
-    played.look(2, "table", TABLE, HERE, 2, n=3)
-    found = read(played, tmp_path)
-    assert {frame: len(looks) for frame, looks in found.observations.items()} == {TrackingFrame("p1", 1, 0): 5}
-    assert found.unowned == 0
-
-
 @pytest.mark.parametrize(("late_ns", "known"), [(5_000_000, True), (-50_000_000, True), (50_000_001, False)])
 def test_observation_has_the_nearest_head_pose(played: Played, tmp_path: Path, late_ns: int, known: bool) -> None:
     played.join(1, "p1", "ann")
@@ -154,13 +143,6 @@ def test_alignments_hold_until_something_ends_them(played: Played, tmp_path: Pat
     assert found[3].frame == TrackingFrame("p1", 1, 1, 1), "jumps are counted through a run, whatever epochs it tells"
 
 
-def test_moved_anchors_are_listed(played: Played, tmp_path: Path) -> None:
-    played.wait(2.0)
-    played.event(AnchorMoved("table", Pose(*HERE)))
-    (moved,) = read(played, tmp_path).anchor_moves
-    assert moved == (2 * S, "table", Pose(*HERE))
-
-
 def test_undecodable_messages_are_counted(played: Played, tmp_path: Path) -> None:
     played.join(1, "p1", "ann")
     played.raw(1, b"\xc1")
@@ -168,20 +150,3 @@ def test_undecodable_messages_are_counted(played: Played, tmp_path: Path) -> Non
     played.look(1, "table", TABLE, HERE, 1, n=2)
     found = read(played, tmp_path)
     assert (found.unreadable, len(found.observations[TrackingFrame("p1", 1, 0)])) == (2, 2)
-
-
-def test_recordings_of_any_session_can_be_read(played: Played, tmp_path: Path) -> None:
-    """A session without participants and without raw messages."""
-    found = read(played, tmp_path)
-    assert (found.participants, found.observations, found.in_force) == ({}, {}, [])
-
-
-def test_progress_reaches_its_end(played: Played, tmp_path: Path) -> None:
-    played.join(1, "p1", "ann")
-    played.look(1, "table", TABLE, HERE, 1, n=2)
-    told: list[tuple[int, int]] = []
-    with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
-        read_alignment_history(recording, lambda done, total: told.append((done, total)))
-        assert told[-1] == (recording.count_rows() + recording.count_samples(),) * 2
-        assert recording.count_samples() == 4
-    assert told == sorted(told)

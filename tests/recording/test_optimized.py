@@ -24,14 +24,8 @@ from tests.recording.support import SmallCore, journal, write
 
 STEPS = 200
 RERUN = Path(sys.executable).parent / "rerun"
-#: Defaults; every column in chunks of its own; small chunks with several columns; many small ones; the other profile.
-OPTIONS = (
-    (),
-    ("--split-size-ratio", "1"),
-    ("--split-size-ratio", "1.5", "--max-size", "12KiB"),
-    ("--split-size-ratio", "1", "--max-rows", "7"),
-    ("--profile", "live"),
-)
+#: Defaults; small chunks with several columns; many small ones.
+OPTIONS = ((), ("--split-size-ratio", "1.5", "--max-size", "12KiB"), ("--split-size-ratio", "1", "--max-rows", "7"))
 
 
 def optimize(copy: Path, *files: Path | str) -> Path:
@@ -84,7 +78,7 @@ def contents(path: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     ("recording_class", "options"),
-    [*((OPEN, options) for options in OPTIONS), (CLOSED, OPTIONS[0]), (CLOSED, OPTIONS[2])],
+    [*((OPEN, options) for options in OPTIONS), (CLOSED, OPTIONS[1])],
 )
 def test_optimized_copy_reads_and_verifies_like_the_original(
     tmp_path: Path, recording_class: str, options: tuple[str, ...]
@@ -163,11 +157,10 @@ def parts(tmp_path: Path) -> tuple[Path, Path]:
     return first, second
 
 
-@pytest.mark.parametrize("remembered", [recording_parts.REPEATED_ITEMS, 20])
 def test_parts_may_be_optimized_separately_or_merged(
-    tmp_path: Path, parts: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, remembered: int
+    tmp_path: Path, parts: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording_parts, "REPEATED_ITEMS", remembered)
+    monkeypatch.setattr(recording_parts, "REPEATED_ITEMS", 20)
     first, second = parts
     (tmp_path / "out").mkdir()
     for part in parts:

@@ -7,8 +7,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,9 +20,8 @@ import zmq
 
 from iris_session.journal.errors import WriteError
 from iris_session.journal.feed import BATCH_NS, RecorderFeed
-from iris_session.journal.messages import FRAME, HEADER, Batch, RecorderConfig, encode_batch, encode_header
+from iris_session.journal.messages import RecorderConfig
 from iris_session.protocol.scene import list_assets
-from iris_session.protocol.server_messages import ParticipantInfo
 from iris_session.protocol.status import ClientReport
 from iris_session.recording import (
     RecorderError,
@@ -36,7 +33,6 @@ from iris_session.recording import (
     verify,
 )
 from iris_session.recording import process as process_module
-from iris_session.recording.lock import is_being_written
 from iris_session.recording.process import DRAIN_S, FLUSH_S, RecorderLoop
 from iris_session.rrd.assets import ALL, list_recorded_assets
 from iris_session.rrd.paths import part_path
@@ -47,8 +43,6 @@ from tests.recording.support import (
     SmallCore,
     SmallSession,
     loop_recorder,
-    make_header,
-    record,
     recorder,
     wait_until,
 )
@@ -124,13 +118,6 @@ def test_reports_of_clients_are_plotted_and_no_raw_samples(one: LoopRecorder) ->
     one.loop._process_samples(msgspec.msgpack.encode([*batch, (7, 9, b"\x92 damaged"), (7, 9, b"\x80")]))
     assert one.loop._writer._reports == [("p1", 5, 2.5)], "of frames that were sent again the age is not known"
     assert (one.loop._samples, one.loop._refused) == (1, 1)
-
-
-def test_name_of_a_participant_that_breaks_a_limit_is_left_out(one: LoopRecorder) -> None:
-    """Each later recorder gets the same."""
-    known = encode_batch(Batch(people=[ParticipantInfo("p1", "n" * 100, "operator", True)]))
-    one.loop._process_message([FRAME.pack(HEADER, 7), encode_header(make_header()), known])
-    assert (one.loop._expecting, one.loop._refused) == (7, 1)
 
 
 def test_batch_beyond_a_limit_is_counted_and_its_journal_kept(one: LoopRecorder) -> None:
@@ -273,31 +260,6 @@ def test_assets_follow_the_journal_and_each_part_has_them(tmp_path: Path) -> Non
             assert set(dict(recording.assets())) == expected
 
 
-def test_assets_are_written_as_the_disk_takes_them(
-    one: LoopRecorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    loop, shared = one.loop, Shared(tmp_path / "store")
-    loop._writer.assets.add_scene(shared.assets, is_patch=False)
-    now_s, bytes_per_s, asked = 0.0, 5e6, []
-    monkeypatch.setattr(process_module.time, "monotonic", lambda: now_s)
-
-    def write(max_bytes: int) -> None:
-        nonlocal now_s
-        asked.append(max_bytes)
-        now_s += max_bytes / bytes_per_s
-        loop._writer.stream.size += max_bytes
-
-    monkeypatch.setattr(loop._writer, "write_assets", write)
-    for rate in (5e6, 5e6, 1e3, 1e3, 1e12, 1e12):
-        bytes_per_s = rate
-        loop._write_assets()
-    loop._write_s = 2 * process_module.SLOW_WRITE_S
-    loop._write_assets()
-    least, most = process_module.MIN_ASSETS_BYTES, process_module.MAX_ASSETS_BYTES
-    assert asked == [most, 100_000, 100_000, least, least, most], "20 ms, and none while the disk is slow"
-    monkeypatch.undo()
-
-
 def test_killed_recorder_loses_at_most_a_quarter_second() -> None:
     """Delays of batch, transfer and write add up."""
     assert BATCH_NS * 1e-9 + DRAIN_S + FLUSH_S + DRAIN_S <= 0.25
@@ -330,31 +292,6 @@ def test_killed_process_has_written_acknowledged_rows_and_the_next_part_the_rest
         assert (feed.stats.recorders, feed.stats.dropped_rows) == (2, 0)
     report = verify(path, SmallCore)
     assert (report.ok, report.parts, report.steps) == (True, 2, session.step_count), report.line()
-
-
-@pytest.mark.e2e
-@pytest.mark.long
-def test_file_is_finished_when_the_parent_dies(tmp_path: Path) -> None:
-    path = tmp_path / "session.rrd"
-    script = (
-        "import os, sys, time; from pathlib import Path; from tests.recording.support import *\n"
-        "r = recorder(Path(sys.argv[1])); process, feed = r.__enter__()\n"
-        "s = SmallSession(feed); s.take(200); \n"
-        "while feed.stats.recorder is None or feed.stats.recorder.expecting < 20: time.sleep(0.01); feed.flush()\n"
-        "os.kill(os.getpid(), 9)"
-    )
-    folder = tmp_path / "tmp"
-    folder.mkdir()
-    environment = {**os.environ, "TMPDIR": str(folder)}
-    subprocess.run([sys.executable, "-c", script, str(path)], cwd=REPOSITORY, timeout=60, check=False, env=environment)
-    wait_until(lambda: not list(folder.iterdir()))  # no other process can remove the folder of the sockets
-    wait_until(lambda: not is_being_written(path))
-    with Recording.open(path) as recording:
-        assert recording.finished
-        assert [row.step for row in recording.rows()] == list(range(200))
-        summary = summarise(recording)
-    assert summary.ok
-    assert "killed" in summary.ending, "a file that was closed by its recorder alone does not pass for a whole session"
 
 
 @pytest.mark.e2e
@@ -401,12 +338,6 @@ def test_failed_starts_are_said_and_may_be_tried_again(tmp_path: Path, monkeypat
         patch.setattr(supervise, "ChildProcess", lambda _, **options: ChildProcess("iris_session.none", **options))
         with pytest.raises(RecorderError, match=r"iris_session\.none"):
             RecorderProcess(tmp_path / "session.rrd", 0).start()
-    folder = tmp_path / ("x" * 100)  # too long for a socket
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    record(tmp_path / "session.rrd", 20)
-    assert list(folder.iterdir()) == []
-    assert verify(tmp_path / "session.rrd", SmallCore).ok
 
 
 def _status(feed: RecorderFeed) -> Any:

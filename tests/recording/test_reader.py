@@ -11,17 +11,12 @@ import msgspec
 import pytest
 
 from iris_session.journal.rows import FORMAT, VERIFIERS
-from iris_session.journal.verification import Verification
 from iris_session.recording import (
-    Continues,
     NotARecordingError,
     Recording,
     RecordingLock,
-    VerifyReport,
-    parts,
     verify,
 )
-from iris_session.recording.verify import _compare_past
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd import file as rrd_file
 from iris_session.rrd import paths
@@ -34,12 +29,6 @@ from tests.recording.support import SmallCore, journal, write
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return write(tmp_path / "session.rrd", *journal(200))
-
-
-def test_scan_finds_every_message_of_a_whole_file(path: Path) -> None:
-    found = rrd_file.scan_file(path)
-    assert found.good_bytes == found.size == os.path.getsize(path)
-    assert found.messages[-1].kind == rrd_file.KIND_END
 
 
 @pytest.mark.parametrize(("lost_messages", "least"), [(1, 200), (4, 180), (16, 80)])
@@ -59,7 +48,7 @@ def test_truncated_file_is_read_up_to_its_end(path: Path, lost_messages: int, le
     assert (report.steps, report.last_step, report.finished) == (len(steps), len(steps) - 1, lost_messages == 1)
 
 
-@pytest.mark.parametrize("window", [rrd_file.WINDOW_BYTES, 1000, 9])
+@pytest.mark.parametrize("window", [rrd_file.WINDOW_BYTES, 9])
 def test_damaged_length_hides_one_message(path: Path, monkeypatch: pytest.MonkeyPatch, window: int) -> None:
     monkeypatch.setattr(rrd_file, "WINDOW_BYTES", window)
     data = bytearray(path.read_bytes())
@@ -76,35 +65,24 @@ def test_damaged_length_hides_one_message(path: Path, monkeypatch: pytest.Monkey
     assert report.last_step == 199
 
 
-@pytest.mark.long
-def test_any_flipped_bit_is_found(path: Path) -> None:
-    """For every bit of the file only the room's own error is raised, and the file is never reported as ok."""
-    rng = random.Random(4)
-    check_flipped_bits(path, [(rng.randrange(os.path.getsize(path)), rng.randrange(8)) for _ in range(8)])
-
-
 @pytest.mark.parametrize("indexed", [False, True])
 def test_flipped_bit_after_the_last_checksum_is_found(path: Path, indexed: bool) -> None:
     assert not indexed or add_index(path)
     *_, mark, _, end_again, end = rrd_file.scan_file(path).messages
     rng = random.Random(5)
-    check_flipped_bits(path, [(rng.randrange(mark.offset, end.offset), rng.randrange(8)) for _ in range(4)])
-    check_flipped_bits(path, [(end_again.offset, 0), (end_again.offset + 8, 4), (end.offset, 1), (end.offset + 8, 3)])
-
-
-def check_flipped_bits(path: Path, places: list[tuple[int, int]]) -> None:
+    places = [(rng.randrange(mark.offset, end.offset), rng.randrange(8)) for _ in range(2)]
     data = path.read_bytes()
-    for at, bit in places:
+    for at, bit in [*places, (end_again.offset, 0), (end_again.offset + 8, 4), (end.offset, 1), (end.offset + 8, 3)]:
         damaged = bytearray(data)
         damaged[at] ^= 1 << bit
         path.write_bytes(damaged)
         try:  # the header itself may be gone
-            report = verify(path, SmallCore)
+            report = verify(path, None)
         except NotARecordingError:
             continue
         assert not report.ok, f"bit {bit} of byte {at}"
     path.write_bytes(data)
-    assert verify(path, SmallCore).ok
+    assert verify(path, None).ok
 
 
 def test_damaged_message_is_skipped(path: Path) -> None:
@@ -125,20 +103,6 @@ def test_damaged_message_is_skipped(path: Path) -> None:
     report = verify(path, SmallCore)
     assert not report.ok
     assert any(p.kind == "unreadable" for p in report.problems)
-
-
-def test_damage_is_a_list_of_lines(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "MOST_DAMAGE", 3)
-    data = bytearray(path.read_bytes())
-    for victim in [m for m in rrd_file.scan_file(path).messages if m.kind == rrd_file.KIND_ARROW][-12:-3]:
-        for i in range(victim.offset + 60, victim.offset + victim.length, 7):
-            data[i] ^= 0xFF
-    path.write_bytes(data)
-    with Recording.open(path, warn=False) as recording:
-        assert len(list(recording.rows())) > 20
-        assert len(recording.damage) == 4
-        assert len(set(recording.damage)) == 4
-        assert recording.damage[-1] == parts.MORE_DAMAGE
 
 
 def test_parts_are_one_recording_and_repeated_rows_count_once(tmp_path: Path) -> None:
@@ -221,12 +185,6 @@ def test_missing_part_is_found(tmp_path: Path) -> None:
     assert report.ok, report.line()
     assert report.finished
     assert "session.part3.rrd" in report.line()
-    (tmp_path / "elsewhere").mkdir()
-    link = tmp_path / "elsewhere" / "latest.rrd"
-    link.symlink_to(files[0])
-    for path in (f"{tmp_path}//session.rrd", f"{tmp_path}/./session.rrd", link):
-        with Recording.open(path) as recording:
-            assert recording.count_rows() == 200, path
     files[1].unlink()
     with pytest.warns(UserWarning, match="part2"):
         recording = Recording.open(files[0])
@@ -235,11 +193,6 @@ def test_missing_part_is_found(tmp_path: Path) -> None:
     report = verify(files[0], SmallCore)
     assert report.gaps == [(70, 139)]
     assert (report.ok, report.missing) == (False, ["session.part2.rrd is missing"])
-    late = files[2].rename(tmp_path / f"session.part{10**18}.rrd")
-    assert verify(files[0], SmallCore).missing == [f"session.part2.rrd to session.part{10**18 - 1}.rrd are missing"]
-    files[0].unlink()
-    with Recording.open(late) as recording:
-        assert recording.finished
 
 
 def test_file_truncated_between_writes_is_not_finished(path: Path) -> None:
@@ -282,34 +235,6 @@ def test_undecodable_content_is_one_line_with_its_place(tmp_path: Path) -> None:
         assert "\n" not in line
 
 
-def test_invalid_byte_count_of_a_mark_is_found(path: Path) -> None:
-    marks = [rrd_file.Mark(-5, 2**62, 0), rrd_file.Mark(12, rrd_file.scan_file(path).size, 0)]
-    assert [line.partition(" are")[0] for line in rrd_file.changed_spans(path, marks, closed=True)] == [
-        f"bytes {mark.begin} to {mark.end}" for mark in marks
-    ]
-
-
-def test_marks_that_overlap_are_not_all_computed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    size = path.stat().st_size
-    computed: list[rrd_file.Mark] = []
-
-    def compute(_: object, mark: rrd_file.Mark) -> int:
-        computed.append(mark)
-        return 7
-
-    monkeypatch.setattr(rrd_file, "_crc", compute)
-    changed = rrd_file.changed_spans(path, [rrd_file.Mark(0, size, 7)] * 1000, closed=False)
-    assert (len(computed), len(changed)) == (2, 998)
-
-
-def test_header_without_continued_file_is_a_problem(path: Path) -> None:
-    with Recording.open(path) as recording:
-        for name in ("", "..", "../session.rrd", "a\0b", "x" * 300):
-            run = Verification(recording.header, recording.root, iter(()), None, VerifyReport(str(path)))
-            _compare_past(run, Continues(name, -1, b""))
-            assert "header" in run.report.problems[-1].text
-
-
 @pytest.mark.parametrize(("data", "reason"), [(None, "x.rrd"), (b"", "x.rrd"), (b"x" * 99, "Rerun")])
 def test_other_files_are_rejected_in_one_line(tmp_path: Path, data: bytes | None, reason: str) -> None:
     path = tmp_path / "x.rrd"
@@ -327,16 +252,3 @@ def test_recording_of_another_format_is_rejected_in_one_line(tmp_path: Path) -> 
         Recording.open(path)
     assert VERIFIERS[FORMAT - 1] in str(refused.value)
     assert "\n" not in str(refused.value)
-
-
-def test_other_rerun_file_is_not_a_recording(tmp_path: Path) -> None:
-    import rerun as rr
-
-    path = tmp_path / "x.rrd"
-    stream = rr.RecordingStream("other")
-    stream.set_sinks(rr.FileSink(path))
-    stream.log("points", rr.Points3D([[0, 0, 0]]))
-    stream.flush()
-    stream.disconnect()
-    with pytest.raises(NotARecordingError, match="header"):
-        Recording.open(path)

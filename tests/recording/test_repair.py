@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import random
 import shutil
 from pathlib import Path
@@ -17,7 +16,6 @@ from iris_session.recording.lock import RecordingLock
 from iris_session.recording.repair import RepairReport, repair
 from iris_session.rrd.file import KIND_STORE_INFO, scan_file
 from iris_session.rrd.paths import part_path
-from iris_session.rrd.rerun_tool import INDEX, rewrite
 from tests.recording.damage import STEPS, Original, check_cut, check_repair, flip_bits, make_original
 from tests.recording.support import SmallCore, journal, write
 
@@ -41,25 +39,6 @@ def test_truncated_file_is_repaired_up_to_its_last_whole_message(original: Origi
 
 def test_flipped_bits_cost_one_message(original: Original, tmp_path: Path) -> None:
     assert [*flip_bits(original, tmp_path, 6, 1)].count("damaged") > 3
-
-
-@pytest.mark.long
-def test_truncation_in_every_message(original: Original, tmp_path: Path) -> None:
-    truncate(original, tmp_path, 1000)
-
-
-@pytest.mark.long
-def test_many_flipped_bits(original: Original, tmp_path: Path) -> None:
-    assert [*flip_bits(original, tmp_path, 60, 2)].count("damaged") > 30
-
-
-def test_part_that_cannot_be_read_is_not_replaced(original: Original, tmp_path: Path) -> None:
-    path = Path(shutil.copy(original.path, tmp_path / "session.rrd"))
-    part = Path(part_path(str(path), 2))
-    part.write_bytes(b"damaged")
-    with pytest.raises(RecorderError, match="is the recording itself"):
-        repair(path, part, overwrite=True)
-    assert part.read_bytes() == b"damaged"
 
 
 def test_cut_file_keeps_its_checksums(original: Original, tmp_path: Path) -> None:
@@ -201,10 +180,3 @@ def test_running_session_is_not_repaired(original: Original, tmp_path: Path) -> 
             repair(path, tmp_path / "repaired.rrd")
     finally:
         lock.release()
-
-
-def test_full_disk_is_an_error_of_the_system(tmp_path: Path) -> None:
-    path = write(tmp_path / "session.rrd", *journal(STEPS))
-    with open("/dev/full", "wb") as full, pytest.raises(OSError, match="No space left") as raised:
-        rewrite(INDEX, [str(path)], full)
-    assert raised.value.errno == errno.ENOSPC

@@ -19,7 +19,7 @@ from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.viewer import scene_geometry as scene
 from iris_session.viewer.scene_layer import build_components
-from tests.models import ALOHA, PANDA
+from tests.models import PANDA
 from tests.recording.support import XML, make_header
 from tests.scene.models import LOOKS, SHAPES, every_shape
 
@@ -86,10 +86,9 @@ def test_nested_fixed_bodies_move_with_their_root(tmp_path: Path) -> None:
     assert apply(T_world_arm, T_arm_visual[0]) == pytest.approx(tuple(data.geom_xpos[1]))
 
 
-@pytest.mark.parametrize("path", [ALOHA, PANDA], ids=["aloha", "panda"])
-def test_every_geom_of_real_robots_is_placed_as_in_mujoco(path: Path, tmp_path: Path) -> None:
+def test_every_geom_of_a_real_robot_is_placed_as_in_mujoco(tmp_path: Path) -> None:
     """In another configuration than that of the specification."""
-    model, store = mujoco.MjModel.from_xml_path(str(path)), AssetStore(tmp_path)
+    model, store = mujoco.MjModel.from_xml_path(str(PANDA)), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, infos(model))
     data = mujoco.MjData(model)
@@ -136,21 +135,6 @@ def test_every_shape_has_its_texture(tmp_path: Path) -> None:
     assert len(looks) >= len(SHAPES) * len(LOOKS)
 
 
-def test_large_mesh_has_the_mean_colour_of_its_cube_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, store = every_shape(), AssetStore(tmp_path)
-    spec = parse_mujoco(model, store).spec
-    reader = scene.SceneReader(spec, store, infos(model))
-    large = [v for v in spec.visuals if v.geometry.hfield >= 0 and "cube" in spec.materials[v.material].name]
-    assert large
-    for visual in large:
-        assert reader.read_shape(visual).mesh is reader.read_shape(visual).mesh  # cut once
-    monkeypatch.setattr(scene, "MOST_BAKED", 1)
-    for visual in large:
-        form = reader.read_shape(visual)
-        assert (form.kind, form.texture, form.uv) == (scene.MESH, None, None)
-        assert all(0.05 < part < 0.95 for part in form.tint)
-
-
 def test_uniform_cube_map_is_a_colour_and_a_large_one_is_reduced(tmp_path: Path) -> None:
     """A shape that wears one colour stays the viewer's own; what is worn is in the file every time."""
     model = mujoco.MjModel.from_xml_string(
@@ -187,15 +171,6 @@ def test_vertex_colours_are_drawn(tmp_path: Path) -> None:
     packed = (colors.astype(np.uint32) * [1 << 24, 1 << 16, 1 << 8, 1]).sum(axis=1)
     assert drawn[0].vertex_colors.as_arrow_array().to_pylist() == packed.tolist()
     assert drawn[1].vertex_colors is None
-
-
-def test_unknown_shape_is_a_box_of_its_size(tmp_path: Path) -> None:
-    model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
-    spec = parse_mujoco(model, store).spec
-    reader = scene.SceneReader(spec, store, infos(model))
-    geometry = msgspec.structs.replace(spec.visuals[4].geometry, kind="superquadric", size=(0.1, 0.2, 0.3))
-    form = reader.read_shape(msgspec.structs.replace(spec.visuals[4], geometry=geometry))
-    assert (form.kind, form.size) == (scene.BOX, (0.1, 0.2, 0.3))
 
 
 def test_specification_is_read_or_made_from_the_model(tmp_path: Path) -> None:
@@ -266,14 +241,3 @@ def test_fine_meshes_are_drawn_at_a_coarser_level(tmp_path: Path) -> None:
         form = scene.SceneReader(changed, store, []).read_shape(changed.visuals[1])
         assert form.mesh is not None
         assert form.mesh.vertices == drawn
-
-
-def test_large_cylinders_are_round(tmp_path: Path) -> None:
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody><geom type="cylinder" size=".05 .14"/><geom type="cylinder" size=".05 .16"/>
-        <geom type="cylinder" size=".16 .01"/></worldbody></mujoco>"""
-    )
-    store = AssetStore(tmp_path)
-    spec = parse_mujoco(model, store).spec
-    kinds = [scene.SceneReader(spec, store, []).read_shape(visual).kind for visual in spec.visuals]
-    assert kinds == [scene.CYLINDER, scene.MESH, scene.MESH]

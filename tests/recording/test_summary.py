@@ -36,10 +36,9 @@ from iris_session.recording import Recording, RecordingSummary, summarise
 from iris_session.recording.summary import SummaryBuilder
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd import file as rrd_file
-from iris_session.rrd.batches import DrawnVertices, FrameTime, RecordedStream, RowTimes
+from iris_session.rrd.batches import FrameTime, RecordedStream, RowTimes
 from iris_session.rrd.paths import part_path
 from tests.recording.support import TICK_NS, journal
-from tests.recording.test_deformables import World
 from tests.recording.test_media import message
 
 S = 1_000_000_000
@@ -188,30 +187,6 @@ def test_a_resumed_session_misses_nothing_before_it() -> None:
     assert builder.make_drops().down_s == 30.0
 
 
-def test_numbers_that_cannot_be_are_no_error() -> None:
-    builder = SummaryBuilder(2**63)
-    most = np.array([-(2**63), 2**63 - 1, 0, 2**63 - 1])
-    builder.add(RowTimes(most, most))
-    builder = SummaryBuilder(-(2**63))
-    builder.add(RowTimes(most, most))
-    builder.add(Event(2**62, 0, -(2**63), EpisodeChanged(1, "success")))
-    builder.add(FrameTime("a", "cloud", 0, 2**63 - 1))
-    builder.add(FrameTime("a", "cloud", 0, -(2**63)))
-    assert builder.list_episodes()
-    assert builder.list_streams()[0].hz == 0.0
-    for step in range(0, 1000, 2):
-        builder.add(RowTimes(np.array([step]), np.array([step])))
-    assert len(builder.list_gaps()) <= 202
-
-
-def test_deformables_are_drawn_more_often_than_patches_redraw() -> None:
-    builder = build([(1.0, SceneChanged(1, 1, "patch"))])
-    for entity, n in (("/scene/1/world/my\\ cloth", 3), ("/scene/1/world/floor", 2), ("/scene/1/arm/pad", 9)):
-        builder.add(DrawnVertices(entity, n))
-    assert builder.list_deformables() == ("my cloth",)
-    assert builder.list_deformables(parts=2) == ()
-
-
 def test_streams_have_rate_and_description() -> None:
     builder = SummaryBuilder()
     for i in range(5):
@@ -296,22 +271,6 @@ def test_parts_are_summarised_once(tmp_path: Path) -> None:
     assert summary.streams[0].frames == 10
 
 
-def test_damage_is_named_and_the_rest_is_summarised(tmp_path: Path) -> None:
-    path = write_session(tmp_path / "session.rrd")
-    data = bytearray(path.read_bytes())
-    with Recording.open(path) as recording:
-        rows = [m for m in rrd_file.scan_file(path).messages if m.kind == rrd_file.KIND_ARROW]
-        assert recording.finished
-    hidden = rows[len(rows) // 2]
-    data[hidden.offset + 12] ^= 0x40  # its length
-    path.write_bytes(data)
-    summary = read(path)
-    assert not summary.ok
-    assert any(f"bytes {hidden.offset} to" in line for line in summary.damage), summary.damage
-    assert any("are not as they were written" in line for line in summary.damage), summary.damage
-    assert summary.people
-
-
 def test_a_cut_recording_ends_where_it_was_cut(tmp_path: Path) -> None:
     path = write_session(tmp_path / "session.rrd")
     messages = rrd_file.scan_file(path).messages
@@ -322,13 +281,3 @@ def test_a_cut_recording_ends_where_it_was_cut(tmp_path: Path) -> None:
     assert 0 < summary.steps < 200
     assert summary.ending.startswith(f"not closed after {summary.begin_s + summary.duration_s:g} s")
     assert f"at byte {cut.offset}" in summary.ending
-
-
-def test_deformables_of_a_file_are_those_that_moved(tmp_path: Path) -> None:
-    world = World(tmp_path)
-    world.state(0)
-    for step, move_m in ((8, 0.01), (16, 0.02)):
-        world.publish(step, 0, world.vertices(0) + move_m)
-        world.state(step)
-    world.writer.close()
-    assert read(world.path).deformables == ("cloth",)

@@ -198,11 +198,3 @@ def test_other_library_versions_are_reported(path: Path) -> None:
     report = verify(write(path, header, batch), SmallCore)
     assert report.version_differences[0].startswith("mujoco: recorded 1.2.3")
     assert "versions" in report.line()
-
-
-def test_many_problems_are_counted_and_not_kept(path: Path) -> None:
-    header, batch = journal(200)
-    batch.rows = batch.rows[::2]
-    report = verify(write(path, header, batch), SmallCore)
-    assert len(report.problems) == 20
-    assert report.more_problems == 79

@@ -31,12 +31,3 @@ def test_large_meshes_share_the_byte_budget(counts: dict[str, int]) -> None:
     first = sum(counts.values()) * VERTEX_BYTES  # goes in whatever its size
     assert 0.7 * 60 * BYTES_PER_S <= size <= 60 * BYTES_PER_S + 2 * first
     assert max(found.values()) - min(found.values()) <= 1
-
-
-def test_new_scene_is_written_at_once() -> None:
-    pace = VertexRateLimit()
-    assert pace.admit_frame("a", 100_000, 0)
-    assert not pace.admit_frame("a", 100_000, S)
-    pace.reset()
-    assert pace.admit_frame("b", 100, S)
-    assert pace.admit_frame("b", 100, S + PERIOD_NS), "the rate is that of the new one"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -13,13 +12,13 @@ import pytest
 
 from iris_session.journal.rows import Continues
 from iris_session.recording import NotARecordingError, Recording, viewer_export
-from iris_session.recording.folders import find_recordings, list_session_files
+from iris_session.recording.folders import find_recordings
 from iris_session.recording.lock import RecordingLock
 from iris_session.recording.viewer_export import open_view_file
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.file import scan_file
 from iris_session.rrd.index import add_index
-from iris_session.rrd.rerun_tool import RerunToolError, find_rerun
+from iris_session.rrd.rerun_tool import find_rerun
 from iris_session.system.files import Replacement
 from tests.recording.support import column, journal, read, write
 
@@ -57,17 +56,6 @@ def write_session(folder: Path) -> None:
         writer.write_header(head)
         writer.add(type(batch)(rows=rows))
         writer.close()
-
-
-def test_session_files_are_in_order(tmp_path: Path) -> None:
-    names = [
-        *("session.rrd", "session.part2.rrd", "session.part10.rrd", "session.resume2.rrd", "session.resume2.part2.rrd"),
-        *("session.resume10.rrd", "other.rrd", "session.view.rrd", "session.rrd.txt", "resume.tokens"),
-    ]
-    for name in names:
-        (tmp_path / name).touch()
-    for name in ("session.rrd", "session.resume2.part2.rrd"):
-        assert [file.name for file in list_session_files(tmp_path / name)] == names[:6]
 
 
 def test_copy_is_kept_and_made_anew_when_the_recording_changes(path: Path) -> None:
@@ -160,30 +148,6 @@ def test_folder_that_cannot_be_written_gets_no_copy(path: Path, monkeypatch: pyt
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_failure_leaves_the_old_copy(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with open_view_file(path) as view:
-        before = view.path.read_bytes()
-    os.utime(path)
-    tool = tmp_path / "tool"
-    reads = f'[ $2 = verify ] && exec {find_rerun()} "$@"'
-    tool.write_text(f"#!/bin/sh\n{reads}\necho part\necho 'Error: it broke' >&2\nexit 3\n")
-    tool.chmod(0o755)
-    monkeypatch.setenv("RERUN_CLI_PATH", str(tool))
-    with pytest.raises(RerunToolError, match="it broke"), open_view_file(path):
-        pass
-    assert view.path.read_bytes() == before
-    assert len(list(path.parent.glob("*"))) == len({"session.rrd", "session.view.rrd", "tool"})
-    assert not list(path.parent.glob(".*"))
-
-
-def test_short_memory_makes_an_index_only(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer_export, "MEMORY_SHARE", 0.0)
-    n_messages = len(scan_file(path).messages)
-    with open_view_file(path) as view:
-        assert len(scan_file(view.path).messages) == n_messages
-        assert has_index(view.path)
-
-
 def test_small_file_with_an_index_needs_no_copy(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert add_index(path)
     with open_view_file(path) as view:
@@ -201,14 +165,3 @@ def test_running_session_is_shown_as_it_is(path: Path) -> None:
             assert steps_of(view.path) == list(range(STEPS))
     finally:
         lock.release()
-
-
-@pytest.mark.parametrize("data", [None, b"", b"x" * 99])
-def test_other_files_are_refused_in_one_line(tmp_path: Path, data: bytes | None) -> None:
-    path = tmp_path / "session.rrd"
-    if data is not None:
-        path.write_bytes(data)
-    with pytest.raises(NotARecordingError) as refused, open_view_file(path):
-        pass
-    assert "\n" not in str(refused.value)
-    assert len(list(tmp_path.iterdir())) == (data is not None)

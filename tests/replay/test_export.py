@@ -13,7 +13,7 @@ import pyarrow.parquet
 import pytest
 
 from iris_session.physics import UnknownNameError
-from iris_session.recording import OPEN, RecordingError
+from iris_session.recording import RecordingError
 from iris_session.replay import export
 from iris_session.replay.export import (
     COMMANDS,
@@ -130,15 +130,6 @@ def test_what_is_not_asked_for_is_not_written(played: Played, tmp_path: Path, mo
     assert [one.file for one in history.tables] == ["samples.csv", "events.csv"], "nothing is simulated for them"
 
 
-def test_open_sessions_are_exported_too(tmp_path: Path) -> None:
-    opened = play(tmp_path / "session.rrd", 10, recording_class=OPEN)
-    opened.write()
-    report = write(opened, tmp_path / "tables", "parquet", hz=None)
-    table = read(Path(report.folder) / "robot-right.parquet")
-    columns = opened.columns(1)
-    assert table["joints/right/joint1"] == [float(qpos[columns[0]]) for qpos in opened.qpos]
-
-
 def test_what_is_left_out_is_reported(tmp_path: Path) -> None:
     gap = play(tmp_path / "session.rrd", 50)
     del gap.batch.rows[25]
@@ -188,14 +179,6 @@ def test_names_of_files_are_safe_and_each_once(tmp_path: Path) -> None:
     assert sorted(files) == sorted(os.listdir(tmp_path / "tables"))
     assert {"object-.._.._etc_passwd.csv", "object-a_b.csv", "object-a_b~2.csv", "object-A_B~3.csv"} <= set(files)
     assert os.listdir(tmp_path) == ["tables"]
-
-
-def test_a_target_that_is_no_folder_is_one_line(played: Played, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ExportError, match="is no folder"):
-        write(played, tmp_path / "file", "csv")
-    with pytest.raises(ExportError, match=r"cannot be written to .*: File exists"):
-        write(played, tmp_path / "file" / "below", "csv")
 
 
 def test_what_cannot_be_asked_for_is_refused_at_once(

@@ -6,7 +6,6 @@ import copy
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -23,7 +22,7 @@ from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, SceneLoaded, ScenePatched
 from iris_session.protocol.scene import AddVisual, Geometry, RemoveVisual, SetVisual, Visual
-from iris_session.protocol.server_messages import BodyInfo, PresenceItem
+from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import OPEN, RecordedState, Recording
 from iris_session.replay import pictures
 from iris_session.replay.pictures import (
@@ -283,22 +282,6 @@ def test_published_worlds_are_refused(tmp_path: Path) -> None:
     ).write()
     with pytest.raises(PictureError, match=r"of a published world, .* `iris-session view` shows it"):
         draw(path, [0], SMALL._replace(camera=""))
-
-
-def test_a_recording_without_steps_is_refused(tmp_path: Path) -> None:
-    path = play(tmp_path / "session.rrd", 0).write()
-    with Recording.open(path) as recording, pytest.raises(PictureError, match="has no step: there is nothing to draw"):
-        Timeline(recording)
-
-
-def test_states_of_other_bodies_are_not_looked_at() -> None:
-    bodies = BodyInfo(1, "a", True), BodyInfo(2, "b", True)
-    states = [
-        RecordedState(i, i, 0.0, step_ns(i), np.zeros((n, 7)), (), (), bodies) for i, n in enumerate((2, 1, 2, 3))
-    ]
-    recording: Any = SimpleNamespace(states=lambda: iter(states))
-    reach = pictures._read_reach(recording, step_ns(0), step_ns(3), with_people=False)[bodies]
-    assert [poses.shape for poses in reach.poses] == [(2, 7)] * 2
 
 
 def test_people_are_drawn_while_they_are_tracked(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:

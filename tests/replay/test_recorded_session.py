@@ -20,7 +20,7 @@ from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, SceneLoaded
 from iris_session.recording import OPEN
-from iris_session.replay.recorded_session import CommandSeries, TimeSeries
+from iris_session.replay.recorded_session import CommandSeries
 from iris_session.session.core import CoreConfig, SessionCore
 from tests.physics.models import arm
 from tests.physics.models import model as compile_model
@@ -195,13 +195,6 @@ def test_steps_that_are_left_out_are_a_warning(tmp_path: Path) -> None:
     assert joints.values.tobytes() == np.array(played.qpos)[:, played.columns()][joints.steps].tobytes()
 
 
-def test_a_recording_without_steps_has_no_rows(tmp_path: Path) -> None:
-    played = play(tmp_path / "session.rrd", 0)
-    with Recording.open(played.write()) as recording:
-        joints = recording.robot("left").joints()
-    assert (joints.values.shape, joints.times_s.shape) == ((0, 0), (0,))
-
-
 # --- another scene ----------------------------------------------------------------------------------------------------
 
 AT = 60
@@ -263,14 +256,6 @@ def test_events_are_records_with_names(closed: Played) -> None:
     assert (engaged["participant"], engaged["participant_name"], engaged["engaged"]) == ("p1", "ann", True)
     assert engaged["session_time_ns"] == closed.session_time[56], "the first sample with a closed clutch"
     assert engaged["time_s"] == engaged["session_time_ns"] * 1e-9
-
-
-def test_a_series_is_immutable(closed: Played) -> None:
-    with Recording.open(closed.path) as recording:
-        joints = recording.robot("left").joints(hz=10)
-    assert isinstance(joints, TimeSeries)
-    with pytest.raises(AttributeError):
-        joints.names = ()  # type: ignore[misc]
 
 
 def test_bodies_of_a_published_world_have_poses(tmp_path: Path) -> None:

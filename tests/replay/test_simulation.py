@@ -12,7 +12,7 @@ import pytest
 from iris_session.journal.rows import CRASHED
 from iris_session.recording import OPEN, Continues, Recording, make_row
 from iris_session.replay.simulation import Replay, ReplayError, StepSelector
-from iris_session.session.core import CoreState, SessionCore
+from iris_session.session.core import SessionCore
 from tests.replay.support import KEYFRAME_STEPS, Played, damaged, play
 from tests.session.play import TICK_NS
 
@@ -128,28 +128,6 @@ def test_a_header_that_is_none_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(found.value)
 
 
-def test_a_keyframe_of_something_else_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    played = play(tmp_path / "session.rrd", 45)
-    del played.batch.rows[25]
-
-    def refuse(self: SessionCore, state: CoreState) -> None:
-        raise KeyError("foreign\nbytes")
-
-    path = played.write()
-    monkeypatch.setattr(SessionCore, "restore", refuse)
-    with pytest.raises(ReplayError, match="the keyframe after step 39 cannot be restored: KeyError"):
-        replay(path)
-
-
-def test_progress_reaches_the_end(tmp_path: Path) -> None:
-    path = play(tmp_path / "session.rrd", 5).write()
-    seen: list[tuple[int, int]] = []
-    with Recording.open(path) as recording:
-        for _ in Replay(recording, progress=lambda done, total: seen.append((done, total))).steps():
-            pass
-    assert seen == [(0, 5), (5, 5)]
-
-
 # --- selection --------------------------------------------------------------------------------------------------------
 
 
@@ -173,18 +151,6 @@ def test_the_rate_of_the_session_is_every_step(hz: float | None) -> None:
 def test_a_fraction_of_the_rate_is_every_nth_step(hz: float, every: int) -> None:
     assert select(hz, iter(range(0, 4000 * TICK_NS, TICK_NS))) == list(range(0, 4000, every))
     assert select(hz, jittered(4000)) == list(range(0, 4000, every)), "within half a tick"
-
-
-def test_any_rate_is_kept_over_a_long_time() -> None:
-    taken = select(60.0, jittered(5000))
-    assert len(taken) == 600, "10 s"
-    assert np.diff(taken).min() >= 7
-
-
-def test_a_stall_does_not_give_a_burst() -> None:
-    times = [*range(0, 100 * TICK_NS, TICK_NS), *range(10**9, 10**9 + 50 * TICK_NS, TICK_NS)]
-    taken = select(50.0, iter(times))
-    assert taken == [*range(0, 100, 10), *range(100, 150, 10)]
 
 
 @pytest.mark.parametrize("hz", [0.0, -1.0, float("nan"), float("inf")])
