@@ -232,18 +232,13 @@ def make_row(
 
 def check_row(prev_chain: bytes, row: JournalRow) -> RowProblem | None:
     """Return the changed field or entry of `row`; None if it is as written after the row with `prev_chain`."""
-    if _rechain(prev_chain, row) == row.chain:
+    if compute_chain(prev_chain, row) == row.chain:
         return None
     problem = _field_problem(prev_chain, row) or _entry_problem(row)
     if problem is not None:
         return problem
     text = "the chain does not continue: its own value was changed, or rows before it were left out, moved or rewritten"
     return RowProblem(row.step, "chain", text)
-
-
-def compute_chain(prev_chain: bytes, row: JournalRow) -> bytes:
-    """Return the correct chain value of `row`, to continue checking after a row whose `chain` was changed."""
-    return _rechain(prev_chain, row)
 
 
 def check_fields(row: JournalRow) -> RowProblem | None:
@@ -270,7 +265,11 @@ def _keyframe_crcs(keyframe: Keyframe, chain: bytes) -> tuple[int, ...]:
     return (*snapshots, zlib.crc32(chain, zlib.crc32(_packed((keyframe.step,)))))
 
 
-def _rechain(prev_chain: bytes, row: JournalRow, field_crcs: tuple[int, ...] | None = None) -> bytes:
+def compute_chain(prev_chain: bytes, row: JournalRow, field_crcs: tuple[int, ...] | None = None) -> bytes:
+    """Return the correct chain value of `row`, to continue checking after a row whose `chain` was changed.
+
+    `field_crcs`: in place of its own.
+    """
     numbers = (*row.entry_lengths, *row.entry_crcs, *(row.field_crcs if field_crcs is None else field_crcs))
     ints = _STEP.pack(row.step, row.now_ns, row.n_ticks)
     return _chain(prev_chain, ints, row.entries, row.digest, row.plant, numbers)
@@ -305,7 +304,7 @@ def _field_problem(prev_chain: bytes | None, row: JournalRow) -> RowProblem | No
     now = _field_crcs(ints, row.digest, row.plant, head, row.entry_lengths, row.entry_crcs)
     if now == row.field_crcs:
         return None
-    if prev_chain is not None and _rechain(prev_chain, row, now) == row.chain:
+    if prev_chain is not None and compute_chain(prev_chain, row, now) == row.chain:
         return RowProblem(row.step, "field_crcs", "the checksums of the fields were changed, the fields are intact")
     if len(row.field_crcs) != len(FIELDS):
         return RowProblem(row.step, "field_crcs", f"{len(row.field_crcs)} field checksums, expected {len(FIELDS)}")

@@ -170,13 +170,10 @@ class RecordingParts:
     def _find_missing(self, files: Sequence[str]) -> None:
         """Note gaps in the part numbers of `files` (in order). A name may hold any number, so a gap is one line."""
         base = os.path.basename(paths.split_part(files[0])[0])
-        numbers = [paths.split_part(path)[1] for path in files]
-        for before, after in pairwise(numbers):
-            first, last = paths.part_path(base, before + 1), paths.part_path(base, after - 1)
-            if after == before + 2:
-                self.missing.append(f"{first} is missing")
-            elif after > before + 2:
-                self.missing.append(f"{first} to {last} are missing")
+        for before, after in pairwise(paths.split_part(path)[1] for path in files):
+            if after > before + 1:
+                more = f" to {paths.part_path(base, after - 1)}" if after > before + 2 else ""
+                self.missing.append(f"{paths.part_path(base, before + 1)}{more} is missing")
 
     def _iterate_blobs(self, entity: str) -> Iterator[tuple[int, bytes, bool]]:
         """Yield part, header and whether its bytes are as written. It is near the beginning, so reading is short."""

@@ -31,8 +31,6 @@ SCENE: Final = "scene"
 ALL: Final = "all"
 RECORD_ASSETS: Final = (NONE, SCENE, ALL)
 SPECIFICATION: Final = "specification of the scene"
-#: Upper bound of the number of assets whose faults and names are kept: a hostile file may name any number.
-MOST_ASSETS: Final = 1 << 20
 #: Largest piece [bytes].
 PIECE_BYTES: Final = 512 << 10
 #: Time between the specifications of two patches [ns]: of patches in between, the last is recorded. The picture has
@@ -122,12 +120,12 @@ class AssetJoiner:
 
     Attributes:
         whole: Assets that were there with the right bytes, with their sizes.
-        broken: Assets that were there otherwise only: `changed` or `incomplete`.
+        changed: Assets that were there with other bytes only.
     """
 
     def __init__(self) -> None:
         self.whole: dict[str, int] = {}
-        self.broken: dict[str, str] = {}
+        self.changed: dict[str, None] = {}
         self._address = ""
         self._parts: list[bytes] = []
         self._n_bytes = 0
@@ -135,14 +133,9 @@ class AssetJoiner:
     def add(self, piece: AssetPiece) -> bytes | None:
         """Add the next piece. Return the asset if it is whole now, and was not before."""
         if piece.offset == 0:
-            self.end()
             self._address, self._parts, self._n_bytes = piece.address, [], 0
-        if piece.address in self.whole:
-            self._address = ""
-            return None
-        if piece.address != self._address or piece.offset != self._n_bytes:  # a piece before it is lost
-            self.end()
-            self._set_broken(piece.address, "incomplete")
+        if piece.address in self.whole or (piece.address, piece.offset) != (self._address, self._n_bytes):
+            self._address, self._parts = "", []  # it is known, or a piece before it is lost
             return None
         self._parts.append(piece.data)
         self._n_bytes += len(piece.data)
@@ -151,22 +144,11 @@ class AssetJoiner:
         data = b"".join(self._parts)
         self._address, self._parts = "", []
         if hashlib.sha256(data).hexdigest() != piece.address:
-            self._set_broken(piece.address, "changed")
+            self.changed[piece.address] = None
             return None
-        self.broken.pop(piece.address, None)
-        if len(self.whole) < MOST_ASSETS:
-            self.whole[piece.address] = len(data)
+        self.changed.pop(piece.address, None)
+        self.whole[piece.address] = len(data)
         return data
-
-    def end(self) -> None:
-        """Note the asset whose last pieces have not come."""
-        if self._address:
-            self._set_broken(self._address, "incomplete")
-        self._address, self._parts = "", []
-
-    def _set_broken(self, address: str, why: str) -> None:
-        if len(self.broken) < MOST_ASSETS:
-            self.broken[address] = why
 
 
 class AssetCollector:
@@ -190,10 +172,9 @@ class AssetCollector:
             if data is not None and item.is_scene:
                 self._read_scene(data)
         elif isinstance(item, RecordedScene):
-            if len(self._changes) < MOST_ASSETS:
-                self._changes.add(item)
-                self._scenes[item.hash] = item.recorded
-        elif len(self._faults) < MOST_ASSETS:
+            self._changes.add(item)
+            self._scenes[item.hash] = item.recorded
+        else:
             self._faults[item.address] = item.text
 
     def _read_scene(self, data: bytes) -> None:
@@ -231,23 +212,12 @@ class AssetCollector:
             finished: Recorders closed all files. One that was killed may have left assets to be written, and the next
                 one gets the newest scene only.
         """
-        self._joiner.end()
-        expected, broken = self._list_expected(), self._joiner.broken
-        missing = [one for one in expected if one not in self._joiner.whole and one not in broken] if finished else []
-        damaged = {one: why for one, why in broken.items() if why == "changed" or finished}
-        lines = {**damaged, **dict.fromkeys(missing, "missing")}
-        return [
-            f"{_describe(expected, address)} {_WORDS[why]}"
-            for address, why in lines.items()
-            if address not in self._faults
-        ]
-
-
-_WORDS: Final = {
-    "changed": "is not as it was written: its bytes have another hash",
-    "incomplete": "is not whole: some of its bytes are missing",
-    "missing": "is missing",
-}
+        expected, changed = self._list_expected(), self._joiner.changed
+        words = dict.fromkeys(changed, "is not as it was written: its bytes have another hash")
+        for address in expected if finished else ():
+            if address not in self._joiner.whole and address not in changed:
+                words[address] = "is missing, or not whole"
+        return [f"{_describe(expected, one)} {text}" for one, text in words.items() if one not in self._faults]
 
 
 def _describe(names: dict[str, str], address: str) -> str:

@@ -58,22 +58,21 @@ class MediaDrawer:
         if info:
             self._describe(header, info)
         if header.budget_class != BudgetClass.NONE:
-            self._draw_frame(header, frame)
+            if header.encoding == MediaEncoding.CLOUD:
+                self._draw_cloud(header, decode_cloud(frame))
+            else:
+                self._draw_picture(header, frame)
         elif not info:
             self._describe(header, b"")
             self._log(_FOLDERS[header.encoding], header, rr.Clear(recursive=False))
 
     def _describe(self, header: MediaHeader, info: bytes) -> None:
         """Log the description of a stream; empty: it has ended."""
-        if info:
-            _check_info(info)
+        try:
+            msgspec.json.decode(info or b"{}", type=StreamInfo)  # it will be read back
+        except msgspec.DecodeError as error:
+            raise StreamError(f"the description of a stream: {error}") from None
         self._log(paths.STREAMS, header, rr.AnyValues(encoding=header.encoding, info=info.decode()))
-
-    def _draw_frame(self, header: MediaHeader, frame: bytes) -> None:
-        if header.encoding == MediaEncoding.CLOUD:
-            self._draw_cloud(header, decode_cloud(frame))
-        else:
-            self._draw_picture(header, frame)
 
     def _draw_cloud(self, header: MediaHeader, cloud: CloudFrame) -> None:
         radius = 0.5 * cloud.voxel_m if cloud.voxel_m else rr.components.Radius.ui_points(_POINT_PX)
@@ -106,14 +105,6 @@ class MediaDrawer:
 def _make_times(header: MediaHeader) -> Any:
     names = ("seq", "capture_ns", "received_ns")
     return rr.AnyValues(**{name: pa.array([getattr(header, name)], pa.int64()) for name in names})
-
-
-def _check_info(info: bytes) -> None:
-    """Check that a description will be read back. Raises `StreamError`."""
-    try:
-        msgspec.json.decode(info, type=StreamInfo)
-    except msgspec.DecodeError as error:
-        raise StreamError(f"the description of a stream: {error}") from None
 
 
 #: Beginning of a JPEG file in which its size has to be: a longer one could be filled with what is searched in vain.

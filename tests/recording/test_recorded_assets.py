@@ -205,7 +205,7 @@ def test_joiner_returns_an_asset_once() -> None:
     joiner = AssetJoiner()
     found = [joiner.add(piece) for piece in (*pieces(b"abcdef", 2), *pieces(b"", 1), *pieces(b"abcdef", 3))]
     assert found == [None, None, b"abcdef", b"", None, None]
-    assert (list(joiner.whole.values()), joiner.broken) == ([6, 0], {})
+    assert (list(joiner.whole.values()), joiner.changed) == ([6, 0], {})
 
 
 def test_joiner_drops_no_other_asset_for_a_broken_one() -> None:
@@ -214,12 +214,11 @@ def test_joiner_drops_no_other_asset_for_a_broken_one() -> None:
         joiner = AssetJoiner()
         rest = [piece for i, piece in enumerate(broken) if i != lost]
         assert [joiner.add(piece) for piece in (*rest, *whole)][-1] == b"y" * 10
-        assert joiner.broken == {broken[0].address: "incomplete"}
+        assert [*joiner.whole] == [whole[0].address]
         assert [joiner.add(piece) for piece in broken][-1] == b"x" * 10, "the next part has it"
-        assert joiner.broken == {}
     joiner = AssetJoiner()
     assert [joiner.add(broken[i]) for i in (0, 1, 1)] == [None] * 3
-    assert joiner.broken == {broken[0].address: "incomplete"}
+    assert [joiner.add(broken[0]._replace(data=b"y" * 10)), [*joiner.changed]] == [None, [broken[0].address]]
 
 
 def test_pieces_with_impossible_numbers_are_refused() -> None:
@@ -252,4 +251,6 @@ def test_missing_asset_of_a_finished_recording_is_named() -> None:
     found.add(RecordedScene(-1, 0, "7" * 64, SCENE))
     found.add(RecordedScene(3, 4, "8" * 64, NONE))
     assert found.list_problems(finished=False) == []
-    assert found.list_problems(finished=True) == ["asset 777777777777 (specification of the scene) is missing"]
+    assert found.list_problems(finished=True) == [
+        "asset 777777777777 (specification of the scene) is missing, or not whole"
+    ]
