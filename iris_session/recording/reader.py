@@ -10,6 +10,7 @@ import os
 import warnings
 from bisect import bisect_left
 from collections.abc import Callable, Hashable, Iterator
+from itertools import repeat
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.journal.errors import NotARecordingError
-from iris_session.journal.messages import DenialRecord
+from iris_session.journal.messages import DenialRecord, EndMark
 from iris_session.journal.rows import JournalRow, Keyframe, unpack_model
 from iris_session.protocol.server_messages import Event
 from iris_session.recording.folders import find_session_in
@@ -81,13 +82,15 @@ class Recording:
         self.damage, self.missing, self.notes, self.cuts = parts.damage, parts.missing, parts.notes, parts.cuts
         self.is_being_written = parts.is_being_written
         try:
-            ends = dict(parts.iterate(paths.END, batches.decode_ends))
+            marks = list(parts.iterate((paths.HEADER, paths.END), _decode_end))
         except BaseException:
             self.close()
             raise
+        ends = {part: end for part, end in marks if end is not None}
         self.end = ends.get(len(self.files) - 1)
         self.samples_left_out = sum(end.samples_left_out for end in ends.values())
-        self.all_closed = len(ends) == len(self.files)
+        # A file that Rerun's tools have written may hold several parts, each with its header.
+        self.all_closed = len({mark for mark in marks if mark[1]}) == sum(end is None for _, end in marks)
         if self.end is not None and self.end.reason:
             self.notes.append(f"{self.end.reason[:200]}; the session may have gone on")
 
@@ -377,6 +380,11 @@ class Recording:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _decode_end(batch: Any) -> Iterator[EndMark | None]:
+    """Yield the marks at the ends of parts, and `None` for each header."""
+    return batches.decode_ends(batch) if get_entity(batch) == paths.END else repeat(None, batch.num_rows)
 
 
 def check_assets(recording: Recording) -> AssetCollector:

@@ -46,7 +46,7 @@ def write(path: Path, bodies: list[EventBody], messages: list[tuple[int, bytes]]
     row = make_row(header_root(header), 0, TICK_NS, 1, joins, b"d" * 16)
     events = [
         Event(seq, seq, TICK_NS * seq, body)  # type: ignore[arg-type]
-        for seq, body in enumerate(bodies, 3)
+        for seq, body in enumerate(bodies, 4)
     ]
     joined = [Event(i, 1, TICK_NS, ParticipantJoined(one)) for i, one in enumerate((ANN, BOB), 1)]
     writer = RrdWriter(path, "id")
@@ -81,9 +81,9 @@ def test_records_have_names_beside_ids_in_all_depths(tmp_path: Path) -> None:
     assert leases["leases"][0]["queue_names"] == [""], "not in this recording"
     assert leases["previous_holders_names"] == ["bob"]
     assert paused == {
-        "event_seq": 5,
-        "session_time_ns": 5 * TICK_NS,
-        "time_s": pytest.approx(5 * TICK_NS * 1e-9),
+        "event_seq": 6,
+        "session_time_ns": 6 * TICK_NS,
+        "time_s": pytest.approx(6 * TICK_NS * 1e-9),
         "event": "pause_changed",
         "paused": True,
         "participant": "p1",

@@ -262,7 +262,8 @@ def test_robots_are_labelled_by_their_holders(tmp_path: Path) -> None:
         writer = RrdWriter(part, "id")
         writer.write_header(SessionHeader("s", "n", "closed", 2_000_000, robots=robots, bodies=bodies))
         writer.add(Batch(states=[frame(0, poses), frame(4, poses)], events=[joined("p1", "Ada"), take]))
-        found = finish(writer)
+        writer.close()
+    found = read(path)
     assert column(found["/robots/left"], "Points3D:labels") == [["left"], ["left: Ada"]]
     assert column(found["/robots/left"], "Points3D:positions") == [[[1.0, 2.0, 3.0]]] * 2
     assert times(found["/robots/left"]) == [7, 8_000_100]

@@ -174,7 +174,7 @@ def test_nothing_is_left_of_an_export_that_ended(
 def test_names_of_files_are_safe_and_each_once(tmp_path: Path) -> None:
     with export._Staging(tmp_path / "tables", "csv", force=False) as staging:
         for name in ("../../etc/passwd", "a/b", "a:b", "A_B", "", "x" * 64 + "é"):
-            staging.make_table(OBJECTS, name, (Column("step", "q"),)).add((1,))
+            staging.make_table(OBJECTS, name, (Column("step", "int"),)).add((1,))
         files = [one.file for one in staging.commit()]
     assert sorted(files) == sorted(os.listdir(tmp_path / "tables"))
     assert {"object-.._.._etc_passwd.csv", "object-a_b.csv", "object-a_b~2.csv", "object-A_B~3.csv"} <= set(files)
