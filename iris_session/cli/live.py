@@ -33,7 +33,7 @@ END_S: Final = 3.0
 
 
 def format_event(event: Event, text: str) -> str:
-    """Return one event, told by `text`, as one line of printable text."""
+    """Return one event, in the words `text`, as one line of printable text."""
     kind = event.body.__struct_config__.tag
     return to_printable(f"{event.session_time * 1e-9:8.2f} s  {kind:20s} {text}")
 
@@ -85,8 +85,8 @@ class TerminalView:
             self.skipped += 1
             return
         fresh = [e for e in self._session.recent_events() if e.event_seq > self._seen]
-        told = [(event, self._narration.add(event).line) for event in fresh]
-        lines = [format_event(event, line.text) for event, line in told if line.level != DEBUG]
+        narrated = [(event, self._narration.add(event).line) for event in fresh]
+        lines = [format_event(event, line.text) for event, line in narrated if line.level != DEBUG]
         status = self._session.status().as_dict()
         status["handovers"] = len(status.get("handovers", ()))  # the list grows with the session
         self._pending = json.dumps({"status": status, "events": lines}).encode() + b"\n"

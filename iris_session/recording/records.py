@@ -31,7 +31,7 @@ ID_FIELDS: Final = frozenset(
 ID_LIST_FIELDS: Final = frozenset(("previous_holders", "sub_holders", "queue"))
 _decode = msgspec.msgpack.Decoder(Sample | Observation).decode
 #: One sample: the fields of `DeviceSamples` with as many numbers in every sample.
-_ROW: Final = [
+_ROW: Final[list[Any]] = [
     *((name, np.int64) for name in ("receive_ns", "capture_ns", "seq")),
     *((name, np.bool_) for name in ("tracked", "worn", "clutch")),
     *(("gripper", np.float64), ("buttons", np.int64), ("poses", np.float64, (7,)), ("twists", np.float64, (6,))),
@@ -196,8 +196,8 @@ def read_device_samples(recording: Recording, participant: str, device: str) -> 
     if not len(rows):
         listed = ", ".join(others) or "none"
         raise RecordingError(f"there are no samples of {participant!r} {device!r}. Samples: {listed}")
-    columns = (rows[name].copy() for name in DeviceSamples._fields[: len(_ROW)])
-    return DeviceSamples(*columns, _pad(joints), _pad(hand_joints))
+    columns = {name: rows[name].copy() for name, *_ in _ROW}
+    return DeviceSamples(**columns, q=_pad(joints), hand_joints=_pad(hand_joints))
 
 
 _NO_POSE: Final = (np.nan,) * 7
