@@ -1,61 +1,48 @@
-"""`iris-session anchors`: print anchor sheets, calibrate cameras.
+"""`iris-session anchors`: print anchor sheets; show and set the alignment of headsets in a running session.
 
-Commands on sessions, running or recorded, are in `anchors_session`.
+`anchors_solve` reads recordings, `calibrate` calibrates cameras.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
-import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterator
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from anchors.camera_calibration import (
-    CalibrationPicture,
-    calibration_to_toml,
-    solve_from_known_sheets,
-    solve_from_robot_poses,
-)
-from iris_session.cli.anchors_session import (
-    register_align,
-    register_move,
-    register_place,
-    register_solve,
-    register_status,
-)
+from iris_session.cli import anchors_solve, calibrate
 from iris_session.cli.common import (
     CommandError,
+    add_address_options,
     add_command,
     add_json_option,
+    add_pose_option,
+    find_participant,
+    make_client,
     open_scene,
     parse_length,
-    parse_pose,
-    print_json,
+    pick_attributes,
+    print_result,
     write_file,
 )
+from iris_session.cli.status import add_watch_options, run_status_command
+from iris_session.doctor.headset_checks import is_consistent
+from iris_session.protocol.names import AlignAction, AlignmentKind, Role
 
 if TYPE_CHECKING:
-    from anchors.camera import CameraModel
-    from anchors.pose import PoseTuple, Vec3
-    from anchors.sheet import Sheet
+    from iris_session.client import Client
+    from iris_session.protocol.server_messages import ParticipantInfo
+    from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
 
-#: For `cloud calibrate` too.
-__all__ = [
-    "CalibrationPicture",
-    "calibration_to_toml",
-    "format_calibration",
-    "make_sheets",
-    "parse_named_length",
-    "parse_named_pose",
-    "solve_from_known_sheets",
-]
 #: Edges of the code where none is given: with its marks it must be smaller to fit on A4.
 PLAIN_SHEET_M: Final = 0.160
 MARKED_SHEET_M: Final = 0.140
+ALL_PARTICIPANTS: Final = "all"
+#: Sheets listed per headset, most recently observed first.
+MAX_LISTED_SHEETS: Final = 8
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -79,12 +66,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_print(actions)
     _register_example(actions)
-    register_status(actions)
-    register_align(actions)
-    register_place(actions)
-    register_move(actions)
-    register_solve(actions)
-    register_calibrate(actions)
+    _register_status(actions)
+    _register_align(actions)
+    _register_place(actions)
+    _register_move(actions)
+    anchors_solve.register(actions)
+    calibrate.register_camera(actions)
 
 
 def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -137,6 +124,95 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
     add_json_option(one)
 
 
+def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `status`."""
+    one = add_command(
+        actions,
+        "status",
+        run_status,
+        help="how well the headsets of a running session are aligned",
+        description="Join as an observer and print for every headset the basis of its alignment, then the anchors, and "
+        "the cross-checks between pairs of headsets.",
+        examples="""
+            iris-session anchors status
+            iris-session anchors status 192.168.1.20 --watch
+            iris-session anchors status --json
+        """,
+    )
+    add_address_options(one)
+    add_watch_options(one, one)
+    add_json_option(one)
+
+
+def _register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `align`."""
+    one = add_command(
+        actions,
+        "align",
+        run_align,
+        help="start or stop measuring the alignment of headsets",
+        description="`start` discards earlier observations and measures again; `stop` keeps the alignment in force and "
+        "ignores later observations. The present alignment stays until there is a better one. Joins as a director.",
+        examples="""
+            iris-session anchors align start                   every participant with a headset
+            iris-session anchors align start ann
+            iris-session anchors align stop p3 --address 192.168.1.20
+        """,
+    )
+    one.add_argument("what", choices=sorted(AlignAction.ALL))
+    one.add_argument(
+        "participant",
+        nargs="?",
+        default=ALL_PARTICIPANTS,
+        metavar="PARTICIPANT",
+        help="name or id, or `all` (%(default)s)",
+    )
+    add_address_options(one, option=True)
+    add_json_option(one)
+
+
+def _register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `place`."""
+    one = add_command(
+        actions,
+        "place",
+        run_place,
+        help="align a headset by hand",
+        description="Set the pose of the tracking frame of a headset, T_world_tracking, or with --offset an offset to "
+        "the measured alignment, which voids its stated error. Joins as a director.",
+        examples="""
+            iris-session anchors place ann --pose 0.4,0,0,1,0,0,0
+            iris-session anchors place ann --offset --pose -0.01,0,0,1,0,0,0
+        """,
+    )
+    one.add_argument("participant", metavar="PARTICIPANT", help="name or id")
+    add_pose_option(one, "T_world_tracking, or the offset in the world")
+    one.add_argument("--offset", action="store_true", help="the pose is an offset to the measured alignment")
+    add_address_options(one, option=True)
+    add_json_option(one)
+
+
+def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the action `move`."""
+    one = add_command(
+        actions,
+        "move",
+        run_move,
+        help="set the pose of an anchor of the session",
+        description="Change T_world_anchor: the shared scene moves for every headset whose measured alignment uses "
+        "that anchor. Further than 5 m only with --force. Joins as a director.",
+        examples="""
+            iris-session anchors move table --pose 0,-0.45,0,1,0,0,0
+            iris-session anchors move table --pose -0.2,0.1,0,0.7071068,0,0,0.7071068
+        """,
+    )
+    one.add_argument("anchor", metavar="ANCHOR", help="id of the anchor, see `anchors status`")
+    add_pose_option(one, "T_world_anchor")
+    one.add_argument("--force", action="store_true", help="allow more than 5 m from the present position")
+    add_address_options(one, option=True)
+    add_json_option(one)
+
+
 def run_print(arguments: argparse.Namespace) -> int:
     """Write the sheet, and print its size."""
     from anchors.sheet import Sheet, SheetError
@@ -152,26 +228,22 @@ def run_print(arguments: argparse.Namespace) -> int:
     except SheetError as error:
         raise CommandError(str(error)) from error
     write_file(out, drawn)
-    if arguments.json:
-        print_json(
-            {
-                "file": str(out),
-                "id": sheet.anchor_id,
-                "size_m": sheet.edge_m,
-                "paper": arguments.paper,
-                "markers": list(sheet.marker_ids),
-                "marker_edge_m": sheet.marker_edge_m,
-                "marks_m": {name: list(p) for name, p in sheet.marks.items()},
-            }
-        )
-        return 0
-    print(f"{out}: anchor {sheet.anchor_id!r}, code {1e3 * sheet.edge_m:g} mm, for {arguments.paper}")
-    print(f"print at 100 % (not 'fit to page'), then measure the code: {1e3 * sheet.edge_m:g} mm from edge to edge")
+    mm = f"{1e3 * sheet.edge_m:g} mm"
+    lines = [
+        f"{out}: anchor {sheet.anchor_id!r}, code {mm}, for {arguments.paper}",
+        f"print at 100 % (not 'fit to page'), then measure the code: {mm} from edge to edge",
+    ]
     if sheet.has_marks:
-        print("prick the crosses with a needle; the session must know them: lines for the anchors file")
-        print(f"\nsize_m = {sheet.edge_m!r}\n[anchors.{json.dumps(sheet.anchor_id)}.marks_m]")
-        for name, p in sheet.marks.items():
-            print(f'"{name}" = [{", ".join(f"{c:.6g}" for c in p)}]')
+        lines += [
+            "prick the crosses with a needle; the session must know them: lines for the anchors file",
+            "",
+            f"size_m = {sheet.edge_m!r}",
+            f"[anchors.{json.dumps(sheet.anchor_id)}.marks_m]",
+            *(f'"{name}" = [{", ".join(f"{c:.6g}" for c in p)}]' for name, p in sheet.marks.items()),
+        ]
+    result = {"file": str(out), "id": sheet.anchor_id, "size_m": sheet.edge_m, "paper": arguments.paper}
+    result |= {"markers": sheet.marker_ids, "marker_edge_m": sheet.marker_edge_m, "marks_m": sheet.marks}
+    print_result(arguments, result, lines)
     return 0
 
 
@@ -185,289 +257,212 @@ def run_example(arguments: argparse.Namespace) -> int:
     if arguments.scene:
         scene = open_scene(arguments.scene)
         anchors, sizes = scene.anchors, scene.anchor_sizes
-    marks: dict[str, dict[str, Vec3]] = {}
-    if arguments.marks:
-        sizes = dict.fromkeys(anchors, MARKED_SHEET_M)
-        marks = {name: compute_marks(MARKED_SHEET_M) for name in anchors}
-    text = dump_anchors(anchors, sizes, marks)
-    if arguments.json:
-        print_json({"toml": text})
-    else:
-        print(text, end="")
+    marks = {name: compute_marks(MARKED_SHEET_M) for name in anchors if arguments.marks}
+    text = dump_anchors(anchors, sizes | dict.fromkeys(marks, MARKED_SHEET_M), marks)
+    print_result(arguments, {"toml": text}, text.splitlines())
     return 0
 
 
-# --- calibrate-camera -------------------------------------------------------------------------------------------------
+# --- align, place, move -----------------------------------------------------------------------------------------------
 
 
-PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
-COLUMNS: Final = ("image", "x", "y", "z", "qw", "qx", "qy", "qz")
+def run_align(arguments: argparse.Namespace) -> int:
+    """Start or stop runs. Exit status 1 if one of several participants was denied."""
+    from iris_session.client import DeniedError
+
+    done: list[dict[str, Any]] = []
+    with make_client(arguments, Role.DIRECTOR, "anchors") as client:
+        people = select_participants(client, arguments.participant)
+        for person in people:
+            denied = ""
+            try:
+                if arguments.what == AlignAction.START:
+                    client.alignment.start_run(person.id)
+                else:
+                    client.alignment.stop_run(person.id)
+            except DeniedError as error:
+                if len(people) == 1:
+                    raise
+                denied = str(error)
+            done.append({"id": person.id, "name": person.name, "denied": denied})
+    ok = not any(one["denied"] for one in done)
+    started = arguments.what == AlignAction.START
+    outcome = "started: bring the sheets into view" if started else "stopped: alignment kept"
+    lines = (f"{one['name']} ({one['id']}): {one['denied'] or outcome}" for one in done)
+    print_result(arguments, {"ok": ok, "action": arguments.what, "participants": done}, lines)
+    return 0 if ok else 1
 
 
-def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Calibrate cameras from pictures. Return the object that `--json` prints.
+def run_place(arguments: argparse.Namespace) -> int:
+    """Place the alignment of one participant."""
+    with make_client(arguments, Role.DIRECTOR, "anchors") as client:
+        one = find_participant(client, arguments.participant)
+        client.alignment.place(one.id, arguments.pose, offset=arguments.offset)
+    line = f"{one.name} ({one.id}) is {'moved by the offset' if arguments.offset else 'placed'}"
+    result = {"ok": True, "participant": {"id": one.id, "name": one.name}, "offset": arguments.offset}
+    print_result(arguments, result, [line])
+    return 0
+
+
+def run_move(arguments: argparse.Namespace) -> int:
+    """Move an anchor, and list the alignments that follow it and those that do not."""
+    from anchors.pose import distance
+
+    with make_client(arguments, Role.DIRECTOR, "anchors") as client:
+        report = client.status()
+        was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
+        moved_m = 0.0 if was is None else distance(was, arguments.pose[0])  # the session denies an unknown anchor
+        client.alignment.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
+    kinds = {AlignmentKind.MEASURED, AlignmentKind.PLACED, *AlignmentKind.VIEW_ONLY}
+    aligned = [p for p in list_headsets(report) if p.alignment in kinds]
+    stay = {
+        p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := explain_unaffected_alignment(p, arguments.anchor))
+    }
+    follow = [p for p in aligned if p.id not in stay]
+    by = "rotated" if moved_m == 0.0 else f"moved by {moved_m * 1e3:.0f} mm"
+    first = f"anchor '{arguments.anchor}' {by}: {len(follow)} alignments measured to it follow"
+    ids = {"follow": [p.id for p in follow], "stay": list(stay)}
+    result = {"ok": True, "anchor": arguments.anchor, "moved_m": moved_m, **ids}
+    print_result(arguments, result, [first, *(f"    unchanged: {line}" for line in stay.values())])
+    return 0
+
+
+def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:
+    """Return why an alignment does not follow a moved anchor; empty if it does."""
+    r = p.alignment_report
+    if r is not None and not r.running:
+        return f"its run is stopped; start it with `iris-session anchors align start {p.id}`"
+    if p.alignment == AlignmentKind.PLACED:
+        return f"a director placed it; measure it with `iris-session anchors align start {p.id}`"
+    if r is None or not p.connected or anchor not in {one.anchor_id for one in r.seen}:
+        return f"it has not observed '{anchor}' since it joined; it follows when it does"
+    return ""
+
+
+def select_participants(client: Client, name: str) -> list[ParticipantInfo]:
+    """Return the participant with an id or name, or all with a headset for `all`.
 
     Raises:
-        CommandError: The options or files are unusable.
-        CalibrationError: The pictures do not determine a result.
+        CommandError: There is none, or several have the name.
     """
-    sheets = make_sheets(arguments.sheet)
-    _check_options(arguments, sheets)
-    if arguments.at:
-        pictures = _read_pictures(arguments.folder, arguments.intrinsics, sheets)
-        return solve_from_known_sheets(pictures, dict(arguments.at))[0]
-    poses = read_poses(arguments.poses)
-    pictures = _read_pictures(arguments.folder, arguments.intrinsics, sheets)
-    if len({picture.camera_name for picture in pictures}) > 1:
-        raise CommandError("--poses calibrates one camera at a time: give the folder of that camera")
-    missing = [picture.path.name for picture in pictures if picture.path.name not in poses]
-    if missing:
-        raise CommandError(f"{arguments.poses} has no line for {missing[0]} ({len(missing)} pictures have no pose)")
-    return solve_from_robot_poses(
-        pictures, poses, camera_on_hand=arguments.camera_on_hand, T_ee_sheet=arguments.in_hand
-    )
-
-
-def make_sheets(sizes: Iterable[tuple[str, float]]) -> list[Sheet]:
-    """Return the sheets of the options `--sheet`: id and edge [m]."""
-    from anchors.sheet import Sheet, SheetError
-
-    try:
-        sheets = [Sheet(name, edge) for name, edge in sizes]
-    except SheetError as error:
-        raise CommandError(str(error)) from error
-    if len({sheet.anchor_id for sheet in sheets}) != len(sheets):
-        raise CommandError("--sheet: the same sheet is given twice")
-    return sheets
-
-
-def _check_options(arguments: argparse.Namespace, sheets: list[Sheet]) -> None:
-    if (arguments.poses is None) == (not arguments.at):
-        raise CommandError("give --poses CSV (the robot's hand moves) or --at ID=POSE (sheets at known poses)")
-    if arguments.at and (arguments.in_hand or arguments.camera_on_hand):
-        raise CommandError("--in-hand and --camera-on-hand need --poses, not --at")
-    if arguments.in_hand and arguments.camera_on_hand:
-        raise CommandError("--in-hand cannot be combined with --camera-on-hand: it is the pose of a sheet on the hand")
-    if arguments.poses is not None and len(sheets) != 1:
-        raise CommandError(
-            f"{len(sheets)} sheets with --poses: give exactly one --sheet, on the hand, or with "
-            "--camera-on-hand in the room"
-        )
-    unknown = {name for name, _ in arguments.at} - {sheet.anchor_id for sheet in sheets}
-    if unknown:
-        raise CommandError(f"--at {sorted(unknown)[0]}: no size is given, add --sheet {sorted(unknown)[0]}=160mm")
-
-
-# --- input ------------------------------------------------------------------------------------------------------------
-
-
-def read_poses(path: Path) -> dict[str, PoseTuple]:
-    """Read `T_base_ee` by name of the picture."""
-    try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines(), skipinitialspace=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise CommandError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if not rows or tuple(word.strip() for word in rows[0]) != COLUMNS:
-        raise CommandError(f"{path}: the first line must be {','.join(COLUMNS)}")
-    poses: dict[str, PoseTuple] = {}
-    for number, row in enumerate(rows[1:], 2):
-        if not any(word.strip() for word in row):
-            continue
-        try:
-            name, x, y, z, *q = row[0].strip(), *map(float, row[1:])
-        except ValueError:
-            q = []
-        if len(q) != 4 or not all(map(math.isfinite, (x, y, z, *q))) or abs(math.hypot(*q) - 1.0) > 0.01:
-            raise CommandError(
-                f"{path}, line {number}: must be the name of a picture, x,y,z in metres, and a unit quaternion "
-                "with w first"
-            )
-        if name in poses:
-            raise CommandError(f"{path}, line {number}: a second pose for {name}")
-        n = math.hypot(*q)
-        poses[name] = ((x, y, z), (q[0] / n, q[1] / n, q[2] / n, q[3] / n))
-    return poses
-
-
-def _read_pictures(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[CalibrationPicture]:
-    """Read the pictures of the folder, or of its subfolders, and detect sheets in them."""
-    if not folder.is_dir():
-        raise CommandError(f"{folder} is not a folder")
-    folders = [folder] if _list_pictures(folder) else [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
-    found = [picture for one in folders for picture in _read_camera_folder(one, intrinsics, sheets)]
+    people = list(client.mirror.participants.values())
+    if name != ALL_PARTICIPANTS or any(name in (one.id, one.name) for one in people):
+        return [find_participant(client, name)]
+    headsets = [one for one in people if one.alignment is None or one.alignment.kind != AlignmentKind.NOT_NEEDED]
+    found = sorted((one for one in headsets if one.connected), key=lambda one: (len(one.id), one.id))
     if not found:
-        raise CommandError(f"no pictures in {folder}: they must end in {', '.join(PICTURES)}")
+        raise CommandError("no participant of this session has a headset that is aligned", status=1)
     return found
 
 
-def _list_pictures(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+# --- status -----------------------------------------------------------------------------------------------------------
 
 
-def _read_camera_folder(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[CalibrationPicture]:
-    import cv2
-
-    from anchors.detection import DetectionError, SheetDetector
-
-    pictures: list[CalibrationPicture] = []
-    detectors: dict[tuple[int, int], SheetDetector] = {}
-    for path in _list_pictures(folder):
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise CommandError(f"{path} is not a readable picture")
-        height, width = image.shape
-        if (width, height) not in detectors:
-            detectors[width, height] = SheetDetector(sheets, _read_camera(folder, intrinsics, width, height))
-        detector = detectors[width, height]
-        try:
-            pictures.append(CalibrationPicture(path, folder.name, detector.camera, tuple(detector.detect(image))))
-        except DetectionError as error:
-            raise CommandError(f"{path}: {error}") from error
-    return pictures
+def run_status(arguments: argparse.Namespace) -> int:
+    """Print the alignment of every headset; with --watch until Ctrl-C."""
+    return run_status_command(arguments, to_dict, format_alignment_status)
 
 
-def _read_camera(folder: Path, intrinsics: Path | None, width: int, height: int) -> CameraModel:
-    from anchors.camera import CameraError, parse_camera
-
-    places = [intrinsics] if intrinsics is not None else [folder / "intrinsics.toml", folder / "intrinsics.txt"]
-    path = next((place for place in places if place.is_file()), None)
-    if path is None:
-        raise CommandError(
-            f"no intrinsics at {places[0]}: give with --intrinsics a TOML file with width, height, fx, fy, cx, cy "
-            "[pixels] and distortion, from the maker of the camera or a calibration"
-        )
-    try:
-        return parse_camera(path.read_text(encoding="utf-8"), width, height)
-    except (CameraError, OSError, UnicodeDecodeError) as error:
-        raise CommandError(f"{path}: {error}") from error
+def list_headsets(report: StatusReport) -> list[ParticipantReport]:
+    """Return the participants that are aligned, or can be."""
+    return [p for p in report.participants if p.alignment != AlignmentKind.NOT_NEEDED]
 
 
-# --- output -----------------------------------------------------------------------------------------------------------
+def to_dict(report: StatusReport) -> dict[str, Any]:
+    """Return the object that `--json` prints; fields as in `StatusReport`."""
+    kept = ("id", "name", "role", "connected", "tracking_epoch", "alignment", "alignment_age_ns", "alignment_void_ns")
+    import msgspec
+
+    people = [{**pick_attributes(p, *kept), "alignment_report": p.alignment_report} for p in list_headsets(report)]
+    checks = [{**msgspec.to_builtins(one), "as_expected": is_consistent(one)} for one in report.cross_checks]
+    return {
+        "session": report.session_name,
+        "session_time": report.session_time,
+        "participants": people,
+        "anchors": report.anchors,
+        "cross_checks": checks,
+    }
 
 
-def format_calibration(result: dict[str, Any]) -> list[str]:
-    """Return the result as lines of text."""
-    lines = []
-    for row in result["pictures"]:
-        name = row["file"] if row["camera"] in ("", row["file"]) else f"{row['camera']}/{row['file']}"
-        if not row["found"]:
-            lines.append(f"{name}  no sheet found")
-            continue
-        note = "" if row["used"] else "  EXCLUDED: contradicts the others"
-        lines.append(
-            f"{name}  {row['sheet']}  {row['residual_mm']:.2f} mm  {row['residual_deg']:.3f} deg  "
-            f"{row['residual_px']:.2f} px{note}"
-        )
-    lines.append(
-        f"{result['used']} used, {result['left_out']} excluded; residual rms {result['residual_mm_rms']:.2f} mm, "
-        f"{result['residual_deg_rms']:.3f} deg, {result['residual_px_rms']:.2f} px"
+def format_alignment_status(report: StatusReport) -> Iterator[str]:
+    """Yield one screen of lines."""
+    people = list_headsets(report)
+    still = f"  STALLED for {report.authority_silent_ns * 1e-9:.1f} s" if report.stalled else ""
+    yield f"session '{report.session_name}'  {len(people)} headsets  {len(report.anchors)} anchors{still}"
+    yield ""
+    yield (
+        f"{'headset':20s} {'alignment':16s} {'version':>7s} {'age':>6s} {'at sheet':>9s} {'at robot':>9s} "
+        f"{'obs.':>6s} {'places':>6s} {'tilt':>8s}  correction"
     )
-    for name, value in _list_poses(result):
-        p, q = value["position_m"], value["quaternion_wxyz"]
-        place = ", ".join(f"{v:.5f}" for v in p)
-        lines.append(f"{name}  p = [{place}] m  q = [{', '.join(f'{v:.6f}' for v in q)}]")
-    for name, part in [("", result), *result.get("cameras", {}).items()]:
-        if "error_mm_p95" in part:
-            turn = f", {part['sigma_deg']:.3f} deg (sigma)" if "sigma_deg" in part else ""
-            lines.append(f"{name + ': ' if name else ''}stated error {part['error_mm_p95']:.2f} mm (95 %){turn}")
-    return lines
+    for p in people:
+        yield from _format_headset(p)
+    yield ""
+    for anchor in report.anchors:
+        x, y, z = anchor.T_world_anchor.p
+        q = ",".join(f"{c:.5g}" for c in anchor.T_world_anchor.q)
+        size = f", {anchor.size_m * 1e3:.0f} mm" if anchor.size_m > 0.0 else ""
+        yield f"anchor '{anchor.anchor_id}': at {x:.4f}, {y:.4f}, {z:.4f} m, rotation {q}{size}"
+    if not report.anchors:
+        yield "this session has no anchors"
+    names = {p.id: p.name for p in report.participants}
+    for check in report.cross_checks:
+        yield _format_cross_check(check, names)
 
 
-def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]]]]:
-    found = [(key, value) for key, value in result.items() if key.startswith("T_")]
-    for kind in ("cameras", "sheets"):
-        for name, part in result.get(kind, {}).items():
-            found += [(f"{key} of {name}", value) for key, value in part.items() if key.startswith("T_")]
-    return found
-
-
-def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `calibrate-camera`."""
-    one = add_command(
-        actions,
-        "calibrate-camera",
-        run_calibrate,
-        help="calibrate the pose of a camera",
-        description="Compute T_base_camera from pictures: of a sheet on the robot's hand while the hand moves "
-        "(--poses), or of sheets at known poses (--at). Prints residuals, and refuses pictures that do not "
-        "determine the result.",
-        examples="""
-            iris-session anchors calibrate-camera pictures --sheet table=160mm --poses poses.csv
-            iris-session anchors calibrate-camera pictures --sheet table=160mm --at table=0,-0.45,0,1,0,0,0
-        """,
-        notes="poses.csv, metres and unit quaternions, one line per picture:\n"
-        "  image,x,y,z,qw,qx,qy,qz\n"
-        "  0001.png,0.412,0.031,0.388,0.0012,0.9998,0.0131,0.0021\n\n"
-        "Several cameras at once: one folder each below FOLDER, with its own intrinsics.toml.",
+def _format_headset(p: ParticipantReport) -> Iterator[str]:
+    r = p.alignment_report
+    name = f"{p.name} ({p.id})" if p.connected else f"{p.name} OFFLINE {p.lost}"
+    if r is None:
+        yield f"{name:20.20s} {p.alignment:16.16s}"
+        return
+    kind = p.alignment + (" + offset" if r.offset else "") + ("" if r.running else " STOPPED")
+    aligned = p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED, *AlignmentKind.VIEW_ONLY)
+    stated = aligned and p.alignment != AlignmentKind.PLACED and not r.offset
+    at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
+    yield (
+        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_duration(p.alignment_age_ns) if aligned else '-':>6s} "
+        f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
+        f"{format_pending_correction(r)}"
     )
-    one.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the pictures")
-    one.add_argument(
-        "--sheet",
-        type=parse_named_length,
-        action="append",
-        required=True,
-        metavar="ID=LENGTH",
-        help="id of a sheet and the printed edge of its code: table=160mm; repeatable",
+    if not aligned and p.alignment_void_ns >= 0:
+        yield f"    void for {format_duration(p.alignment_void_ns)}: the tracking frame jumped"
+    seen = sorted(r.seen, key=lambda one: one.age_ns)
+    if seen:
+        sheets = [
+            f"{one.anchor_id} {one.observations} times, {format_duration(one.age_ns)} ago"
+            for one in seen[:MAX_LISTED_SHEETS]
+        ]
+        more = f"; {len(seen) - MAX_LISTED_SHEETS} more" if len(seen) > MAX_LISTED_SHEETS else ""
+        unusable = f"; {r.unusable} unusable" if r.unusable else ""
+        yield f"    saw {'; '.join(sheets)}{more}{unusable}"
+    elif r.unusable:
+        yield f"    observed nothing usable, {r.unusable} times"
+    if r.alarm:
+        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_duration(r.alarm_ns)} ago"
+    if r.advice:
+        yield f"    advice: {r.advice}"
+
+
+def format_pending_correction(r: AlignmentReport) -> str:
+    """Return the rest of a correction that is not yet in force."""
+    if not (r.pending_m > 0.0 or r.pending_rad > 0.0):
+        return "-"
+    return f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go"
+
+
+def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
+    a, b = (f"{names[one]} ({one})" if one in names else one for one in (check.a, check.b))
+    verdict = "" if is_consistent(check) else "  TOO FAR APART"
+    return (
+        f"{a} - {b}: {check.error_m * 1e3:.1f} mm, {degrees(check.error_rad):.2f} deg apart at '{check.anchor_id}', "
+        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {check.n} observations, "
+        f"{format_duration(check.age_ns)} ago{verdict}"
     )
-    one.add_argument(
-        "--intrinsics",
-        type=Path,
-        metavar="FILE",
-        help="TOML with width, height, fx, fy, cx, cy, distortion, or a 3x3 matrix as text "
-        "(default: intrinsics.toml or intrinsics.txt beside the pictures)",
-    )
-    one.add_argument("--poses", type=Path, metavar="CSV", help="T_base_ee, pose of the robot's hand, per picture")
-    one.add_argument(
-        "--camera-on-hand", action="store_true", help="with --poses: the camera is on the hand, the sheet does not move"
-    )
-    one.add_argument(
-        "--in-hand",
-        type=parse_pose,
-        metavar="X,Y,Z,QW,QX,QY,QZ",
-        help="with --poses: known pose of the sheet on the hand, T_ee_sheet; one picture is enough",
-    )
-    one.add_argument(
-        "--at",
-        type=parse_named_pose,
-        action="append",
-        default=[],
-        metavar="ID=X,Y,Z,QW,QX,QY,QZ",
-        help="known pose of a sheet, T_base_sheet; repeatable",
-    )
-    one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
-    add_json_option(one)
 
 
-def parse_named_length(text: str) -> tuple[str, float]:
-    """Parse `ID=LENGTH`, such as `table=160mm`."""
-    name, _, rest = text.rpartition("=")
-    return _check_sheet_id(name, text), parse_length(rest)
-
-
-def parse_named_pose(text: str) -> tuple[str, PoseTuple]:
-    """Parse `ID=X,Y,Z,QW,QX,QY,QZ`."""
-    name, _, rest = text.rpartition("=")
-    return _check_sheet_id(name, text), parse_pose(rest)
-
-
-def _check_sheet_id(name: str, text: str) -> str:
-    if not name:
-        raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=160mm")
-    return name
-
-
-def run_calibrate(arguments: argparse.Namespace) -> int:
-    """Calibrate, print the result, and write it to `--out`. Exit status 1 if the pictures do not determine it."""
-    from anchors.robot_world import CalibrationError
-
-    try:
-        result = calibrate_cameras(arguments)
-    except CalibrationError as error:
-        raise CommandError(str(error), status=1) from error
-    if arguments.out is not None:
-        write_file(arguments.out, calibration_to_toml(result))
-    if arguments.json:
-        print_json(result)
-    else:
-        print("\n".join(format_calibration(result)))
-    return 0
+def format_duration(duration_ns: int) -> str:
+    """Return a duration as seconds or minutes."""
+    seconds = duration_ns * 1e-9
+    if seconds < 0.0:
+        return "never"
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import math
+import shutil
 import signal
 import sys
 import threading
@@ -14,18 +15,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from iris_session.cli.cloud_calibrate import register_calibrate
+from iris_session.cli import calibrate
 from iris_session.cli.common import (
     CommandError,
     add_address_options,
+    add_command,
     add_json_option,
-    check_session_reachable,
+    make_client,
     parse_seconds,
+    print_error,
     print_json,
+    print_result,
     to_printable,
 )
 from iris_session.protocol.errors import IrisError
-from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.names import MediaEncoding, Role
 
 if TYPE_CHECKING:
     from iris_session.client.stream_meter import StreamMeasurement
@@ -49,81 +53,88 @@ log = logging.getLogger(__name__)
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `cloud` with its actions."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "cloud",
+        None,
         help="point clouds of depth cameras: run, example, inspect, calibrate",
         description="Show what depth cameras see as a point cloud in a session. `serve --camera FILE` does so by "
         "itself for cameras at its machine.",
-        epilog="examples:\n"
-        "  iris-session cloud example -o camera.toml           a commented camera file, to be edited\n"
-        "  iris-session cloud calibrate camera.toml --out calibration.toml   poses of the cameras, by printed sheets\n"
-        "  iris-session cloud inspect camera.toml              rate, points, faults, without a session\n"
-        "  iris-session serve scene.xml --camera camera.toml   the cloud in a session of this machine\n"
-        "  iris-session cloud run camera.toml --address 192.168.1.20   in a session of another machine\n"
-        "  iris-session cloud inspect 192.168.1.20             what arrives here, and how old it is",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session cloud example -o camera.toml           a commented camera file, to be edited
+            iris-session cloud calibrate camera.toml --out calibration.toml   poses of the cameras, by printed sheets
+            iris-session cloud inspect camera.toml              rate, points, faults, without a session
+            iris-session serve scene.xml --camera camera.toml   the cloud in a session of this machine
+            iris-session cloud run camera.toml --address 192.168.1.20   in a session of another machine
+            iris-session cloud inspect 192.168.1.20             what arrives here, and how old it is
+        """,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    for register_action in (_register_run, _register_example, _register_inspect, register_calibrate):
-        register_action(actions)
+    _register_run(actions)
+    _register_example(actions)
+    _register_inspect(actions)
+    calibrate.register_depth_cameras(actions)
 
 
 def _register_run(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = actions.add_parser(
+    parser = add_command(
+        actions,
         "run",
+        run_file,
         help="publish the cloud of a camera file in a session",
         description="Publish the cloud and the pictures of a camera file in a session until Ctrl-C. At an encrypted "
         "session the key of this user must be allowed in role camera: `iris-session pair --role camera` there.",
-        epilog="examples:\n"
-        "  iris-session cloud run camera.toml\n"
-        "  iris-session cloud run camera.toml --address 192.168.1.20 --code 7KQ2-M4XD-9PTR    the first time\n"
-        "  iris-session cloud run camera.toml --session lab-1 --json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session cloud run camera.toml
+            iris-session cloud run camera.toml --address 192.168.1.20 --code 7KQ2-M4XD-9PTR    the first time
+            iris-session cloud run camera.toml --session lab-1 --json
+        """,
     )
     parser.add_argument("file", type=Path, help="camera file; `iris-session cloud example` prints one")
     add_address_options(parser, option=True)
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
     parser.add_argument("--json", action="store_true", help="one JSON object per second")
-    parser.set_defaults(run=run_file)
 
 
 def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     from iris_session.cloud.example import SOURCES
 
-    parser = actions.add_parser(
+    parser = add_command(
+        actions,
         "example",
+        run_example,
         help="print a commented camera file",
         description="Print a commented camera file, to be edited.",
-        epilog="examples:\n"
-        "  iris-session cloud example > camera.toml\n"
-        "  iris-session cloud example --source realsense -o camera.toml",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session cloud example > camera.toml
+            iris-session cloud example --source realsense -o camera.toml
+        """,
     )
     parser.add_argument(
         "--source", choices=sorted(SOURCES), default="folder", help="what the frames come from (default: %(default)s)"
     )
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write it to a file that does not exist yet")
-    parser.set_defaults(run=run_example)
 
 
 def _register_inspect(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = actions.add_parser(
+    parser = add_command(
+        actions,
         "inspect",
+        run_inspect,
         help="measure a camera file, or the clouds of a session",
         description="Measure what a camera file gives, without a session: rate, points, stages, faults. Or, for an "
         "address, join as an observer and measure the clouds and pictures that arrive: rate, points, age by stage. "
         "Exit status 1 if there is a fault, or nothing comes.",
-        epilog="examples:\n"
-        "  iris-session cloud inspect camera.toml\n"
-        "  iris-session cloud inspect 192.168.1.20 --seconds 10\n"
-        "  iris-session cloud inspect 127.0.0.1:7721 --json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session cloud inspect camera.toml
+            iris-session cloud inspect 192.168.1.20 --seconds 10
+            iris-session cloud inspect 127.0.0.1:7721 --json
+        """,
     )
     parser.add_argument("target", metavar="FILE|ADDRESS", help="camera file, or HOST:PORT or iris://... of a session")
     parser.add_argument("--code", default="", help="join code, needed the first time at an encrypted session")
     parser.add_argument("--seconds", type=parse_seconds, default=3.0, help="time to measure (default: %(default)s)")
     add_json_option(parser)
-    parser.set_defaults(run=run_inspect)
 
 
 # --- run --------------------------------------------------------------------------------------------------------------
@@ -131,22 +142,13 @@ def _register_inspect(actions: argparse._SubParsersAction[argparse.ArgumentParse
 
 def run_file(arguments: argparse.Namespace) -> int:
     """Publish a camera file until Ctrl-C. Exit status 1 if the session does not admit us, or has such a stream."""
-    from iris_session.client import Client
     from iris_session.cloud.camera_file import load_camera_file
     from iris_session.cloud.process import run_cameras
-    from iris_session.protocol.names import Role
     from iris_session.system.priority import lower_thread_priority
 
     settings = load_camera_file(arguments.file)
-    check_session_reachable(arguments)
+    client = make_client(arguments, Role.CAMERA, settings.stream)
     lower_thread_priority()
-    client = Client(
-        arguments.address,
-        session=arguments.session,
-        join_code=arguments.code,
-        role=Role.CAMERA,
-        name=settings.stream,
-    )
     seconds = math.inf if arguments.seconds is None else arguments.seconds
     printer = _ReportPrinter(as_json=arguments.json)
     with _catch_signals() as ending, _name_unexpected_error(settings):
@@ -156,7 +158,7 @@ def run_file(arguments: argparse.Namespace) -> int:
             fault = f"no session admitted the cameras within {seconds:g} s: {where}"
     printer.end()
     if fault:
-        print(f"iris-session: {to_printable(fault)}", file=sys.stderr)
+        print_error(fault)
     return 1 if fault else 0
 
 
@@ -179,7 +181,7 @@ def _name_unexpected_error(settings: CloudSettings) -> Iterator[None]:
 
     try:
         yield
-    except (CommandError, ImportError, IrisError):
+    except (ImportError, IrisError):
         raise
     except Exception as error:
         log.debug("the cameras of %r end", settings.stream, exc_info=True)
@@ -205,16 +207,15 @@ class _ReportPrinter:
         return max(0.0, time.monotonic() - self._first_at)
 
     def __call__(self, report: CameraReport) -> None:
-        import msgspec
-
         self._first_at = min(self._first_at, time.monotonic())
         self.was_connected |= report.connected
         if self._as_json:
-            print_json(msgspec.to_builtins(report))
+            print_json(report)
             return
         line = format_report(report)
         if self._is_terminal:
-            print(f"\r\x1b[K{line[: _terminal_width() - 1]}", end="", flush=True)
+            width = shutil.get_terminal_size((120, 24)).columns
+            print(f"\r\x1b[K{line[: width - 1]}", end="", flush=True)
             return
         faults = f"{report.connected} {format_faults(report)}"
         if faults != self._faults or time.monotonic() - self._at >= QUIET_S:
@@ -225,12 +226,6 @@ class _ReportPrinter:
         """End the line that is written over."""
         if self._is_terminal and not self._as_json:
             print(flush=True)
-
-
-def _terminal_width() -> int:
-    import shutil
-
-    return shutil.get_terminal_size((120, 24)).columns
 
 
 def format_report(report: CameraReport) -> str:
@@ -317,10 +312,7 @@ def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
         finally:
             worker.close()
     is_well = report.hz > 0.0 and not format_faults(report)
-    if arguments.json:
-        print_json({"ok": is_well, **msgspec.to_builtins(report)})
-    else:
-        print("\n".join(format_inspection(settings, report)))
+    print_result(arguments, {"ok": is_well, **msgspec.to_builtins(report)}, format_inspection(settings, report))
     return 0 if is_well else 1
 
 
@@ -334,9 +326,9 @@ def format_inspection(settings: CloudSettings, report: CameraReport) -> Iterator
     """Return what a camera file gives, in lines."""
     for name, one in report.cameras.items():
         state = f"{one.fault}: {one.detail}" if one.fault else "well"
-        yield to_printable(f"camera {name}: {one.hz:.1f} frames per second, {state}")
+        yield f"camera {name}: {one.hz:.1f} frames per second, {state}"
     if report.warning:
-        yield to_printable(report.warning)
+        yield report.warning
     if not report.points:
         yield f"cloud {report.stream}: no points came"
         yield from _format_drops(report)
@@ -362,14 +354,10 @@ def _format_drops(report: CameraReport) -> Iterator[str]:
 
 
 def _inspect_session(arguments: argparse.Namespace) -> int:
-    import msgspec
-
-    from iris_session.client import Client
     from iris_session.client.stream_meter import StreamMeter
 
     arguments.address, arguments.session = arguments.target, ""
-    check_session_reachable(arguments)
-    with Client(arguments.address, role="observer", name="cloud inspect", join_code=arguments.code) as client:
+    with make_client(arguments, Role.OBSERVER, "cloud inspect") as client:
         shown = (MediaEncoding.CLOUD, MediaEncoding.JPEG)
 
         def list_streams() -> list[str]:
@@ -385,18 +373,15 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
                 meter.poll(time.monotonic_ns())
         found = [meter.measure(time.monotonic_ns()) for meter in meters]
     is_well = bool(found) and all(one.frames and not one.fault and not one.stale for one in found)
-    if arguments.json:
-        print_json({"ok": is_well, "streams": msgspec.to_builtins(found)})
-    elif not found:
-        print("the session has no cloud: `iris-session serve --camera FILE`, or `iris-session cloud run FILE`")
-    else:
-        print("\n".join(line for one in found for line in _format_stream(one)))
+    none = "the session has no cloud: `iris-session serve --camera FILE`, or `iris-session cloud run FILE`"
+    lines = [line for one in found for line in _format_stream(one)] or [none]
+    print_result(arguments, {"ok": is_well, "streams": found}, lines)
     return 0 if is_well else 1
 
 
 def _format_stream(one: StreamMeasurement) -> Iterator[str]:
     name = f"{one.stream} ({one.title})" if one.title not in ("", one.stream) else one.stream
-    yield to_printable(f"{name}: {one.hz:.1f} Hz, class {one.budget_class}, {one.mbit_per_s:.1f} Mbit/s")
+    yield f"{name}: {one.hz:.1f} Hz, class {one.budget_class}, {one.mbit_per_s:.1f} Mbit/s"
     if one.points is not None and one.voxel_m is not None:
         error = "" if one.error_mm is None else f", stated error {one.error_mm:.1f} mm"
         size = "" if one.bytes_per_point is None else f", {one.bytes_per_point:.2f} bytes each"
@@ -405,4 +390,4 @@ def _format_stream(one: StreamMeasurement) -> Iterator[str]:
         stages = ", ".join(f"{stage} {ms:.1f}" for stage, ms in one.ages_ms.items())
         yield f"  age {one.age_ms:.0f} ms, median{': ' if stages else ''}{stages}"
     if one.fault or one.stale:
-        yield to_printable(f"  {one.fault or 'stale'}: {one.detail or 'no frames come'}")
+        yield f"  {one.fault or 'stale'}: {one.detail or 'no frames come'}"

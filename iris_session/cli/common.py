@@ -9,14 +9,16 @@ import math
 import re
 import signal
 import socket
+import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
-from anchors.pose import pose_to_dict as pose_to_dict  # noqa: PLC0414 - for all commands
-from iris_session.protocol.names import AssignmentPolicy, LeaseMode
+from anchors.pose import quat_normalize
+from iris_session.protocol.errors import IrisError
+from iris_session.protocol.names import AlignmentKind, AssignmentPolicy, LeaseMode
 from iris_session.system.files import write_output
 
 if TYPE_CHECKING:
@@ -27,16 +29,21 @@ if TYPE_CHECKING:
     from iris_session.demo.named_scenes import NamedScene
     from iris_session.protocol.server_messages import ParticipantInfo
 
+N = TypeVar("N", int, float)
 
 #: Bytes of each unit of a size.
 _BYTES: Final = {
     f"{letter}{i}b": base**n for n, letter in enumerate("kmgt", 1) for i, base in (("", 1000), ("i", 1024))
 }
+#: The least number above 0.
+ABOVE_0: Final = math.ulp(0.0)
+#: Lines of one kind that are printed; `--json` has all.
+MOST_LINES: Final = 20
 #: Timeout of the test whether a session is reachable [s].
 CONNECT_S: Final = 2.0
 
 
-class CommandError(Exception):
+class CommandError(IrisError):
     """The command cannot continue. The text is one line: what is wrong, and what would be right."""
 
     def __init__(self, text: str, status: int = 2) -> None:
@@ -63,24 +70,29 @@ def ending_as_interrupts() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def parse_number(text: str, is_valid: Callable[[float], bool], wanted: str) -> float:
-    """Parse the number of an option.
+def make_number_type(kind: Callable[[str], N], wanted: str, low: float, high: float = math.inf) -> Callable[[str], N]:
+    """Return a type for `add_argument`: finite numbers from `low` to `high`.
 
     Args:
-        text: What was given.
-        is_valid: Whether the option takes a number.
+        kind: `float` or `int`.
         wanted: What it is and what to give, for the error.
+        low: Least number.
+        high: Greatest number.
     """
-    with suppress(ValueError):
-        number = float(text)
-        if math.isfinite(number) and is_valid(number):
-            return number
-    raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
+
+    def parse(text: str) -> N:
+        with suppress(ValueError):
+            number = kind(text)
+            if math.isfinite(number) and low <= number <= high:
+                return number
+        raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
+
+    return parse
 
 
-def parse_seconds(text: str) -> float:
-    """Parse the duration of an option [s]."""
-    return parse_number(text, lambda s: s > 0.0, "a duration: give seconds above 0, for example 30")
+#: Types of options: a duration [s], and `--port-base`.
+parse_seconds: Final = make_number_type(float, "a duration: give seconds above 0, for example 30", ABOVE_0)
+parse_port_base: Final = make_number_type(int, "a base of seven ports: give 1 to 65529, for example 7730", 1, 65529)
 
 
 def parse_cloud_rate(text: str) -> float:
@@ -88,11 +100,10 @@ def parse_cloud_rate(text: str) -> float:
     from iris_session.session.config import MAX_CLOUDS_HZ, MIN_CLOUDS_HZ
 
     number = text.lower().removesuffix("hz").strip()
-    return parse_number(
-        "0" if number == "off" else number,
-        lambda hz: hz == 0.0 or MIN_CLOUDS_HZ <= hz <= MAX_CLOUDS_HZ,
-        f"a rate: give {MIN_CLOUDS_HZ:g} to {MAX_CLOUDS_HZ:g} a second, for example 2Hz, or off",
-    )
+    if number in ("off", "0"):
+        return 0.0
+    wanted = f"a rate: give {MIN_CLOUDS_HZ:g} to {MAX_CLOUDS_HZ:g} a second, for example 2Hz, or off"
+    return make_number_type(float, wanted, MIN_CLOUDS_HZ, MAX_CLOUDS_HZ)(number)
 
 
 def parse_budget(text: str) -> int:
@@ -106,13 +117,6 @@ def parse_budget(text: str) -> int:
             f"{text!r} is not a size for a recording: give {MIN_BUDGET_BYTES // 10**6}MB or more, for example 20GB"
         )
     return n_bytes
-
-
-def parse_port_base(text: str) -> int:
-    """Parse `--port-base`."""
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 65529:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a base of seven ports: give 1 to 65529, for example 7730")
-    return int(text)
 
 
 def add_command(
@@ -142,13 +146,8 @@ def add_command(
     lines = inspect.cleandoc(examples).split("\n")
     title = "examples" if len(lines) > 1 else "example"
     epilog = f"{notes}\n\n" * bool(notes) + "\n  ".join((f"{title}:", *lines))
-    parser = commands.add_parser(
-        name,
-        help=help,
-        description=description,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    form = argparse.RawDescriptionHelpFormatter
+    parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=form)
     if run is not None:
         parser.set_defaults(run=run)
     return parser
@@ -211,6 +210,21 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
         ) from None
 
 
+def make_client(arguments: argparse.Namespace, role: str, name: str) -> Client:
+    """Return a client, not connected yet, for the options of `add_address_options`.
+
+    Raises:
+        CommandError: Nothing listens at the address.
+    """
+    from iris_session.client import Client
+
+    check_session_reachable(arguments)
+    session, code = arguments.session, arguments.code
+    return Client(
+        arguments.address, session=session, join_code=code, role=role, name=name, alignment=AlignmentKind.NOT_NEEDED
+    )
+
+
 def find_participant(client: Client, name: str) -> ParticipantInfo:
     """Return the participant with an id or name.
 
@@ -243,7 +257,7 @@ def describe_own_sessions() -> str:
 def add_session_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of commands that open a session."""
     group = parser.add_argument_group("session")
-    group.add_argument("--name", default=None, help="name of the session (default: that of the scene)")
+    group.add_argument("--name", help="name of the session (default: that of the scene)")
     group.add_argument(
         "--host",
         default="127.0.0.1",
@@ -266,38 +280,32 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--port-base",
         type=parse_port_base,
-        default=None,
         metavar="N",
         help="block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)",
     )
     group.add_argument("--no-beacon", action="store_true", help="do not announce the session on the network")
-    group.add_argument("--control-port", type=int, default=None, metavar="PORT", help="0: any free port")
-    group.add_argument("--state-port", type=int, default=None, metavar="PORT", help="0: any free port")
+    group.add_argument("--control-port", type=int, metavar="PORT", help="0: any free port")
+    group.add_argument("--state-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--curve", action="store_true", help="encrypt on loopback too, and admit listed keys only")
     group.add_argument(
         "--curve-key", default="", metavar="FILE", help="CURVE secret key of the server (default: the user's)"
     )
-    group.add_argument(
-        "--record", default=None, metavar="FILE", help="path of the recording (default: below sessions/)"
-    )
+    group.add_argument("--record", metavar="FILE", help="path of the recording (default: below sessions/)")
     group.add_argument(
         "--record-clouds",
         type=parse_cloud_rate,
-        default=None,
         metavar="RATE",
         help="frames per second of each point cloud and picture in the recording, or off (default: 2Hz)",
     )
     group.add_argument(
         "--record-assets",
         choices=("none", "scene", "all"),
-        default=None,
         help="what of the scenes goes into the recording: what the best level of detail needs (scene), all levels, or "
         "nothing (default: scene)",
     )
     group.add_argument(
         "--record-budget",
         type=parse_budget,
-        default=None,
         metavar="SIZE",
         help="size that the recording may have, such as 20GB; the session goes on without one then (default: no limit)",
     )
@@ -310,17 +318,13 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--no-web", action="store_true", help="serve no page for browsers")
     group.add_argument("--sites", action="store_true", help="send the model's sites to clients")
     group.add_argument("--tendons", action="store_true", help="send the model's spatial tendons to clients")
-    group.add_argument(
-        "--assignment", choices=sorted(AssignmentPolicy.ALL), default=None, help="how robots are assigned"
-    )
-    group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")
+    group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), help="how robots are assigned")
+    group.add_argument("--mode", choices=sorted(LeaseMode.ALL), help="lease mode of every robot")
 
 
 def add_page_options(group: argparse._ActionsContainer) -> None:
     """Add the options of the page for browsers, for `serve`, `demo` and `web`."""
-    group.add_argument(
-        "--web-port", type=int, default=None, metavar="PORT", help="port of the page for browsers (default: 7725)"
-    )
+    group.add_argument("--web-port", type=int, metavar="PORT", help="port of the page for browsers (default: 7725)")
     group.add_argument(
         "--web-cert", default="", metavar="FILE", help="certificate for HTTPS, PEM (default: one of this user's own)"
     )
@@ -362,9 +366,43 @@ def to_printable(text: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
-def print_json(value: dict[str, Any]) -> None:
-    """Print one JSON object to standard output."""
-    print(json.dumps(value, allow_nan=False), flush=True)
+def print_json(value: object) -> None:
+    """Print one JSON object to standard output. Structs in it are printed by their fields."""
+    from msgspec import to_builtins
+
+    print(json.dumps(value, allow_nan=False, default=to_builtins), flush=True)
+
+
+def print_result(arguments: argparse.Namespace, value: object, lines: Iterable[str]) -> None:
+    """Print the result of a command: one JSON object for `--json`, else lines, made printable."""
+    if arguments.json:
+        print_json(value)
+    else:
+        print("\n".join(map(to_printable, lines)), flush=True)
+
+
+def list_first(lines: Sequence[str], most: int = MOST_LINES) -> list[str]:
+    """Return the first lines of a long list, and how many more `--json` has."""
+    more = [f"and {len(lines) - most} more: --json has all"] if len(lines) > most else []
+    return [*lines[:most], *more]
+
+
+def pick_attributes(value: object, *names: str) -> dict[str, object]:
+    """Return some attributes of an object by their names."""
+    return {name: getattr(value, name) for name in names}
+
+
+def print_error(text: str) -> None:
+    """Print one printable line to standard error."""
+    print(to_printable(f"iris-session: {text}"), file=sys.stderr)
+
+
+def report_damage(path: Path, problems: Sequence[str]) -> int:
+    """Print the first problem of a recording. Return the exit status."""
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        print_error(f"{path} is damaged: {problems[0]}{more}")
+    return 1 if problems else 0
 
 
 _UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -384,8 +422,7 @@ def parse_pose(text: str) -> PoseTuple:
             f"{text!r} is not a pose: x,y,z in metres and a unit quaternion qw,qx,qy,qz, for example 0,-0.45,0,1,0,0,0"
         )
     x, y, z, *q = numbers
-    norm = math.hypot(*q)
-    return (x, y, z), (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+    return (x, y, z), quat_normalize((q[0], q[1], q[2], q[3]))
 
 
 def join_negative_poses(arguments: Sequence[str]) -> list[str]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import getpass
 import re
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,10 +19,11 @@ from iris_session.cli.common import (
     add_address_options,
     add_command,
     add_json_option,
-    check_session_reachable,
     find_participant,
+    make_client,
+    print_error,
     print_json,
-    to_printable,
+    print_result,
 )
 from iris_session.protocol.client_messages import Rename, SetRole
 from iris_session.protocol.names import ControlAction, DenialReason, EpisodeAction, LeaseMode, Role
@@ -152,16 +152,13 @@ def run(arguments: argparse.Namespace) -> int:
             text += "; on the server: `iris-session pair --role director`"
         if isinstance(error, RefusedError) and arguments.act is stop_session:
             text += "; the e-stop was sent before, but not confirmed: look at the robots"
-        print(f"iris-session: {to_printable(text)}", file=sys.stderr)
+        print_error(text)
         if arguments.json:
             denied = error.denial.reason if isinstance(error, DeniedError) else ""
             reason = denied or (error.code if isinstance(error, RefusedError) else "no_answer")
             print_json({**result, "ok": False, "reason": reason, "error": text})
         return error.status if isinstance(error, CommandError) else 1
-    if arguments.json:
-        print_json({**result, **outcome.fields})
-    else:
-        print(to_printable(outcome.text))
+    print_result(arguments, {**result, **outcome.fields}, [outcome.text])
     return 0
 
 
@@ -172,9 +169,8 @@ def _join_session(arguments: argparse.Namespace) -> Iterator[Client]:
     stops = arguments.act is stop_session
     if stops and _ADDRESS.fullmatch(" ".join(arguments.reason)):
         raise CommandError(f"{arguments.reason[0]} is an address, not a reason: give it with --address")
-    check_session_reachable(arguments)
     for role in arguments.roles:
-        client = _make_client(arguments, role)
+        client = make_client(arguments, role, f"{_get_user_name()} (terminal)")
         try:
             if stops:
                 _begin_stop(client, " ".join(arguments.reason))
@@ -207,19 +203,6 @@ def _begin_stop(client: Client, reason: str) -> None:
     client.wait_for(try_stop, TIMEOUT_S)
 
 
-def _make_client(arguments: argparse.Namespace, role: str) -> Client:
-    from iris_session.client import Client
-
-    return Client(
-        arguments.address,
-        session=arguments.session,
-        join_code=arguments.code,
-        role=role,
-        name=f"{_get_user_name()} (terminal)",
-        alignment="not_needed",
-    )
-
-
 def _get_user_name() -> str:
     try:
         return getpass.getuser()[:32]
@@ -236,15 +219,10 @@ def stop_session(client: Client, arguments: argparse.Namespace) -> Outcome:
             f"the e-stop was sent, but the session has not confirmed it within {TIMEOUT_S:g} s: "
             "use the emergency stop of the robot"
         )
-    where = "".join(f" {name} {value}" for name, value in _get_place(arguments))
+    given = (("--address", arguments.address), ("--session", arguments.session))
+    where = "".join(f" {option} {value}" for option, value in given if value)
     text = f"E-STOP at {client.address}: every robot holds; continue with `iris-session clear-estop{where}`"
     return Outcome(text, {"estop": True})
-
-
-def _get_place(arguments: argparse.Namespace) -> list[tuple[str, str]]:
-    """Return the options that name the session."""
-    given = (("--address", arguments.address), ("--session", arguments.session))
-    return [(option, value) for option, value in given if value]
 
 
 def clear_session(client: Client, _: argparse.Namespace) -> Outcome:

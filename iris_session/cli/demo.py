@@ -12,9 +12,9 @@ from iris_session.cli.common import (
     add_command,
     add_json_option,
     add_session_options,
-    parse_number,
+    make_number_type,
     parse_seconds,
-    print_json,
+    print_result,
 )
 from iris_session.cli.view import live_viewer
 
@@ -68,7 +68,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     link.add_argument(
         "--latency",
-        type=parse_milliseconds,
+        type=make_number_type(float, "a delay: give 0 to 10000 milliseconds, for example 40", 0.0, 10_000.0),
         metavar="MS",
         help="delay of every operator's link, each way",
     )
@@ -77,15 +77,8 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.set_defaults(control_port=0, state_port=0)
 
 
-def parse_milliseconds(text: str) -> float:
-    """Parse the delay of an option [ms]."""
-    return parse_number(text, lambda ms: 0.0 <= ms <= 10_000.0, "a delay: give 0 to 10000 milliseconds, for example 40")
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run one demo and print its summary."""
-    import msgspec
-
     from iris_session.cli.live import TerminalView
     from iris_session.cli.serve import make_session_config
     from iris_session.demo.demos import make_demo
@@ -110,15 +103,12 @@ def run(arguments: argparse.Namespace) -> int:
     if play.cameras:
         print("preparing the cameras: the first time takes some seconds", file=out, flush=True)
     result = run_demo(play, config, arguments.timeout, show, profile, arguments.seed)
-    if arguments.json:
-        print_json(msgspec.to_builtins(result))
-    else:
-        print(format_summary(result))
+    print_result(arguments, result, format_summary(result))
     return 130 if result.interrupted else 0 if result.ok else 1
 
 
-def format_summary(result: DemoResult) -> str:
-    """Return the result as a few lines of text."""
+def format_summary(result: DemoResult) -> list[str]:
+    """Return the result as a few lines."""
     outcome = "ok" if result.ok else "interrupted" if result.interrupted else "FAILED"
     lines = [f"demo {result.demo}: {outcome} after {result.seconds:.1f} s"]
     lines += [
@@ -139,7 +129,7 @@ def format_summary(result: DemoResult) -> str:
     lines += [f"  problem: {problem}" for problem in result.problems]
     if result.recording:
         lines.append(f"look at it: iris-session view {result.recording}")
-    return "\n".join(lines)
+    return lines
 
 
 def _format_stream(observer: str, one: StreamMeasurement) -> str:

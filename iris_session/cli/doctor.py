@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import add_address_options, add_command, add_json_option, print_json, to_printable
+from iris_session.cli.common import add_address_options, add_command, add_json_option, print_result
 from iris_session.protocol.names import Role
 
 if TYPE_CHECKING:
@@ -49,16 +50,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the checks and print one screen, or one JSON object. Exit status 1 if a check failed."""
-    import os
-
     from iris_session.doctor.runner import DoctorReport, run_checks, run_host_checks
 
     if arguments.identity:
         os.environ["IRIS_HOME"] = arguments.identity
-    progress = sys.stderr.isatty() and not arguments.json
 
     def show_progress(what: str) -> None:
-        if progress:
+        if sys.stderr.isatty() and not arguments.json:
             print(f"... {what}", file=sys.stderr, flush=True)
 
     result: DoctorReport
@@ -72,29 +70,19 @@ def run(arguments: argparse.Namespace) -> int:
             role=arguments.role,
             on_progress=show_progress,
         )
-    if arguments.json:
-        print_json(result.as_dict())
-    else:
-        print("\n".join(format_findings(result.findings, show_skipped=arguments.all)))
-        print(format_verdict(result.findings))
+    lines = [*format_findings(result.findings, show_skipped=arguments.all), format_verdict(result.findings)]
+    print_result(arguments, result.as_dict(), lines)
     return 0 if result.ok else 1
 
 
-def format_findings(findings: Iterable[Finding], *, show_skipped: bool = False) -> list[str]:
-    """Return one line per check, with cause and advice below warnings and failures. Lines are printable: they hold
-    names that other users chose."""
-    found = []
+def format_findings(findings: Iterable[Finding], *, show_skipped: bool = False) -> Iterator[str]:
+    """Yield one line per check, with cause and advice below warnings and failures."""
     for one in findings:
         if one.state == "skipped" and not show_skipped:
             continue
-        found.append(to_printable(f"{MARKS[one.state]} {one.check:12s} {one.text}"))
+        yield f"{MARKS[one.state]} {one.check:12s} {one.text}"
         if one.state in ("warning", "failed"):
-            found += [
-                to_printable(f"{'':20s} {label}: {text}")
-                for label, text in (("why", one.why), ("do", one.advice))
-                if text
-            ]
-    return found
+            yield from (f"{'':20s} {label}: {text}" for label, text in (("why", one.why), ("do", one.advice)) if text)
 
 
 def format_verdict(findings: Iterable[Finding]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 
 from iris_session.cli.common import (
     CommandError,
@@ -12,6 +11,7 @@ from iris_session.cli.common import (
     add_command,
     check_session_reachable,
     parse_seconds,
+    print_error,
 )
 
 
@@ -91,12 +91,10 @@ def run(arguments: argparse.Namespace) -> int:
     options += [flag for flag, given in (("--json", arguments.json), ("--orders", arguments.orders)) if given]
     status = main(options, "iris-session")
     if status == 1:
-        try:
-            check_session_reachable(
-                arguments
-            )  # checked only now, for a better message: the session may have started meanwhile
+        try:  # only now, for a better message: the session may have started meanwhile
+            check_session_reachable(arguments)
         except CommandError as error:
-            print(f"iris-session: {error}", file=sys.stderr)
+            print_error(str(error))
     return status
 
 

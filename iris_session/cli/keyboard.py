@@ -10,7 +10,7 @@ import threading
 import tty
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
     from iris_session.session.session_base import SessionBase
@@ -21,30 +21,28 @@ ESTOP_KEY: Final = " "
 _LOCAL_MODES: Final = 3  # in what `tcgetattr` returns
 
 
-class KeyBinding:
-    """One key: what it does, and its name in the footer."""
+class KeyBinding(NamedTuple):
+    """A key: its name in the footer, and what it does."""
 
-    def __init__(self, key: str, text: str, act: Callable[[], None]) -> None:
-        self.key = key
-        self.text = text
-        self.act = act
+    text: str
+    act: Callable[[], None]
 
 
 def bind_session_keys(session: SessionBase) -> dict[str, KeyBinding]:
     """Return the keys of a session: space for the e-stop, `c` to clear it, `p` to pause and resume where it can."""
     from iris_session.session.session import Session
 
-    keys = [
-        KeyBinding(ESTOP_KEY, "space e-stop", lambda: session.estop("key in the terminal of the session")),
-        KeyBinding("c", "c clear e-stop", session.clear_estop),
-    ]
+    keys = {
+        ESTOP_KEY: KeyBinding("space e-stop", lambda: session.estop("key in the terminal of the session")),
+        "c": KeyBinding("c clear e-stop", session.clear_estop),
+    }
     if isinstance(session, Session):
 
         def toggle_pause() -> None:
             session.resume() if session.status().paused else session.pause()
 
-        keys.append(KeyBinding("p", "p pause/resume", toggle_pause))
-    return {one.key: one for one in keys}
+        keys["p"] = KeyBinding("p pause/resume", toggle_pause)
+    return keys
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import CommandError, add_command, add_json_option, print_json
+from iris_session.cli.common import CommandError, add_command, add_json_option, pick_attributes, print_result
 from iris_session.cli.pair import add_role_option, parse_roles
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import CURVE
@@ -97,18 +97,15 @@ def run_list(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome
 
     keys = KeyHome().clients.read()
-    if arguments.json:
-        names = ("name", "key", "roles", "kind", "added", "last_seen")
-        rows = [{"fingerprint": mark, **{name: getattr(one, name) for name in names}} for mark, one in keys.items()]
-        print_json({"keys": rows})
-        return 0
-    if not keys:
-        print("no keys are allowed yet: `iris-session pair` adds a new device")
+    names = ("name", "key", "roles", "kind", "added", "last_seen")
+    rows = [{"fingerprint": mark, **pick_attributes(one, *names)} for mark, one in keys.items()]
     width = max((len(one.name) for one in keys.values()), default=0)
-    for mark, one in keys.items():
-        roles, seen = ", ".join(one.roles) or "any role", one.last_seen or "never"
-        kind = "" if one.kind == CURVE else f"{one.kind}  "
-        print(f"{one.name:{width}}  {mark}  {kind}{roles}  added {one.added or 'manually'}  last seen {seen}")
+    lines = [
+        f"{one.name:{width}}  {mark}  {'' if one.kind == CURVE else f'{one.kind}  '}"
+        f"{', '.join(one.roles) or 'any role'}  added {one.added or 'manually'}  last seen {one.last_seen or 'never'}"
+        for mark, one in keys.items()
+    ]
+    print_result(arguments, {"keys": rows}, lines or ["no keys are allowed yet: `iris-session pair` adds a new device"])
     return 0
 
 
@@ -118,18 +115,14 @@ def run_allow(arguments: argparse.Namespace) -> int:
 
     home = KeyHome()
     given = arguments.key or home.load_identity().public
-    key = load_public(given) if _is_key_file(given) else given
+    is_file = os.path.exists(given) or Path(given).suffix in (".key", ".key_secret")
+    key = load_public(given) if is_file else given
     roles = parse_roles(arguments.role)
     if not arguments.key and arguments.role is None:
         roles = (*roles, Role.DIRECTOR)  # a user who can write this list can take every role anyway
     entry = home.clients.allow_key(arguments.name, key, roles)
     print(f"{entry.name} may join ({entry.fingerprint}) as {', '.join(entry.roles) or 'any role'}")
     return 0
-
-
-def _is_key_file(text: str) -> bool:
-    """Return whether the text names a file rather than being a key."""
-    return os.path.exists(text) or Path(text).suffix in (".key", ".key_secret")
 
 
 def run_revoke(arguments: argparse.Namespace) -> int:
@@ -151,18 +144,18 @@ def run_show(arguments: argparse.Namespace) -> int:
 
     home = KeyHome()
     server, own, page = home.find_server_key(), home.find_identity(), _find_page_certificate(home)
-    if arguments.json:
-        certificate = None if page is None else {"fingerprint": page.fingerprint, "key": page.key}
-        keys = {"server": _key_to_dict(server), "identity": _key_to_dict(own), "certificate": certificate}
-        print_json({"home": str(home.path), **keys})
-        return 0
-    print(f"folder of keys    {home.path}")
-    print(f"your sessions     {_format_key(server, 'created when you serve an encrypted session')}")
-    print(f"you as a client   {_format_key(own, 'created when you join an encrypted session')}")
+    certificate = None if page is None else {"fingerprint": page.fingerprint, "key": page.key}
+    keys = {"server": _key_to_dict(server), "identity": _key_to_dict(own), "certificate": certificate}
     text = "no certificate yet, created when you serve an encrypted session"
     if page is not None:
         text = f"certificate {page.fingerprint}    for {', '.join(page.names)}"
-    print(f"page for browsers {text}")
+    lines = [
+        f"folder of keys    {home.path}",
+        f"your sessions     {_format_key(server, 'created when you serve an encrypted session')}",
+        f"you as a client   {_format_key(own, 'created when you join an encrypted session')}",
+        f"page for browsers {text}",
+    ]
+    print_result(arguments, {"home": str(home.path), **keys}, lines)
     return 0
 
 

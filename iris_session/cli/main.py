@@ -31,7 +31,7 @@ from iris_session.cli import (
     view,
     web,
 )
-from iris_session.cli.common import CommandError, join_negative_poses, to_printable
+from iris_session.cli.common import CommandError, join_negative_poses, print_error
 from iris_session.protocol.errors import IrisError
 from iris_session.system.extras import describe_import_error
 from iris_session.system.log import LEVEL_VARIABLE, configure_logging
@@ -114,31 +114,25 @@ def _run_command(argv: list[str] | None) -> int:
     except BrokenPipeError:  # the reader of the pipe has closed it (`| head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has nowhere to go
         return 1
-    except CommandError as error:
-        print(f"iris-session: {error}", file=sys.stderr)
-        return error.status
     except ImportError as error:
         text = describe_import_error(error)
         if not text:
             raise
-        print(f"iris-session: {text}", file=sys.stderr)
+        print_error(text)
         return 2
     except IrisError as error:
-        lines = f"iris-session: {error}{_format_option_hint(error)}".split("\n")
-        print("\n".join(map(to_printable, lines)), file=sys.stderr)  # what a file holds may be in it
+        in_use = str(error).startswith("port ") and "is in use" in str(error)
+        # The library does not name options that help: a script has none.
+        hint = " (here: --port-base 7730, or --control-port 0 --state-port 0)" if in_use else ""
+        for line in f"{error}{hint}".split("\n"):
+            print_error(line)
         toml = getattr(error, "toml", "")  # of `AmbiguousModelError`
         if toml:  # to standard output: `iris-session robots scene.xml > robots.toml`
             print(toml)
-        return 2
+        return error.status if isinstance(error, CommandError) else 2
     finally:
         session_log.setLevel(logging.NOTSET)
     return status
-
-
-def _format_option_hint(error: Exception) -> str:
-    """Return the options that help with an error. The library does not name them: a script has no options."""
-    in_use = str(error).startswith("port ") and "is in use" in str(error)
-    return " (here: --port-base 7730, or --control-port 0 --state-port 0)" if in_use else ""
 
 
 if __name__ == "__main__":

@@ -8,7 +8,16 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from iris_session.cli.common import CommandError, add_command, add_json_option, parse_number, print_json
+from iris_session.cli.common import (
+    ABOVE_0,
+    CommandError,
+    add_command,
+    add_json_option,
+    make_number_type,
+    print_error,
+    print_json,
+    print_result,
+)
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import DEFAULT_ROLES
 from iris_session.security.private_folder import KeysBusyError
@@ -48,7 +57,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         """,
     )
     add_role_option(parser)
-    parser.add_argument("--minutes", type=_parse_minutes, default=10.0, metavar="M", help="validity in minutes (10)")
+    wanted = f"a time: give more than 0 and at most {MAX_MINUTES:g} minutes"
+    minutes = make_number_type(float, wanted, ABOVE_0, MAX_MINUTES)
+    parser.add_argument("--minutes", type=minutes, default=10.0, metavar="M", help="validity in minutes (10)")
     parser.add_argument("--name", default="", help="name of the device in the list (default: as the device sends it)")
     parser.add_argument(
         "--session", default="", metavar="NAME", help="name of the session, if several run on this machine"
@@ -93,7 +104,9 @@ def parse_roles(names: list[str] | None) -> tuple[str, ...]:
 def run(arguments: argparse.Namespace) -> int:
     """Create a code, print it, and wait. Exit status 1 if the code was not used."""
     from iris_session.client.address import pairing_uri
+    from iris_session.link.discovery import host_port
     from iris_session.security import KeyHome, load_secret
+    from iris_session.web.process import format_page_address
 
     if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
         raise CommandError(f"--web-port {arguments.web_port} is not a port: give 1 to 65535")
@@ -111,12 +124,14 @@ def run(arguments: argparse.Namespace) -> int:
     )
     try:
         uri = pairing_uri(*places[0], key.public, code, session)
-        page = "" if certificate is None or not web else _make_page_link(places[0][0], web, code)
+        page = ""
+        if certificate is not None and web:  # what follows the `#` is not sent to the server
+            page = f"{format_page_address(places[0][0], web, secure=True)}#c={code}"
         invitation = {
             "code": code,
             "uri": uri,
             "session": session,
-            "addresses": [_format_address(*place) for place in places],
+            "addresses": [host_port(*place) for place in places],
             "fingerprint": key.fingerprint,
             "roles": list(roles),
             "expires": made.expires,
@@ -128,11 +143,6 @@ def run(arguments: argparse.Namespace) -> int:
     except BaseException:
         home.join_codes.cancel(made.id)  # no process waits for the code any more
         raise
-
-
-def _parse_minutes(text: str) -> float:
-    wanted = f"a time: give more than 0 and at most {MAX_MINUTES:g} minutes"
-    return parse_number(text, lambda minutes: 0.0 < minutes <= MAX_MINUTES, wanted)
 
 
 def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[str]) -> Certificate | None:
@@ -148,13 +158,6 @@ def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[
         if arguments.web:
             raise
         return None  # no page, no certificate
-
-
-def _make_page_link(host: str, port: int, code: str) -> str:
-    """Return the link that opens the page and joins. What follows the `#` is not sent to the server."""
-    from iris_session.web.process import format_page_address
-
-    return f"{format_page_address(host, port, secure=True)}#c={code}"
 
 
 def _find_addresses(
@@ -186,7 +189,7 @@ def _find_web_port(arguments: argparse.Namespace, note: RegisteredSession) -> in
             f"session {note.name!r} serves no page: pip install 'iris-session[web]' there, or leave out --no-web"
         )
     if arguments.web and note.web and port != note.web:
-        print(f"iris-session: session {note.name!r} serves its page at port {note.web}, not {port}", file=sys.stderr)
+        print_error(f"session {note.name!r} serves its page at port {note.web}, not {port}")
     return port
 
 
@@ -198,10 +201,9 @@ def _guess_web_port(arguments: argparse.Namespace, control_port: int) -> int:
         return int(arguments.web_port)
     port = control_port + WEB_FROM_CONTROL
     if arguments.web:
-        print(
-            f"iris-session: no session with control port {control_port} runs here, so the page is assumed at port "
-            f"{port}: give --web-port if it has another one",
-            file=sys.stderr,
+        print_error(
+            f"no session with control port {control_port} runs here, so the page is assumed at port {port}: give "
+            "--web-port if it has another one"
         )
     return port
 
@@ -216,12 +218,6 @@ def _format_session_choice(name: str, here: list[RegisteredSession], found: list
     if not found:
         return f"no session {name!r} runs here; running: {names}"
     return f"{len(found)} sessions run here ({names}): choose with --session NAME or --address HOST:PORT"
-
-
-def _format_address(host: str, port: int) -> str:
-    from iris_session.link.discovery import host_port
-
-    return host_port(host, port)
 
 
 def _print_invitation(arguments: argparse.Namespace, invitation: dict[str, Any]) -> None:
@@ -266,23 +262,13 @@ def _wait_until_used(home: KeyHome, made: JoinCode, arguments: argparse.Namespac
             break
         time.sleep(POLL_S)
     entry = None if now is None else now.paired
-    listed = entry is not None and entry.fingerprint in home.clients.read()
-    if entry is not None and listed:
-        invitation: dict[str, Any] = {
-            "paired": entry.name,
-            "fingerprint": entry.fingerprint,
-            "roles": list(entry.roles),
-        }
-        text = f"paired: {entry.name} ({entry.fingerprint})"
-    else:
-        reason = _find_failure_reason(now)
-        invitation = {"paired": None, "reason": reason}
-        text = FAILURE_TEXTS[reason]
-    if arguments.json:
-        print_json(invitation)
-    else:
-        print(text, flush=True)
-    return 0 if listed else 1
+    if entry is not None and entry.fingerprint in home.clients.read():
+        result = {"paired": entry.name, "fingerprint": entry.fingerprint, "roles": entry.roles}
+        print_result(arguments, result, [f"paired: {entry.name} ({entry.fingerprint})"])
+        return 0
+    reason = _find_failure_reason(now)
+    print_result(arguments, {"paired": None, "reason": reason}, [FAILURE_TEXTS[reason]])
+    return 1
 
 
 def _find_failure_reason(code: JoinCode | None) -> str:

@@ -49,33 +49,30 @@ class ProgressLine:
         self.end()
 
 
-class ReadingProgress:
+class ReadingProgress(ProgressLine):
     """A progress line while a file takes more than `PROGRESS_AFTER_S` to be read."""
 
     def __init__(self, path: Path) -> None:
-        self._line = ProgressLine(path, PROGRESS_AFTER_S)
-        self._opening = Timer(PROGRESS_AFTER_S, self._line.show, ["opening"])  # takes about as long as reading
+        super().__init__(path, PROGRESS_AFTER_S)
+        self._opening = Timer(PROGRESS_AFTER_S, self.show, ["opening"])  # takes about as long as reading
         self._opening.daemon = True
 
-    def show(self, done: int, total: int) -> None:
+    def show_steps(self, done: int, total: int) -> None:
         """Show how many steps were read; `total` 0 if unknown."""
         self._opening.cancel()
-        self._line.show(f"step {done} of {total}" if total else f"step {done}")
+        self.show(f"step {done} of {total}" if total else f"step {done}")
 
     def show_bytes(self, done: int, total: int) -> None:
         """Show how many bytes were read for a copy; after all of them, Rerun still has to write it."""
         self._opening.cancel()
         read = f"read {done / 1e6:.0f} of {total / 1e6:.0f} MB"
-        self._line.show(read if done < total else f"{read}, writing the copy", at_once=done >= total)
+        self.show(read if done < total else f"{read}, writing the copy", at_once=done >= total)
 
     def end(self) -> None:
         """End the line. May be called twice."""
         self._opening.cancel()
-        self._line.end()
+        super().end()
 
     def __enter__(self) -> Self:
         self._opening.start()
         return self
-
-    def __exit__(self, *_: object) -> None:
-        self.end()

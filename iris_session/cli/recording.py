@@ -1,24 +1,34 @@
-"""`iris-session recording`, and its action `inspect`: what a recording holds, or one line for each of a folder."""
+"""`iris-session recording`, its actions `inspect` (what a recording, or each of a folder, holds) and `repair`."""
 
 from __future__ import annotations
 
 import argparse
 import os
-import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli import recording_export, recording_render, recording_repair
-from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
+from iris_session.cli import recording_export, recording_render
+from iris_session.cli.common import (
+    MOST_LINES,
+    CommandError,
+    add_command,
+    add_json_option,
+    ending_as_interrupts,
+    list_first,
+    print_error,
+    print_json,
+    print_result,
+    to_printable,
+)
 from iris_session.cli.progress import ReadingProgress
 
 if TYPE_CHECKING:
+    from iris_session.recording.repair import RepairReport
     from iris_session.recording.summary import PersonSummary, RecordingSummary, StopSummary, StreamSummary
     from iris_session.rrd.assets import AssetsSummary
 
-#: Lines of one kind that are printed; `--json` has all.
-MOST_LINES: Final = 20
 SUFFIX: Final = ".rrd"
 _CLASSES: Final = {
     "closed": "closed: `verify` re-simulates authority, control and physics",
@@ -28,43 +38,60 @@ _CLASSES: Final = {
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `recording`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "recording",
+        None,
         help="show what a recording holds, export it as tables, make a film of it, repair it",
         description="Show what a recording holds, export it as tables, make a film or a picture of it, or repair it.",
-        epilog="examples:\n"
-        "  iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd\n"
-        "  iris-session recording inspect sessions\n"
-        "  iris-session recording export session.rrd --to csv -o tables\n"
-        "  iris-session recording render session.rrd -o session.mp4\n"
-        "  iris-session recording repair session.rrd -o repaired.rrd",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd
+            iris-session recording inspect sessions
+            iris-session recording export session.rrd --to csv -o tables
+            iris-session recording render session.rrd -o session.mp4
+            iris-session recording repair session.rrd -o repaired.rrd
+        """,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    inspect = actions.add_parser(
+    inspect = add_command(
+        actions,
         "inspect",
+        run_inspect,
         help="who took part, what happened, how long, what is damaged",
         description="Show what a recording holds: scene, people, robots that they held, episodes, handovers, e-stops, "
         "clouds and pictures, alignment, drops, damage. Of a folder: every recording below it, one line each. "
         "Exit status 1 if something is damaged or missing inside.",
-        epilog="examples:\n"
-        "  iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd\n"
-        "  iris-session recording inspect session.rrd --json\n"
-        "  iris-session recording inspect sessions    a line for every recording",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd
+            iris-session recording inspect session.rrd --json
+            iris-session recording inspect sessions    a line for every recording
+        """,
     )
     inspect.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it")
     add_json_option(inspect)
-    inspect.set_defaults(run=run_inspect)
     recording_export.register(actions)
     recording_render.register(actions)
-    recording_repair.register(actions)
+    repair = add_command(
+        actions,
+        "repair",
+        run_repair,
+        help="everything that can be read of a damaged recording, in a new file",
+        description="Write everything that can be read of a recording, its parts included, into one new file that "
+        "Rerun's viewer opens at once, and say what is lost. The recording itself is not changed. Exit status 1 if "
+        "something inside is damaged or missing, as with `inspect`; 2 if nothing could be written.",
+        examples="""
+            iris-session recording repair sessions/20261121T093000.000000Z-handover -o repaired.rrd
+            iris-session recording repair session.rrd -o repaired.rrd --force --json
+        """,
+    )
+    repair.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
+    repair.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the file to write")
+    repair.add_argument("--force", action="store_true", help="replace FILE if it exists")
+    add_json_option(repair)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print the summary of a recording, or a line for each of a folder."""
-    import msgspec
-
     from iris_session.system.extras import require_package
 
     path: Path = arguments.path
@@ -75,10 +102,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         if path.is_dir():
             return _inspect_folder(path, as_json=arguments.json)
         summary = _summarise_file(path)
-    if arguments.json:
-        print_json(msgspec.to_builtins(summary))
-    else:
-        print("\n".join(format_summary(summary)))
+    print_result(arguments, summary, format_summary(summary))
     return 0 if summary.ok else 1
 
 
@@ -93,7 +117,7 @@ def _inspect_folder(folder: Path, *, as_json: bool) -> int:
 
     def refuse(path: str, why: str) -> None:
         rows.append({"path": path, "ok": False, "error": why})
-        print(to_printable(f"iris-session: {why}"), file=sys.stderr)
+        print_error(why)
 
     files = find_recordings(folder, lambda error: refuse(str(error.filename), str(error)))
     if not files and not rows:
@@ -109,7 +133,7 @@ def _inspect_folder(folder: Path, *, as_json: bool) -> int:
             continue
         rows.append(msgspec.to_builtins(summary))
         if not as_json:
-            print(format_line(summary), flush=True)
+            print(to_printable(format_line(summary)), flush=True)
     ok = all(row["ok"] for row in rows)
     if as_json:
         print_json({"ok": ok, "recordings": rows})
@@ -121,7 +145,7 @@ def _summarise_file(path: Path) -> RecordingSummary:
     from iris_session.recording.summary import summarise
 
     with ReadingProgress(path) as progress, Recording.open(path, warn=False) as recording:
-        return summarise(recording, progress.show)
+        return summarise(recording, progress.show_steps)
 
 
 def format_line(summary: RecordingSummary) -> str:
@@ -135,8 +159,8 @@ def format_line(summary: RecordingSummary) -> str:
         _join(people) if people else "no people",
     ]
     if summary.episodes:
-        verdicts = [episode.verdict for episode in summary.episodes]
-        parts.append(f"{_count(len(verdicts), 'episode')} ({_format_counts(_count_all(verdicts))})")
+        verdicts = Counter(episode.verdict for episode in summary.episodes)
+        parts.append(f"{_count(len(summary.episodes), 'episode')} ({_format_counts(verdicts)})")
     if summary.handovers:
         parts.append(_count(len(summary.handovers), "handover"))
     if summary.stops:
@@ -145,15 +169,11 @@ def format_line(summary: RecordingSummary) -> str:
         parts.append(summary.ending.partition(":")[0])
     if summary.damage:
         parts.append(f"DAMAGED: {summary.damage[0]}")
-    return to_printable("  ".join(parts))
+    return "  ".join(parts)
 
 
-def format_summary(summary: RecordingSummary) -> list[str]:
-    """Return a recording as printable lines."""
-    return [to_printable(line) for line in _format_lines(summary)]
-
-
-def _format_lines(summary: RecordingSummary) -> Iterator[str]:
+def format_summary(summary: RecordingSummary) -> Iterator[str]:
+    """Yield a recording as lines."""
     yield f"{summary.session_name}  {_format_day(summary)}  {_format_duration(summary.duration_s)}"
     files = f", {len(summary.files)} parts: {_join(summary.files)}" if len(summary.files) > 1 else ""
     yield f"  file       {summary.path}, {summary.bytes / 1e6:.1f} MB, format {summary.format}{files}"
@@ -194,10 +214,8 @@ def _format_lines(summary: RecordingSummary) -> Iterator[str]:
 
 
 def _format_list(title: str, lines: Sequence[str]) -> Iterator[str]:
-    for i, line in enumerate(lines[:MOST_LINES] or ["none"]):
+    for i, line in enumerate(list_first(lines or ["none"])):
         yield f"  {title if i == 0 else '':9s}  {line}"
-    if len(lines) > MOST_LINES:
-        yield f"  {'':9s}  and {len(lines) - MOST_LINES} more: --json has all"
 
 
 def _format_person(person: PersonSummary) -> str:
@@ -286,10 +304,6 @@ def _format_counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{n} {name}" for name, n in sorted(counts.items(), key=lambda item: -item[1]))
 
 
-def _count_all(names: Sequence[str]) -> dict[str, int]:
-    return {name: names.count(name) for name in dict.fromkeys(names)}
-
-
 def _count(n: int, noun: str) -> str:
     return f"{n:,} {noun}{'' if n == 1 else 's'}"
 
@@ -297,3 +311,38 @@ def _count(n: int, noun: str) -> str:
 def _join(names: Sequence[str]) -> str:
     shown = ", ".join(names[:MOST_LINES]) or "none"
     return f"{shown} and {len(names) - MOST_LINES} more" if len(names) > MOST_LINES else shown
+
+
+# --- repair -----------------------------------------------------------------------------------------------------------
+
+
+def run_repair(arguments: argparse.Namespace) -> int:
+    """Repair a recording, and print what is in the new file and what is lost."""
+    from iris_session.recording.repair import repair
+
+    path: Path = arguments.path
+    if not path.exists():
+        raise CommandError(f"{path} does not exist: give a recording (session.rrd), or its folder")
+    with ending_as_interrupts(), ReadingProgress(path) as progress:
+        report = repair(path, arguments.out, overwrite=arguments.force, progress=progress.show_bytes)
+    print_result(arguments, report, format_repair(report))
+    return 0 if report.ok else 1
+
+
+def format_repair(report: RepairReport) -> Iterator[str]:
+    """Yield a report as lines."""
+    yield (
+        f"{report.output}: {report.steps:,} steps, {report.duration_s:.1f} s, {report.bytes / 1e6:.1f} MB, of "
+        f"{', '.join(report.files)}"
+    )
+    lost = []
+    if report.lost_bytes:
+        lost.append(f"{report.lost_bytes:,} bytes that cannot be read")
+    if report.lost_steps:
+        span = f" in {report.lost_s:.2f} s" if report.lost_s else ""
+        lost.append(f"{report.lost_steps:,} steps{span}")
+    if not report.finished:
+        lost.append("what may have followed the last step: the recording was not closed")
+    yield f"  lost    {'; '.join(lost) or 'nothing'}"
+    for i, line in enumerate(list_first((*report.damage, *report.cuts, *report.notes))):
+        yield f"  {'found' if i == 0 else '':7s} {line}"

@@ -3,46 +3,53 @@
 from __future__ import annotations
 
 import argparse
-import math
-import sys
 from pathlib import Path
 from typing import Final
 
-from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
+from iris_session.cli.common import (
+    ABOVE_0,
+    MOST_LINES,
+    CommandError,
+    add_command,
+    add_json_option,
+    ending_as_interrupts,
+    make_number_type,
+    print_result,
+    report_damage,
+)
 from iris_session.cli.progress import ProgressLine
 
 DEFAULT_HZ: Final = 100.0
 #: What `--to` may be: formats of tables, and the other thing that is exported.
 FORMATS: Final = ("csv", "parquet", "npz")
 ASSETS: Final = "assets"
-#: Lines about assets that are printed; `--json` has all.
-MOST_LINES: Final = 20
 
 
 def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `export` of `recording`."""
-    parser = actions.add_parser(
+    parser = add_command(
+        actions,
         "export",
+        run_export,
         help="write joints, poses, forces, commands, samples and events as tables, or what its scenes are drawn of",
         description="Write a recording as tables: one per robot (joints, end effector, gripper, contact force), per "
         "object (pose, contact force) and of the commands of each robot, one of raw samples, one of events. Rows are "
         "steps of the session as they were: of class closed it is simulated again and compared bit for bit, of class "
         "open the states are in the recording. Or write the assets of its scenes: specifications, meshes, textures, "
         "each in a file named by its hash, and scenes.json. Exit status 1 if something is damaged or missing.",
-        epilog="examples:\n"
-        "  iris-session recording export session.rrd --to parquet -o tables\n"
-        "  iris-session recording export session.rrd --to csv -o tables --hz 30 --robot left --table robots\n"
-        "  iris-session recording export session.rrd --to npz -o tables --hz 500    every step at 500 Hz\n"
-        "  iris-session recording export session.rrd --to assets -o scene-files",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session recording export session.rrd --to parquet -o tables
+            iris-session recording export session.rrd --to csv -o tables --hz 30 --robot left --table robots
+            iris-session recording export session.rrd --to npz -o tables --hz 500    every step at 500 Hz
+            iris-session recording export session.rrd --to assets -o scene-files
+        """,
     )
     parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
     parser.add_argument("--to", required=True, choices=(*FORMATS, ASSETS), help="format of the tables, or assets")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the files")
     parser.add_argument(
         "--hz",
-        type=parse_hz,
-        default=None,
+        type=make_number_type(float, "a rate: give rows per second above 0, for example 100", ABOVE_0),
         metavar="RATE",
         help="rows per second of robots, objects and commands; at the rate of the session, every step (default: 100)",
     )
@@ -57,24 +64,10 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     )
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty, replace its files")
     add_json_option(parser)
-    parser.set_defaults(run=run_export)
-
-
-def parse_hz(text: str) -> float:
-    """Parse `--hz`."""
-    try:
-        hz = float(text)
-    except ValueError:
-        hz = math.nan
-    if not (math.isfinite(hz) and hz > 0.0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a rate: give rows per second above 0, for example 100")
-    return hz
 
 
 def run_export(arguments: argparse.Namespace) -> int:
     """Write the tables, and print a line for each, or write the assets."""
-    import msgspec
-
     from iris_session.system.extras import require_package
 
     require_package("rerun", "reading recordings")
@@ -96,15 +89,10 @@ def run_export(arguments: argparse.Namespace) -> int:
         SessionRecording.open(arguments.path, warn=False) as recording,
     ):
         report = export_recording(recording, arguments.out, arguments.to, options, progress.show)
-    if arguments.json:
-        print_json(msgspec.to_builtins(report))
-    else:
-        for table in report.tables:
-            print(to_printable(f"{arguments.out / table.file}: {table.rows:,} rows, {table.columns} columns"))
-    return _report_damage(
-        arguments.path,
-        [*(f"steps {first} to {last} are left out" for first, last in report.left_out), *report.damage],
-    )
+    lines = (f"{arguments.out / one.file}: {one.rows:,} rows, {one.columns} columns" for one in report.tables)
+    print_result(arguments, report, lines)
+    left_out = (f"steps {first} to {last} are left out" for first, last in report.left_out)
+    return report_damage(arguments.path, [*left_out, *report.damage])
 
 
 def _export_assets(arguments: argparse.Namespace) -> int:
@@ -135,19 +123,7 @@ def _export_assets(arguments: argparse.Namespace) -> int:
         )
         damage = (*recording.missing, *recording.damage, *report.damage)
         report = msgspec.structs.replace(report, damage=damage)
-    if arguments.json:
-        print_json(msgspec.to_builtins(report))
-    else:
-        size = f"{report.assets:,} assets, {report.bytes / 1e6:.1f} MB, scenes: {report.scenes:,}"
-        print(to_printable(f"{report.folder}: {size}"))
-        for line in report.left_out[:MOST_LINES]:
-            print(to_printable(f"  not recorded: {line}"))
-    return _report_damage(arguments.path, list(report.damage))
-
-
-def _report_damage(path: Path, problems: list[str]) -> int:
-    """Print the first problem of a recording. Return the exit status."""
-    if problems:
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        print(to_printable(f"iris-session: {path} is damaged: {problems[0]}{more}"), file=sys.stderr)
-    return 1 if problems else 0
+    size = f"{report.assets:,} assets, {report.bytes / 1e6:.1f} MB, scenes: {report.scenes:,}"
+    missing = (f"  not recorded: {line}" for line in report.left_out[:MOST_LINES])
+    print_result(arguments, report, [f"{report.folder}: {size}", *missing])
+    return report_damage(arguments.path, report.damage)

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
-from iris_session.cli.common import CommandError, add_json_option, ending_as_interrupts, print_json, to_printable
+from iris_session.cli.common import (
+    CommandError,
+    add_command,
+    add_json_option,
+    ending_as_interrupts,
+    make_number_type,
+    print_result,
+    report_damage,
+)
 from iris_session.cli.progress import ProgressLine
 from iris_session.system.files import Replacement
 
@@ -36,21 +42,23 @@ _SECOND: Final = 1_000_000_000
 
 def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the action `render` of `recording`."""
-    parser = actions.add_parser(
+    parser = add_command(
+        actions,
         "render",
+        run,
         help="a film or a picture of the scene, through a camera of the model",
         description="Draw a recording with MuJoCo's renderer: a video (.mp4, codec VP9, which browsers play), an "
         "animation (.gif) or a picture of one moment (.png). Every picture is that of a step as it was: of class "
         "closed the session is simulated again and compared bit for bit, of class open the states are in the "
         "recording. It needs no display, but OpenGL (Debian: libegl1 libgl1-mesa-dri). Exit status 1 if something is "
         "damaged or missing.",
-        epilog="examples:\n"
-        "  iris-session recording render session.rrd -o session.mp4              a view of all that moves\n"
-        "  iris-session recording render session.rrd -o session.mp4 --camera operator --size 1920x1080\n"
-        "  iris-session recording render session.rrd -o handover.gif --from 4 --to 14 --speed 2 --fps 12 --people\n"
-        "  iris-session recording render session.rrd -o picture.png --at 12.5s\n"
-        "  iris-session recording render session.rrd --list-cameras",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session recording render session.rrd -o session.mp4              a view of all that moves
+            iris-session recording render session.rrd -o session.mp4 --camera operator --size 1920x1080
+            iris-session recording render session.rrd -o handover.gif --from 4 --to 14 --speed 2 --fps 12 --people
+            iris-session recording render session.rrd -o picture.png --at 12.5s
+            iris-session recording render session.rrd --list-cameras
+        """,
     )
     parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="the file to write: .mp4, .gif or .png")
@@ -62,10 +70,10 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         "--size", type=parse_size, default=DEFAULT_SIZE, metavar="WxH", help="pixels (default: 960x540)"
     )
     parser.add_argument(
-        "--fps", type=parse_positive, default=DEFAULT_FPS, metavar="N", help="pictures per second (default: 30)"
+        "--fps", type=parse_rate, default=DEFAULT_FPS, metavar="N", help="pictures per second (default: 30)"
     )
     parser.add_argument(
-        "--speed", type=parse_positive, default=1.0, metavar="N", help="times as fast as it was (default: 1)"
+        "--speed", type=parse_rate, default=1.0, metavar="N", help="times as fast as it was (default: 1)"
     )
     parser.add_argument("--from", dest="begin", type=parse_time, metavar="S", help="session time to begin at [s]")
     parser.add_argument("--to", dest="end", type=parse_time, metavar="S", help="session time to end at [s]")
@@ -75,7 +83,6 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     parser.add_argument("--people", action="store_true", help="draw heads and hands too, in their colours in `view`")
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
     add_json_option(parser)
-    parser.set_defaults(run=run)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -89,27 +96,9 @@ def parse_size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def parse_positive(text: str) -> float:
-    """Parse `--fps` and `--speed`."""
-    number = _to_number(text)
-    if not 1e-3 <= number <= 1e3:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a rate: give a number from 0.001 to 1000, for example 30")
-    return number
-
-
-def parse_time(text: str) -> float:
-    """Parse a session time [s]."""
-    seconds = _to_number(text.strip().removesuffix("s"))
-    if not 0.0 <= seconds <= 1e9:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a session time: give seconds from 0, for example 12.5")
-    return seconds
-
-
-def _to_number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+parse_rate: Final = make_number_type(float, "a rate: give a number from 0.001 to 1000, for example 30", 1e-3, 1e3)
+_SESSION_TIME: Final = "a session time: give seconds from 0, for example 12.5"
+parse_time: Final = make_number_type(lambda text: float(text.removesuffix("s")), _SESSION_TIME, 0.0, 1e9)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -124,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list_cameras:
         with Recording.open(arguments.path, warn=False) as recording:
             cameras = list_cameras(recording)
-        print_json({"cameras": cameras}) if arguments.json else print("\n".join(map(to_printable, cameras)))
+        print_result(arguments, {"cameras": cameras}, cameras)
         return 0
     out = _check_output(arguments)
     width, height = arguments.size
@@ -142,19 +131,13 @@ def run(arguments: argparse.Namespace) -> int:
         problems = [f"steps {first} to {last} are left out" for first, last in pictures.left_out]
         problems += [*recording.missing, *recording.damage]
     begin_s, end_s, n = times_ns[0] / _SECOND, times_ns[-1] / _SECOND, len(times_ns)
-    if arguments.json:
-        report = {"file": str(out), "pictures": n, "begin_s": begin_s, "end_s": end_s, "codec": codec}
-        size = {"width": width, "height": height, "bytes": out.stat().st_size}
-        print_json({**report, **size, "notes": pictures.notes, "problems": problems})
-    else:
-        span = f"{n:,} pictures from {begin_s:.2f} s to {end_s:.2f} s" if n > 1 else f"the picture of {begin_s:.2f} s"
-        print(to_printable(f"{out}: {span}, {width} x {height}, {codec}, {out.stat().st_size / 1e6:.1f} MB"))
-        for note in pictures.notes:
-            print(to_printable(note))
-    if problems:
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        print(to_printable(f"iris-session: {arguments.path} is damaged: {problems[0]}{more}"), file=sys.stderr)
-    return 1 if problems else 0
+    n_bytes = out.stat().st_size
+    report = {"file": str(out), "pictures": n, "begin_s": begin_s, "end_s": end_s, "codec": codec, "width": width}
+    report |= {"height": height, "bytes": n_bytes, "notes": pictures.notes, "problems": problems}
+    span = f"{n:,} pictures from {begin_s:.2f} s to {end_s:.2f} s" if n > 1 else f"the picture of {begin_s:.2f} s"
+    line = f"{out}: {span}, {width} x {height}, {codec}, {n_bytes / 1e6:.1f} MB"
+    print_result(arguments, report, [line, *pictures.notes])
+    return report_damage(arguments.path, problems)
 
 
 def _check_output(arguments: argparse.Namespace) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from iris_session.cli.common import add_command, add_json_option, explain_no_robots, open_scene, print_json
+from iris_session.cli.common import add_command, add_json_option, explain_no_robots, open_scene, print_result
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -27,8 +27,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the result of `find_robots`. An ambiguous model is an error that carries the same TOML."""
-    import msgspec
-
     from iris_session.physics import dump_robots_toml, find_objects, find_robots
 
     model = open_scene(arguments.scene).model
@@ -36,9 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     objects = find_objects(model)
     if not robots:
         print(explain_no_robots(model), file=sys.stderr)
-    if arguments.json:
-        print_json({"robots": msgspec.to_builtins(robots), "objects": msgspec.to_builtins(objects)})
-    else:
-        print(f"# {len(robots)} robots, {len(objects)} free objects: {', '.join(o.name for o in objects) or 'none'}")
-        print(dump_robots_toml(robots))
+    first = f"# {len(robots)} robots, {len(objects)} free objects: {', '.join(o.name for o in objects) or 'none'}"
+    lines = [first, *dump_robots_toml(robots).split("\n")]
+    print_result(arguments, {"robots": robots, "objects": objects}, lines)
     return 0

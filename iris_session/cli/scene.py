@@ -9,10 +9,19 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from iris_session.cli.common import CommandError, add_command, add_json_option, open_scene, parse_number, print_json
+from iris_session.cli.common import (
+    ABOVE_0,
+    CommandError,
+    add_command,
+    add_json_option,
+    make_number_type,
+    open_scene,
+    print_result,
+)
 
 if TYPE_CHECKING:
     from iris_session.protocol.scene import SceneSpec
@@ -95,52 +104,43 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     parsed, store = _parse_scene(arguments)
     extent = compute_extent(parsed.spec, store)
     found = build_report(parsed.spec, parsed.scene_hash, parsed.skipped, extent)
-    if arguments.json:
-        print_json({**msgspec.to_builtins(found), "notes": parsed.notes})
-    else:
-        _print_report(parsed.spec, found, parsed.notes)
+    result = {**msgspec.to_builtins(found), "notes": parsed.notes}
+    print_result(arguments, result, _format_report(parsed.spec, found, parsed.notes))
     return 0
 
 
-def _print_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -> None:
+def _format_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -> Iterator[str]:
     from iris_session.scene.extent import format_coordinates, format_size
     from iris_session.scene.report import format_tree
 
-    for line in format_tree(spec):
-        print(line)
+    yield from format_tree(spec)
     totals = found.totals
-    print(
-        f"\n{found.bodies} bodies ({found.moving} can move), {totals.objects} objects, {totals.triangles:,} triangles, "
+    yield ""
+    yield (
+        f"{found.bodies} bodies ({found.moving} can move), {totals.objects} objects, {totals.triangles:,} triangles, "
         f"{len(spec.lights)} lights, {len(spec.deformables)} deformables"
     )
     if found.extent is not None:
         box = found.extent
         low, high = (", ".join(format_coordinates(box, corner)) for corner in (box.low, box.high))
-        print(f"extent: {format_size(box)} along x, y, z, from ({low}) to ({high}), planes not counted")
-    for text in notes:
-        print(f"note: {text}")
-    print(
+        yield f"extent: {format_size(box)} along x, y, z, from ({low}) to ({high}), planes not counted"
+    yield from (f"note: {text}" for text in notes)
+    yield (
         f"{_format_size(totals.asset_bytes)} of assets: {_format_size(totals.mesh_bytes)} meshes and "
         f"{_format_size(totals.texture_bytes)} textures, the rest coarser levels; "
         f"{_format_size(totals.texture_memory)} of textures on a graphics card"
     )
-    print("\nheaviest:")
+    yield from ("", "heaviest:")
     for heavy in found.heavy:
-        print(f"  {heavy.kind} {heavy.name}: {heavy.why}; {_format_size(heavy.bytes)}, {heavy.levels} levels")
-    for text in found.skipped:
-        print(f"skipped: {text}")
-    for text in found.simplified:
-        print(f"in recordings and GLB: {text}")
-    for text in found.struggles:
-        print(f"headset: {text}")
-    if not found.struggles:
-        print("headset: nothing is too much for a Quest 3")
+        yield f"  {heavy.kind} {heavy.name}: {heavy.why}; {_format_size(heavy.bytes)}, {heavy.levels} levels"
+    yield from (f"skipped: {text}" for text in found.skipped)
+    yield from (f"in recordings and GLB: {text}" for text in found.simplified)
+    yield from (f"headset: {text}" for text in found.struggles or ("nothing is too much for a Quest 3",))
 
 
 def run_export(arguments: argparse.Namespace) -> int:
     """Write the file, and print its size and what it does not contain."""
     from iris_session.assets.errors import AssetStoreError
-    from iris_session.scene import SceneBuildError
     from iris_session.scene.glb import write_glb
     from iris_session.scene.importers.references import files_read
     from iris_session.scene.report import list_glb_differences
@@ -156,22 +156,22 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise CommandError(f"{out} is part of {arguments.scene}: give another output file")
     try:
         size = write_glb(parsed.spec, store, out)
-    except (SceneBuildError, AssetStoreError) as error:
-        raise CommandError(str(error)) from None
+    except AssetStoreError:
+        raise
     except OSError as error:
         raise CommandError(f"{out} cannot be written: {error.strerror or error}") from None
     simplified = list_glb_differences(parsed.spec)
-    if arguments.json:
-        lists = {"skipped": parsed.skipped, "simplified": simplified, "notes": parsed.notes}
-        print_json({"file": str(out), "bytes": size, "scene_hash": parsed.scene_hash, **lists})
-        return 0
-    for text in parsed.notes:
-        print(f"note: {text}", file=sys.stderr)
-    for text in parsed.skipped:
-        print(f"skipped: {text}", file=sys.stderr)
-    for text in simplified:
-        print(f"in the GLB: {text}", file=sys.stderr)
-    print(f"{out}: {_format_size(size)}")
+    lists = {"note": parsed.notes, "skipped": parsed.skipped, "in the GLB": simplified}
+    if not arguments.json:
+        print(
+            *(f"{kind}: {text}\n" for kind, texts in lists.items() for text in texts), sep="", end="", file=sys.stderr
+        )
+    result = {"file": str(out), "bytes": size, "scene_hash": parsed.scene_hash, "skipped": parsed.skipped}
+    print_result(
+        arguments,
+        {**result, "simplified": simplified, "notes": parsed.notes},
+        [f"{out}: {_format_size(size)}"],
+    )
     return 0
 
 
@@ -196,7 +196,6 @@ def _is_same_file(a: Path, b: Path) -> bool:
 
 def _parse_scene(arguments: argparse.Namespace) -> tuple[_ParsedScene, AssetStore]:
     """Return the scene, and the store of its assets."""
-    from iris_session.protocol.scene import SceneError
     from iris_session.scene import AssetStore
 
     path = find_scene_file(arguments.scene)
@@ -206,8 +205,6 @@ def _parse_scene(arguments: argparse.Namespace) -> tuple[_ParsedScene, AssetStor
         return _parse_model(arguments.scene, store) if path is None else _compose_file(path, arguments, store), store
     except OSError as error:
         raise CommandError(f"assets cannot be stored: {error} (choose another folder with --assets DIR)") from None
-    except SceneError as error:  # the scene exceeds the limits of clients
-        raise CommandError(str(error)) from None
 
 
 def _parse_model(scene: str, store: AssetStore) -> _ParsedScene:
@@ -215,21 +212,13 @@ def _parse_model(scene: str, store: AssetStore) -> _ParsedScene:
     from iris_session.scene.mujoco_scene import parse_mujoco
 
     model = open_scene(scene).model
-    beginning = World(
-        model, (), ()
-    ).make_initial_data()  # the initial state of a session: the keyframe `home`, if there is one
-    parsed = parse_mujoco(model, store, data=beginning, name=Path(scene).stem)
+    # The initial state of a session: the keyframe `home`, if there is one.
+    parsed = parse_mujoco(model, store, data=World(model, (), ()).make_initial_data(), name=Path(scene).stem)
     return _ParsedScene(parsed.spec, parsed.scene_hash, parsed.skipped, check_model_units(parsed.spec))
 
 
 def _compose_file(path: Path, arguments: argparse.Namespace, store: AssetStore) -> _ParsedScene:
-    from iris_session.scene import SceneBuildError
-
-    builder = make_builder(path, path.stem, arguments)
-    try:
-        made = builder.build(store)
-    except SceneBuildError as error:
-        raise CommandError(str(error)) from None
+    made = make_builder(path, path.stem, arguments).build(store)
     return _ParsedScene(made.spec, made.scene_hash, made.skipped, made.notes)
 
 
@@ -239,7 +228,6 @@ def _format_size(n_bytes: int) -> str:
 
 #: Suffixes of files that MuJoCo simulates; any other file is composed and shown as it is.
 SIMULATED: Final = (".xml", ".mjcf", ".mjb")
-_ROBOT: Final = ".urdf"
 #: Advice for meshes of a model that are too large or too small.
 _MESH_SCALE_ADVICE: Final = 'scale="{factor} {factor} {factor}" at its <mesh>, times the one that it has,'
 #: Limits above which work takes longer than about a second and progress is printed.
@@ -257,16 +245,12 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--scale",
-        type=_parse_factor,
-        default=None,
+        type=make_number_type(
+            float, "a factor: give a number above 0, for example 0.001 for a file in millimetres", ABOVE_0
+        ),
         metavar="FACTOR",
         help="scale of the file: 0.001 for millimetres; not for MJCF and MJB, which are simulated",
     )
-
-
-def _parse_factor(text: str) -> float:
-    wanted = "a factor: give a number above 0, for example 0.001 for a file in millimetres"
-    return parse_number(text, lambda factor: factor > 0.0, wanted)
 
 
 def expand_path(text: str | Path) -> Path:
@@ -283,32 +267,23 @@ def find_scene_file(scene: str) -> Path | None:
     Raises:
         CommandError: It is a folder, or a file that does not exist or has an unknown suffix.
     """
-    from iris_session.scene import SceneBuildError
+    from iris_session.demo.scene_names import SCENE_NAMES
     from iris_session.scene.importers.files import ENDINGS, check_present, xacro_advice
 
     path = expand_path(scene)
     kind = path.suffix.lower()
     if kind in SIMULATED and not path.is_dir():
         return None
-    if not kind and not path.is_file() and (_is_scene_name(scene) or not path.is_dir()):
+    has_name = scene.rstrip("0123456789") in SCENE_NAMES  # a folder of the same name does not hide it
+    if not kind and not path.is_file() and (has_name or not path.is_dir()):
         return None
-    try:
-        check_present(path)
-    except SceneBuildError as error:
-        raise CommandError(str(error)) from None
+    check_present(path)
     if kind == ".xacro":
         raise CommandError(f"{path.name}: {xacro_advice(path)}")
     if kind.lstrip(".") not in ENDINGS:
         what = f"files that end in {kind} cannot be read" if kind else "a file without a suffix cannot be read"
         raise CommandError(f"{path.name}: {what}; supported are {', '.join(ENDINGS)}")
     return path
-
-
-def _is_scene_name(scene: str) -> bool:
-    """Return whether a scene has this name. A folder of the same name does not hide it."""
-    from iris_session.demo.scene_names import SCENE_NAMES
-
-    return scene.rstrip("0123456789") in SCENE_NAMES
 
 
 def check_file_options(arguments: argparse.Namespace, path: Path | None) -> None:
@@ -332,23 +307,17 @@ def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneB
 
     builder, scale = SceneBuilder(name), 1.0 if arguments.scale is None else arguments.scale
     if (size := path.stat().st_size) > _LARGE_FILE_BYTES:
-        _print_progress(f"reading {path.name} ({size / 1e6:.1f} MB)")
+        print(f"reading {path.name} ({size / 1e6:.1f} MB)", file=sys.stderr, flush=True)
+    add = builder.add_urdf if path.suffix.lower() == ".urdf" else builder.add_file
     try:
-        if path.suffix.lower() == _ROBOT:
-            builder.add_urdf(path, package_dirs=arguments.package_dir, scale=scale)
-        else:
-            builder.add_file(path, package_dirs=arguments.package_dir, scale=scale)
+        add(path, package_dirs=arguments.package_dir, scale=scale)
     except SceneBuildError as error:
         advice = " (here: --package-dir DIR)" if "package_dirs" in str(error) else ""
         raise CommandError(f"{error}{advice}") from None
     if builder.triangles > _MANY_TRIANGLES:
-        _print_progress(f"preparing meshes of {path.name} ({builder.triangles:,} triangles; cached for the next time)")
+        text = f"preparing meshes of {path.name} ({builder.triangles:,} triangles; cached for the next time)"
+        print(text, file=sys.stderr, flush=True)
     return builder
-
-
-def _print_progress(text: str) -> None:
-    """Print what is being done to standard error, at once."""
-    print(text, file=sys.stderr, flush=True)
 
 
 def check_model_units(spec: SceneSpec) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from iris_session.cli.common import (
     CommandError,
@@ -20,6 +20,7 @@ from iris_session.cli.common import (
     format_scene_names,
     open_scene,
     parse_seconds,
+    print_error,
     print_json,
 )
 from iris_session.cli.scene import add_file_options, check_file_options, find_scene_file, make_builder
@@ -113,7 +114,6 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
         raise CommandError(f"--record {arguments.record}: a recording is one file: give a name that ends in .rrd")
     if arguments.no_record and (arguments.record_assets or arguments.record_budget):
         raise CommandError("--record-assets and --record-budget are for a recording: leave --no-record out")
-    defaults = SessionConfig()
     assigned = parse_assignments(getattr(arguments, "assign", []))
     policy = arguments.assignment or (AssignmentPolicy.CONFIG if assigned else None)
     if assigned and policy != AssignmentPolicy.CONFIG:
@@ -121,23 +121,24 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
     changes = {"policy": policy, "default_mode": arguments.mode, "assignments": assigned or None}
     changes["unaligned"] = parse_unaligned(getattr(arguments, "unaligned", []))
     authority = msgspec.structs.replace(AuthorityConfig(), **{k: v for k, v in changes.items() if v is not None})
-    if arguments.interface and arguments.host != defaults.host:
+    if arguments.interface and arguments.host != SessionConfig().host:
         raise CommandError("--interface and --host both set where to listen: give one of them")
     base = arguments.port_base
     if base is not None and (arguments.control_port or arguments.state_port):
         raise CommandError("--port-base sets all ports: give it without --control-port and --state-port")
-    control, state = (defaults.control_port, defaults.state_port) if base is None else (base + 1, base + 2)
+    given: dict[str, Any] = {
+        "control_port": arguments.control_port if base is None else base + 1,
+        "state_port": arguments.state_port if base is None else base + 2,
+        "beacon_port": 0 if arguments.no_beacon else None,
+        "record_clouds_hz": arguments.record_clouds,
+        "record_assets": arguments.record_assets,
+    }
     return SessionConfig(
         name=arguments.name or name,
         host=arguments.host,
         interfaces=tuple(arguments.interface),
         advertise=arguments.advertise,
-        beacon_port=0 if arguments.no_beacon else defaults.beacon_port,
-        control_port=control if base or arguments.control_port is None else arguments.control_port,
-        state_port=state if base or arguments.state_port is None else arguments.state_port,
         record=False if arguments.no_record else arguments.record or True,
-        record_clouds_hz=defaults.record_clouds_hz if arguments.record_clouds is None else arguments.record_clouds,
-        record_assets=defaults.record_assets if arguments.record_assets is None else arguments.record_assets,
         record_budget_bytes=arguments.record_budget or 0,
         curve=arguments.curve,
         curve_key=arguments.curve_key,
@@ -150,6 +151,7 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
         sites=arguments.sites,
         tendons=arguments.tendons,
         authority=authority,
+        **{name: value for name, value in given.items() if value is not None},
     )
 
 
@@ -192,14 +194,9 @@ def create_session(arguments: argparse.Namespace) -> Session:
     scene = open_scene(arguments.scene)
     robots = None if arguments.robots is None else load_robots_toml(arguments.robots, scene.model)
     config = make_session_config(arguments, make_session_name(Path(arguments.scene)))
-    config = dataclasses.replace(
-        config,
-        anchors=scene.anchors,
-        anchor_sizes=scene.anchor_sizes,
-        cameras=(*scene.cameras, *config.cameras),
-    )
-    config = apply_anchors_file(config, arguments.anchors)
-    return Session(scene.model, config=config, robots=robots)
+    cameras = (*scene.cameras, *config.cameras)
+    config = dataclasses.replace(config, anchors=scene.anchors, anchor_sizes=scene.anchor_sizes, cameras=cameras)
+    return Session(scene.model, config=apply_anchors_file(config, arguments.anchors), robots=robots)
 
 
 def create_publisher(arguments: argparse.Namespace, path: Path) -> ScenePublisher:
@@ -224,8 +221,7 @@ def resume_session(arguments: argparse.Namespace) -> Session:
         raise CommandError(f"{', '.join(given)} cannot be combined with --resume: the recording defines them")
     model = None if arguments.scene is None else open_scene(arguments.scene).model
     config = dataclasses.replace(make_session_config(arguments, "session"), resume=arguments.resume)
-    config = apply_anchors_file(config, arguments.anchors)
-    return Session(model, config=config)
+    return Session(model, config=apply_anchors_file(config, arguments.anchors))
 
 
 def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfig:
@@ -235,13 +231,8 @@ def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfi
     if path is None:
         return config
     given = load_anchors(path)
-    return dataclasses.replace(
-        config,
-        anchors=given.anchors,
-        anchor_sizes=given.sizes,
-        anchor_errors=given.error_m,
-        anchor_marks=given.marks,
-    )
+    known: dict[str, Any] = {"anchor_sizes": given.sizes, "anchor_errors": given.error_m, "anchor_marks": given.marks}
+    return dataclasses.replace(config, anchors=given.anchors, **known)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -249,9 +240,8 @@ def run(arguments: argparse.Namespace) -> int:
     shown = None if arguments.resume is not None or arguments.scene is None else find_scene_file(arguments.scene)
     check_file_options(arguments, shown)
     if shown is not None:
-        return _serve(
-            arguments, create_publisher(arguments, shown), lambda session: _describe_shown_file(session, shown)
-        )
+        publisher = create_publisher(arguments, shown)
+        return _serve(arguments, publisher, lambda session: _describe_shown_file(session, shown))
     session = resume_session(arguments) if arguments.resume is not None else create_session(arguments)
     hint = ""
     if not session.robots:
@@ -304,7 +294,7 @@ def _serve(
         print(f"recording: {recording}")
         print(f"  look at it: iris-session view {recording}    check it: iris-session verify {recording}")
     if fault:
-        print(f"iris-session: {fault}", file=sys.stderr)
+        print_error(fault)
     return 1 if fault else 0
 
 

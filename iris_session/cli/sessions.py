@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from iris_session.cli.common import add_command, add_json_option, parse_seconds, print_json
+from iris_session.cli.common import add_command, add_json_option, parse_seconds, pick_attributes, print_result
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -33,21 +33,11 @@ def run(arguments: argparse.Namespace) -> int:
     known = known_fingerprints()
     found = find_sessions(arguments.seconds)
     names = ("name", "address", "addresses", "session_id", "kind", "key_fingerprint")
-    rows = [
-        {
-            **{name: getattr(one, name) for name in names},
-            "encrypted": bool(one.key_fingerprint),
-            "known": one.key_fingerprint in known,
-        }
-        for one in found
-    ]
-    if arguments.json:
-        print_json({"ok": bool(rows), "sessions": rows})
-        return 0 if rows else 1
-    for row in rows:
-        print(f"{row['name']:<24} {row['address']:<24} {row['kind']:<8} {_format_key(row)}")
-    if not rows:
-        print("no session was heard: type the address of a session, or scan its code (docs/network.md)")
+    marks = [{"encrypted": bool(one.key_fingerprint), "known": one.key_fingerprint in known} for one in found]
+    rows = [pick_attributes(one, *names) | mark for one, mark in zip(found, marks, strict=True)]
+    lines = [f"{row['name']:<24} {row['address']:<24} {row['kind']:<8} {_format_key(row)}" for row in rows]
+    none = "no session was heard: type the address of a session, or scan its code (docs/network.md)"
+    print_result(arguments, {"ok": bool(rows), "sessions": rows}, lines or [none])
     return 0 if rows else 1
 
 

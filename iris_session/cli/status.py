@@ -5,20 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from iris_session.cli.common import (
     CommandError,
     add_address_options,
     add_command,
     add_json_option,
-    check_session_reachable,
+    make_client,
     parse_seconds,
-    print_json,
+    print_result,
     to_printable,
 )
 
@@ -51,9 +50,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     form = parser.add_mutually_exclusive_group()
     add_watch_options(form, parser)
     form.add_argument("--prometheus", action="store_true", help="print metrics in the text format of Prometheus, once")
-    form.add_argument(
-        "--metrics-port", type=int, default=None, metavar="PORT", help="serve the metrics on 127.0.0.1 over HTTP"
-    )
+    form.add_argument("--metrics-port", type=int, metavar="PORT", help="serve the metrics on 127.0.0.1 over HTTP")
     add_json_option(parser)
 
 
@@ -73,15 +70,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the status; with --watch or --metrics-port until Ctrl-C."""
     from iris_session.cli.metrics import format_metrics
 
+    if arguments.metrics_port is None and not arguments.prometheus:
+        return run_status_command(arguments, lambda report: report, format_status)
     with open_status(arguments) as (client, report):
         if arguments.metrics_port is not None:
             return _serve_metrics(client, arguments.metrics_port)
-        if arguments.watch:
-            return watch_status(client, arguments.period, print_status, as_json=arguments.json)
-        if arguments.prometheus:
-            sys.stdout.write(format_metrics(report))
-        else:
-            print_status(report, as_json=arguments.json)
+        sys.stdout.write(format_metrics(report))
         return 0
 
 
@@ -91,17 +85,9 @@ def open_status(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusR
 
     A stalled session admits no participant, but answers a request for its status.
     """
-    from iris_session.client import Client, NotConnectedError, RequestTimeoutError
+    from iris_session.client import NotConnectedError, RequestTimeoutError
 
-    check_session_reachable(arguments)
-    client = Client(
-        arguments.address,
-        session=arguments.session,
-        join_code=arguments.code,
-        role="observer",
-        name="status",
-        alignment="not_needed",
-    )
+    client = make_client(arguments, "observer", "status")
     try:
         client.open()
         if client.wait_for(lambda one: one.ready, JOIN_S):
@@ -116,37 +102,35 @@ def open_status(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusR
         client.close()
 
 
-class ReportPrinter(Protocol):
-    """Function that prints one report."""
+def run_status_command(
+    arguments: argparse.Namespace,
+    to_object: Callable[[StatusReport], object],
+    format_lines: Callable[[StatusReport], Iterable[str]],
+) -> int:
+    """Print the status of a session; with --watch until Ctrl-C: if the session ends, wait for it to return.
 
-    def __call__(self, report: StatusReport, *, as_json: bool) -> None: ...
-
-
-def print_status(report: StatusReport, *, as_json: bool) -> None:
-    """Print one report as text or JSON."""
-    import msgspec
-
-    if as_json:
-        print_json(msgspec.to_builtins(report))
-    else:
-        print("\n".join(format_status(report)), flush=True)
-
-
-def watch_status(client: Client, period_s: float, print_report: ReportPrinter, *, as_json: bool) -> int:
-    """Print reports until Ctrl-C. If the session ends, wait for it to return."""
+    Args:
+        arguments: Options of `add_address_options`, `add_watch_options`, `add_json_option`.
+        to_object: Makes what `--json` prints.
+        format_lines: Makes one screen.
+    """
     from iris_session.client import NotConnectedError, RequestTimeoutError
 
-    clear = "\x1b[2J\x1b[H" if sys.stdout.isatty() and not as_json else ""
-    while True:
-        began = time.monotonic()
-        try:
-            report = client.status()
-        except (NotConnectedError, RequestTimeoutError) as error:
-            print(f"{clear}{error}", flush=True)
-        else:
-            print(clear, end="")
-            print_report(report, as_json=as_json)
-        client.sleep(max(0.1, period_s - (time.monotonic() - began)))
+    clear = "\x1b[2J\x1b[H" if arguments.watch and sys.stdout.isatty() and not arguments.json else ""
+    with open_status(arguments) as (client, first):
+        report: StatusReport | None = first
+        while True:
+            if report is not None:
+                print(clear, end="")
+                print_result(arguments, to_object(report), format_lines(report))
+            if not arguments.watch:
+                return 0
+            client.sleep(max(0.1, arguments.period))
+            try:
+                report = client.status()
+            except (NotConnectedError, RequestTimeoutError) as error:
+                report = None
+                print(f"{clear}{error}", flush=True)
 
 
 def _serve_metrics(client: Client, port: int) -> int:
@@ -187,12 +171,8 @@ def _serve_metrics(client: Client, port: int) -> int:
     return 0
 
 
-def format_status(report: StatusReport) -> list[str]:
-    """Return one screen of printable lines."""
-    return [to_printable(line) for line in _format_lines(report)]
-
-
-def _format_lines(report: StatusReport) -> Iterator[str]:
+def format_status(report: StatusReport) -> Iterator[str]:
+    """Yield one screen of lines."""
     from iris_session.doctor.session_checks import measure_stages
     from iris_session.protocol.status import NOT_PUBLISHED
 
@@ -247,12 +227,12 @@ def _format_lines(report: StatusReport) -> Iterator[str]:
         f"{report.memory_bytes / 1e6:.0f} MB"
     )
     one = report.recorder
-    if one is not None:
-        yield f"recorder: {one.state}" + (
-            ""
-            if one.state == "off"
-            else f", {one.bytes_written / 1e6:.1f} MB, {one.disk_free_bytes / 1e9:.1f} GB free, "
-            f"{one.lost_rows} rows lost, {one.path}" + (f": {one.text}" if one.text else "")
+    if one is not None and one.state == "off":
+        yield "recorder: off"
+    elif one is not None:
+        yield (
+            f"recorder: {one.state}, {one.bytes_written / 1e6:.1f} MB, {one.disk_free_bytes / 1e9:.1f} GB free, "
+            f"{one.lost_rows} rows lost, {one.path}{f': {one.text}' if one.text else ''}"
         )
     most = sorted(report.drops.items(), key=lambda item: -item[1])[:8]
     yield "drops: " + (", ".join(f"{reason} {n}" for reason, n in most) or "none")
@@ -284,11 +264,12 @@ def _format_media(report: StatusReport) -> Iterator[str]:
     if report.media:
         yield ""
     for one in report.media:
-        subscribers = []
-        for p in report.participants:
-            for budget in p.media:
-                if budget.stream == one.stream:
-                    subscribers.append(f"{p.name} ({p.id}) {budget.budget_class}")
+        subscribers = [
+            f"{p.name} ({p.id}) {budget.budget_class}"
+            for p in report.participants
+            for budget in p.media
+            if budget.stream == one.stream
+        ]
         source = f" from {one.source}" if one.source else ""
         receivers = ", ".join(subscribers) or "no subscribers"
         title = f" ({one.title})" if one.title else ""

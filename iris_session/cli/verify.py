@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from iris_session.cli.common import (
     add_command,
     add_json_option,
     ending_as_interrupts,
+    print_error,
     print_json,
     to_printable,
 )
@@ -49,12 +49,12 @@ def run(arguments: argparse.Namespace) -> int:
 
     def refuse(path: str, why: str) -> None:  # must not hide the others
         reports.append(VerifyReport(path, problems=[Problem(-1, "unreadable", "file", why)]))
-        print(to_printable(f"iris-session: {why}"), file=sys.stderr)
+        print_error(why)
 
     for path in list_files(arguments.files, lambda error: refuse(str(error.filename), str(error))):
         try:
             with ending_as_interrupts(), ReadingProgress(path) as progress:
-                report = verify_recording(path, progress.show)
+                report = verify_recording(path, progress.show_steps)
         except RecordingError as error:
             refuse(str(path), str(error))
             continue

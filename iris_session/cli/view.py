@@ -15,7 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TextIO
 from urllib.parse import quote
 
-from iris_session.cli.common import CommandError, ending_as_interrupts, to_printable
+from iris_session.cli.common import (
+    MOST_LINES,
+    CommandError,
+    add_command,
+    ending_as_interrupts,
+    print_error,
+    to_printable,
+)
 from iris_session.cli.progress import ReadingProgress
 
 if TYPE_CHECKING:
@@ -34,25 +41,25 @@ MIN_MEMORY: Final = 1 << 30
 LIVE_NICE: Final = 10
 #: Bytes of the messages of a viewer that has failed.
 MOST_WORDS: Final = 10_000
-#: Other sessions of a folder that are listed.
-MOST_LISTED: Final = 20
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command `view`."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "view",
+        run,
         help="show a recording in Rerun's viewer",
         description="Show a recording in Rerun's viewer: the whole session, with its parts and resumed recordings, "
         "also if it was killed, cut or damaged. A copy that opens at once is kept beside it (session.view.rrd); the "
         "recording is never changed. The viewer listens on this machine only. Ctrl-C ends it.",
-        epilog="examples:\n"
-        "  iris-session view                          the newest session below the folder sessions\n"
-        "  iris-session view sessions/20261121T093000.000000Z-handover\n"
-        "  iris-session view session.rrd --web        in a browser on this machine\n"
-        "  iris-session view session.rrd --no-open    only make the copy\n"
-        "  iris-session view --live                   follow the session that runs",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples="""
+            iris-session view                          the newest session below the folder sessions
+            iris-session view sessions/20261121T093000.000000Z-handover
+            iris-session view session.rrd --web        in a browser on this machine
+            iris-session view session.rrd --no-open    only make the copy
+            iris-session view --live                   follow the session that runs
+        """,
     )
     parser.add_argument(
         "path",
@@ -73,7 +80,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         metavar="N",
         help="port of the viewer; with --web of the page, which gets its data from port N+1 (default: free ones)",
     )
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -88,7 +94,11 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError(f"something listens on port {taken[0]} already: give another one, or leave --port out")
     tool = find_rerun()
     if arguments.live:
-        return _show_live(tool, arguments, find_live(arguments.path or DEFAULT_FOLDER))
+        live = find_live(arguments.path or DEFAULT_FOLDER)
+        os.nice(LIVE_NICE)  # the session comes first
+        print(f"follows {to_printable(str(live))} until the session ends", flush=True)
+        with ending_as_interrupts():
+            return _show(tool, arguments, None, live)
     path = choose_recording(arguments.path or DEFAULT_FOLDER)
     with ending_as_interrupts(), ReadingProgress(path) as progress, open_view_file(path, progress.show_bytes) as view:
         progress.end()
@@ -101,13 +111,6 @@ def run(arguments: argparse.Namespace) -> int:
         return _show(tool, arguments, view.path)
 
 
-def _show_live(tool: str, arguments: argparse.Namespace, path: Path) -> int:
-    os.nice(LIVE_NICE)  # the session comes first
-    print(f"follows {to_printable(str(path))} until the session ends", flush=True)
-    with ending_as_interrupts():
-        return _show(tool, arguments, None, path)
-
-
 def find_live(path: Path) -> Path:
     """Return the first file of a recording that is being written: of a session, or the newest in or below a folder.
 
@@ -117,9 +120,9 @@ def find_live(path: Path) -> Path:
     from iris_session.recording.folders import find_newest_s, find_recordings, list_session_files
     from iris_session.recording.lock import is_being_written
 
-    found = (
-        find_recordings(path, lambda _: None) if path.is_dir() else list_session_files(path) if path.exists() else []
-    )
+    found = find_recordings(path, lambda _: None) if path.is_dir() else []
+    if path.is_file():
+        found = list_session_files(path)
     for file in sorted(found, key=lambda file: find_newest_s([file]), reverse=True):
         if is_being_written(file):
             return file
@@ -138,21 +141,18 @@ def choose_recording(path: Path) -> Path:
         return path
     from iris_session.recording.folders import find_newest_s, find_recordings, group_by_session
 
-    found = find_recordings(path, lambda error: print(to_printable(f"iris-session: {error}"), file=sys.stderr))
+    found = find_recordings(path, lambda error: print_error(str(error)))
     if not found:
         raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` or `demo` wrote")
     newest = group_by_session(found)
     if len(newest) > 1:
         print(f"{len(newest)} sessions below {to_printable(str(path))}, the newest is shown; the others:")
-        for files in newest[1 : MOST_LISTED + 1]:
-            print(f"  {_format_time(find_newest_s(files))}  {to_printable(str(files[0]))}")
-        if len(newest) > MOST_LISTED + 1:
-            print(f"  and {len(newest) - MOST_LISTED - 1} more")
+        for files in newest[1 : MOST_LINES + 1]:
+            at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(find_newest_s(files)))
+            print(f"  {at}  {to_printable(str(files[0]))}")
+        if len(newest) > MOST_LINES + 1:
+            print(f"  and {len(newest) - MOST_LINES - 1} more")
     return newest[0][0]
-
-
-def _format_time(seconds: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(seconds))
 
 
 def _print_file(view: ViewFile) -> None:
@@ -265,12 +265,7 @@ def _started(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
     from iris_session.rrd.rerun_tool import make_environment
 
     # In a group of its own, so that Ctrl-C reaches this process alone, which then ends it in order.
-    process = subprocess.Popen(
-        command,
-        env=make_environment(),
-        process_group=0,
-        stdin=subprocess.DEVNULL,
-    )
+    process = subprocess.Popen(command, env=make_environment(), process_group=0, stdin=subprocess.DEVNULL)
     try:
         yield process
     finally:

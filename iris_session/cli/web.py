@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import TYPE_CHECKING
 
 from iris_session.cli.common import (
@@ -12,6 +11,7 @@ from iris_session.cli.common import (
     add_command,
     add_page_options,
     check_session_reachable,
+    print_error,
 )
 from iris_session.system.extras import require_package
 
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     endpoint.store_key()
     fault = asyncio.run(serve(GatewayStart(config)))
     if fault:
-        print(f"iris-session: {fault}", file=sys.stderr)
+        print_error(fault)
     return 1 if fault else 0
 
 

@@ -1,116 +1,50 @@
-"""`iris-session anchors print` and `calibrate-camera`: exact sheets, calibration from rendered photographs, errors."""
+"""`iris-session anchors print`, `example`, `status`, `align`, `place` and `move`: sheets, screens, requests."""
 
 from __future__ import annotations
 
 import json
-import math
-import shutil
-import sys
 import tomllib
-from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
+import msgspec
 import pytest
 
-from anchors.camera import CameraModel, pose_from_rvec_tvec
-from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_from_rotvec
-from anchors.sheet import Sheet
-from anchors.sheet_print import to_pdf
+from iris_session.cli import anchors
+from iris_session.cli.anchors import format_alignment_status, select_participants, to_dict
+from iris_session.cli.common import CommandError, find_participant
 from iris_session.cli.main import main
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from render_sheet import Conditions, Page, photograph
-
-CAMERA = CameraModel(640, 480, 585.0, 585.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.0))
-INTRINSICS = (
-    "width = 640\nheight = 480\nfx = 585.0\nfy = 585.0\ncx = 319.5\ncy = 239.5\n"
-    "distortion = [0.08, -0.18, 0.0008, -0.0005, 0.0]\n"
+from iris_session.client import DeniedError
+from iris_session.protocol.common import IDENTITY, Alignment, Denial, Pose
+from iris_session.protocol.server_messages import ParticipantInfo
+from iris_session.protocol.status import (
+    AlignmentReport,
+    AnchorReport,
+    AnchorSeen,
+    CrossCheckReport,
+    ParticipantReport,
+    StatusReport,
 )
-T_BASE_CAMERA: PoseTuple = ((1.2, -0.2, 0.8), quat_from_rotvec((-1.8, 0.5, 0.4)))
-T_EE_SHEET: PoseTuple = ((0.01, 0.03, 0.12), quat_from_rotvec((0.2, 0.4, -1.0)))
-SHEET = ("--sheet", "table=120mm")
-HEADER = "image,x,y,z,qw,qx,qy,qz"
+
+Capture = pytest.CaptureFixture[str]
+
+# --- print ------------------------------------------------------------------------------------------------------------
 
 
-def _facing(x: float, y: float, z: float, r: Sequence[float]) -> PoseTuple:
-    facing = quat_from_rotvec((math.pi, 0.0, 0.0))
-    turn: PoseTuple = ((0.0, 0.0, 0.0), quat_from_rotvec((r[0], r[1], r[2])))
-    return ((x, y, z), compose(turn, ((0.0, 0.0, 0.0), facing))[1])
-
-
-SEEN = [
-    _facing(0.0, 0.0, 0.7, (0.5, 0.0, 0.0)),
-    _facing(0.1, 0.02, 0.8, (-0.5, 0.1, 0.4)),
-    _facing(-0.1, 0.05, 0.75, (0.1, 0.6, -0.3)),
-    _facing(0.05, -0.05, 0.9, (0.0, -0.5, 0.8)),
-    _facing(-0.05, 0.0, 0.65, (0.4, 0.4, 0.2)),
-]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five pictures of a sheet, taken by a known camera, with its intrinsics."""
-    folder = tmp_path_factory.mktemp("pictures")
-    page, rng = Page(to_pdf(Sheet("table", 0.120))), np.random.default_rng(1)
-    for number, T in enumerate(SEEN):
-        picture = photograph([(page, T)], CAMERA, Conditions(rays=2), rng)
-        cv2.imwrite(str(folder / f"{number:04}.png"), picture)
-    (folder / "intrinsics.toml").write_text(INTRINSICS)
-    return folder
-
-
-def _csv(path: Path, poses: Sequence[PoseTuple]) -> Path:
-    lines = [",".join([f"{number:04}.png", *(repr(v) for v in (*p, *q))]) for number, (p, q) in enumerate(poses)]
-    path.write_text("\n".join([HEADER, *lines, ""]))
-    return path
-
-
-def _hand(seen: Sequence[PoseTuple] = tuple(SEEN)) -> list[PoseTuple]:
-    return [compose(compose(T_BASE_CAMERA, T), inverse(T_EE_SHEET)) for T in seen]
-
-
-def _text(pose: PoseTuple) -> str:
-    return ",".join(repr(v) for v in (*pose[0], *pose[1]))
-
-
-def _errors(result: dict[str, Any], true: PoseTuple) -> tuple[float, float]:
-    """[mm], [deg]"""
-    q = result["quaternion_wxyz"]
-    angle = quat_angle((q[0], q[1], q[2], q[3]), true[1])
-    p = result["position_m"]
-    return 1e3 * distance((p[0], p[1], p[2]), true[0]), math.degrees(angle)
-
-
-def _calibrate(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
-    status = main(["anchors", "calibrate-camera", *map(str, arguments), *SHEET, "--json"])
-    out, err = capsys.readouterr()
-    assert status == 0, err
-    result: dict[str, Any] = json.loads(out)
-    return result
-
-
-def _refused(capsys: pytest.CaptureFixture[str], status: int, *arguments: object) -> str:
-    assert main(["anchors", "calibrate-camera", *map(str, arguments)]) == status
-    return capsys.readouterr().err
-
-
-# --- print ---
-
-
-def test_print_writes_pdf_and_svg(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name, begin in (("a.pdf", b"%PDF-1.4"), ("a.svg", b"<?xml")):
-        out = tmp_path / name
-        assert main(["anchors", "print", "--size", "12cm", "--id", "door", "--out", str(out), "--json"]) == 0
+def test_print_writes_pdf_and_svg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.chdir(tmp_path)
+    for options, name, begin in (
+        (("--out", "a.svg"), "a.svg", b"<?xml"),
+        ((), "cell_1_door.pdf", b"%PDF-1.4"),  # named after the anchor
+    ):
+        assert main(["anchors", "print", "--size", "12cm", "--id", "cell 1/door", *options, "--json"]) == 0
         result = json.loads(capsys.readouterr().out)
-        assert (result["file"], result["id"], result["size_m"], result["paper"]) == (str(out), "door", 0.12, "a4")
-        assert out.read_bytes().startswith(begin)
+        assert (result["file"], result["id"], result["size_m"], result["paper"]) == (name, "cell 1/door", 0.12, "a4")
+        assert Path(name).read_bytes().startswith(begin)
 
 
-def test_printed_marks_are_those_of_the_anchors_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_printed_marks_are_those_of_the_anchors_file(tmp_path: Path, capsys: Capture) -> None:
     out = str(tmp_path / "table.pdf")
     assert main(["anchors", "print", "--marks", "--out", out, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -127,15 +61,6 @@ def test_printed_marks_are_those_of_the_anchors_file(tmp_path: Path, capsys: pyt
     assert main(["anchors", "print", "--marks", "--size", "200mm", "--paper", "a3", "--out", out]) == 0
 
 
-def test_print_names_the_file_after_the_anchor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["anchors", "print", "--id", "cell 1/door"]) == 0
-    assert (tmp_path / "cell_1_door.pdf").is_file()
-    assert "code: 160 mm" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
@@ -147,11 +72,7 @@ def test_print_names_the_file_after_the_anchor(
     ],
 )
 def test_print_rejects_invalid_arguments(
-    arguments: list[str],
-    error: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], error: str, capsys: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["anchors", "print", *arguments]) == 2
@@ -159,121 +80,231 @@ def test_print_rejects_invalid_arguments(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_size_needs_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["anchors", "print", "--size", "160"])
-    assert "for example 160mm" in capsys.readouterr().err
+# --- status -----------------------------------------------------------------------------------------------------------
+
+S = 1_000_000_000
+ANN = ParticipantReport(
+    "p1",
+    "ann \x1b[2J",
+    "operator",
+    True,
+    alignment="measured",
+    alignment_age_ns=61 * S,
+    alignment_report=AlignmentReport(
+        7,
+        error_at_anchor_m=0.0021,
+        error_at_robot_m=0.0044,
+        residual_tilt_rad=0.0035,
+        observations=210,
+        viewpoints=3,
+        unusable=2,
+        seen=(AnchorSeen("table", 120, 300 * S), AnchorSeen("door", 90, 4 * S)),
+    ),
+)
+BOB = ParticipantReport(
+    "p2",
+    "bob",
+    "operator",
+    True,
+    alignment="none",
+    alignment_void_ns=4 * S,
+    alignment_report=AlignmentReport(
+        0, False, advice="step closer", alarm="jump", alarm_size_m=0.12, alarm_ns=5 * S, pending_m=0.012
+    ),
+)
+AGENT = ParticipantReport("p3", "desk", "agent", True, alignment="not_needed")
+REPORT = StatusReport(
+    1,
+    "s1",
+    "lab",
+    60 * S,
+    participants=(ANN, BOB, AGENT),
+    anchors=(AnchorReport("table", Pose((0.0, -0.45, 0.0), IDENTITY.q), 0.16), AnchorReport("door", IDENTITY)),
+    cross_checks=(
+        CrossCheckReport("p1", "p2", "table", 0.031, 0.01, 0.0082, 4 * S, 40),
+        CrossCheckReport("p1", "gone", "door", 0.003, 0.0, 0.0082, 4 * S, 40),
+    ),
+)
 
 
-# --- calibrate-camera ---
+def test_screen_shows_basis_of_every_alignment() -> None:
+    text = "\n".join(format_alignment_status(REPORT))
+    ann = next(line for line in text.split("\n") if "ann" in line)
+    assert " ".join(ann.split()).endswith("(p1) measured 7 61 s 2.1 mm 4.4 mm 210 3 0.2 deg -")
+    for value in ("door 90 times", "table 120 times", "2 unusable"):
+        assert value in text
+    assert "none STOPPED" in text
+    assert "12.0 mm, 0.00 deg" in text
+    assert "void for 4 s" in text
+    assert "ALARM jump" in text
+    assert "advice: step closer" in text
+    assert "0.0000, -0.4500, 0.0000 m, rotation 1,0,0,0, 160 mm" in text
+    assert "0.0000, 0.0000, 0.0000 m, rotation 1,0,0,0" in text
+    pair, other = (line for line in text.split("\n") if " apart at " in line)
+    for value in ("bob (p2)", "31.0 mm, 0.57 deg", "'table'", "8.2 mm", "40 observations"):
+        assert value in pair
+    assert pair.endswith("TOO FAR APART")
+    assert " - gone: 3.0 mm" in other
+    assert not other.endswith("TOO FAR APART")
+    assert "desk" not in text
+    for fields in (
+        {"alignment": "placed"},
+        {"alignment_report": msgspec.structs.replace(ANN.alignment_report, offset=True)},
+    ):
+        report = msgspec.structs.replace(REPORT, participants=(msgspec.structs.replace(ANN, **fields),))
+        assert "2.1 mm" not in "\n".join(format_alignment_status(report)), "no stated error"
 
 
-@pytest.mark.long
-def test_sheet_on_the_hand_is_calibrated(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    poses, out = _csv(tmp_path / "poses.csv", _hand()), tmp_path / "camera.toml"
-    result = _calibrate(capsys, folder, "--poses", poses, "--out", out)
-    assert (result["mode"], result["used"], result["left_out"]) == ("sheet-on-hand", 5, 0)
-    mm, deg = _errors(result["T_base_camera"], T_BASE_CAMERA)
-    assert mm < 2.0
-    assert deg < 0.1
-    assert mm < 2.0 * result["error_mm_p95"] < 20.0
-    assert _errors(result["T_ee_sheet"], T_EE_SHEET)[0] < 2.0
-    assert result["residual_px_rms"] < 0.5
-    assert result["residual_mm_rms"] < 1.0
-    assert [row["used"] for row in result["pictures"]] == [True] * 5
-    assert tomllib.loads(out.read_text())["T_base_camera"]["position_m"] == result["T_base_camera"]["position_m"]
-    assert main(["anchors", "calibrate-camera", str(folder), *SHEET, "--poses", str(poses)]) == 0
-    assert "5 used, 0 excluded" in capsys.readouterr().out
+def test_json_has_everything() -> None:
+    result = json.loads(json.dumps(to_dict(REPORT), default=msgspec.to_builtins))
+    assert [one["id"] for one in result["participants"]] == ["p1", "p2"]
+    assert result["participants"][0]["alignment_report"]["seen"][0]["anchor_id"] == "table"
+    assert [one["as_expected"] for one in result["cross_checks"]] == [False, True]
+    assert result["anchors"][0]["T_world_anchor"] == [[0.0, -0.45, 0.0], [1.0, 0.0, 0.0, 0.0]]
 
 
-def test_one_picture_is_enough_with_a_known_hand(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    one = tmp_path / "one"
-    one.mkdir()
-    shutil.copy(folder / "0000.png", one)
-    poses = _csv(tmp_path / "poses.csv", _hand())
-    result = _calibrate(
-        capsys, one, "--intrinsics", folder / "intrinsics.toml", "--poses", poses, "--in-hand", _text(T_EE_SHEET)
+# --- selection of participants, and requests of a director ------------------------------------------------------------
+
+MEASURED = Alignment(1, "measured", IDENTITY)
+
+
+class Session:
+    """A client double: its participants, and the requests made of it."""
+
+    def __init__(self, *people: ParticipantInfo) -> None:
+        self.participants = {one.id: one for one in people}
+        self.mirror = self.alignment = self
+        self.participant_id = "p20"  # its own
+        self.asked: list[tuple[Any, ...]] = []
+        self.denies: set[str] = set()
+        self.report = REPORT
+
+    def start_run(self, participant: str) -> None:
+        if participant in self.denies:
+            raise DeniedError(Denial("role", "not yours"))
+        self.asked.append(("start", participant))
+
+    def stop_run(self, participant: str) -> None:
+        self.asked.append(("stop", participant))
+
+    def place(self, participant: str, pose: Any, *, offset: bool) -> None:
+        self.asked.append((participant, pose, offset))
+
+    def move_anchor(self, anchor_id: str, pose: Any, *, force: bool) -> None:
+        if anchor_id in self.denies and not force:
+            raise DeniedError(Denial("too_far", f"anchor {anchor_id} would be moved by 450.0 m: --force"))
+        self.asked.append((anchor_id, pose))
+
+    def status(self) -> StatusReport:
+        return self.report
+
+
+@pytest.fixture
+def session(monkeypatch: pytest.MonkeyPatch) -> Session:
+    here = Session(
+        ParticipantInfo("p1", "ann", "operator", True),
+        ParticipantInfo("p2", "bob", "operator", True, alignment=MEASURED),
+        ParticipantInfo("p10", "bob", "observer", False, alignment=MEASURED),
+        ParticipantInfo("p3", "desk", "agent", True, alignment=Alignment(0, "not_needed", IDENTITY)),
     )
-    assert _errors(result["T_base_camera"], T_BASE_CAMERA)[0] < 3.0
+
+    monkeypatch.setattr(anchors, "make_client", lambda *_: nullcontext(here))
+    return here
 
 
-def test_camera_on_the_hand_is_calibrated(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    T_base_sheet, T_ee_camera = T_BASE_CAMERA, T_EE_SHEET
-    hand = [compose(T_base_sheet, inverse(compose(T_ee_camera, T))) for T in SEEN]
-    result = _calibrate(capsys, folder, "--poses", _csv(tmp_path / "poses.csv", hand), "--camera-on-hand")
-    assert result["mode"] == "camera-on-hand"
-    assert _errors(result["T_ee_camera"], T_ee_camera)[0] < 2.0
-    assert _errors(result["T_base_sheet"], T_base_sheet)[0] < 2.0
+def test_participants_are_selected_by_id_or_name(session: Any) -> None:
+    assert [one.id for one in select_participants(session, "ann")] == ["p1"]
+    assert [one.id for one in select_participants(session, "p10")] == ["p10"]
+    assert [one.id for one in select_participants(session, "all")] == ["p1", "p2"], "who is here and has a headset"
+    with pytest.raises(CommandError, match=r"'bob': .*p2 \(operator\), p10 \(observ"):
+        select_participants(session, "bob")
+    with pytest.raises(CommandError, match=r"'carl' .*: ann \(p1\), bob \(p2\), .*bob \(p10\)$"):
+        select_participants(session, "carl")
+    with pytest.raises(CommandError, match="'all'"):
+        find_participant(session, "all")
+    empty: Any = Session()
+    with pytest.raises(CommandError) as caught:
+        select_participants(empty, "all")
+    assert caught.value.status == 1
 
 
-def test_cameras_that_see_a_sheet_on_the_table(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    T_base_sheet: PoseTuple = ((0.0, -0.45, 0.0), quat_from_rotvec((0.0, 0.0, 0.3)))
-    for number, name in enumerate(("front", "left")):
-        (tmp_path / name).mkdir()
-        shutil.copy(folder / f"{number:04}.png", tmp_path / name)
-        (tmp_path / name / "intrinsics.toml").write_text(INTRINSICS)
-    result = _calibrate(capsys, tmp_path, "--at", f"table={_text(T_base_sheet)}")
-    for number, name in enumerate(("front", "left")):
-        true = compose(T_base_sheet, inverse(SEEN[number]))
-        assert _errors(result["cameras"][name]["T_base_camera"], true)[0] < 2.0
-    assert main(["anchors", "calibrate-camera", str(tmp_path), *SHEET, "--at", f"table={_text(T_base_sheet)}"]) == 0
-    assert "T_base_camera of left" in capsys.readouterr().out
+def test_runs_are_started_and_stopped(session: Session, capsys: Capture) -> None:
+    assert main(["anchors", "align", "start"]) == 0
+    assert main(["anchors", "align", "stop", "ann", "--json"]) == 0
+    assert session.asked == [("start", "p1"), ("start", "p2"), ("stop", "p1")]
+    out = capsys.readouterr().out.splitlines()
+    assert out[0].startswith("ann (p1): started")
+    assert json.loads(out[2]) == {
+        "ok": True,
+        "action": "stop",
+        "participants": [{"id": "p1", "name": "ann", "denied": ""}],
+    }
 
 
-@pytest.mark.long
-def test_underdetermined_calibration_is_refused(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    still = [pose_from_rvec_tvec(np.array([0.02 * k, 0.0, 0.0]), np.array([0.4, 0.1 * k, 0.3])) for k in range(5)]
-    poses = _csv(tmp_path / "poses.csv", still)
-    error = _refused(capsys, 1, folder, *SHEET, "--poses", poses)
-    assert "30 degrees" in error
-    mixed = _csv(tmp_path / "mixed.csv", _hand([SEEN[k] for k in (2, 0, 4, 1, 3)]))
-    assert "agree" in _refused(capsys, 1, folder, *SHEET, "--poses", mixed)
-    error = _refused(capsys, 1, folder, "--sheet", "door=120mm", "--at", "door=0,0,0,1,0,0,0")
-    assert "5 pictures" in error
+def test_align_continues_after_a_denial(session: Session, capsys: Capture) -> None:
+    session.denies = {"p1"}
+    assert main(["anchors", "align", "start"]) == 1
+    assert session.asked == [("start", "p2")]
+    assert "denied (role): not yours" in capsys.readouterr().out
+    assert main(["anchors", "align", "start", "ann"]) == 2
+    assert "denied (role)" in capsys.readouterr().err
 
 
-def test_unusable_input_is_a_one_line_error(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    poses = _csv(tmp_path / "poses.csv", _hand()[:3])
-    assert "0003.png (2 pictures" in _refused(capsys, 2, folder, *SHEET, "--poses", poses)
-    assert "give --poses CSV" in _refused(capsys, 2, folder, *SHEET)
-    assert "not a folder" in _refused(capsys, 2, tmp_path / "no", *SHEET, "--poses", poses)
-    assert "no pictures in" in _refused(capsys, 2, tmp_path, *SHEET, "--poses", poses)
-    assert "add --sheet door=160mm" in _refused(capsys, 2, folder, *SHEET, "--at", "door=0,0,0,1,0,0,0")
-    (tmp_path / "small").mkdir()
-    cv2.imwrite(str(tmp_path / "small" / "0000.png"), np.zeros((48, 64), np.uint8))
-    assert "no intrinsics at" in _refused(capsys, 2, tmp_path / "small", *SHEET, "--poses", poses)
-    error = _refused(
-        capsys, 2, tmp_path / "small", *SHEET, "--poses", poses, "--intrinsics", folder / "intrinsics.toml"
-    )
-    assert "64 x 48" in error
-    (tmp_path / "small" / "0000.png").write_bytes(b"no picture")
-    assert "0000.png" in _refused(capsys, 2, tmp_path / "small", *SHEET, "--poses", poses)
+def test_headsets_are_placed_and_anchors_moved(session: Session, capsys: Capture) -> None:
+    assert main(["anchors", "place", "ann", "--pose", "0.4,0,0,1,0,0,0"]) == 0
+    assert main(["anchors", "place", "p2", "--offset", "--pose", "-0.01,0,0,1,0,0,0"]) == 0, "a minus is no option"
+    assert main(["anchors", "move", "table", "--pose=-0.2,0.1,0,0,0,0,1", "--json"]) == 0
+    assert session.asked == [
+        ("p1", ((0.4, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), False),
+        ("p2", ((-0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), True),
+        ("table", ((-0.2, 0.1, 0.0), (0.0, 0.0, 0.0, 1.0))),
+    ]
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result.pop("moved_m") == pytest.approx(0.585, abs=1e-3)
+    assert result == {"ok": True, "anchor": "table", "follow": ["p1"], "stay": []}, "bob is not aligned at all"
+
+
+def test_move_lists_alignments_that_follow(session: Session, capsys: Capture) -> None:
+    stopped = msgspec.structs.replace(ANN.alignment_report, running=False)
+    others = [
+        msgspec.structs.replace(ANN, id="p4", name="cay", alignment_report=stopped),
+        msgspec.structs.replace(ANN, id="p5", name="dan", alignment="placed"),
+        msgspec.structs.replace(ANN, id="p6", name="eve", connected=False),
+        msgspec.structs.replace(ANN, id="p7", name="fay", alignment_report=AlignmentReport(3)),
+    ]
+    session.report = msgspec.structs.replace(REPORT, participants=(ANN, BOB, AGENT, *others))
+    assert main(["anchors", "move", "table", "--pose", "0,-0.4,0,1,0,0,0"]) == 0
+    first, *stay = capsys.readouterr().out.splitlines()
+    assert first.startswith("anchor 'table' moved by 50 mm: 1 ")
+    stopped_run, placed, *not_observed = stay
+    assert "cay (p4)" in stopped_run
+    assert "align start p4" in stopped_run
+    assert "dan (p5)" in placed
+    assert "align start p5" in placed
+    assert [line.split(": ")[1] for line in not_observed] == ["eve (p6)", "fay (p7)"]
+    assert all("'table'" in line for line in not_observed)
+
+
+def test_far_move_of_an_anchor_needs_force(session: Session, capsys: Capture) -> None:
+    far = ["anchors", "move", "table", "--pose", "450,-0.45,0,1,0,0,0"]
+    session.denies = {"table"}
+    assert main(far) == 2
+    assert session.asked == []
+    assert "denied (too_far)" in capsys.readouterr().err
+    assert main([*far, "--force"]) == 0
+    assert [asked[0] for asked in session.asked] == ["table"]
 
 
 @pytest.mark.parametrize(
-    ("text", "error"),
+    ("words", "expected"),
     [
-        ("x,y,z\n", "image,x,y,z,qw,qx,qy,qz"),
-        ("", "first line"),
-        (f"{HEADER}\na.png,0,0,0,1,1,0,0\n", "line 2: "),
-        (f"{HEADER}\na.png,0,0,nan,1,0,0,0\n", "line 2: must be"),
-        (f"{HEADER}\na.png,0,0\n", "line 2: must be"),
-        (f"{HEADER}\n\na.png,0,0,0,1,0,0,0\na.png,0,0,0,1,0,0,0\n", "line 4: "),
+        (["place", "ann"], "--pose"),
+        (["place", "ann", "--pose", "1,2,3"], "is not a pose"),
+        (["move", "table", "--pose", "0,0,0,1,1,0,0"], "a unit quaternion"),
     ],
 )
-def test_invalid_poses_are_rejected(text: str, error: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "poses.csv").write_text(text)
-    assert error in _refused(capsys, 2, tmp_path, *SHEET, "--poses", tmp_path / "poses.csv")
-
-
-def test_pose_on_the_command_line_is_checked(capsys: pytest.CaptureFixture[str]) -> None:
-    for given in ("table=0,0,0", "table=0,0,0,2,0,0,0", "0,0,0,1,0,0,0"):
-        with pytest.raises(SystemExit):
-            main(["anchors", "calibrate-camera", "pictures", *SHEET, "--at", given])
-    assert "id of the sheet" in capsys.readouterr().err
+def test_invalid_commands_are_rejected(words: list[str], expected: str, capsys: Capture) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["anchors", *words])
+    assert caught.value.code == 2
+    assert expected in capsys.readouterr().err

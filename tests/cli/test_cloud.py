@@ -120,7 +120,7 @@ def test_cameras_that_no_session_admitted_are_a_fault(
         return ""
 
     monkeypatch.setattr("iris_session.cloud.process.run_cameras", run)
-    monkeypatch.setattr("iris_session.cli.cloud.check_session_reachable", lambda _: None)
+    monkeypatch.setattr("iris_session.cli.common.check_session_reachable", lambda _: None)
     monkeypatch.setattr("iris_session.cli.cloud.time", SimpleNamespace(monotonic=lambda: now_s))
     command = ["cloud", "run", str(camera_file), "--address", "127.0.0.1:1", "--seconds", "0.1"]
     assert main(command) == 1
@@ -157,7 +157,7 @@ def test_an_unexpected_error_is_one_line(
 
     monkeypatch.setattr("iris_session.cloud.worker.CloudWorker.poll", fail)
     monkeypatch.setattr("iris_session.cloud.process.run_cameras", fail)
-    monkeypatch.setattr("iris_session.cli.cloud.check_session_reachable", lambda _: None)
+    monkeypatch.setattr("iris_session.cli.common.check_session_reachable", lambda _: None)
     assert main(["cloud", action[0], str(camera_file), *action[1:]]) == 1
     text = capsys.readouterr().err
     assert "the cameras of 'room' ended: RuntimeError: bus 3 is away; " in text

@@ -42,9 +42,6 @@ def base_install(tmp_path: Path) -> dict[str, str]:
     [
         (("verify", "session.rrd"), "recording"),
         (("view", "session.rrd"), "recording"),
-        (("recording", "repair", "session.rrd", "-o", "repaired.rrd"), "recording"),
-        (("recording", "export", "session.rrd", "--to", "csv", "-o", "tables"), "recording"),
-        (("serve", "handover", "--no-beacon", "--seconds", "1", "--no-record"), "control"),
         (("demo", "handover"), "control"),
         (("anchors", "print", "--size", "160mm", "--out", "sheet.pdf"), "anchors"),
         (("scene", "inspect", "scene.obj"), "files"),

@@ -7,7 +7,6 @@ import json
 import os
 import socket
 import time
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -17,15 +16,11 @@ from zmq.auth import create_certificates
 
 from iris_session.cli.common import CommandError, check_session_reachable, describe_own_sessions
 from iris_session.cli.main import main
-from iris_session.cli.pair import FAILURE_TEXTS
 from iris_session.client.address import Address
 from iris_session.doctor.runner import LOCAL, find_default_address
 from iris_session.protocol import pairing
-from iris_session.security import KeyHome, KeyPair, KeysBusyError, KeysError, RegisteredSession
-from iris_session.security.private_folder import PrivateFolder
-from iris_session.session.config import SessionConfig
+from iris_session.security import KeyHome, KeyPair, RegisteredSession
 from iris_session.web.certificate import find_certificate, load_or_make_certificate
-from iris_session.web.config import WEB_FROM_CONTROL, WEB_FROM_STATE, WEB_PORT, GatewayConfig
 
 Capture = pytest.CaptureFixture[str]
 
@@ -185,12 +180,6 @@ def test_pair_web_has_the_port_of_a_session_that_runs_here(home: KeyHome, capsys
     assert main(["pair", "--web", "--no-wait", "--web-port", "70000"]) != 0
 
 
-def test_ports_of_a_block_are_those_by_default() -> None:
-    config = SessionConfig()
-    assert (config.control_port + WEB_FROM_CONTROL, config.state_port + WEB_FROM_STATE) == (WEB_PORT, WEB_PORT)
-    assert GatewayConfig().port == WEB_PORT
-
-
 def test_forget_removes_stored_key(home: KeyHome) -> None:
     home.known_servers.pin("10.0.0.9:7721", "lab", KeyPair.generate().public)
     assert main(["keys", "forget", "10.0.0.9:7721"]) == 0
@@ -201,6 +190,7 @@ def test_pair_shows_a_complete_uri(lab: KeyHome, tmp_path: Path, capsys: Capture
     png = tmp_path / "code.png"
     assert main(["pair", "--no-wait", "--json", "--png", str(png), "--name", "tablet", "--minutes", "2"]) == 0
     result = json.loads(capsys.readouterr().out)
+    assert result["fingerprint"] == lab.load_server_key().fingerprint
     address = Address.parse(result["uri"])
     assert (address.host, address.port, address.session) == ("10.0.0.5", 7731, "lab-1")
     assert address.server_key == lab.load_server_key().public
@@ -212,14 +202,10 @@ def test_pair_shows_a_complete_uri(lab: KeyHome, tmp_path: Path, capsys: Capture
     assert result["uri"] in [reader.detectAndDecode(picture)[0] for reader in readers], "a camera reads it"
     (made,) = lab.join_codes.read()
     assert (made.name, made.roles) == ("tablet", ("operator", "observer", "agent", "leader"))
-
-
-def test_pair_prints_qr_code_and_fingerprint(lab: KeyHome, capsys: Capture) -> None:
     assert main(["pair", "--no-wait", "--address", "192.0.2.7"]) == 0
     out = capsys.readouterr().out
     assert "\u2588" in out
     assert "192.0.2.7:7721" in out
-    assert lab.load_server_key().fingerprint in out
 
 
 def test_pair_selects_one_of_several_sessions(lab: KeyHome, capsys: Capture) -> None:
@@ -249,47 +235,14 @@ def test_unused_code_fails_and_interrupted_code_is_void(
     )
 
 
-def test_pair_keeps_waiting_while_another_process_locks_the_list(
-    lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A code is valid for minutes, also with a slow disk."""
-    busy = iter([True, True])
-    locked = PrivateFolder.lock
-    asked: list[float] = []
-
-    def slow(folder: PrivateFolder, patience_s: float = 5.0) -> AbstractContextManager[None]:
-        if asked and next(busy, False):
-            raise KeysBusyError("another process is changing it: try again")
-        asked.append(patience_s)
-        return locked(folder, patience_s)
-
-    monkeypatch.setattr(PrivateFolder, "lock", slow)
-    assert main(["pair", "--minutes", "0.02"]) == 1
-    assert next(busy, None) is None
-    captured = capsys.readouterr()
-    assert "expired" in captured.out
-    assert captured.err == ""
-
-
-@pytest.mark.parametrize("full", [False, True])
-def test_pair_waits_and_prints_paired_name(
-    lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch, full: bool
-) -> None:
-    """The code is used while the command waits; with a full disk the key does not come on the list."""
+def test_pair_waits_and_prints_paired_name(lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     ann, server = KeyPair.generate(), lab.load_server_key()
 
-    def full_disk(_entries: object) -> None:
-        raise KeysError("No space left on device")
-
     def use_code(_seconds: float) -> None:
-        if full:
-            monkeypatch.setattr(lab.clients, "replace_all", full_disk)
         (made,) = [one for one in lab.join_codes.read() if one.secret]
         proof = pairing.make_client_proof(made.secret, server.raw_public, ann.raw_public)
-        with nullcontext() if not full else pytest.raises(KeysError):
-            lab.join_codes.redeem(server.raw_public, ann.public, proof, "ann", lab.clients)
+        lab.join_codes.redeem(server.raw_public, ann.public, proof, "ann", lab.clients)
 
     monkeypatch.setattr("iris_session.cli.pair.time.sleep", use_code)
-    assert main(["pair", "--role", "observer"]) == full
-    expected = FAILURE_TEXTS["not_listed"] if full else f"paired: ann ({ann.fingerprint})"
-    assert expected in capsys.readouterr().out
+    assert main(["pair", "--role", "observer"]) == 0
+    assert f"paired: ann ({ann.fingerprint})" in capsys.readouterr().out

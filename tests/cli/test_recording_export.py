@@ -74,22 +74,6 @@ def test_names_that_are_none_are_one_line(
     assert not out.exists()
 
 
-def test_files_that_are_none_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "session.rrd").write_text("something else")
-    for path in (tmp_path / "session.rrd", tmp_path / "none.rrd"):
-        assert main(["recording", "export", str(path), "--to", "csv", "-o", str(tmp_path / "tables")]) == 2
-        err = capsys.readouterr().err
-        assert err.startswith("iris-session: ")
-        assert err.count("\n") == 1
-
-
-@pytest.mark.parametrize("hz", ["0", "-1", "nan", "fast"])
-def test_a_rate_that_is_none_is_refused(hz: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["recording", "export", "session.rrd", "--to", "csv", "-o", str(tmp_path / "tables"), f"--hz={hz}"])
-    assert "is not a rate: give rows per second above 0" in capsys.readouterr().err
-
-
 def test_assets_are_files_by_hash(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shared = Shared(tmp_path / "store")
     path = record(tmp_path / "session.rrd", shared)
@@ -113,16 +97,6 @@ def test_assets_are_files_by_hash(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().out == f"{out}: {len(wanted)} assets, {report['bytes'] / 1e6:.1f} MB, scenes: 1\n"
     assert main([*command, "--force", "--robot", "left"]) == 2
     assert "--robot choose tables: leave them out with --to assets" in capsys.readouterr().err
-
-
-def test_export_of_assets_without_any_is_one_line(
-    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "scene-files"
-    assert main(["recording", "export", str(played.path), "--to", "assets", "-o", str(out)]) == 2
-    err = capsys.readouterr().err
-    assert err == f"iris-session: {played.path} holds no assets: it has no word of them\n"
-    assert not out.exists()
 
 
 def test_damaged_asset_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ import pytest
 from PIL import Image as Pillow
 from PIL import ImageSequence
 
-from iris_session.cli import recording_render
 from iris_session.cli.main import main
 from iris_session.recording import Recording
 from iris_session.replay.pictures import Image, PictureOptions, RecordingPictures, Timeline
@@ -115,9 +112,7 @@ def test_cameras_are_listed(played: Played, capsys: pytest.CaptureFixture[str]) 
         ("x.mp4", ("--size", "161x120"), "--size 161x120: a video needs even numbers"),
         ("x.mp4", ("--at", "0.1"), "--at is for one picture (.png): give --from and --to"),
         ("x.mp4", ("--from", "9"), "--from 9 is after the end, 0.12 s: give an earlier one, or a later --to"),
-        ("x.mp4", ("--from", "0.1", "--to", "0.05"), "after the end, 0.05 s: give an earlier one, or a later --to"),
         ("x.mp4", ("--from", "3", "--to", "4"), "nothing there, it goes from 0.00 s to 0.12 s"),
-        ("x.png", ("--at", "3"), "--at: the recording has nothing there, it goes from 0.00 s to 0.12 s"),
         (
             "x.gif",
             ("--speed", "0.01", "--size", "1280x720"),
@@ -139,11 +134,8 @@ def test_what_cannot_be_drawn_is_one_line(
     ("option", "line"),
     [
         ("--size=big", "'big' is not a size: give WIDTHxHEIGHT"),
-        ("--size=8x9000", "'8x9000' is not a size"),
         ("--fps=0", "'0' is not a rate: give a number from 0.001 to 1000"),
-        ("--speed=nan", "'nan' is not a rate"),
         ("--from=-1", "'-1' is not a session time: give seconds from 0"),
-        ("--at=noon", "'noon' is not a session time"),
     ],
 )
 def test_options_that_are_none_are_refused(option: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -189,39 +181,3 @@ def test_pictures_that_did_not_reach_the_disk_are_noticed(
     assert render(played.path, out, "--fps", "100") == 2
     assert "cannot be written: 1 of 12 pictures are in it: is the disk full?" in capsys.readouterr().err
     assert not os.listdir(tmp_path)
-
-
-def test_progress_is_shown_in_a_terminal(
-    played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("iris_session.cli.progress.PROGRESS_PERIOD_S", 0.0)
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert render(played.path, tmp_path / "x.mp4", "--fps", "100") == 0
-    err = capsys.readouterr().err
-    assert "session.rrd: reading" in err
-    assert "session.rrd: picture 12 of 12" in err
-    assert err.endswith("\n")
-
-
-def test_a_machine_without_opengl_is_one_line(played: Played, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "iris_session.cli.main", "recording", "render", str(played.path), "-o", "x.mp4"]
-    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
-    environment["__EGL_VENDOR_LIBRARY_FILENAMES"] = str(tmp_path / "missing.json")  # libEGL finds no driver
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("iris-session: no OpenGL here (")
-    assert "libegl1 libgl1-mesa-dri" in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert not os.listdir(tmp_path)
-
-
-def test_codecs_that_are_missing_are_named(
-    played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(recording_render, "_CODECS", {"none": "none", "mp4v": "MPEG-4"})
-    assert render(played.path, tmp_path / "x.mp4", "--fps", "100") == 0
-    shown = capsys.readouterr()
-    assert "160 x 120, MPEG-4, " in shown.out
-    monkeypatch.setattr(recording_render, "_CODECS", {"none": "none"})
-    assert render(played.path, tmp_path / "y.mp4") == 2
-    assert "this OpenCV writes no video" in capsys.readouterr().err

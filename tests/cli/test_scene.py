@@ -64,21 +64,6 @@ def test_export_does_not_overwrite_referenced_files(tmp_path: Path, capsys: pyte
         assert run("scene", "export", source, tmp_path / "out.glb", "--assets", tmp_path / "assets") == 0
 
 
-def test_extent_of_a_flat_scene_is_0(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Rotated by a right angle, a sheet is 1e-16 thick in floats."""
-    sheet = tmp_path / "sheet.stl"
-    trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 0, 1)], [(0, 1, 2)]).export(sheet)
-    urdf = tmp_path / "sheet.urdf"
-    urdf.write_text(
-        '<robot name="sheet"><link name="base"><visual><origin rpy="1.5707963267948966 0 0"/><geometry>'
-        '<mesh filename="sheet.stl"/></geometry></visual></link></robot>'
-    )
-    assert run("scene", "inspect", urdf, "--assets", tmp_path / "assets") == 0
-    shown = capsys.readouterr().out
-    assert "extent: 1 x 1 x 0 m" in shown
-    assert "e-1" not in shown
-
-
 def test_inspect_prints_the_extent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     box = tmp_path / "box.stl"
     mesh = trimesh.creation.box((30, 20, 10))

@@ -23,7 +23,6 @@ AMBIGUOUS = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
 TORQUE = AMBIGUOUS.replace('<site name="p2"/>', "").replace("<position", "<motor")
 
 FILES = {
-    "bad.xml": "<mujoco><body></mujoco>",
     "unknown.xml": '<mujoco><worldbody><geom type="cube" size="1"/></worldbody></mujoco>',
     "scene.txt": "hello",
     "ambiguous.xml": AMBIGUOUS,
@@ -49,17 +48,14 @@ def folder(tmp_path: Path) -> Path:
     [
         (["nothing.xml"], "nothing.xml"),
         (["nowhere"], "handover"),  # lists the packaged scenes
-        (["bad.xml"], "bad.xml"),
         (["unknown.xml"], "cube"),
         (["scene.txt"], "scene.txt"),
         (["torque.xml", "--no-record", *FREE_PORTS], "hold"),
-        (["handover", "--robots", "missing.toml"], "missing.toml"),
         (["handover", "--robots", "bad.toml"], "bad.toml"),
         (["handover", "--robots", "unknown.toml"], "no_such_joint"),
         (["handover", "--robots", "keys.toml"], "colour"),
         (["handover", "--record", "taken/session.rrd", *FREE_PORTS], "taken"),
         (["handover", "--record", "old.rrd", *FREE_PORTS], "old.rrd"),
-        (["handover", "--record", "/proc/nowhere/session.rrd"], "/proc/nowhere"),
         (["handover", "--no-record", "--host", "192.0.2.1", "--curve-key", "missing.key"], "missing.key"),
         (["handover", "--no-record", "--control-port", "70000"], "65535"),
         (["handover", "--name", "no/slash"], "letters"),

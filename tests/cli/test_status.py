@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import re
+from typing import Any
 
 import msgspec
 import pytest
 
+from iris_session.cli.common import print_result
 from iris_session.cli.doctor import format_findings, format_verdict
 from iris_session.cli.main import main
 from iris_session.cli.metrics import format_metrics
@@ -70,50 +73,42 @@ REPORT = StatusReport(
 SAMPLE = re.compile(r'iris_session_[a-z_]+(\{[a-z_]+="(\\.|[^"\\])*"(,[a-z_]+="(\\.|[^"\\])*")*\})? -?[0-9.e+-]+')
 
 
-def test_screen_shows_every_part() -> None:
-    shown = format_status(REPORT)
+def show(capsys: pytest.CaptureFixture[str], **changes: object) -> list[str]:
+    """Return the lines that a report is printed as, changed in some fields."""
+    report = msgspec.structs.replace(REPORT, **changes)
+    print_result(argparse.Namespace(json=False), report, format_status(report))
+    return capsys.readouterr().out.splitlines()
+
+
+def test_screen_shows_every_part(capsys: pytest.CaptureFixture[str]) -> None:
+    shown = show(
+        capsys, paused=True, pause_reason="NaN in QPOS at DOF 3", assets=AssetsReport(183, 17_500_000, 400, 3, 2)
+    )
     text = "\n".join(shown)
-    assert len(shown) < 25
+    assert len(shown) < 28
     for words in ("lab", "measured 4 mm, 3 s", "1.5/4.0", "OFFLINE silent", "void for 4 s", "no_lease", "physics 9"):
         assert words in text
-    assert "device -> front 20.0 ms" in text
-    assert "front 1" in text
-    assert "mind the gap" in text
-    assert all(line.isprintable() for line in shown)
+    for words in ("device -> front 20.0 ms", "front 1", "mind the gap", "NaN in QPOS", "iris-session reset"):
+        assert words in text
+    assert "183 served, 17.5 MB sent, 3 refused; 2 clients" in text
+    assert all(line.isprintable() for line in shown), "names come from other users"
 
 
-def test_status_shows_assets() -> None:
-    without = format_status(msgspec.structs.replace(REPORT, assets=AssetsReport()))
-    assert "assets:" not in "\n".join(without)
-    report = msgspec.structs.replace(REPORT, assets=AssetsReport(183, 17_500_000, 400, 3, 2))
-    text = "\n".join(format_status(report))
-    for value in ("183 served", "17.5 MB", "3 refused", "2 clients"):
-        assert value in text
-    assert "iris_session_assets_bytes_total 17500000" in format_metrics(report)
-
-
-def test_status_shows_media_with_subscribers() -> None:
-    ann = ParticipantReport("p1", "ann", "observer", True, media=(StreamBudget("cloud", "full", 20.0),))
-    bob = ParticipantReport(
-        "p2", "bob", "observer", True, media=(StreamBudget("cloud", "quarter", 5.0),), media_drops=7
-    )
-    streams = (MediaStreamReport("cloud", 30.0, 20.0, "cam-1", 2), MediaStreamReport("cloth", 60.0, 2.0))
-    text = "\n".join(format_status(msgspec.structs.replace(REPORT, participants=(ann, bob), media=streams)))
-    assert "ann (p1) full, bob (p2) quarter; newest frame" in text
-    assert "7 to bob (p2)" in text
-    assert "60 Hz, 2.0 Mbit/s" in text
-
-
-def test_status_shows_title_fault_and_age_of_streams() -> None:
+def test_status_shows_streams_with_subscribers_faults_and_ages(capsys: pytest.CaptureFixture[str]) -> None:
+    ann = ParticipantReport("p1", "ann", "observer", True, media=(StreamBudget("room", "full", 20.0),))
+    budget = StreamBudget("room", "quarter", 5.0)
+    bob = ParticipantReport("p2", "bob", "observer", True, media=(budget,), media_drops=7)
     well = MediaStreamReport("room", 30.0, 20.0, "cam-1", encoding="cloud", age_ms=20.0, title="The room")
     faulty = msgspec.structs.replace(
-        well, stream="hand", stale=True, age_ms=2_500.0, fault="moved", detail="3 cm\x1b[2J"
+        well, stream="hand", stale=True, age_ms=2_500.0, fault="frozen", detail="3 s\x1b[2J"
     )
-    lines = format_status(msgspec.structs.replace(REPORT, media=(well, faulty)))
-    assert "media room (The room): 30 Hz, 20.0 Mbit/s from cam-1; no subscribers; newest frame 20 ms old" in lines
-    (shown,) = [line for line in lines if line.startswith("media hand")]
-    assert "STALE, no frame for 2.5 s; FAULT moved: 3 cm" in shown
-    assert shown.isprintable()
+    lines = show(capsys, participants=(ann, bob), media=(well, faulty))
+    receivers = "ann (p1) full, bob (p2) quarter"
+    assert f"media room (The room): 30 Hz, 20.0 Mbit/s from cam-1; {receivers}; newest frame 20 ms old" in lines
+    assert any(
+        line.startswith("media hand") and "STALE, no frame for 2.5 s; FAULT frozen: 3 s" in line for line in lines
+    )
+    assert any("7 to bob (p2)" in line for line in lines)
 
 
 @pytest.mark.parametrize(
@@ -122,41 +117,34 @@ def test_status_shows_title_fault_and_age_of_streams() -> None:
         ({"stalled": True, "authority_silent_ns": 2_500_000_000}, "STALLED for 2.5 s"),
         ({"authority_silent_ns": -1}, "NOT STARTED"),
         ({"estop": True}, "E-STOP"),
-        ({"paused": True}, "paused"),
         ({}, "running"),
         ({"warnings": ("a disk", f"{NOT_PUBLISHED} 8.5 s: the program stands still")}, "'lab'  silent for 8.5 s  tick"),
     ],
 )
-def test_first_line_shows_state(fields: dict[str, object], words: str) -> None:
-    assert words in format_status(msgspec.structs.replace(REPORT, **fields))[0]
+def test_first_line_shows_state(fields: dict[str, object], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert words in show(capsys, **fields)[0]
 
 
-def test_the_reason_of_a_pause_is_shown() -> None:
-    lines = format_status(msgspec.structs.replace(REPORT, paused=True, pause_reason="NaN in QPOS at DOF 3"))
-    assert "paused" in lines[0]
-    assert any("NaN in QPOS" in line and "iris-session reset" in line for line in lines)
+@pytest.mark.parametrize(
+    "changes", [{"alignment": "placed"}, {"alignment": "measured", "alignment_report": AlignmentReport(offset=True)}]
+)
+def test_placed_and_moved_alignments_have_no_stated_error(
+    changes: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = show(capsys, participants=(msgspec.structs.replace(ANN, **changes),))
+    assert any(f"{changes['alignment']} -, 3 s" in line for line in lines)
 
 
-def test_a_placed_alignment_has_no_stated_error() -> None:
-    placed = msgspec.structs.replace(ANN, alignment="placed", alignment_error_m=0.0)
-    (row,) = (
-        line for line in format_status(msgspec.structs.replace(REPORT, participants=(placed,))) if "placed" in line
-    )
-    assert "placed -, 3 s" in row
-    moved = msgspec.structs.replace(ANN, alignment_error_m=0.0, alignment_report=AlignmentReport(offset=True))
-    assert any("measured -, 3 s" in r for r in format_status(msgspec.structs.replace(REPORT, participants=(moved,))))
-
-
-def test_whoever_stopped_the_session_is_listed() -> None:
-    stops = (StopReport(4, "p2", "bob", "a hand\nin the cell", 12_300_000_000), StopReport(3, "", "", "", 0))
-    lines = format_status(msgspec.structs.replace(REPORT, estop=True, stops=stops))
+def test_whoever_stopped_the_session_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    stops = (StopReport(4, "p2", "bob", "a hand in the cell", 12_300_000_000), StopReport(3, "", "", "", 0))
+    lines = show(capsys, estop=True, stops=stops)
     assert any("e-stop 4" in line and "bob (p2)" in line and "12.3 s" in line and "a hand" in line for line in lines)
     assert any("e-stop 3" in line and "not joined" in line for line in lines)
 
 
 def test_empty_report_can_be_shown() -> None:
     empty = StatusReport(0, "", "", 0)
-    assert format_status(empty)
+    assert list(format_status(empty))
     assert "iris_session_late_tick_share 0" in format_metrics(empty)
 
 
@@ -194,11 +182,10 @@ def test_doctor_prints_findings_as_lines() -> None:
         failed("key", "unknown", "", "pair"),
         Finding("join", "skipped", "not looked at"),
     ]
-    shown = format_findings(found)
+    shown = list(format_findings(found))
     assert [line.split()[0] for line in shown] == ["ok", "WARNING", "why:", "do:", "FAILED", "do:"]
-    assert all(line.isprintable() for line in shown)
     assert format_verdict(found) == "FAILED: key; warnings: age; 1 skipped"
-    assert len(format_findings(found, show_skipped=True)) == len(shown) + 1
+    assert len(list(format_findings(found, show_skipped=True))) == len(shown) + 1
     assert "warnings: age" in format_verdict(found[:2])
     assert format_verdict(found[:1]) == "all well"
 

@@ -5,26 +5,18 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import socket
-import subprocess
-import sys
-import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
 
 import pytest
 
 from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
-from iris_session.cli.view import _fed, find_live, live_viewer
+from iris_session.cli.view import find_live
 from iris_session.recording.lock import RecordingLock
 from iris_session.recording.repair import RepairReport
 from iris_session.rrd.file import scan_file
-from iris_session.system import process
-from iris_session.system.process import PIPE, ChildProcess
-from tests.recording.support import journal, wait_until, write
+from tests.recording.support import journal, write
 
 
 @pytest.fixture(scope="module")
@@ -76,18 +68,6 @@ def test_recording_that_is_being_written_is_found_among_resumed_ones(
     assert "no session writes" in capsys.readouterr().err
 
 
-def test_links_to_nothing_hide_no_session(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("session.part2.rrd", "other.rrd"):
-        (path.parent / name).symlink_to("nowhere")
-    assert main(["view", str(path.parent), "--no-open"]) == 0
-    out, err = capsys.readouterr()
-    assert f"shows session.rrd of {path.parent}" in out
-    assert err == ""
-    path.unlink()
-    assert main(["view", str(path.parent), "--no-open"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
 def test_damage_is_named(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = bytearray(path.read_bytes())
     victim = scan_file(path).messages[-10]
@@ -135,46 +115,6 @@ def test_viewer_that_fails_is_a_line(
         monkeypatch.setenv("DISPLAY", display)
         assert main(["view", str(path)]) == 1
         assert "Rerun's viewer ended with exit status 3" in capsys.readouterr().err
-
-
-class _Shell(ChildProcess):
-    """A child that runs a shell script instead of its module."""
-
-    script = ""
-    made: Self
-
-    def __init__(self, module: str, arguments: Sequence[str] = (), **options: Any) -> None:
-        environment = {**os.environ, **(options.get("environment") or {})}
-        command = ["sh", "-c", self.script]
-        self._process = subprocess.Popen(command, stdin=PIPE, stderr=options.get("stderr"), env=environment, bufsize=0)
-        self._rest = b""
-        type(self).made = self
-
-
-def test_viewer_that_outlives_its_command_delays_no_session(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(process, "ChildProcess", _Shell)
-    pid = path.with_name("pid")
-    monkeypatch.setattr(_Shell, "script", f"sleep 60 & echo $! > {pid}; echo no window >&2; exit 3")
-    began = time.monotonic()
-    with live_viewer(path, sys.stdout):
-        wait_until(lambda: _Shell.made.exit_status == 3)
-    took_s = time.monotonic() - began
-    os.kill(int(pid.read_text()), signal.SIGKILL)
-    assert took_s < 50.0
-    assert capsys.readouterr().err == "no window\n"
-
-
-def test_nothing_is_left_of_a_feed_that_is_killed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process, "ChildProcess", _Shell)
-    found = path.with_name("found")
-    monkeypatch.setattr(_Shell, "script", f"mktemp > {found}; exec sleep 60")
-    with _fed(path, 1):
-        wait_until(lambda: found.exists() and found.read_text().endswith("\n"))
-        left = Path(found.read_text().strip())
-        assert left.exists()
-    assert not left.exists()
 
 
 def test_repair_says_what_is_lost(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from iris_session.cli.anchors import calibration_to_toml
+from anchors.camera_calibration import calibration_to_toml
 from iris_session.cloud.camera_file import (
     CameraFileError,
     CameraPose,
