@@ -21,15 +21,7 @@ import mujoco
 from anchors.pose import PoseTuple, Vec3
 from iris_session.cloud.camera_file import load_camera_file
 from iris_session.demo.goals import FoldGoal, Goal, StowGoal
-from iris_session.demo.named_scenes import (
-    NamedScene,
-    make_aloha,
-    make_arms,
-    make_cloth,
-    make_panda,
-    make_soft,
-    scene_by_name,
-)
+from iris_session.demo.named_scenes import NamedScene, scene_by_name
 from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, RADIUS
 from iris_session.demo.scenes.generators import arm_names, compute_bearing, compute_circle_radius
 from iris_session.demo.scenes.panda import compute_panda_radius
@@ -40,6 +32,7 @@ from iris_session.session.errors import ConfigError
 
 MAX_OPERATORS: Final = 8
 MAX_OBSERVERS: Final = 16
+MORE_PEOPLE: Final = "For more people: iris-session demo handover --operators N"
 #: Names of operators, in the order in which they join.
 NAMES: Final = ("ann", "bob", "cem", "dia", "eli", "fay", "gus", "hoa")
 #: Distance of an operator behind the arm, and height of the eyes above the table [m].
@@ -93,25 +86,20 @@ def make_demo(name: str, operators: int = 2, observers: int = 0, seed: int = 0) 
 def _make_handover(operators: int, seed: int) -> Demo:
     _check_operators("handover", operators)
     if operators == 2:
-        play = _make_without_cast("handover", scene_by_name("handover"), ("hammer",))
-        return _cast_around_table(play, operators, 0.6, "arm", seed)
-    play = _make_without_cast("handover", make_arms(operators), _list_objects(operators))
+        return _cast_around_table(_make_without_cast("handover", "handover", ("hammer",)), operators, 0.6, "arm", seed)
+    play = _make_without_cast("handover", f"arms{operators}", _list_objects(operators))
     return _cast_around_table(play, operators, compute_circle_radius(operators), "arm", seed)
 
 
 def _make_panda(operators: int, seed: int) -> Demo:
     _check_operators("panda", operators)
-    return _cast_around_table(
-        _make_without_cast("panda", make_panda(operators), _list_objects(operators)),
-        operators,
-        compute_panda_radius(operators),
-        "panda",
-        seed,
-    )
+    play = _make_without_cast("panda", f"panda{operators}", _list_objects(operators))
+    return _cast_around_table(play, operators, compute_panda_radius(operators), "panda", seed)
 
 
-def _make_without_cast(name: str, scene: NamedScene, objects: tuple[str, ...]) -> Demo:
-    """Return a demo without its cast."""
+def _make_without_cast(name: str, scene_name: str, objects: tuple[str, ...]) -> Demo:
+    """Return a demo in the named scene, without its cast."""
+    scene: NamedScene = scene_by_name(scene_name)
     return Demo(name, scene.model, scene.anchors, (), objects, anchor_sizes=scene.anchor_sizes, cameras=scene.cameras)
 
 
@@ -121,6 +109,11 @@ def _check_operators(demo: str, operators: int) -> None:
             f"demo {demo} takes 2 to {MAX_OPERATORS} operators, not {operators}: each has an arm, and it "
             "takes two to hand something over"
         )
+
+
+def _require_two(demo: str, operators: int, places: str, advice: str) -> None:
+    if operators != 2:
+        raise ConfigError(f"demo {demo} has {places}: 2 operators, not {operators}. {advice}")
 
 
 def _list_objects(operators: int) -> tuple[str, ...]:
@@ -164,11 +157,8 @@ def _compute_seat(i: int, operators: int, radius: float, sheet: Vec3) -> Vec3:
 
 
 def _make_cloud(operators: int, seed: int) -> Demo:
-    if operators != 2:
-        raise ConfigError(
-            f"demo cloud has two arms at one table: 2 operators, not {operators}. More people may watch: --observers N"
-        )
-    play = _make_without_cast("cloud", scene_by_name("cloud"), ("hammer",))
+    _require_two("cloud", operators, "two arms at one table", "More people may watch: --observers N")
+    play = _make_without_cast("cloud", "cloud", ("hammer",))
     streams = tuple(name for path in play.cameras for name in load_camera_file(path).list_streams())
     return dataclasses.replace(_cast_around_table(play, operators, 0.6, "arm", seed), streams=streams)
 
@@ -177,12 +167,8 @@ def _make_cloud(operators: int, seed: int) -> Demo:
 
 
 def _make_aloha(operators: int, seed: int) -> Demo:
-    if operators != 2:
-        raise ConfigError(
-            f"demo aloha has two stations with two arms each: 2 operators, not {operators}. For more people: "
-            "iris-session demo handover --operators N"
-        )
-    play = _make_without_cast("aloha", make_aloha(), ("red_board", "blue_board"))
+    _require_two("aloha", operators, "two stations with two arms each", MORE_PEOPLE)
+    play = _make_without_cast("aloha", "aloha", ("red_board", "blue_board"))
     sheet = play.anchors[DEFAULT_ANCHOR_ID]
 
     def hand(station: str, side: str, behaviour: str, thing: str, partner: str, place: tuple[float, float]) -> HandTask:
@@ -217,35 +203,27 @@ def _make_aloha(operators: int, seed: int) -> Demo:
 
 def _make_cloth(operators: int, seed: int) -> Demo:
     goals = (FoldGoal("cloth", FOLD_PAIRS),)
-    return _cast_at_table("cloth", operators, seed, make_cloth(), goals, ("folder", "folder"), ("cloth", "cloth"))
+    return _cast_at_table("cloth", operators, seed, goals, "folder", ("cloth", "cloth"))
 
 
 def _make_soft(operators: int, seed: int) -> Demo:
-    goals = tuple(StowGoal(name, BOX_LOW, BOX_HIGH) for name in ("rose", "mint"))
-    return _cast_at_table("soft", operators, seed, make_soft(), goals, ("stower", "stower"), ("rose", "mint"))
+    things = ("rose", "mint")
+    goals = tuple(StowGoal(name, BOX_LOW, BOX_HIGH) for name in things)
+    return _cast_at_table("soft", operators, seed, goals, "stower", things)
 
 
 def _cast_at_table(
-    name: str,
-    operators: int,
-    seed: int,
-    scene: NamedScene,
-    goals: tuple[Goal, ...],
-    behaviours: tuple[str, str],
-    things: tuple[str, str],
+    name: str, operators: int, seed: int, goals: tuple[Goal, ...], behaviour: str, things: tuple[str, str]
 ) -> Demo:
     """Cast two operators side by side before the sheet, one arm each."""
-    if operators != 2:
-        raise ConfigError(
-            f"demo {name} has two arms at one table: 2 operators, not {operators}. For more people: "
-            "iris-session demo handover --operators N"
-        )
-    sheet = scene.anchors[DEFAULT_ANCHOR_ID]
+    _require_two(name, operators, "two arms at one table", MORE_PEOPLE)
+    play = _make_without_cast(name, name, ())
+    sheet = play.anchors[DEFAULT_ANCHOR_ID]
     left, right = arm_names(2)
     people = tuple(
         HeadsetSpec(
             name=NAMES[i],
-            behaviour=behaviours[i],
+            behaviour=behaviour,
             robot=robot,
             partner=partner,
             object=things[i],
@@ -255,7 +233,6 @@ def _cast_at_table(
         )
         for i, (robot, partner) in enumerate(((left, right), (right, left)))
     )
-    play = _make_without_cast(name, scene, ())
     return dataclasses.replace(play, headsets=people, goals=goals)
 
 

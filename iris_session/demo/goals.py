@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,29 +22,12 @@ STILL_S: Final = 0.5
 Vertices = NDArray[np.float64]
 
 
-class Goal(Protocol):
-    """A goal for one deformable. Vertices: world [m], shape (n, 3), in the order of the model."""
-
-    @property
-    def deformable(self) -> str: ...
-
-    @property
-    def name(self) -> str:
-        """One word for the state in which it is reached, such as `folded`."""
-        ...
-
-    def has_begun(self, vertices: Vertices) -> bool:
-        """Return True for a state that must occur before the goal counts."""
-        ...
-
-    def is_met(self, vertices: Vertices) -> bool:
-        """Return True if the deformable lies as it should."""
-        ...
-
-
 @dataclass(frozen=True)
 class FoldGoal:
-    """Every pair of vertices of `pairs`, apart at first, comes closer than `within_m`."""
+    """Every pair of vertices of `pairs`, apart at first, comes closer than `within_m`.
+
+    `name`: one word for the state in which the goal is reached. Vertices: world [m], shape (n, 3), in model order.
+    """
 
     deformable: str
     pairs: tuple[tuple[int, int], ...]
@@ -52,9 +35,11 @@ class FoldGoal:
     name: str = "folded"
 
     def has_begun(self, vertices: Vertices) -> bool:
+        """Return True for a state that must occur before the goal counts."""
         return all(gap > 2.0 * self.within_m for gap in self._measure_gaps(vertices))
 
     def is_met(self, vertices: Vertices) -> bool:
+        """Return True if the deformable lies as it should."""
         return all(gap <= self.within_m for gap in self._measure_gaps(vertices))
 
     def _measure_gaps(self, vertices: Vertices) -> list[float]:
@@ -80,6 +65,9 @@ class StowGoal:
 
     def is_met(self, vertices: Vertices) -> bool:
         return bool((vertices >= self.low).all() and (vertices <= self.high).all())
+
+
+Goal = FoldGoal | StowGoal
 
 
 class GoalMonitor:

@@ -5,12 +5,11 @@ Each comes with the pose of its alignment sheet. Names like `arms4` say how many
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 
@@ -48,62 +47,39 @@ class NamedScene:
         return dict.fromkeys(self.anchors, DEFAULT_SHEET_M)
 
 
-def make_arms(n: int) -> NamedScene:
-    """Return `n` arms drawn from primitives around a round table."""
+def _around_table(spec: Any, n: int) -> NamedScene:
+    """Return a scene of `n` arms around a round table, whose sheet lies on it."""
+    return NamedScene(spec.compile(), {ANCHOR_ID: (get_sheet_position(n), IDENTITY_QUAT)})
+
+
+def _make_arms(n: int) -> NamedScene:
     spec = n_arms_scene(n)
     add_sheet(spec, get_sheet_position(n))
-    return NamedScene(spec.compile(), _place_sheet(get_sheet_position(n)))
+    return _around_table(spec, n)
 
 
-def make_panda(n: int) -> NamedScene:
-    """Return `n` Franka Panda arms around a round table."""
-    return NamedScene(panda_scene(n).compile(), _place_sheet(get_sheet_position(n)))
-
-
-def make_aloha() -> NamedScene:
-    """Return two ALOHA stations face to face."""
-    return NamedScene(aloha_scene().compile(), _place_sheet((0.0, 0.0, SHEET_Z)))
-
-
-def make_cloth() -> NamedScene:
-    """Return two arms and a cloth between them."""
-    return NamedScene(cloth_scene().compile(), _place_sheet(get_sheet_position(2)))
-
-
-def make_soft() -> NamedScene:
-    """Return two arms, a soft body before each, and an open box."""
-    return NamedScene(soft_scene().compile(), _place_sheet(get_sheet_position(2)))
-
-
-def make_cloud() -> NamedScene:
-    """Return the scene `handover` with two drawn depth cameras, which see it and the room around it."""
-    return dataclasses.replace(load_packaged("handover"), cameras=(scene_path("cloud").with_suffix(".toml"),))
-
-
-def load_packaged(name: str) -> NamedScene:
-    """Return a scene from an MJCF file of the package."""
-    return NamedScene(load_model(scene_path(name)))
-
-
-def _place_sheet(p_world: tuple[float, float, float]) -> dict[str, PoseTuple]:
-    return {ANCHOR_ID: (p_world, IDENTITY_QUAT)}
+def _load_packaged(name: str, cameras: tuple[Path, ...] = ()) -> NamedScene:
+    return NamedScene(load_model(scene_path(name)), cameras=cameras)
 
 
 #: Endings of files in place of a name, for the error text; `serve` shows those that MuJoCo does not simulate.
 FILES: Final = ".xml, .mjcf, .mjb; to be shown: .urdf, .glb, .gltf, .stl, .obj, .ply, .off, .dae"
 #: Constructors of the scenes of `SCENE_NAMES`.
 SCENES: Final[dict[str, Callable[[], NamedScene]]] = {
-    "handover": lambda: load_packaged("handover"),
-    "arm": lambda: load_packaged("arm"),
-    "arms": lambda: make_arms(8),
-    "panda": lambda: make_panda(2),
-    "aloha": make_aloha,
-    "cloth": make_cloth,
-    "soft": make_soft,
-    "cloud": make_cloud,
+    "handover": lambda: _load_packaged("handover"),
+    "arm": lambda: _load_packaged("arm"),
+    "arms": lambda: _make_arms(8),
+    "panda": lambda: _around_table(panda_scene(2), 2),
+    "aloha": lambda: NamedScene(aloha_scene().compile(), {ANCHOR_ID: ((0.0, 0.0, SHEET_Z), IDENTITY_QUAT)}),
+    "cloth": lambda: _around_table(cloth_scene(), 2),
+    "soft": lambda: _around_table(soft_scene(), 2),
+    "cloud": lambda: _load_packaged("handover", (scene_path("cloud").with_suffix(".toml"),)),
     "bodies": lambda: NamedScene(free_bodies_scene().compile()),
 }
-NUMBERED: Final[dict[str, Callable[[int], NamedScene]]] = {"arms": make_arms, "panda": make_panda}
+NUMBERED: Final[dict[str, Callable[[int], NamedScene]]] = {
+    "arms": _make_arms,
+    "panda": lambda n: _around_table(panda_scene(n), n),
+}
 
 
 def scene_by_name(name: str) -> NamedScene:

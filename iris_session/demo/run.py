@@ -46,8 +46,8 @@ LEAVE_S: Final = 4.0
 #: Nice value of emulated headsets where it is permitted: a headset has processors of its own.
 HEADSET_NICE: Final = -5
 #: Attempts at the whole demo, each after a reset, and time that must be left for another one [s].
-MAX_TAKES: Final = 3
-TAKE_S: Final = 30.0
+MAX_ATTEMPTS: Final = 3
+ATTEMPT_S: Final = 30.0
 #: Every stream of a camera is measured for so long, and it is waited for so long after all operators are done [s].
 MEASURE_S: Final = 3.0
 STREAMS_S: Final = 20.0
@@ -124,8 +124,8 @@ class DemoResult(msgspec.Struct, frozen=True):
     """Result of a demo, as printed by `demo NAME --json`.
 
     `alignment_mm`: stated p95 and true error at the sheet [mm], by name of the headset, of the aligned ones only.
-    `takes`: attempts, each from a reset scene; `handovers` and `goals` are those of the last one. `streams`: the cloud
-    and the pictures of the cameras as they came to each observer, with rate and age, by its name.
+    `attempts` (`takes` in JSON): each from a reset scene; `handovers` and `goals` are those of the last one.
+    `streams`: the cloud and the pictures of the cameras as they came to each observer, with rate and age, by its name.
     """
 
     ok: bool
@@ -145,7 +145,7 @@ class DemoResult(msgspec.Struct, frozen=True):
     notes: tuple[str, ...] = ()
     interrupted: bool = False
     goals: tuple[GoalStatus, ...] = ()
-    takes: int = 1
+    attempts: int = msgspec.field(name="takes", default=1)
     streams: dict[str, tuple[StreamMeasurement, ...]] = {}
 
 
@@ -174,11 +174,11 @@ def run_demo(
         groups = _group_by_process(demo.headsets)
         addresses = _open_links(stack, session, len(groups), profile, seed)
         people = stack.enter_context(_EmulatorGroup(addresses, groups, timeout_s))
-        next_read_ns = began_ns = take_ns = 0
-        failed_takes: list[str] = []
+        next_read_ns = began_ns = attempt_ns = 0
+        failed_attempts: list[str] = []
 
         def finished() -> bool:
-            nonlocal next_read_ns, began_ns, take_ns
+            nonlocal next_read_ns, began_ns, attempt_ns
             update()
             now_ns = session.clock()
             began_ns = began_ns or now_ns  # preparing the loop is not part of its pace
@@ -190,17 +190,17 @@ def run_demo(
             is_over = is_over and people.have_seen_streams(now_ns)
             failures = judge.list_failures(people.list_failures(), is_over)
             left_s = timeout_s - (now_ns - began_ns) * 1e-9
-            if failures and len(failed_takes) < MAX_TAKES - 1 and left_s > TAKE_S:
-                failed_takes.append(f"begun again at {now_ns * 1e-9:.0f} s: {'; '.join(failures)}")
+            if failures and len(failed_attempts) < MAX_ATTEMPTS - 1 and left_s > ATTEMPT_S:
+                failed_attempts.append(f"begun again at {now_ns * 1e-9:.0f} s: {'; '.join(failures)}")
                 judge.restart()
                 session.reset()
                 people.restart(left_s)  # ticks wait until the old processes have ended; nothing is driven meanwhile
-                take_ns = now_ns
+                attempt_ns = now_ns
                 return False
             return is_over
 
         session.run(seconds=timeout_s + 5.0, until=finished)
-        run_s = max(session.clock() - max(began_ns, take_ns), 1) * 1e-9
+        run_s = max(session.clock() - max(began_ns, attempt_ns), 1) * 1e-9
         watched = people.reports  # while the session ran
         people.close()
         camera_problems, camera_notes = _list_camera_faults(demo, watched, session)
@@ -208,7 +208,7 @@ def run_demo(
         status = session.status()
         seconds, recording = session.clock() * 1e-9, session.recording
     reports = people.reports
-    handovers = tuple(one for one in status.handovers if one.at_s * 1e9 >= take_ns)
+    handovers = tuple(one for one in status.handovers if one.at_s * 1e9 >= attempt_ns)
     # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify_recording(recording)
     problems = judge.list_problems()
@@ -235,10 +235,10 @@ def run_demo(
         real_time_factor=round(status.sim_time / run_s, 3),
         state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items() if math.isfinite(r.age_ms_p99)},
         problems=tuple(problems),
-        notes=(*demo.notes, *failed_takes, *camera_notes),
+        notes=(*demo.notes, *failed_attempts, *camera_notes),
         interrupted=interrupted,
         goals=judge.get_status(),
-        takes=1 + len(failed_takes),
+        attempts=1 + len(failed_attempts),
         streams={name: r.streams for name, r in watched.items() if r.streams},
     )
 
@@ -292,7 +292,7 @@ class _GoalTracker:
         return 0 < len(reached) == len(self._monitors) and now_s - max(reached) >= seconds
 
     def list_failures(self, of_operators: list[str], is_over: bool) -> list[str]:
-        """Return why the take has failed: none once the goals are reached, whatever operators still meant to do."""
+        """Return why the attempt has failed: none once the goals are reached, whatever operators still meant to do."""
         if self.is_reached_for(0.0):
             return []
         return of_operators or (self.list_problems() if is_over else [])

@@ -1,4 +1,4 @@
-"""Supervision of the recorder process by its parent: start, monitor, restart on the next part of the file, close."""
+"""The recorder process from the side of its parent: start, monitor, restart on the next part of the file, close."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ import signal
 import tempfile
 import uuid
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 import msgspec
 import psutil
 
 from iris_session.journal.errors import RecorderError
-from iris_session.journal.messages import FAULT_PREFIX, RecorderConfig
+from iris_session.journal.messages import FAULT_PREFIX, RecorderConfig, RecorderStatus
+from iris_session.recording.budget import LOW_SHARE, describe_used_budget
 from iris_session.rrd.assets import NONE
 from iris_session.rrd.paths import part_path
-from iris_session.system.process import PIPE, ChildProcess
+from iris_session.system.process import PIPE, ChildProcess, open_memory_file
+from iris_session.system.supervised import SHORT_RESTART_DELAYS_NS, NoReport, SupervisedProcess, describe_exit
 
 #: Signal by which a session tells its recorder to finish the file. SIGTERM may come from anybody.
 FINISH_SIGNAL: Final = signal.SIGUSR1
@@ -27,54 +29,78 @@ START_S: Final = 60.0
 CRASHED: Final = 1
 #: Maximum length [bytes] of the folder for temporary files; the rest is for our folder and socket names.
 LONGEST_FOLDER: Final = 75
+#: Length of the recorder's own words that is read.
+LOG_BYTES: Final = 1 << 20
+#: A recorder reports twice a second. It is not ended when it hangs: a slow disk would delay its successor too.
+HANGING_NS: Final = 5_000_000_000
+#: Time at the end for a successor that is just being started: a process more, unless the disk hangs.
+CLOSING_S: Final = 5.0
 
 
 class RecorderProcess:
     """Recorder process of the file `path`, started by exec, listening on sockets in a private temporary folder.
 
-    It runs in a session of its own, so that Ctrl-C of a terminal reaches only the parent. After it has ended, `restart`
-    begins the next part (`session.part2.rrd`); the feed sends it everything that was not written.
+    It runs in a session of its own, so that Ctrl-C of a terminal reaches only the parent. After it has ended, `poll`
+    begins the next part (`session.part2.rrd`); the feed sends it everything that was not written. After an error in
+    our own code or Rerun's, which would come again, that part has only what verification needs.
+
+    Attributes:
+        journal_only: An error in drawing has ended a recorder: parts since then have no picture.
+        starts: How many were started.
+        hangs: The recorder has not reported for `HANGING_NS` though it has something to write.
+        is_used_up: The budget of the recording is used up: the file is closed, and nothing more is recorded.
+        budget_text: One line for people once the budget comes to its end; empty before, and without a budget.
     """
 
     def __init__(self, path: str | Path, origin_ns: int, *, record_assets: str = NONE, budget_bytes: int = 0) -> None:
         """Set what is recorded; nothing is started or written yet. See `RecorderConfig`."""
         self.path = str(path)
-        self.part = 0
+        self.part = 1
         self._origin_ns = origin_ns
         self._record_assets = record_assets
         self._budget_bytes = budget_bytes
-        #: An error in drawing has ended a recorder: parts since then have no picture.
-        self.journal_only = False
+        self.journal_only = self.hangs = self.is_used_up = False
+        self.budget_text = ""
         # The path of a Unix socket has at most 107 bytes: some TMPDIR are too long for one.
         short = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
         self._folder = tempfile.mkdtemp(prefix="iris-rec-", dir=None if short else "/tmp")
         self.feed_endpoint = f"ipc://{self._folder}/feed"
         self.samples_endpoint = f"ipc://{self._folder}/samples"
         self.media_endpoint = f"ipc://{self._folder}/media"
-        self._log = Path(self._folder) / "recorder.log"
         self._recording_id = uuid.uuid4().hex
-        self._process: ChildProcess | None = None
+        #: What the newest recorder says, in memory, so that reading it waits for no disk.
+        self._log: IO[bytes] | None = None
         self.starts = 0
+        self._supervised = SupervisedProcess(
+            "the recorder",
+            self._spawn,
+            NoReport,
+            delays_ns=SHORT_RESTART_DELAYS_NS,
+            describe_exit=self._note_exit,
+        )
 
     @property
     def part_path(self) -> str:
         """The newest file of the recording."""
-        part = max(1, self.part)
+        part = self.part
         while os.path.exists(part_path(self.path, part + 1)):
             part += 1
         return part_path(self.path, part)
 
     @property
     def pid(self) -> int:
-        """Process id of the recorder, 0 if none was started. May be read while another thread restarts it."""
-        process = self._process
-        return 0 if process is None else process.pid
+        """Process id of the recorder, 0 while there is none. From any thread."""
+        return self._supervised.pid
 
     @property
     def alive(self) -> bool:
-        """False before the start and after the process has ended. May be read from another thread, like `pid`."""
-        process = self._process
-        return process is not None and process.is_running
+        """False before the start and after the process has ended. From any thread."""
+        return bool(self.pid)
+
+    @property
+    def restarts(self) -> int:
+        """How often it was restarted."""
+        return self._supervised.restarts
 
     @property
     def cpu_s(self) -> float:
@@ -88,53 +114,89 @@ class RecorderProcess:
 
     @property
     def failure(self) -> str:
-        """One line describing how the process ended, empty while it runs and after a clean end."""
-        if self._process is None or not (code := self._process.exit_status):
+        """One line about why it has ended, or why one after the other has; empty while it runs."""
+        process = self._supervised.process
+        status = None if process is None else process.exit_status
+        if self.is_used_up:
             return ""
-        how = f"killed by signal {-code}" if code < 0 else f"exit status {code}"
-        left_out = " (the next one leaves out the picture)" if code == CRASHED else ""
-        return f"the recorder ended ({how}): {_reason(self._log) or 'no message'}{left_out}"
+        return f"the recorder {self._describe_exit(status)}" if status else self._supervised.failure
 
     def start(self) -> None:
         """Begin the recording and wait until the recorder writes.
 
         Raises `RecorderError`: permission denied, no space, or the file exists.
         """
-        self.part = 1
         try:
-            self._spawn()
-        except RecorderError:
+            process = self._supervised.start_now()
+        except OSError as error:
             self.close(0.0)
-            raise
-        answer = self._answer()
+            raise RecorderError(f"the recorder cannot be started: {error.strerror or error}") from error
+        try:
+            answer = process.read_line(START_S).decode(errors="replace").strip()
+        except TimeoutError:
+            answer = f"the recorder did not start within {START_S:g} s: {self._read_reason()}"
+        except EOFError:
+            answer = f"the recorder ended as it started: {self._read_reason()}"
         if answer != "ready":
             self.close(0.0)
             raise RecorderError(answer.removeprefix("failed: "))
 
-    def restart(self) -> None:
-        """Begin the next part without waiting for it: check `alive` and `failure` later, as after a crash.
+    def poll(self, now_ns: int, silence_ns: int = 0, status: RecorderStatus | None = None) -> list[str]:
+        """Begin the next part when the recorder has ended. Never waits.
 
-        After an error in our own code or Rerun's, which would come again, it writes only what verification needs.
-        Raises `RecorderError` if the process or its log cannot be created; it may be tried again.
+        Args:
+            now_ns: Session time.
+            silence_ns: How long it has not reported though it has something to write.
+            status: Its last report. One that has used up the budget is not restarted.
+
+        Returns:
+            What is to be announced, one line each.
         """
-        self.journal_only |= self._end(0.0) == CRASHED
-        while os.path.exists(part_path(self.path, self.part)):
-            self.part += 1
-        self._spawn()
+        announcements = [] if status is None or not status.budget or self.is_used_up else self._watch_budget(status)
+        if self.is_used_up:
+            self.hangs = False
+            return announcements
+        announcements += self._supervised.poll(now_ns)
+        hangs = silence_ns > HANGING_NS
+        if hangs and not self.hangs:
+            announcements.append("the recorder hangs: its rows wait in memory")
+        self.hangs = hangs
+        return announcements
+
+    def _watch_budget(self, status: RecorderStatus) -> list[str]:
+        """Return the announcement that the budget comes to its end, or is used up, once each."""
+        if status.ended:
+            self.is_used_up = True
+            self.budget_text = describe_used_budget(status.budget)
+            return [f"{self.budget_text}; the session goes on without it"]
+        if status.budget_left >= LOW_SHARE * status.budget:
+            return []
+        is_new = not self.budget_text
+        left = f"{status.budget_left / 1e6:,.1f} of {status.budget / 1e6:,.0f} MB"
+        self.budget_text = f"{left} are left of the recording's budget"
+        rest = "what the journal does not need is left out first, then the recording ends"
+        return [f"{self.budget_text}: {rest}"] if is_new else []
+
+    def list_warnings(self) -> list[str]:
+        """Return the warning for status reports about the budget, if there is one."""
+        return [self.budget_text] if self.budget_text else []
+
+    def stop_restarts(self) -> None:
+        """Begin no further part: the recorder that runs writes what is left."""
+        self._supervised.stop_restarts(CLOSING_S)
 
     def close(self, timeout_s: float = 10.0) -> bool:
         """Finish the file. Return whether the process ended cleanly by itself. Close feed and front before."""
-        status = self._end(timeout_s)
+        status = self._supervised.close(0.0, exit_s=timeout_s, finish=FINISH_SIGNAL if timeout_s else 0)
         shutil.rmtree(self._folder, ignore_errors=True)
+        if self._log is not None:
+            self._log.close()
+            self._log = None
         return status == 0
 
-    def _spawn(self) -> None:
-        try:
-            self._try_spawn()
-        except OSError as error:
-            raise RecorderError(f"the recorder cannot be started: {error.strerror or error}") from error
-
-    def _try_spawn(self) -> None:
+    def _spawn(self) -> ChildProcess:
+        while self.starts and os.path.exists(part_path(self.path, self.part)):
+            self.part += 1
         config = RecorderConfig(
             self.path,
             self.part,
@@ -150,44 +212,31 @@ class RecorderProcess:
         )
         # RERUN=off in a user's shell would silence the stream. Nothing is drawn here: MuJoCo need not load OpenGL.
         environment = {"RERUN": "on", "RUST_LOG": "error", "MUJOCO_GL": "disable"}
-        with open(self._log, "ab") as log:
-            self._process = ChildProcess(
-                "iris_session.recording.process",
-                config=msgspec.msgpack.encode(config),
-                stdout=PIPE,
-                stderr=log,
-                environment=environment,
-                own_session=True,
-            )
+        if self._log is not None:
+            self._log.close()
+        self._log = open_memory_file()
+        process = ChildProcess(
+            "iris_session.recording.process",
+            config=msgspec.msgpack.encode(config),
+            stdout=PIPE,
+            stderr=self._log,
+            environment=environment,
+            own_session=True,
+        )
         self.starts += 1
+        return process
 
-    def _answer(self) -> str:
-        """Return the first line on standard output: `ready`, or the error."""
-        process = self._process
-        assert process is not None
-        try:
-            return process.read_line(START_S).decode(errors="replace").strip()
-        except TimeoutError:
-            what = f"did not start within {START_S:g} s"
-        except EOFError:
-            what = "ended as it started"
-        return f"the recorder {what}: {_reason(self._log) or 'no message'}"
+    def _note_exit(self, status: int) -> str:
+        self.journal_only |= status == CRASHED
+        return self._describe_exit(status)
 
-    def _end(self, timeout_s: float) -> int:
-        """End the process. Return its exit status, 0 if there was none."""
-        process, self._process = self._process, None
-        if process is None:
-            return 0
-        if timeout_s:
-            process.send_signal(FINISH_SIGNAL)
-        return process.close(exit_s=timeout_s)
+    def _describe_exit(self, status: int) -> str:
+        left_out = " (the next one leaves out the picture)" if status == CRASHED else ""
+        return f"{describe_exit(status)}: {self._read_reason()}{left_out}"
 
-
-def _reason(log: Path) -> str:
-    """Return the recorder's last own line in its log, else the last line of the log."""
-    try:
-        lines = log.read_text(errors="replace").strip().splitlines()
-    except OSError:
-        return ""
-    own = [line.removeprefix(FAULT_PREFIX) for line in lines if line.startswith(FAULT_PREFIX)]
-    return (own or lines or [""])[-1][:300]
+    def _read_reason(self) -> str:
+        """Return the recorder's last own line in its log, else the last line of the log."""
+        data = b"" if self._log is None else os.pread(self._log.fileno(), LOG_BYTES, 0)
+        lines = data.decode(errors="replace").strip().splitlines()
+        own = [line.removeprefix(FAULT_PREFIX) for line in lines if line.startswith(FAULT_PREFIX)]
+        return (own or lines or ["no message"])[-1][:300]

@@ -25,6 +25,7 @@ from iris_session.link import FrontConfig, FrontError, FrontProcess, Ports, addr
 from iris_session.link.sockets import host_in_address
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.names import BudgetClass
+from iris_session.protocol.status import StatusReport
 from iris_session.recording import (
     CLOSED,
     OPEN,
@@ -53,9 +54,8 @@ from iris_session.session.resume import (
     wait_for_free_ports,
 )
 from iris_session.session.shared_scene import SharedScenes
-from iris_session.session.status import ProcessStatus, StatusReporter
+from iris_session.session.status import StatusReporter, make_recorder_report, make_report
 from iris_session.session.stepper import NextPatch, NextScene, ResumedFrom, Stepper, label_robots
-from iris_session.session.supervision import RecorderSupervisor, RestartTimer, make_recorder_report, try_restart
 from iris_session.session.unique_name import NameFinder
 from iris_session.session.web_page import WebPage, open_web_page
 
@@ -95,7 +95,6 @@ class SessionProcesses:
     Attributes:
         name: Name of the session; with a number where another session on the network has the configured one.
         notes: Messages for people about how the session started, one line each.
-        supervisor: Of the recorder, `None` when nothing is recorded.
     """
 
     def __init__(
@@ -126,14 +125,11 @@ class SessionProcesses:
         self.web: WebPage | None = None
         self.cameras: SessionCameras | None = None
         self._deformables: DeformableStreams | None = None
-        self._front_timer = RestartTimer()
-        self.supervisor: RecorderSupervisor | None = None
         self.reporter = StatusReporter()
         self._next_supervise_ns = 0
         self._address = ""
-        # Contacts that MuJoCo had no room for: since the session began, and since the last reset of the world.
-        self._overflows: dict[str, int] = {}
-        self._world_overflows: dict[str, int] = {}
+        self._overflows: dict[str, int] = {}  # contacts that MuJoCo had no room for, at most in one run of the world
+        self._dropped: set[str] = set()  # reasons that were logged
 
     def start(self) -> None:
         """Start the recorder, then the front; end both again when one fails.
@@ -156,8 +152,7 @@ class SessionProcesses:
                     budget_bytes=self._config.record_budget_bytes,
                 )
                 self.recorder.start()
-                self.supervisor = RecorderSupervisor(self.recorder)
-                self.reporter.warning_sources.append(self.supervisor.budget.list_warnings)
+                self.reporter.warning_sources.append(self.recorder.list_warnings)
                 self.feed = RecorderFeed(self.recorder.feed_endpoint)
                 self._in_use = RecordingLock(self.recording, shared=True)
                 if not self._core.config.authority.user_owned_loop:  # others cannot be resumed
@@ -187,6 +182,7 @@ class SessionProcesses:
             self.notes += self.web.start(ports, self.scenes.asset_root)
             self.notes += self.cameras.start(ports)
             self.reporter.warning_sources.append(self.cameras.list_warnings)
+            _log.info("session %r on %s, recording: %s", self.name, self._address, self.recording or "none")
         except (FrontError, RecordingError) as error:
             self.close()
             raise StartError(str(error)) from None  # the text says it all
@@ -325,23 +321,21 @@ class SessionProcesses:
             return
         self._next_supervise_ns = now_ns + SUPERVISE_PERIOD_NS
         self._save_resume_note()
-        if self.front is not None and not self.front.alive and self._front_timer.is_due(now_ns):
-            self.front.set_anchors(stepper.core.authority.anchors)
-            fault = self.front.fault or "ended"
-            outcome = try_restart(self.front.restart, FrontError)
-            self._announce(stepper, f"the front process {fault} and {outcome}")
-        if self.supervisor is not None and self.feed is not None:
-            for text in self.supervisor.poll(now_ns, self.feed.silence_ns, self.feed.stats.recorder):
-                self._announce(stepper, text)
+        announcements: list[str] = []
+        if self.front is not None:
+            self.front.anchors = stepper.core.authority.anchors
+            announcements += self.front.poll(now_ns)
+        if self.recorder is not None and self.feed is not None:
+            announcements += self.recorder.poll(now_ns, self.feed.silence_ns, self.feed.stats.recorder)
         if self.web is not None:
-            for text in self.web.poll(now_ns):
-                self._announce(stepper, text)
+            announcements += self.web.poll(now_ns)
         if self.cameras is not None:
-            for text in self.cameras.poll(now_ns):
-                self._announce(stepper, text)
+            announcements += self.cameras.poll(now_ns)
+        for text in announcements:
+            self._announce(stepper, text)
         self._report_overflows(stepper)
         if self.front is not None and self.reporter.is_due(now_ns):
-            self.front.link.send_report(self.reporter.make_report(stepper, self.make_status()))
+            self.front.link.send_report(self.make_report(stepper))
 
     def _announce(self, stepper: Stepper, text: str) -> None:
         """Announce an event of the session itself in the recording, to participants and in the log."""
@@ -350,19 +344,20 @@ class SessionProcesses:
 
     def _report_overflows(self, stepper: Stepper) -> None:
         """Count the contacts that MuJoCo drops, which change what happens, and announce the first."""
-        counts = stepper.core.world.dropped_counts
-        for reason, count in counts.items():
-            before = self._world_overflows.get(reason, 0)
+        for reason, count in stepper.core.world.dropped_counts.items():
             if reason not in self._overflows:
                 self._announce(stepper, f"MuJoCo: {reason}; give the model <size memory='...'/>")
-            added = count - before if count >= before else count  # less: the world was reset
-            self._overflows[reason] = self._overflows.get(reason, 0) + added
-        self._world_overflows = counts
+            self._overflows[reason] = max(count, self._overflows.get(reason, 0))
 
-    def make_status(self) -> ProcessStatus:
-        """Return how front and recorder do, for status reports."""
-        recorder = make_recorder_report(self.feed, self.recorder, self.supervisor)
-        return ProcessStatus(recorder, self.count_own_drops(), self.count_restarts(), self._config.sheet_sizes())
+    def make_report(self, stepper: Stepper) -> StatusReport:
+        """Return the authority's half of a status report."""
+        drops = self.count_own_drops()
+        for reason in drops.keys() - self._dropped:
+            _log.info("drops begin: %s", reason)
+        self._dropped |= drops.keys()
+        report = make_report(stepper, self.reporter.scheduling, drops, self.count_restarts())
+        report = msgspec.structs.replace(report, recorder=make_recorder_report(self.feed, self.recorder))
+        return self.reporter.make_report(stepper, report, self._config.sheet_sizes())
 
     @property
     def front_pid(self) -> int:
@@ -399,13 +394,13 @@ class SessionProcesses:
 
     def count_restarts(self) -> dict[str, int]:
         """Return how often front and recorder were restarted, and the web gateway and cameras where they were."""
-        recorder = 0 if self.supervisor is None else self.supervisor.restarts
+        recorder = 0 if self.recorder is None else self.recorder.restarts
         others = {
             "web": 0 if self.web is None else self.web.restarts,
             "cameras": 0 if self.cameras is None else self.cameras.restarts,
         }
         restarted = {name: n for name, n in others.items() if n}
-        return {"front": self._front_timer.restarts, "recorder": recorder, **restarted}
+        return {"front": 0 if self.front is None else self.front.restarts, "recorder": recorder, **restarted}
 
     def close(self) -> str:
         """End the front, which notifies its clients, then finish the recording. May be called twice.
@@ -427,10 +422,10 @@ class SessionProcesses:
             self.cameras.close()
             self.cameras = None
         self.scenes.close()
-        if self.supervisor is not None:
-            self.supervisor.close()
         feed, self.feed = self.feed, None
-        recorder, self.recorder, self.supervisor = self.recorder, None, None
+        recorder, self.recorder = self.recorder, None
+        if recorder is not None:
+            recorder.stop_restarts()
         fault, is_accepted = "", True
         if feed is not None and recorder is not None:
             has_reported = feed.stats.recorders >= recorder.starts  # a new one is silent until it is up

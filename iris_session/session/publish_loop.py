@@ -19,13 +19,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.physics.carrier import Carrier
+from iris_session.physics.kinematic_model import KinematicModel
 from iris_session.protocol.entries import ExternalReset
 from iris_session.protocol.status import NOT_PUBLISHED
 from iris_session.scene.result import ComposedScene
 from iris_session.session.deformables import DeformableSourceMesh
-from iris_session.session.draft import Frame
 from iris_session.session.errors import OwnershipError
+from iris_session.session.pending_state import Frame
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.stepper import Stepper, end_error
 
@@ -63,13 +63,13 @@ class PublishLoop:
 
     def __init__(
         self,
-        carrier: Carrier,
+        kinematic_model: KinematicModel,
         vertices: PublishedVertices,
         stepper: Stepper,
         processes: SessionProcesses,
         period_ns: int,
     ) -> None:
-        self._carrier = carrier
+        self._kinematic_model = kinematic_model
         self._vertices = vertices
         self._stepper = stepper
         self._processes = processes
@@ -167,7 +167,7 @@ class PublishLoop:
             self._due_ns = now_ns + self._period_ns
         if frame.anew:
             self._stepper.post_own(ExternalReset())
-        self._step(1, self._carrier.encode_state(frame.time_s, frame.poses))
+        self._step(1, self._kinematic_model.encode_state(frame.time_s, frame.poses))
         self._vertices.newest = frame.vertices
         self._delay_ns = max(0, now_ns - frame.capture_ns)
         self._publish_state(frame.capture_ns)

@@ -34,7 +34,6 @@ from iris_session.journal.verification import Models
 from iris_session.physics import (
     PhysicsError,
     compute_scene_hash,
-    decode_model,
     encode_model,
     find_objects,
     find_robots,
@@ -55,16 +54,16 @@ from iris_session.recording import (
     RecordingLock,
     SessionHeader,
     check_row,
-    unpack_model,
 )
 from iris_session.recording.folders import find_session_in
 from iris_session.recording.lock import PATIENCE_S
 from iris_session.rrd.paths import resume_path, split_part, split_resume
 from iris_session.security.resume_tokens import encode_handback
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots
-from iris_session.session.core import CoreConfig, CoreState, SessionCore
+from iris_session.session.core import SessionCore
 from iris_session.session.errors import ConfigError, ResumeError
-from iris_session.system.files import Replacement, sync_folder
+from iris_session.session.verification import ReplayCore
+from iris_session.system.files import Replacement
 
 NOTE_FILE: Final = "resume.tokens"
 #: Changes of the note within this time are written together.
@@ -345,22 +344,18 @@ def list_recordings(first: Path) -> Iterator[tuple[int, Path]]:
             yield number, folder / name
 
 
-def make_core(header: SessionHeader, models: Models) -> SessionCore:
-    """Return the core that a header describes, in its initial state. Raises `ResumeError`."""
+def restore_core(header: SessionHeader, keyframe: Keyframe, models: Models) -> SessionCore:
+    """Return the core in the state of `keyframe`. A damaged snapshot may raise any exception.
+
+    Raises `ResumeError` for a header from which no session can be built.
+    """
     try:
-        config = msgspec.msgpack.decode(header.config, type=CoreConfig)
-        model = decode_model(unpack_model(header.model))
-        return SessionCore(model, config, lambda model_hash: decode_model(models(model_hash)))
+        replay = ReplayCore(header, models)
     except (msgspec.DecodeError, zlib.error, PhysicsError, ControlError, ValueError) as error:
         raise ResumeError(f"the session cannot be built from the header of its recording: {error}") from error
-
-
-def restore_core(header: SessionHeader, keyframe: Keyframe, models: Models) -> SessionCore:
-    """Return the core in the state of `keyframe`. A damaged snapshot may raise any exception."""
-    core = make_core(header, models)
     if keyframe.plant:
-        core.restore(CoreState(keyframe.plant, keyframe.authority, keyframe.controller, keyframe.status))
-    return core
+        replay.restore(keyframe)
+    return replay.core
 
 
 def list_keyframes(recording: Recording) -> Iterator[Keyframe]:
@@ -461,10 +456,8 @@ class ResumeNoteWriter:
         self._path = path
         self._note: ResumeNote | None = None
         self._changed = threading.Event()
-        self._closed = threading.Event()
-        self._is_closed = False
-        self._replacing = threading.Lock()
-        self._warned = False
+        self._closing = threading.Event()
+        self._is_closed = self._has_warned = False
         self._thread = threading.Thread(target=self._run, name="iris-session-note", daemon=True)
         self._thread.start()
 
@@ -476,41 +469,33 @@ class ResumeNoteWriter:
 
     def close(self, patience_s: float = 0.5) -> None:
         """Write the last note, waiting for the disk at most `patience_s` seconds."""
-        self._closed.set()
+        self._closing.set()
         self._changed.set()
         self._thread.join(patience_s)
-        free = self._replacing.acquire(timeout=patience_s)  # a disk that hangs must not delay the end
         self._is_closed = True
-        if free:
-            self._replacing.release()
 
     def _run(self) -> None:
         written: ResumeNote | None = None
-        while True:
+        is_last = False
+        while not is_last:
             self._changed.wait()
-            self._closed.wait(NOTE_PERIOD_S)
+            self._closing.wait(NOTE_PERIOD_S)
             self._changed.clear()
-            last = self._closed.is_set()  # before the note is read: no other one is offered afterwards
+            is_last = self._closing.is_set()  # before the note is read: no other one is offered afterwards
             note = self._note
             if note is not None and note is not written:
                 self._write(note)
                 written = note
-            if last:
-                return
 
     def _write(self, note: ResumeNote) -> None:
         try:
             with Replacement(self._path, durable=True) as replacement:
                 replacement.file.write(msgspec.msgpack.encode(note))
-                replacement.finish()  # before the lock is taken: it may wait for a disk
-                with self._replacing:
-                    if self._is_closed:
-                        replacement.discard()
-                    else:
-                        replacement.commit(sync_folder_too=False)
-            sync_folder(self._path.parent)
+                replacement.finish()  # may wait for a disk
+                if self._is_closed:
+                    replacement.discard()
         except OSError as error:
-            if not self._warned:
+            if not self._has_warned:
                 text = "%s cannot be written (%s): clients cannot resume after a restart of the session"
                 _log.warning(text, self._path, error.strerror)
-            self._warned = True
+            self._has_warned = True

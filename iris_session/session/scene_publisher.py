@@ -19,20 +19,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 from numpy.typing import ArrayLike
 
 from iris_session.physics import PhysicsError
-from iris_session.physics.carrier import Carrier
+from iris_session.physics.kinematic_model import KinematicModel
 from iris_session.protocol.entries import EntryMessage
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.result import ComposedScene
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import make_session_core
-from iris_session.session.draft import SceneDraft
 from iris_session.session.errors import ConfigError, OwnershipError, PublishError, StartError
+from iris_session.session.pending_state import PendingState
 from iris_session.session.processes import PublishedScene, SessionProcesses
 from iris_session.session.publish_loop import PublishedVertices, PublishLoop
 from iris_session.session.session_base import SessionBase
@@ -44,10 +44,6 @@ RUN_PERIOD_S: Final = 1.0 / 60.0
 LONGEST_S: Final = 9e9
 #: A capture may lie so far ahead of the session's clock, because the clocks are read one after the other.
 AHEAD_NS: Final = 1_000_000
-_NOT_DRIVEN: Final = (
-    "a published scene has nothing that people drive; for a robot that they do, use Session(model, data) with "
-    "begin_tick() and end_tick()"
-)
 
 
 class ScenePublisher(SessionBase):
@@ -77,7 +73,7 @@ class ScenePublisher(SessionBase):
         self._builder = scene
         self._shown: frozenset[str] = frozenset()  # names in the builder when the session began
         self._stop = threading.Event()
-        self._draft: SceneDraft | None = None
+        self._pending: PendingState | None = None
         self._loop: PublishLoop | None = None
         self._order = threading.Lock()  # of frames; guards the times and the reset of the next one
         self._capture_ns = 0
@@ -106,16 +102,16 @@ class ScenePublisher(SessionBase):
             store = AssetStore(None if isinstance(where, bool) else where)
             self._shown = self._builder.names
             composed = self._builder.build(store)
-            carrier = Carrier(composed.moving, composed.poses)
+            kinematic_model = KinematicModel(composed.moving, composed.poses)
         except (SceneBuildError, PhysicsError) as error:
             raise ConfigError(f"the scene cannot be built: {error}") from None
         except OSError as error:
             raise StartError(f"assets: {error.filename or where}: {error.strerror or error}") from None
         with _hold_assets(store, composed.addresses):  # until the processes hold them
-            self._begin(composed, carrier)
+            self._begin(composed, kinematic_model)
 
-    def _begin(self, composed: ComposedScene, carrier: Carrier) -> None:
-        core = make_session_core(self.config, carrier.model, None, (), (), user_owned=True)
+    def _begin(self, composed: ComposedScene, kinematic_model: KinematicModel) -> None:
+        core = make_session_core(self.config, kinematic_model.model, None, (), (), user_owned=True)
         vertices = PublishedVertices(composed)
         published = PublishedScene(composed, vertices.meshes)
         processes = SessionProcesses(self.config, core, self.origin_ns, published=published)
@@ -124,9 +120,9 @@ class ScenePublisher(SessionBase):
         self._processes = processes
         try:
             self._stepper = processes.make_stepper(core, self.clock, user_owned=True)
-            self._draft = SceneDraft(composed)
-            self._loop = PublishLoop(carrier, vertices, self._stepper, processes, processes.state_period_ns)
-            processes.reporter.warning_sources += [self._loop.warnings, self._draft.warnings]
+            self._pending = PendingState(composed)
+            self._loop = PublishLoop(kinematic_model, vertices, self._stepper, processes, processes.state_period_ns)
+            processes.reporter.warning_sources += [self._loop.warnings, self._pending.warnings]
             self._loop.start()
         except BaseException:
             self.close()
@@ -251,7 +247,7 @@ class ScenePublisher(SessionBase):
             PublishError: A time that is out of range, out of order, or given only sometimes.
             OwnershipError: The session is not started, or closed.
         """
-        draft, loop = self._require_parts()
+        pending, loop = self._require_parts()
         loop.raise_if_ended()
         now_ns = self.clock()
         captured_ns = now_ns if capture_ns is None else _check_capture(capture_ns, now_ns)
@@ -270,7 +266,7 @@ class ScenePublisher(SessionBase):
             at_s = captured_ns * 1e-9 if given_s is None else given_s
             anew = self._anew or (self._time_s is not None and at_s < self._time_s)
             self._capture_ns, self._time_s, self._anew = captured_ns, at_s, False
-            loop.offer(draft.make_frame(captured_ns, at_s, anew))
+            loop.offer(pending.make_frame(captured_ns, at_s, anew))
 
     def reset(self) -> None:
         """Declare that the world is reset before the next `publish`, which begins a new `scene_epoch`.
@@ -304,62 +300,6 @@ class ScenePublisher(SessionBase):
         assert self._stepper is not None
         self._stepper.post(message)
 
-    def pause(self) -> NoReturn:
-        """Not available: your program advances the world. To pause it, publish nothing.
-
-        Raises:
-            OwnershipError: Always.
-        """
-        raise OwnershipError("pause: your own program advances the world; to pause it, publish nothing for a while")
-
-    def resume(self) -> NoReturn:
-        """Not available: your program advances the world. To continue, publish again.
-
-        Raises:
-            OwnershipError: Always.
-        """
-        raise OwnershipError("resume: your own program advances the world; publish again")
-
-    def begin_tick(self) -> NoReturn:
-        """Not available: `publish` takes the place of a tick.
-
-        Raises:
-            OwnershipError: Always.
-        """
-        raise OwnershipError(f"begin_tick: publish() is the tick here. {_NOT_DRIVEN}")
-
-    def end_tick(self) -> NoReturn:
-        """Not available: `publish` takes the place of a tick.
-
-        Raises:
-            OwnershipError: Always.
-        """
-        raise OwnershipError(f"end_tick: publish() is the tick here. {_NOT_DRIVEN}")
-
-    def assign(self, robots: Sequence[str], participant: str = "") -> NoReturn:
-        """Not available: a published scene has no robots that participants drive.
-
-        Raises:
-            OwnershipError: Always.
-        """
-        raise OwnershipError(f"assign: {_NOT_DRIVEN}")
-
-    def set_scale(self, robot: str, scale: float) -> NoReturn:
-        """Not available: a published scene has no robots that participants drive.
-
-        Raises:
-            OwnershipError: Always.
-        """
-        raise OwnershipError(f"set_scale: {_NOT_DRIVEN}")
-
-    def load_scene(self, scene: object) -> NoReturn:
-        """Not available: close this session and start another with the other scene.
-
-        Raises:
-            OwnershipError: Always.
-        """
-        raise OwnershipError("load_scene: end this session and begin another with the other scene")
-
     # --- inside ------------------------------------------------------------------------------------------------------
 
     @contextmanager
@@ -382,11 +322,11 @@ class ScenePublisher(SessionBase):
     def _hold_steps(self) -> AbstractContextManager[object]:
         return nullcontext() if self._loop is None else self._loop.lock
 
-    def _require_parts(self) -> tuple[SceneDraft, PublishLoop]:
+    def _require_parts(self) -> tuple[PendingState, PublishLoop]:
         self._require_open()
-        if self._draft is None or self._loop is None:
+        if self._pending is None or self._loop is None:
             raise OwnershipError("the session is not started: use `with ScenePublisher(...) as session`, or start()")
-        return self._draft, self._loop
+        return self._pending, self._loop
 
 
 def _hold_assets(store: AssetStore, addresses: Sequence[str]) -> AbstractContextManager[object]:

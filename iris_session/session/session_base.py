@@ -26,7 +26,7 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.scene_change import check_patch
-from iris_session.session.status import DataFault, SessionStatus, make_session_status
+from iris_session.session.status import DataFault, SessionStatus, make_report, make_session_status
 from iris_session.session.stepper import MAX_PENDING_SCENES, NextPatch, OwnerRequest, Stepper
 
 
@@ -231,12 +231,14 @@ class SessionBase:
         Returns:
             Participants and their leases, lateness of ticks, drops and restarts.
         """
-        processes = self._processes
+        processes, stepper = self._processes, self._stepper
         with self._hold_steps():
             drops = {} if processes is None else processes.count_drops()
             restarts = {} if processes is None else processes.count_restarts()
-            fault = self._find_data_fault()
-            return make_session_status(self._stepper, self._pacer, drops, restarts, self._scheduling, fault)
+            if stepper is None or stepper.last is None:
+                return SessionStatus(drops=drops, restarts=restarts, scheduling=self._scheduling)
+            report = make_report(stepper, self._scheduling, drops, restarts)
+            return make_session_status(report, stepper, self._pacer, self._find_data_fault())
 
     def recent_events(self) -> list[Event]:
         """Return the newest events.

@@ -5,6 +5,7 @@ It needs no snapshot and no query of the pure core. `status` makes reports for u
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -21,12 +22,15 @@ from iris_session.protocol.server_messages import (
     ParticipantChanged,
     ParticipantJoined,
     ParticipantLeft,
+    Reply,
     SamplesRejected,
     Snapshot,
 )
 from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.status import AlignmentReport, ParticipantReport, Quantiles, compute_quantiles
 from iris_session.protocol.steps import ControlStatus, Decision
+
+_log = logging.getLogger(__name__)
 
 #: Handovers listed by the status; the recording has them all.
 MAX_HANDOVERS: Final = 1000
@@ -70,6 +74,7 @@ class SessionView:
         self._aligned_ns: dict[str, int] = {}
         self._void_ns: dict[str, int] = {}
         self._receive_to_step_ns: dict[str, deque[int]] = {}
+        self._hold_reasons: dict[str, str] = {}
 
     def apply_step(self, decision: Decision, status: tuple[ControlStatus, ...]) -> None:
         """Apply the decision and the control status of one step."""
@@ -80,17 +85,30 @@ class SessionView:
             self.mirror.apply_event(event)
             self.recent.append(event)
             body = event.body
-            if isinstance(body, SamplesRejected):
+            if isinstance(body, ParticipantJoined):
+                again = " again" if body.resumed else ""
+                _log.info("%s joined as %s%s", body.participant.name, body.participant.role, again)
+            elif isinstance(body, ParticipantLeft):
+                _log.info("participant %s left: %s", body.participant, body.reason)
+            elif isinstance(body, SamplesRejected):
                 self.rejected[body.participant, body.device, body.reason] = body.count
-            if isinstance(body, Handover):
+            elif isinstance(body, Handover):
                 self.handovers.append(
                     HandoverStatus(
                         body.object, body.giver, body.receiver, event.session_time * 1e-9, body.duration_ns * 1e-9
                     )
                 )
         for outgoing in decision.outgoing:
-            if outgoing.connection == HOST and isinstance(outgoing.message, Snapshot):
-                self._apply_snapshot(outgoing.message)
+            message = outgoing.message
+            if outgoing.connection == HOST and isinstance(message, Snapshot):
+                self._apply_snapshot(message)
+            elif isinstance(message, Reply) and message.denial is not None:
+                _log.info("denied to connection %d: %s", outgoing.connection, message.denial.message)
+        for command in decision.commands:
+            if command.hold_reason != self._hold_reasons.get(command.robot, ""):
+                self._hold_reasons[command.robot] = command.hold_reason
+                if command.hold_reason:
+                    _log.info("%s holds: %s", command.robot, command.hold_reason)
         for robot in status:
             if robot.applied is not None and robot.applied is not self.applied.get(robot.robot):
                 self._note_applied(robot.robot, robot.applied)

@@ -38,7 +38,7 @@ KEPT_PATCHES_S: Final = 10.0
 NO_SPECIFICATION: Final = "clients get no meshes and textures"
 
 
-class Shown(NamedTuple):
+class SharedScene(NamedTuple):
     """One scene as clients get it.
 
     `spec`: `None` where only bodies and poses are shared. `notes`: what is left out, a line each.
@@ -77,7 +77,7 @@ class SharedScenes:
     ) -> None:
         self._store_notes: list[str] = []
         self.lock = threading.RLock()
-        self.newest: Shown | None = None
+        self.newest: SharedScene | None = None
         self._name = name
         self._composed = composed
         self._sites, self._tendons = sites, tendons
@@ -105,7 +105,7 @@ class SharedScenes:
         newest = self.newest
         return list(dict.fromkeys((*(() if newest is None else newest.notes), *self._store_notes)))
 
-    def make(self, world: World, initial_state: bytes = b"", patches: Sequence[PatchOp] = ()) -> Shown:
+    def make(self, world: World, initial_state: bytes = b"", patches: Sequence[PatchOp] = ()) -> SharedScene:
         """Make specification and assets of a scene. Slow for a model that was never shared before. From any thread.
 
         Args:
@@ -120,7 +120,7 @@ class SharedScenes:
         )
         store = self._store
         if store is None:
-            return Shown(plain)
+            return SharedScene(plain)
         try:
             parsed = self._composed or parse_mujoco(
                 world.model,
@@ -132,10 +132,10 @@ class SharedScenes:
             )
             shown = _store_spec(store, apply_patch(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session works without its picture
-            return Shown(plain, notes=(f"{NO_SPECIFICATION}: {error}",))
+            return SharedScene(plain, notes=(f"{NO_SPECIFICATION}: {error}",))
         return shown._replace(notes=tuple(f"left out for clients: {what}" for what in parsed.skipped))
 
-    def patch(self, ops: Sequence[PatchOp]) -> Shown:
+    def patch(self, ops: Sequence[PatchOp]) -> SharedScene:
         """Return the newest scene with `ops` applied. Raises `SceneError`, `OSError`. Hold `lock` until `show`."""
         newest = self.newest
         if self._store is None or newest is None or newest.spec is None:
@@ -151,7 +151,7 @@ class SharedScenes:
         info = msgspec.structs.replace(newest.info, patches=newest.info.patches + 1)
         return _store_spec(self._store, apply_patch(newest.spec, ops), info, merging)._replace(notes=newest.notes)
 
-    def show(self, shown: Shown) -> SceneInfo:
+    def show(self, shown: SharedScene) -> SceneInfo:
         """Make a scene the newest. Its files are held, and those of the one before, which the front still serves.
 
         Raises nothing: what clients see has changed already, and a full disk does not change it back.
@@ -205,11 +205,11 @@ class _PatchedSpec(NamedTuple):
     shown_s: float
 
 
-def _store_spec(store: AssetStore, spec: SceneSpec, info: SceneInfo, patches: tuple[PatchOp, ...]) -> Shown:
+def _store_spec(store: AssetStore, spec: SceneSpec, info: SceneInfo, patches: tuple[PatchOp, ...]) -> SharedScene:
     named = list_assets(spec)
     if missing := next((address for address in named if address not in store), ""):
         raise SceneError(f"asset {missing} is not in {store.root}: put it there (AssetStore.put) before it is shown")
     address = store.put(encode_scene(spec))
     addresses = (address, *named)
     info = msgspec.structs.replace(info, scene_hash=address, asset_root=str(store.root), assets=addresses)
-    return Shown(info, spec, patches)
+    return SharedScene(info, spec, patches)

@@ -8,13 +8,12 @@ no disk, because a disk that hangs must not stop physics: the recorder reports t
 from __future__ import annotations
 
 import os
-import resource
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
+import psutil
 
 from iris_session.physics import Pacer
 from iris_session.protocol.common import MAX_TEXT, Pose
@@ -26,6 +25,7 @@ from iris_session.protocol.status import (
     StatusReport,
     StopReport,
 )
+from iris_session.recording import RecorderFeed, RecorderProcess
 from iris_session.session.session_view import HandoverStatus
 from iris_session.session.stepper import Stepper
 from iris_session.session.tick_times import TickTimes
@@ -33,20 +33,8 @@ from iris_session.session.tick_times import TickTimes
 PERIOD_NS: Final = 1_000_000_000
 #: A loop that is behind gets this long to catch up before a report is built all the same.
 PATIENCE_NS: Final = 1_000_000_000
-PAGE_BYTES: Final = resource.getpagesize()
-
-
-class ProcessStatus(msgspec.Struct, frozen=True):
-    """Front and recorder, as their supervisor sees them.
-
-    `drops`: what did not leave this process, by reason. `restarts`: of `front` and `recorder`. `sheet_sizes`: edges of
-    the printed sheets [m], where known.
-    """
-
-    recorder: RecorderReport = RecorderReport()
-    drops: dict[str, int] = {}
-    restarts: dict[str, int] = {}
-    sheet_sizes: dict[str, float] = {}
+#: Why a recording that goes on has no picture.
+NO_PICTURE: Final = "the picture is not recorded: an error in drawing has ended the recorder before"
 
 
 class DataFault(msgspec.Struct, frozen=True):
@@ -89,17 +77,17 @@ class SessionStatus(msgspec.Struct, frozen=True):
         pause_reason: Why physics stands still until a reset (`reset()` or `resume()`), empty otherwise.
     """
 
-    session_time_s: float
-    tick: int
-    sim_time: float
-    paused: bool
-    estop: bool
-    participants: tuple[ParticipantReport, ...]
-    handovers: tuple[HandoverStatus, ...]
-    lateness: dict[str, float]
-    input_to_ctrl_ms: dict[str, float]
-    drops: dict[str, int]
-    restarts: dict[str, int]
+    session_time_s: float = 0.0
+    tick: int = 0
+    sim_time: float = 0.0
+    paused: bool = False
+    estop: bool = False
+    participants: tuple[ParticipantReport, ...] = ()
+    handovers: tuple[HandoverStatus, ...] = ()
+    lateness: dict[str, float] = {}
+    input_to_ctrl_ms: dict[str, float] = {}
+    drops: dict[str, int] = {}
+    restarts: dict[str, int] = {}
     scheduling: str = "normal"
     data_fault: DataFault | None = None
     stops: tuple[StopReport, ...] = ()
@@ -110,21 +98,35 @@ class SessionStatus(msgspec.Struct, frozen=True):
         return dict(msgspec.to_builtins(self))
 
 
+def make_report(
+    stepper: Stepper, scheduling: str, drops: dict[str, int] | None = None, restarts: dict[str, int] | None = None
+) -> StatusReport:
+    """Return the part of a `StatusReport` that owners get, too; all other fields keep their defaults."""
+    now_ns, core, last = stepper.clock(), stepper.core, stepper.last
+    return StatusReport(
+        0,
+        "",
+        "",
+        now_ns,
+        tick=core.world.view().tick,
+        paused=stepper.paused,
+        estop=last is not None and last.decision.estop,
+        scheduling=scheduling,
+        participants=stepper.view.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
+        drops=drops or {},
+        restarts=restarts or {},
+        stops=core.authority.build_stop_reports(),
+        pause_reason=core.authority.pause_reason,
+    )
+
+
 def make_session_status(
-    stepper: Stepper | None,
-    pacer: Pacer | None,
-    drops: dict[str, int],
-    restarts: dict[str, int],
-    scheduling: str,
-    data_fault: DataFault | None = None,
+    report: StatusReport, stepper: Stepper, pacer: Pacer | None, data_fault: DataFault | None
 ) -> SessionStatus:
-    """Return the status now, empty before the first step."""
-    if stepper is None or stepper.last is None:
-        return SessionStatus(0.0, 0, 0.0, False, False, (), (), {}, {}, drops, restarts, scheduling)
-    now_ns = stepper.clock()
+    """Return what `report` says, with what its owner knows besides."""
     lateness = {}
     if pacer is not None:
-        stats = pacer.get_stats(now_ns)
+        stats = pacer.get_stats(report.session_time)
         lateness = {
             "ticks": stats.ticks,
             "late": stats.late,
@@ -133,24 +135,17 @@ def make_session_status(
             "p99_ms": stats.p99_ns * 1e-6,
             "max_ms": stats.max_ns * 1e-6,
         }
-    core, view, decision = stepper.core, stepper.view, stepper.last.decision
-    world = core.world.view()
+    own = {name: getattr(report, name) for name in SessionStatus.__struct_fields__ if hasattr(report, name)}
     return SessionStatus(
-        now_ns * 1e-9,
-        world.tick,
-        world.sim_time,
-        decision.paused,
-        decision.estop,
-        view.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
-        tuple(view.handovers),
-        lateness,
-        view.compute_input_to_ctrl_ms(),
-        drops,
-        restarts,
-        scheduling,
-        data_fault,
-        core.authority.build_stop_reports(),
-        core.authority.pause_reason,
+        **own
+        | {
+            "session_time_s": report.session_time * 1e-9,
+            "sim_time": stepper.core.world.view().sim_time,
+            "handovers": tuple(stepper.view.handovers),
+            "lateness": lateness,
+            "input_to_ctrl_ms": stepper.view.compute_input_to_ctrl_ms(),
+            "data_fault": data_fault,
+        }
     )
 
 
@@ -181,25 +176,23 @@ class StatusReporter:
         self._next_ns = now_ns + PERIOD_NS
         return True
 
-    def make_report(self, stepper: Stepper, processes: ProcessStatus) -> StatusReport:
-        """Return the session now; fields of the front keep their defaults."""
-        now_ns = stepper.clock()
-        pacer, times = self.pacer, self.times
-        stats = None if pacer is None else pacer.get_stats(now_ns)
+    def make_report(self, stepper: Stepper, report: StatusReport, sizes: Mapping[str, float]) -> StatusReport:
+        """Return the authority's half of a report, once a second; fields of the front keep their defaults.
+
+        Args:
+            stepper: Of the session.
+            report: That of `make_report`, with the recorder.
+            sizes: Edges of the printed sheets [m], where known.
+        """
+        pacer, times, core = self.pacer, self.times, stepper.core
+        stats = None if pacer is None else pacer.get_stats(report.session_time)
         if times is not None and stats is not None:
             times.mark(stats)
-        last, core = stepper.last, stepper.core
         warnings = [text for source in self.warning_sources for text in source()]
-        return StatusReport(
-            0,
-            "",
-            "",
-            now_ns,
-            tick=core.world.view().tick,
+        recorder = report.recorder or RecorderReport()
+        return msgspec.structs.replace(
+            report,
             tick_period_ns=core.world.tick_period_ns,
-            paused=stepper.paused,
-            estop=last is not None and last.decision.estop,
-            scheduling=self.scheduling,
             late_share=0.0 if times is None else times.compute_late_share(),
             late_share_total=0.0 if stats is None else stats.late_share,
             lateness=None if times is None else times.compute_lateness(),
@@ -208,16 +201,10 @@ class StatusReporter:
             load=os.getloadavg()[0],
             cpus=os.cpu_count() or 1,
             memory_bytes=measure_memory_bytes(),
-            participants=stepper.view.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
             robots=make_robot_reports(stepper),
-            recorder=processes.recorder,
-            drops=processes.drops,
-            restarts=processes.restarts,
-            warnings=tuple(collect_warnings(stepper, processes.recorder, self.scheduling, warnings)),
-            anchors=make_anchor_reports(core.authority.anchors, processes.sheet_sizes),
+            warnings=tuple(collect_warnings(stepper, recorder, self.scheduling, warnings)),
+            anchors=make_anchor_reports(core.authority.anchors, sizes),
             cross_checks=core.authority.build_cross_check_reports(),
-            stops=core.authority.build_stop_reports(),
-            pause_reason=core.authority.pause_reason,
         )
 
     def _measure_cpu_share(self) -> float:
@@ -226,6 +213,34 @@ class StatusReporter:
         share = (cpu_ns - self._cpu_ns) / max(1, at_ns - self._cpu_at_ns)
         self._cpu_ns, self._cpu_at_ns = cpu_ns, at_ns
         return share
+
+
+def make_recorder_report(feed: RecorderFeed | None, recorder: RecorderProcess | None) -> RecorderReport:
+    """Return how the recording does, from the recorder's last report and its supervision; `off` without a recorder."""
+    if feed is None or recorder is None:
+        return RecorderReport()
+    stats = feed.stats
+    last = stats.recorder
+    fault = recorder.failure or ("" if last is None else last.fault)
+    state = "running"
+    if recorder.is_used_up:
+        state, fault = "ended", recorder.budget_text
+    elif fault:
+        state = "failed"
+    elif not recorder.alive:
+        state = "dead"
+    elif recorder.hangs:
+        state = "hangs"
+    fault = fault or stats.drop_reason or (NO_PICTURE if recorder.journal_only else "")
+    return RecorderReport(
+        state,
+        recorder.path[-MAX_TEXT:],
+        0 if last is None else last.bytes,
+        0 if last is None else last.disk_free,
+        stats.dropped_rows,
+        stats.waiting_bytes,
+        fault[:MAX_TEXT],
+    )
 
 
 def make_anchor_reports(poses: Mapping[str, Pose], sizes: Mapping[str, float]) -> tuple[AnchorReport, ...]:
@@ -272,10 +287,5 @@ def collect_warnings(
 
 
 def measure_memory_bytes() -> int:
-    """Return the resident memory of this process; its peak where the system does not say."""
-    try:
-        with open("/proc/self/statm", "rb") as file:
-            return int(file.read().split()[1]) * PAGE_BYTES
-    except (OSError, ValueError, IndexError):
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else peak * 1024
+    """Return the resident memory of this process."""
+    return int(psutil.Process().memory_info().rss)

@@ -1,7 +1,7 @@
 """`Stepper`: one step of a live session. Gathers entries, runs the core, sends the results, journals. No pacing.
 
-Session time is stamped here, once per step, and passed to the pure core. The ports (front link, recorder feed) bound
-everything that is sent, and count what they drop.
+Session time is stamped here, once per step, and passed to the pure core. Link and feed bound everything that is sent,
+and count what they drop.
 """
 
 from __future__ import annotations
@@ -11,17 +11,19 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType, TracebackType
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.journal.feed import RecorderFeed
 from iris_session.journal.messages import RobotLabels
-from iris_session.journal.rows import CRASHED, JournalRow, Keyframe, make_row
+from iris_session.journal.rows import CRASHED, Keyframe, make_row
+from iris_session.link import FrontLink
 from iris_session.physics import World
 from iris_session.protocol.client_messages import Control, Episode, EStop, GetSnapshot, Marker
-from iris_session.protocol.common import MAX_TEXT, Applied, Pose
+from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import (
     HOST,
     Entry,
@@ -34,14 +36,14 @@ from iris_session.protocol.entries import (
     encode_entry,
 )
 from iris_session.protocol.names import ControlAction, DenialReason, EpisodeAction, LateCause
-from iris_session.protocol.server_messages import BodyInfo, Reply, StateHeader
+from iris_session.protocol.server_messages import Reply, StateHeader
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Decision
 from iris_session.session.core import Plant, SessionCore, StepOutcome, ignore_lap
 from iris_session.session.deformables import DeformableSourceMesh
 from iris_session.session.errors import OwnershipError
 from iris_session.session.session_view import SessionView
-from iris_session.session.shared_scene import Shown
+from iris_session.session.shared_scene import SharedScene
 
 #: Pending host entries; a script that posts more in one step gets an error.
 MAX_HOST_ENTRIES: Final = 256
@@ -57,65 +59,13 @@ GAP_LOG_PERIOD_NS: Final = 10_000_000_000
 _log = logging.getLogger(__name__)
 
 
-class FrontPort(Protocol):
-    """The part of `FrontLink` that the stepper uses."""
-
-    def poll(self) -> list[Entry]: ...
-
-    def send_decision(self, step: int, decision: Decision) -> None: ...
-
-    def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None: ...
-
-
-class RecorderPort(Protocol):
-    """The part of `RecorderFeed` that the stepper uses."""
-
-    @property
-    def wants_keyframe(self) -> bool: ...
-
-    def send_scene(
-        self,
-        model_hash: str,
-        packed_model: bytes,
-        bodies: tuple[BodyInfo, ...],
-        root: str = "",
-        scene_hash: str = "",
-        robots: tuple[RobotLabels, ...] = (),
-    ) -> None: ...
-
-    def send_patch(self, root: str, scene_hash: str) -> None: ...
-
-    def add_row(self, row: JournalRow) -> None: ...
-
-    def flush(self) -> None: ...
-
-    def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
-
-    def add_state(
-        self,
-        step: int,
-        tick: int,
-        sim_time: float,
-        session_time: int,
-        poses: NDArray[np.float64],
-        applied: Sequence[Applied] = (),
-        robots: bytes = b"",
-    ) -> None: ...
-
-    def add_decision(self, step: int, session_time: int, decision: Decision) -> None: ...
-
-    def add_metric(self, step: int, session_time: int, name: str, value: float) -> None: ...
-
-    def take_gap(self) -> int: ...
-
-
 class NextScene(NamedTuple):
     """A scene that is to replace the present one. `packed_model`: for the recording; `shown`: for clients."""
 
     plant: Plant
     model_hash: str
     packed_model: bytes
-    shown: Shown
+    shown: SharedScene
     deformables: Sequence[DeformableSourceMesh] = ()
 
 
@@ -123,7 +73,7 @@ class NextPatch(NamedTuple):
     """A visual change of the scene. `shown`: the scene after it, for clients."""
 
     message: ScenePatched
-    shown: Shown
+    shown: SharedScene
 
 
 class OwnerRequest(msgspec.Struct, frozen=True):
@@ -181,8 +131,8 @@ class Stepper:
     def __init__(
         self,
         core: SessionCore,
-        front: FrontPort,
-        recorder: RecorderPort | None,
+        front: FrontLink,
+        recorder: RecorderFeed | None,
         clock: Callable[[], int],
         state_period_ns: int,
         keyframe_period_ns: int,
@@ -417,7 +367,7 @@ class Stepper:
             self.lateness_ns = 0
 
     def _record(
-        self, recorder: RecorderPort, now_ns: int, n_ticks: int, entries: Sequence[Entry], plant: bytes
+        self, recorder: RecorderFeed, now_ns: int, n_ticks: int, entries: Sequence[Entry], plant: bytes
     ) -> None:
         assert self.last is not None
         row = make_row(self._chain, self.step_count, now_ns, n_ticks, entries, self.last.digest, plant)

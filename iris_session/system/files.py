@@ -50,12 +50,8 @@ class Replacement:
                 os.fsync(self.file.fileno())
             self.file.close()
 
-    def commit(self, *, sync_folder_too: bool = True) -> None:
-        """Replace the file with what was written.
-
-        Args:
-            sync_folder_too: Of a durable file: wait until the folder is on the disk. Else call `sync_folder` later.
-        """
+    def commit(self) -> None:
+        """Replace the file with what was written. Of a durable file: wait until the folder is on the disk, too."""
         try:
             self.finish()
             os.replace(self.temporary, self.path)
@@ -63,7 +59,7 @@ class Replacement:
         except BaseException:
             self.discard()
             raise
-        if self._durable and sync_folder_too:
+        if self._durable:
             sync_folder(self.path.parent)
 
     def discard(self) -> None:

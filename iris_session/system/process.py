@@ -83,7 +83,7 @@ def take_stdout() -> int:
     return own
 
 
-def _open_memory_file() -> IO[bytes]:
+def open_memory_file() -> IO[bytes]:
     """Open a file without a name. Outside of Linux it lies on disk."""
     if not hasattr(os, "memfd_create"):
         return tempfile.TemporaryFile()
@@ -136,7 +136,7 @@ class ChildProcess:
         Raises:
             OSError: No process or memory can be had.
         """
-        with nullcontext() if config is None else _open_memory_file() as file:
+        with nullcontext() if config is None else open_memory_file() as file:
             if file is not None and config is not None:
                 file.write(config)
                 file.seek(0)

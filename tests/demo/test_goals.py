@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iris_session.demo.goals import STILL_M, STILL_S, FoldGoal, Goal, GoalMonitor, StowGoal, Vertices
+from iris_session.demo.goals import STILL_S, FoldGoal, Goal, GoalMonitor, StowGoal, Vertices
 
 TICK_S = 0.005
 FOLD = FoldGoal("cloth", ((0, 1), (2, 3)))
@@ -37,13 +37,6 @@ def test_cloth_is_folded_when_both_pairs_of_corners_meet_and_rest() -> None:
     now_s = play(watch, 0.1, FLAT, 0.0)
     now_s = play(watch, 2 * STILL_S, folded(0.049), now_s)
     assert watch.at_s == pytest.approx(0.1 + TICK_S + STILL_S, abs=2 * TICK_S)
-
-
-def test_success_is_reported_once() -> None:
-    watch = GoalMonitor(FOLD)
-    watch.update(0.0, FLAT, ())
-    reported = [watch.update(0.1 + k * TICK_S, folded(0.01), ()) for k in range(300)]
-    assert reported.count(True) == 1
 
 
 @pytest.mark.parametrize(
@@ -88,13 +81,3 @@ def test_success_waits_for_release_and_rest(hindrance: str) -> None:
     if hindrance == "touched":
         play(watch, 0.2 * STILL_S, vertices, now_s)
         assert watch.at_s is not None
-
-
-def test_vibration_within_the_bound_is_rest() -> None:
-    watch = GoalMonitor(FOLD)
-    watch.update(0.0, FLAT, ())
-    for k in range(300):
-        vertices = folded(0.02)
-        vertices[:, 0] += 0.4 * STILL_M * (-1) ** k
-        watch.update(k * TICK_S, vertices, ())
-    assert watch.at_s is not None

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from iris_session.cli.main import main
 from iris_session.demo.scenes.models import find_model_file
 from iris_session.physics import ModelNotFoundError
 from tests.models import ALOHA
@@ -61,26 +60,9 @@ def test_first_source_that_has_the_file_counts(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.usefixtures("no_source")
-def test_what_has_not_the_file_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("iris_session.demo.scenes.models.find_wheel_folder", lambda: ALOHA.parents[1])
-    monkeypatch.setenv("IRIS_DATA", str(tmp_path))
-    monkeypatch.setitem(sys.modules, "mujoco_menagerie", Menagerie())
-    assert find_model_file("aloha", "scene.xml") == ALOHA
-
-
-@pytest.mark.usefixtures("no_source")
 def test_error_names_what_would_help(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ModelNotFoundError, match=r"aloha.*mujoco-menagerie.*IRIS_DATA.*models/aloha/scene\.xml"):
         find_model_file("aloha", "scene.xml")
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", Menagerie())
     with pytest.raises(ModelNotFoundError, match="no connection"):
         find_model_file("aloha", "scene.xml")
-
-
-@pytest.mark.usefixtures("no_source")
-@pytest.mark.parametrize("command", ["demo", "serve"])
-def test_commands_end_with_one_line_without_a_model(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "panda"]) == 2
-    text = capsys.readouterr().err
-    assert "franka_emika_panda" in text
-    assert text.count("\n") == 1

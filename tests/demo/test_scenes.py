@@ -31,30 +31,6 @@ def test_unknown_scene_lists_the_available_ones() -> None:
         scene_path("../physics")
 
 
-def test_handover_scene_has_its_documented_names() -> None:
-    model = _handover()
-    for arm in ("left", "right"):
-        for part in [f"joint{i}" for i in range(1, 8)]:
-            assert model.joint(f"{arm}/{part}").id >= 0
-            assert model.actuator(f"{arm}/{part}").id >= 0
-        assert model.site(f"{arm}/tcp").id >= 0
-        assert model.actuator(f"{arm}/gripper").id >= 0
-        for finger in ("finger_left", "finger_right"):
-            assert model.body(f"{arm}/{finger}").id >= 0
-    for thing in ("hammer", "board"):
-        joint = model.body(thing).jntadr[0]
-        assert int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
-    assert model.key("home").id == 0
-
-
-def test_objects_are_held_by_friction_only() -> None:
-    """No weld, connect or adhesion anywhere: the only equalities couple the two fingers of a gripper."""
-    model = _handover()
-    assert {int(kind) for kind in model.eq_type} == {int(mujoco.mjtEq.mjEQ_JOINT)}
-    assert int(mujoco.mjtTrn.mjTRN_BODY) not in {int(kind) for kind in model.actuator_trntype}
-    assert not model.body_mocapid[model.body("hammer").id] >= 0
-
-
 def test_home_is_at_rest() -> None:
     model = _handover()
     data = _settled(model)
@@ -95,7 +71,7 @@ def test_hammer_held_at_its_end_does_not_creep() -> None:
     assert data.body("hammer").xpos[2] > 0.27
 
 
-@pytest.mark.parametrize("n", [1, 2, 4, 8])
+@pytest.mark.parametrize("n", [1, 8])
 def test_arms_around_a_table(n: int) -> None:
     model = n_arms_scene(n).compile()
     data = _settled(model, 250)
@@ -110,17 +86,6 @@ def test_arms_around_a_table(n: int) -> None:
     touching = {int(model.geom_bodyid[g]) for c in data.contact for g in (c.geom1, c.geom2)}
     things = {model.body(f"object{i + 1}").id for i in range((n + 1) // 2)}
     assert touching <= things | {0}  # only objects on the table
-
-
-def test_number_of_arms_is_checked() -> None:
-    with pytest.raises(ValueError, match="1 to 12"):
-        n_arms_scene(13)
-
-
-def test_same_arguments_give_the_same_model() -> None:
-    assert n_arms_scene(3).to_xml() == n_arms_scene(3).to_xml()
-    assert free_bodies_scene(20, seed=3).to_xml() == free_bodies_scene(20, seed=3).to_xml()
-    assert free_bodies_scene(20, seed=3).to_xml() != free_bodies_scene(20, seed=4).to_xml()
 
 
 def test_free_bodies_keep_their_speed_and_stay_inside() -> None:

@@ -8,7 +8,6 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 
 from iris_session.demo import run
@@ -63,7 +62,7 @@ def test_failed_operators_begin_again_from_a_reset_scene(tmp_path: Path, monkeyp
     config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd")
     result = run.run_demo(make_demo("handover"), config, timeout_s=360.0)
     assert (result.ok, result.verified) == (True, True), result.problems
-    assert 2 <= result.takes <= 3  # on a busy machine an operator may fail by itself, too
+    assert 2 <= result.attempts <= 3  # on a busy machine an operator may fail by itself, too
     assert "dropped it" in "".join(result.notes)
     assert [one.object for one in result.handovers] == ["hammer"]
 
@@ -84,19 +83,6 @@ def demo(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @pytest.mark.long
-def test_timeout_fails_and_lists_the_problems(tmp_path: Path) -> None:
-    done = run_command("demo", "handover", "--json", "--timeout", "4", cwd=tmp_path)
-    assert done.returncode == 1, done.stderr
-    result = json.loads(done.stdout)
-    assert result["ok"] is False
-    assert result["handovers"] == []
-    text = " ".join(result["problems"])
-    assert "4 s" in text
-    assert "handover" in text
-    assert result["verified"] is True, "the recording of a failed demo verifies, too"
-
-
-@pytest.mark.long
 def test_ctrl_c_leaves_no_process_and_a_finished_recording(demo: subprocess.Popen[bytes], tmp_path: Path) -> None:
     children = list_descendants(demo.pid)
     assert len(children) == CHILDREN
@@ -107,27 +93,3 @@ def test_ctrl_c_leaves_no_process_and_a_finished_recording(demo: subprocess.Pope
     assert "interrupted" in (tmp_path / "demo.out").read_text()
     (recording,) = tmp_path.glob("sessions/*/session.rrd")
     assert run_verify(recording)["finished"]
-
-
-@pytest.mark.long
-def test_killed_demo_leaves_no_process_and_a_finished_recording(demo: subprocess.Popen[bytes], tmp_path: Path) -> None:
-    children = list_descendants(demo.pid)
-    assert len(children) == CHILDREN
-    demo.kill()
-    demo.wait()
-    assert_all_end(children)
-    assert not [p for p in psutil.process_iter() if p.pid in {c.pid for c in children} and p.is_running()]
-    (recording,) = tmp_path.glob("sessions/*/session.rrd")
-    assert run_verify(recording)["finished"]
-
-
-@pytest.mark.long
-def test_handover_over_busy_wifi(tmp_path: Path) -> None:
-    recording = tmp_path / "session.rrd"
-    options = ("--profile", "busy-wifi", "--seed", "3", "--record", str(recording), *DEMO_OPTIONS)
-    done = run_command("demo", "handover", *options, cwd=tmp_path, timeout_s=DEMO_S)
-    result = json.loads(done.stdout)
-    assert result["ok"], (result["problems"], done.stderr[-2000:])
-    assert result["verified"]
-    assert [h["object"] for h in result["handovers"]] == ["hammer"]
-    assert all(age > 10.0 for age in result["state_age_ms_p99"].values()), "the delay of the link is in the ages"

@@ -13,21 +13,21 @@ from tests.e2e.session_process import DEMO_OPTIONS, DEMO_S, run_command
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 60.0)]
 
 
-def run_demo(folder: Path, *arguments: str, max_takes: int = 2) -> dict[str, Any]:
+def run_demo(folder: Path, *arguments: str, max_attempts: int = 2) -> dict[str, Any]:
     """Run a demo, which must succeed within so many attempts: a busy machine spoils one. Return its result."""
     done = run_command("demo", *arguments, *DEMO_OPTIONS, cwd=folder, timeout_s=DEMO_S)
     assert done.stdout, done.stderr[-3000:]
     result: dict[str, Any] = json.loads(done.stdout)
     problems = "\n".join([*result["problems"], done.stderr[-6000:], done.stdout])
     assert (done.returncode, result["ok"], result["verified"]) == (0, True, True), problems
-    assert result["takes"] <= max_takes, problems
+    assert result["takes"] <= max_attempts, problems
     assert result["participants"] == ["ann", "bob"]
     return result
 
 
 @pytest.mark.long
 def test_aloha_operators_exchange_boards(tmp_path: Path) -> None:
-    result = run_demo(tmp_path, "aloha", max_takes=3)  # a board is dropped in about one of twelve, by physics alone
+    result = run_demo(tmp_path, "aloha", max_attempts=3)  # a board is dropped in about one of twelve, by physics alone
     found = {h["object"]: (h["giver"], h["receiver"]) for h in result["handovers"]}
     assert found == {
         "red_board": ("south/right", "north/left"),
@@ -51,5 +51,5 @@ def test_two_operators_stow_two_soft_bodies(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_two_operators_fold_a_cloth(tmp_path: Path) -> None:
-    goals = run_demo(tmp_path, "cloth", max_takes=3)["goals"]  # on a busy machine, one fold in some ten fails
+    goals = run_demo(tmp_path, "cloth", max_attempts=3)["goals"]  # on a busy machine, one fold in some ten fails
     assert [(goal["deformable"], goal["goal"]) for goal in goals] == [("cloth", "folded")]

@@ -7,7 +7,6 @@ import json
 import os
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,6 @@ from typing import Any
 import psutil
 import pytest
 
-from iris_session.client import Client
-from iris_session.protocol.names import LateCause
 from iris_session.security import KeyHome, KeyPair
 from tests.e2e.session_process import (
     COMMAND,
@@ -24,7 +21,6 @@ from tests.e2e.session_process import (
     kill_all,
     make_serve_command,
     skip_unless_ci,
-    wait_until,
 )
 
 pytestmark = pytest.mark.e2e
@@ -110,67 +106,6 @@ def test_refused_keys_and_codes_at_an_encrypted_session(tmp_path: Path) -> None:
         found.assert_names("server_key", "iris-session keys forget")
     finally:
         server.stop()
-
-
-def test_checks_of_the_server_name_its_ports_and_processes(tmp_path: Path) -> None:
-    recording = tmp_path / "session.rrd"
-    server = SessionProcess(tmp_path, recording, make_serve_command("arm", recording))
-    try:
-        found = run_doctor("--server", server.address)
-    finally:
-        server.stop()
-    assert {"scheduling", "processors", "key_home", "ports", "interfaces", "clock_source", "disk"} <= set(found.checks)
-    assert found.checks["session"]["state"] == "ok"
-    ports = found.checks["ports"]
-    assert ports["state"] == "ok", ports
-    assert server.address.rpartition(":")[2] in ports["text"]
-    assert "front.main" in ports["text"]
-
-
-OVERLOADED = """
-import os, sys, time
-from iris_session import Session, SessionConfig
-from iris_session.demo.scenes import scene_path
-config = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
-with Session(scene_path("arm"), config=config) as session:
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # not of the front, which runs already
-    print(f"on {session.address}, recording to nothing", flush=True)
-    session.run()
-"""
-HOG = "import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass\n"
-
-#: Late ticks of a few seconds of a session without enough processor time.
-MANY_LATE_TICKS = 50
-
-
-@pytest.mark.long
-def test_late_ticks_name_their_cause(tmp_path: Path) -> None:
-    """Other programs occupy the processor of the session."""
-    with contextlib.ExitStack() as stack:
-        server = SessionProcess(tmp_path, tmp_path / "none", [sys.executable, "-c", OVERLOADED])
-        stack.callback(server.stop)
-        for _ in range(3):
-            hog = stack.enter_context(subprocess.Popen([sys.executable, "-c", HOG]))
-            stack.callback(hog.kill)
-        wait_for_late_ticks(server)
-        found = run_doctor(server.address)
-    state = found.checks["ticks"]["state"]
-    assert state in ("failed", "warning"), found.troubles()
-    found.assert_names("ticks", "scheduler", state=state)
-
-
-def wait_for_late_ticks(server: SessionProcess) -> None:
-    """Wait until more late ticks were counted than at a start, most of them of the scheduler."""
-    with Client(server.address, role="observer", name="watch", alignment="not_needed") as client:
-
-        def late() -> bool:
-            causes = client.status().late_causes
-            return (
-                sum(causes.values()) >= MANY_LATE_TICKS
-                and max(causes, key=lambda name: causes[name]) == LateCause.SCHEDULER
-            )
-
-        wait_until(late, "late ticks, most of them of the scheduler")
 
 
 @pytest.fixture

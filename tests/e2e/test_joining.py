@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from iris_session.security import KeyHome, KeyPair
 from tests.e2e.session_process import wait_until
 from tests.e2e.virtual_network import ENOUGH_FRAMES, Machine, Network, ServedSession, require_namespaces
 
@@ -79,17 +78,3 @@ def test_pairing_uri_is_sufficient_where_broadcasts_are_blocked(network: Network
         assert other_user.run_observer("10.77.1.1")["frames"] > ENOUGH_FRAMES
     finally:
         network.allow_broadcasts()
-
-
-def test_changed_server_key_is_refused_until_it_is_forgotten(network: Network, lab: ServedSession) -> None:
-    headset = network.headset
-    headset.run_command("keys", "forget", "10.77.1.1:7721")
-    impostor = KeyPair.generate().public
-    KeyHome(headset.folder / "keys").known_servers.pin("10.77.1.1:7721", "lab-1", impostor)
-    for target in (("10.77.1.1",), ("--session", "lab-1")):
-        done = headset.run_command("emulate", *target)
-        assert done.returncode == 1
-        assert "keys forget" in done.stderr
-        assert len(done.stderr.strip().splitlines()) == 1
-    assert headset.run_command("keys", "forget", "10.77.1.1:7721").returncode == 0
-    assert headset.run_observer("10.77.1.1", "--code", pair(network.server)["code"])["frames"] > ENOUGH_FRAMES

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +11,9 @@ import pytest
 
 from anchors.pose import compose
 from iris_session.assets.store import AssetStore
-from iris_session.client import Client
 from iris_session.client.deformables import Deformables
 from iris_session.protocol.scene import decode_scene
 from iris_session.protocol.server_messages import SceneChanged
-from iris_session.recording import Recording
-from iris_session.scene import decode_mesh
 from iris_session.session.deformables import BOUND_M
 from iris_session.streams.rigid import MAX_POSITION_ERROR_M, MAX_ROTATION_ERROR_RAD
 from tests.e2e import publisher_program
@@ -132,28 +129,3 @@ def test_observers_receive_poses_and_vertices_of_a_world_without_mujoco(scenario
     refused = run_command("serve", "--resume", str(scenario.server.recording), cwd=tmp_path)
     assert refused.returncode == 2
     assert "open" in refused.stderr
-
-
-@pytest.mark.long
-def test_served_mesh_file_is_shown_without_moving_bodies(tmp_path: Path, serve: Callable[..., SessionProcess]) -> None:
-    publisher_program.build_scene(tmp_path)
-    server = serve(str(tmp_path / "corner.off"), "--name", "shelf")
-    scenario = Scenario(server)
-    try:
-        ann: Client = scenario.join("ann", role="observer")
-        scenario.run_until(lambda: ann.scene.state is not None, "ann receives state")
-        fetch = ann.assets.fetch([ann.mirror.scene_hash])
-        scenario.run_until(lambda: fetch.done, "the specification was received")
-        (visual,) = decode_scene(fetch.read(ann.mirror.scene_hash)).visuals
-        assert visual.geometry.kind == "mesh"
-        assert ann.scene.state is not None
-        assert ann.scene.state.poses.shape == (0, 7), "nothing moves"
-        assert "without robots" in server.output
-        assert server.finish()["ok"]
-        with Recording.open(server.recording) as recording:  # shows the scene without the mesh file
-            (scene,) = recording.scenes()
-            spec = decode_scene(recording.asset(scene.hash))
-            assert spec.visuals == (visual,)
-            assert decode_mesh(recording.asset(spec.meshes[0].levels[0].address)).triangles > 0
-    finally:
-        scenario.close()

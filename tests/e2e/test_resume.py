@@ -5,21 +5,18 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import psutil
 import pytest
 
 from anchors.pose import distance
-from iris_session.client import Client, CurveKeys
+from iris_session.client import Client
 from iris_session.protocol.entries import SessionResumed, decode_entries
 from iris_session.protocol.server_messages import Gap, Handover, ParticipantJoined
 from iris_session.recording import Recording
-from iris_session.security import KeyHome, KeyPair
 from tests.e2e.scenario import Hand, Scenario
 from tests.e2e.session_process import (
     COMMAND,
-    DEADLINE_S,
     SessionProcess,
     assert_all_end,
     kill_all,
@@ -176,36 +173,3 @@ def test_resume_after_a_power_cut_continues_at_the_last_readable_row(
     assert report["continues"].startswith("session.resume2.rrd ")
     assert again.verify()["continues"].startswith("session.rrd ")
     assert run_verify(scenario.server.recording)["cuts"]
-
-
-@pytest.mark.long
-def test_encrypted_session_resumes_encrypted_with_the_same_keys(
-    serve: Callable[..., SessionProcess], resume: Resume, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The options are not repeated: resume tokens are bound to keys, and the allow-list stays."""
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "server-home"))
-    home, pair = KeyHome(tmp_path / "server-home"), KeyPair.generate()
-    home.clients.allow_key("ann", pair.public, ())
-    keys = CurveKeys(home.load_server_key().public.encode(), pair.public.encode(), pair.secret.encode())
-    scenario = Scenario(serve("handover", "--curve", "--no-beacon"))
-    try:
-        ann = Client(
-            scenario.server.address, name="ann", devices=("desktop",), alignment="not_needed", curve=keys
-        )  # fmt: skip
-        scenario.clients.append(ann)
-        ann.connect(DEADLINE_S)
-        hand = scenario.add_hand(ann, "left")
-        ann.acquire(["left"])
-        scenario.engage(hand)
-        me = ann.participant_id
-        wait_until_recorded(scenario, scenario.server.recording, ann.session_now_ns())
-        kill_authority(scenario.server)
-        again = resume(scenario.server)
-        wait_reconnected(scenario, again, ann)
-        assert ann.connection.welcome is not None
-        assert ann.connection.welcome.key_fingerprint == home.load_server_key().fingerprint
-        assert ann.participant_id == me
-        assert ann.mirror.leases["left"].holder == me
-        again.finish()
-    finally:
-        scenario.close()

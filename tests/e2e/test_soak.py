@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,25 +13,6 @@ sys.path.insert(0, str(TOOLS))
 from soak import check_log, check_memory  # noqa: E402
 
 RECORDED = {1: 11, 2: 22, 3: 33, 4: 44, 5: 55}
-
-
-@pytest.mark.long
-@pytest.mark.e2e
-def test_short_soak_finds_no_problem(tmp_path: Path) -> None:
-    """Three participants over busy Wi-Fi: all are connected at the end, no event is lost, the recording verifies."""
-    command = [sys.executable, str(TOOLS / "soak.py"), "--seconds", "22", "--operators", "2", "--observers", "1"]
-    command += ["--per-process", "1", "--seed", "1", "--keep", str(tmp_path), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300.0)
-    assert done.stdout, done.stderr[-3000:]
-    result = json.loads(done.stdout)
-    assert result["problems"] == [], done.stderr[-3000:]
-    assert done.returncode == 0
-    assert result["verified"]
-    assert sum(result["disturbances"].values()) >= 5
-    assert set(result["memory"]) == {"authority", "front", "recorder"}
-    events = result["events"]
-    assert events["recorded"] > 30
-    assert events["handed_out"] > events["recorded"], "each of three participants received most events"
 
 
 def test_event_check_finds_gaps_repeats_and_changes() -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import pty
-import signal
 import subprocess
 import termios
 from pathlib import Path
 
 import pytest
 
-from tests.e2e.session_process import DEADLINE_S, make_serve_command, wait_until
+from tests.e2e.session_process import make_serve_command, wait_until
 
 pytestmark = pytest.mark.e2e
 
@@ -54,22 +53,3 @@ def test_keys_of_the_terminal_stop_and_clear(tmp_path: Path) -> None:
     assert termios.tcgetattr(terminal) == before
     os.close(parent)
     os.close(terminal)
-
-
-@pytest.mark.long
-def test_background_session_does_not_read_the_terminal(tmp_path: Path) -> None:
-    """A process of a background group that reads its terminal would be stopped by the system."""
-    parent, terminal = pty.openpty()
-    script = 'set -m; "$@" & wait'  # -m: a process group of its own, so not in the foreground
-    command = make_serve_command("handover", tmp_path / "session.rrd", "--no-beacon", "--seconds", "1")
-    process = subprocess.Popen(
-        ["setsid", "--ctty", "bash", "-c", script, "bash", *command],
-        stdin=terminal, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=tmp_path,
-    )  # fmt: skip
-    try:
-        assert process.wait(DEADLINE_S) == 0
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        os.close(parent)
-        os.close(terminal)

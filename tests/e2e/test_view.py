@@ -79,14 +79,6 @@ def test_viewer_that_is_killed_ends_the_command(recording: Path) -> None:
         assert "Rerun's viewer ended with exit status -9" in process.stdout.read()
 
 
-def test_terminated_command_ends_the_viewer(recording: Path) -> None:
-    with viewed("view", recording, "--web", "--no-open") as (process, _):
-        viewers = list_descendants(process.pid)
-        process.terminate()
-        assert process.wait(DEADLINE_S) == 0
-        assert_all_end(viewers)
-
-
 def is_answered(address: str) -> bool:
     try:
         urllib.request.urlopen(address, timeout=DEADLINE_S).close()

@@ -20,7 +20,9 @@ from iris_session.link import FrontConfig, FrontError, FrontLink, FrontProcess, 
 from iris_session.link.config import FrontStart
 from iris_session.link.front_process import HANGING_NS, START_S, STARVED_NS, StarvationDetector
 from iris_session.security import KeyHome
+from iris_session.system import supervised
 from tests.front.harness import scene
+from tests.threads import Threads
 
 SECOND = 1_000_000_000
 PORTS = Ports("127.0.0.1", 7001, 7002, 7003, 7004, 7005)
@@ -33,10 +35,17 @@ class Child:
 
     def __init__(self, config: bytes) -> None:
         self.start = msgspec.msgpack.decode(config, type=FrontStart)
-        self.is_running = True
+        self.exit_status: int | None = None
+
+    @property
+    def is_running(self) -> bool:
+        return self.exit_status is None
+
+    def send_signal(self, number: int) -> None:
+        self.exit_status = -number
 
     def close(self, *, exit_s: float = 0.0, terminate_s: float = 0.0) -> int:
-        self.is_running = False
+        self.send_signal(signal.SIGKILL)
         return -signal.SIGKILL
 
 
@@ -60,18 +69,6 @@ class Link:
     def close(self) -> None: ...
 
 
-class Thread:
-    """Does its work at once."""
-
-    def __init__(self, target: Callable[..., None], args: tuple[Any, ...], name: str) -> None:
-        self.start = lambda: target(*args)
-
-    def is_alive(self) -> bool:
-        return False
-
-    def join(self) -> None: ...
-
-
 class Supervision:
     """A `FrontProcess` and what it sees.
 
@@ -91,7 +88,8 @@ class Supervision:
             monotonic=lambda: self.now_s, monotonic_ns=lambda: round(self.now_s * 1e9), sleep=self.advance
         )
         monkeypatch.setattr(front_process, "time", clock)
-        monkeypatch.setattr(front_process, "threading", SimpleNamespace(Thread=Thread))
+        self.threads = Threads()
+        monkeypatch.setattr(supervised, "threading", self.threads)
         monkeypatch.setattr(front_process, "FrontLink", Link)
         monkeypatch.setattr(front_process, "ChildProcess", self._spawn)
         monkeypatch.setattr(front_process, "_read_times", lambda pid: self.times)
@@ -117,13 +115,21 @@ class Supervision:
     def make_ready(self) -> None:
         self.link.ports = PORTS
 
-    def is_silent_for(self, silence_ns: int) -> bool:
-        """Let the front say nothing for so long. Return whether it still counts as alive."""
-        while self.link.silence_ns < silence_ns:
+    def poll(self) -> str:
+        """Return what is announced, with the successor that is started meanwhile."""
+        now_ns = round(self.now_s * 1e9)
+        announced = [*self.process.poll(now_ns), *self.process.poll(now_ns)]
+        self.threads.run_started()
+        return "; ".join(announced)
+
+    def is_silent_for(self, silence_ns: int) -> str:
+        """Let the front say nothing for so long. Return what is announced then."""
+        announced = ""
+        while self.link.silence_ns < silence_ns and not announced:
             self.link.silence_ns += SECOND // 10
             self.advance(0.1)
-            alive = self.process.alive
-        return alive
+            announced = self.poll()
+        return announced
 
 
 @pytest.fixture
@@ -133,58 +139,51 @@ def front(monkeypatch: pytest.MonkeyPatch) -> Iterator[Supervision]:
     front.process.close()
 
 
-def test_front_that_hangs_is_replaced_after_a_while(front: Supervision) -> None:
+@pytest.mark.parametrize(("state", "limit_ns"), [("S", HANGING_NS), ("R", STARVED_NS)])
+def test_front_that_hangs_is_replaced_and_one_without_processor_time_is_waited_for(
+    front: Supervision, state: str, limit_ns: int
+) -> None:
     front.start()
-    assert front.is_silent_for(HANGING_NS)
-    assert not front.is_silent_for(HANGING_NS + SECOND // 10)
-    assert "1.6 s" in front.process.fault
-
-
-def test_front_without_processor_time_is_waited_for(front: Supervision) -> None:
-    front.start()
-    front.state = "R"  # ready, and it never runs
-    assert front.is_silent_for(STARVED_NS)
-    assert not front.is_silent_for(STARVED_NS + SECOND // 10)
+    front.state = state
+    assert front.is_silent_for(limit_ns) == ""
+    assert "said nothing for" in front.is_silent_for(limit_ns + SECOND // 10)
+    assert len(front.children) == 2
 
 
 def test_front_that_reads_nothing_or_does_not_listen_is_replaced(front: Supervision) -> None:
     front.start()
     front.link.overrun = True
-    assert not front.process.alive
+    assert "read nothing any more" in front.poll()
     front.link.overrun = False
-    front.process.restart()
     front.advance(START_S)
-    assert front.process.alive
+    assert front.poll() == ""
     front.advance(0.1)
-    assert not front.process.alive
+    assert "did not listen within 60 s" in front.poll()
 
 
 def test_successor_has_ports_and_memory_of_the_one_before(front: Supervision) -> None:
     front.start()
-    front.children[0].is_running = False
-    assert front.process.fault == "ended"
-    front.process.set_anchors({})
-    front.process.restart()
-    assert front.process.alive
+    front.children[0].exit_status = 1
+    front.process.anchors = {}
+    assert "ended with status 1" in front.poll()
     start = front.children[1].start
     got = (start.config.control_port, start.config.state_port, start.config.media_port, start.handback)
     assert got == (PORTS.control, PORTS.state, PORTS.media, b"tokens")
+    assert start.config.anchors == {}
     assert start.link_endpoint != front.children[0].start.link_endpoint
     assert front.process.restarts == 1
 
 
-def test_failed_restart_is_raised_by_the_next_one_and_then_tried_again(front: Supervision) -> None:
+def test_failed_restart_is_announced_and_tried_again(front: Supervision) -> None:
     front.start()
+    front.children[0].exit_status = 1
     front.error = OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
-    front.process.restart()
-    assert not front.process.alive
+    front.poll()
+    assert os.strerror(errno.ENOMEM) in front.poll()
     front.error = None
-    with pytest.raises(FrontError, match=os.strerror(errno.ENOMEM)):
-        front.process.restart()
-    assert not front.process.alive
-    front.process.restart()
-    front.make_ready()
-    assert front.process.alive
+    front.advance(1.0)
+    assert front.poll() == ""
+    assert front.process.pid == Child.pid
 
 
 @pytest.mark.parametrize("ends", [True, False])

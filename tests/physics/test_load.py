@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import mujoco
-import numpy as np
 import pytest
 
 from iris_session.physics import ModelInvalidError, ModelNotFoundError, decode_model, encode_model, load_model
-from iris_session.physics.load import catch_warnings
 from tests.physics.models import clutter
 
 XML = '<mujoco><worldbody><body name="b"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
@@ -23,14 +20,6 @@ def test_xml_and_mjb_give_the_same_model(tmp_path: Path) -> None:
     again = load_model(str(tmp_path / "scene.mjb"))
     assert again.nq == 7
     assert encode_model(again) == encode_model(m)
-
-
-def test_bytes_round_trip(aloha: mujoco.MjModel) -> None:
-    for m in (clutter(), aloha):
-        again = decode_model(encode_model(m))
-        assert (again.nq, again.nu, again.ngeom) == (m.nq, m.nu, m.ngeom)
-        assert (again.geom_pos == m.geom_pos).all()
-        assert bytes(again.names) == bytes(m.names)
 
 
 def test_errors_are_one_line(tmp_path: Path) -> None:
@@ -86,26 +75,6 @@ def test_damaged_binary_is_a_one_line_error_without_a_log_file(
         mujoco.set_mju_user_warning(None)
     assert capfd.readouterr() == ("", "")
     assert list(here.iterdir()) == []
-
-
-def test_warnings_of_other_threads_are_not_captured(capfd: pytest.CaptureFixture[str]) -> None:
-    """One thread simulates while another loads a model."""
-    model = mujoco.MjModel.from_xml_string(XML)
-    data = mujoco.MjData(model)
-    data.qpos[0] = np.nan
-    with catch_warnings() as caught:
-        stepping = threading.Thread(target=mujoco.mj_step, args=(model, data))
-        stepping.start()
-        stepping.join()
-        assert caught == []
-        data = mujoco.MjData(model)  # MuJoCo warns once per state
-        data.qpos[0] = np.nan
-        mujoco.mj_step(model, data)
-        assert [text.startswith("Nan") for text in caught] == [True]
-    assert mujoco.get_mju_user_warning() is None
-    shown = capfd.readouterr()
-    assert shown.out == ""
-    assert shown.err.startswith("WARNING: Nan")
 
 
 def test_names_that_are_not_utf_8_are_reported_at_load(tmp_path: Path) -> None:

@@ -42,16 +42,6 @@ def test_panda_has_one_arm(panda: mujoco.MjModel) -> None:
     )
 
 
-def test_handover_scene_has_two_arms(handover: mujoco.MjModel) -> None:
-    left, right = find_robots(handover)
-    assert (left.name, right.name) == ("left", "right")
-    assert left.joints == tuple(f"left/joint{i}" for i in range(1, 8))
-    assert left.site == "left/tcp"
-    assert left.gripper_actuator == "left/gripper"
-    assert left.finger_bodies == ("left/finger_left", "left/finger_right")
-    assert left.gripper_open > left.gripper_closed
-
-
 def test_scene_without_robots() -> None:
     assert find_robots(model("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")) == ()
     assert find_robots(scene(*arm("door", joints=2))) == ()
@@ -117,20 +107,6 @@ def test_mobile_base_is_part_of_its_arm_and_a_camera_is_not() -> None:
     assert robot.name == "cart"
 
 
-def test_names_without_a_prefix() -> None:
-    body, actuators = arm(joint_name="spin{i}")
-    (robot,) = find_robots(scene(body, actuators, name="thing"))
-    assert robot.name == "thing"
-    named = scene(body.replace('"base"', '"crane"'), actuators, name="thing")
-    assert [r.name for r in find_robots(named)] == ["crane"]
-    twins = "".join(
-        arm(f"t{i}", joint_name=f"{'ab'[i]}{{i}}")[0].replace(f'"t{i}/base"', f'"m{i}/base"') for i in range(2)
-    )
-    acts = "".join(arm(f"t{i}", joint_name=f"{'ab'[i]}{{i}}")[1] for i in range(2))
-    assert [r.name for r in find_robots(scene(twins, acts))] == ["m0", "m1"]
-    assert [r.name for r in find_robots(scene(twins.replace("m0/base", "base"), acts))] == ["robot", "m1"]
-
-
 @pytest.mark.parametrize(
     ("kwargs", "extra", "text"),
     [
@@ -185,32 +161,6 @@ def test_unnamed_joints_are_refused() -> None:
     unnamed = scene(body, actuators.replace('name="a/a2" ', ""))
     with pytest.raises(AmbiguousModelError, match="actuator 2 needs a name"):
         find_robots(unnamed)
-
-
-def test_hand_with_a_long_thumb_is_no_arm() -> None:
-    thumb = arm("thumb", joints=4, end='<site name="thumb/tip"/>')
-    index = arm("index", joints=2, end="")
-    body, actuators = arm("a", joints=6, end='<site name="tcp"/>' + thumb[0] + index[0])
-    with pytest.raises(AmbiguousModelError, match="'a': 6 actuators"):
-        find_robots(scene(body, actuators + thumb[1] + index[1]))
-
-
-def test_three_joint_torso_carries_two_long_arms() -> None:
-    left, right = arm("l", joints=6), arm("r", joints=7)
-    body, actuators = arm("torso", joints=3, end=left[0] + right[0])
-    assert [r.name for r in find_robots(scene(body, actuators + left[1] + right[1]))] == ["l", "r"]
-
-
-def test_shortest_site_name_is_preferred() -> None:
-    body, actuators = arm("x", end='<site name="ee_x"/><site name="ee"/><site name="ee_y"/><site name="imu"/>')
-    assert find_robots(scene(body, actuators))[0].site == "ee"
-
-
-@pytest.mark.parametrize(("joints", "name"), [("joint_{i}", "arm"), ("{p}joint_{i}", "b"), ("ur_joint_{i}", "ur")])
-def test_generic_joint_prefixes_are_not_robot_names(joints: str, name: str) -> None:
-    body, actuators = arm("b", joint_name=joints)
-    m = scene(body.replace("b/base", "arm" if name == "arm" else "b/base"), actuators)
-    assert [r.name for r in find_robots(m)] == [name]
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

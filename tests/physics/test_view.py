@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, cloth_scene, soft_scene
+from iris_session.demo.scenes.deformables import cloth_scene, soft_scene
 from iris_session.physics import UnknownNameError, World, find_objects, find_robots
 from iris_session.physics.contacts import ContactTables
 from iris_session.physics.tree import KinematicTree
@@ -259,17 +259,6 @@ def move(world: World, name: str, by: np.ndarray) -> None:
     world.restore_state(world.save_state())
 
 
-def test_two_arms_and_no_objects(flex_model: Any) -> None:
-    assert [robot.name for robot in find_robots(flex_model)] == ["left", "right"]
-    assert find_objects(flex_model) == ()
-
-
-def test_vertices_are_no_bodies_of_the_stream(flex_model: Any) -> None:
-    names = {body.name for body in world_of(flex_model).bodies}
-    assert {"table", "sheet", "left/base", "right/hand"} <= names
-    assert len(names) < 30 < flex_model.nbody
-
-
 def test_deformed_world_is_restored_bit_for_bit(flex_model: Any) -> None:
     """Flexes have caches outside of `mjSTATE_INTEGRATION`; later states must not depend on them."""
     world, other, rng = world_of(flex_model), world_of(flex_model), np.random.default_rng(3)
@@ -291,24 +280,6 @@ def test_deformed_world_is_restored_bit_for_bit(flex_model: Any) -> None:
         assert (other.flexes.read_vertices(name) == world.flexes.read_vertices(name)).all()
 
 
-def test_corners_to_fold_are_the_near_and_the_far_ones() -> None:
-    vertices = world_of(cloth_scene().compile()).flexes.read_vertices("cloth")
-    for near, far in FOLD_PAIRS:
-        assert vertices[far] - vertices[near] == pytest.approx([0.0, 0.36, 0.0], abs=1e-6)
-        assert abs(vertices[near][0]) == pytest.approx(0.18)
-
-
-def test_box_of_the_goal_is_that_of_the_scene(soft: Any) -> None:
-    world = world_of(soft)
-    walls = {side: world.data.geom(f"box_{side}").xpos for side in ("west", "east", "south", "north")}
-    thick = soft.geom("box_west").size[0]
-    assert BOX_LOW[0] == pytest.approx(walls["west"][0] + thick)
-    assert BOX_HIGH[0] == pytest.approx(walls["east"][0] - thick)
-    assert BOX_LOW[1] == pytest.approx(walls["south"][1] + thick)
-    assert BOX_HIGH[1] == pytest.approx(walls["north"][1] - thick)
-    assert BOX_HIGH[2] == pytest.approx(walls["west"][2] + soft.geom("box_west").size[2])
-
-
 def test_contacts_and_grip_force_of_a_deformable(soft: Any) -> None:
     world = world_of(soft)
     tip = np.array(world.view().tip_pose("right").p)
@@ -322,13 +293,6 @@ def test_contacts_and_grip_force_of_a_deformable(soft: Any) -> None:
     assert world.view().gripper_force("right") > 20.0
     assert world.view().gripper_force("left") == 0.0
     assert world.flexes.read_vertices("mint")[:, 2].mean() == pytest.approx(tip[2], abs=0.02)  # held by friction
-
-
-def test_unknown_deformable_is_rejected_with_known_ones(soft: Any) -> None:
-    world = world_of(soft)
-    for ask in (world.flexes.read_vertices, world.flexes.find_touching_robots):
-        with pytest.raises(UnknownNameError, match="rose"):
-            ask("cloth")
 
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import msgspec
 import mujoco
@@ -60,7 +56,7 @@ def test_ticks_equal_mj_steps_bit_for_bit(integrator: str, option: str, flag: st
     m = clutter(names.get(integrator, integrator if integrator == "Euler" else integrator.lower()), option, flag)
     plain, world = mujoco.MjData(m), World(m, (), ())
     contacts = 0
-    for k in range(600):
+    for k in range(200):
         drive(plain, k)
         drive(world.data, k)
         mujoco.mj_step(m, plain)
@@ -95,24 +91,6 @@ def test_real_models_tick_like_mj_step_and_restore(name: str, request: pytest.Fi
     assert other.snapshot() == world.snapshot()
 
 
-def test_state_contains_every_input(handover: mujoco.MjModel) -> None:
-    """Everything that an application may write into `MjData` is part of `save_state`."""
-    m = clutter()
-    world = World(m, (), ())
-    before = world.save_state()
-    for field in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "userdata"):
-        array = getattr(world.data, field)
-        kept = array.copy()
-        array.flat[-1] += 0.25
-        assert world.save_state() != before, field
-        array[...] = kept
-    world.data.eq_active[0] = 1
-    assert world.save_state() != before
-    world.data.eq_active[0] = 0
-    world.data.qacc_warmstart[0] = 1.0
-    assert world.save_state() != before
-
-
 @pytest.mark.parametrize(("integrator", "option", "flag"), CASES)
 def test_restore_has_no_effect_on_later_ticks(integrator: str, option: str, flag: str) -> None:
     """A world saved and restored every 37 ticks, and one restored elsewhere, stay equal to an untouched one."""
@@ -121,7 +99,7 @@ def test_restore_has_no_effect_on_later_ticks(integrator: str, option: str, flag
     objects = find_objects(m)
     world, saved_often, other = (World(m, (), objects) for _ in range(3))
     shared = b""
-    for k in range(400):
+    for k in range(260):
         for w in (world, saved_often, other) if k >= 200 else (world, saved_often):
             drive(w.data, k)
             if k in (50, 230):
@@ -166,53 +144,6 @@ def test_delayed_actuators_and_sensors_are_saved() -> None:
             restored.restore(world.snapshot())
         assert world.save_state() == restored.save_state() == state_of(m, plain)
     assert world.data.sensordata.tobytes() == restored.data.sensordata.tobytes()
-
-
-CONTINUE = """
-import hashlib, sys, numpy as np
-from pathlib import Path
-from iris_session.physics import World, find_objects, find_robots, decode_model
-folder = Path(sys.argv[1])
-model = decode_model((folder / "model.mjb").read_bytes())
-world = World(model, find_robots(model), find_objects(model))
-world.restore((folder / "snapshot").read_bytes())
-for k in range(200):
-    world.ctrl[:] = world.ctrl + 0.001 * np.cos(0.1 * k)
-    world.tick()
-print(hashlib.blake2b(world.snapshot()).hexdigest())
-"""
-
-
-def test_another_process_continues_bit_for_bit(handover: mujoco.MjModel, tmp_path: Path) -> None:
-    world = World(handover, find_robots(handover), find_objects(handover))
-    for k in range(100):
-        world.ctrl[:] = world.ctrl + 0.002 * np.sin(0.1 * k)
-        world.tick()
-    (tmp_path / "model.mjb").write_bytes(world.encode_model())
-    (tmp_path / "snapshot").write_bytes(world.snapshot())
-    command = [sys.executable, "-c", CONTINUE, str(tmp_path)]
-    output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
-    for k in range(200):
-        world.ctrl[:] = world.ctrl + 0.001 * np.cos(0.1 * k)
-        world.tick()
-    assert output.strip() == hashlib.blake2b(world.snapshot()).hexdigest()
-
-
-def test_derived_quantities_follow_the_new_state() -> None:
-    m = clutter()
-    world = World(m, (), find_objects(m))
-    for _ in range(150):
-        world.tick()
-    fresh = mujoco.MjData(m)
-    mujoco.mj_setState(m, fresh, np.frombuffer(world.save_state()).copy(), STATE)
-    mujoco.mj_forward(m, fresh)
-    assert world.data.xpos.tobytes() == fresh.xpos.tobytes()
-    assert int(world.data.ncon) == int(fresh.ncon) > 0
-    assert world.data.contact.dist.tobytes() == fresh.contact.dist.tobytes()
-    out = np.zeros((len(world.bodies), 7))
-    world.read_poses(out)
-    assert (out[:, :3] == fresh.xpos[1:]).all()
-    assert (out[:, 3:] == fresh.xquat[1:]).all()
 
 
 def test_reset_uses_home_then_the_first_keyframe_then_the_default(aloha: mujoco.MjModel) -> None:
@@ -265,20 +196,6 @@ def test_bodies_of_a_scene_with_flexes_mocap_and_unnamed_bodies() -> None:
     assert np.allclose(np.linalg.norm(out[:, 3:], axis=1), 1.0)
 
 
-def test_robot_infos(handover: mujoco.MjModel) -> None:
-    world = World(handover, find_robots(handover), find_objects(handover))
-    left = world.robot_infos[0]
-    by_id = {b.id: b for b in world.bodies}
-    assert by_id[left.base_body].name == "left/base"
-    assert left.gripper
-    assert by_id[left.site_body].moving
-    tip = world.view().tip_pose("left")
-    body = world.data.xpos[left.site_body]
-    turned = np.zeros(3)
-    mujoco.mju_rotVecQuat(turned, np.array(left.T_body_site.p), world.data.xquat[left.site_body])
-    assert np.allclose(body + turned, tip.p, atol=1e-12)
-
-
 def test_divergence_raises_until_reset() -> None:
     m = clutter()
     world = World(m, (), ())
@@ -324,17 +241,6 @@ def test_exhausted_memory_is_counted() -> None:
     assert world.diverged == ""
 
 
-def test_memory_too_small_for_a_tick_raises() -> None:
-    errors: list[str] = []
-    for kilobytes in range(20, 170, 10):
-        try:
-            World(pile(f"{kilobytes}K"), (), ()).tick()
-        except SimulationDivergedError as error:
-            errors.append(str(error))
-    assert errors
-    assert all("out of memory" in text and "\n" not in text for text in errors)
-
-
 def test_foreign_snapshots_are_rejected(handover: mujoco.MjModel) -> None:
     world = World(clutter(), (), ())
     with pytest.raises(SnapshotError, match="no world snapshot"):
@@ -350,11 +256,6 @@ def test_foreign_snapshots_are_rejected(handover: mujoco.MjModel) -> None:
     with_robots = World(handover, find_robots(handover), ())
     with pytest.raises(SnapshotError, match=r"0 robots, .* 2"):
         with_robots.restore(World(handover, (), ()).snapshot())
-
-
-def test_unknown_object_body_is_rejected() -> None:
-    with pytest.raises(UnknownNameError, match=r"object 'x': body 'nope' .*box0, box1"):
-        World(clutter(), (), (ObjectSpec("x", "nope"),))
 
 
 @pytest.mark.skipif(not SLEEPS, reason="this MuJoCo has no sleeping islands")
@@ -377,26 +278,6 @@ def test_scene_hash_does_not_depend_on_the_folder(panda: mujoco.MjModel) -> None
 
 
 # --- user loop --------------------------------------------------------------------------------------------------------
-
-
-def test_twin_shows_the_new_state_of_user_data(handover: mujoco.MjModel) -> None:
-    robots, objects = find_robots(handover), find_objects(handover)
-    user = mujoco.MjData(handover)
-    mujoco.mj_resetDataKeyframe(handover, user, 0)
-    world, ours = World(handover, robots, objects), World(handover, robots, objects)
-    for k in range(200):
-        for d in (user, ours.data):
-            d.ctrl[:] = handover.key_ctrl[0] + 0.1 * np.sin(0.03 * k)
-        mujoco.mj_step(handover, user)
-        ours.tick()
-        world.restore_state(state_of(handover, user))
-    assert state_of(handover, user) == world.save_state()
-    view, expected = world.view(), ours.view()
-    assert view.tick == expected.tick == 200
-    assert view.tip_pose("left") == expected.tip_pose("left")
-    assert view.joints("right") == expected.joints("right")
-    assert view.object_pose("hammer") == expected.object_pose("hammer")
-    assert view.object_contacts() == expected.object_contacts() != ()
 
 
 def test_actuators_and_bodies_belong_to_one_robot(handover: mujoco.MjModel) -> None:

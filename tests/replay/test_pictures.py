@@ -17,7 +17,7 @@ from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import decode_model, find_objects, find_robots
-from iris_session.physics.carrier import Carrier
+from iris_session.physics.kinematic_model import KinematicModel
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, SceneLoaded, ScenePatched
@@ -274,7 +274,7 @@ def test_cameras_are_listed_and_others_are_refused(played: Played) -> None:
 
 
 def test_published_worlds_are_refused(tmp_path: Path) -> None:
-    carrier = Carrier(["box"], [Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))])
+    carrier = KinematicModel(["box"], [Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))])
     core = SessionCore(carrier.model, CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ()))
     plant = carrier.encode_state(0.0, np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]))
     path = play(

@@ -15,7 +15,7 @@ from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.physics import UnknownNameError, decode_model, find_objects, find_robots
-from iris_session.physics.carrier import Carrier
+from iris_session.physics.kinematic_model import KinematicModel
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, SceneLoaded
@@ -259,8 +259,8 @@ def test_events_are_records_with_names(closed: Played) -> None:
 
 
 def test_bodies_of_a_published_world_have_poses(tmp_path: Path) -> None:
-    """A carrier of bodies, moved by frames of a publisher; the rows between them have no plant."""
-    carrier = Carrier(("crate", "drum"), (Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),) * 2)
+    """A kinematic model, moved by frames of a publisher; the rows between them have no plant."""
+    carrier = KinematicModel(("crate", "drum"), (Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),) * 2)
     core = SessionCore(carrier.model, CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ()))
     frames = {3: 0.25, 6: 0.5}
 

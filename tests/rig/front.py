@@ -22,7 +22,6 @@ from iris_session.link import FrontConfig, Ports, SceneInfo
 from iris_session.link import messages as link
 from iris_session.link.config import FrontStart
 from iris_session.link.front_link import FrontLink
-from iris_session.protocol.common import Pose
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security.keyring import Keyring
@@ -115,6 +114,7 @@ class RigFrontProcess:
         self._config = msgspec.structs.replace(config, limits=limits)
         self._simulation = simulation
         self.scene = scene
+        self.anchors = config.anchors
         self.link = RigLink(config, lambda: simulation.now_ns)
         self.front: Front | None = None
         self.restarts = -1
@@ -125,23 +125,18 @@ class RigFrontProcess:
 
     pid = 0
 
-    @property
-    def fault(self) -> str:
-        return "" if self.front is not None or self._is_starting else "ended"
-
-    @property
-    def alive(self) -> bool:
-        return not self.fault
-
     def start(self) -> Ports:
         self._spawn(self._open_link())
         self.link.receive()
         assert self.link.ports is not None
         return self.link.ports
 
-    def restart(self) -> None:
+    def poll(self, now_ns: int) -> list[str]:
+        if self.front is not None or self._is_starting:
+            return []
         start, self._is_starting = self._open_link(), True
         self._simulation.call_at(self._simulation.now_ns + START_NS, lambda: self._spawn(start))
+        return ["the front process ended with status -9 (SIGKILL); it is started again"]
 
     def kill(self) -> None:
         """End the front at once, as SIGKILL does: what it has not sent is lost, every connection closes."""
@@ -151,9 +146,6 @@ class RigFrontProcess:
     def set_scene(self, scene: SceneInfo) -> None:
         self.scene = scene
         self.link.send_scene(scene)
-
-    def set_anchors(self, anchors: dict[str, Pose]) -> None:
-        self._config = msgspec.structs.replace(self._config, anchors=anchors)
 
     def publish_media(self, stream: str, frames: bytes | Mapping[str, bytes], *_: Any, **__: Any) -> bool:
         return False
@@ -169,7 +161,8 @@ class RigFrontProcess:
     def _open_link(self) -> FrontStart:
         self.restarts += 1
         endpoint = self.link.open(Path(f"/rig/front-{self.restarts}"))
-        return FrontStart(self._config, self.scene, endpoint, 0, self.link.handback)
+        config = msgspec.structs.replace(self._config, anchors=self.anchors)
+        return FrontStart(config, self.scene, endpoint, 0, self.link.handback)
 
     def _spawn(self, start: FrontStart) -> None:
         self._is_starting = False

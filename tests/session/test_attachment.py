@@ -7,22 +7,18 @@ import os
 import sys
 import types
 from collections.abc import Iterator
-from types import FrameType
 from typing import Any
 
 import mujoco
-import numpy as np
 import pytest
 
 from iris_session import ConfigError, OwnershipError, Session
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import load_model
 from iris_session.protocol.server_messages import SceneChanged
-from iris_session.session.attachment import STEP_FUNCTIONS, Attachment, EnvironmentStep, find_simulation
+from iris_session.session.attachment import STEP_FUNCTIONS, Attachment, find_simulation
 from tests.rig.owned import keep_journal
-from tests.session.loops import Agent, Rig, largest_step
-from tests.session.play import TICK_NS
-from tests.session.test_ctrl_sharing import SPEED_STEP, sideways
+from tests.session.loops import Rig
 from tests.session.test_session import QUIET
 
 ORIGINALS = {name: getattr(mujoco, name) for name in STEP_FUNCTIONS}
@@ -109,21 +105,6 @@ def test_models_can_be_compiled_and_forward_is_no_tick(attached: Attached) -> No
     assert data.time == pytest.approx(5 * 0.002)
 
 
-def test_the_integrator_may_be_rk4(model: mujoco.MjModel) -> None:
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    free = make_data(model)
-    attached = Attached(model)
-    try:
-        for _ in range(20):
-            mujoco.mj_step(model, attached.data)
-    finally:
-        attached.close()
-    for _ in range(20):
-        mujoco.mj_step(model, free)
-    assert attached.counts == [1] * 20
-    assert np.array_equal(attached.data.qpos, free.qpos)
-
-
 def test_names_bound_before_are_wrapped_in_every_module_and_restored() -> None:
     script, late = types.ModuleType("a_script"), types.ModuleType("imported_later")
     exec("from mujoco import mj_step\nfrom mujoco import mj_step as advance, mj_step2", script.__dict__)
@@ -146,29 +127,6 @@ def test_names_bound_before_are_wrapped_in_every_module_and_restored() -> None:
         sys.modules.pop("imported_later", None)
 
 
-def test_other_data_pass_through_at_nearly_no_cost(attached: Attached) -> None:
-    mujoco.mj_step(attached.model, make_data(attached.model))
-    with pytest.raises(TypeError):
-        mujoco.mj_step(attached.model)
-    assert attached.counts == []
-    tiny = mujoco.MjModel.from_xml_string("<mujoco/>")
-    empty = mujoco.MjData(tiny)
-
-    calls: list[str] = []
-
-    def note(frame: FrameType, event: str, _argument: object) -> None:
-        if event == "call":
-            calls.append(frame.f_code.co_name)
-
-    before = sys.getprofile()
-    sys.setprofile(note)
-    try:
-        mujoco.mj_step(tiny, empty)
-    finally:
-        sys.setprofile(before)
-    assert calls == ["mj_step"], "one look-up, and MuJoCo's own function"
-
-
 @pytest.mark.parametrize("first", [0, 1])
 def test_two_sessions_in_one_process_close_in_any_order(first: int) -> None:
     both = [Attached(), Attached()]
@@ -185,25 +143,6 @@ def test_two_sessions_in_one_process_close_in_any_order(first: int) -> None:
     finally:
         for one in both:
             one.close()
-
-
-def test_a_function_that_somebody_puts_around_ours_stays(attached: Attached) -> None:
-    inner, calls = mujoco.mj_step, []
-
-    def around(m: Any, d: Any, nstep: int = 1) -> None:
-        calls.append(nstep)
-        inner(m, d, nstep)
-
-    try:
-        mujoco.mj_step = around
-        mujoco.mj_step(attached.model, attached.data)
-        attached.close()
-        assert mujoco.mj_step is around
-        mujoco.mj_step(attached.model, attached.data)
-        assert calls == [1, 1]
-        assert attached.data.time == pytest.approx(0.004)
-    finally:
-        mujoco.mj_step = ORIGINALS["mj_step"]
 
 
 def test_a_child_that_is_forked_does_not_belong_to_the_session(attached: Attached) -> None:
@@ -241,38 +180,6 @@ def test_a_reset_after_exactly_one_step_is_seen(attached: Attached) -> None:
     for _ in range(3):
         mujoco.mj_step(model, data)
     assert attached.changes() == 2
-
-
-def test_a_viewer_is_no_reset(attached: Attached) -> None:
-    """MuJoCo's passive viewer clears the timers of the data at every sync."""
-    for step in range(60):
-        mujoco.mj_step(attached.model, attached.data)
-        if step % 8 == 0:
-            attached.data.timer.number[:] = 0
-            mujoco.mj_forward(attached.model, attached.data)
-    assert attached.changes() == 0
-    assert attached.counts == [1] * 60
-
-
-@pytest.mark.parametrize("how", ["attach then reset", "reset, forward, pose, forward"])
-def test_resets_leave_robots_where_their_owner_put_them(attached: Attached, how: str) -> None:
-    model, data = attached.model, attached.data
-    if how != "attach then reset":
-        for _ in range(20):
-            mujoco.mj_step(model, data)
-        mujoco.mj_resetData(model, data)
-        mujoco.mj_forward(model, data)
-    data.qpos[:] = model.key_qpos[0]
-    joint = attached.rig.joints()[0]
-    data.qpos[joint] += 0.5
-    data.ctrl[:] = model.key_ctrl[0]
-    data.ctrl[attached.rig.actuators()[0]] = data.qpos[joint]
-    mujoco.mj_forward(model, data)
-    placed, ctrl = data.qpos[attached.rig.joints()].copy(), data.ctrl.copy()
-    for _ in range(300):
-        mujoco.mj_step(model, data)
-    assert np.array_equal(data.ctrl, ctrl)
-    assert np.abs(data.qpos[attached.rig.joints()] - placed).max() < 0.02
 
 
 # --- environments -----------------------------------------------------------------------------------------------------
@@ -343,18 +250,6 @@ def test_the_step_of_an_environment_that_is_not_seen_through_is_the_tick() -> No
     assert len(counts) == 4
 
 
-def test_wrapped_steps_of_one_environment_end_in_any_order() -> None:
-    environment = Environment()
-    first = EnvironmentStep(environment, "step", lambda original: original())
-    between = environment.step
-    second = EnvironmentStep(environment, "step", lambda original: (original(), "second"))
-    first.remove()
-    assert environment.step() == ("observation", "second")
-    second.remove()
-    assert environment.step is between
-    assert environment.step() == "observation"
-
-
 def test_shapes_of_known_environments_are_found(model: mujoco.MjModel) -> None:
     data = make_data(model)
     space = types.SimpleNamespace
@@ -385,36 +280,3 @@ def test_steps_that_are_not_seen_are_a_warning(attached: Attached) -> None:
 
 
 # --- driving through the wrapped step ---------------------------------------------------------------------------------
-
-
-def test_a_pause_of_seconds_while_a_hand_moves_on_is_no_leap() -> None:
-    rig = Rig()
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
-    rig.applied.clear()
-    attachment = Attachment(rig.loop, None, "step", lambda model, data: None)
-    try:
-
-        def tick() -> None:
-            rig.now_ns += TICK_NS
-            mujoco.mj_step(rig.model, rig.data)
-            rig.applied.append(rig.data.ctrl.copy())
-
-        goal = sideways(agent.tip(), 0.3)
-        for i in range(100):
-            if i % 7 == 0:
-                agent.sample(goal(i / 500), clutch=True)
-            tick()
-        assert rig.loop.driven == ("left",)
-        rig.now_ns += 5_000_000_000  # the script plots; the hand goes on
-        for i in range(200):
-            if i % 7 == 0:
-                agent.sample(goal(5.0 + i / 500), clutch=True)
-            tick()
-        assert largest_step(rig.applied, rig.actuators()) <= SPEED_STEP
-        assert np.abs(rig.applied[-1] - rig.applied[100])[rig.actuators()].max() < 0.05, "it holds until clutched again"
-    finally:
-        attachment.close()
-        rig.loop.close()

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.cloud.config import CameraReport, CameraStart
+from iris_session.cloud.config import CameraReport
 from iris_session.link import Ports
 from iris_session.session import cameras as session_cameras
 from iris_session.session.cameras import SILENT_NS, SLOW_START_NS, SessionCameras, load_camera_files
-from iris_session.session.config import ConfigError, SessionConfig
+from iris_session.session.config import SessionConfig
 from iris_session.session.errors import StartError
 from iris_session.system.process import ChildProcess
 
@@ -57,22 +57,6 @@ def test_two_streams_of_one_name(tmp_path: Path) -> None:
         load_camera_files([first, pictures])
 
 
-def test_more_streams_than_a_session_has(tmp_path: Path) -> None:
-    names = [f"c{i}" for i in range(7)]
-    first, second = write_file(tmp_path, "room", *names), write_file(tmp_path, "hall", *names)
-    assert len(load_camera_files([first, second])) == 2
-    third = write_file(tmp_path, "yard")
-    with pytest.raises(StartError, match="18 streams, a session has at most 16"):
-        load_camera_files([first, second, third])
-
-
-def test_paths_are_checked_with_the_configuration() -> None:
-    with pytest.raises(ConfigError, match="cameras must be"):
-        SessionConfig(cameras="room.toml")  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="cameras must be"):
-        SessionConfig(cameras=(3,))  # type: ignore[arg-type]
-
-
 def test_each_process_of_an_encrypted_session_has_a_key(tmp_path: Path) -> None:
     paths = (write_file(tmp_path, "room"), write_file(tmp_path, "hall"))
     assert SessionCameras(SessionConfig(cameras=paths)).public_keys == ()
@@ -98,26 +82,6 @@ def test_warnings_name_what_the_processes_cannot_say(tmp_path: Path, monkeypatch
     assert cameras.restarts == 1
     cameras.close()
     assert cameras.list_warnings() == []
-
-
-def test_a_successor_is_told_what_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[CameraStart] = []
-
-    def spawn(start: CameraStart) -> ChildProcess:
-        started.append(start)
-        raise OSError("no memory")
-
-    monkeypatch.setattr(session_cameras, "_spawn", spawn)
-    cameras = SessionCameras(SessionConfig(cameras=(write_file(tmp_path, "room"),)))
-    cameras.start(Ports("127.0.0.1", 1, 2))
-    process = cameras._processes["room"]
-    for fault in ("", "ImportError: libGL.so.1"):
-        process.fault = fault
-        process.start(SECOND)
-        assert process._thread is not None
-        process._thread.join()
-    assert [one.known_fault for one in started] == ["", "ImportError: libGL.so.1"]
-    cameras.close()
 
 
 def test_a_process_that_is_silent_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -89,18 +89,6 @@ def test_observers_and_a_holder_that_has_not_engaged_change_nothing(rig: Rig) ->
     assert rig.loop.driven == ()
 
 
-def test_for_control_a_robot_that_its_owner_moves_stands_where_it_is_measured(rig: Rig) -> None:
-    controller, robot = rig.stepper.core.controller, rig.stepper.core.config.robots[0]
-    rig.round()
-    rig.data.qpos[rig.joints()] += 0.3
-    twin = mujoco.MjData(rig.model)
-    mujoco.mj_copyData(twin, rig.model, rig.data)
-    mujoco.mj_forward(rig.model, twin)
-    rig.round()
-    assert controller.get_targets()[robot.name].p == pytest.approx(twin.site(robot.site).xpos, abs=1e-6)
-    assert controller.get_status()[0].limits == ()
-
-
 def test_engaging_begins_at_the_present_ctrl_and_the_policy_is_out(rig: Rig) -> None:
     agent = Agent(rig)
     rig.round()
@@ -140,19 +128,6 @@ def test_a_release_gives_the_owners_ctrl_back_without_a_jump(rig: Rig) -> None:
     owner.ctrl[:], owner.time = rig.data.ctrl, rig.data.time - 0.002
     rig.policy(owner)
     assert np.array_equal(rig.data.ctrl, owner.ctrl), "in the end it is the owner's to the bit"
-
-
-def test_a_ctrl_that_the_owner_set_once_comes_back(rig: Rig) -> None:
-    home = rig.data.ctrl.copy()
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
-    agent.drive(sideways(agent.tip(), 0.2), 1.0)
-    assert not np.array_equal(rig.data.ctrl, home)
-    agent.release()
-    rig.rounds(1000)
-    assert np.array_equal(rig.data.ctrl, home)
 
 
 def test_what_the_owner_writes_while_a_robot_is_driven_counts_when_it_is_given_back(rig: Rig) -> None:
@@ -363,37 +338,6 @@ def test_the_loop_verifies_from_its_journal_with_every_change_of_hands(rig: Rig)
     second.restore(middle[1])
     for row in rows[middle[0] + 1 :]:
         assert second.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant).digest == row.digest
-
-
-ACTUATORS = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody>
-<body name="arm"><joint name="j1" axis="0 0 1" damping="1" armature=".1"/><geom size=".05"/>
-<body name="b" pos=".3 0 0"><joint name="j2" axis="0 1 0" damping="1" armature=".1"/><geom size=".05"/>
-<body name="c" pos=".3 0 0"><joint name="j3" axis="0 1 0" damping="1" armature=".1"/><geom size=".05"/>
-<site name="tip"/></body></body></body></worldbody><actuator>{}</actuator></mujoco>"""
-VELOCITY = "".join(f'<velocity name="a{i}" joint="j{i}" kv="5"/>' for i in (1, 2, 3))
-
-
-def test_velocity_actuators_change_hands_within_their_acceleration() -> None:
-    rig = Rig(mujoco.MjModel.from_xml_string(ACTUATORS.format(VELOCITY)))
-    try:
-        robot = rig.stepper.core.config.robots[0].name
-        agent = Agent(rig, robot=robot)
-
-        def policy(data: mujoco.MjData) -> None:
-            data.ctrl[:] = 0.5
-
-        rig.policy = policy
-        rig.rounds(20)
-        agent.acquire()
-        agent.engage()
-        agent.drive(lambda t: agent.tip(), 0.3)
-        assert np.abs(rig.data.ctrl).max() < 0.1, "the robot stands"
-        agent.release()
-        rig.rounds(400)
-        assert (rig.data.ctrl == 0.5).all()
-        assert largest_step(rig.applied, [0, 1, 2]) <= 40.0 * 0.002 + 1e-9
-    finally:
-        rig.loop.close()
 
 
 def test_an_estop_of_an_observer_leaves_the_owners_robot_to_the_owner() -> None:

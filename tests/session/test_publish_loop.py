@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,15 +9,14 @@ import pytest
 
 from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
-from iris_session.journal.rows import CRASHED
-from iris_session.physics.carrier import Carrier
+from iris_session.physics.kinematic_model import KinematicModel
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry, ExternalReset, Join, decode_entries
 from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
-from iris_session.session.draft import Frame, SceneDraft
 from iris_session.session.errors import OwnershipError
+from iris_session.session.pending_state import Frame, PendingState
 from iris_session.session.publish_loop import REPEAT_NS, PublishedVertices, PublishLoop
 from iris_session.session.stepper import Stepper
 from tests.session.loops import Watch
@@ -34,19 +32,19 @@ class PublishLoopRig:
     def __init__(self, period_ns: int = PERIOD_NS) -> None:
         self.now_ns = 1000 * MS
         scene = composed()
-        self.draft = SceneDraft(scene)
-        carrier = Carrier(scene.moving, scene.poses)
+        self.pending = PendingState(scene)
+        kinematic_model = KinematicModel(scene.moving, scene.poses)
         config = CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ())
-        self.config, self.model = config, carrier.model
+        self.config, self.model = config, kinematic_model.model
         self.front, self.recorder = Front(), Recorder()
-        core = SessionCore(carrier.model, config)
+        core = SessionCore(kinematic_model.model, config)
         self.stepper = Stepper(core, self.front, self.recorder, lambda: self.now_ns, MS, 10**15, b"root")
         self.entries: list[Entry] = []
         self.stepper.on_entries = self.entries.extend
         self.shown: list[tuple[float, float, int]] = []  # x of the red box and of a vertex, scene epoch
         self.vertices = PublishedVertices(scene)
         self.stepper.on_publish.append(self._record)
-        self.loop = PublishLoop(carrier, self.vertices, self.stepper, Watch(), period_ns)  # type: ignore[arg-type]
+        self.loop = PublishLoop(kinematic_model, self.vertices, self.stepper, Watch(), period_ns)  # type: ignore[arg-type]
 
     def _record(self, epoch: int, end_ns: int, shown_ns: int) -> None:
         assert self.front.states[-1].session_time == shown_ns, "deformables have the time of the state"
@@ -55,9 +53,9 @@ class PublishLoopRig:
         self.shown.append((float(red[0]), float(mesh.vertices()[0, 0]), epoch))
 
     def publish(self, x: float, anew: bool = False, delay_ns: int = 0) -> None:
-        self.draft.set_pose("red", (x, 0.0, 0.0), UNIT)
-        self.draft.set_vertices("cloth", CLOTH + np.float32(x))
-        self.loop.offer(self.draft.make_frame(self.now_ns - delay_ns, self.now_ns * 1e-9, anew))
+        self.pending.set_pose("red", (x, 0.0, 0.0), UNIT)
+        self.pending.set_vertices("cloth", CLOTH + np.float32(x))
+        self.loop.offer(self.pending.make_frame(self.now_ns - delay_ns, self.now_ns * 1e-9, anew))
 
     def xs(self) -> list[float]:
         return [x for x, _, _ in self.shown]
@@ -141,22 +139,6 @@ def test_session_steps_while_nothing_is_published(rig: PublishLoopRig) -> None:
     assert rig.recorder.state_times == sorted(set(rig.recorder.state_times))
 
 
-def test_frames_delayed_by_a_silent_source_keep_their_times(rig: PublishLoopRig) -> None:
-    """The link of a robot hangs for half a second, then delivers all frames: no two poses are a nanosecond apart."""
-    rig.now_ns += PERIOD_NS
-    rig.publish(1.0, delay_ns=5 * MS)
-    begun_ns, sent = rig.now_ns, len(rig.front.states)
-    rig.advance(2 * REPEAT_NS)
-    assert len(rig.front.states) > sent
-    captured = [begun_ns + n * PERIOD_NS for n in range(20)]
-    first = len(rig.front.states)
-    for n, capture_ns in enumerate(captured):
-        rig.publish(2.0 + n, delay_ns=rig.now_ns - capture_ns)
-        rig.now_ns += PERIOD_NS
-    assert [state.session_time for state in rig.front.states[first:]] == captured
-    assert rig.recorder.state_times == sorted(set(rig.recorder.state_times)), "recorded states are in order"
-
-
 def test_silent_publisher_is_a_warning_until_its_next_frame(rig: PublishLoopRig) -> None:
     for x in range(1, 5):
         rig.now_ns += PERIOD_NS
@@ -184,20 +166,6 @@ def test_state_is_not_repeated_between_two_frames_of_a_slow_source(rig: PublishL
         rig.advance(100 * MS)
         assert rig.stepper.step_count > steps + 1
     assert rig.xs() == [0.0, 1.0, 2.0, 3.0, 4.0]
-
-
-def test_state_of_a_low_rate_is_not_repeated_between_two_frames() -> None:
-    rig = PublishLoopRig(period_ns=1000 * MS)
-    try:
-        for x in range(1, 31):  # ten a second, of which the state takes one
-            steps = rig.stepper.step_count
-            rig.now_ns += 100 * MS
-            rig.publish(float(x))
-            rig.loop.poll()
-            assert rig.stepper.step_count > steps
-        assert len(set(rig.xs())) == len(rig.xs())
-    finally:
-        rig.loop.close()
 
 
 def test_reset_of_a_superseded_frame_comes_with_the_newer_frame(rig: PublishLoopRig) -> None:
@@ -244,100 +212,6 @@ def test_close_publishes_the_pending_frame_and_no_later_one(rig: PublishLoopRig)
     assert rig.xs()[-1] == 2.0
     with pytest.raises(OwnershipError, match="closed"):
         rig.publish(3.0)
-
-
-class ClosingLock:
-    """A lock that closes the loop from another thread before it is acquired for the first time."""
-
-    def __init__(self, rig: PublishLoopRig) -> None:
-        self._lock, self._closes = threading.Lock(), [threading.Thread(target=rig.loop.close)]
-
-    def __enter__(self) -> None:
-        while self._closes:
-            thread = self._closes.pop()
-            thread.start()
-            thread.join()
-        self._lock.acquire()
-
-    def __exit__(self, *_: object) -> None:
-        self._lock.release()
-
-
-def test_offer_during_close_takes_no_step(rig: PublishLoopRig) -> None:
-    """Front and recorder have ended then."""
-    rig.publish(1.0)
-    rig.now_ns += PERIOD_NS
-    rig.loop._pending_lock = ClosingLock(rig)  # type: ignore[assignment]
-    with pytest.raises(OwnershipError, match="closed"):
-        rig.publish(2.0)
-    assert rig.xs()[-1] == 1.0
-
-
-def test_no_step_follows_a_failed_step_in_the_publisher_thread(rig: PublishLoopRig) -> None:
-    rig.loop.start()
-    rig.publish(1.0)
-    steps = rig.stepper.core.step
-
-    def broken(*_: object, **__: object) -> None:
-        rig.stepper.core.step = steps  # type: ignore[method-assign]
-        raise KeyError("the core is broken")
-
-    with rig.loop.lock:  # the helper waits
-        rig.now_ns += 100 * MS
-        rig.stepper.core.step = broken  # type: ignore[method-assign,assignment]
-        with pytest.raises(KeyError, match="broken"):
-            rig.publish(2.0)
-    rows = len(rig.recorder.rows)
-    assert rig.recorder.rows[-1].digest == CRASHED
-    rig.loop._helper.join(10.0)
-    depths = []
-    for _ in range(3):
-        with pytest.raises(KeyError, match="broken") as caught:
-            rig.publish(3.0)
-        depths.append(len(caught.traceback))
-    assert len(set(depths)) == 1, "repeated errors keep the length of their traceback"
-    rig.loop.close()
-    assert len(rig.recorder.rows) == rows
-
-
-def test_ctrl_c_within_a_step_ends_session_and_journal_before_it(rig: PublishLoopRig) -> None:
-    rig.publish(1.0)
-    steps = rig.stepper.core.step
-
-    def interrupted(*_: object, **__: object) -> None:
-        rig.stepper.core.step = steps  # type: ignore[method-assign]
-        raise KeyboardInterrupt
-
-    rig.now_ns += 100 * MS
-    rig.stepper.core.step = interrupted  # type: ignore[method-assign,assignment]
-    with pytest.raises(KeyboardInterrupt):
-        rig.publish(2.0)
-    rows = len(rig.recorder.rows)
-    with pytest.raises(OwnershipError, match="interrupt"):
-        rig.publish(3.0)
-    rig.loop.close()
-    assert len(rig.recorder.rows) == rows
-    assert rig.recorder.rows[-1].digest != CRASHED, "the step itself did not fail"
-
-
-def test_state_is_not_repeated_when_a_newer_frame_is_pending(rig: PublishLoopRig) -> None:
-    rig.now_ns += PERIOD_NS
-    rig.publish(1.0)
-    assert rig.xs()[-1] == 1.0
-    step, publishers = rig.stepper.step, [threading.Thread(target=rig.publish, args=(2.0,))]
-
-    def meanwhile(n_ticks: int, plant: bytes = b"", *, publish: bool = True) -> None:
-        if n_ticks == 0 and publishers:
-            publisher = publishers.pop()
-            publisher.start()
-            publisher.join()  # it finds the lock held, and leaves its frame pending
-        step(n_ticks, plant, publish=publish)
-
-    rig.stepper.step = meanwhile  # type: ignore[method-assign,assignment]
-    rig.advance(REPEAT_NS)
-    rig.loop.poll()
-    assert rig.xs()[-1] == 2.0
-    assert rig.xs() == [0.0, 1.0, 2.0]
 
 
 def test_error_of_the_helper_is_raised_by_the_next_offer(rig: PublishLoopRig) -> None:

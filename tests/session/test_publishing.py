@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from iris_session import SceneBuilder, ScenePublisher, SessionConfig, StreamInfo
+from iris_session import SceneBuilder, ScenePublisher, SessionConfig
 from iris_session.session.session_base import SessionBase
 
 
@@ -28,34 +28,6 @@ class Closing(SessionBase):
 
 def test_publish_media_during_close_raises() -> None:
     assert not Closing().publish_media("cloud", b"points")
-
-
-class Publishing(Closing):
-    """A session at 500 ns whose front keeps what it was given."""
-
-    clock = staticmethod(lambda: 500)
-
-    def __init__(self) -> None:
-        self.given: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
-
-    def _require_started(self) -> Any:
-        processes = super()._require_started()
-        processes.front = self
-        return processes
-
-    def publish_media(self, *arguments: Any, **named: Any) -> bool:
-        self.given.append((arguments, named))
-        return True
-
-
-def test_description_and_time_of_sending_are_passed_on() -> None:
-    session, info = Publishing(), StreamInfo("The room", hz=30.0)
-    assert SessionBase.publish_media(session, "room", b"points", capture_ns=7, encoding="cloud", info=info)
-    assert SessionBase.publish_media(session, "room", {}, info=info)
-    assert session.given == [
-        (("room", b"points", 7, 0, "cloud"), {"info": info, "sent_ns": 500}),
-        (("room", {}, 500, 0, "bytes"), {"info": info, "sent_ns": 500}),
-    ]
 
 
 @pytest.mark.usefixtures("simulation")

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import msgspec
 import mujoco
@@ -22,7 +21,7 @@ from iris_session.authority import AuthorityConfig
 from iris_session.demo.scenes import scene_path
 from iris_session.journal.environment import read_boot_id
 from iris_session.journal.messages import Batch
-from iris_session.journal.rows import CRASHED, seal_keyframe
+from iris_session.journal.rows import seal_keyframe
 from iris_session.physics import encode_model, load_model
 from iris_session.protocol.client_messages import Marker, MoveAnchor
 from iris_session.protocol.common import Pose
@@ -35,9 +34,7 @@ from iris_session.recording import (
     OPEN,
     JournalRow,
     Keyframe,
-    RecorderError,
     Recording,
-    RecordingInUseError,
     RecordingLock,
     SessionHeader,
     Settings,
@@ -46,7 +43,6 @@ from iris_session.recording import (
     pack_model,
 )
 from iris_session.security.resume_tokens import ResumeTokens, encode_handback
-from iris_session.session import resume
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import CoreState, SessionCore
 from iris_session.session.errors import ConfigError, ResumeError
@@ -206,22 +202,6 @@ def test_damaged_keyframe_is_replaced_by_the_previous_one(tmp_path: Path) -> Non
     assert past.core.snapshot() == state_after(STEPS - 1)
 
 
-def test_crashed_step_is_not_repeated(tmp_path: Path) -> None:
-    def change(row: JournalRow) -> JournalRow:
-        return make_row(chains[-1], row.step, row.now_ns, 1, [], CRASHED) if row.step == STEPS - 1 else row
-
-    chains: list[bytes] = []
-
-    def noting(row: JournalRow) -> JournalRow:
-        changed = change(row)
-        chains.append(changed.chain)
-        return changed
-
-    past = PastSession(recorded(tmp_path / "session.rrd", noting))
-    assert past.step == STEPS - 2
-    assert any("ended the session" in note for note in past.notes)
-
-
 def test_newest_readable_recording_is_continued(session: Path) -> None:
     session.with_name("session.resume2.rrd").write_bytes(b"")
     session.with_name("session.resume3.rrd").write_bytes(b"no recording at all")
@@ -241,30 +221,6 @@ def test_recording_in_use_is_refused(session: Path) -> None:
         PastSession(session, patience_s=0.1)
     first.close()
     PastSession(session).close()
-
-
-def test_resume_after_waiting_continues_the_newer_recording(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the search for the newest recording and its lock, another process wrote a newer one."""
-    newer = session.with_name("session.resume2.rrd")
-
-    class Late(RecordingLock):
-        def __init__(self, path: str, **options: Any) -> None:
-            super().__init__(path, **options)
-            newer.touch()
-
-    monkeypatch.setattr(resume, "RecordingLock", Late)
-    past = PastSession(session)
-    assert past.recording.name == "session.resume3.rrd"
-    assert past.file == "session.rrd"
-    RecordingLock(session, shared=False, patience_s=0.0).release()
-    with pytest.raises(RecordingInUseError):
-        RecordingLock(newer, shared=True, patience_s=0.0)
-    past.close()
-
-
-def test_unreadable_recording_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(RecorderError, match=r"nothing\.rrd.*No such file"):
-        RecordingLock(tmp_path / "nothing.rrd", shared=True)
 
 
 def test_recording_of_a_user_loop_is_refused(tmp_path: Path) -> None:
@@ -322,22 +278,6 @@ def test_rates_are_those_of_the_recording_by_default(tmp_path: Path) -> None:
     assert past is not None
     past.close()
     assert (config.state_hz, config.keyframe_s, config.realtime) == (30.0, 1.0, False)
-
-
-@pytest.mark.parametrize(("given", "sizes"), [({}, {"wall": 0.2}), ({"door": ((0.0, 0.0, 1.0), IDENTITY_QUAT)}, {})])
-def test_sheet_sizes_are_those_of_the_recording(
-    tmp_path: Path, given: dict[str, PoseTuple], sizes: dict[str, float]
-) -> None:
-    """Sheets that are given again have no known size."""
-    settings = Settings(60.0, 5.0, True, adapt_media=False, anchor_sizes={"wall": 0.2})
-    anchors = {"wall": Pose((1.0, 0.0, 1.0), IDENTITY_QUAT)}
-    path = recorded(tmp_path / "session.rrd", settings=settings, anchors=anchors)
-    anew = {"anchors": given} if given else {}
-    past, config, _ = prepare_session(SessionConfig(resume=path, **anew), None, None, None, None)  # type: ignore[arg-type]
-    assert past is not None
-    past.close()
-    assert config.sheet_sizes() == sizes
-    assert not config.adapt_media
 
 
 @pytest.mark.parametrize("given", [{}, {"door": ((0.0, 0.0, 1.0), IDENTITY_QUAT)}])

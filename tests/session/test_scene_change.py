@@ -12,14 +12,12 @@ from iris_session import Session, SessionConfig
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import Pacer, PhysicsError, find_objects, find_robots
 from iris_session.physics.load import compute_scene_hash, decode_model, encode_model
-from iris_session.protocol.client_messages import Control, GetSnapshot
 from iris_session.protocol.entries import SceneLoaded, decode_entries
-from iris_session.protocol.server_messages import SceneChanged, Snapshot
-from iris_session.session.core import SessionCore, make_plant, read_plant_state
+from iris_session.protocol.server_messages import SceneChanged
+from iris_session.session.core import SessionCore, make_plant
 from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.scene_change import adopt_timestep, prepare_scene
 from iris_session.session.shared_scene import SharedScenes
-from iris_session.session.stepper import MAX_PENDING_SCENES
 from iris_session.session.tick_times import TickTimes
 from tests.session.play import TICK_NS, entries, host, make_core
 from tests.session.test_stepper import Rig
@@ -83,53 +81,6 @@ def test_restoring_a_snapshot_before_or_after_a_scene_change(at: int, timestep: 
     assert straight.snapshot() == fresh.snapshot()
 
 
-def test_reset_restores_the_initial_state_of_the_new_scene() -> None:
-    model = bench_scene()
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    data.qpos[0] += 0.2
-    scene = loaded(model, read_plant_state(model, data))
-    core = with_models(model)
-    core.step(TICK_NS, [host(TICK_NS, scene)], 0)
-    begun = core.world.data.qpos[0]
-    assert begun == data.qpos[0]
-    for i in range(2, 20):
-        core.step(i * TICK_NS, [], 1)
-    core.step(21 * TICK_NS, [host(21 * TICK_NS, Control(0, "reset"))], 0)
-    assert core.world.data.qpos[0] == begun
-    assert core.current_config().initial_state == scene.initial_state
-
-
-def test_core_resumed_in_the_new_scene_needs_no_other_model() -> None:
-    """As `serve --resume` does: its recording begins with the scene as it is."""
-    model = bench_scene()
-    scene = loaded(model)
-    before = with_models(model)
-    play(before, 0, 120, scene)
-    resumed = SessionCore(before.world.model, before.current_config())
-    resumed.restore(before.snapshot())
-    assert play(resumed, 120, 150, scene) == play(before, 120, 150, scene)
-
-
-def test_scene_with_another_timestep_runs_in_real_time_and_clients_are_notified() -> None:
-    """Twice as many ticks of half the duration: sim_time, speeds of control and the clients' tick period follow."""
-    model = bench_scene(0.001)
-    scene = loaded(model)
-    core = with_models(model)
-    play(core, 0, AT, scene)
-    joined = core.step(AT * TICK_NS + 1, [host(AT * TICK_NS + 1, scene), host(AT * TICK_NS + 1, GetSnapshot())], 1)
-    assert [e.body.tick_period_ns for e in joined.decision.events if isinstance(e.body, SceneChanged)] == [1_000_000]
-    told = [o.message for o in joined.decision.outgoing if isinstance(o.message, Snapshot)]
-    assert [m.tick_period_ns for m in told] == [1_000_000]
-    for i in range(AT + 1, AT + 100):
-        core.step(i * TICK_NS + 1, entries(i, 2), 2)
-    view = core.world.view()
-    assert (view.tick, view.tick_period_ns) == (199, 1_000_000)
-    assert view.sim_time == pytest.approx(0.199)
-    core.step(500 * TICK_NS, [host(500 * TICK_NS, Control(0, "reset"))], 0)
-    assert core.world.tick_period_ns == 1_000_000
-
-
 def test_speed_of_control_is_independent_of_the_timestep() -> None:
     """The same hand, the same time: the tips end at the same place."""
     ends = []
@@ -184,15 +135,6 @@ def test_stepper_sends_the_scene_before_the_step() -> None:
     assert rig.stepper.view.mirror.synced
     assert set(rig.stepper.view.mirror.leases) == {"left", "right", "object1", "object2", "object3"}
     assert rig.front.n_bodies == len(scene.plant.world.bodies)
-
-
-def test_unprocessed_scene_changes_are_bounded() -> None:
-    rig = Rig()
-    scene = prepare_scene(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
-    for _ in range(MAX_PENDING_SCENES):
-        rig.stepper.queue_scene(scene)
-    with pytest.raises(RuntimeError, match="loop"):
-        rig.stepper.queue_scene(scene)
 
 
 def test_unsuitable_scenes_are_refused_with_a_reason() -> None:

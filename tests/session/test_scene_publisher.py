@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import math
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import pytest
 import trimesh
 
 from iris_session import (
-    Client,
     ConfigError,
     OwnershipError,
     PublishError,
@@ -24,9 +21,6 @@ from iris_session import (
 )
 from iris_session.protocol.scene import Environment, RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
-from iris_session.scene import AssetStore
-from iris_session.session.publish_loop import SILENT_NS
-from iris_session.session.scene_publisher import AHEAD_NS, _check_capture
 from tests.rig.owned import simulate_sessions
 from tests.rig.simulation import Simulation
 
@@ -91,23 +85,6 @@ def test_owner_posts_and_patches(session: ScenePublisher) -> None:
     assert session.scene.visuals[0].rgba == (0.0, 0.0, 1.0, 1.0)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "value"),
-    [
-        (lambda s: s.begin_tick(), "publish"),
-        (lambda s: s.end_tick(), "Session"),
-        (lambda s: s.load_scene("scene.xml"), "scene"),
-        (lambda s: s.assign(["arm"], "ann"), "nothing that people drive"),
-        (lambda s: s.set_scale("arm", 0.5), "nothing that people drive"),
-        (lambda s: s.pause(), "publish"),
-        (lambda s: s.resume(), "publish"),
-    ],
-)  # fmt: skip
-def test_unsupported_methods_of_a_publisher_raise(wrong: Callable[[ScenePublisher], None], value: str) -> None:
-    with pytest.raises(OwnershipError, match=value):
-        wrong(ScenePublisher(scene(), CONFIG))
-
-
 def test_invalid_times_raise_and_change_nothing(session: ScenePublisher) -> None:
     session.run(seconds=0.1)
     session.publish(13.0)
@@ -148,84 +125,6 @@ def test_time_going_back_begins_a_scene_epoch(session: ScenePublisher) -> None:
     session.publish(5.0)
     session.run(until=lambda: session.status().sim_time == 5.0, seconds=30.0)
     assert kinds(session).count(SceneChanged) == before + 2, "a reset is one"
-
-
-def test_two_states_may_have_the_same_time(session: ScenePublisher) -> None:
-    moment = session.clock()
-    for time_s in (6.0, 7.0):
-        session.publish(time_s, capture_ns=moment)
-    session.run(until=lambda: session.status().sim_time == 7.0, seconds=30.0)
-    assert session.status().sim_time == 7.0
-
-
-def test_capture_time_slightly_ahead_is_clamped_to_now() -> None:
-    assert _check_capture(7_000 + AHEAD_NS, 7_000) == 7_000
-    with pytest.raises(PublishError, match="ahead of"):
-        _check_capture(7_001 + AHEAD_NS, 7_000)
-
-
-def test_reset_during_publish_comes_with_the_next_state(session: ScenePublisher) -> None:
-    class Now(float):
-        """A time during whose comparison another thread value `reset`."""
-
-        def __gt__(self, other: object) -> bool:
-            thread = threading.Thread(target=session.reset)
-            thread.start()
-            thread.join(0.2)
-            return float.__gt__(self, other)  # type: ignore[arg-type, operator]
-
-    session.publish(16.0)
-    session.run(until=lambda: session.status().sim_time == 16.0, seconds=30.0)
-    before = kinds(session).count(SceneChanged)
-    session._time_s = Now(16.0)
-    session.publish(16.5)
-    session.run(until=lambda: session._anew, seconds=30.0)
-    session.publish(17.0)
-    session.run(until=lambda: session.status().sim_time == 17.0, seconds=30.0)
-    assert kinds(session).count(SceneChanged) == before + 1
-
-
-def test_silent_publisher_has_aging_state_and_a_warning(session: ScenePublisher) -> None:
-    """Like a simulator or a robot driver that hangs: the age of the shown state grows."""
-    with Client(session.address, role="observer", name="ann", alignment="not_needed") as ann:
-        for i in range(5):
-            session.publish(18.0 + 0.1 * i)
-        assert ann.wait_for(lambda c: c.scene.state is not None and c.scene.state.header.sim_time == 18.4, 30.0)
-        assert ann.scene.state is not None
-        shown = ann.scene.state.header
-        assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 0) > SILENT_NS, 30.0)
-        assert ann.scene.state.header.session_time == shown.session_time
-        assert ann.scene.state.header.state_seq > shown.state_seq, "it is sent again, for those who join"
-        assert ann.wait_for(lambda c: "nothing was published for" in " ".join(c.status(30.0).warnings), 30.0)
-        report = ann.status(30.0)
-        way = report.step_to_publish
-        assert way is None or way.p99 < 1000.0, "the front is not to blame"
-        row = next(row for row in report.participants if row.name == "ann")
-        assert row.state_age is None or row.state_age.p99 < 1000.0, "nor her link"
-        session.publish(19.0)
-        assert ann.wait_for(lambda c: not c.status(30.0).warnings, 30.0)
-        assert ann.wait_for(lambda c: c.scene.state is not None and c.scene.state.header.sim_time == 19.0, 30.0)
-
-
-def test_several_threads_may_publish(session: ScenePublisher) -> None:
-    faults: list[BaseException] = []
-
-    def work(x: float) -> None:
-        try:
-            for _ in range(200):
-                session.set_pose("box", (x, x, x))
-                session.publish(20.0)
-        except BaseException as error:
-            faults.append(error)
-
-    threads = [threading.Thread(target=work, args=(float(x),)) for x in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not faults
-    session.run(until=lambda: session.status().sim_time == 20.0, seconds=30.0)
-    assert len(set(box(session))) == 1, "never half of one and half of another"
 
 
 def test_setting_before_start_and_publishing_after_close_raise() -> None:
@@ -281,18 +180,6 @@ def test_probable_mistakes_are_notes_and_late_bodies_raise(tmp_path: Path) -> No
                 say()
         with pytest.raises(PublishError, match="nearest: 'box'"):
             session.set_pose("boxx", (0, 0, 0))
-
-
-def test_store_without_locks_is_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Network drives have no locks: other processes may remove assets, which is a note."""
-
-    def no_locks(*_: object) -> None:
-        raise OSError(errno.ENOLCK, "no locks")
-
-    monkeypatch.setattr(AssetStore, "hold", no_locks)
-    with ScenePublisher(scene(), replace(CONFIG, assets=tmp_path)) as session:
-        session.publish()
-        assert any("cannot be held" in note for note in session.notes)
 
 
 def test_error_that_stopped_the_session_is_raised_by_later_calls(monkeypatch: pytest.MonkeyPatch) -> None:

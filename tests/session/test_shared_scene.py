@@ -30,17 +30,6 @@ def held(folder: Path) -> list[Path]:
     return list((folder / "holds").glob("*"))
 
 
-def test_scene_built_after_the_end_is_not_held(world: World, tmp_path: Path) -> None:
-    """The thread of `load_scene` may end after the session."""
-    scenes = SharedScenes(tmp_path, "test")
-    shown = scenes.make(world)
-    scenes.show(shown)
-    assert held(tmp_path)
-    scenes.close()
-    assert scenes.show(shown) is shown.info
-    assert not held(tmp_path)
-
-
 def test_replaced_specifications_are_released(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shared_scene, "KEPT_PATCHES", 5)
     monkeypatch.setattr(shared_scene, "KEPT_PATCHES_S", 0.0)
@@ -53,20 +42,6 @@ def test_replaced_specifications_are_released(world: World, tmp_path: Path, monk
     kept = [address in store for address in addresses]
     assert len(set(addresses)) == len(addresses)
     assert kept == [True, *[False] * 7, *[True] * 5], "the scene itself, and the newest looks of it"
-    scenes.close()
-
-
-def test_previous_scene_is_held_and_repeated_patches_count_once(world: World, tmp_path: Path) -> None:
-    scenes = SharedScenes(tmp_path, "test")
-    scenes.show(scenes.make(world))
-    looks = [scenes.show(scenes.patch([SetVisual(0, rgba=(i / 4, 0.0, 0.0, 1.0))])).scene_hash for i in range(3)]
-    store = AssetStore(tmp_path)
-    removed = [store.discard(address, store.last_used_ns(address)) for address in looks]
-    assert removed == [True, False, False], "the front still serves the one before"
-    assert scenes.newest is not None
-    assert len(scenes.newest.patches) == 1
-    assert scenes.newest.info.patches == 3, "so the front knows that no body has moved"
-    assert scenes.make(world).info.patches == 0
     scenes.close()
 
 

@@ -12,24 +12,22 @@ from iris_session.journal.messages import RecorderStatus
 from iris_session.physics import Pacer
 from iris_session.protocol.client_messages import MoveAnchor, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose
-from iris_session.protocol.entries import Bye, Entry, Join
+from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.names import Role
-from iris_session.protocol.server_messages import Event, Handover, ParticipantLeft
 from iris_session.protocol.status import AnchorReport, ParticipantReport, RecorderReport
-from iris_session.protocol.steps import Admitted, Decision
 from iris_session.session.config import SessionConfig
 from iris_session.session.processes import SessionProcesses
-from iris_session.session.session_view import MAX_HANDOVERS, SessionView
 from iris_session.session.status import (
+    NO_PICTURE,
     PATIENCE_NS,
     PERIOD_NS,
     StatusReporter,
     collect_warnings,
     make_anchor_reports,
+    make_recorder_report,
     make_robot_reports,
 )
 from iris_session.session.stepper import Stepper
-from iris_session.session.supervision import NO_PICTURE, make_recorder_report
 from tests.session.play import TICK_NS, entries, host, make_core
 from tests.session.test_stepper import Front
 
@@ -62,24 +60,6 @@ def bob(now_ns: int) -> Entry:
     return Entry(BOB, BOB, now_ns, Join("key2", Role.OPERATOR, "bob", devices=("head",), alignment="measured"))
 
 
-def test_handovers_of_the_status_are_bounded() -> None:
-    view = SessionView()
-    for n in range(MAX_HANDOVERS + 5):
-        handed = Handover(f"object{n}", "left", "right", "p1", "p2", 1)
-        view.apply_step(Decision(commands=(), events=(Event(n + 1, n, n, handed),)), ())
-    assert len(view.handovers) == MAX_HANDOVERS
-    assert view.handovers[-1].object == f"object{MAX_HANDOVERS + 4}"
-
-
-def test_connections_of_a_session_are_the_newest_of_those_who_are_in_it() -> None:
-    view = SessionView()
-    for connection in range(1, 6):
-        view.apply_step(Decision(commands=(), admitted=(Admitted(connection, "p1", "operator", connection > 1),)), ())
-    assert view.connections == {"p1": 5}
-    view.apply_step(Decision(commands=(), events=(Event(1, 1, 1, ParticipantLeft("p1", "bye")),)), ())
-    assert view.connections == {}
-
-
 def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
     session.step(bob(TICK_NS))
     row = session.people()["bob"]
@@ -97,15 +77,6 @@ def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
     assert row.tracking_epoch == 1
     session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
     assert session.people()["bob"].alignment_void_ns == -1
-
-
-def test_participants_that_left_are_removed(session: Session) -> None:
-    session.step(bob(TICK_NS))
-    session.stepper.view.rejected[session.people()["bob"].id, "head", "stale"] = 3
-    assert session.people()["bob"].rejected == {"stale": 3}
-    session.step(Entry(BOB, BOB, session.now_ns, Bye()))
-    assert session.people() == {}
-    assert session.stepper.view.rejected == {}
 
 
 def test_report_lists_robots_and_holders(session: Session) -> None:
@@ -158,14 +129,12 @@ def test_new_front_gets_the_current_anchors() -> None:
     core = make_core(anchors={"table": IDENTITY})
     moved = Pose((1.0, 0.0, 0.0), IDENTITY.q)
     core.step(TICK_NS, [host(TICK_NS, MoveAnchor(0, "table", moved))], 0)
-    told: list[object] = []
     session_processes = SessionProcesses(SessionConfig(record=False), core, 0)
-    session_processes.front = SimpleNamespace(  # type: ignore[assignment]
-        alive=False, fault="ended", set_anchors=told.append, restart=lambda: told.append("restarted"), link=Front()
-    )
+    front: Any = SimpleNamespace(poll=lambda _: ["it was replaced"], link=Front())
+    session_processes.front = front
     session_processes.reporter = SimpleNamespace(is_due=lambda now_ns: False)  # type: ignore[assignment]
     session_processes.supervise(Stepper(core, Front(), None, lambda: 10**12, 10**9, 10**9))
-    assert told == [{"table": moved}, "restarted"]
+    assert front.anchors == {"table": moved}
 
 
 def processes(
@@ -177,14 +146,12 @@ def processes(
     ended: bool = False,
     journal_only: bool = False,
 ) -> Any:
-    """Return feed, recorder and supervisor."""
+    """Return feed and recorder."""
     said = RecorderStatus(1, 0, 0, bytes=1000, fault=fault, disk_free=5000)
+    state = {"alive": alive, "hangs": hangs, "failure": failure, "is_used_up": ended, "budget_text": budget}
     return (
         SimpleNamespace(stats=FeedStats(dropped_rows=2, waiting_bytes=30, recorder=said)),
-        SimpleNamespace(path="/data/session.rrd", journal_only=journal_only),
-        SimpleNamespace(
-            alive=alive, hangs=hangs, failure=failure, budget=SimpleNamespace(is_used_up=ended, text=budget)
-        ),
+        SimpleNamespace(path="/data/session.rrd", journal_only=journal_only, **state),
     )
 
 
@@ -208,4 +175,4 @@ def test_recorder(fields: dict[str, Any], state: str, text: str) -> None:
 
 
 def test_without_recorder() -> None:
-    assert make_recorder_report(None, None, None).state == "off"
+    assert make_recorder_report(None, None).state == "off"

@@ -1,177 +1,131 @@
-"""Restarts of child processes, for which the tick loop does not wait."""
+"""The recorder as a supervised process, for which the tick loop does not wait: restarts, hangs, the end of a budget."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 
-from iris_session.journal.messages import RecorderStatus
-from iris_session.recording import RecordingError
-from iris_session.session import supervision
-from iris_session.session.supervision import (
-    HANGING_NS,
-    HEALTHY_NS,
-    RESTART_DELAYS_NS,
-    BudgetWatch,
-    RecorderSupervisor,
-    RestartTimer,
-)
+from iris_session.journal.messages import RecorderConfig, RecorderStatus
+from iris_session.recording import RecorderProcess, supervise
+from iris_session.recording.supervise import CRASHED, HANGING_NS
+from iris_session.system import supervised
 from tests.threads import Threads
 
-MS = 1_000_000
-SECOND = 1_000 * MS
+SECOND = 1_000_000_000
 
 
-def _restarts(timer: RestartTimer, start_ns: int, until_ns: int) -> list[int]:
-    """Return the times of restarts of a process that dies at once."""
-    return [now for now in range(start_ns, until_ns, 50 * MS) if timer.is_due(now)]
+class Child:
+    """A recorder by the test: it creates its file, as the process does."""
 
+    pid = 4711
 
-def test_first_restart_is_immediate_and_later_ones_back_off() -> None:
-    timer = RestartTimer()
-    times = _restarts(timer, 60_000 * MS, 90_000 * MS)
-    waits = [b - a for a, b in pairwise(times)]
-    assert times[0] == 60_000 * MS
-    for wait, least in zip(waits, (*RESTART_DELAYS_NS[1:], *[RESTART_DELAYS_NS[-1]] * 10), strict=False):
-        assert least <= wait <= least + 100 * MS
-    assert timer.restarts == len(times)
-
-
-def test_long_lived_process_is_restarted_at_once() -> None:
-    timer = RestartTimer()
-    now_ns = 60_000 * MS
-    for _ in range(3):
-        while not timer.is_due(now_ns):
-            now_ns += 50 * MS
-    assert not timer.is_due(now_ns)  # the process died again: restarts wait by now
-    while not timer.is_due(now_ns):
-        now_ns += 50 * MS
-    now_ns += HEALTHY_NS + 50 * MS
-    assert timer.is_due(now_ns)
-    assert not timer.is_due(now_ns + 50 * MS)
-    assert timer.is_due(now_ns + 50 * MS + RESTART_DELAYS_NS[1])
-
-
-class Recorder:
-    """A recorder by the test. Its disk is asked only in threads."""
-
-    def __init__(self) -> None:
-        self.alive = True
-        self.refused = False
+    def __init__(self, _: str, *, config: bytes, stderr: Any, **options: Any) -> None:
+        self.config = msgspec.msgpack.decode(config, type=RecorderConfig)
+        self.exit_status: int | None = None
+        self.stderr = stderr
+        part = "" if self.config.part == 1 else f".part{self.config.part}"
+        Path(self.config.path).with_suffix(f"{part}.rrd").touch()
 
     @property
-    def failure(self) -> str:
-        return "the recorder ended (exit status 1): no space left"
+    def is_running(self) -> bool:
+        return self.exit_status is None
 
-    def restart(self) -> None:
-        if self.refused:
-            raise RecordingError("no room for its log")
-        self.alive = True
+    def end(self, status: int) -> None:
+        os.write(self.stderr.fileno(), b"Rerun: something\nrecorder: no space left\nRerun: something else\n")
+        self.exit_status = status
 
-    def close(self, timeout_s: float) -> bool:
-        self.alive = False
-        return True
+    def read_line(self, _: float) -> bytes:
+        return b"ready"
 
+    def send_signal(self, number: int) -> None: ...
 
-@pytest.fixture(autouse=True)
-def threads(monkeypatch: pytest.MonkeyPatch) -> Threads:
-    threads = Threads()
-    monkeypatch.setattr(supervision, "threading", threads)
-    return threads
+    def close(self, **_: float) -> int:
+        self.exit_status = self.exit_status or 0
+        return self.exit_status
 
 
-def test_dead_recorder_is_replaced_while_the_loop_continues(threads: Threads) -> None:
-    recorder = Recorder()
-    supervisor = RecorderSupervisor(recorder)
-    assert supervisor.poll(SECOND, 0) == []
-    recorder.alive = False
-    for i in range(100):  # its log cannot be read now: no look waits
-        assert supervisor.poll(2 * SECOND + i * 50 * MS, 0) == []
-    assert not supervisor.alive
-    assert supervisor.restarts == 1
-    threads.run_started()
-    (told,) = supervisor.poll(8 * SECOND, 0)
-    assert recorder.failure in told
-    assert supervisor.alive
-    assert supervisor.failure == recorder.failure
-    assert supervisor.poll(8 * SECOND + HANGING_NS + MS, 0) == []
-    assert supervisor.failure == ""  # its successor writes
+class Lab:
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.children: list[Child] = []
+        self.threads = Threads()
+        monkeypatch.setattr(supervised, "threading", self.threads)
+        monkeypatch.setattr(supervise, "ChildProcess", self._spawn)
+        self.recorder = RecorderProcess(folder / "session.rrd", 0)
+        self.recorder.start()
+        self.now_ns = SECOND
+
+    def _spawn(self, *arguments: Any, **options: Any) -> Child:
+        self.children.append(Child(*arguments, **options))
+        return self.children[-1]
+
+    def poll(self, silence_ns: int = 0, status: RecorderStatus | None = None) -> list[str]:
+        """Poll after a second, with whatever thread has started by then at its end."""
+        self.now_ns += SECOND
+        found = self.recorder.poll(self.now_ns, silence_ns, status)
+        self.threads.run_started()
+        return found + self.recorder.poll(self.now_ns, silence_ns, status)
 
 
-def test_failed_start_of_a_recorder_is_retried_and_stays_reported(threads: Threads) -> None:
-    recorder = Recorder()
-    recorder.alive, recorder.refused = False, True
-    supervisor = RecorderSupervisor(recorder)
-
-    def poll(now_ns: int) -> str:
-        """Return what is announced when the thread that starts now has ended."""
-        assert supervisor.poll(now_ns, 0) == []
-        threads.run_started()
-        (told,) = supervisor.poll(now_ns, 0)
-        return told
-
-    assert "no room for its log" in poll(SECOND)
-    assert supervisor.poll(SECOND + 100 * MS, 0) == []
-    assert "not replaced" in poll(SECOND + 3 * HANGING_NS)
-    assert supervisor.failure
-    assert not supervisor.alive
-    recorder.refused = False
-    assert "was replaced" in poll(SECOND + 9 * HANGING_NS)
-    assert supervisor.alive
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
+    lab = Lab(tmp_path, monkeypatch)
+    yield lab
+    lab.recorder.close(0.0)
 
 
-def test_hanging_recorder_is_reported_once_and_close_waits_for_the_thread() -> None:
-    recorder = Recorder()
-    supervisor = RecorderSupervisor(recorder)
-    (told,) = supervisor.poll(SECOND, HANGING_NS + 1)
-    assert "hangs" in told
-    assert supervisor.hangs
-    assert supervisor.poll(2 * SECOND, HANGING_NS + 1) == []
-    recorder.alive = False
-    supervisor.poll(3 * SECOND, 0)
-    assert not supervisor.hangs
-    supervisor.close()
-    assert recorder.alive, "it writes what is left"
+def test_dead_recorder_is_replaced_by_one_of_the_next_part_that_leaves_out_a_picture_that_failed(lab: Lab) -> None:
+    assert lab.poll() == []
+    lab.children[0].end(CRASHED)
+    assert "no space left" in lab.recorder.failure
+    (announced,) = lab.poll()
+    assert "no space left" in announced
+    assert lab.recorder.failure == ""
+    assert (lab.recorder.part, lab.recorder.starts, lab.recorder.restarts) == (2, 2, 1)
+    assert [child.config.journal_only for child in lab.children] == [False, True]
+    lab.children[1].end(CRASHED)
+    lab.poll()
+    lab.poll()
+    assert lab.recorder.alive
+    assert "no space left" in lab.recorder.failure, "one after the other has ended"
 
 
-def test_close_does_not_wait_for_a_hanging_disk(threads: Threads) -> None:
-    recorder = Recorder()
-    supervisor = RecorderSupervisor(recorder)
-    recorder.alive = False
-    supervisor.poll(SECOND, 0)
-    threads.are_stuck = True
-    supervisor.close(0.05)
-    threads.run_started()
-    assert not recorder.alive, "nobody would look after the successor that is started now"
+def test_hanging_recorder_is_announced_once_and_not_ended(lab: Lab) -> None:
+    assert len(lab.poll(HANGING_NS + 1)) == 1
+    assert lab.recorder.hangs
+    assert lab.poll(HANGING_NS + 1) == []
+    assert lab.poll() == []
+    assert (lab.recorder.hangs, len(lab.children)) == (False, 1)
+
+
+def test_close_does_not_wait_for_a_hanging_disk(lab: Lab) -> None:
+    lab.children[0].end(1)
+    lab.recorder.poll(lab.now_ns)
+    lab.threads.are_stuck = True
+    lab.recorder.stop_restarts()
+    lab.threads.run_started()
+    assert not lab.recorder.alive, "nobody would look after the successor that is started now"
 
 
 def _left(n_bytes: int, *, ended: bool = False) -> RecorderStatus:
     return RecorderStatus(1, 5, 4, budget=100_000_000, budget_left=n_bytes, ended=ended)
 
 
-def test_end_of_a_budget_is_announced_before_and_when_it_comes() -> None:
-    watch = BudgetWatch()
-    assert watch.poll(None) == watch.poll(RecorderStatus(1, 5, 4)) == watch.poll(_left(20_000_000)) == []
-    assert watch.list_warnings() == []
-    (told,) = watch.poll(_left(19_900_000))
-    assert told.startswith("19.9 of 100 MB are left of the recording's budget")
-    assert watch.poll(_left(12_300_000)) == [], "once"
-    assert watch.list_warnings() == ["12.3 of 100 MB are left of the recording's budget"]
-    assert not watch.is_used_up
-    (told,) = watch.poll(_left(0, ended=True))
-    assert told.startswith("recording ended: budget of 100 MB is used up")
-    assert watch.poll(_left(0, ended=True)) == []
-    assert watch.is_used_up
-
-
-def test_recorder_that_has_used_its_budget_is_not_restarted() -> None:
-    recorder = Recorder()
-    supervisor = RecorderSupervisor(recorder)
-    assert len(supervisor.poll(SECOND, 0, _left(0, ended=True))) == 1
-    recorder.alive = False
-    for i in range(2 * HANGING_NS // (50 * MS)):
-        assert supervisor.poll(2 * SECOND + i * 50 * MS, HANGING_NS + 1) == []
-    assert supervisor.restarts == 0
-    assert not recorder.alive
-    assert (supervisor.failure, supervisor.hangs) == ("", False)
+def test_end_of_a_budget_is_announced_before_and_when_it_comes_and_nothing_is_restarted(lab: Lab) -> None:
+    assert lab.poll(status=RecorderStatus(1, 5, 4)) == lab.poll(status=_left(20_000_000)) == []
+    assert lab.recorder.list_warnings() == []
+    (announced,) = lab.poll(status=_left(19_900_000))
+    assert announced.startswith("19.9 of 100 MB")
+    assert lab.poll(status=_left(12_300_000)) == [], "once"
+    assert lab.recorder.list_warnings()[0].startswith("12.3 of 100 MB")
+    assert not lab.recorder.is_used_up
+    lab.children[0].end(0)
+    (announced,) = lab.poll(status=_left(0, ended=True))
+    assert "100 MB" in announced
+    assert lab.recorder.is_used_up
+    assert lab.poll(HANGING_NS + 1, _left(0, ended=True)) == []
+    assert (lab.recorder.restarts, lab.recorder.failure, lab.recorder.hangs) == (0, "", False)

@@ -6,7 +6,7 @@ import pytest
 
 from iris_session.physics import PacerStats
 from iris_session.protocol.names import LateCause
-from iris_session.session.tick_times import CAUSES, SKIPPED, TickTimes, make_run_delay_reader
+from iris_session.session.tick_times import CAUSES, SKIPPED, TickTimes
 
 MS = 1_000_000
 PERIOD = 2 * MS
@@ -74,22 +74,6 @@ def test_slow_part_is_the_cause(loop: Loop, cause: str) -> None:
     assert loop.times.count_late_causes() == {cause: loop.late}
 
 
-def test_time_between_ticks_is_of_the_owner(loop: Loop) -> None:
-    loop.tick({LateCause.OWNER: 9 * MS})
-    for _ in range(50):
-        loop.tick()
-    loop.mark()
-    assert set(loop.times.count_late_causes()) == {LateCause.OWNER}
-
-
-def test_oversleeping_is_of_the_scheduler(loop: Loop) -> None:
-    loop.tick(overslept_ns=6 * MS)
-    for _ in range(50):
-        loop.tick()
-    loop.mark()
-    assert set(loop.times.count_late_causes()) == {LateCause.SCHEDULER}
-
-
 @pytest.mark.parametrize("cause", [c for c in CAUSES if c != LateCause.SCHEDULER])
 def test_preempted_part_is_not_the_cause(loop: Loop, cause: str) -> None:
     loop.tick({cause: 7 * MS}, delayed=True)
@@ -99,45 +83,11 @@ def test_preempted_part_is_not_the_cause(loop: Loop, cause: str) -> None:
     assert set(loop.times.count_late_causes()) == {LateCause.SCHEDULER}
 
 
-def test_larger_share_is_the_cause(loop: Loop) -> None:
-    loop.tick({LateCause.PHYSICS: 4 * MS}, delayed=True)
-    loop.tick({LateCause.OUTPUT: 9 * MS})
-    for _ in range(50):
-        loop.tick()
-    loop.mark()
-    causes = loop.times.count_late_causes()
-    assert causes[LateCause.OUTPUT] > causes[LateCause.SCHEDULER] > 0
-
-
-def test_physics_that_is_always_slow_is_always_the_cause() -> None:
-    loop = Loop()
-    loop.mark()
-    for _ in range(200):
-        loop.tick({LateCause.PHYSICS: 2 * MS})
-    loop.mark()
-    assert loop.times.count_late_causes() == {LateCause.PHYSICS: loop.late}
-    assert loop.times.compute_late_share() == pytest.approx(loop.late / 200)
-
-
-def test_skipped_ticks_have_the_cause_of_their_chain(loop: Loop) -> None:
-    for _ in range(300):
-        loop.tick({LateCause.CONTROL: 5 * MS})
-    loop.times.count_skipped(500)
-    loop.mark(missing=500)
-    assert loop.times.count_late_causes() == {LateCause.CONTROL: loop.late + 500}
-
-
 def test_suspended_process_is_a_cause_of_its_own(loop: Loop) -> None:
     loop.tick(overslept_ns=3_000 * MS)
     loop.times.count_skipped(1400)
     loop.mark(missing=1400)
     assert loop.times.count_late_causes() == {LateCause.SCHEDULER: 1, SKIPPED: 1400}
-
-
-def test_system_reports_the_time_without_processor() -> None:
-    delayed = make_run_delay_reader()
-    before = delayed()
-    assert delayed() >= before >= 0
 
 
 def test_shares_cover_the_last_ten_marks() -> None:
@@ -153,23 +103,6 @@ def test_shares_cover_the_last_ten_marks() -> None:
         loop.mark()
     assert loop.times.compute_late_share() == 0.0
     assert loop.times.count_late_causes() == {}
-
-
-def test_lateness_covers_the_newest_ticks(loop: Loop) -> None:
-    usual_ms = sum(USUAL.values()) * 1e-6
-    lateness = loop.times.compute_lateness()
-    assert lateness is not None
-    assert lateness.p50 == pytest.approx(usual_ms)
-    for _ in range(5000):
-        loop.tick({LateCause.CONTROL: 500_000})
-    lateness = loop.times.compute_lateness()
-    assert lateness is not None
-    assert lateness.p50 == pytest.approx(usual_ms + 0.5)
-
-
-def test_no_causes_at_first() -> None:
-    times = Loop().times
-    assert (times.compute_lateness(), times.compute_late_share(), times.count_late_causes()) == (None, 0.0, {})
 
 
 def test_pause_has_no_cause(loop: Loop) -> None:

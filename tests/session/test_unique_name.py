@@ -66,11 +66,6 @@ def test_name_in_use_gets_the_next_free_number(network: Network, heard: tuple[st
     finder.close()
 
 
-def test_a_session_does_not_hear_itself(network: Network) -> None:
-    network.names = ("lab",)
-    assert NameFinder(7720).find_free_name("lab", "s0") == "lab"
-
-
 def test_finder_waits_only_for_the_rest_of_its_time(network: Network) -> None:
     finder = NameFinder(7720)
     network.now_s += 0.2

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from types import SimpleNamespace
 
 import pytest
 
-from iris_session.system import file_worker
-from iris_session.system.file_worker import CAPACITY, CLOSE_TIMEOUT_S, FileWorker
+from iris_session.system.file_worker import CAPACITY, FileWorker
 from tests.front.slow_disk import turns
 
 
@@ -65,26 +63,6 @@ def test_hanging_job_blocks_no_caller_and_the_queue_is_bounded() -> None:
     disk.set()
     turns(files.tick, lambda: len(reports) == 1 + CAPACITY)
     assert reports[0] == "slow"
-    files.close()
-
-
-def test_close_has_one_deadline_for_queue_and_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    files = FileWorker(DiskError)
-    files.submit(lambda: None, lambda _outcome, _now: None)
-    now_s, waited = 100.0, []
-
-    def put(_job: object, timeout: float) -> None:
-        nonlocal now_s
-        now_s += 0.7 * timeout
-
-    thread = files._thread
-    assert thread is not None
-    monkeypatch.setattr(file_worker, "time", SimpleNamespace(monotonic=lambda: now_s))
-    monkeypatch.setattr(files._jobs, "put", put)
-    monkeypatch.setattr(thread, "join", waited.append)
-    files.close()
-    assert waited == [pytest.approx(0.3 * CLOSE_TIMEOUT_S)]
-    monkeypatch.undo()
     files.close()
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.recording import Recording
 from iris_session.system import process
 from iris_session.system.process import DEVNULL, PIPE, ChildProcess
 
@@ -20,13 +19,8 @@ ROOT = Path(__file__).parents[2]
 TRAPS = ("queue", "zmq", "json", "random", "select", "selectors", "anchors", "msgspec", "numpy", "rerun", "rich")
 TRAP = "raise SystemExit('a file of the working folder was taken for a module')"
 SERVE = ("serve", "handover", "--no-beacon", "--control-port", "0", "--state-port", "0", "--seconds", "0.5")
-#: The code of the installed command. An empty part of PYTHONPATH means the working folder, too.
-INSTALLED = """
-import os
-from iris_session.cli.main import main
-os.environ["PYTHONPATH"] = os.pathsep
-raise SystemExit(main())
-"""
+
+
 #: Starts a child from a package that only this process can import, as in a checkout that is not installed.
 FROM_CHECKOUT = """
 import subprocess, sys
@@ -42,20 +36,6 @@ def module_traps(tmp_path: Path) -> Path:
     for name in TRAPS:
         (tmp_path / f"{name}.py").write_text(TRAP)
     return tmp_path
-
-
-@pytest.mark.long
-@pytest.mark.e2e
-def test_session_imports_nothing_from_the_working_folder(module_traps: Path) -> None:
-    """With its front, recorder and display, started as the installed command is."""
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", INSTALLED, *SERVE, "--record", "session.rrd"],
-        cwd=module_traps, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "for a module" not in done.stdout + done.stderr
-    with Recording.open(module_traps / "session.rrd") as recording:
-        assert recording.finished
 
 
 @pytest.mark.e2e
@@ -137,16 +117,6 @@ def test_silent_child_times_out_and_is_killed(module_folder: Path) -> None:
         assert child.read_available_lines() == []
         assert child.close(terminate_s=0.05) == -signal.SIGKILL
         assert child.close() == -signal.SIGKILL
-
-
-@pytest.mark.e2e
-def test_child_exits_at_the_end_of_its_input(module_folder: Path) -> None:
-    (module_folder / "echo.py").write_text("import sys\nfor line in sys.stdin: print(line.upper(), end='', flush=True)")
-    child = ChildProcess("echo", stdout=PIPE)
-    child.write(b"a\nb\n")
-    assert [child.read_line(30.0), child.read_line(30.0)] == [b"A", b"B"]
-    assert child.stop(exit_s=30.0) == 0
-    child.close()
 
 
 @pytest.mark.e2e

@@ -1,4 +1,4 @@
-"""A carrier: a compiled model of bodies that are moved externally, so that their poses can be a plant's state.
+"""A kinematic model: a compiled model of bodies that are moved externally, so that their poses can be a plant's state.
 
 A world that is not MuJoCo's is streamed, journaled and verified through it. It has one mocap body per moving body, and
 neither shapes nor dynamics: to show a state takes some tens of microseconds for hundreds of bodies.
@@ -21,7 +21,7 @@ from iris_session.protocol.common import Pose
 TICK_S: Final = 0.001
 
 
-class Carrier:
+class KinematicModel:
     """Bodies with the ids 1..n, in the order of `names`. `model`: the model of a `World` of them.
 
     `poses`: T_world_body of each at the beginning. Raises `ModelInvalidError` for names that repeat, or that MuJoCo

@@ -1,4 +1,4 @@
-"""`SceneDraft`: poses, joints and vertices that a publisher has set, checked when set, and published as one frame.
+"""`PendingState`: poses, joints and vertices that a publisher has set, checked when set, and published as one frame.
 
 A wrong value raises `PublishError` in the caller and changes nothing. Joints beyond their limits are not wrong, as real
 robots report some: they are shown so, and `warnings` names those far beyond. All methods work from any thread.
@@ -51,7 +51,7 @@ class Frame:
     anew: bool = False
 
 
-class SceneDraft:
+class PendingState:
     """The moving things of a composed scene as they will be published next. Thread-safe."""
 
     def __init__(self, scene: ComposedScene) -> None:

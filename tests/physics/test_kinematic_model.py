@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from iris_session.physics import ModelInvalidError, World
-from iris_session.physics.carrier import TICK_S, Carrier
-from iris_session.physics.load import decode_model
+from iris_session.physics.kinematic_model import TICK_S, KinematicModel
 from iris_session.protocol.common import Pose
 
 NAMES = ("cup", "arm/link 1", "table top")
@@ -27,7 +26,7 @@ def random_poses(seed: int) -> np.ndarray:
 
 
 def test_bodies_have_the_ids_and_first_poses_of_the_scene() -> None:
-    world = World(Carrier(NAMES, FIRST).model, (), ())
+    world = World(KinematicModel(NAMES, FIRST).model, (), ())
     assert [(body.id, body.name, body.moving) for body in world.bodies] == [
         (i + 1, n, True) for i, n in enumerate(NAMES)
     ]
@@ -36,7 +35,7 @@ def test_bodies_have_the_ids_and_first_poses_of_the_scene() -> None:
 
 
 def test_state_has_the_poses_and_time_that_were_set() -> None:
-    carrier = Carrier(NAMES, FIRST)
+    carrier = KinematicModel(NAMES, FIRST)
     world = World(carrier.model, (), ())
     for seed, time_s in ((1, 12.3456), (2, 0.0)):
         world.restore_state(carrier.encode_state(time_s, random_poses(seed)))
@@ -44,24 +43,7 @@ def test_state_has_the_poses_and_time_that_were_set() -> None:
         assert (world.view().tick, world.view().sim_time) == (round(time_s / TICK_S), time_s)
 
 
-def test_state_and_model_survive_their_bytes() -> None:
-    carrier = Carrier(NAMES, FIRST)
-    world = World(carrier.model, (), ())
-    world.restore_state(carrier.encode_state(7.0, random_poses(3)))
-    again = World(decode_model(world.encode_model()), (), ())
-    again.restore(world.snapshot())
-    assert again.save_state() == world.save_state()
-    assert (read_poses(again) == read_poses(world)).all()
-
-
-def test_carried_bodies_do_not_move() -> None:
-    carrier = Carrier((), ())
-    world = World(carrier.model, (), ())
-    world.restore_state(carrier.encode_state(1.0, np.zeros((0, 7))))
-    assert (world.bodies, world.view().tick) == ((), 1000)
-
-
 @pytest.mark.parametrize("names", [("cup", "cup"), ("world",)])
 def test_invalid_names_are_rejected(names: tuple[str, ...]) -> None:
     with pytest.raises(ModelInvalidError, match="cannot be published"):
-        Carrier(names, FIRST[: len(names)])
+        KinematicModel(names, FIRST[: len(names)])
