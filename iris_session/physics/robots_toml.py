@@ -19,9 +19,8 @@ from typing import Any, Final
 
 import mujoco
 
-from iris_session.physics.errors import RobotsFileError, UnknownNameError, one_line
-from iris_session.physics.names import find_element_id, get_element_name, is_wire_name, list_body_names
-from iris_session.physics.specs import find_shared_by_robots
+from iris_session.physics.errors import RobotsFileError, one_line
+from iris_session.physics.names import find_element_id, get_element_name, is_wire_name
 from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.names import LeaseMode
 from iris_session.protocol.specs import RobotSpec
@@ -58,10 +57,7 @@ def load_robots_toml(path_or_text: str | Path, model: mujoco.MjModel) -> tuple[R
     if unknown or not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
         raise RobotsFileError(f"{where}: expected only [[robot]] tables, found {', '.join(unknown) or 'robot'}")
     tree = KinematicTree(model)
-    robots = tuple(_parse_robot(tree, table, f"{where}, robot {index + 1}") for index, table in enumerate(tables))
-    if shared := find_shared_by_robots(robots):
-        raise RobotsFileError(f"{where}: {shared}")
-    return robots
+    return tuple(_parse_robot(tree, table, f"{where}, robot {index + 1}") for index, table in enumerate(tables))
 
 
 def dump_robots_toml(robots: Sequence[RobotSpec], notes: Sequence[Mapping[str, str]] = ()) -> str:
@@ -183,10 +179,6 @@ def _base_body(tree: KinematicTree, fields: dict[str, Any], joints: list[int], s
 
 
 def _check_gripper(tree: KinematicTree, fields: dict[str, Any], where: str) -> None:
-    bodies = list_body_names(tree.model)
-    for body in fields.get("finger_bodies", ()):
-        if body not in bodies:
-            raise UnknownNameError("body", body, bodies[1:], where)
     name = fields.get("gripper_actuator", "")
     if not name:
         if fields.get("gripper_open", 0.0) or fields.get("gripper_closed", 0.0) or fields.get("finger_bodies"):

@@ -10,7 +10,7 @@ derived quantities are those of the state before it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final, NoReturn
 
 import msgspec
@@ -23,11 +23,12 @@ from iris_session.physics.errors import (
     ModelUnsupportedError,
     SimulationDivergedError,
     SnapshotError,
+    SpecError,
+    UnknownNameError,
     one_line,
 )
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.physics.names import find_element_id, list_body_names, list_element_names
-from iris_session.physics.specs import check_specs
 from iris_session.physics.tree import KinematicTree
 from iris_session.physics.view import Flexes, MujocoView
 from iris_session.protocol.common import Pose
@@ -75,7 +76,7 @@ _decoder = msgspec.msgpack.Decoder(_Saved)
 class World:
     """The simulated scene.
 
-    `keyframe`: the initial state by name; empty takes `home`, else the first keyframe, else the model's default state.
+    It begins with keyframe `home`, else the first keyframe, else the model's default state.
     Raises `UnknownNameError` for specs that do not fit the model, `SpecError` for those that do not fit each other, and
     `ModelUnsupportedError` for sleeping islands, whose hidden state MuJoCo cannot restore. The model must not be
     changed afterwards.
@@ -86,14 +87,13 @@ class World:
         model: mujoco.MjModel,
         robots: Sequence[RobotSpec],
         objects: Sequence[ObjectSpec],
-        keyframe: str = "",
     ) -> None:
         self.model = model
         _require_exact(model)
-        check_specs(model, robots, objects)
+        _check_specs(model, robots, objects)
         #: What control writes to, and what the view shows.
         self.data: Any = mujoco.MjData(model)
-        self._keyframe = _initial_keyframe(model, keyframe)
+        self._keyframe = _initial_keyframe(model)
         self._split = int(model.opt.integrator) in _SPLIT_INTEGRATORS
         self._state: NDArray[np.float64] = np.empty(mujoco.mj_stateSize(model, STATE))
         tree = KinematicTree(model)
@@ -357,9 +357,7 @@ def _require_exact(model: mujoco.MjModel) -> None:
         )
 
 
-def _initial_keyframe(model: mujoco.MjModel, name: str) -> int:
-    if name:
-        return find_element_id(model, "keyframe", name)
+def _initial_keyframe(model: mujoco.MjModel) -> int:
     names = list_element_names(model, "keyframe")
     return names.index(HOME) if HOME in names else min(0, model.nkey - 1)
 
@@ -387,3 +385,28 @@ def _robot_info(model: mujoco.MjModel, spec: RobotSpec) -> RobotInfo:
         T_body_site=Pose((x, y, z), (w, i, j, k)),
         gripper=bool(spec.gripper_actuator),
     )
+
+
+def _check_specs(model: mujoco.MjModel, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
+    """Raise `SpecError` for anything that two robots or two objects share, `UnknownNameError` for finger bodies."""
+    _check_claims("robot", ((robot.name, _list_owned(robot)) for robot in robots))
+    bodies = list_body_names(model)
+    for robot in robots:
+        for body in robot.finger_bodies:
+            if body not in bodies:
+                raise UnknownNameError("body", body, bodies[1:], f"robot {robot.name!r}: ")
+    _check_claims("object", ((item.name, (("name", item.name), ("body", item.body))) for item in objects))
+
+
+def _list_owned(robot: RobotSpec) -> list[tuple[str, str]]:
+    actuators = [name for name in (*robot.actuators, robot.gripper_actuator) if name]
+    return [("name", robot.name), *(("joint", j) for j in robot.joints), *(("actuator", a) for a in actuators)]
+
+
+def _check_claims(kind: str, claims: Iterable[tuple[str, Iterable[tuple[str, str]]]]) -> None:
+    owner: dict[tuple[str, str], str] = {}
+    for claimant, claimed in claims:
+        for key in claimed:
+            if key in owner:
+                raise SpecError(f"{key[0]} {key[1]!r} belongs to {kind} {owner[key]!r} and to {kind} {claimant!r}")
+            owner[key] = claimant

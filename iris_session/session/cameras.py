@@ -93,7 +93,9 @@ class SessionCameras:
         return [f"cameras: {', '.join(self._processes)}"] if self._processes else []
 
     def _spawn(self, start: CameraStart) -> ChildProcess:
-        return _spawn(msgspec.structs.replace(start, known_fault=self._processes[start.settings.stream].fault))
+        start = msgspec.structs.replace(start, known_fault=self._processes[start.settings.stream].fault)
+        # Of a session of its own: Ctrl-C of a terminal reaches only the parent, and the scheduler groups it apart.
+        return ChildProcess(_MODULE, config=msgspec.msgpack.encode(start), stdout=PIPE, own_session=True)
 
     def poll(self, now_ns: int) -> list[str]:
         """Start what was not started, and what has ended; return what is to be announced, a line each. Never waits."""
@@ -180,8 +182,3 @@ def load_camera_files(paths: Sequence[str | Path]) -> tuple[CloudSettings, ...]:
             "file has one"
         )
     return tuple(found)
-
-
-def _spawn(start: CameraStart) -> ChildProcess:
-    # Of a session of its own, so that Ctrl-C of a terminal reaches only the parent, and the scheduler groups it apart.
-    return ChildProcess(_MODULE, config=msgspec.msgpack.encode(start), stdout=PIPE, own_session=True)

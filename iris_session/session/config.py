@@ -135,12 +135,10 @@ class SessionConfig:
             )
         if not re.fullmatch(r"[A-Za-z0-9._:-]{0,64}", self.advertise):
             raise ConfigError(f"advertise {self.advertise!r} is not an address without port, for example 203.0.113.7")
-        for label in ("control_port", "state_port", "beacon_port"):
+        for label in ("control_port", "state_port", "beacon_port", "web_port"):
             port = getattr(self, label)
-            if not 0 <= port <= 65535:
+            if port is not None and not 0 <= port <= 65535:
                 raise ConfigError(f"{label} {port} is not a port: 0 (any free one) to 65535")
-        if self.web_port is not None and not 0 <= self.web_port <= 65535:
-            raise ConfigError(f"web_port {self.web_port} is not a port: 0 (any free one) to 65535")
         if bool(self.web_cert) != bool(self.web_key):
             raise ConfigError("web_cert and web_key belong together: give both, or none")
         if not 1.0 <= self.state_hz <= 240.0:

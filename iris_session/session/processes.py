@@ -196,18 +196,9 @@ class SessionProcesses:
         """Queue for the disk the data that resuming needs and the journal lacks: the front's state and its ports."""
         if self._note_writer is None or self.front is None or self.front.link.ports is None:
             return
-        config, ports = self._config, self.front.link.ports
-        listening = Listening(
-            config.host,
-            config.interfaces,
-            config.advertise,
-            config.beacon_port,
-            ports.control,
-            ports.state,
-            config.curve,
-            config.curve_key,
-            config.curve_clients,
-        )
+        ports = self.front.link.ports
+        given = {name: getattr(self._config, name) for name in Listening.__struct_fields__}
+        listening = Listening(**given | {"control_port": ports.control, "state_port": ports.state})
         self._note_writer.offer(ResumeNote(self.session_id, listening, self.front.link.handback))
 
     def _make_front_config(self) -> FrontConfig:
@@ -327,10 +318,8 @@ class SessionProcesses:
             announcements += self.front.poll(now_ns)
         if self.recorder is not None and self.feed is not None:
             announcements += self.recorder.poll(now_ns, self.feed.silence_ns, self.feed.stats.recorder)
-        if self.web is not None:
-            announcements += self.web.poll(now_ns)
-        if self.cameras is not None:
-            announcements += self.cameras.poll(now_ns)
+        for part in (self.web, self.cameras):
+            announcements += [] if part is None else part.poll(now_ns)
         for text in announcements:
             self._announce(stepper, text)
         self._report_overflows(stepper)
@@ -385,22 +374,16 @@ class SessionProcesses:
             drops["recorded_samples"] = 0 if last is None else last.samples_left_out
             drops["recorded_media"] = 0 if last is None else last.media_refused
             drops["recorded_assets"] = 0 if last is None else last.assets_left_out
-        if self.web is not None:
-            drops |= self.web.drops
-        if self.cameras is not None:
-            drops |= self.cameras.drops
+        for part in (self.web, self.cameras):
+            drops |= {} if part is None else part.drops
         drops |= self._overflows
         return {reason: count for reason, count in drops.items() if count}
 
     def count_restarts(self) -> dict[str, int]:
         """Return how often front and recorder were restarted, and the web gateway and cameras where they were."""
-        recorder = 0 if self.recorder is None else self.recorder.restarts
-        others = {
-            "web": 0 if self.web is None else self.web.restarts,
-            "cameras": 0 if self.cameras is None else self.cameras.restarts,
-        }
-        restarted = {name: n for name, n in others.items() if n}
-        return {"front": 0 if self.front is None else self.front.restarts, "recorder": recorder, **restarted}
+        parts = {"front": self.front, "recorder": self.recorder, "web": self.web, "cameras": self.cameras}
+        counts = {name: 0 if part is None else part.restarts for name, part in parts.items()}
+        return {name: n for name, n in counts.items() if n or name in ("front", "recorder")}
 
     def close(self) -> str:
         """End the front, which notifies its clients, then finish the recording. May be called twice.

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
-from types import TracebackType
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -27,7 +26,7 @@ from iris_session.session.deformables import DeformableSourceMesh
 from iris_session.session.errors import OwnershipError
 from iris_session.session.pending_state import Frame
 from iris_session.session.processes import SessionProcesses
-from iris_session.session.stepper import Stepper, end_error
+from iris_session.session.stepper import Stepper
 
 #: Silence after which steps without a frame begin, and their distance.
 IDLE_AFTER_NS: Final = 20_000_000
@@ -45,12 +44,9 @@ class PublishedVertices:
     def __init__(self, scene: ComposedScene) -> None:
         self.newest: Mapping[str, NDArray[np.float32]] = {name: one.vertices for name, one in scene.deformables.items()}
         self.meshes = tuple(
-            DeformableSourceMesh(one.stream, one.topology, self._make_reader(name))
+            DeformableSourceMesh(one.stream, one.topology, lambda name=name: self.newest[name])  # type: ignore[misc]
             for name, one in scene.deformables.items()
         )
-
-    def _make_reader(self, name: str) -> Callable[[], NDArray[np.floating]]:
-        return lambda: self.newest[name]
 
 
 class PublishLoop:
@@ -90,8 +86,6 @@ class PublishLoop:
         self._arrivals = ArrivalMonitor()
         self._closed = threading.Event()
         self._wake = threading.Event()
-        self._error: Exception | None = None
-        self._traceback: TracebackType | None = None
         with self.lock:
             self._take_idle_step()  # clients that join before the first frame see the scene as it was composed
         self._helper = threading.Thread(target=self._run_helper, name="iris-session-publish", daemon=True)
@@ -104,7 +98,7 @@ class PublishLoop:
         """Publish the pending frame if it is due; without one, take a step without a tick if the last is long ago."""
         with self.lock:
             now_ns = self._stepper.clock()
-            if self._closed.is_set() or self._error is not None:
+            if self._closed.is_set() or self._stepper.has_ended:
                 return
             if self._pending is not None and now_ns >= self._due_ns:
                 self._publish_pending()
@@ -139,8 +133,7 @@ class PublishLoop:
 
     def raise_if_ended(self) -> None:
         """Raise what stopped the helper, or `OwnershipError` after `close`."""
-        if self._error is not None:
-            raise self._error.with_traceback(self._traceback)  # else it would grow each time
+        self._stepper.raise_if_ended()
         if self._closed.is_set():
             raise OwnershipError("the session is closed: nothing can be published any more")
 
@@ -159,7 +152,7 @@ class PublishLoop:
         """Take a step with the pending frame, if there is one."""
         with self._pending_lock:
             frame, self._pending = self._pending, None
-        if frame is None or self._error is not None:
+        if frame is None or self._stepper.has_ended:
             return
         now_ns = self._stepper.clock()
         self._due_ns += self._period_ns  # a fixed rate, so that a source with jitter loses nothing
@@ -180,11 +173,7 @@ class PublishLoop:
             self._publish_state(now_ns - max(0, self._delay_ns), is_repeat=self._delay_ns >= 0)
 
     def _step(self, n_ticks: int, plant: bytes = b"") -> None:
-        try:
-            self._stepper.step(n_ticks, plant, publish=False)
-        except BaseException as error:  # the helper ends, whichever thread took the step; Ctrl-C interrupts one, too
-            self._fail(error)
-            raise
+        self._stepper.step(n_ticks, plant, publish=False)
         self._processes.supervise(self._stepper)
         self._step_ns = self._stepper.clock()
 
@@ -195,19 +184,15 @@ class PublishLoop:
         self._sent_ns = self._stepper.clock()
         self._stepper.publish_now(self._state_ns, self._shown_ns)
 
-    def _fail(self, error: BaseException) -> None:
-        self._error, self._traceback = end_error(error), error.__traceback__
-
     # --- the helper ---------------------------------------------------------------------------------------------------
 
     def _run_helper(self) -> None:
         try:
-            while not self._closed.is_set() and self._error is None:
+            while not self._closed.is_set() and not self._stepper.has_ended:
                 self._wake.wait(self._compute_pause_s())
                 self._wake.clear()
                 self.poll()
-        except BaseException as error:  # raised at the next `publish`, which may not come
-            self._fail(error)
+        except BaseException as error:  # the stepper raises it at the next `publish`, which may not come
             _log.error("the session stands still after an error: %s: %s", type(error).__name__, error)
 
     def _compute_pause_s(self) -> float:

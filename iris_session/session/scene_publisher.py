@@ -17,8 +17,8 @@ from __future__ import annotations
 import operator
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Final
 
 from numpy.typing import ArrayLike
@@ -28,7 +28,6 @@ from iris_session.physics.kinematic_model import KinematicModel
 from iris_session.protocol.entries import EntryMessage
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.result import ComposedScene
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import make_session_core
 from iris_session.session.errors import ConfigError, OwnershipError, PublishError, StartError
@@ -53,7 +52,7 @@ class ScenePublisher(SessionBase):
     everything that any thread has set before it. Call `start`, `close` and `signals` from one thread.
 
     Args:
-        scene: The scene. Names added to it after `start` are not shown.
+        scene: The scene. What is added to it after `start` is not shown.
         config: Settings; `None` for the defaults. `resume` is not possible, and `assets` cannot be False.
 
     Attributes:
@@ -71,7 +70,6 @@ class ScenePublisher(SessionBase):
         self.origin_ns = time.monotonic_ns()
         self.clock = make_session_clock(self.origin_ns)
         self._builder = scene
-        self._shown: frozenset[str] = frozenset()  # names in the builder when the session began
         self._stop = threading.Event()
         self._pending: PendingState | None = None
         self._loop: PublishLoop | None = None
@@ -100,17 +98,12 @@ class ScenePublisher(SessionBase):
         where = self.config.assets
         try:
             store = AssetStore(None if isinstance(where, bool) else where)
-            self._shown = self._builder.names
             composed = self._builder.build(store)
             kinematic_model = KinematicModel(composed.moving, composed.poses)
         except (SceneBuildError, PhysicsError) as error:
             raise ConfigError(f"the scene cannot be built: {error}") from None
         except OSError as error:
             raise StartError(f"assets: {error.filename or where}: {error.strerror or error}") from None
-        with _hold_assets(store, composed.addresses):  # until the processes hold them
-            self._begin(composed, kinematic_model)
-
-    def _begin(self, composed: ComposedScene, kinematic_model: KinematicModel) -> None:
         core = make_session_core(self.config, kinematic_model.model, None, (), (), user_owned=True)
         vertices = PublishedVertices(composed)
         published = PublishedScene(composed, vertices.meshes)
@@ -182,8 +175,7 @@ class ScenePublisher(SessionBase):
             PublishError: No such body, or a value that cannot be used; nothing has changed.
             OwnershipError: The session is not started, or closed.
         """
-        with self._explain_late_names(name):
-            self._require_parts()[0].set_pose(name, position, quaternion)
+        self._require_parts()[0].set_pose(name, position, quaternion)
 
     def set_poses(self, names: Sequence[str], positions: ArrayLike, quaternions: ArrayLike) -> None:
         """Set the poses of many bodies at once, all or none. The next `publish` sends them.
@@ -197,8 +189,7 @@ class ScenePublisher(SessionBase):
             PublishError: No such body, a name given twice, or a value that cannot be used; nothing has changed.
             OwnershipError: The session is not started, or closed.
         """
-        with self._explain_late_names(*(names if isinstance(names, list | tuple) else ())):
-            self._require_parts()[0].set_poses(names, positions, quaternions)
+        self._require_parts()[0].set_poses(names, positions, quaternions)
 
     def set_joints(self, name: str, positions: Mapping[str, float]) -> None:
         """Set joint positions of an articulation. The next `publish` sends them.
@@ -214,8 +205,7 @@ class ScenePublisher(SessionBase):
             PublishError: No such articulation or joint, or a value that cannot be used; nothing has changed.
             OwnershipError: The session is not started, or closed.
         """
-        with self._explain_late_names(name):
-            self._require_parts()[0].set_joints(name, positions)
+        self._require_parts()[0].set_joints(name, positions)
 
     def set_vertices(self, name: str, vertices: ArrayLike) -> None:
         """Set the vertices of a deformable. The next `publish` sends them.
@@ -228,8 +218,7 @@ class ScenePublisher(SessionBase):
             PublishError: No such deformable, another shape, or a value that cannot be used; nothing has changed.
             OwnershipError: The session is not started, or closed.
         """
-        with self._explain_late_names(name):
-            self._require_parts()[0].set_vertices(name, vertices)
+        self._require_parts()[0].set_vertices(name, vertices)
 
     def publish(self, time_s: float | None = None, *, capture_ns: int | None = None) -> None:
         """Publish all poses, joints and vertices as they are set now, as one state of the world.
@@ -302,19 +291,6 @@ class ScenePublisher(SessionBase):
 
     # --- inside ------------------------------------------------------------------------------------------------------
 
-    @contextmanager
-    def _explain_late_names(self, *names: object) -> Iterator[None]:
-        """Add to a `PublishError` the reason when a name was added to the builder after the session began."""
-        try:
-            yield
-        except PublishError as error:
-            late = [name for name in names if isinstance(name, str) and name in self._builder.names - self._shown]
-            if not late:
-                raise
-            raise PublishError(
-                f"{late[0]!r} was added after the session had begun, and is not shown: add everything before `with`"
-            ) from error
-
     def _queue_patch(self, patch: NextPatch) -> None:
         self._require_parts()[1].raise_if_ended()
         super()._queue_patch(patch)
@@ -327,13 +303,6 @@ class ScenePublisher(SessionBase):
         if self._pending is None or self._loop is None:
             raise OwnershipError("the session is not started: use `with ScenePublisher(...) as session`, or start()")
         return self._pending, self._loop
-
-
-def _hold_assets(store: AssetStore, addresses: Sequence[str]) -> AbstractContextManager[object]:
-    try:
-        return store.hold(addresses)
-    except OSError:  # no locks, or no room: the session reports it when it cannot hold them either
-        return nullcontext()
 
 
 def _check_arguments(scene: SceneBuilder, config: SessionConfig) -> SessionConfig:

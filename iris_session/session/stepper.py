@@ -216,13 +216,22 @@ class Stepper:
             publish: Publish the state when it is due. False: the state of this step does not exist yet, the caller
                 publishes it later.
         """
-        if self._ended is not None:
-            raise self._ended.with_traceback(self._ended_at)  # else it would grow each time
+        self.raise_if_ended()
         try:
             return self._step(n_ticks, plant, publish)
         except BaseException as error:
             self._ended, self._ended_at = end_error(error), error.__traceback__
             raise
+
+    def raise_if_ended(self) -> None:
+        """Raise what has ended the session in an earlier step."""
+        if self._ended is not None:
+            raise self._ended.with_traceback(self._ended_at)  # else it would grow each time
+
+    @property
+    def has_ended(self) -> bool:
+        """Return whether a step has raised."""
+        return self._ended is not None
 
     def _step(self, n_ticks: int, plant: bytes, publish: bool) -> StepOutcome:
         now_ns = self.clock()

@@ -22,9 +22,9 @@ ticks of the rounds before, so that robots keep their speed. At the end robots t
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
-from types import TracebackType
 from typing import Final
 
 import mujoco
@@ -74,6 +74,7 @@ _FIELDS: Final = {
 }
 
 Floats = NDArray[np.float64]
+_log = logging.getLogger(__name__)
 
 
 class _BorrowedArray:
@@ -144,8 +145,6 @@ class UserLoop:
         self._ticks_before = 0  # of the round before the newest, 0 when there is none
         self._in_tick = False
         self._was_reset = False
-        self._helper_error: BaseException | None = None
-        self._helper_traceback: TracebackType | None = None
         self._helper = threading.Thread(target=self._run_helper, name="iris-session-idle", daemon=True)
         self._helper.start()
 
@@ -279,8 +278,7 @@ class UserLoop:
     def _require_open(self) -> None:
         if self._closed.is_set():
             raise OwnershipError("the session is closed: no tick can be taken any more")
-        if self._helper_error is not None:
-            raise self._helper_error.with_traceback(self._helper_traceback)  # as in `Stepper.step`
+        self._stepper.raise_if_ended()
 
     def _finish_tick(self) -> bool:
         """Publish the state after a tick; return whether it is one after time went back."""
@@ -399,5 +397,5 @@ class UserLoop:
         try:
             while not self._closed.wait(IDLE_PERIOD_S):
                 self._step_if_idle()
-        except BaseException as error:  # raised at the user's next tick, where it is seen
-            self._helper_error, self._helper_traceback = error, error.__traceback__
+        except BaseException as error:  # the stepper raises it at the user's next tick, where it is seen
+            _log.error("the session stands still after an error: %s", error)

@@ -77,26 +77,6 @@ def test_mistakes_are_reported_with_valid_values(change: dict[str, str], text: s
     assert "\n" not in str(caught.value)
 
 
-def test_two_robots_share_no_joints_or_actuators(handover: mujoco.MjModel) -> None:
-    left, right = (dict(_dumped(spec)) for spec in find_robots(handover))
-    cases = [
-        ({"name": left["name"]}, "name 'left' belongs to robot 'left' and to robot 'left'"),
-        ({k: left[k] for k in ("joints", "actuators", "site", "base_body")}, "joint 'left/joint1' belongs to robot"),
-        ({"gripper_actuator": left["gripper_actuator"]}, "actuator 'left/gripper' belongs to robot 'left' and to rob"),
-    ]
-    for change, text in cases:
-        tables = [left, {**right, **change}]
-        toml = "".join("[[robot]]\n" + "".join(f"{k} = {v}\n" for k, v in t.items()) for t in tables)
-        with pytest.raises(RobotsFileError) as caught:
-            load_robots_toml(toml, handover)
-        assert text in str(caught.value)
-
-
-def _dumped(spec: object) -> list[tuple[str, str]]:
-    lines = dump_robots_toml([spec]).splitlines()  # type: ignore[list-item]
-    return [(k, v) for line in lines if " = " in line for k, v in [line.split(" = ", 1)]]
-
-
 def test_invalid_files_are_rejected(handover: mujoco.MjModel, tmp_path: Path) -> None:
     with pytest.raises(RobotsFileError, match=r"gone\.toml' cannot"):
         load_robots_toml(tmp_path / "gone.toml", handover)

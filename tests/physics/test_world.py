@@ -159,10 +159,7 @@ def test_reset_uses_home_then_the_first_keyframe_then_the_default(aloha: mujoco.
     world.reset()
     assert world.snapshot() == first
     assert world.view().tick == 0
-    assert World(model(xml.format(keys)), (), (), keyframe="up").data.qpos[0] == 1.0
     assert World(model(xml.format("")), (), ()).data.qpos[0] == 0.0
-    with pytest.raises(UnknownNameError, match=r"keyframe 'down' .*: up, home\."):
-        World(model(xml.format(keys)), (), (), keyframe="down")
     assert (World(aloha, (), ()).data.qpos == aloha.key_qpos[0]).all()
 
 

@@ -12,7 +12,6 @@ from iris_session.session import cameras as session_cameras
 from iris_session.session.cameras import SILENT_NS, SLOW_START_NS, SessionCameras, load_camera_files
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import StartError
-from iris_session.system.process import ChildProcess
 
 SECOND = 1_000_000_000
 
@@ -66,10 +65,10 @@ def test_each_process_of_an_encrypted_session_has_a_key(tmp_path: Path) -> None:
 
 
 def test_warnings_name_what_the_processes_cannot_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(start: object) -> ChildProcess:
+    def fail(*_: object, **__: object) -> None:
         raise OSError("no memory")
 
-    monkeypatch.setattr(session_cameras, "_spawn", fail)
+    monkeypatch.setattr(session_cameras, "ChildProcess", fail)
     cameras = SessionCameras(SessionConfig(cameras=(write_file(tmp_path, "room"),)))
     assert cameras.start(Ports("127.0.0.1", 1, 2)) == ["cameras: room"]
     assert cameras.list_warnings() == []
