@@ -89,10 +89,6 @@ class EmulatorProcess:
         reports = [self.reports.get(name) for name in self._awaited]
         return any(r is None or not (r.done or r.failed) for r in reports)
 
-    @property
-    def pid(self) -> int:
-        return self._process.pid
-
     def poll(self) -> None:
         """Read the newest report of each headset."""
         for line in self._process.read_available_lines():

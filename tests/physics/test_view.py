@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -13,7 +12,7 @@ from iris_session.demo.scenes.deformables import cloth_scene, soft_scene
 from iris_session.physics import UnknownNameError, World, find_objects, find_robots
 from iris_session.physics.contacts import ContactTables
 from iris_session.physics.tree import KinematicTree
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import ObjectContact, WorldView
 from tests.physics.models import GRIPPER_TENDON, model
 
@@ -91,23 +90,6 @@ def test_grasp_is_reported_with_its_force(cone: str) -> None:
     assert restored.view().object_contacts() == view.object_contacts()
 
 
-def test_gripper_force_agrees_with_mj_contact_force() -> None:
-    world = grasp_world("elliptic")
-    world.ctrl[3] = -20.0
-    for _ in range(300):
-        world.tick()
-    mujoco.mj_forward(world.model, world.data)
-    fingers = {mujoco.mj_name2id(world.model, int(mujoco.mjtObj.mjOBJ_BODY), n) for n in ("left_pad", "right_pad")}
-    expected, force = 0.0, np.zeros(6)
-    for i in range(int(world.data.ncon)):
-        if fingers & set(world.model.geom_bodyid[world.data.contact[i].geom].tolist()):
-            mujoco.mj_contactForce(world.model, world.data, i, force)
-            expected += force[0]
-    assert expected > 15.0
-    world.restore_state(world.save_state())
-    assert world.view().gripper_force("robot") == pytest.approx(expected, rel=1e-6)
-
-
 def test_single_finger_grips_only_where_it_is_the_only_one() -> None:
     world = grasp_world("elliptic")
     m, robots, objects = world.model, find_robots(world.model), find_objects(world.model)
@@ -142,37 +124,6 @@ def test_objects_touch_each_other_the_world_and_cloth() -> None:
     assert "near" not in found, "within the gap, but not touching"
 
 
-def find_contacts(world: World, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> set[tuple[str, str]]:
-    """Return the touching (object, body) pairs, one contact at a time."""
-    m, d = world.model, world.data
-    pairs = set()
-    for i in range(int(d.ncon)):
-        c = d.contact[i]
-        if c.efc_address >= 0:
-            a, b = (m.body(int(m.geom_bodyid[g])).name for g in c.geom)
-            pairs |= {(x, y) for x, y in ((a, b), (b, a)) if x in {o.body for o in objects}}
-    return pairs
-
-
-def test_contacts_match_a_simple_loop_in_the_handover_scene(handover: mujoco.MjModel) -> None:
-    robots, objects = find_robots(handover), find_objects(handover)
-    world = World(handover, robots, objects)
-    seen = set()
-    for k in range(600):
-        world.ctrl[:7] = handover.key_ctrl[0][:7] + 0.7 * np.sin(0.01 * k) * np.array([1, 1, 0, -1, 0, 1, 0])
-        world.tick()
-        pairs = find_contacts(world, robots, objects)
-        found = {
-            (c.object, other)
-            for c in world.view().object_contacts()
-            for other in (*c.others, *(f"{r}/" for r in c.touching))
-        }
-        assert {(o, b.split("/")[0] + "/" if "/" in b else b) for o, b in pairs} == found
-        seen |= found
-    assert ("hammer", "table") in seen
-    assert ("board", "table") in seen
-
-
 def test_poses_and_joints(panda: mujoco.MjModel) -> None:
     world = World(panda, find_robots(panda), ())
     view = world.view()
@@ -199,27 +150,6 @@ def test_unknown_names_are_rejected_with_known_ones(handover: mujoco.MjModel) ->
         view.gripper_force("lift")
     with pytest.raises(UnknownNameError, match=r"'nail' .* hammer, board"):
         view.object_pose("nail")
-
-
-def test_two_arms_on_a_shared_base_have_separate_contacts() -> None:
-    """A robots file may give two arms the same base; each body belongs to the arm whose joints move it."""
-    arm = """<body name="{s}1" pos="{x} 0 1"><joint name="{s}j1" axis="0 1 0"/><geom size=".03"/>
-      <body name="{s}2"><joint name="{s}j2" axis="1 0 0"/><geom size=".03"/>
-      <body name="{s}3"><joint name="{s}j3" axis="0 0 1"/><geom name="{s}g" size=".05" pos="0 0 -.1"/>
-      <site name="{s}tcp"/></body></body></body>"""
-    bodies = arm.format(s="l", x=-0.5) + arm.format(s="r", x=0.5)
-    m = model(
-        f"""<mujoco><worldbody><body name="torso">{bodies}</body>
-        <body name="ball" pos="-.5 0 .82"><freejoint/><geom size=".05"/></body></worldbody>
-        <actuator>{"".join(f'<motor name="{s}a{i}" joint="{s}j{i}"/>' for s in "lr" for i in (1, 2, 3))}</actuator>
-        </mujoco>"""
-    )
-    specs = tuple(
-        RobotSpec(s, tuple(f"{s}j{i}" for i in (1, 2, 3)), tuple(f"{s}a{i}" for i in (1, 2, 3)), f"{s}tcp", "torso")
-        for s in "lr"
-    )
-    world = World(m, specs, find_objects(m))
-    assert contacts_of(world)["ball"].touching == ("l",)
 
 
 # --- deformables of a world ---

@@ -20,7 +20,7 @@ from iris_session.physics import (
     find_objects,
     find_robots,
 )
-from iris_session.physics.world import STATE, RobotSignals, find_opening_law
+from iris_session.physics.world import STATE, RobotSignals
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from tests.models import MENAGERIE
@@ -360,23 +360,3 @@ def test_robot_signals_are_joints_openings_and_tips() -> None:
     assert values[4:].reshape(2, 3) == pytest.approx(data.site_xpos)
     assert signals.units == (("rad",), ("rad",))
     assert RobotSignals(model, []).read(data) == b""
-
-
-@pytest.mark.parametrize(
-    ("actuator", "law"),
-    [
-        ('position name="grip" joint="finger" kp="10"', (2.0, 0.0)),
-        ('position name="grip" joint="finger" kp="10" timeconst="0.1"', (2.0, 0.0)),
-        ('intvelocity name="grip" joint="finger" kp="10" actrange="-1 1"', None),  # `ctrl` is a velocity
-        ('motor name="grip" joint="finger"', None),
-    ],
-)
-def test_opening_of_a_gripper_is_known_of_position_actuators_only(
-    actuator: str, law: tuple[float, float] | None
-) -> None:
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><body><joint name="finger" type="slide"/><geom size="0.1"/></body></worldbody>'
-        f"<actuator><{actuator}/></actuator></mujoco>"
-    )
-    robot = RobotSpec("left", (), (), "tip", "base", gripper_actuator="grip", gripper_open=0.5, gripper_closed=0.0)
-    assert find_opening_law(model, 0, robot) == (None if law is None else pytest.approx(law))

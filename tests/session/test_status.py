@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,9 +11,9 @@ import pytest
 from iris_session.journal.feed import FeedStats
 from iris_session.journal.messages import RecorderStatus
 from iris_session.physics import Pacer
-from iris_session.protocol.client_messages import MoveAnchor, PlaceAlignment, TrackingEpoch
+from iris_session.protocol.client_messages import Acquire, MoveAnchor, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose
-from iris_session.protocol.entries import Entry, Join
+from iris_session.protocol.entries import Bye, Entry, Join
 from iris_session.protocol.names import Role
 from iris_session.protocol.status import AnchorReport, ParticipantReport, RecorderReport
 from iris_session.session.config import SessionConfig
@@ -77,6 +78,20 @@ def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
     assert row.tracking_epoch == 1
     session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
     assert session.people()["bob"].alignment_void_ns == -1
+
+
+def test_joins_denials_holds_and_leaves_are_logged(session: Session, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, "iris_session.session"):
+        session.step(bob(TICK_NS))
+        session.step(Entry(BOB, BOB, session.now_ns, Acquire(1, ("nothing",))))
+        session.step(Entry(BOB, BOB, session.now_ns, Bye()))
+    assert [word for text in caplog.messages for word in ("joined", "holds", "denied", "left:") if word in text] == [
+        "joined",
+        "holds",
+        "holds",
+        "denied",
+        "left:",
+    ]
 
 
 def test_report_lists_robots_and_holders(session: Session) -> None:

@@ -117,19 +117,3 @@ def test_silent_child_times_out_and_is_killed(module_folder: Path) -> None:
         assert child.read_available_lines() == []
         assert child.close(terminate_s=0.05) == -signal.SIGKILL
         assert child.close() == -signal.SIGKILL
-
-
-@pytest.mark.e2e
-def test_what_libraries_print_does_not_reach_who_reads_standard_output() -> None:
-    code = (
-        "import os, sys\n"
-        "from iris_session.system.process import take_stdout\n"
-        "own = take_stdout()\n"
-        "os.write(own, b'report\\n')\n"
-        "print('by Python', flush=True)\n"
-        "os.write(1, b'by a library')\n"
-        "os.write(own, b'report\\n')\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, timeout=60)
-    assert done.stdout == b"report\nreport\n"
-    assert done.stderr.splitlines() == [b"by Python", b"by a library"]
