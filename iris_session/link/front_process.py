@@ -76,7 +76,7 @@ class FrontProcess:
 
     @property
     def restarts(self) -> int:
-        """How often the front was replaced."""
+        """Number of times that the front was replaced."""
         return self._supervised.restarts
 
     def start(self, timeout_s: float = START_S) -> Ports:

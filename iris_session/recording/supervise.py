@@ -99,7 +99,7 @@ class RecorderProcess:
 
     @property
     def restarts(self) -> int:
-        """How often it was restarted."""
+        """Number of restarts."""
         return self._supervised.restarts
 
     @property

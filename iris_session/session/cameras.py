@@ -88,7 +88,6 @@ class SessionCameras:
                 partial(self._spawn, start),
                 CameraReport,
                 hang_ns=HANG_NS,
-                is_starting=lambda report: report.starting,
             )
         return [f"cameras: {', '.join(self._processes)}"] if self._processes else []
 

@@ -32,7 +32,10 @@ log = logging.getLogger(__name__)
 
 
 class ProcessReport(Protocol):
-    """Report of a process: what it has refused or dropped by reason, and why it ends, empty while all is well."""
+    """Report of a process: what it has refused or dropped by reason, and why it ends, empty while all is well.
+
+    One with `starting` says that the process still starts; by default it has started with its first report.
+    """
 
     @property
     def drops(self) -> dict[str, int]: ...
@@ -73,7 +76,6 @@ class SupervisedProcess(Generic[Report]):
             replaced when it does not report for `hang_ns`.
         describe_exit: Returns how a process ended, by its exit status.
         hang_ns: A process that has started and then does not report for this long is ended; 0: none ever is.
-        is_starting: Whether a process still starts, by a report of it; by default it has started with the first one.
 
     Attributes:
         report: The newest report of the process.
@@ -93,7 +95,6 @@ class SupervisedProcess(Generic[Report]):
         find_fault: Callable[[int], str] | None = None,
         describe_exit: Callable[[int], str] = describe_exit,
         hang_ns: int = 0,
-        is_starting: Callable[[Report], bool] = lambda _: False,
     ) -> None:
         self._title = title
         self._spawn = spawn
@@ -102,7 +103,6 @@ class SupervisedProcess(Generic[Report]):
         self._find_fault = find_fault or self._find_silence
         self._describe_exit = describe_exit
         self._hang_ns = hang_ns
-        self._is_starting = is_starting
         self._process: ChildProcess | None = None
         self._thread: threading.Thread | None = None
         self._backoff = Backoff(delays_ns)
@@ -133,7 +133,7 @@ class SupervisedProcess(Generic[Report]):
 
     @property
     def fails_repeatedly(self) -> bool:
-        """Whether one process after the other has ended, or could not be started."""
+        """True when one process after the other has ended, or could not be started."""
         return self._backoff.failures > 1
 
     @property
@@ -149,7 +149,7 @@ class SupervisedProcess(Generic[Report]):
     @property
     def is_starting(self) -> bool:
         """True until a report says that the process has started."""
-        return self.heard_ns is None or self._is_starting(self.report)
+        return self.heard_ns is None or getattr(self.report, "starting", False)
 
     @property
     def limit_ns(self) -> int:

@@ -58,7 +58,7 @@ def wait_reconnected(scenario: Scenario, server: SessionProcess, *clients: Clien
     def is_back(client: Client) -> bool:
         state = client.scene.state
         fresh = state is not None and client.session_now_ns() - state.header.session_time < 200_000_000
-        return client.ready and fresh and f"name={client.name} " in server.output
+        return client.ready and fresh and f"participant_joined   {client.name}" in server.output
 
     scenario.run_until(lambda: all(map(is_back, clients)), "all clients have reconnected")
 
