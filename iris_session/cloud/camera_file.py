@@ -199,7 +199,7 @@ class _Reader:
     def read(self) -> CloudSettings:
         try:
             document = tomllib.loads(self._text)
-        except (ValueError, RecursionError) as error:  # also a number or a nesting that Python does not take
+        except ValueError as error:
             line = re.search(r"line (\d+)", str(error))
             raise CameraFileError(f"{self._path}: {error}", line=int(line[1]) if line else 0) from error
         tables = document.get("cameras")
@@ -214,10 +214,19 @@ class _Reader:
         except msgspec.ValidationError as error:
             key, camera, text = _explain(error, document)
             raise self._error(key, text, camera) from error
-        self._check(settings)
+        if not is_stream_name(settings.stream):
+            raise self._error("stream", describe_bad_stream_name(settings.stream))
+        for index, camera in enumerate(settings.cameras):
+            if camera.name in {one.name for one in settings.cameras[:index]}:
+                raise self._error("name", f"two cameras are named {camera.name!r}: names must differ", index)
+            if not is_stream_name(stream := settings.name_picture_stream(camera.name)):
+                raise self._error("name", describe_bad_stream_name(stream), index)
+            self._check_source(camera, index)
+        if (n := len(settings.list_streams())) > MAX_STREAMS:
+            raise self._error(
+                "cameras", f"{n} streams, one for each camera's pictures: at most {MAX_STREAMS}; picture_hz = 0: none"
+            )
         return settings
-
-    # --- files that the tables name ---
 
     def _resolve(self, table: dict[str, Any], index: int) -> dict[str, Any]:
         """Return the table of a camera with the contents of the files that it names."""
@@ -257,34 +266,32 @@ class _Reader:
         """Return the path of a file that a camera names, relative to the camera file."""
         return self._path.parent / os.path.expanduser(path)
 
-    # --- checks ---
-
-    def _check(self, settings: CloudSettings) -> None:
-        if not is_stream_name(settings.stream):
-            raise self._error("stream", describe_bad_stream_name(settings.stream))
-        names: set[str] = set()
-        for index, camera in enumerate(settings.cameras):
-            if camera.name in names:
-                raise self._error("name", f"two cameras are named {camera.name!r}: names must differ", index)
-            names.add(camera.name)
-            stream = settings.name_picture_stream(camera.name)
-            if not is_stream_name(stream):
-                raise self._error("name", describe_bad_stream_name(stream), index)
-            if problem := _find_source_problem(camera):
-                raise self._error(*problem, index)
-            has_poses = camera.source == "folder" and any(Path(camera.path).glob("*.pose.txt"))
-            if self._calibrated and camera.pose is None and camera.source != "mujoco" and not has_poses:
-                file, out = (shlex.quote(str(one)) for one in (self._path, self._path.with_name("calibration.toml")))
-                raise self._error(
-                    "calibration",
-                    f"no calibration: `iris-session cloud calibrate {file} --out {out}` writes one, "
-                    'then calibration = "calibration.toml"; or pose = { position_m, quaternion_wxyz }',
-                    index,
-                )
-        if (n := len(settings.list_streams())) > MAX_STREAMS:
-            raise self._error(
-                "cameras", f"{n} streams, one for each camera's pictures: at most {MAX_STREAMS}; picture_hz = 0: none"
+    def _check_source(self, camera: CameraSettings, index: int) -> None:
+        """Raise the error of what the source of a camera cannot use, or lacks."""
+        model, reads = camera.intrinsics, camera.source in _READ_FROM_DISK
+        if model is not None and max(model.width, model.height) > MAX_IMAGE_SIZE:
+            text = (
+                f"intrinsics are of {model.width} x {model.height} pixels: at most {MAX_IMAGE_SIZE} x {MAX_IMAGE_SIZE}"
             )
+            raise self._error("intrinsics", f"{text} are possible", index)
+        for key in ("model", "camera") if camera.source == "mujoco" else ():
+            if not getattr(camera, key):
+                raise self._error(key, f"{key} is missing: a rendered camera needs model and camera", index)
+        if reads and not camera.path:
+            raise self._error("path", f"path is missing: source {camera.source!r} reads a file or folder", index)
+        if reads and not Path(camera.path).exists():
+            raise self._error("path", f"{camera.path!r} does not exist", index)
+        if camera.source == "folder" and model is None:
+            text = "intrinsics are missing: a file, or { width, height, fx, fy, cx, cy } in pixels"
+            raise self._error("intrinsics", text, index)
+        has_poses = camera.source == "folder" and any(Path(camera.path).glob("*.pose.txt"))
+        if self._calibrated and camera.pose is None and camera.source != "mujoco" and not has_poses:
+            file, out = (shlex.quote(str(one)) for one in (self._path, self._path.with_name("calibration.toml")))
+            text = (
+                f"no calibration: `iris-session cloud calibrate {file} --out {out}` writes one, "
+                'then calibration = "calibration.toml"; or pose = { position_m, quaternion_wxyz }'
+            )
+            raise self._error("calibration", text, index)
 
     def _error(self, key: str, message: str, camera: int | None = None) -> CameraFileError:
         """Return the error of a key, of the file or of one of its cameras."""
@@ -292,25 +299,6 @@ class _Reader:
         where = f"{self._path}, line {line}" if line else f"{self._path}"
         which = f"camera {camera + 1}: " if camera is not None else ""
         return CameraFileError(f"{where}: {which}{message}", key, line)
-
-
-def _find_source_problem(camera: CameraSettings) -> tuple[str, str] | None:
-    """Return key and description of what the source of a camera cannot use, None where there is nothing."""
-    model = camera.intrinsics
-    if model is not None and max(model.width, model.height) > MAX_IMAGE_SIZE:
-        wrong = f"intrinsics are of {model.width} x {model.height} pixels"
-        return "intrinsics", f"{wrong}: at most {MAX_IMAGE_SIZE} x {MAX_IMAGE_SIZE} are possible"
-    if camera.source == "mujoco":
-        missing = next((key for key in ("model", "camera") if not getattr(camera, key)), "")
-        return (missing, f"{missing} is missing: a rendered camera needs model and camera") if missing else None
-    if camera.source in _READ_FROM_DISK:
-        if not camera.path:
-            return "path", f"path is missing: source {camera.source!r} reads a file or folder"
-        if not Path(camera.path).exists():
-            return "path", f"{camera.path!r} does not exist"
-    if camera.source == "folder" and model is None:
-        return "intrinsics", "intrinsics are missing: a file, or { width, height, fx, fy, cx, cy } in pixels"
-    return None
 
 
 def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> tuple[str, int | None, str]:
@@ -324,7 +312,9 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> tuple[
         key = name or key
         value = value[name] if name else value[int(number)]
     if found := re.fullmatch(r"Object contains unknown field (.+)", message):
-        return found[1], camera, f"unknown key {found[1]!r}: known are {', '.join(_list_keys(key))}"
+        kind = {"cameras": CameraSettings, "pose": CameraPose, "T_base_camera": CameraPose, "T_ee_camera": CameraPose}
+        keys = [*kind.get(key, CloudSettings).__struct_fields__, *["calibration"][: key == "cameras"]]
+        return found[1], camera, f"unknown key {found[1]!r}: known are {', '.join(keys)}"
     if found := re.fullmatch(r"Object missing required field (.+)", message):
         return found[1], camera, f"{found[1]} is missing"
     if key in _CHOICES and isinstance(value, str):
@@ -360,7 +350,7 @@ def read_calibration(path: Path, camera: str, *, on_body: bool) -> tuple[CameraP
     text = _read_text(path, "calibration")
     try:
         document = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise CameraFileError(f"{path}: {error}", "calibration") from error
     cameras = document.get("cameras")
     part = cameras.get(camera) if isinstance(cameras, dict) else document
@@ -400,18 +390,6 @@ def find_line(text: str, key: str, camera: int | None = None) -> int:
         elif table == (-1 if camera is None else camera) and re.search(rf"^\s*\[?[\w.]*\b{re.escape(key)}\b", line):
             return number
     return at
-
-
-def _list_keys(table: str) -> list[str]:
-    """Return the keys of a table, named by the key that holds it."""
-    if table == "cameras":
-        return [*CameraSettings.__struct_fields__, "calibration"]
-    kinds: dict[str, type[msgspec.Struct]] = {
-        "pose": CameraPose,
-        "T_base_camera": CameraPose,
-        "T_ee_camera": CameraPose,
-    }
-    return list(kinds.get(table, CloudSettings).__struct_fields__)
 
 
 def _read_text(path: Path, kind: str) -> str:

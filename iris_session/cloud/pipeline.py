@@ -299,7 +299,9 @@ class CloudPipeline:
         self._next_voxel_m = choose_voxel_m(voxel_m, self._count_needed(n), settings.points, settings.voxel_m)
         if n > settings.points:  # as at the beginning, and when a camera turns to something near
             self.drops["budget"] += n - settings.points
-            points = _take_sample(points, settings.points, voxel_m)
+            # A fair sample, which keeps points at rest from frame to frame.
+            chosen = order_points(points.positions.T, voxel_m)[: settings.points]
+            points = PointSet(points.positions[chosen], points.colors[chosen], points.counts[chosen])
         times.append(clock_ns())
         error_m = max(self._states[name].error_m for name in frames)
         encoded = encode_cloud(points.positions, points.colors, voxel_m=voxel_m, error_m=error_m, classes=CLASSES)
@@ -383,9 +385,3 @@ def _join_frames(
         if not left[oldest]:
             del left[oldest]
     return {}, too_old
-
-
-def _take_sample(points: PointSet, n: int, voxel_m: float) -> PointSet:
-    """Return `n` of the points, a fair sample that keeps points at rest from frame to frame."""
-    chosen = order_points(points.positions.T, voxel_m)[:n]
-    return PointSet(points.positions[chosen], points.colors[chosen], points.counts[chosen])

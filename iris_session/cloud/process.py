@@ -218,12 +218,7 @@ class SessionSink:
             return False
 
 
-def run_cameras(
-    settings: CloudSettings,
-    client: Client,
-    on_report: OnReport,
-    is_ending: Callable[[], bool],
-) -> str:
+def run_cameras(settings: CloudSettings, client: Client, on_report: OnReport, is_ending: Callable[[], bool]) -> str:
     """Publish the cloud and the pictures of a camera file in a session.
 
     Args:
@@ -252,8 +247,7 @@ def run_cameras(
         on_report(CameraReport(settings.stream, starting=True))
 
         def report(one: CameraReport) -> None:
-            warnings = (one.warning, "" if robots is None else robots.warning)
-            warning = "; ".join(filter(None, warnings))
+            warning = "; ".join(filter(None, (one.warning, robots.warning if robots else "")))
             on_report(msgspec.structs.replace(one, warning=warning, starting=worker.cloud is None))
 
         try:
@@ -279,10 +273,7 @@ def _work(
         connected = client.wait_for(lambda one: one.ready, CONNECT_S)
         welcome = client.connection.welcome
         if connected and welcome is not None and welcome.session_id != session_id:
-            if session_id:
-                worker.restart_clock()
-            else:
-                worker.start()
+            worker.restart_clock() if session_id else worker.start()
             session_id = welcome.session_id
         if connected:
             worker.poll(POLL_S)
@@ -307,29 +298,16 @@ def find_taken_stream(settings: CloudSettings, delivery: DeliveryBudget | None) 
     return ""
 
 
-def make_client(start: CameraStart) -> Client:
-    """Return the client of a camera process."""
-    keys = (start.server_key, start.public_key, start.secret_key)
-    return Client(
-        host_port(start.host, start.control_port),
-        role=Role.CAMERA,
-        name=start.settings.stream,
-        curve=CurveKeys(*(one.encode() for one in keys)) if start.server_key else None,
-    )
-
-
-def write_report(descriptor: int, report: CameraReport) -> None:
-    """Write a report for the parent. One that does not read it is not waited for."""
-    with contextlib.suppress(OSError):
-        os.write(descriptor, msgspec.json.encode(report) + b"\n")
-
-
 def run_start(start: CameraStart, on_report: OnReport, is_ending: Callable[[], bool]) -> str:
     """Run the cameras of a process, and report why they end. Return it, empty where they were to end."""
     # Before the filter is compiled: on a busy machine that takes as long again as what was imported by now.
     on_report(CameraReport(start.settings.stream, starting=True))
+    keys = (start.server_key, start.public_key, start.secret_key)
+    curve = CurveKeys(*(one.encode() for one in keys)) if start.server_key else None
     try:
-        fault = run_cameras(start.settings, make_client(start), on_report, is_ending)
+        address = host_port(start.host, start.control_port)
+        client = Client(address, role=Role.CAMERA, name=start.settings.stream, curve=curve)
+        fault = run_cameras(start.settings, client, on_report, is_ending)
     except (ClientError, MissingExtraError) as error:
         fault = str(error)
     except Exception as error:
@@ -360,12 +338,16 @@ def main() -> int:
         signal.signal(signal.SIGHUP, on_signal)  # wakes the loop, which looks for its parent
         die_with_parent(signal.SIGHUP)
 
+    def write_report(report: CameraReport) -> None:
+        with contextlib.suppress(OSError):  # a parent that does not read is not waited for
+            os.write(reports, msgspec.json.encode(report) + b"\n")
+
     def is_ending() -> bool:
         return ending.is_set() or (start.parent_pid != 0 and not is_parent(start.parent_pid))
 
     gc.collect()
     gc.freeze()
-    fault = run_start(start, partial(write_report, reports), is_ending)
+    fault = run_start(start, write_report, is_ending)
     # A driver that hangs in a thread would keep the interpreter from ending.
     os._exit(1 if fault else 0)
 

@@ -12,7 +12,6 @@ from typing import Final
 
 from iris_session.cloud.frames import DepthSource, SourceEndedError, SourceError, SourceFrame
 from iris_session.cloud.health import CameraHealth, Fault
-from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.names import StreamFault
 from iris_session.system.backoff import Backoff
 from iris_session.system.extras import MissingExtraError
@@ -154,7 +153,7 @@ class SourceReader:
         self._close()
         with self._lock:
             said = " ".join(text.split()).removeprefix(f"camera {self._name!r}: ")
-            self._failure = (said or "the source failed")[:MAX_TEXT]
+            self._failure = said or "the source failed"
             self.failures += 1
         self._on_frame()
 

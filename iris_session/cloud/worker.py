@@ -11,6 +11,7 @@ import math
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
+from statistics import fmean
 from typing import Final, Protocol
 
 import msgspec
@@ -75,15 +76,13 @@ class _Stream:
     def restart(self) -> None:
         """Begin anew: for another session."""
         self.due_ns = 0
-        self._kind = ""
-        self._described_ns = -INFO_NS
+        self.described_ns = -INFO_NS
+        self.described: Fault | None = None
 
     def needs_info(self, fault: Fault | None, now_ns: int) -> bool:
         """Return whether the description is due: the kind of fault is another one, or a second has passed."""
-        return _kind(fault) != self._kind or now_ns - self._described_ns >= INFO_NS
-
-    def note_described(self, fault: Fault | None, now_ns: int) -> None:
-        self._kind, self._described_ns = _kind(fault), now_ns
+        kinds = {None if one is None else one.fault for one in (fault, self.described)}
+        return len(kinds) > 1 or now_ns - self.described_ns >= INFO_NS
 
     def is_due(self, hz: float, now_ns: int) -> bool:
         """Return whether another frame may be published, at most `hz` of them in the mean; count it then."""
@@ -147,8 +146,7 @@ class CloudWorker:
         self._reported_ns: int | None = None
         self._clouds = self._bytes = 0
         self._age_ms = 0.0
-        self._stages: defaultdict[str, float] = defaultdict(float)  # sums of durations [ms], and how many
-        self._stage_counts: Counter[str] = Counter()
+        self._stages: defaultdict[str, list[float]] = defaultdict(list)  # durations since the last report [ms]
 
     def _make_reader(self, camera: CameraSettings, open_source: OpenSource) -> SourceReader:
         settings, now_ns = self._settings, self._sink.now_ns
@@ -207,21 +205,19 @@ class CloudWorker:
         for name in self._readers:
             fault = self._find_camera_fault(name, now_ns)
             if fault is not None:
-                return Fault(fault.fault, f"camera {name}: {fault.detail}"[:MAX_TEXT])
+                return Fault(fault.fault, f"camera {name}: {fault.detail}")
         failure = self._failures.get(self._stream.name)
-        return None if failure is None else Fault(StreamFault.SOURCE, failure[:MAX_TEXT])
+        return None if failure is None else Fault(StreamFault.SOURCE, failure)
 
     def make_report(self, *, connected: bool = True, fault: str = "") -> CameraReport:
         """Return the state of the work, with rates and means since the last report."""
         now_ns = self._sink.now_ns()
         elapsed_s = (now_ns - (now_ns if self._reported_ns is None else self._reported_ns)) / SECOND
         self._reported_ns = now_ns
-        n, self._clouds = self._clouds, 0
-        sent, self._bytes = self._bytes, 0
-        age_ms, self._age_ms = self._age_ms, 0.0
-        stages_ms = {stage: total / self._stage_counts[stage] for stage, total in self._stages.items()}
+        n, sent, age_ms = self._clouds, self._bytes, self._age_ms
+        self._clouds, self._bytes, self._age_ms = 0, 0, 0.0
+        stages_ms = {stage: fmean(durations_ms) for stage, durations_ms in self._stages.items()}
         self._stages.clear()
-        self._stage_counts.clear()
         cloud = self.cloud
         return CameraReport(
             self._settings.stream,
@@ -269,7 +265,7 @@ class CloudWorker:
                 self._note_failure(picture, error)
                 return
             self._failures.pop(picture.name, None)
-            self._note_stage("jpeg", (self._clock_ns() - began_ns) / MILLISECOND)
+            self._stages["jpeg"].append((self._clock_ns() - began_ns) / MILLISECOND)
             self._publish(picture, data, new.frame.capture_ns, self._find_camera_fault(name, now_ns), now_ns)
 
     def _make_cloud(self, now_ns: int) -> bool:
@@ -285,12 +281,14 @@ class CloudWorker:
             return False
         self._failures.pop(self._stream.name, None)
         self.poses = {name: one.T_world_camera for name, one in frames.items()}
-        self._note_stage("read", max(self._readers[name].read_ms for name in frames))
-        for stage, duration_ms in cloud.stages_ms.items():
-            self._note_stage(stage, duration_ms)
+        for stage, duration_ms in {
+            "read": max(self._readers[name].read_ms for name in frames),
+            **cloud.stages_ms,
+        }.items():
+            self._stages[stage].append(duration_ms)
         began_ns = self._clock_ns()
         self._publish(self._stream, cloud.frames, cloud.capture_ns, self.find_fault(now_ns), now_ns)
-        self._note_stage("send", (self._clock_ns() - began_ns) / MILLISECOND)
+        self._stages["send"].append((self._clock_ns() - began_ns) / MILLISECOND)
         self._clouds += 1
         self._age_ms += (self._sink.now_ns() - cloud.capture_ns) / MILLISECOND
         return True
@@ -323,13 +321,12 @@ class CloudWorker:
             return
         self._has_sent = True
         if described:
-            stream.note_described(fault, now_ns)
+            stream.described, stream.described_ns = fault, now_ns
         self._bytes += len(frames) if isinstance(frames, bytes) else sum(map(len, frames.values()))
 
     def _make_info(self, stream: _Stream, fault: Fault | None) -> StreamInfo:
         settings = self._settings
-        names = [name for name, picture in self._pictures.items() if picture is stream]
-        name = names[0] if names else ""
+        name = next((name for name, picture in self._pictures.items() if picture is stream), "")
         camera = self._describe_camera(name or settings.cameras[0].name) if name or len(self._cameras) == 1 else None
         info = StreamInfo(
             title=(f"{settings.title}: {name}" if name else settings.title)[:MAX_TEXT],
@@ -376,14 +373,6 @@ class CloudWorker:
             "" if fault is None else fault.detail,
             reader.failures,
         )
-
-    def _note_stage(self, stage: str, duration_ms: float) -> None:
-        self._stages[stage] += duration_ms
-        self._stage_counts[stage] += 1
-
-
-def _kind(fault: Fault | None) -> str:
-    return "" if fault is None else fault.fault
 
 
 def encode_picture(color: Colors) -> bytes:

@@ -6,11 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from anchors.camera import CameraModel
 from iris_session.cloud.frames import DepthFrame
-from iris_session.cloud.health import CameraHealth, find_pose_fault
+from iris_session.cloud.health import CameraHealth
 from iris_session.protocol.names import StreamFault
 
 MS = 1_000_000
@@ -120,15 +119,6 @@ def test_frames_that_cannot_be_used_are_refused() -> None:
     assert health.check_frame(without_depth(make_frame(4)), CAMERA, 4 * MS)
 
 
-@pytest.mark.parametrize(
-    ("pose", "said"), [(np.eye(3), "shape (3, 3)"), (np.full((4, 4), np.inf), "not finite"), (np.eye(4), "")]
-)
-def test_what_is_wrong_with_a_pose_is_said(pose: NDArray[np.float64], said: str) -> None:
-    fault = find_pose_fault(make_frame(1)._replace(T_world_camera=pose))
-    assert said in ("" if fault is None else fault.detail)
-    assert (fault is None) == (said == "")
-
-
 def test_a_rate_far_below_what_is_asked_for() -> None:
     watch = Watch()
     assert watch.run(4000, hz=10) == "", "half of it is a camera that has no more"
@@ -136,7 +126,7 @@ def test_a_rate_far_below_what_is_asked_for() -> None:
     assert watch.run(3000) == ""
 
 
-@pytest.mark.parametrize("hz", [0.2, 0.3, 0.45, 1.0])
+@pytest.mark.parametrize("hz", [0.2, 0.45])
 def test_a_slow_camera_that_keeps_its_rate_is_not_slow(hz: float) -> None:
     health = CameraHealth(hz)
     health.restart(0)

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from anchors.camera import CameraModel, pose_to_matrix
-from anchors.pose import PoseTuple, quat_from_rotvec
+from anchors.camera import CameraModel
+from anchors.pose import PoseTuple
 from iris_session.cloud.camera_file import CameraPose, CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceFrame
 from iris_session.cloud.pipeline import CloudPipeline
-from iris_session.cloud.voxels import (
-    Floats,
-    PointSet,
-    VoxelFilter,
-    make_rays,
-)
+from iris_session.cloud.voxels import PointSet, VoxelFilter
 from iris_session.streams.cloud import decode_cloud
 
 MS = 1_000_000
@@ -33,13 +27,6 @@ def make_frame(capture_ms: float, depth_mm: int = 1500, color: int = 100, **chan
     depth = np.full((120, 160), depth_mm, np.uint16)
     frame = DepthFrame(depth, np.full((120, 160, 3), color, np.uint8), round(capture_ms * MS))
     return SourceFrame(frame._replace(**changes), CAMERA, 0.001)
-
-
-def place(x: float) -> Floats:
-    """Return the pose of a camera at `x` that looks along z."""
-    pose = np.eye(4)
-    pose[0, 3] = x
-    return pose
 
 
 def make_pipeline(
@@ -144,17 +131,7 @@ def capture_evenly(hz: float, phase_ms: float = 0.0, late_ms: float = 5.0) -> Ca
     return lambda number: (1000.0 * number / hz + phase_ms, 1000.0 * number / hz + phase_ms + late_ms)
 
 
-@pytest.mark.parametrize(
-    ("hz", "phase_ms"),
-    [
-        (30, 0),
-        (30, 20),
-        (15, 33),
-        (10, 60),
-        (5, 45),
-        (1, 14),
-    ],
-)
+@pytest.mark.parametrize(("hz", "phase_ms"), [(30, 20), (15, 33), (5, 45), (1, 14)])
 def test_cameras_of_any_rate_and_phase_are_joined(hz: int, phase_ms: int) -> None:
     sight = run_cameras(capture_evenly(hz), capture_evenly(hz, phase_ms), seconds=max(3.0, 6.0 / hz))
     assert sight.count("0", "1") >= max(2 * hz - 1, 3)
@@ -163,7 +140,7 @@ def test_cameras_of_any_rate_and_phase_are_joined(hz: int, phase_ms: int) -> Non
     assert not sight.left_out
 
 
-@pytest.mark.parametrize(("hz", "phase_ms"), [(8, 60), (5, 100), (1, 500)])
+@pytest.mark.parametrize(("hz", "phase_ms"), [(8, 60), (1, 500)])
 def test_cameras_that_are_never_close_in_time_are_shown_in_turn(hz: int, phase_ms: int) -> None:
     sight = run_cameras(capture_evenly(hz), capture_evenly(hz, phase_ms))
     assert sight.count("0", "1") == 0
@@ -207,7 +184,7 @@ def test_a_camera_that_stops_does_not_stop_the_cloud() -> None:
     assert len([at for at, _ in sight.clouds if at > 2100]) >= 26, "it is not waited for any more"
 
 
-@pytest.mark.parametrize(("late_ms", "least"), [(100.0, 18), (200.0, 10), (400.0, 5)])
+@pytest.mark.parametrize(("late_ms", "least"), [(100.0, 18), (400.0, 5)])
 def test_frames_that_take_long_are_joined(late_ms: float, least: int) -> None:
     """As drawn ones do on a slow machine."""
     sight = run_cameras(capture_evenly(30), capture_evenly(30, late_ms=late_ms))
@@ -216,22 +193,13 @@ def test_frames_that_take_long_are_joined(late_ms: float, least: int) -> None:
     assert not sight.left_out
 
 
-@pytest.mark.parametrize("late_ms", [600.0, 5000.0])
+@pytest.mark.parametrize("late_ms", [600.0])
 def test_a_camera_whose_captures_are_dated_too_early_is_named(late_ms: float) -> None:
     """Its driver dates frames by another clock."""
     sight = run_cameras(capture_evenly(30), capture_evenly(30, -late_ms, late_ms + 5.0))
     assert sight.left_out == {"1"}
     assert len(sight.clouds) >= 50
     assert sight.pipeline.drops["join"] >= 50
-
-
-def test_captures_of_all_cameras_may_go_back() -> None:
-    def back(number: int) -> tuple[float, float]:
-        captured = 1000.0 * number / 30.0
-        return captured - (900.0 if number > 45 else 0.0), captured + 5.0
-
-    sight = run_cameras(back, back)
-    assert len([at for at, _ in sight.clouds if at > 2100]) >= 24
 
 
 def test_the_voxel_meets_the_budget_and_no_frame_is_above_it() -> None:
@@ -300,13 +268,6 @@ def test_waiting_frames_are_bounded() -> None:
     assert pipeline.drops["superseded"] == 7
 
 
-def test_a_frame_with_a_pose_of_its_own_is_placed_by_it() -> None:
-    pipeline = make_pipeline("front")
-    pipeline.offer("front", make_frame(0, T_world_camera=place(-7.0)), 0)
-    cloud = pipeline.make_cloud(pipeline.take_frames(0))
-    assert decode_cloud(cloud.frames["full"]).positions[:, 0].mean() == pytest.approx(-7.0, abs=0.05)
-
-
 def test_points_are_removed_at_the_time_of_capture() -> None:
     class Remover:
         """Removes the right half, once it knows about that time."""
@@ -324,31 +285,14 @@ def test_points_are_removed_at_the_time_of_capture() -> None:
             return PointSet(points.positions[kept], points.colors[kept], points.counts[kept])
 
     remover = Remover()
-    pipeline = make_pipeline("front", remover=remover)
+    pipeline = make_pipeline("front", "back", remover=remover)
     pipeline.offer("front", make_frame(20), 30 * MS)
+    pipeline.offer("back", make_frame(10), 30 * MS)
     assert pipeline.take_frames(30 * MS) == {}, "the state of that moment is not there yet"
     remover.known_ns = 25 * MS
     cloud = pipeline.make_cloud(pipeline.take_frames(32 * MS))
-    assert remover.asked == [20 * MS]
+    assert remover.asked == [10 * MS, 20 * MS], "at the time of each camera"
     assert decode_cloud(cloud.frames["full"]).positions[:, 0].max() < 0.001
-
-
-def test_points_are_removed_at_the_time_of_each_camera() -> None:
-    asked: list[int] = []
-
-    class Remover:
-        def is_ready(self, capture_ns: int) -> bool:
-            return True
-
-        def remove(self, points: PointSet, capture_ns: int) -> PointSet:
-            asked.append(capture_ns)
-            return points
-
-    pipeline = make_pipeline("left", "middle", "right", remover=Remover())
-    for name, at in (("left", 60), ("middle", 20), ("right", 60)):
-        pipeline.offer(name, make_frame(at), 60 * MS)
-    assert pipeline.make_cloud(pipeline.take_frames(60 * MS)).capture_ns == 20 * MS
-    assert asked == [20 * MS, 60 * MS]
 
 
 def test_a_cloud_without_points_is_one() -> None:
@@ -357,41 +301,6 @@ def test_a_cloud_without_points_is_one() -> None:
     cloud = pipeline.make_cloud(pipeline.take_frames(0))
     assert cloud.n_points == 0
     assert len(decode_cloud(cloud.frames["full"]).positions) == 0
-
-
-def test_another_clock_drops_what_waits() -> None:
-    pipeline = make_pipeline("front")
-    pipeline.offer("front", make_frame(0), 0)
-    pipeline.clear()
-    assert pipeline.take_frames(0) == {}
-
-
-def test_a_camera_on_a_moving_hand_draws_a_still_wall() -> None:
-    """A wall at z = 2 m, seen from a hand that turns and moves."""
-    rays = make_rays(CAMERA)
-
-    def hand(capture_ns: int) -> PoseTuple:
-        t = capture_ns / 1000 / MS
-        return (0.3 * math.sin(3.0 * t), 0.2 * t, 0.1 * t), quat_from_rotvec((0.2 * t, -0.3 * t, 0.1))
-
-    pose_on_hand = CameraPose((0.05, 0.0, 0.1), quat_from_rotvec((0.1, 0.0, 0.0)))
-    camera = CameraSettings(name="hand", source="folder", pose=pose_on_hand, body="hand", farthest_m=100.0)
-    low, high = (-100.0, -100.0, -100.0), (100.0, 100.0, 100.0)
-    pipeline = CloudPipeline(
-        CloudSettings(stream="room", voxel_m=VOXEL_M, low=low, high=high, cameras=(camera,)),
-        lambda: 0,
-        body_pose=lambda body, at: hand(at),
-        voxels=VoxelFilter(VOXEL_M, use_numba=False),
-    )
-    for at in (0, 300, 700):
-        pose = pose_to_matrix(hand(at * MS)) @ pose_on_hand.to_matrix()
-        along = pose[2, 0] * rays.x + pose[2, 1] * rays.y + pose[2, 2]
-        depth = np.rint((2.0 - pose[2, 3]) / along / 0.0001).astype(np.uint16)
-        pipeline.offer("hand", make_frame(at, depth=depth)._replace(depth_scale_m=0.0001), at * MS)
-        cloud = pipeline.make_cloud(pipeline.take_frames(at * MS))
-        z = decode_cloud(cloud.frames["full"]).positions[:, 2]
-        assert len(z) > 1000
-        assert np.abs(z - 2.0).max() < 0.001
 
 
 def test_a_camera_without_a_pose_does_not_stop_the_other() -> None:

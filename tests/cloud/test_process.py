@@ -204,35 +204,16 @@ def test_shapes_that_are_missing_are_a_warning_and_fetched_again(monkeypatch: py
     monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed=dict(failed)))
     lab = Lab()
     robots = SessionRobots(lab.client, lab.history)
-    at_ns = 0
-
-    def fetch_again() -> str:
-        nonlocal at_ns
-        robots.is_ready(at_ns)
+    for number, (warning, n_built) in enumerate((("2 shapes", 1), ("2 shapes", 1), ("1 shapes", 2), ("", 3))):
+        robots.is_ready(number * FETCH_AGAIN_NS)
         wait_for_fetch(robots)
-        at_ns += FETCH_AGAIN_NS
-        return robots.warning
-
-    assert fetch_again() == "points on robots stay in the cloud: 2 shapes are missing"
+        assert (len(built), warning in robots.warning) == (n_built, True), "again while something new comes"
+        if number:
+            failed.popitem() if failed else None
     assert len(robots.remove(make_points(), 0).positions) == 1, "those that are there are used"
-    fetch_again()
-    assert len(built) == 1, "nothing has come"
-    del failed["a"]
-    assert fetch_again() == "points on robots stay in the cloud: 1 shapes are missing"
-    failed.clear()
-    assert fetch_again() == ""
-    assert len(built) == 3
     thread = robots._thread
-    robots.is_ready(at_ns)
+    robots.is_ready(4 * FETCH_AGAIN_NS)
     assert robots._thread is thread, "all are there"
-
-
-def test_shapes_of_a_session_without_robots_are_not_fetched() -> None:
-    lab = Lab()
-    lab.client.mirror.robots = {}
-    robots = SessionRobots(lab.client, lab.history)
-    assert robots.is_ready(0)
-    assert robots._thread is None
 
 
 def test_bodies_without_poses_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,9 +243,7 @@ def test_a_frame_that_cannot_be_sent_is_dropped(error: Exception) -> None:
         raise error
 
     client: Any = SimpleNamespace(media=SimpleNamespace(publish=publish))
-    sink = SessionSink(client)
-    assert not sink.publish("room", b"", 0, "cloud", None)
-    assert not sink.publish("room", b"", 0, "cloud", None)
+    assert not SessionSink(client).publish("room", b"", 0, "cloud", None)
 
 
 def test_a_stream_that_another_source_has_is_named_with_the_key_to_change() -> None:

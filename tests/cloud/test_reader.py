@@ -111,17 +111,6 @@ def test_another_clock_forgets_the_frames_and_opens_the_source_anew() -> None:
     assert (len(lab.sources), lab.reader.failures) == (2, 0)
 
 
-def test_a_frame_that_comes_while_the_clock_changes_is_forgotten() -> None:
-    class Changing(FakeSource):
-        def read(self, timeout_s: float) -> None:
-            lab.reader.restart_clock()
-            return super().read(timeout_s)  # type: ignore[return-value]
-
-    lab = Lab(make_source=Changing)
-    lab.read(0)
-    assert lab.reader.take_frame() is None
-
-
 def test_a_recording_is_expected_to_come_at_its_own_rate() -> None:
     lab = Lab(30.0, lambda: FakeSource(recorded_hz=5.0))
     for _ in range(25):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -90,17 +89,6 @@ def test_cloud_and_picture_of_a_camera() -> None:
     assert (cloud_info.title, cloud_info.audience, cloud_info.fault) == ("Room", "remote", "")
 
 
-def test_the_description_comes_once_a_second() -> None:
-    lab = Lab("front", hz=100.0)
-    for _ in range(250):
-        lab.step(10, "front")
-    told = [one[2] for one in lab.sink.published if one[4] is not None]
-    assert len(lab.sink.published) > 200
-    gaps = [(b - a) * 1e-9 for a, b in itertools.pairwise(told)]
-    assert len(gaps) == 2
-    assert all(1.0 <= gap < 1.1 for gap in gaps)
-
-
 def test_clouds_and_pictures_have_the_rate_that_is_asked_for() -> None:
     lab = Lab("front", hz=5.0, picture_hz=2.0)
     for _ in range(100):  # 4 s of a camera at 25 Hz
@@ -109,37 +97,6 @@ def test_clouds_and_pictures_have_the_rate_that_is_asked_for() -> None:
     assert 20 <= streams.count("room") <= 22
     assert 8 <= streams.count("room-front") <= 10
     assert lab.worker.count_drops()["superseded"] >= 70
-
-
-@pytest.mark.parametrize("hz", [4.0, 7.0, 30.0])
-def test_a_cloud_has_the_rate_of_its_cameras(hz: float) -> None:
-    lab = Lab("left", "right", hz=30.0)
-    for _ in range(round(3 * hz)):
-        lab.step(500 / hz, "left")
-        lab.step(500 / hz, "right")
-    clouds = [one for one in lab.sink.published if one[1]]
-    assert len(clouds) >= 2 * 3 * hz - 3 if hz < 10.0 else len(clouds) >= 3 * hz - 3, "each or both in a cloud"
-
-
-def test_a_disk_or_bus_that_is_too_slow_is_named() -> None:
-    lab = Lab("front", hz=30.0, picture_hz=10.0)
-    for _ in range(90):
-        lab.step(33, "front")
-    assert lab.fault() == ("", "")
-    lab.worker.make_report()
-    for _ in range(13):
-        lab.step(150, "front", late_ms=120)
-    for stream in ("room", "room-front"):
-        fault, detail = lab.fault(stream)
-        assert fault == StreamFault.SLOW
-        assert "frames per second come, 30 are asked for" in detail
-    report = lab.worker.make_report()
-    assert report.cameras["front"].fault == StreamFault.SLOW
-    assert report.stages_ms["read"] > 40.0, "the age of frames says that reading takes long"
-    assert len([one for one in lab.sink.published[-26:] if one[0] == "room" and one[1]]) == 13, "what comes is shown"
-    for _ in range(65):
-        lab.step(33, "front")
-    assert lab.fault() == ("", "")
 
 
 @pytest.mark.parametrize("jump_ms", [-5000.0, 3000.0])
@@ -183,15 +140,6 @@ def test_a_fault_whose_text_changes_is_told_once_a_second() -> None:
     for _ in range(250):
         lab.step(10)
     assert len(lab.sink.published) == 3
-
-
-def test_a_camera_that_fails_does_not_stop_the_other() -> None:
-    lab = Lab("left", "right")
-    lab.fail("right", SourceError("gone"))
-    lab.step(40, "left")
-    assert lab.worker.cloud is not None
-    assert lab.worker.cloud.cameras == ("left",)
-    assert lab.fault() == (StreamFault.SOURCE, "camera right: gone")
 
 
 def test_frames_that_cannot_be_made_end_nothing(

@@ -14,14 +14,14 @@ from scipy.spatial import cKDTree
 from anchors.camera import CameraModel
 from iris_session.cloud.camera_file import CameraPose, CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceEndedError, SourceError
-from iris_session.cloud.sources import open_source
 from iris_session.cloud.voxels import DepthLimits, VoxelFilter, make_rays
+from tests.cloud.sources.test_rerun_recording import read_source
 
 CAMERA = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5)
 
 
 def make_settings(folder: Path, camera: CameraModel = CAMERA, *, loop: bool = False) -> CameraSettings:
-    return CameraSettings(name="front", source="folder", path=str(folder), intrinsics=camera, hz=240.0, loop=loop)
+    return CameraSettings(name="front", source="folder", path=str(folder), intrinsics=camera, hz=100.0, loop=loop)
 
 
 def write_frame(folder: Path, name: str, depth: int, color: tuple[int, int, int] = (10, 20, 30)) -> None:
@@ -31,16 +31,7 @@ def write_frame(folder: Path, name: str, depth: int, color: tuple[int, int, int]
 
 
 def read_all(settings: CameraSettings) -> list[DepthFrame]:
-    ticks = iter(range(0, 10**12, 4_166_667))  # each call is a frame later
-    source = open_source(settings, lambda: next(ticks))
-    frames = []
-    try:
-        while (frame := source.read(1.0)) is not None:
-            frames.append(frame)
-    except SourceEndedError:
-        pass
-    source.close()
-    return frames
+    return read_source(settings)[1]
 
 
 def test_frames_are_read_in_order_of_their_names(tmp_path: Path) -> None:
@@ -50,7 +41,7 @@ def test_frames_are_read_in_order_of_their_names(tmp_path: Path) -> None:
     assert [int(frame.depth[0, 0]) for frame in frames] == [1000, 1001, 1002]
     assert [frame.color[5, 5].tolist() for frame in frames] == [[k, 50, 200] for k in range(3)]
     assert all(frame.T_world_camera is None for frame in frames)
-    assert np.diff([frame.capture_ns for frame in frames]).tolist() == [4_166_667, 4_166_666]
+    assert np.diff([frame.capture_ns for frame in frames]).tolist() == [10_000_000] * 2
 
 
 def test_poses_are_in_the_frame_that_the_camera_file_places(tmp_path: Path) -> None:
@@ -73,27 +64,14 @@ def spoil(folder: Path, how: str) -> None:
         (folder / "b.color.png").unlink()
     elif how == "damaged depth":
         (folder / "b.depth.png").write_bytes((folder / "b.depth.png").read_bytes()[:50])
-    elif how == "depth of 8 bits":
-        cv2.imwrite(str(folder / "b.depth.png"), np.zeros((48, 64), np.uint8))
-    elif how == "another view":
-        cv2.imwrite(str(folder / "b.color.png"), np.zeros((36, 64, 3), np.uint8))
     elif how == "no pose":
         np.savetxt(folder / "a.pose.txt", np.eye(4))
     elif how == "half a pose":
         for name in "ab":
             np.savetxt(folder / f"{name}.pose.txt", np.eye(4)[:2])
-    elif how == "pose of words":
-        for name in "ab":
-            (folder / f"{name}.pose.txt").write_text("here")
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        "no frames", "no colour", "damaged depth", "depth of 8 bits", "another view", "no pose", "half a pose",
-        "pose of words",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("how", ["no frames", "no colour", "damaged depth", "no pose", "half a pose"])
 def test_what_is_missing_or_damaged_is_named(tmp_path: Path, how: str) -> None:
     for name in "ab":
         write_frame(tmp_path, name, 1000)

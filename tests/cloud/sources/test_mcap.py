@@ -14,8 +14,7 @@ import pytest
 from anchors.camera import CameraModel
 from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceEndedError, SourceError
-from iris_session.cloud.sources import open_source
-from tests.cloud.sources.test_rerun_recording import SHAPE, N, encode, make_color, make_depth
+from tests.cloud.sources.test_rerun_recording import SHAPE, N, encode, make_color, make_depth, read_source
 
 pytest.importorskip("mcap_ros2")
 pytest.importorskip("mcap_protobuf")
@@ -152,19 +151,7 @@ def open_foxglove(file: Any, form: str) -> tuple[Callable[..., None], Callable[[
 
 
 def read_all(path: Path, **values: Any) -> tuple[Any, list[DepthFrame]]:
-    """Return the source, closed, and its frames, on a clock that is a frame later at each look."""
-    ticks = iter(range(0, 10**12, STEP_NS))
-    source = open_source(
-        CameraSettings(name="a", source="mcap", path=str(path), loop=False, **values), lambda: next(ticks)
-    )
-    frames = []
-    try:
-        while (frame := source.read(1.0)) is not None:
-            frames.append(frame)
-    except SourceEndedError:
-        pass
-    source.close()
-    return source, frames
+    return read_source(CameraSettings(name="a", source="mcap", path=str(path), loop=False, **values))
 
 
 def check(source: Any, frames: list[DepthFrame]) -> None:
@@ -186,7 +173,7 @@ def test_messages_of_ros_2(tmp_path: Path, depth: str, color: str) -> None:
 
 @pytest.mark.parametrize(
     ("model", "coefficients"),
-    [("", [0.1, 0.2, 0.3, 0.4]), ("rational_polynomial", [0.1] * 8), ("plumb_bob", [0.1] * 5)],
+    [("", [0.1, 0.2, 0.3, 0.4]), ("rational_polynomial", [0.1] * 8)],
 )
 def test_a_lens_of_opencv_s_model_is_taken(tmp_path: Path, model: str, coefficients: list[float]) -> None:
     write_ros2(tmp_path / "a.mcap", lens=(model, coefficients))
@@ -213,13 +200,7 @@ def test_messages_of_foxglove(tmp_path: Path, form: str) -> None:
 
 @pytest.mark.parametrize(
     ("written", "values"),
-    [
-        ({"info": False}, {}),
-        ({"depth": ""}, {}),
-        ({"color": ""}, {}),
-        ({"color": "yuv"}, {}),
-        ({}, {"depth": "/other"}),
-    ],
+    [({"info": False}, {}), ({"depth": ""}, {}), ({"color": "yuv"}, {}), ({}, {"depth": "/other"})],
 )
 def test_what_is_missing_is_named(tmp_path: Path, written: dict[str, Any], values: dict[str, Any]) -> None:
     write_ros2(tmp_path / "a.mcap", **written)
@@ -236,7 +217,6 @@ def test_what_is_missing_is_named(tmp_path: Path, written: dict[str, Any], value
         ("/cam/depth", "RawImage", {"encoding": "16UC1"}),
         ("/cam/depth", "RawImage", {"encoding": "16UC1", "height": 48, "width": 64, "step": 128, "data": bytes(100)}),
         ("/cam/calibration", "CameraCalibration", {"width": 64, "height": 48, "K": [50.0], "D": []}),
-        ("/cam/calibration", "CameraCalibration", {"K": MATRIX}),
     ],
 )
 def test_messages_that_lack_what_their_schemas_say_are_refused(

@@ -110,18 +110,6 @@ def test_points_lie_on_the_surfaces(camera: MujocoCamera, tmp_path: Path) -> Non
     assert np.median(errors) < 0.001
 
 
-def test_colour_is_that_of_the_same_pixels(camera: MujocoCamera) -> None:
-    frame = read(camera)
-    points, measured = deproject(camera, frame)
-    colors = frame.color[measured].astype(int)
-    top = np.abs(points[:, 2] - 0.3) < 0.003
-    floor = np.abs(points[:, 2]) < 0.003
-    assert top.sum() > 1000
-    assert floor.sum() > 1000
-    assert (colors[top, 0] > 2 * colors[top, 1]).mean() > 0.98
-    assert (colors[floor, 1] > 2 * colors[floor, 0]).mean() > 0.98
-
-
 def test_a_frame_is_of_the_time_of_the_state_that_it_shows(tmp_path: Path, poses: Poses) -> None:
     now = [10**9]
     source = MujocoCamera(make_settings(tmp_path, width=64, height=48), lambda: now[0], poses)

@@ -71,13 +71,6 @@ def test_frames_come_at_their_times_and_again_after_the_end() -> None:
     assert clock.t_ns == 5_120 * MS
 
 
-def test_a_recording_that_does_not_loop_ends() -> None:
-    recording = Recording(Clock(), [0, 30])
-    assert recording.play(2) == [(0, 5_000 * MS), (1, 5_030 * MS)]
-    with pytest.raises(SourceEndedError):
-        recording.read(1.0)
-
-
 def test_no_frame_within_the_timeout() -> None:
     clock = Clock()
     recording = Recording(clock, [0, 30])
@@ -108,10 +101,12 @@ def test_the_rate_is_that_of_the_times() -> None:
 def test_empty_and_closed_recordings_have_no_frames() -> None:
     with pytest.raises(SourceError):
         Recording(Clock(), [])
-    recording = Recording(Clock(), [0, 30], loop=True)
-    recording.close()
-    with pytest.raises(SourceEndedError):
-        recording.read(1.0)
+    ended, closed = Recording(Clock(), [0, 30]), Recording(Clock(), [0, 30], loop=True)
+    ended.play(2)
+    closed.close()
+    for recording in (ended, closed):
+        with pytest.raises(SourceEndedError):
+            recording.read(1.0)
 
 
 def test_depth_is_paired_with_colour_of_its_time() -> None:
@@ -167,7 +162,7 @@ def test_colour_becomes_red_green_blue() -> None:
         to_rgb(np.zeros((2, 2, 3), np.uint16), "x")
 
 
-@pytest.mark.parametrize("scale", [2, 3, 0.5])
+@pytest.mark.parametrize("scale", [3, 0.5])
 def test_colour_of_another_resolution_is_put_on_the_grid_of_the_depth(scale: float) -> None:
     depth = np.zeros((12, 16), np.uint16)
     height, width = round(12 * scale), round(16 * scale)
@@ -182,10 +177,8 @@ def test_colour_of_another_resolution_is_put_on_the_grid_of_the_depth(scale: flo
 
 
 def test_colour_of_another_view_is_refused_with_both_sizes() -> None:
-    with pytest.raises(SourceError) as caught:
+    with pytest.raises(SourceError, match=r"16 x 9.*16 x 12"):
         fit_color(np.zeros((9, 16, 3), np.uint8), np.zeros((12, 16), np.uint16), "x")
-    assert "16 x 9" in str(caught.value)
-    assert "16 x 12" in str(caught.value)
 
 
 def claim(data: bytes, size: int) -> bytes:
@@ -200,6 +193,9 @@ def claim(data: bytes, size: int) -> bytes:
 @pytest.mark.parametrize("end", [".png", ".jpg"])
 def test_a_picture_that_claims_to_be_huge_is_refused_by_its_header(end: str) -> None:
     data = cv2.imencode(end, np.zeros((4, 4, 3), np.uint8))[1].tobytes()
+    for other in (b"", b"not a picture", data[:20]):
+        with pytest.raises(SourceError):
+            decode_picture(other, "x")
     assert decode_picture(claim(data, 4), "x").shape == (4, 4, 3)
     for size in (65_535, 4_097):
         with pytest.raises(SourceError, match=f"{size} x {size}"):
@@ -232,15 +228,8 @@ def test_errors_of_packages_are_one_line_with_the_camera(monkeypatch: pytest.Mon
         open_source(settings, lambda: 0)
 
 
-def test_what_is_no_picture_is_refused() -> None:
-    for data in (b"", b"not a picture", cv2.imencode(".png", np.zeros((4, 4), np.uint16))[1].tobytes()[:20]):
-        with pytest.raises(SourceError):
-            decode_picture(data, "x")
-
-
 @pytest.mark.parametrize(
-    ("source", "package", "extra"),
-    [("realsense", "pyrealsense2", "realsense"), ("orbbec", "pyorbbecsdk", "orbbec"), ("mcap", "mcap", "mcap")],
+    ("source", "package", "extra"), [("realsense", "pyrealsense2", "realsense"), ("mcap", "mcap", "mcap")]
 )
 def test_a_missing_package_is_named_with_its_extra(
     source: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch

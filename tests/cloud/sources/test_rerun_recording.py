@@ -68,12 +68,10 @@ def write(
     rec.disconnect()
 
 
-def read_all(path: Path, **values: Any) -> tuple[Any, list[DepthFrame]]:
+def read_source(settings: CameraSettings) -> tuple[Any, list[DepthFrame]]:
     """Return the source, closed, and its frames, on a clock that is a frame later at each look."""
     ticks = iter(range(0, 10**12, 10_000_000))
-    source = open_source(
-        CameraSettings(name="a", source="rerun", path=str(path), loop=False, **values), lambda: next(ticks)
-    )
+    source = open_source(settings, lambda: next(ticks))
     frames = []
     try:
         while (frame := source.read(1.0)) is not None:
@@ -82,6 +80,10 @@ def read_all(path: Path, **values: Any) -> tuple[Any, list[DepthFrame]]:
         pass
     source.close()
     return source, frames
+
+
+def read_all(path: Path, **values: Any) -> tuple[Any, list[DepthFrame]]:
+    return read_source(CameraSettings(name="a", source="rerun", path=str(path), loop=False, **values))
 
 
 @pytest.mark.parametrize(("depth", "color"), [("raw", "raw"), ("png", "png"), ("raw", "bgr")])
@@ -114,13 +116,7 @@ def test_a_rate_takes_the_place_of_the_times(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("written", "values"),
-    [
-        ({"pinhole": False}, {}),
-        ({"depth": ""}, {}),
-        ({"color": ""}, {}),
-        ({"color": "nv12"}, {}),
-        ({}, {"depth": "/cam/other"}),
-    ],
+    [({"pinhole": False}, {}), ({"depth": ""}, {}), ({"color": "nv12"}, {}), ({}, {"depth": "/cam/other"})],
 )
 def test_what_is_missing_is_named(tmp_path: Path, written: dict[str, Any], values: dict[str, Any]) -> None:
     write(tmp_path / "a.rrd", **written)
