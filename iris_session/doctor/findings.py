@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
@@ -51,6 +51,13 @@ def failed(check: str, text: str, why: str = "", advice: str = "") -> Finding:
     return Finding(check, FAILED, text, why, advice)
 
 
+def report_problems(
+    check: str, problems: Sequence[str], fine: str, why: str = "", advice: str = "", state: str = WARNING
+) -> Finding:
+    """Return one finding about all problems; in state `OK`, with the text `fine`, where there are none."""
+    return Finding(check, state, "; ".join(problems), why, advice) if problems else ok(check, fine)
+
+
 class Findings:
     """All findings of one run, in order. At most one per check: a later finding replaces an earlier one."""
 
@@ -84,7 +91,3 @@ class Findings:
     def ok(self) -> bool:
         """True if no check failed. Warnings may exist."""
         return not any(finding.failed for finding in self._by_check.values())
-
-    def as_list(self) -> list[dict[str, Any]]:
-        """Return the findings as JSON objects."""
-        return [msgspec.to_builtins(finding) for finding in self._by_check.values()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from iris_session.doctor.findings import Finding, failed, ok, warning
+from iris_session.doctor.findings import FAILED, WARNING, Finding, ok, report_problems, warning
 from iris_session.protocol.common import Nanoseconds
 from iris_session.protocol.names import AlarmKind, AlignmentKind
 from iris_session.protocol.status import CrossCheckReport, ParticipantReport, StatusReport
@@ -37,7 +37,7 @@ def check_headsets(people: tuple[ParticipantReport, ...], report: StatusReport) 
 
 def check_alarms(people: tuple[ParticipantReport, ...]) -> Finding:
     """Report alarms that no new alignment has answered."""
-    texts, worst = [], warning
+    texts, state = [], WARNING
     for p in people:
         r = p.alignment_report
         if r is None or not r.alarm:
@@ -45,14 +45,12 @@ def check_alarms(people: tuple[ParticipantReport, ...]) -> Finding:
         what = ALARMS.get(r.alarm, r.alarm)
         texts.append(f"{p.name}: {what}, by {r.alarm_size_m * 1e3:.0f} mm, {_format_age(r.alarm_ns)} ago")
         if r.alarm == AlarmKind.JUMP:
-            worst = failed  # it has voided the alignment: no robot that `p` holds moves
-    if not texts:
-        return ok("alarm", "no alignment was found wrong")
+            state = FAILED  # it has voided the alignment: no robot that `p` holds moves
     why = "the headset was bumped, recentred or lost its tracking, or a sheet was moved"
     advice = (
         "bring a sheet into view that was not moved; if one was moved, put it back or use `iris-session anchors move`"
     )
-    return worst("alarm", "; ".join(texts), why, advice)
+    return report_problems("alarm", texts, "no alignment was found wrong", why, advice, state)
 
 
 def check_staleness(people: tuple[ParticipantReport, ...]) -> Finding:
@@ -65,10 +63,9 @@ def check_staleness(people: tuple[ParticipantReport, ...]) -> Finding:
         seen_ns = min((one.age_ns for one in r.seen if one.age_ns >= 0), default=p.alignment_age_ns)
         if seen_ns > STALE_NS:
             texts.append(f"{p.name} has seen no sheet for {_format_age(seen_ns)}")
-    if not texts:
-        return ok("stale", "measured alignments were confirmed within ten minutes")
+    fine = "measured alignments were confirmed within ten minutes"
     why = "tracking frames drift by millimetres a minute, which the stated error does not include"
-    return warning("stale", "; ".join(texts), why, "glance at a sheet now and then")
+    return report_problems("stale", texts, fine, why, "glance at a sheet now and then")
 
 
 def check_runs(people: tuple[ParticipantReport, ...]) -> Finding:
@@ -82,15 +79,15 @@ def check_runs(people: tuple[ParticipantReport, ...]) -> Finding:
 
 def check_corrections(people: tuple[ParticipantReport, ...]) -> Finding:
     """Report corrections that are not in force yet."""
-    texts = []
-    for p in people:
-        r = p.alignment_report
-        if r is not None and (r.pending_m > 0.0 or r.pending_rad > 0.0):
-            texts.append(f"{p.name}: {r.pending_m * 1e3:.0f} mm, {math.degrees(r.pending_rad):.1f} deg to go")
-    if not texts:
-        return ok("correction", "no correction of an alignment is pending")
+    reports = [(p.name, p.alignment_report) for p in people]
+    texts = [
+        f"{name}: {r.pending_m * 1e3:.0f} mm, {math.degrees(r.pending_rad):.1f} deg to go"
+        for name, r in reports
+        if r is not None and (r.pending_m > 0.0 or r.pending_rad > 0.0)
+    ]
+    fine = "no correction of an alignment is pending"
     why = "corrections are applied gradually, are announced, or wait until the clutch is open"
-    return warning("correction", "; ".join(texts), why, "open the clutch for some seconds")
+    return report_problems("correction", texts, fine, why, "open the clutch for some seconds")
 
 
 def is_consistent(check: CrossCheckReport) -> bool:
@@ -102,19 +99,18 @@ def check_agreement(people: tuple[ParticipantReport, ...], checks: tuple[CrossCh
     """Report pairs of headsets whose difference exceeds their stated errors."""
     names = {p.id: p.name for p in people}
     recent = [one for one in checks if one.age_ns <= MAX_CROSS_CHECK_AGE_NS]
-    apart = [one for one in recent if not is_consistent(one)]
-    if apart:
-        texts = [
-            f"{names.get(one.a, one.a)} and {names.get(one.b, one.b)} put '{one.anchor_id}' {one.error_m * 1e3:.0f} mm "
-            f"apart, expected is below {one.expected_p95_m * 1e3:.0f} mm"
-            for one in apart
-        ]
-        why = "one of the two is aligned wrongly, or a sheet is not at the configured place"
-        return warning("agreement", "; ".join(texts), why, "let both headsets observe the same sheet from two sides")
-    if not recent:
-        return ok("agreement", "no two headsets have observed the same anchor in the last ten minutes")
-    worst = max(recent, key=lambda one: one.error_m)
-    return ok("agreement", f"{len(recent)} pairs compared, at most {worst.error_m * 1e3:.0f} mm apart, as expected")
+    texts = [
+        f"{names.get(one.a, one.a)} and {names.get(one.b, one.b)} put '{one.anchor_id}' {one.error_m * 1e3:.0f} mm "
+        f"apart, expected is below {one.expected_p95_m * 1e3:.0f} mm"
+        for one in recent
+        if not is_consistent(one)
+    ]
+    fine = "no two headsets have observed the same anchor in the last ten minutes"
+    if recent:
+        worst_mm = 1e3 * max(one.error_m for one in recent)
+        fine = f"{len(recent)} pairs compared, at most {worst_mm:.0f} mm apart, as expected"
+    why = "one of the two is aligned wrongly, or a sheet is not at the configured place"
+    return report_problems("agreement", texts, fine, why, "let both headsets observe the same sheet from two sides")
 
 
 def _format_age(duration_ns: Nanoseconds) -> str:

@@ -17,16 +17,8 @@ from iris_session.protocol.discovery import DISCOVERY_PORT
 from iris_session.security import KeyHome, KeysError
 
 CONTROL_PORT: Final = 7721
-#: TCP ports of a session, from the control port.
-PORT_OFFSETS: Final = {
-    -1: "introduction",
-    0: "control",
-    1: "state",
-    2: "media",
-    3: "assets",
-    4: "web",
-    5: "media ingest",
-}
+#: TCP ports of a session, the first one below the control port.
+PORT_NAMES: Final = ("introduction", "control", "state", "media", "assets", "web", "media ingest")
 CLOCK_SOURCE: Final = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 SLOW_CLOCKS: Final = frozenset({"hpet", "acpi_pm", "jiffies", "pit"})
 
@@ -62,11 +54,11 @@ def check_scheduling() -> Finding:
 def check_processors() -> Finding:
     """Check number and load of the processors."""
     count, load = os.cpu_count() or 1, os.getloadavg()[0]
-    busy = sorted(
-        ((p.info["cpu_percent"] or 0.0, p.info["name"], p.pid) for p in _sample_processes(0.3)),
-        reverse=True,
-        key=lambda x: x[0],
-    )
+    for process in psutil.process_iter(["cpu_percent"]):
+        del process  # the first call begins the measurement
+    psutil.cpu_percent(0.3)
+    found = psutil.process_iter(["cpu_percent", "name"])
+    busy = sorted(((p.info["cpu_percent"] or 0.0, p.info["name"], p.pid) for p in found), key=lambda one: -one[0])
     text = f"{count} processors, load {load:.1f}"
     top = ", ".join(f"{name} ({pid}) {share:.0f} %" for share, name, pid in busy[:3] if share > 10.0)
     if count < 2:
@@ -74,14 +66,6 @@ def check_processors() -> Finding:
     if load > count:
         return warning("processors", text, f"more work than processors: {top}", "end other programs")
     return ok("processors", text + (f"; busiest: {top}" if top else ""))
-
-
-def _sample_processes(interval_s: float) -> list[psutil.Process]:
-    """Return all processes, with their share of a processor over `interval_s`."""
-    for process in psutil.process_iter(["cpu_percent"]):
-        del process  # the first call begins the measurement
-    psutil.cpu_percent(interval_s)
-    return list(psutil.process_iter(["cpu_percent", "name"]))
 
 
 def check_memory() -> Finding:
@@ -124,11 +108,8 @@ def check_key_home() -> Finding:
 
 def check_ports(control: int) -> Finding:
     """Check that the ports of a session are free, and name the programs that use them."""
-    wanted = {control + offset: name for offset, name in PORT_OFFSETS.items()}
-    taken: dict[int, str] = {}
-    for port in wanted:
-        if _is_port_in_use(port):
-            taken[port] = "another program"
+    wanted = dict(enumerate(PORT_NAMES, control - 1))
+    taken = {port: "another program" for port in wanted if _is_port_in_use(port)}
     for connection in _list_connections():
         if connection.status == psutil.CONN_LISTEN and connection.laddr.port in taken:
             taken[connection.laddr.port] = _describe_process(connection.pid)

@@ -130,12 +130,8 @@ def explain_unpaired_key(target: Address, introduction: Introduction | None) -> 
     """Explain that our key is not on the list of a session: our own, one that admitted us before, or a new one."""
     pair = PAIR_ADVICE.format(target)
     try:
-        home = KeyHome()
-        mark = (
-            compute_fingerprint(decode_key(introduction.server_key))
-            if introduction is not None and introduction.server_key
-            else ""
-        )
+        home, key = KeyHome(), "" if introduction is None else introduction.server_key
+        mark = compute_fingerprint(decode_key(key)) if key else ""
         if any(note.server == mark for note in home.sessions.read()):
             why = "the session belongs to this user; nevertheless the user's key must be allowed once"
             return failed("key", NOT_LISTED, why, "iris-session keys allow me")
@@ -156,25 +152,18 @@ def explain_refusal(error: ClientError) -> Finding:
     if isinstance(error, SessionNameError):
         return failed("beacon", text, "", "give the address of the session")
     if isinstance(error, RefusedError):
-        if error.code == RefusalCode.UNPAIRED:
-            return failed("key", NOT_LISTED, "", PAIR_ADVICE.format("ADDRESS"))
         if error.code == RefusalCode.CODE:
             why = "a code works once, and expires after ten minutes unless `pair --minutes` sets another time"
             advice = f"{error.advice}; else {NEW_CODE_ADVICE}" if error.advice else NEW_CODE_ADVICE
             return failed("code", f"the join code was refused: {error.message}", why, advice)
         if error.code == DenialReason.ROLE:
-            advice = (
-                "join in another role, or allow this one for the key, on the server's machine: iris-session keys allow"
-            )
-            return failed("role", f"this key may not join in this role: {error.message}", error.advice, advice)
+            text = f"this key may not join in this role: {error.message}"
+            advice = "join in another role, or allow this one for the key, on the server's machine"
+            return failed("role", text, error.advice, f"{advice}: iris-session keys allow")
         return failed("join", f"refused ({error.code}): {error.message}", "", error.advice)
     if isinstance(error, NotConnectedError):
-        return failed(
-            "join",
-            "the port accepts connections, but no session answers",
-            text,
-            "is it the port of another program? a firewall that accepts every connection? the wrong server key?",
-        )
+        advice = "is it the port of another program? a firewall that accepts every connection? the wrong server key?"
+        return failed("join", "the port accepts connections, but no session answers", text, advice)
     return failed("join", text)
 
 
@@ -213,12 +202,8 @@ def _check_state(client: Client, states: list[SceneState]) -> Finding:
         port = 0 if welcome is None else welcome.endpoints.state
         address = Address.parse(client.address)
         client.close()  # the next check takes seconds without heartbeats: we would be reported as disconnected
-        try:
-            finding = network_checks.check_tcp(
-                address, network_checks.check_address(address)[1], port, "state", "state"
-            )
-        except OSError as error:
-            return failed("state", f"no state arrives: {error}")
+        ip = network_checks.check_address(address)[1]
+        finding = network_checks.check_tcp(address, ip, port, "state", "state")
         if finding.failed:
             return finding
         return failed("state", f"no state arrives, but port {port} accepts connections", "the session does not step?")

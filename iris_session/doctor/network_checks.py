@@ -47,37 +47,32 @@ def check_beacon(session: str, address: Address | None) -> tuple[Finding, list[F
     except DiscoveryError as error:
         return (failed if session else warning)("beacon", str(error)), []
     heard = ", ".join(f"{one.name} ({one.address})" for one in found) or "none"
-    if session:
-        named = [one for one in found if one.name == session]
-        if len(named) == 1:
-            return ok("beacon", f"session {session!r} is heard at {named[0].address}"), found
-        if named:
-            where = ", ".join(one.address for one in named)
-            return failed(
-                "beacon", f"{len(named)} sessions are called {session!r}: {where}", "", "give the address"
-            ), found
-        return failed(
+    named = [one for one in found if one.name == session]
+    if session and len(named) == 1:
+        finding = ok("beacon", f"session {session!r} is heard at {named[0].address}")
+    elif session and named:
+        where = ", ".join(one.address for one in named)
+        finding = failed("beacon", f"{len(named)} sessions are called {session!r}: {where}", "", "give the address")
+    elif session:
+        finding = failed(
             "beacon",
             f"no session {session!r} is heard; heard: {heard}",
             f"no beacon on UDP port {DISCOVERY_PORT}: none runs, it is in another network, or broadcasts are blocked",
             "give its address as `iris-session serve` prints it, or scan the code of `iris-session pair`",
-        ), found
-    if found:
-        return ok("beacon", f"sessions heard: {heard}"), found
-    others = f"; ignored: {ignored}" if ignored else ""
-    if "other_version" in ignored:
-        return warning(
+        )
+    elif found:
+        finding = ok("beacon", f"sessions heard: {heard}")
+    elif "other_version" in ignored:
+        text = "the sessions that are heard speak another protocol version"
+        finding = warning("beacon", text, f"this is version {PROTOCOL_VERSION}", "update the older side")
+    else:
+        finding = warning(
             "beacon",
-            "the sessions that are heard speak another protocol version",
-            f"this is version {PROTOCOL_VERSION}",
-            "update the older side",
-        ), found
-    return warning(
-        "beacon",
-        f"no session is heard on UDP port {DISCOVERY_PORT}{others}",
-        "none runs in this network, or the access point blocks broadcasts" if address is not None else "",
-        "not needed if you type or scan the address",
-    ), found
+            f"no session is heard on UDP port {DISCOVERY_PORT}{f'; ignored: {ignored}' if ignored else ''}",
+            "none runs in this network, or the access point blocks broadcasts" if address is not None else "",
+            "not needed if you type or scan the address",
+        )
+    return finding, found
 
 
 def mention_heard_sessions(finding: Finding, target: Address, found: list[FoundSession]) -> Finding:
@@ -211,19 +206,15 @@ def check_introduction(address: Address) -> tuple[Finding, Finding, Introduction
 def check_port_base(address: Address) -> Finding | None:
     """Return a failed finding if the port is the base of a session's block of ports and not its control port."""
     joined = Address(address.host, address.port + 1)
-    said = _try_introduction(joined, PORT_BASE_TIMEOUT_S)
-    if said is None or said.beacon.control != joined.port:
+    try:
+        said = _request_introduction(joined, PORT_BASE_TIMEOUT_S)
+    except (OSError, ProtocolError):
+        return None
+    if said.beacon.control != joined.port:
         return None
     name = f"session {said.beacon.session_name!r}"
     text = f"port {address.port} is the base of the ports of {name}, whose control port is {joined}"
     return failed("introduction", text, "the control port of `serve --port-base N` is N + 1", f"use {joined}")
-
-
-def _try_introduction(address: Address, patience_s: float) -> Introduction | None:
-    try:
-        return _request_introduction(address, patience_s)
-    except (OSError, ProtocolError):
-        return None
 
 
 def _request_introduction(address: Address, patience_s: float) -> Introduction:

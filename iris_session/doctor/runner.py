@@ -16,35 +16,22 @@ from iris_session.doctor import join_checks, network_checks, session_checks
 from iris_session.doctor.findings import OK, Findings, failed, ok
 from iris_session.doctor.host_checks import check_host
 from iris_session.link.config import is_loopback
-from iris_session.link.discovery import FoundSession
 from iris_session.protocol.names import Role
 from iris_session.protocol.status import StatusReport
 from iris_session.security import KeyHome, KeysError
 
 LOCAL: Final = "127.0.0.1:7721"
-JOIN_CHECKS: Final = ("server_key", "key", "role", "join")
-STREAM_CHECKS: Final = ("clock", "state")
 SESSION_CHECKS: Final = (
     "session", "alignment", "alarm", "stale", "align_run", "correction", "agreement", "leases", "robots", "clients",
     "age", "ticks", "streams", "media", "recorder", "disk", "drops",
 )  # fmt: skip
-
 #: As a user asks: is there a route, am I admitted, does state arrive, how is the session?
 ORDER: Final = (
-    "beacon",
-    "address",
-    "subnet",
-    "tcp",
-    "introduction",
-    "version",
-    "server_key",
-    "key",
-    "code",
-    "role",
-    "join",
-    *STREAM_CHECKS,
-    *SESSION_CHECKS,
-)
+    "beacon", "address", "subnet", "tcp", "introduction", "version", "server_key", "key", "code", "role", "join",
+    "clock", "state", *SESSION_CHECKS,
+)  # fmt: skip
+#: Checks that are not made every time.
+OPTIONAL: Final = frozenset({"beacon", "code"})
 
 
 @dataclass
@@ -65,7 +52,7 @@ class DoctorReport:
         return {
             "ok": self.ok,
             "address": self.address,
-            "checks": self.findings.as_list(),
+            "checks": [msgspec.to_builtins(one) for one in self.findings],
             "report": None if self.report is None else msgspec.to_builtins(self.report),
         }
 
@@ -90,30 +77,61 @@ def run_checks(
         on_progress: Called with a short text before each part.
     """
     result = DoctorReport()
+    _check_session(result, address, session, code, role, on_progress)
+    result.findings.skip(*(check for check in ORDER if check not in OPTIONAL))
+    result.findings.sort(ORDER)
+    return result
+
+
+def _check_session(
+    result: DoctorReport, address: str, session: str, code: str, role: str, on_progress: Callable[[str], None]
+) -> None:
+    """Make the checks of `run_checks` until one fails that the others need."""
     findings = result.findings
     try:
         target = None if session else Address.parse(address or find_default_address())
     except ClientError as error:
         findings.add(failed("address", str(error)))
-        findings.skip("tcp", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
-        return result
+        return
     on_progress("listening for sessions")
     heard, found = network_checks.check_beacon(session, target)
     findings.add(heard)
-    if target is None and not heard.failed:
-        target = Address.parse(next(one.address for one in found if one.name == session))
     if target is None:
-        findings.skip(
-            "address", "subnet", "tcp", "introduction", "version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS
-        )
-        return result
+        if heard.failed:
+            return
+        target = Address.parse(next(one.address for one in found if one.name == session))
     result.address = str(target)
     on_progress(f"connecting to {target}")
-    if not _check_network(target, findings, found):
-        findings.skip("introduction", "version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
-        return result
-    _check_join(result, target, address or str(target), code or target.join_code, role, on_progress)
-    return result
+    named, ip = network_checks.check_address(target)
+    findings.add(named)
+    if not ip:
+        return
+    tcp = network_checks.mention_heard_sessions(network_checks.check_tcp(target, ip), target, found)
+    findings.add(network_checks.check_subnet(ip), tcp)
+    if tcp.failed:
+        return
+    introduced, version, said = network_checks.check_introduction(target)
+    base = network_checks.check_port_base(target) if introduced.state != OK else None
+    if base is not None:
+        findings.add(base)
+        return
+    findings.add(introduced, version)
+    if version.failed:
+        return
+    server_key = join_checks.check_server_key(target, said)
+    findings.add(server_key)
+    if server_key.failed:
+        return
+    on_progress(f"joining {target} as {role}")
+    visit = join_checks.attempt_join(target, address or str(target), code or target.join_code, role, said)
+    findings.add(*visit.findings)
+    if any(one.check == "join" and not one.failed for one in visit.findings):
+        plain = is_loopback(target.host) and not (said is not None and said.server_key)
+        text = "not needed on the session's own machine" if plain else "this machine's key is on the session's list"
+        findings.add(ok("key", text))
+    result.report = visit.report
+    if visit.report is not None:
+        findings.add(*session_checks.check_session_report(visit.report, visit.own_id))
 
 
 def find_default_address() -> str:
@@ -124,50 +142,6 @@ def find_default_address() -> str:
     except KeysError:  # reported by the check `key_home`
         notes = []
     return str(Address(notes[0].hosts[0], notes[0].control)) if len(notes) == 1 and notes[0].hosts else LOCAL
-
-
-def _check_network(target: Address, findings: Findings, heard: list[FoundSession]) -> bool:
-    named, ip = network_checks.check_address(target)
-    findings.add(named)
-    if not ip:
-        return False
-    findings.add(
-        network_checks.check_subnet(ip),
-        network_checks.mention_heard_sessions(network_checks.check_tcp(target, ip), target, heard),
-    )
-    return not findings["tcp"].failed
-
-
-def _check_join(
-    result: DoctorReport, target: Address, typed: str, code: str, role: str, on_progress: Callable[[str], None]
-) -> None:
-    findings = result.findings
-    introduced, version, said = network_checks.check_introduction(target)
-    base = network_checks.check_port_base(target) if introduced.state != OK else None
-    if base is not None:
-        findings.add(base)
-        findings.skip("version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
-        return
-    findings.add(introduced, version)
-    if version.failed:
-        findings.skip(*JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
-        return
-    findings.add(join_checks.check_server_key(target, said))
-    if findings["server_key"].failed:
-        findings.skip(*JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
-        return
-    on_progress(f"joining {target} as {role}")
-    visit = join_checks.attempt_join(target, typed, code, role, said)
-    findings.add(*visit.findings)
-    if any(one.check == "join" and not one.failed for one in visit.findings):
-        plain = is_loopback(target.host) and not (said is not None and said.server_key)
-        text = "not needed on the session's own machine" if plain else "this machine's key is on the session's list"
-        findings.add(ok("key", text))
-    result.report = visit.report
-    if visit.report is not None:
-        findings.add(*session_checks.check_session_report(visit.report, visit.own_id))
-    findings.skip(*JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
-    findings.sort(ORDER)
 
 
 def run_host_checks(
@@ -191,15 +165,11 @@ def run_host_checks(
         return result
     if network_checks.check_tcp(target, ip).failed and not address:
         own = {one.address for addresses in psutil.net_if_addrs().values() for one in addresses}
-        local = [found for found in map(_to_address, network_checks.check_beacon("", None)[1]) if found.host in own]
-        target = local[0] if local else target
+        heard = [Address.parse(found.address) for found in network_checks.check_beacon("", None)[1]]
+        target = next((one for one in heard if one.host in own), target)
         ip = network_checks.check_address(target)[1]
     if not network_checks.check_tcp(target, ip).failed:
         inside = run_checks(str(target), on_progress=on_progress)
         result.address, result.report = inside.address, inside.report
         result.findings.add(*(one for one in inside.findings if one.check not in ("beacon", "address", "subnet")))
     return result
-
-
-def _to_address(found: FoundSession) -> Address:
-    return Address.parse(found.address)

@@ -7,7 +7,7 @@ from typing import Final
 
 from iris_session.doctor import headset_checks, stream_checks
 from iris_session.doctor.drop_explanations import explain_drops
-from iris_session.doctor.findings import Finding, failed, ok, warning
+from iris_session.doctor.findings import FAILED, WARNING, Finding, failed, ok, report_problems, warning
 from iris_session.protocol.common import Nanoseconds
 from iris_session.protocol.names import AlignmentKind, CommandKind, HoldReason, LateCause, Role
 from iris_session.protocol.status import ParticipantReport, RobotReport, StatusReport
@@ -139,17 +139,14 @@ def check_alignment(people: tuple[ParticipantReport, ...], sheets: str = "", *, 
     void = [p for p in people if p.connected and p.alignment == AlignmentKind.NONE and (driven or _has_seen_sheet(p))]
     texts = [f"{p.name} has no alignment{_explain_unaligned(p)}" for p in void]
     measured = [p for p in people if p.alignment == AlignmentKind.MEASURED]
-    fine = ", ".join(f"{p.name} {p.alignment_error_m * 1e3:.0f} mm" for p in measured)
-    if not texts:
-        return ok(
-            "alignment", f"stated error at the robot: {fine}" if fine else "no participant needs one, or all have one"
-        )
+    errors = ", ".join(f"{p.name} {p.alignment_error_m * 1e3:.0f} mm" for p in measured)
+    fine = f"stated error at the robot: {errors}" if errors else "no participant needs one, or all have one"
     why = "the headset has not observed an anchor well enough since it joined or since its tracking frame jumped"
     advice = "bring the sheet into view, nearer or from a second place" + (
         f"; sheets of this session: {sheets}" if sheets else ""
     )
-    say = failed if driven and any(p.role in DRIVERS for p in void) else warning
-    return say("alignment", "; ".join(texts), why, advice)
+    state = FAILED if driven and any(p.role in DRIVERS for p in void) else WARNING
+    return report_problems("alignment", texts, fine, why, advice, state)
 
 
 def _has_seen_sheet(p: ParticipantReport) -> bool:
@@ -174,10 +171,8 @@ def check_leases(people: tuple[ParticipantReport, ...], all_robots: tuple[RobotR
     without = [p for p in people if p.connected and p.role in DRIVERS and not p.holds]
     if not without or not all_robots:
         return ok("leases", held)
-    texts = []
-    for p in without:
-        waits = f", waits for {', '.join(p.waits_for)}" if p.waits_for else ""
-        texts.append(f"{p.name} has no robot{waits}")
+    waits = {p.name: f", waits for {', '.join(p.waits_for)}" if p.waits_for else "" for p in without}
+    text = "; ".join(f"{name} has no robot{waiting}" for name, waiting in waits.items())
     free = [r.name for r in all_robots if not r.holder]
     disconnected = {p.id: p.name for p in people if not p.connected}
     kept = [
@@ -186,14 +181,8 @@ def check_leases(people: tuple[ParticipantReport, ...], all_robots: tuple[RobotR
         if r.holder in disconnected
     ]
     why = "; ".join([held, *kept])
-    if free:
-        return warning("leases", "; ".join(texts), why, f"acquire one: {', '.join(free)} is free")
-    return warning(
-        "leases",
-        "; ".join(texts),
-        why,
-        "ask the holder, wait for it (acquire with `wait`), or let a director assign it",
-    )
+    advice = "ask the holder, wait for it (acquire with `wait`), or let a director assign it"
+    return warning("leases", text, why, f"acquire one: {', '.join(free)} is free" if free else advice)
 
 
 def check_robots(all_robots: tuple[RobotReport, ...], people: tuple[ParticipantReport, ...]) -> Finding:
@@ -206,10 +195,8 @@ def check_robots(all_robots: tuple[RobotReport, ...], people: tuple[ParticipantR
             top = ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items(), key=lambda item: -item[1])[:3])
             texts.append(f"{r.name} ({r.holder_name}) holds: {r.hold_reason}" + (f", rejected: {top}" if top else ""))
             reasons.append(HOLD_ADVICE[r.hold_reason])
-    if texts:
-        return warning("robots", "; ".join(texts), "", "; ".join(dict.fromkeys(reasons)))
     states = ", ".join(f"{r.name} {r.hold_reason or r.state}" for r in all_robots)
-    return ok("robots", states or "none")
+    return report_problems("robots", texts, states or "none", "", "; ".join(dict.fromkeys(reasons)))
 
 
 def check_clients(people: tuple[ParticipantReport, ...]) -> Finding:
@@ -222,10 +209,9 @@ def check_clients(people: tuple[ParticipantReport, ...]) -> Finding:
         if problems:
             advice[PROGRAM_ADVICE if p.role in PROGRAMS else HEADSET_ADVICE] = None
             (worst if not p.connected or p.heard_ns > SILENT_NS else bad).append(f"{p.name}: {', '.join(problems)}")
-    if not bad and not worst:
-        return ok("clients", f"{len(people)} connected, all keep up" if people else "no other participants")
+    fine = f"{len(people)} connected, all keep up" if people else "no other participants"
     why = "the application is stopped or too slow, or its network is"
-    return (failed if worst else warning)("clients", "; ".join(worst + bad), why, "; ".join(advice))
+    return report_problems("clients", worst + bad, fine, why, "; ".join(advice), FAILED if worst else WARNING)
 
 
 def _list_client_problems(p: ParticipantReport) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from iris_session.doctor.findings import Finding, ok, warning
+from iris_session.doctor.findings import Finding, report_problems
 from iris_session.protocol.names import BudgetClass, StreamFault
 from iris_session.protocol.status import MediaStreamReport, ParticipantReport
 
@@ -52,12 +52,13 @@ _SILENT: Final = (
 def check_streams(streams: tuple[MediaStreamReport, ...]) -> Finding:
     """Report streams whose source found a fault, or whose newest frame is missing or too old for their rate."""
     bad = [one for one in streams if one.fault or one.stale]
-    if not bad:
-        return ok("streams", ", ".join(one.stream for one in streams) or "none")
     found = [FAULTS.get(one.fault, ("", "")) if one.fault else _SILENT for one in bad]
     named = dict.fromkeys(f"{one.stream}: {why}" for one, (why, _) in zip(bad, found, strict=True) if why)
     advice = dict.fromkeys(what for _, what in found if what)
-    return warning("streams", "; ".join(map(_describe_problem, bad)), "; ".join(named), "; ".join(advice))
+    fine = ", ".join(one.stream for one in streams) or "none"
+    return report_problems(
+        "streams", [_describe_problem(one) for one in bad], fine, "; ".join(named), "; ".join(advice)
+    )
 
 
 def _describe_problem(one: MediaStreamReport) -> str:
@@ -76,9 +77,8 @@ def check_media(people: tuple[ParticipantReport, ...]) -> Finding:
         lost = f"{p.media_drops} frames dropped" if p.media_drops >= MEDIA_DROPS else ""
         if p.connected and (cut or lost):
             texts.append(f"{p.name}: {', '.join([*cut, *([lost] if lost else [])])}")
-    if not texts:
-        wanted = any(p.media for p in people)
-        return ok("media", "every subscriber gets full streams" if wanted else "no participant subscribes to media")
+    wanted = any(p.media for p in people)
+    fine = "every subscriber gets full streams" if wanted else "no participant subscribes to media"
     why = "their link has no more capacity; state and control have priority"
     advice = "a better network for them, or fewer and smaller streams; docs/evidence/links.md"
-    return warning("media", "; ".join(texts), why, advice)
+    return report_problems("media", texts, fine, why, advice)

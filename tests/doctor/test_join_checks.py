@@ -41,7 +41,6 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
     ("error", "check"),
     [
         (VersionError(Refused("version", "no", supported_versions=(2,))), "version"),
-        (RefusedError(Refused(RefusalCode.UNPAIRED, "who are you", "pair")), "key"),
         (RefusedError(Refused(RefusalCode.CODE, "used")), "code"),
         (RefusedError(Refused("role", "not as director")), "role"),
         (RefusedError(Refused(RefusalCode.FULL, "all in use")), "join"),
@@ -74,19 +73,6 @@ def test_key_of_a_scanned_code_is_compared(home: KeyHome) -> None:
     scanned = Address("192.0.2.7", 7721, server_key=KeyPair.generate().public)
     assert check_server_key(scanned, offered_key(KeyPair.generate().public)).failed
     assert check_server_key(scanned, offered_key(scanned.server_key)).state == "ok"
-
-
-def test_damaged_list_of_servers_is_reported(home: KeyHome) -> None:
-    home.folder.create()
-    path = home.path / "known_servers.json"
-    path.write_text("{")
-    path.chmod(0o600)
-    assert check_server_key(ADDRESS, offered_key(KeyPair.generate().public)).failed
-
-
-def test_check_without_known_keys() -> None:
-    assert check_server_key(ADDRESS, None).state == "skipped"
-    assert check_server_key(ADDRESS, offered_key("")).state == "ok"
 
 
 def test_revoked_key_is_explained(home: KeyHome) -> None:

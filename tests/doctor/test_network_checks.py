@@ -13,7 +13,7 @@ from iris_session.client.address import Address
 from iris_session.doctor import network_checks
 from iris_session.doctor.findings import failed, ok
 from iris_session.doctor.runner import run_checks
-from iris_session.link.discovery import DiscoveryError, FoundSession
+from iris_session.link.discovery import FoundSession
 from iris_session.protocol.codec import decode_introduction, encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import PROTOCOL_VERSION
@@ -46,14 +46,6 @@ OTHER_PROGRAM = b"SSH-2.0-OpenSSH_9.2p1 Debian\r\n"
 def introduction(protocol: int = PROTOCOL_VERSION) -> bytes:
     beacon = Beacon(protocol, "s1", "lab", "live", "127.0.0.1", 7721, 7722, 0, 0, 0)
     return encode_introduction(Introduction(beacon, pairing=True, participants=3))
-
-
-def test_introduction_is_ok(answers: Answers) -> None:
-    answers.by_port[7721] = introduction()
-    introduced, version, message = network_checks.check_introduction(ADDRESS)
-    assert (introduced.state, version.state) == ("ok", "ok")
-    assert "'lab' (live), 3 participants" in introduced.text
-    assert message is not None
 
 
 @pytest.mark.parametrize(("theirs", "older"), [(PROTOCOL_VERSION + 1, "this machine"), (0, "the session")])
@@ -123,18 +115,9 @@ def test_silent_and_unreachable_machines_are_distinguished(
     assert why in found.why
 
 
-def test_own_machine_and_networks_are_ok() -> None:
-    assert network_checks.check_subnet("127.0.0.1").state == "ok"
-    assert network_checks.check_subnet("::1").state == "ok"
-    for name, network in network_checks.list_own_networks():
-        inside = str(next(network.hosts()))
-        found = network_checks.check_subnet(inside)
-        assert found.state == "ok"
-        assert name in found.text or str(network) in found.text or "the network of" in found.text
-
-
 def test_foreign_network_is_reported() -> None:
     """Addresses of TEST-NET-3 are in no network."""
+    assert network_checks.check_subnet("127.0.0.1").state == "ok"
     found = network_checks.check_subnet("203.0.113.77")
     assert found.state in ("warning", "failed")
     assert "none of" in found.text
@@ -148,13 +131,8 @@ def test_names_are_resolved() -> None:
     for unknown_name in ("a..b", "x" * 300, ""):
         found, ip = network_checks.check_address(Address(unknown_name, 7721))
         assert (found.state, ip) == ("failed", "")
-        assert network_checks.check_tcp(
-            Address(unknown_name, 7721), ip
-        ).failed  # not this machine, which an empty address means
-        assert network_checks.check_tcp(Address(unknown_name, 7721), unknown_name).failed
-    found, ip = network_checks.check_address(Address("no-such-machine.invalid", 7721))
-    assert found.failed
-    assert ip == ""
+        # Not this machine, which an empty address means.
+        assert network_checks.check_tcp(Address(unknown_name, 7721), ip).failed
 
 
 class Listener:
@@ -190,12 +168,7 @@ def listening(name: str, address: str) -> FoundSession:
     ],
 )
 def test_beacon_is_compared_with_the_address(
-    monkeypatch: pytest.MonkeyPatch,
-    sessions: tuple[FoundSession, ...],
-    ignored: dict[str, int],
-    name: str,
-    state: str,
-    text: str,
+    monkeypatch: pytest.MonkeyPatch, sessions: object, ignored: dict[str, int], name: str, state: str, text: str
 ) -> None:
     monkeypatch.setattr(network_checks, "LISTEN_S", 0.01)
     monkeypatch.setattr(network_checks, "BeaconListener", Listener)
@@ -204,18 +177,6 @@ def test_beacon_is_compared_with_the_address(
     found, _ = network_checks.check_beacon(name, None)
     assert found.state == state
     assert text in found.text
-
-
-@pytest.mark.parametrize(("name", "state"), [("lab", "failed"), ("", "warning")])
-def test_port_that_cannot_be_opened_is_a_failure_where_a_name_must_be_found(
-    monkeypatch: pytest.MonkeyPatch, name: str, state: str
-) -> None:
-    def fail() -> None:
-        raise DiscoveryError("port 7720 is in use")
-
-    monkeypatch.setattr(network_checks, "BeaconListener", fail)
-    found, heard = network_checks.check_beacon(name, None)
-    assert (found.state, heard) == (state, [])
 
 
 def test_other_sessions_on_the_network_are_suggested() -> None:
@@ -229,7 +190,3 @@ def test_other_sessions_on_the_network_are_suggested() -> None:
     assert network_checks.mention_heard_sessions(dead, typed, there[1:]) is dead
     well = ok("tcp", "takes connections")
     assert network_checks.mention_heard_sessions(well, typed, there) is well
-
-
-def test_link_local_networks_are_not_listed() -> None:
-    assert not any(network.version == 6 and network.is_link_local for _, network in network_checks.list_own_networks())

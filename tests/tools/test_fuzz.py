@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -22,14 +21,14 @@ from iris_session.protocol.common import Lease  # noqa: E402
 
 @pytest.mark.parametrize("target", sorted(DECODERS))
 def test_decoders_raise_only_documented_errors(target: str) -> None:
-    result = fuzz.fuzz(target, 2000, seed=11)
+    result = fuzz.fuzz(target, 1000, seed=11)
     assert result.findings == []
-    assert 0 < result.accepted < result.inputs == 2000
+    assert 0 < result.accepted < result.inputs == 1000
 
 
 @pytest.mark.parametrize(
     ("target", "inputs"),
-    [("connection", 10_000), ("state-stream", 3000), ("core", 3000), ("asset-loader", 5000), ("web-hub", 5000)],
+    [("connection", 4000), ("state-stream", 1500), ("core", 1500), ("asset-loader", 2000), ("web-hub", 2000)],
 )
 def test_random_conversations_keep_state_machines_consistent(target: str, inputs: int) -> None:
     result = fuzz.fuzz(target, inputs, seed=11)
@@ -103,11 +102,3 @@ def test_growing_memory_is_a_finding() -> None:
         [sys.executable, "-c", LEAK, str(TOOLS)], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.startswith("memory grew by 1")
-
-
-def test_command_prints_json() -> None:
-    command = [sys.executable, str(TOOLS / "fuzz.py"), "--target", "beacon,rigid", "--inputs", "300", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
-    report = json.loads(done.stdout)
-    assert report["ok"] is True
-    assert [(one["target"], one["inputs"]) for one in report["results"]] == [("beacon", 300), ("rigid", 300)]
