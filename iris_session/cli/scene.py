@@ -268,7 +268,7 @@ def find_scene_file(scene: str) -> Path | None:
         CommandError: It is a folder, or a file that does not exist or has an unknown suffix.
     """
     from iris_session.demo.scene_names import SCENE_NAMES
-    from iris_session.scene.importers.files import ENDINGS, check_present, xacro_advice
+    from iris_session.scene.importers.references import ENDINGS, check_present, xacro_advice
 
     path = expand_path(scene)
     kind = path.suffix.lower()

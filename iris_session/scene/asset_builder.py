@@ -28,7 +28,7 @@ from iris_session.scene.mesh_processing import simplify_mesh
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
 
 #: Increased whenever the encoding of the same content changes.
-ENCODER_VERSION: Final = 4
+ENCODER_VERSION: Final = 5
 ALONE_BYTES: Final = 16 << 20
 #: Factor between levels of a mesh, and the minimum number of triangles of a level.
 _COARSER: Final = 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from typing import Final, NamedTuple
 
 import msgspec
@@ -10,10 +11,6 @@ import msgspec
 from iris_session.protocol.names import GeometryKind, TextureKind
 from iris_session.protocol.scene import Mesh, SceneSpec, Texture, TextureLevel, Totals, list_assets
 
-#: Limits above which a Quest 3 begins to struggle: objects (draw calls), triangles, memory of textures [bytes].
-QUEST_OBJECTS: Final = 200
-QUEST_TRIANGLES: Final = 750_000
-QUEST_TEXTURE_BYTES: Final = 700 << 20
 #: Triangles of primitives at a usual tessellation, for estimates.
 PRIMITIVE_TRIANGLES: Final = {
     GeometryKind.PLANE: 2,
@@ -39,7 +36,8 @@ class Budget(msgspec.Struct, frozen=True):
     objects: int = 0
 
 
-QUEST_3: Final = Budget(QUEST_TRIANGLES, QUEST_TEXTURE_BYTES, QUEST_OBJECTS)
+#: Limits above which a Quest 3 begins to struggle.
+QUEST_3: Final = Budget(triangles=750_000, texture_bytes=700 << 20, objects=200)
 
 
 class LevelChoice(NamedTuple):
@@ -103,51 +101,46 @@ def _longest_side(mesh: Mesh) -> float:
 
 def _choose_mesh_levels(spec: SceneSpec, kept: list[int], limit: int, besides: int) -> tuple[tuple[int, ...], int]:
     """Return the level of each mesh, and the triangles drawn. `besides`: triangles of visuals without levels."""
-    levels = [0] * len(spec.meshes)
-    uses = [0] * len(spec.meshes)
-    for i in kept:
-        if spec.visuals[i].geometry.mesh >= 0:
-            uses[spec.visuals[i].geometry.mesh] += 1
-    total = besides + sum(count_triangles(spec, i) for i in kept)
-    queue = [
-        (_relative_loss(spec.meshes[m], 1, uses[m]), m)
-        for m in range(len(levels))
-        if _relative_loss(spec.meshes[m], 1, uses[m])
+    uses = Counter(spec.visuals[i].geometry.mesh for i in kept)
+    costs = [[uses[m] * level.triangles for level in mesh.levels] for m, mesh in enumerate(spec.meshes)]
+    shapes = sum(count_triangles(spec, i) for i in kept if spec.visuals[i].geometry.mesh < 0)
+    losses = [
+        [_relative_loss(mesh, level, uses[m]) for level in range(1, len(mesh.levels))]
+        for m, mesh in enumerate(spec.meshes)
     ]
+    return _coarsen(costs, losses, limit, besides + shapes)
+
+
+def _choose_texture_levels(spec: SceneSpec, limit: int) -> tuple[tuple[int, ...], int]:
+    costs = [[texture_memory_bytes(texture, level) for level in texture.levels] for texture in spec.textures]
+    return _coarsen(costs, [[-float(size) for size in sizes[:-1]] for sizes in costs], limit, 0)
+
+
+def _coarsen(
+    costs: list[list[int]], losses: list[list[float]], limit: int, besides: int
+) -> tuple[tuple[int, ...], int]:
+    """Return the level of each thing, and the cost of all with `besides`: at most `limit` (0: none) if that can be.
+
+    `costs`: of each thing by level. `losses`: of each step to a coarser level; the step that loses least comes first, 0
+    is not taken.
+    """
+    levels = [0] * len(costs)
+    total = besides + sum(cost[0] for cost in costs)
+    queue = [(loss[0], k) for k, loss in enumerate(losses) if loss and loss[0]]
     heapq.heapify(queue)
     while limit and total > limit and queue:
-        _, m = heapq.heappop(queue)
-        mesh, level = spec.meshes[m], levels[m]
-        total -= uses[m] * (mesh.levels[level].triangles - mesh.levels[level + 1].triangles)
-        levels[m] += 1
-        if loss := _relative_loss(mesh, level + 2, uses[m]):
-            heapq.heappush(queue, (loss, m))
+        _, k = heapq.heappop(queue)
+        total += costs[k][levels[k] + 1] - costs[k][levels[k]]
+        levels[k] += 1
+        if levels[k] < len(losses[k]) and (loss := losses[k][levels[k]]):
+            heapq.heappush(queue, (loss, k))
     return tuple(levels), total
 
 
 def _relative_loss(mesh: Mesh, level: int, uses: int) -> float:
     """Return the error relative to the size, per triangle that `level` saves; 0 when it saves none."""
-    if level >= len(mesh.levels) or not uses:
-        return 0.0
-    saved = mesh.levels[level - 1].triangles - mesh.levels[level].triangles
-    return (
-        (mesh.levels[level].max_error_m + 1e-9) / max(_longest_side(mesh), 1e-6) / (uses * saved) if saved > 0 else 0.0
-    )
-
-
-def _choose_texture_levels(spec: SceneSpec, limit: int) -> tuple[tuple[int, ...], int]:
-    levels = [0] * len(spec.textures)
-    sizes = [[texture_memory_bytes(texture, level) for level in texture.levels] for texture in spec.textures]
-    total = sum(size[0] for size in sizes)
-    queue = [(-size[0], t) for t, size in enumerate(sizes) if len(size) > 1]
-    heapq.heapify(queue)
-    while limit and total > limit and queue:
-        _, t = heapq.heappop(queue)
-        levels[t] += 1
-        total -= sizes[t][levels[t] - 1] - sizes[t][levels[t]]
-        if levels[t] + 1 < len(sizes[t]):
-            heapq.heappush(queue, (-sizes[t][levels[t]], t))
-    return tuple(levels), total
+    saved = uses * (mesh.levels[level - 1].triangles - mesh.levels[level].triangles)
+    return (mesh.levels[level].max_error_m + 1e-9) / max(_longest_side(mesh), 1e-6) / saved if saved > 0 else 0.0
 
 
 # --- costs ------------------------------------------------------------------------------------------------------------

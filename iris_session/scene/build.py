@@ -8,9 +8,10 @@ lists follows only from the order in which content was added.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Final
 
 import msgspec
@@ -268,18 +269,8 @@ def _build_materials(
 
 
 def _to_material(look: Appearance, uses: tuple[TextureUse, ...]) -> Material:
-    return Material(
-        name=look.name,
-        rgba=look.rgba,
-        emission=look.emission,
-        specular=look.specular,
-        shininess=look.shininess,
-        metallic=look.metallic,
-        roughness=look.roughness,
-        textures=uses,
-        repeat=look.repeat,
-        uniform=look.uniform,
-    )
+    shared = {name: getattr(look, name) for name in Material.__struct_fields__ if hasattr(look, name)}
+    return Material(**shared, textures=uses)
 
 
 # --- deformables and environment --------------------------------------------------------------------------------------
@@ -298,9 +289,8 @@ def _build_deformables(
         sources.append(DeformableSource(one.name, f"deformable-{k}", topology, one.vertices))
         uv = None if one.uv is None or one.elements.shape[1] == 2 else one.uv[one.elements]
         raw: list[bytes | NDArray[Any]] = [b"deformable", one.elements, one.vertices]
-        works.append(
-            builder.blob_work([*raw, *([] if uv is None else [uv])], _make_deformable_encoder(one, uv, topology))
-        )
+        encode = partial(encode_deformable, one.elements, uv, one.vertices, topology)
+        works.append(builder.blob_work([*raw, *([] if uv is None else [uv])], encode))
     notes = builder.run(works)
     listed = tuple(
         Deformable(
@@ -320,12 +310,6 @@ def _build_deformables(
         for one, material, source, note in zip(flexibles, materials, sources, notes, strict=True)
     )
     return listed, sources
-
-
-def _make_deformable_encoder(
-    one: ComposedDeformable, uv: NDArray[np.float32] | None, topology: DeformableTopology
-) -> Callable[[], bytes]:
-    return lambda: encode_deformable(one.elements, uv, one.vertices, topology)
 
 
 def _build_environment(spec: SceneSpec, sources: Sequence[DeformableSource]) -> Environment:

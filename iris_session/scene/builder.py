@@ -14,7 +14,7 @@ from typing import Any, Final, Unpack
 import numpy as np
 
 from iris_session.assets.store import AssetStore
-from iris_session.protocol.common import IDENTITY, Vec3
+from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.names import GeometryKind, LightKind, TextureKind
 from iris_session.protocol.scene import Camera, Environment, Light, Rgb
@@ -24,12 +24,21 @@ from iris_session.scene.build import ComposedBody, ComposedDeformable, SceneCont
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.files import load_file
 from iris_session.scene.importers.urdf import read_urdf
-from iris_session.scene.nodes import GREY, Appearance, DrawnItem, Matrix, TextureImage, to_matrix, truncate_name
+from iris_session.scene.nodes import (
+    GREY,
+    Appearance,
+    DrawnItem,
+    Matrix,
+    TextureImage,
+    to_matrix,
+    to_vec3,
+    truncate_name,
+)
 from iris_session.scene.result import ComposedScene
 from iris_session.scene.validation import (
     AppearanceOptions,
     DrawingOptions,
-    ScenePlacement,
+    PlacementOptions,
     check_mesh,
     check_number,
     check_numbers,
@@ -39,7 +48,6 @@ from iris_session.scene.validation import (
     check_triangles,
     check_vertices,
     parse_appearance,
-    parse_options,
 )
 from iris_session.streams.deformable_topology import MAX_VERTICES
 
@@ -192,11 +200,10 @@ class SceneBuilder:
         Raises:
             SceneBuildError: An argument is wrong. Nothing is added.
         """
-        x, y = check_numbers("half_size", half_size, 2)
-        if x < 0 or y < 0:
+        size = check_numbers("half_size", half_size, 2)
+        if min(size) < 0:
             raise SceneBuildError(f"half_size of a plane is {tuple(half_size)}: expected lengths, or 0 for endless")
-        size = (x, y, 1.0)
-        return self._add_shape(GeometryKind.PLANE, name, size, options)
+        return self._add_shape(GeometryKind.PLANE, name, (*size, 1.0), options)
 
     def add_mesh(
         self,
@@ -224,10 +231,8 @@ class SceneBuilder:
             SceneBuildError: An argument is wrong. Nothing is added.
         """
         mesh = check_mesh(f"mesh {reprlib.repr(name)}", vertices, triangles, normals, uvs, colors)
-        placement, appearance = parse_options(options)
-        if appearance is None:
-            appearance = Appearance(rgba=(1.0, 1.0, 1.0, 1.0) if colors is not None else GREY)
-        body, matrix = self._place(name, placement)
+        appearance = parse_appearance(options) or Appearance(rgba=GREY if colors is None else (1.0, 1.0, 1.0, 1.0))
+        body, matrix = self._place(name, options)
         self._content.items.append(DrawnItem(body, truncate_name(name), matrix, appearance, mesh))
         return name
 
@@ -272,18 +277,17 @@ class SceneBuilder:
         if up_axis not in ("y", "z"):
             wrong = f"{where.name} says that {up_axis} is up" if up is None else f"up is {up!r}"
             raise SceneBuildError(f"{wrong}: give up='y' or up='z', or None for what the format means")
-        uniform_scale = to_array(scale, "scale").ndim == 0
-        if uniform_scale:
-            factor = check_number("scale", scale)
-        factors = (factor,) * 3 if uniform_scale else check_numbers("scale", scale, 3)
+        whole = to_array(scale, "scale").ndim == 0
+        factors = (check_number("scale", scale),) * 3 if whole else check_numbers("scale", scale, 3)
         if 0.0 in factors:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
         T_up_file = _FROM_Y_UP if up_axis == "y" else np.eye(4)
         T_body_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ T_up_file
-        placement, appearance = parse_options(options)
+        appearance = parse_appearance(options)
         with self._content.atomic(), np.errstate(all="ignore"):  # poses that are not finite are refused
-            body, T_parent_body = self._place(name, placement, named=True)
-            self._content.add_nodes(loaded, body, T_parent_body @ T_body_file, appearance, flat=self._is_moving(body))
+            body, T_parent_body = self._place(name, options, named=True)
+            moving = body >= 0 and self._content.bodies[body].moving
+            self._content.add_nodes(loaded, body, T_parent_body @ T_body_file, appearance, flat=moving)
         return name
 
     def add_urdf(
@@ -370,7 +374,7 @@ class SceneBuilder:
         what, given, width = ("triangles", triangles, 3) if edges is None else ("edges", edges, 2)
         elements = check_triangles(f"{what} of {whose}", given, len(points), width)
         half = check_number("radius", radius, above=0.0)
-        look = parse_appearance(appearance)
+        look = parse_appearance(appearance, AppearanceOptions)
         uv = None if uvs is None else check_vertices(f"uvs of {whose}", uvs, 2, len(points))
         self._content.deformables.append(
             ComposedDeformable(name, points, elements, uv, half, flat, look or Appearance())
@@ -422,11 +426,11 @@ class SceneBuilder:
             name=truncate_name(name),
             kind=kind,
             body=0,
-            p_body=_three("position", position),
-            direction_body=_three("direction", along / length),
-            ambient=_three("ambient", ambient),
-            diffuse=_three("diffuse", diffuse),
-            specular=_three("specular", specular),
+            p_body=to_vec3(check_numbers("position", position, 3)),
+            direction_body=to_vec3(along / length),
+            ambient=to_vec3(check_numbers("ambient", ambient, 3)),
+            diffuse=to_vec3(check_numbers("diffuse", diffuse, 3)),
+            specular=to_vec3(check_numbers("specular", specular, 3)),
             cutoff=check_number("cutoff", cutoff),
             castshadow=castshadow,
         )
@@ -503,34 +507,32 @@ class SceneBuilder:
     # --- internal -----------------------------------------------------------------------------------------------------
 
     def _add_shape(self, kind: str, name: str, size: tuple[float, ...], options: DrawingOptions) -> str:
-        placement, appearance = parse_options(options)
-        body, matrix = self._place(name, placement)
-        x, y, z = size
+        appearance = parse_appearance(options) or Appearance()
+        body, matrix = self._place(name, options)
         self._content.items.append(
-            DrawnItem(body, truncate_name(name), matrix, appearance or Appearance(), kind=kind, size=(x, y, z))
+            DrawnItem(body, truncate_name(name), matrix, appearance, kind=kind, size=to_vec3(size))
         )
         return name
 
-    def _place(self, name: str, placement: ScenePlacement, *, named: bool = False) -> tuple[int, Matrix]:
+    def _place(self, name: str, options: PlacementOptions, *, named: bool = False) -> tuple[int, Matrix]:
         """Return the index of the body to add to (-1: the world), created if movable or `named`, and T_body_item."""
         if not isinstance(name, str):
             raise SceneBuildError(f"name is {name!r}: text is expected, '' for no name")
-        if placement.on and placement.movable:
-            raise SceneBuildError(f"{name!r} is to be movable and on {placement.on!r}: one of both")
-        if placement.on:
-            return self._find_movable(placement.on), to_matrix(placement.pose)
-        if placement.movable:
+        pose = check_pose(options.get("position", IDENTITY.p), options.get("quaternion", IDENTITY.q))
+        movable, on = bool(options.get("movable", False)), options.get("on", "")
+        if on and movable:
+            raise SceneBuildError(f"{name!r} is to be movable and on {on!r}: one of both")
+        if on:
+            return self._find_movable(on), to_matrix(pose)
+        if movable:
             self._check_new_name(name)
             if name == _WORLD:
                 raise SceneBuildError(f"name is {name!r}: that is the frame that all is in, give name= another one")
             self._content.names.add(name)
-        if placement.movable or named:
-            self._content.bodies.append(ComposedBody(truncate_name(name), -1, placement.pose, placement.movable))
+        if movable or named:
+            self._content.bodies.append(ComposedBody(truncate_name(name), -1, pose, movable))
             return len(self._content.bodies) - 1, np.eye(4)
-        return -1, to_matrix(placement.pose)
-
-    def _is_moving(self, body: int) -> bool:
-        return body >= 0 and self._content.bodies[body].moving
+        return -1, to_matrix(pose)
 
     def _find_movable(self, on: str) -> int:
         """Return the index of the movable body `on`, -1 for none."""
@@ -550,8 +552,3 @@ class SceneBuilder:
             )
         if name in self._content.names:
             raise SceneBuildError(f"there is a {name!r} already: choose another name")
-
-
-def _three(what: str, values: Any) -> Vec3:
-    x, y, z = check_numbers(what, values, 3)
-    return x, y, z

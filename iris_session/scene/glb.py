@@ -24,7 +24,7 @@ from anchors.pose import apply, compose, inverse, quat_conj, quat_rotate
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import IDENTITY, Pose, Quat, Vec3
 from iris_session.protocol.names import ArrayKind, AssetEncoding, Follow, LightKind, TextureKind, TextureRole
-from iris_session.protocol.scene import Body, Camera, Light, SceneSpec, Visual
+from iris_session.protocol.scene import Camera, Deformable, Light, SceneSpec, Visual
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.colors import to_linear
 from iris_session.scene.cube_maps import CUBE_SIDE, CubeMap, CubeMapReader, bake_cube_map, direction_scale
@@ -32,7 +32,7 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.mesh_processing import normalise
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
-from iris_session.scene.nodes import compose_poses, to_vec3
+from iris_session.scene.nodes import to_vec3
 from iris_session.scene.shapes import (
     add_texture_coordinates,
     build_height_field,
@@ -88,61 +88,63 @@ class _GlbWriter:
         self._meshes: dict[tuple[object, ...], int | None] = {}
         self._materials: dict[str, int] = {}  # by their text
         self._textures: dict[str, int] = {}  # by the address of the asset
+        self._bodies = {body.id: body for body in spec.bodies}
         self._cubes = CubeMapReader(spec, store, CUBE_SIDE)
         self._accessors: dict[tuple[object, ...], int] = {}
 
     def encode(self) -> bytes:
-        T_world = {body.id: body.T_world_body for body in self._spec.bodies}
-        nodes = {
-            body.id: self._add_node(body.name or f"body_{body.id}", _initial_pose(body, T_world.get(body.parent)))
-            for body in self._spec.bodies
-        }
-        for body in self._spec.bodies:
-            self._get_children(nodes.get(body.parent, 0)).append(nodes[body.id])
+        nodes = {-1: 0}
+        for body in self._spec.bodies:  # parents before their children; joints need not be at zero
+            T_world_parent = IDENTITY if body.parent < 0 else self._bodies[body.parent].T_world_body
+            T = body.T_world_body
+            T_parent_body = compose(inverse((T_world_parent.p, T_world_parent.q)), (T.p, T.q))
+            nodes[body.id] = self._add_node(nodes[body.parent], body.name or f"body_{body.id}", Pose(*T_parent_body))
         for visual in self._spec.visuals:
             if visual.rgba[3] > 0 and visual.group in self._spec.groups_shown:
                 mesh = self._add_visual_mesh(visual)
                 if mesh is not None:
-                    node = self._add_node(visual.name or f"visual_{visual.id}", visual.T_body_visual)
-                    self._json["nodes"][node]["mesh"] = mesh
-                    self._get_children(nodes[visual.body]).append(node)
-        for index, deformable in enumerate(self._spec.deformables):
+                    name = visual.name or f"visual_{visual.id}"
+                    self._add_node(nodes[visual.body], name, visual.T_body_visual, mesh=mesh)
+        for k, deformable in enumerate(self._spec.deformables):
             if deformable.rgba[3] > 0 and deformable.group in self._spec.groups_shown:
-                node = self._add_node(deformable.name or f"deformable_{index}", IDENTITY)
-                self._json["nodes"][node]["mesh"] = self._add_deformable(index)
-                self._get_children(0).append(node)
+                mesh = self._add_deformable(deformable)
+                self._add_node(0, deformable.name or f"deformable_{k}", IDENTITY, mesh=mesh)
         self._add_viewpoints(nodes)
         return self._pack()
 
     def _add_viewpoints(self, nodes: Mapping[int, int]) -> None:
         """Add cameras, and lights that are on, below the nodes of their bodies. `nodes`: nodes by id of the body."""
-        spec = self._spec
-        for k, camera in enumerate(spec.cameras):
-            pose = camera.T_body_camera
-            node = self._add_node(camera.name or f"camera_{k}", pose)
-            entry: dict[str, Any] = self._json["nodes"][node]
-            entry["camera"] = self._add("cameras", _build_camera(camera))
-            ahead = _find_direction_to_target(camera, pose.p, spec)
+        for k, camera in enumerate(self._spec.cameras):
+            pose, ahead = camera.T_body_camera, self._find_direction_to_target(camera, camera.T_body_camera.p)
             if ahead is not None:  # upright
-                q_world_body = next(body.T_world_body.q for body in spec.bodies if body.id == camera.body)
-                up = np.array(quat_rotate(quat_conj(q_world_body), (0.0, 0.0, 1.0)))
-                entry["rotation"] = _orient(-ahead, up, pose.q)
-            self._get_children(nodes[camera.body]).append(node)
-        lights = [light for light in spec.lights if light.active and light.kind in _LIGHTS]
+                q_world_body = self._bodies[camera.body].T_world_body.q
+                pose = Pose(pose.p, _orient(-ahead, quat_rotate(quat_conj(q_world_body), (0.0, 0.0, 1.0)), pose.q))
+            lens = self._add("cameras", _build_camera(camera))
+            self._add_node(nodes[camera.body], camera.name or f"camera_{k}", pose, camera=lens)
+        lights = [light for light in self._spec.lights if light.active and light.kind in _LIGHTS]
         if lights:
             self._json["extensionsUsed"] = [_EXTENSION]
             self._json["extensions"] = {_EXTENSION: {"lights": [_build_light(light) for light in lights]}}
         for k, light in enumerate(lights):
-            node = self._add_node(light.name or f"light_{k}", Pose(light.p_body, IDENTITY.q))
-            ahead = _find_direction_to_target(light, light.p_body, spec)
+            ahead = self._find_direction_to_target(light, light.p_body)
             back = -np.array(light.direction_body if ahead is None else ahead, np.float64)
             back /= np.linalg.norm(back) or 1.0
-            up = np.array([0.0, 1.0, 0.0] if abs(back[1]) < 0.9 else [1.0, 0.0, 0.0])
-            self._json["nodes"][node] |= {
-                "rotation": _orient(back, up, IDENTITY.q),
-                "extensions": {_EXTENSION: {"light": k}},
-            }
-            self._get_children(nodes[light.body]).append(node)
+            up = (0.0, 1.0, 0.0) if abs(back[1]) < 0.9 else (1.0, 0.0, 0.0)
+            pose = Pose(light.p_body, _orient(back, up, IDENTITY.q))
+            name = light.name or f"light_{k}"
+            self._add_node(nodes[light.body], name, pose, extensions={_EXTENSION: {"light": k}})
+
+    def _find_direction_to_target(self, watcher: Light | Camera, p_body: Vec3) -> NDArray[np.float64] | None:
+        """Return the unit vector from a light or camera to the body that it tracks, in the frame of its own body.
+
+        At the beginning; `None` when it tracks no body.
+        """
+        if watcher.follow not in _WATCHING or watcher.target < 0:
+            return None
+        own = self._bodies[watcher.body].T_world_body
+        way = np.subtract(self._bodies[watcher.target].T_world_body.p, apply((own.p, own.q), p_body))
+        way = np.array(quat_rotate(quat_conj(own.q), to_vec3(way)))
+        return np.asarray(way / np.linalg.norm(way)) if way.any() else None
 
     def _pack(self) -> bytes:
         self._json["buffers"] = [{"byteLength": len(self._blob)}]
@@ -165,15 +167,11 @@ class _GlbWriter:
             chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
-    def _get_children(self, node: int) -> list[int]:
-        children: list[int] = self._json["nodes"][node].setdefault("children", [])
-        return children
-
-    def _add_node(self, name: str, pose: Pose) -> int:
-        w, x, y, z = pose.q
-        length = float(np.linalg.norm(pose.q)) or 1.0
-        turn = [x / length, y / length, z / length, w / length]
-        return self._add("nodes", {"name": name, "translation": list(pose.p), "rotation": turn})
+    def _add_node(self, parent: int, name: str, pose: Pose, **content: Any) -> int:
+        w, x, y, z = (v / (math.hypot(*pose.q) or 1.0) for v in pose.q)
+        node = self._add("nodes", {"name": name, "translation": list(pose.p), "rotation": [x, y, z, w], **content})
+        self._json["nodes"][parent].setdefault("children", []).append(node)
+        return node
 
     def _add(self, kind: str, item: dict[str, Any]) -> int:
         self._json[kind].append(item)
@@ -185,8 +183,8 @@ class _GlbWriter:
         """Add one glTF mesh per shape and appearance, shared by all visuals that have it."""
         key = (visual.geometry, visual.material, visual.rgba)
         if key not in self._meshes:
-            primitives = self._build_primitive(visual)
-            self._meshes[key] = None if primitives is None else self._add("meshes", {"primitives": [primitives]})
+            primitive = self._build_primitive(visual)
+            self._meshes[key] = None if primitive is None else self._add("meshes", {"primitives": [primitive]})
         return self._meshes[key]
 
     def _build_primitive(self, visual: Visual) -> dict[str, Any] | None:
@@ -220,28 +218,26 @@ class _GlbWriter:
             return build_height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
         return build_primitive(geometry)
 
-    def _add_deformable(self, index: int) -> int:
+    def _add_deformable(self, deformable: Deformable) -> int:
         """Add the rest shape: surfaces, of cloths with both sides; ropes as lines."""
-        deformable = self._spec.deformables[index]
         arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
-        both_sides, mapped = deformable.dim == 2, deformable.dim > 1 and "uv" in arrays
-        look = self._add_material(deformable.material, deformable.rgba, mapped=mapped, both_sides=both_sides)
+        mapped = deformable.dim > 1 and "uv" in arrays
+        look = self._add_material(deformable.material, deformable.rgba, mapped=mapped, both_sides=deformable.dim == 2)
         if deformable.dim == 1:
             attributes = {"POSITION": self._add_accessor(arrays["position"], "VEC3", bounds=True)}
-            rope = {"attributes": attributes, "indices": self._add_indices(arrays["elements"]), "mode": _LINES}
-            return self._add("meshes", {"primitives": [{**rope, "material": look}]})
-        corners = arrays["position"][arrays["elements"]]
-        normal = normalise(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-        worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
-        mesh = index_corners(
-            corners, np.repeat(normal[:, None], 3, axis=1), repeat_texture_coordinates(arrays.get("uv"), worn)
-        )
-        return self._add("meshes", {"primitives": [{**self._add_attributes(mesh), "material": look}]})
+            primitive = {"attributes": attributes, "indices": self._add_indices(arrays["elements"]), "mode": _LINES}
+        else:
+            corners = arrays["position"][arrays["elements"]]
+            normal = normalise(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+            worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
+            uv = repeat_texture_coordinates(arrays.get("uv"), worn)
+            primitive = self._add_attributes(index_corners(corners, np.repeat(normal[:, None], 3, axis=1), uv))
+        return self._add("meshes", {"primitives": [{**primitive, "material": look}]})
 
     def _add_attributes(self, mesh: MeshArrays) -> dict[str, Any]:
         attributes = {
             "POSITION": self._add_accessor(mesh.position, "VEC3", bounds=True),
-            "NORMAL": self._add_accessor(_normalise(mesh.normal), "VEC3"),
+            "NORMAL": self._add_accessor(mesh.normal, "VEC3"),
         }
         if mesh.uv is not None:
             attributes["TEXCOORD_0"] = self._add_accessor(mesh.uv, "VEC2")
@@ -307,17 +303,16 @@ class _GlbWriter:
             found["name"] = material.name or f"material_{index}"
             color_texture = material.find_texture()
             blended = blended or (mapped and color_texture >= 0 and self._spec.textures[color_texture].channels == 4)
-            base = self._add_texture(color_texture) if cube is None else self._add_atlas(cube)
-            shade = material.find_texture(TextureRole.ORM, TextureRole.OCCLUSION)
             for where, key, texture in (
-                (look, "baseColorTexture", base),
-                (look, "metallicRoughnessTexture", self._add_texture(material.find_texture(TextureRole.ORM))),
-                (found, "occlusionTexture", self._add_texture(shade)),
-                (found, "normalTexture", self._add_texture(material.find_texture(TextureRole.NORMAL))),
-                (found, "emissiveTexture", self._add_texture(material.find_texture(TextureRole.EMISSIVE))),
+                (look, "baseColorTexture", color_texture),
+                (look, "metallicRoughnessTexture", material.find_texture(TextureRole.ORM)),
+                (found, "occlusionTexture", material.find_texture(TextureRole.ORM, TextureRole.OCCLUSION)),
+                (found, "normalTexture", material.find_texture(TextureRole.NORMAL)),
+                (found, "emissiveTexture", material.find_texture(TextureRole.EMISSIVE)),
             ):
-                if mapped and texture is not None:
-                    where[key] = {"index": texture}
+                number = self._add_texture(texture, cube if key == "baseColorTexture" else None) if mapped else None
+                if number is not None:
+                    where[key] = {"index": number}
             if material.emission > 0:  # of the visible colour, including the texture
                 found["emissiveFactor"] = to_linear(material.emission * np.array(colour)).tolist()
                 if "baseColorTexture" in look:
@@ -331,50 +326,24 @@ class _GlbWriter:
             self._materials[known] = self._add("materials", found)
         return self._materials[known]
 
-    def _add_texture(self, index: int) -> int | None:
-        if index < 0 or self._spec.textures[index].kind != TextureKind.IMAGE:
+    def _add_texture(self, index: int, cube: CubeMap | None) -> int | None:
+        """Add a 2d texture, or the atlas of a cube map, once; `None` without a picture that glTF can hold."""
+        if cube is not None and cube.atlas is not None:
+            address, encoding, pixels = cube.address, cube.encoding, cube.atlas.pixels
+        elif index < 0 or self._spec.textures[index].kind != TextureKind.IMAGE:
             return None
-        level = self._spec.textures[index].levels[0]
-        if level.encoding == AssetEncoding.OPAQUE:
+        else:
+            level, pixels = self._spec.textures[index].levels[0], None
+            address, encoding = level.address, level.encoding
+        if encoding == AssetEncoding.OPAQUE:
             return None
-        if level.address not in self._textures:
-            data, encoding = self._store.get(level.address), level.encoding
+        if address not in self._textures:
             if encoding == AssetEncoding.ARRAYS:
-                data, encoding, _ = encode_image(decode_image(data, encoding), AssetEncoding.PNG)
-            self._textures[level.address] = self._add_image(data, encoding)
-        return self._textures[level.address]
-
-    def _add_atlas(self, cube: CubeMap) -> int | None:
-        if cube.atlas is None:
-            return None
-        if cube.address not in self._textures:
-            data, encoding, _ = encode_image(cube.atlas.pixels, cube.encoding)
-            self._textures[cube.address] = self._add_image(data, encoding)
-        return self._textures[cube.address]
-
-    def _add_image(self, data: bytes, encoding: str) -> int:
-        image = self._add("images", {"bufferView": self._add_view(data), "mimeType": f"image/{encoding}"})
-        return self._add("textures", {"source": image, "sampler": 0})
-
-
-def _normalise(normal: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return unit vectors; those that are as close to length 1 as float32 allows stay unchanged to the bit."""
-    off = np.abs(np.linalg.norm(normal, axis=1) - 1.0) > 1e-6
-    kept = normal.copy()
-    kept[off] = normalise(normal[off])
-    return kept
-
-
-def _initial_pose(body: Body, T_world_parent: Pose | None) -> Pose:
-    """Return the initial pose in the parent: joints need not be at zero then."""
-    T_world_body = body.T_world_body
-    if T_world_parent is None:
-        return T_world_body
-    at_zero = compose_poses(T_world_parent, body.T_parent_body)
-    if np.allclose((*at_zero.p, *at_zero.q), (*T_world_body.p, *T_world_body.q), rtol=0, atol=1e-9):
-        return body.T_parent_body  # to the bit
-    T_parent_world = inverse((T_world_parent.p, T_world_parent.q))
-    return Pose(*compose(T_parent_world, (T_world_body.p, T_world_body.q)))
+                pixels, encoding = decode_image(self._store.get(address), encoding), AssetEncoding.PNG
+            data = self._store.get(address) if pixels is None else encode_image(pixels, encoding).data
+            image = self._add("images", {"bufferView": self._add_view(data), "mimeType": f"image/{encoding}"})
+            self._textures[address] = self._add("textures", {"source": image, "sampler": 0})
+        return self._textures[address]
 
 
 # --- cameras and lights -----------------------------------------------------------------------------------------------
@@ -408,28 +377,14 @@ def _build_light(light: Light) -> dict[str, Any]:
     return lamp
 
 
-def _find_direction_to_target(watcher: Light | Camera, p_body: Vec3, spec: SceneSpec) -> NDArray[np.float64] | None:
-    """Return the unit vector from a light or camera to the body that it tracks, in the frame of its own body.
+def _orient(back: NDArray[np.float64], up: Vec3, default: Quat) -> Quat:
+    """Return the rotation of a frame whose z axis is `back`, with its y axis close to `up`.
 
-    At the beginning; `None` when it tracks no body.
-    """
-    if watcher.follow not in _WATCHING or watcher.target < 0:
-        return None
-    poses = {body.id: body.T_world_body for body in spec.bodies}
-    own = poses[watcher.body]
-    way = np.subtract(poses[watcher.target].p, apply((own.p, own.q), p_body))
-    way = np.array(quat_rotate(quat_conj(own.q), to_vec3(way)))
-    return np.asarray(way / np.linalg.norm(way)) if way.any() else None
-
-
-def _orient(back: NDArray[np.float64], up: NDArray[np.float64], default: Quat) -> list[float]:
-    """Return `[x, y, z, w]` of a frame whose z axis is `back`, with its y axis close to `up`.
-
-    `default`: orientation where these are parallel.
+    `default`: rotation where these are parallel.
     """
     side = np.cross(up, back)
-    w, x, y, z = default
-    if np.linalg.norm(side) > 1e-9:
-        side /= np.linalg.norm(side)
-        w, x, y, z = quat_from_matrix(np.stack([side, np.cross(back, side), back], axis=1)).tolist()
-    return [x, y, z, w]
+    if np.linalg.norm(side) <= 1e-9:
+        return default
+    side /= np.linalg.norm(side)
+    w, x, y, z = quat_from_matrix(np.stack([side, np.cross(back, side), back], axis=1)).tolist()
+    return w, x, y, z

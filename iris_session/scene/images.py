@@ -40,23 +40,17 @@ def encode_image(pixels: Pixels, encoding: str = AssetEncoding.ARRAYS, quality: 
     if encoding == AssetEncoding.ARRAYS:
         stored = StoredArray(ArrayName.PIXELS, pixels, _choose_filter(pixels))
         return EncodedImage(encode_arrays(ArrayKind.IMAGE, [stored]), encoding)
-    cv2 = _import_opencv()
-    swapped = _swap_red_blue(pixels)
-    if encoding == AssetEncoding.PNG:
-        ok, data = cv2.imencode(".png", swapped, [cv2.IMWRITE_PNG_COMPRESSION, 6])
-    elif encoding == AssetEncoding.JPEG:
-        if pixels.shape[2] not in (1, 3):
-            raise AssetDecodeError(f"JPEG holds 1 or 3 channels, not {pixels.shape[2]}: use PNG")
-        ok, data = cv2.imencode(".jpg", swapped, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    else:
+    if encoding not in (AssetEncoding.PNG, AssetEncoding.JPEG):
         raise AssetDecodeError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
-    if not ok:
-        raise AssetDecodeError(f"an image of {pixels.shape} cannot be written as {encoding}")
-    encoded = data.tobytes()
+    if pixels.shape[2] not in ((1, 3) if encoding == AssetEncoding.JPEG else (1, 3, 4)):
+        raise AssetDecodeError(f"an image of {pixels.shape[2]} channels: JPEG holds 1 or 3, PNG 1, 3 or 4")
+    image = _import_pillow().fromarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels)
+    file = io.BytesIO()
+    image.save(file, encoding, quality=quality)
     if encoding == AssetEncoding.PNG:
-        return EncodedImage(encoded, encoding)
-    back = decode_image(encoded, encoding).astype(np.int16)
-    return EncodedImage(encoded, encoding, int(np.abs(back - pixels).max()))
+        return EncodedImage(file.getvalue(), encoding)
+    back = decode_image(file.getvalue(), encoding).astype(np.int16)
+    return EncodedImage(file.getvalue(), encoding, int(np.abs(back - pixels).max()))
 
 
 def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes: int = MAX_ARRAY_BYTES) -> Pixels:
@@ -73,18 +67,22 @@ def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes:
     width, height = read_stated_size(bytes(data[:65_536]), encoding)
     if width * height * 4 > max_bytes:
         raise AssetDecodeError(f"an image of {width} x {height} pixels, at most {max_bytes} bytes are read")
-    cv2 = _import_opencv()
+    pillow = _import_pillow()
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
+        image = pillow.open(io.BytesIO(data), formats=(encoding,))
+        if image.mode not in ("L", "RGB", "RGBA") and not image.mode.startswith("I"):  # palettes, CMYK
+            image = image.convert("RGBA" if "transparency" in image.info or "A" in image.mode else "RGB")
+        pixels = np.array(image)
+    except (OSError, ValueError, SyntaxError, EOFError, pillow.DecompressionBombError) as error:
         raise AssetDecodeError(f"damaged {encoding}: {error}") from None
-    if image is None or image.dtype != np.uint8:
-        raise AssetDecodeError(f"damaged {encoding}, or one with more than 8 bits a channel")
-    if image.shape[:2] != (height, width):
+    pixels = pixels if pixels.ndim == 3 else pixels[:, :, None]
+    if pixels.dtype != np.uint8:
+        raise AssetDecodeError(f"{encoding} of {pixels.dtype}: 8 bits a channel are read")
+    if pixels.shape[:2] != (height, width):
         raise AssetDecodeError(
-            f"damaged {encoding}: {image.shape[1]} x {image.shape[0]} pixels, stated {width} x {height}"
+            f"damaged {encoding}: {pixels.shape[1]} x {pixels.shape[0]} pixels, stated {width} x {height}"
         )
-    return _swap_red_blue(image if image.ndim == 3 else image[:, :, None])
+    return pixels
 
 
 def halve(pixels: Pixels) -> Pixels:
@@ -137,20 +135,13 @@ def read_stated_size(head: bytes, encoding: str) -> tuple[int, int]:
     raise AssetDecodeError("a JPEG without a size in its first 64 KiB")
 
 
-def _swap_red_blue(pixels: Pixels) -> Pixels:
-    """Exchange red and blue: OpenCV's order to ours, and back."""
-    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2])
-    if order is None:
-        raise AssetDecodeError(f"an image of {pixels.shape[2]} channels has no PNG or JPEG: 1, 3 or 4")
-    return np.ascontiguousarray(pixels[:, :, order])
-
-
-def _import_opencv() -> Any:
+def _import_pillow() -> Any:
+    """Return the module `PIL.Image`."""
     try:
-        import cv2
+        from PIL import Image
     except ImportError:
-        raise AssetDecodeError("PNG and JPEG need OpenCV: pip install 'iris-session[scene]'") from None
-    return cv2
+        raise AssetDecodeError("PNG, JPEG and other images need Pillow: pip install 'iris-session[scene]'") from None
+    return Image
 
 
 # --- image files ------------------------------------------------------------------------------------------------------
@@ -222,11 +213,3 @@ def check_pixels(pixels: Any, what: str) -> Pixels:
     if array.shape[0] * array.shape[1] > MAX_PIXELS:
         raise SceneBuildError(f"{what} has {array.shape[1]} x {array.shape[0]} pixels, at most {MAX_PIXELS:,}")
     return np.array(array)
-
-
-def _import_pillow() -> Any:
-    try:
-        from PIL import Image
-    except ImportError:
-        raise SceneBuildError("textures of files need Pillow: pip install 'iris-session[files]'") from None
-    return Image

@@ -35,7 +35,7 @@ def simplify_mesh(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] 
     """
     if mesh.uv is not None or mesh.color is not None or triangles <= 0 or mesh.triangles <= triangles:
         return None
-    first, inverse = sort_rows(mesh.position)
+    first, inverse = find_unique_rows(mesh.position + np.float32(0.0))  # -0 is 0
     points = mesh.position[first].astype(np.float64)
     index = inverse[mesh.index]
     area = float(np.linalg.norm(_face_vectors(points[index]), axis=1).sum())
@@ -76,7 +76,7 @@ def _cluster_once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, I
     used, index = _compact(index, len(points))
     points = points[used]
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    _, cluster = sort_rows(cells)
+    _, cluster = find_unique_rows(cells)
     count = np.bincount(cluster)
     mean = np.stack([np.bincount(cluster, points[:, k]) for k in range(3)], axis=1) / count[:, None]
     off = np.linalg.norm(points - mean[cluster], axis=1)
@@ -91,7 +91,7 @@ def _cluster_once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, I
     faces[turned_over] = faces[turned_over][:, ::-1]
     turned = np.argmin(faces, axis=1)[:, None] + np.arange(3)
     faces = np.take_along_axis(faces, turned % 3, axis=1)
-    faces = faces[sort_rows(faces)[0]]
+    faces = faces[np.sort(find_unique_rows(faces)[0])]
     stay, faces = np.unique(faces, return_inverse=True)
     return points[keep[stay]], faces.reshape(-1, 3), lost, moved
 
@@ -141,20 +141,6 @@ def _connected_parts(faces: Ints, n_points: int) -> Ints:
         if np.array_equal(lower, least):
             return least[faces[:, 0]]
         least = lower
-
-
-def sort_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
-    """Return the first index of each different row (n, 3), ordered by columns, and for every row which of these it is.
-
-    As `np.unique` over an axis, which takes several times as long on large meshes.
-    """
-    order = np.lexsort(rows.T[::-1])
-    ordered = rows[order]
-    new = np.ones(len(rows), bool)
-    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
-    which = np.empty(len(rows), np.int64)
-    which[order] = np.cumsum(new) - 1
-    return order[new], which
 
 
 def build_smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:

@@ -76,7 +76,7 @@ def index_corners(position: Floats, normal: Floats, uv: Floats | None, color: By
     )
 
 
-def find_unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def find_unique_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first index of each different row, and for every row which of these it is. Compared by bits."""
     bits = rows.view(np.uint32)
     key = np.zeros(len(rows), np.uint64)

@@ -12,9 +12,10 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from iris_session.protocol.common import MAX_TEXT, Pose, Vec3
+from anchors.pose import PoseTuple, compose, inverse, quat_rotate
+from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose, Vec3
 from iris_session.protocol.names import Follow, LightKind, TextureKind
-from iris_session.protocol.scene import Camera, Environment, Headlight, Light, Material, Rgb, Rgba, Texture, TextureUse
+from iris_session.protocol.scene import Camera, Environment, Headlight, Light, Material, Rgba, Texture, TextureUse
 
 #: MuJoCo's default colour: a geom with it has the colour of its material.
 _DEFAULT_RGBA: Final = (0.5, 0.5, 0.5, 1.0)
@@ -42,30 +43,19 @@ _TYPES: Final = {
 }
 
 
-def to_rgb(values: Any) -> Rgb:
-    red, green, blue = (float(v) for v in values)
-    return red, green, blue
-
-
-def to_rgba(values: Any) -> Rgba:
-    red, green, blue, alpha = (float(v) for v in values)
-    return red, green, blue, alpha
-
-
-def to_vec3(values: Any) -> Vec3:
-    x, y, z = (float(v) for v in values)
-    return x, y, z
+def to_floats(values: Any) -> Any:
+    """Return an array as a tuple of floats: a vector or a colour."""
+    return tuple(np.asarray(values, np.float64).tolist())
 
 
 def to_pose(position: Any, quaternion: Any) -> Pose:
-    w, x, y, z = (float(v) for v in quaternion)
-    return Pose(to_vec3(position), (w, x, y, z))
+    return Pose(to_floats(position), to_floats(quaternion))
 
 
 def resolve_rgba(model: mujoco.MjModel, own: Any, material: int) -> Rgba:
     """Return the colour that MuJoCo draws: the own colour, unless that is the default and there is a material."""
-    color = to_rgba(own)
-    return to_rgba(model.mat_rgba[material]) if material >= 0 and color == _DEFAULT_RGBA else color
+    color: Rgba = to_floats(own)
+    return to_floats(model.mat_rgba[material]) if material >= 0 and color == _DEFAULT_RGBA else color  # type: ignore[no-any-return]
 
 
 def read_materials(model: mujoco.MjModel) -> tuple[Material, ...]:
@@ -73,7 +63,7 @@ def read_materials(model: mujoco.MjModel) -> tuple[Material, ...]:
     return tuple(
         Material(
             name=read_name(model, "material", i),
-            rgba=to_rgba(model.mat_rgba[i]),
+            rgba=to_floats(model.mat_rgba[i]),
             emission=float(model.mat_emission[i]),
             specular=float(model.mat_specular[i]),
             shininess=float(model.mat_shininess[i]),
@@ -85,7 +75,7 @@ def read_materials(model: mujoco.MjModel) -> tuple[Material, ...]:
                 for role, texture in enumerate(model.mat_texid[i])
                 if texture >= 0
             ),
-            repeat=(float(model.mat_texrepeat[i, 0]), float(model.mat_texrepeat[i, 1])),
+            repeat=to_floats(model.mat_texrepeat[i]),
             uniform=bool(model.mat_texuniform[i]),
         )
         for i in range(model.nmat)
@@ -106,22 +96,20 @@ def compute_tracked(model: mujoco.MjModel, data: Any) -> Any | None:
     return own
 
 
-def _to_body_frame(at: Any, body: int, v_world: Any) -> Any:
-    """Return a vector of the world in the frame of a body."""
-    q_body_world, v_body = np.zeros(4), np.zeros(3)
-    mujoco.mju_negQuat(q_body_world, at.xquat[body])
-    mujoco.mju_rotVecQuat(v_body, v_world, q_body_world)
-    return v_body
+def _to_body_frame(at: Any, body: int, p_world: Any, q_world: Any = IDENTITY.q) -> PoseTuple:
+    """Return T_body_x of something at `p_world` with the orientation `q_world`. `at`: result of `compute_tracked`."""
+    T_world_body = to_floats(at.xpos[body]), to_floats(at.xquat[body])
+    return compose(inverse(T_world_body), (to_floats(p_world), to_floats(q_world)))
 
 
 def _find_light_place(model: mujoco.MjModel, i: int, at: Any | None) -> tuple[Vec3, Vec3]:
     """Return position and direction in the frame of the body. `at`: result of `compute_tracked`."""
-    rigid = to_vec3(model.light_pos[i]), to_vec3(model.light_dir[i])
+    rigid = to_floats(model.light_pos[i]), to_floats(model.light_dir[i])
     if at is None or int(model.light_mode[i]) not in _TRACKING:
         return rigid
     body = int(model.light_bodyid[i])
-    p_body = _to_body_frame(at, body, at.light_xpos[i] - at.xpos[body])
-    found = to_vec3(p_body), to_vec3(_to_body_frame(at, body, at.light_xdir[i]))
+    p_body, q_body_world = _to_body_frame(at, body, at.light_xpos[i])
+    found = p_body, quat_rotate(q_body_world, to_floats(at.light_xdir[i]))
     return rigid if np.allclose(rigid, found, rtol=0, atol=_SAME) else found
 
 
@@ -130,11 +118,9 @@ def _find_camera_pose(model: mujoco.MjModel, i: int, at: Any | None) -> Pose:
     rigid = to_pose(model.cam_pos[i], model.cam_quat[i])
     if at is None or int(model.cam_mode[i]) not in _TRACKING:
         return rigid
-    body, q_world, q_body_world, q_body = int(model.cam_bodyid[i]), np.zeros(4), np.zeros(4), np.zeros(4)
+    q_world = np.zeros(4)
     mujoco.mju_mat2Quat(q_world, at.cam_xmat[i])
-    mujoco.mju_negQuat(q_body_world, at.xquat[body])
-    mujoco.mju_mulQuat(q_body, q_body_world, q_world)
-    found = to_pose(_to_body_frame(at, body, at.cam_xpos[i] - at.xpos[body]), q_body)
+    found = Pose(*_to_body_frame(at, int(model.cam_bodyid[i]), at.cam_xpos[i], q_world))
     near = abs(np.dot(rigid.q, found.q)) >= 1.0 - _SAME**2 and np.allclose(rigid.p, found.p, rtol=0, atol=_SAME)
     return rigid if near else found
 
@@ -149,10 +135,10 @@ def read_lights(model: mujoco.MjModel, at: Any | None = None) -> tuple[Light, ..
             body=int(model.light_bodyid[i]),
             p_body=places[i][0],
             direction_body=places[i][1],
-            ambient=to_rgb(model.light_ambient[i]),
-            diffuse=to_rgb(model.light_diffuse[i]),
-            specular=to_rgb(model.light_specular[i]),
-            attenuation=to_vec3(model.light_attenuation[i]),
+            ambient=to_floats(model.light_ambient[i]),
+            diffuse=to_floats(model.light_diffuse[i]),
+            specular=to_floats(model.light_specular[i]),
+            attenuation=to_floats(model.light_attenuation[i]),
             cutoff=float(model.light_cutoff[i]),
             exponent=float(model.light_exponent[i]),
             range=_read_optional(model, "light_range", i, 0.0),
@@ -177,36 +163,27 @@ def _read_light_kind(model: mujoco.MjModel, index: int) -> str:
 def read_cameras(model: mujoco.MjModel, at: Any | None = None) -> tuple[Camera, ...]:
     """Return all cameras, by id. `at`: result of `compute_tracked`."""
     found = []
+    projection = "cam_projection" if hasattr(model, "cam_projection") else "cam_orthographic"
     for i in range(model.ncam):
-        width, height = (int(n) for n in model.cam_resolution[i])
-        sensor = [float(v) for v in model.cam_sensorsize[i]]
-        focal, principal = (0.0, 0.0), (0.0, 0.0)
-        if sensor[0] > 0 and sensor[1] > 0:  # convert lengths on the sensor to pixels
-            per_metre = (width / sensor[0], height / sensor[1])
-            f_x, f_y, c_x, c_y = (float(v) for v in model.cam_intrinsic[i])
-            focal = (f_x * per_metre[0], f_y * per_metre[1])
-            principal = (c_x * per_metre[0], c_y * per_metre[1])
+        sensor = np.asarray(model.cam_sensorsize[i], np.float64)
+        lens = np.zeros((2, 2))
+        if (sensor > 0).all():  # convert lengths on the sensor to pixels
+            lens = np.reshape(model.cam_intrinsic[i], (2, 2)).astype(np.float64) * (model.cam_resolution[i] / sensor)
         found.append(
             Camera(
                 name=read_name(model, "camera", i),
                 body=int(model.cam_bodyid[i]),
                 T_body_camera=_find_camera_pose(model, i, at),
                 fovy=float(model.cam_fovy[i]),
-                orthographic=_read_projection(model, i) == _ORTHOGRAPHIC,
-                focal=focal,
-                principal=principal,
-                resolution=(width, height),
+                orthographic=int(getattr(model, projection)[i]) == _ORTHOGRAPHIC,
+                focal=to_floats(lens[0]),
+                principal=to_floats(lens[1]),
+                resolution=tuple(model.cam_resolution[i].tolist()),
                 follow=_FOLLOW.get(int(model.cam_mode[i]), Follow.FIXED),
                 target=int(model.cam_targetbodyid[i]),
             )
         )
     return tuple(found)
-
-
-def _read_projection(model: mujoco.MjModel, index: int) -> int:
-    if hasattr(model, "cam_projection"):
-        return int(model.cam_projection[index])
-    return int(model.cam_orthographic[index])
 
 
 def read_environment(model: mujoco.MjModel, textures: Sequence[Texture]) -> Environment:
@@ -216,18 +193,19 @@ def read_environment(model: mujoco.MjModel, textures: Sequence[Texture]) -> Envi
     skyboxes = [i for i, texture in enumerate(textures) if texture.kind == TextureKind.SKYBOX]
     return Environment(
         headlight=Headlight(
-            bool(headlight.active), to_rgb(headlight.ambient), to_rgb(headlight.diffuse), to_rgb(headlight.specular)
+            bool(headlight.active),
+            *(to_floats(light) for light in (headlight.ambient, headlight.diffuse, headlight.specular)),
         ),
         skybox=skyboxes[0] if skyboxes else -1,
-        haze_rgba=to_rgba(model.vis.rgba.haze),
+        haze_rgba=to_floats(model.vis.rgba.haze),
         haze=float(scale.haze),
-        fog_rgba=to_rgba(model.vis.rgba.fog),
+        fog_rgba=to_floats(model.vis.rgba.fog),
         fog_start=float(scale.fogstart) * extent,
         fog_end=float(scale.fogend) * extent,
         znear=float(scale.znear) * extent,
         zfar=float(scale.zfar) * extent,
         extent=extent,
-        center=to_vec3(model.stat.center),
+        center=to_floats(model.stat.center),
     )
 
 

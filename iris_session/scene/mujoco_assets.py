@@ -7,8 +7,9 @@ the image. Skins are not shared: MuJoCo moves their vertices by weighted bodies,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import mujoco
@@ -80,6 +81,7 @@ def read_mesh_corners(model: mujoco.MjModel, index: int) -> MeshArrays:
 def read_textures(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[Texture, ...]:
     """Return all textures, by id."""
     kinds = [_KINDS.get(int(kind), TextureKind.IMAGE) for kind in model.tex_type]
+    spaces = getattr(model, "tex_colorspace", None)  # since MuJoCo 3.3.1
     images = [_read_pixels(model, i, kind) for i, kind in enumerate(kinds)]
     notes = builder.run([builder.texture_work(image, kind) for image, kind in zip(images, kinds, strict=True)])
     return tuple(
@@ -89,28 +91,19 @@ def read_textures(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[Texture
             width=image.shape[1],
             height=image.shape[0] // (1 if kind == TextureKind.IMAGE else _FACES),
             channels=image.shape[2],
-            colorspace=_read_color_space(model, i),
+            colorspace=ColorSpace.AUTO if spaces is None else _SPACES.get(int(spaces[i]), ColorSpace.AUTO),
             levels=note.levels,
         )
         for i, (kind, image, note) in enumerate(zip(kinds, images, notes, strict=True))
     )
 
 
-def _read_color_space(model: mujoco.MjModel, index: int) -> str:
-    if not hasattr(model, "tex_colorspace"):  # before MuJoCo 3.3.1
-        return ColorSpace.AUTO
-    return _SPACES.get(int(model.tex_colorspace[index]), ColorSpace.AUTO)
-
-
 def _read_pixels(model: mujoco.MjModel, index: int, kind: str) -> NDArray[np.uint8]:
     """Return pixels (height, width, channels), of cubes six faces. A cube of one square has it on every face."""
     shape = tuple(int(getattr(model, f"tex_{side}")[index]) for side in ("height", "width", "nchannel"))
     start = int(model.tex_adr[index])
-    data = model.tex_data[start : start + shape[0] * shape[1] * shape[2]].reshape(shape)
-    if kind != TextureKind.IMAGE and shape[0] == shape[1]:
-        return np.tile(data, (_FACES, 1, 1))
-    image: NDArray[np.uint8] = data
-    return image
+    image: NDArray[np.uint8] = model.tex_data[start : start + math.prod(shape)].reshape(shape)
+    return np.tile(image, (_FACES, 1, 1)) if kind != TextureKind.IMAGE and shape[0] == shape[1] else image
 
 
 def read_hfields(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[HeightField, ...]:
@@ -119,7 +112,7 @@ def read_hfields(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[HeightFi
     for i in range(model.nhfield):
         rows, columns, start = (int(getattr(model, f"hfield_{name}")[i]) for name in ("nrow", "ncol", "adr"))
         grids.append(model.hfield_data[start : start + rows * columns].reshape(rows, columns))
-    notes = builder.run([builder.blob_work([b"hfield", grid], _encode_grid(grid)) for grid in grids])
+    notes = builder.run([builder.blob_work([b"hfield", grid], partial(_encode_grid, grid)) for grid in grids])
     return tuple(
         HeightField(
             name=read_name(model, "hfield", i),
@@ -133,8 +126,8 @@ def read_hfields(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[HeightFi
     )
 
 
-def _encode_grid(grid: NDArray[np.float32]) -> Callable[[], bytes]:
-    return lambda: encode_arrays(ArrayKind.GRID, [StoredArray(ArrayName.ELEVATION, grid, ArrayFilter.SHUFFLE)])
+def _encode_grid(grid: NDArray[np.float32]) -> bytes:
+    return encode_arrays(ArrayKind.GRID, [StoredArray(ArrayName.ELEVATION, grid, ArrayFilter.SHUFFLE)])
 
 
 # --- deformables ------------------------------------------------------------------------------------------------------
@@ -151,7 +144,7 @@ def read_deformables(model: mujoco.MjModel, data: Any, builder: AssetBuilder) ->
     rest = [np.array(data.flexvert_xpos[part.vertices], np.float32) for part in parts]
     notes = builder.run(
         [
-            builder.blob_work([b"flex", *part.raw, vertices], part.encode(vertices))
+            builder.blob_work([b"flex", *part.raw, vertices], partial(part.encode, vertices))
             for part, vertices in zip(parts, rest, strict=True)
         ]
     )
@@ -202,11 +195,10 @@ class FlexMesh:
         """Return the content that the asset depends on, besides the vertices at rest."""
         return [self.elements, self.numbers, *([] if self.uv is None else [self.uv])]
 
-    def encode(self, rest: NDArray[np.float32]) -> Callable[[], bytes]:
-        """Return a function that encodes the asset, for vertices at rest (n, 3) [m], world frame."""
-
+    def encode(self, rest: NDArray[np.float32]) -> bytes:
+        """Return the asset, for vertices at rest (n, 3) [m], world frame."""
         numbers = self.numbers if len(self.numbers) <= int(self.numbers.max()) else None  # the inside is left out
-        return lambda: encode_deformable(self.elements, self.uv, rest, self.topology, numbers)
+        return encode_deformable(self.elements, self.uv, rest, self.topology, numbers)
 
 
 def read_flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:

@@ -6,14 +6,13 @@ The model is not changed. Left out: collision settings, actuators, sensors, cont
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 
 from iris_session.assets.store import AssetStore
-from iris_session.protocol.common import MAX_TEXT, Vec3
+from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.names import AssetEncoding, GeometryKind
 from iris_session.protocol.scene import (
@@ -24,7 +23,6 @@ from iris_session.protocol.scene import (
     Tendon,
     Visual,
     encode_scene,
-    list_assets,
 )
 from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions
 from iris_session.scene.budget import add_totals
@@ -36,39 +34,17 @@ from iris_session.scene.mujoco_appearance import (
     read_materials,
     read_name,
     resolve_rgba,
+    to_floats,
     to_pose,
 )
 from iris_session.scene.mujoco_assets import read_deformables, read_hfields, read_meshes, read_textures
+from iris_session.scene.result import ParsedScene
 
 _KINDS: Final = {
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind
     for kind in ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
 }
 _WRAP_SITE: Final = int(mujoco.mjtWrap.mjWRAP_SITE)
-
-
-@dataclass(frozen=True)
-class ParsedScene:
-    """Scene whose assets, the specification among them, are in the store.
-
-    Attributes:
-        spec: The specification.
-        scene_hash: Address of the specification.
-        skipped: Content of the model that the specification lacks, one line each.
-        built: Number of meshes, textures and other content that were encoded.
-        recalled: Number of those whose encoding the store already had.
-    """
-
-    spec: SceneSpec
-    scene_hash: str
-    skipped: tuple[str, ...]
-    built: int
-    recalled: int
-
-    @property
-    def addresses(self) -> tuple[str, ...]:
-        """Addresses of all assets in the order in which they become visible, to be kept in the store and served."""
-        return (self.scene_hash, *list_assets(self.spec))
 
 
 def parse_mujoco(
@@ -125,19 +101,17 @@ def parse_mujoco(
         environment=read_environment(model, found_textures),
     )
     spec = add_totals(spec)
-    skipped = (*_list_skipped(model), *_list_unrequested(model, sites=sites, tendons=tendons), *_list_containers(spec))
+    skipped = tuple(_list_skipped(model, spec, sites=sites, tendons=tendons))
     return ParsedScene(spec, store.put(encode_scene(spec)), skipped, builder.built, builder.recalled)
 
 
 def _read_bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
     """Return all bodies by id, without those that MuJoCo made for vertices of flexes; the world is 0."""
     vertices = _flex_vertex_bodies(model)
-    weld = model.body_weldid.tolist()
-    mocap = model.body_mocapid.tolist()
-    moving = [False] * len(weld)
+    moving = ((model.body_weldid != 0) | (model.body_mocapid >= 0)).tolist()
     for i, parent in enumerate(model.body_parentid.tolist()):
         # Before MuJoCo 3.4 mocap bodies, and bodies fixed to them, are welded to the world.
-        moving[i] = i > 0 and (weld[i] != 0 or mocap[i] >= 0 or moving[parent])
+        moving[i] = moving[i] or moving[parent]
     return tuple(
         Body(
             id=i,
@@ -167,21 +141,13 @@ def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
         *model.light_targetbodyid.tolist(),
         *model.cam_targetbodyid.tolist(),
     }
+    of_slides = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE]
+    slides = np.bincount(of_slides, minlength=model.nbody).tolist()
     return frozenset(
         body
-        for body in listed
-        if body > 0
-        and body not in used
-        and int(model.body_geomnum[body]) == 0
-        and 1 <= int(model.body_jntnum[body]) <= 3
-        and _has_only_slides(model, body)
+        for body in listed - used
+        if body > 0 and model.body_geomnum[body] == 0 and 1 <= model.body_jntnum[body] == slides[body] <= 3
     )
-
-
-def _has_only_slides(model: mujoco.MjModel, body: int) -> bool:
-    """Return whether all joints of a body are slides."""
-    first, n = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-    return bool((model.jnt_type[first : first + n] == mujoco.mjtJoint.mjJNT_SLIDE).all())
 
 
 def _read_visual(model: mujoco.MjModel, index: int) -> Visual:
@@ -217,8 +183,7 @@ def _read_site(model: mujoco.MjModel, index: int) -> Site:
 
 def _read_geometry(model: mujoco.MjModel, kind: int, size: Any, asset: int) -> Geometry:
     shape = _KINDS.get(kind, GeometryKind.BOX)
-    a, b, c = (float(v) for v in size)
-    full: Vec3 = (a, b, c)
+    full = a, b, _ = to_floats(size)
     mesh = hfield = -1
     match shape:
         case GeometryKind.SPHERE:
@@ -229,8 +194,7 @@ def _read_geometry(model: mujoco.MjModel, kind: int, size: Any, asset: int) -> G
             mesh = asset
         case GeometryKind.HFIELD:
             hfield = asset
-            x, y, z, _ = (float(v) for v in model.hfield_size[asset])
-            full = (x, y, z)
+            full = to_floats(model.hfield_size[asset][:3])
     return Geometry(shape, full, mesh, hfield)
 
 
@@ -255,18 +219,13 @@ def _read_tendons(model: mujoco.MjModel) -> tuple[Tendon, ...]:
     return tuple(found)
 
 
-def _list_skipped(model: mujoco.MjModel) -> tuple[str, ...]:
-    found = []
+def _list_skipped(model: mujoco.MjModel, spec: SceneSpec, *, sites: bool, tendons: bool) -> Iterator[str]:
+    """Yield lines on content that clients will not see: also sites and tendons that were not requested."""
+    shown = spec.groups_shown
     if model.nskin:
-        found.append(f"{model.nskin} skins: only bodies, shapes and flexes are shared; use a flex")
+        yield f"{model.nskin} skins: only bodies, shapes and flexes are shared; use a flex"
     if model.nflex > MAX_STREAMS:
-        found.append(f"motion of {model.nflex - MAX_STREAMS} of {model.nflex} flexes: {MAX_STREAMS} are streamed")
-    return tuple(found)
-
-
-def _list_unrequested(model: mujoco.MjModel, *, sites: bool, tendons: bool) -> Iterator[str]:
-    """Yield lines on sites and tendons that MuJoCo shows and that were not requested."""
-    shown = SceneSpec().groups_shown
+        yield f"motion of {model.nflex - MAX_STREAMS} of {model.nflex} flexes: {MAX_STREAMS} are streamed"
     if not sites:
         marks = (_read_site(model, i) for i in range(model.nsite))
         if n := sum(mark.group in shown and mark.rgba[3] > 0 for mark in marks):
@@ -275,8 +234,5 @@ def _list_unrequested(model: mujoco.MjModel, *, sites: bool, tendons: bool) -> I
         cables = (cable for cable in _read_tendons(model) if cable.group in shown)
         if n := sum(cable.width > 0 and cable.rgba[3] > 0 for cable in cables):
             yield f"{n} tendons: serve --tendons, or SessionConfig(tendons=True), shares them"
-
-
-def _list_containers(spec: SceneSpec) -> Iterator[str]:
     if n := sum(texture.levels[0].encoding == AssetEncoding.OPAQUE for texture in spec.textures):
         yield f"{n} textures in a form of their own (KTX) where that is not read: PNG is everywhere"

@@ -1,4 +1,5 @@
-"""Result of a `SceneBuilder`: a specification with its assets in a store, and what is needed to move its bodies.
+"""Results of `parse_mujoco` and of a `SceneBuilder`: a specification with its assets in a store, and what moves its
+bodies.
 
 Publishing code reads this; nothing here knows files, sessions or clocks. Body 0 is the world; moving bodies have the
 ids 1..n in the order of `ComposedScene.moving` and no parent but the world; static bodies come after them.
@@ -42,8 +43,32 @@ class DeformableSource:
 
 
 @dataclass(frozen=True)
-class ComposedScene:
+class ParsedScene:
     """Scene whose assets, the specification among them, are in the store: hold `addresses` there while it is served.
+
+    Attributes:
+        spec: The specification.
+        scene_hash: Address of the specification.
+        skipped: Content that clients will not see, one line each.
+        built: Number of meshes, textures and other content that were encoded.
+        recalled: Number of those whose encoding the store already had.
+    """
+
+    spec: SceneSpec
+    scene_hash: str
+    skipped: tuple[str, ...]
+    built: int
+    recalled: int
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """Addresses of all assets in the order in which they become visible, to be kept in the store and served."""
+        return (self.scene_hash, *list_assets(self.spec))
+
+
+@dataclass(frozen=True)
+class ComposedScene(ParsedScene):
+    """Scene with what is needed to move it.
 
     Attributes:
         moving: Names of the streamed bodies, each once; body `i + 1` is `moving[i]`. Bodies of an articulation are
@@ -51,27 +76,14 @@ class ComposedScene:
         poses: Initial poses T_world_body, in the order of `moving`.
         articulations: Articulations by name.
         deformables: Deformables by name.
-        skipped: Content that clients will not see, one line each.
         notes: A likely mistake of units, with the correction, or nothing.
-        built: Number of pieces of work that were done.
-        recalled: Number of those whose result the store already had.
     """
 
-    spec: SceneSpec
-    scene_hash: str
     moving: tuple[str, ...]
     poses: tuple[Pose, ...]
     articulations: Mapping[str, Articulation]
     deformables: Mapping[str, DeformableSource]
-    skipped: tuple[str, ...]
     notes: tuple[str, ...] = ()
-    built: int = 0
-    recalled: int = 0
-
-    @property
-    def addresses(self) -> tuple[str, ...]:
-        """Addresses of all assets in the order in which they become visible, to be kept in the store and served."""
-        return (self.scene_hash, *list_assets(self.spec))
 
 
 # --- articulations ----------------------------------------------------------------------------------------------------

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypedDict, cast
+from typing import Any, Final, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,30 +56,16 @@ class DrawingOptions(PlacementOptions, AppearanceOptions, total=False):
     """Arguments of `SceneBuilder` for what is drawn at a place."""
 
 
-class ScenePlacement(NamedTuple):
-    """Place of something: its pose in the world, or in the frame of the body `on`; `movable`: a body of its own."""
-
-    pose: Pose
-    movable: bool
-    on: str
-
-
-def parse_options(options: DrawingOptions) -> tuple[ScenePlacement, Appearance | None]:
-    """Return placement and appearance, `None` when no argument of appearance is given. Raises `SceneBuildError`."""
-    _reject_unknown(options, DrawingOptions)
-    pose = check_pose(options.get("position", IDENTITY.p), options.get("quaternion", IDENTITY.q))
-    look = {name: value for name, value in options.items() if name in AppearanceOptions.__annotations__}
-    appearance = parse_appearance(cast("AppearanceOptions", look))
-    return ScenePlacement(pose, bool(options.get("movable", False)), options.get("on", "")), appearance
-
-
-def parse_appearance(options: AppearanceOptions) -> Appearance | None:
+def parse_appearance(options: AppearanceOptions | DrawingOptions, known: type = DrawingOptions) -> Appearance | None:
     """Return the appearance that arguments describe, `None` when all are defaults.
 
     Raises:
         SceneBuildError: A value is out of its range, or the texture cannot be read.
+        TypeError: An argument is not one of `known`.
     """
-    _reject_unknown(options, AppearanceOptions)
+    if unknown := [name for name in options if name not in known.__annotations__]:
+        names = ", ".join(known.__annotations__)
+        raise TypeError(f"unexpected argument {unknown[0]!r}: these are known: {names}")
     rgba, texture = options.get("rgba"), options.get("texture")
     across, down = check_numbers("repeat", options.get("repeat", (1.0, 1.0)), 2)
     uniform = bool(options.get("uniform", False))
@@ -98,20 +84,14 @@ def parse_appearance(options: AppearanceOptions) -> Appearance | None:
     return replace(Appearance(rgba=color, images=images, repeat=(across, down), uniform=uniform), **values)
 
 
-def _reject_unknown(options: Mapping[str, Any], known: type) -> None:
-    names = known.__annotations__
-    if unknown := [name for name in options if name not in names]:
-        raise TypeError(f"unexpected argument {unknown[0]!r}: these are known: {', '.join(names)}")
-
-
 def _check_rgba(rgba: Any) -> Rgba:
-    short = hasattr(rgba, "__len__") and len(rgba) == 3
     try:
-        red, green, blue, alpha = (*check_numbers("rgba", rgba, 3 if short else 4), 1.0)[:4]
-    except SceneBuildError:
-        red = green = blue = alpha = -1.0
-    if not all(0.0 <= v <= 1.0 for v in (red, green, blue, alpha)):
+        numbers = check_numbers("rgba", rgba, len(rgba))
+    except (TypeError, SceneBuildError):
+        numbers = ()
+    if len(numbers) not in (3, 4) or not all(0.0 <= v <= 1.0 for v in numbers):
         raise SceneBuildError(f"rgba is {rgba!r}: red, green, blue, alpha from 0 to 1 are needed; (1, 0, 0, 1) is red")
+    red, green, blue, alpha = (*numbers, 1.0)[:4]
     return red, green, blue, alpha
 
 
@@ -137,21 +117,21 @@ def check_numbers(
     what: str, values: Any, count: int, needed: str = "", *, above: float | None = None
 ) -> tuple[float, ...]:
     """Return `count` finite numbers, greater than `above`. `needed`: what they are, for the message."""
-    try:  # texts are no numbers, although `float` takes their digits
-        found = [float(v) for v in values if not isinstance(v, str | bytes)] if not isinstance(values, str) else []
-    except (TypeError, ValueError, OverflowError):
-        found = []
-    if len(found) != count or not np.isfinite(found).all():
+    try:
+        found = tuple(check_number(what, v) for v in values)
+    except (TypeError, SceneBuildError):
+        found = ()
+    if len(found) != count:
         raise SceneBuildError(f"{what} is {values!r}: {count} finite numbers {needed} are needed".replace("  ", " "))
     if above is not None and min(found) <= above:
         raise SceneBuildError(f"{what} is {values!r}: numbers greater than {above:g} are needed")
-    return tuple(found)
+    return found
 
 
 def check_number(what: str, value: Any, *, above: float | None = None) -> float:
     """Return one finite number, greater than `above`."""
     try:
-        found = math.nan if isinstance(value, str | bytes) else float(value)
+        found = math.nan if isinstance(value, str | bytes) else float(value)  # though `float` takes their digits
     except (TypeError, ValueError, OverflowError):
         found = math.nan
     if not math.isfinite(found):
@@ -164,13 +144,9 @@ def check_number(what: str, value: Any, *, above: float | None = None) -> float:
 def check_vertices(what: str, values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:
     """Return rows of finite float32, read-only."""
     needed = f"finite numbers of shape (n, {width}) are needed"
-    try:
-        given = np.asarray(values)
-    except (TypeError, ValueError):
-        raise SceneBuildError(f"{what}: rows that are no array: {needed}") from None
+    given = to_array(values, what)
     if given.dtype.kind not in "biuf":
-        kind = "texts" if given.dtype.kind in "US" else f"an array of {given.dtype}"
-        raise SceneBuildError(f"{what}: {kind} of shape {given.shape}: {needed}")
+        raise SceneBuildError(f"{what}: an array of {given.dtype} of shape {given.shape}: {needed}")
     with np.errstate(over="ignore"):  # what float32 cannot hold is not finite then
         array = np.array(given, np.float32)
     if array.ndim != 2 or array.shape[1] != width or not len(array) or not np.isfinite(array).all():

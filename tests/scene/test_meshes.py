@@ -20,7 +20,7 @@ from iris_session.scene import (
     encode_mesh_quantised,
 )
 from iris_session.scene.arrays import StoredArray
-from iris_session.scene.mesh_processing import build_smooth_mesh, simplify_mesh, sort_rows
+from iris_session.scene.mesh_processing import build_smooth_mesh, simplify_mesh
 from iris_session.scene.meshes import index_corners
 
 
@@ -158,15 +158,3 @@ def test_invalid_meshes_are_rejected(arrays: list[StoredArray], text: str) -> No
         del whole["normal"]
     with pytest.raises(AssetDecodeError, match=text):
         decode_mesh(encode_arrays("mesh", [StoredArray(name, values) for name, values in whole.items()]))
-
-
-@pytest.mark.parametrize("kind", [np.float32, np.int64])
-def test_unique_rows_agree_with_numpy(kind: type) -> None:
-    rows = np.random.default_rng(5).integers(-3, 3, (2000, 3)).astype(kind)
-    first, which = sort_rows(rows)
-    unique, place, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    np.testing.assert_array_equal(rows[first], unique)
-    np.testing.assert_array_equal(first, place)
-    np.testing.assert_array_equal(which, inverse.reshape(-1))
-    none, nowhere = sort_rows(rows[:0])
-    assert len(none) == len(nowhere) == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -12,20 +11,19 @@ from typing import Any, Final
 import numpy as np
 
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.importers.references import References
+from iris_session.scene.importers.references import (
+    GLTF,
+    MESHES,
+    MODELS,
+    ROBOTS,
+    References,
+    check_present,
+    get_ending,
+    xacro_advice,
+)
 from iris_session.scene.nodes import LoadedFile
 
 _logger = logging.getLogger("iris_session.scene")
-#: Suffixes that `load_file` reads; the others of trimesh are point clouds, general archives, or very rare.
-_GLTF: Final = ("glb", "gltf")
-MESHES: Final = ("dae", "obj", "off", "ply", "stl")
-ROBOTS: Final = ("urdf",)
-#: Suffixes of files that MuJoCo reads.
-MODELS: Final = ("mjb", "mjcf", "xml")
-ENDINGS: Final = tuple(sorted((*_GLTF, *MESHES, *ROBOTS, *MODELS)))
-_ADDRESS: Final = re.compile(r"(https?|ftp):[/\\]")
-#: Maximum number of files that an error message lists.
-_LISTED: Final = 8
 #: Errors whose messages are about code, not about the file.
 _CODE_ERRORS: Final = (AttributeError, TypeError, NameError, AssertionError, NotImplementedError, RecursionError)
 
@@ -43,7 +41,7 @@ def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name
     """
     kind = get_ending(path)
     check_present(path)
-    if kind not in (*_GLTF, *MESHES):
+    if kind not in (*GLTF, *MESHES):
         raise SceneBuildError(f"{path.name}: {_suggest_reader(path, kind)}")
     references = References(path, package_dirs)
     found: LoadedFile = read_guarded(path, kind, lambda: _read(path, kind, references, name or path.stem))
@@ -54,21 +52,14 @@ def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name
     return found
 
 
-def check_present(path: Path) -> None:
-    """Check that there is a file that is not empty. Raises `SceneBuildError`."""
-    try:
-        if _ADDRESS.match(str(path)):  # `Path` merges the two slashes of an address
-            raise SceneBuildError(f"{path.name}: files are read, not addresses: download it first")
-        if path.is_dir():
-            raise SceneBuildError(f"{path} is a folder: name a file{list_readable_files(path, 'in it')}")
-        if not path.is_file():
-            raise SceneBuildError(
-                f"{path}: no such file{list_readable_files(path.parent, 'in its folder', get_ending(path))}"
-            )
-        if not path.stat().st_size:
-            raise SceneBuildError(f"{path} is empty: 0 bytes")
-    except (OSError, ValueError) as error:  # not a possible file name
-        raise SceneBuildError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+def _read(path: Path, kind: str, references: References, name: str) -> LoadedFile:
+    if kind in GLTF:
+        from iris_session.scene.importers.gltf import read_gltf
+
+        return read_gltf(path, references)
+    from iris_session.scene.importers.trimesh_files import read_with_trimesh
+
+    return read_with_trimesh(path, references, name)
 
 
 def read_guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
@@ -95,24 +86,6 @@ def read_guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
         raise SceneBuildError(f"{path} is damaged, or no {kind.upper()}: {type(error).__name__}: {text}") from error
 
 
-def get_ending(path: Path) -> str:
-    """Return the suffix in lower case, without the dot."""
-    return path.suffix.lower().lstrip(".")
-
-
-def list_readable_files(folder: Path, where: str, wanted: str = "") -> str:
-    """Return, for error messages, the readable files of a folder, those with suffix `wanted` first."""
-    try:
-        found = [entry for entry in folder.iterdir() if get_ending(entry) in ENDINGS and entry.is_file()]
-        names = [entry.name for entry in sorted(found, key=lambda one: (get_ending(one) != wanted, one.name))]
-    except OSError:
-        return "" if folder.is_dir() else f"; there is no folder {folder} either"
-    if not names:
-        return f"; none {where} is of a kind that is read ({', '.join(ENDINGS)})"
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return f"; {where}: {', '.join(names[:_LISTED])}{more}"
-
-
 def _suggest_reader(path: Path, kind: str) -> str:
     if kind in ROBOTS:
         return "a URDF is a robot: use add_urdf"
@@ -120,21 +93,5 @@ def _suggest_reader(path: Path, kind: str) -> str:
         return xacro_advice(path)
     if kind in MODELS:
         return f"files that end in .{kind} are MuJoCo's: Session({path.name!r}) shares one"
-    these = f"{', '.join((*_GLTF, *MESHES))}; urdf by add_urdf; {', '.join(MODELS)} by Session"
+    these = f"{', '.join((*GLTF, *MESHES))}; urdf by add_urdf; {', '.join(MODELS)} by Session"
     return f"files that end in .{kind} are not read. These are: {these}" if kind else f"no ending. Read are {these}"
-
-
-def xacro_advice(path: Path) -> str:
-    """Return advice on expanding xacro to URDF."""
-    stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
-    return f"xacro must be expanded first: xacro {path.name} > {stem}.urdf (ROS has it; else pip install xacro)"
-
-
-def _read(path: Path, kind: str, references: References, name: str) -> LoadedFile:
-    if kind in _GLTF:
-        from iris_session.scene.importers.gltf import read_gltf
-
-        return read_gltf(path, references)
-    from iris_session.scene.importers.trimesh_files import read_with_trimesh
-
-    return read_with_trimesh(path, references, name)

@@ -1,5 +1,7 @@
-"""Files that a geometry file may refer to. All participants see the scene, and files come from untrusted sources, so a
-reference is followed only into folders that belong to the file:
+"""Files of geometry: their kinds, and `References`, which decides which further files one may name.
+
+All participants see the scene, and files come from untrusted sources, so a reference is followed only into folders that
+belong to the file:
 
 - its own folder with all subfolders;
 - sibling folders with the usual names for models (`SIBLINGS`);
@@ -24,6 +26,16 @@ from typing import Final
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.nodes import MAX_FILE_BYTES
 
+#: Suffixes that `load_file` reads; the others of trimesh are point clouds, general archives, or very rare.
+GLTF: Final = ("glb", "gltf")
+MESHES: Final = ("dae", "obj", "off", "ply", "stl")
+ROBOTS: Final = ("urdf",)
+#: Suffixes of files that MuJoCo reads.
+MODELS: Final = ("mjb", "mjcf", "xml")
+ENDINGS: Final = tuple(sorted((*GLTF, *MESHES, *ROBOTS, *MODELS)))
+_ADDRESS: Final = re.compile(r"(https?|ftp):[/\\]")
+#: Maximum number of files that an error message lists.
+_LISTED: Final = 8
 #: Number of parent folders that are searched for a package.
 _UP: Final = 8
 #: Sibling folders that belong to a file in one of `MODEL_FOLDERS`: most models refer to their meshes as
@@ -46,10 +58,50 @@ SIBLINGS: Final = (
 #: Names, or parts of names, of folders that hold the models of a robot and nothing else. What lies beside another
 #: folder, such as one of downloads, need not belong to the file: it could be the user's own images.
 MODEL_FOLDERS: Final = ("urdf", "xacro", "robot", "sdf", "mjcf", "xml", "model", "description", "gltf", "scene", "mesh")
-#: Maximum number of files that an error message lists.
-_LISTED: Final = 8
 _PACKAGE: Final = "package.xml"
 _files: ContextVar[list[Path] | None] = ContextVar("files that were read", default=None)
+
+
+def check_present(path: Path) -> None:
+    """Check that there is a file that is not empty. Raises `SceneBuildError`."""
+    try:
+        if _ADDRESS.match(str(path)):  # `Path` merges the two slashes of an address
+            raise SceneBuildError(f"{path.name}: files are read, not addresses: download it first")
+        if path.is_dir():
+            raise SceneBuildError(
+                f"{path} is a folder: name a file ({', '.join(ENDINGS)}){_list_files(path / path.name)}"
+            )
+        if not path.is_file():
+            raise SceneBuildError(f"{path}: no such file{_list_files(path)}")
+        if not path.stat().st_size:
+            raise SceneBuildError(f"{path} is empty: 0 bytes")
+    except (OSError, ValueError) as error:  # not a possible file name
+        raise SceneBuildError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def get_ending(path: Path) -> str:
+    """Return the suffix in lower case, without the dot."""
+    return path.suffix.lower().lstrip(".")
+
+
+def xacro_advice(path: Path) -> str:
+    """Return advice on expanding xacro to URDF."""
+    stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
+    return f"xacro must be expanded first: xacro {path.name} > {stem}.urdf (ROS has it; else pip install xacro)"
+
+
+def _list_files(path: Path) -> str:
+    """Return, for error messages, files beside `path` with similar names, else those of a kind that is read."""
+    try:
+        names = sorted(entry.name for entry in path.parent.iterdir() if entry.is_file())
+    except OSError:
+        return f"; there is no folder {path.parent}"
+    near = difflib.get_close_matches(path.name, names, n=3)
+    near = near or [name for name in names if get_ending(Path(name)) in ENDINGS][:_LISTED]
+    return f"; in {path.parent}: {', '.join(near)}" if near else ""
+
+
+# --- references -------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -98,10 +150,7 @@ class References:
     def find(self, reference: str) -> Path:
         """Return the file that `reference` names. Raises `SceneBuildError` when it is missing or may not be read."""
         if "$(" in reference or "${" in reference:
-            raise SceneBuildError(
-                f"{self.path.name} refers to {reference}: xacro must be expanded first: xacro IN.urdf.xacro > OUT.urdf "
-                "(ROS has it; else pip install xacro)"
-            )
+            raise SceneBuildError(f"{self.path.name} refers to {reference}: {xacro_advice(self.path)}")
         scheme, found, rest = reference.partition("://")
         if not found:
             plain = self.path.parent / reference.replace("\\", "/")
@@ -111,11 +160,9 @@ class References:
             return self._in_package(reference, package, inside.lstrip("/"))
         if scheme == "file":
             return self._allowed(reference, Path(_decode_percent(rest)))
-        if scheme in ("http", "https", "ftp"):
-            raise SceneBuildError(
-                f"{self.path.name} refers to {reference}: files are read, not addresses: download it first"
-            )
-        raise SceneBuildError(f"{self.path.name} refers to {reference}: only files and package:// are read")
+        raise SceneBuildError(
+            f"{self.path.name} refers to {reference}: only files and package:// are read; download it first"
+        )
 
     def folders(self, path: Path) -> tuple[Path, ...]:
         """Return the allowed folders that contain a found file: its own references may lead there too."""
@@ -129,7 +176,7 @@ class References:
             )
         if not found.is_file():
             raise SceneBuildError(
-                f"{self.path.name} refers to {reference}: there is no file {found}{_list_similar(found, 0)}"
+                f"{self.path.name} refers to {reference}: there is no file {found}{_list_files(found)}"
             )
         return found
 
@@ -139,29 +186,26 @@ class References:
         """
         if package in ("", ".", ".."):
             raise SceneBuildError(f"{self.path.name} refers to {reference}: no package is named there")
-        tried, closed = [], None
         places = (*self.given, *self._list_parents())
-        for root in (*places, *(place / package for place in places)):
-            if root.name != package and not _is_package(root, package):
-                continue
-            tried.append(root)
-            found = (root / inside).resolve()
-            if found.is_relative_to(root.resolve()) and found.is_file():
-                if self._is_trusted_root(root, found):
-                    return found
-                closed = closed or root
-        lost = [(root / inside).resolve() for root in tried if root.is_dir() and self._is_trusted_root(root, root)]
-        within = [path for path in lost if any(path.is_relative_to(root.resolve()) for root in tried)]
-        if closed is None and within:
-            raise SceneBuildError(
-                f"{self.path.name} refers to {reference}: package {package} is there, and has no file {within[0]}"
-                f"{_list_similar(within[0])}"
-            )
+        tried = [
+            root
+            for root in (*places, *(place / package for place in places))
+            if root.name == package or _is_package(root, package)
+        ]
         hint = f"looked in {', '.join(map(str, tried))}" if tried else "no such package above the file"
-        if closed is not None:  # any folder could be named as a package, also one of private images or keys
-            hint = f"{closed} has no {_PACKAGE}, so it is no package"
+        for root in tried:
+            found = (root / inside).resolve()
+            if not found.is_relative_to(root.resolve()):
+                continue
+            if not self._is_trusted_root(root, found):  # any folder could be named, also one of private images or keys
+                if found.is_file():
+                    hint = f"{root} has no {_PACKAGE}, so it is no package"
+            elif found.is_file():
+                return found
+            elif root.is_dir():
+                hint = f"package {package} is there, and has no file {found}{_list_files(found)}"
         raise SceneBuildError(
-            f"{self.path.name} refers to {reference}: {hint}; name the package's folder in package_dirs"
+            f"{self.path.name} refers to {reference}: name the package's folder in package_dirs: {hint}"
         )
 
     def _is_trusted_root(self, root: Path, found: Path) -> bool:
@@ -172,17 +216,6 @@ class References:
     def _list_parents(self) -> tuple[Path, ...]:
         """Return the folder of the file and its parents, without the root of the file system."""
         return tuple(up for up in self.path.parents if up != Path(up.anchor))[:_UP]
-
-
-def _list_similar(path: Path, others: int = _LISTED) -> str:
-    """Return, for error messages, files with similar names, else at most `others` other files of that folder."""
-    folder = path.parent
-    try:
-        names = sorted(entry.name for entry in folder.iterdir() if entry.is_file())
-    except OSError:
-        return f"; there is no folder {folder}"
-    near = difflib.get_close_matches(path.name, names, n=3) or names[:others]
-    return f"; in {folder}: {', '.join(near)}" if near else ""
 
 
 def _is_package(root: Path, name: str) -> bool:

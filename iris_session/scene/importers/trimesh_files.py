@@ -1,14 +1,17 @@
 """Reader of mesh files by way of trimesh: OBJ with MTL, STL, PLY with colours, OFF, DAE. Not glTF: see `gltf`.
 
-Colours are taken unchanged. Missing normals are computed with creases, as MuJoCo does.
+Colours are taken unchanged. Missing normals are computed with creases, as MuJoCo does. What trimesh reads without an
+error although it is cut, or reads wrongly, is checked before.
 """
 
 from __future__ import annotations
 
+import codecs
 import io
 import logging
 import math
 import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +21,6 @@ from numpy.typing import NDArray
 from iris_session.protocol.scene import Rgba
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, to_pixels
-from iris_session.scene.importers.mesh_validation import CHECKS
 from iris_session.scene.importers.references import References, read_bounded
 from iris_session.scene.importers.xml_files import check_dae
 from iris_session.scene.mesh_processing import compute_creased_normals, merge_vertex_color, normalise
@@ -37,6 +39,10 @@ from iris_session.scene.nodes import (
 )
 
 _UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
+_STL_HEAD: Final = 84
+_STL_TRIANGLE: Final = 50
+#: Face of an OBJ that counts back.
+_RELATIVE_CORNER: Final = re.compile(rb"^[ \t]*f[ \t][^\n#]*[ \t/]-", re.MULTILINE)
 #: Names that trimesh gives to geometries without a name in the file.
 _MADE_UP: Final = re.compile(r"geometry(_\d+)?")
 
@@ -47,31 +53,32 @@ def read_with_trimesh(path: Path, references: References, name: str) -> LoadedFi
     Raises `SceneBuildError`, and any error that trimesh raises for damaged files.
     """
     trimesh, kind = _import_trimesh(), path.suffix.lower().lstrip(".")
-    data = _check_file(path.name, kind, read_bounded(path))
-    resolver = _make_resolver(trimesh, references)
+    data = _CHECKS[kind](path.name, read_bounded(path))
+    resolver = _Resolver(references)
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
     reader = _Reader(trimesh, path.name, name)
+    stated = _UP.search(data) if kind == "dae" else None
+    up = stated.group(1).decode().lower() if stated else "y" if kind == "dae" else "z"
     nodes = reader.read_nodes(scene)
     unit = float(trimesh.units.unit_conversion(scene.units, "meters")) if scene.units else 1.0
-    return LoadedFile(nodes, _find_up_axis(kind, data), unit, (*resolver.missing, *reader.skipped))
+    return LoadedFile(nodes, up, unit, (*resolver.missing, *reader.skipped))
 
 
-def _check_file(name: str, kind: str, data: bytes) -> bytes:
-    if kind == "dae":
+class _Resolver:
+    """Reader of the further files that trimesh asks for: `references` decides, and missing ones are recorded."""
+
+    def __init__(self, references: References) -> None:
+        self._references = references
+        self.missing: list[str] = []
+
+    def get(self, name: str) -> bytes:
         try:
-            import collada  # noqa: F401
-        except ImportError:
-            raise SceneBuildError(f"{name}: DAE files need pycollada: pip install 'iris-session[files]'") from None
-        return check_dae(name, data)
-    return CHECKS[kind](name, data) if kind in CHECKS else data
+            return read_bounded(self._references.find(str(name).strip()))
+        except SceneBuildError as error:
+            self.missing.append(str(error))
+            raise
 
-
-def _find_up_axis(kind: str, data: bytes) -> str:
-    """Return the up axis: COLLADA states it, y by default; the other formats do not, and count as z up."""
-    if kind != "dae":
-        return "z"
-    found = _UP.search(data)
-    return found.group(1).decode().lower() if found else "y"
+    __getitem__ = get
 
 
 class _Reader:
@@ -225,32 +232,6 @@ def _to_number(value: Any, default: float) -> float:
     return found if math.isfinite(found) else default
 
 
-def _make_resolver(trimesh: Any, references: References) -> Any:
-    """Return the resolver that trimesh asks for further files: `references` decides, and missing files are recorded."""
-
-    class Resolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
-        def __init__(self) -> None:
-            self.missing: list[str] = []
-
-        def get(self, name: str) -> bytes:
-            try:
-                return read_bounded(references.find(str(name).strip()))
-            except SceneBuildError as error:
-                self.missing.append(str(error))
-                raise
-
-        def write(self, name: str, data: Any) -> None:
-            raise SceneBuildError("nothing is written where files are read")
-
-        def namespaced(self, namespace: str) -> Any:
-            return self
-
-        def keys(self) -> list[str]:
-            return []
-
-    return Resolver()
-
-
 def _import_trimesh() -> Any:
     try:
         import trimesh
@@ -260,3 +241,73 @@ def _import_trimesh() -> Any:
     if not logger.handlers:  # otherwise Python prints its tracebacks although no logging was configured
         logger.addHandler(logging.NullHandler())
     return trimesh
+
+
+# --- checks of files: each takes the name and the bytes, and returns the bytes to be read -----------------------------
+
+
+def _check_stl(name: str, data: bytes) -> bytes:
+    """Check that a binary STL has as many triangles as its header states, and that a text STL has an end."""
+    if data[:512].lstrip()[:5].lower() == b"solid" and b"\0" not in data[:512]:
+        if b"endsolid" not in data[-4096:].lower():
+            raise SceneBuildError(f"{name} is cut: an STL of text ends with endsolid; export or download it again")
+        return data
+    count = int.from_bytes(data[80:_STL_HEAD], "little")
+    size = _STL_HEAD + count * _STL_TRIANGLE
+    if len(data) < size:
+        raise SceneBuildError(
+            f"{name} is cut, or no STL: its head says {count:,} triangles, {size:,} bytes, and it has {len(data):,}; "
+            "export or download it again"
+        )
+    return data[:size]  # some writers pad the last block
+
+
+def _check_ply(name: str, data: bytes) -> bytes:
+    """Check that a text PLY has as many lines as its header states."""
+    head, _, body = data.partition(b"end_header\n")
+    rows = sum(int(count) for count in re.findall(rb"^element[ \t]+\S+[ \t]+(\d{1,18})", head, re.MULTILINE))
+    if b"format ascii" in head and (lines := len(body.splitlines())) < rows:
+        raise SceneBuildError(f"{name} is cut: its head says {rows:,} lines, and it has {lines:,}; export it again")
+    return data
+
+
+def _check_off(name: str, data: bytes) -> bytes:
+    """Check that an OFF has as many faces as its header states, and that the last face is complete.
+
+    Comments are removed: trimesh reads everything but one line before the first comment twice.
+    """
+    data = b"\n".join(line.partition(b"#")[0] for line in data.splitlines())
+    rows = [row for line in data.partition(b"OFF")[2].splitlines() if (row := line.split())]
+    vertices, faces = (int(word) for word in rows[0][:2])
+    listed = rows[1 + vertices : 1 + vertices + faces]
+    if len(listed) < faces or (faces and len(listed[-1]) <= int(listed[-1][0])):
+        raise SceneBuildError(
+            f"{name} is cut: its head says {faces:,} faces, and it ends in number {len(listed):,}; "
+            "export or download it again"
+        )
+    return data
+
+
+def _check_obj(name: str, data: bytes) -> bytes:
+    """Check that no face counts back from its own line: trimesh counts from the end of the file."""
+    if found := _RELATIVE_CORNER.search(data):
+        line = data.count(b"\n", 0, found.start()) + 1
+        raise SceneBuildError(f"{name}, line {line}: a face with negative numbers: export it with numbers from 1")
+    return data.removeprefix(codecs.BOM_UTF8)
+
+
+def _check_dae(name: str, data: bytes) -> bytes:
+    try:
+        import collada  # noqa: F401
+    except ImportError:
+        raise SceneBuildError(f"{name}: DAE files need pycollada: pip install 'iris-session[files]'") from None
+    return check_dae(name, data)
+
+
+_CHECKS: Final[Mapping[str, Callable[[str, bytes], bytes]]] = {
+    "stl": _check_stl,
+    "ply": _check_ply,
+    "off": _check_off,
+    "obj": _check_obj,
+    "dae": _check_dae,
+}

@@ -23,16 +23,16 @@ from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import Rgba
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, read_pixels
-from iris_session.scene.importers.files import (
+from iris_session.scene.importers.files import load_file, read_guarded
+from iris_session.scene.importers.references import (
     ENDINGS,
     ROBOTS,
+    References,
     check_present,
     get_ending,
-    load_file,
-    read_guarded,
+    read_bounded,
     xacro_advice,
 )
-from iris_session.scene.importers.references import References, read_bounded
 from iris_session.scene.importers.xml_files import line_of, parse_xml
 from iris_session.scene.nodes import (
     Appearance,

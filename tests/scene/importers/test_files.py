@@ -229,7 +229,7 @@ def test_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         "PIL": lambda: scene.add_box(half_size=(1, 1, 1), texture=tmp_path / name),
         "defusedxml": lambda: scene.add_urdf(tmp_path / name),
     }.get(package, lambda: scene.add_file(tmp_path / name))
-    with pytest.raises(SceneBuildError, match=r"pip install 'iris-session\[files\]'"):
+    with pytest.raises(SceneBuildError, match=r"pip install 'iris-session\[(files|scene)\]'"):
         add()
 
 

@@ -276,7 +276,7 @@ def test_missing_package_file_lists_the_existing_ones(tmp_path: Path) -> None:
         ("package://mybot/mesh/base.stl", "package mybot is there, and has no file .*; there is no folder .*mesh$"),
         ("../meshes/bsae.stl", "there is no file .*bsae.stl; in .*meshes: base.stl$"),
         ("$(find mybot)/meshes/base.stl", "xacro must be expanded first"),
-        ("package://mybt/meshes/base.stl", "mybt; name the package's folder in package_dirs"),
+        ("package://mybt/meshes/base.stl", "name the package's folder in package_dirs: looked in "),
     ):
         text = f'<robot name="r"><link name="a"><visual><geometry><mesh filename="{reference}"/></geometry></visual>'
         (package / "urdf" / "r.urdf").write_text(f"{text}</link></robot>")
