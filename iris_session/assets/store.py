@@ -59,8 +59,6 @@ SCAN_EVERY_BYTES: Final = 64 << 20
 MAX_MAPPED_FILES: Final = 256
 
 _PART: Final = re.compile(r"([0-9a-f]{64})(\.\w[\w-]*)?\.part")
-#: Of a hold: its note before it has its name, and a lock, which is of no use without the note.
-_HALF_MADE_HOLD: Final = re.compile(r"(tmp\w+\.new)(\.hold\.lock)?")
 #: Neither a link nor a pipe that another user put into the folder may be followed or waited for.
 _OPEN_FLAGS: Final = (
     getattr(os, "O_CLOEXEC", 0)
@@ -170,25 +168,8 @@ class AssetStore:
     def __contains__(self, address: object) -> bool:
         return isinstance(address, str) and is_address(address) and _find_status(self.path(address)) is not None
 
-    def size(self, address: str) -> int:
-        """Look up the size of an asset.
-
-        Args:
-            address: Content hash, 64 lower-case hex digits.
-
-        Returns:
-            The size [bytes].
-
-        Raises:
-            AssetMissingError: The store does not have it.
-        """
-        status = _find_status(self.path(address))
-        if status is None:
-            raise self._missing_error(address)
-        return status.st_size
-
     def get(self, address: str) -> bytes:
-        """Read an asset and check its hash. A damaged file is removed.
+        """Read an asset, check its hash, and mark it as used. A damaged file is removed.
 
         Args:
             address: Content hash, 64 lower-case hex digits.
@@ -198,15 +179,11 @@ class AssetStore:
 
         Raises:
             AssetMissingError: The store does not have it, or its file was damaged.
+            AssetStoreError: The folder cannot be used.
         """
-        try:
-            view = self._read_verified(address)
-        except OSError as error:
-            raise self._missing_error(address) from error
+        view = self.find(address)
         if view is None:
-            raise AssetMissingError(
-                f"asset {address} was damaged on disk and was removed: build the scene again", address
-            )
+            raise self._missing_error(address)
         return bytes(view)
 
     def find(self, address: str) -> memoryview | None:
@@ -497,7 +474,6 @@ class AssetStore:
         """
         unscanned = self._unscanned
         held, now = self._read_holds(), time.time()
-        self._remove_half_made_holds(now)
         files: list[tuple[float, int, os.DirEntry[str]]] = []
         for entry, status in self._iterate_files():
             age_s = now - status.st_mtime
@@ -553,16 +529,6 @@ class AssetStore:
             with contextlib.suppress(OSError):
                 Path(lock.lock_file).unlink(missing_ok=True)
         return held
-
-    def _remove_half_made_holds(self, now: float) -> None:
-        """Remove what dead processes left of holds. Young files may belong to a process at work."""
-        holds = self.root / _HOLDS
-        for entry in _list_entries(holds):
-            half = _HALF_MADE_HOLD.fullmatch(entry.name)
-            if half and not (holds / f"{half[1]}.hold").exists():
-                with contextlib.suppress(OSError):
-                    if now - entry.stat(follow_symlinks=False).st_mtime > GRACE_S:
-                        os.unlink(entry.path)
 
 
 class AssetPart:

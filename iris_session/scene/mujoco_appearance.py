@@ -55,7 +55,7 @@ def to_pose(position: Any, quaternion: Any) -> Pose:
 def resolve_rgba(model: mujoco.MjModel, own: Any, material: int) -> Rgba:
     """Return the colour that MuJoCo draws: the own colour, unless that is the default and there is a material."""
     color: Rgba = to_floats(own)
-    return to_floats(model.mat_rgba[material]) if material >= 0 and color == _DEFAULT_RGBA else color  # type: ignore[no-any-return]
+    return to_floats(model.mat_rgba[material]) if material >= 0 and color == _DEFAULT_RGBA else color
 
 
 def read_materials(model: mujoco.MjModel) -> tuple[Material, ...]:

@@ -76,15 +76,6 @@ def test_windows_of_bytes_and_requests_are_limited() -> None:
     assert request(one, 3, "empty") == AssetRefusal.TOO_MANY
 
 
-def test_length_is_cut_at_the_end_of_the_asset() -> None:
-    one = scheduler()
-    for _ in range(MAX_ASSET_REQUESTS):
-        assert request(one, 1, "small", 40, MAX_ASSET_CHUNK_BYTES) == ""
-    reader = one.next_reader(0)
-    assert reader is not None
-    assert (reader.queue[0].length, reader.queue[0].total) == (60, 100)
-
-
 def test_refusals_have_their_reason() -> None:
     one = scheduler()
     assert request(one, 9) == AssetRefusal.NOT_ALLOWED
@@ -157,16 +148,6 @@ def test_disconnected_participant_has_no_pending_requests() -> None:
     request(one, 2)
     one.remove_descriptor(102)
     assert (one.n_waiting, serve(one, 1)) == (0, [])
-
-
-def test_reset_clears_requests_and_limits() -> None:
-    one = scheduler()
-    request(one, 1)
-    request(one, 2)
-    assert one.clear() == [101, 102]
-    assert (one.n_waiting, one.next_reader(0), one.next_due_ns()) == (0, None, None)
-    assert request(one, 1) == ""
-    assert serve(one, 10) == [1]
 
 
 def test_reused_name_of_another_peer_starts_empty() -> None:

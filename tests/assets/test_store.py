@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import os
 import random
 import resource
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from filelock import FileLock, Timeout
 
 from iris_session.assets.errors import AssetMissingError, AssetStoreError
 from iris_session.assets.store import GRACE_S, MAX_MAPPED_FILES, AssetStore, ServedAssets, default_root
@@ -38,7 +35,7 @@ def test_put_and_get(tmp_path: Path) -> None:
     assert address == hashlib.sha256(b"hello").hexdigest()
     assert store.path(address) == tmp_path / address[:2] / address
     assert store.put(memoryview(b"hello")) == address
-    assert (store.get(address), store.size(address), address in store) == (b"hello", 5, True)
+    assert (store.get(address), address in store) == (b"hello", True)
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == [store.path(address)]
     other = AssetStore(tmp_path)
     assert other.get(address) == b"hello"
@@ -50,9 +47,8 @@ def test_missing_assets(tmp_path: Path) -> None:
     assert missing not in store
     assert not store.mark_used(missing, 0)
     assert store.read_index(missing) is None
-    for call in (store.get, store.size):
-        with pytest.raises(AssetMissingError):
-            call(missing)
+    with pytest.raises(AssetMissingError):
+        store.get(missing)
     assert "../../etc/passwd" not in store
     for bad in ("", "../../etc/passwd", "A" * 64, "0" * 63):
         with pytest.raises(ValueError, match="address"):
@@ -90,7 +86,7 @@ def test_links_and_pipes_in_the_folder_count_as_missing_and_are_replaced(tmp_pat
         assert address not in store
         assert (store.find(address), store.mark_used(address, 5), store.last_used_ns(address)) == (None, False, 0)
         assert not store.discard(address, elsewhere.stat().st_mtime_ns)
-        for call in (store.get, store.view, store.size):
+        for call in (store.get, store.view):
             with pytest.raises(AssetMissingError):
                 call(address)
         assert store.put(b"hello") == address
@@ -103,32 +99,6 @@ def test_links_and_pipes_in_the_folder_count_as_missing_and_are_replaced(tmp_pat
     store.write_index(address, b"note")
     assert store.read_index(address) == b"note"
     assert (elsewhere.read_bytes(), elsewhere.stat().st_mtime) == (b"hello", 1)
-
-
-def test_bytes_that_were_not_written_or_were_removed_do_not_count(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = AssetStore(tmp_path)
-    address = store.put(b"h" * 1_000)
-
-    def fail(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, "no space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", fail)
-        for _ in range(3):
-            with pytest.raises(OSError, match="no space"):
-                store.put(b"x" * 5_000)
-    assert store._total == 1_000
-    part = store.open_part(ADDRESS)
-    part.append(b"?" * 4_000)
-    assert store._total == 5_000
-    assert not part.finish()
-    part.close()
-    assert store._total == 1_000
-    store.path(address).write_bytes(b"?" * 1_000)
-    assert store.find(address) is None
-    assert store._total == store.trim() == 0
 
 
 def test_least_recently_used_assets_are_evicted(tmp_path: Path) -> None:
@@ -259,31 +229,6 @@ def test_read_only_disk_serves_what_it_has(tmp_path: Path, monkeypatch: pytest.M
     assert not list((tmp_path / "holds").glob("*"))
 
 
-def test_file_removed_during_a_scan_is_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    address = AssetStore(tmp_path).put(b"hello")
-    scan = os.scandir
-
-    class VanishingFolder:
-        """The entries of a folder whose files another process removes after listing."""
-
-        def __init__(self, path: str) -> None:
-            with scan(path) as entries:
-                self.entries = list(entries)
-            for entry in self.entries:
-                if entry.name == address:
-                    os.unlink(entry.path)
-
-        def __enter__(self) -> Iterator[os.DirEntry[str]]:
-            return iter(self.entries)
-
-        def __exit__(self, *_: object) -> None: ...
-
-    monkeypatch.setattr(os, "scandir", VanishingFolder)
-    store = AssetStore(tmp_path)
-    assert store.trim() == 0
-    assert address not in store
-
-
 def test_asset_used_by_another_process_during_eviction_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The other process marks an asset as used and then holds it; both may follow the scan."""
     store = AssetStore(tmp_path, max_bytes=1_500)
@@ -299,30 +244,6 @@ def test_asset_used_by_another_process_during_eviction_is_kept(tmp_path: Path, m
     monkeypatch.setattr(store, "_iterate_files", use_afterwards)
     store.put(b"n" * 1_000)
     assert (taken in store, other in store, store.evicted) == (True, False, 1)
-
-
-def test_hold_can_be_released_in_another_thread(tmp_path: Path) -> None:
-    """A scene is built by one thread and released by another; an open lock would leak a descriptor each time."""
-    store = AssetStore(tmp_path)
-    with ThreadPoolExecutor(1) as other:
-        hold = other.submit(store.hold, [store.put(b"x")]).result()
-        lock = FileLock(next((tmp_path / "holds").glob("*.lock")))
-        with pytest.raises(Timeout):
-            lock.acquire(blocking=False)
-        hold.release()
-        assert not other.submit(lambda: hold._lock.is_locked).result()
-    assert not list((tmp_path / "holds").iterdir())
-
-
-def test_disk_is_not_rescanned_when_nothing_can_be_evicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = AssetStore(tmp_path, max_bytes=64_000)
-    scans: list[None] = []
-    held = store._read_holds
-    monkeypatch.setattr(store, "_read_holds", lambda: scans.append(None) or held())
-    for number in range(300):
-        store.put(number.to_bytes(4, "little") * 250)
-    assert 0 < len(scans) <= 130
-    assert store.evicted == 0
 
 
 def test_default_roots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -341,32 +262,23 @@ def test_default_roots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def test_files_of_killed_processes_are_removed_by_the_next_scan(tmp_path: Path) -> None:
-    """A crash between two files of a hold, or within an asset; recent files may belong to a running process."""
+    """Recent files may belong to a running process, and a part that can be resumed is kept for a week."""
     store = AssetStore(tmp_path)
     address = store.put(b"hello")
-    hold = store.hold([address])
     holds, folder = tmp_path / "holds", store.path(address).parent
-    left = [
-        holds / "tmpa1_.new",
-        holds / "tmpb2.new.hold.lock",
-        folder / f"{address}.c3.part",
-        tmp_path / f"index/ab/ab{0:062x}.d4.part",
-    ]
-    dead = [holds / "tmpe5.new.hold", holds / "tmpe5.new.hold.lock"]
-    young = [holds / "tmpf6.new", holds / "tmpf6.new.hold.lock", folder / f"{address}.g7.part"]
-    others = [holds / "notes.new", holds / "tmp.txt", folder / "mine.part"]
-    living = list(holds.iterdir())
-    for path in (*left, *dead, *young, *others):
+    left = [folder / f"{address}.c3.part", tmp_path / f"index/ab/ab{0:062x}.d4.part", holds / "tmpe5.new.hold"]
+    kept = [folder / f"{address}.part", folder / "mine.part"]
+    young = folder / f"{address}.g7.part"
+    for path in (*left, *kept, young):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"half")
-    then = store.path(address).stat().st_mtime - 2 * GRACE_S
-    for path in (*left, *dead, *others, *living, store.path(address)):
+    then = time.time() - 2 * GRACE_S
+    for path in (*left, *kept, store.path(address)):
         os.utime(path, (then, then))
     AssetStore(tmp_path).trim()
-    assert not [path for path in (*left, *dead) if path.exists()]
-    assert all(path.exists() for path in (*young, *others, *living))
+    assert not [path for path in left if path.exists()]
+    assert all(path.exists() for path in (*kept, young))
     assert store.get(address) == b"hello"
-    hold.release()
 
 
 # --- downloads ---
@@ -399,17 +311,6 @@ def test_partial_download_is_resumed(tmp_path: Path) -> None:
     nothing = AssetStore(tmp_path).open_part("0" * 64)
     nothing.close()
     assert len(list(tmp_path.glob("??/*"))) == 1
-
-
-def test_wrong_bytes_are_never_stored(tmp_path: Path) -> None:
-    cache = AssetStore(tmp_path)
-    part = cache.open_part(ADDRESS)
-    part.append(DATA[:-1] + b"?")
-    assert not part.finish()
-    assert part.offset == 0
-    assert cache.find(ADDRESS) is None
-    part.append(DATA)
-    assert part.finish()
 
 
 def test_two_processes_can_download_the_same_asset(tmp_path: Path) -> None:
@@ -465,65 +366,6 @@ def test_full_disk_is_reported_and_the_part_is_resumed(tmp_path: Path) -> None:
     assert AssetStore(tmp_path).find(ADDRESS) == DATA
 
 
-def test_open_part_is_kept_at_any_age(tmp_path: Path) -> None:
-    """A connection stalled for longer than the keeping time: what then arrives is not lost."""
-    cache = AssetStore(tmp_path, max_bytes=100_000)
-    parts = [cache.open_part(ADDRESS), cache.open_part(ADDRESS)]  # the shared part and a private one
-    left = cache.open_part("1" * 64)
-    for part in (*parts, left):
-        part.append(DATA[:40_000])
-    left.close()
-    for path in tmp_path.glob("??/*.part"):
-        os.utime(path, (1, 1))
-    assert cache.trim() == 80_000
-    for part in parts:
-        part.append(DATA[40_000:])
-        assert part.finish()
-    assert cache.find(ADDRESS) == DATA
-
-
-def test_only_the_shared_part_is_kept(tmp_path: Path) -> None:
-    cache = AssetStore(tmp_path)
-    common, own = cache.open_part(ADDRESS), cache.open_part(ADDRESS)
-    for part in (common, own):
-        part.append(DATA[:40_000])
-        part.close()
-    assert [path.name for path in tmp_path.glob("??/*")] == [f"{ADDRESS}.part"]
-
-
-def test_part_finished_by_another_process_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The other process finishes between opening and locking: the part is the asset then."""
-    cache = AssetStore(tmp_path)
-    other = cache.open_part(ADDRESS)
-    other.append(DATA)
-    lock = fcntl.flock
-
-    def finish_first(descriptor: int, how: int) -> None:
-        monkeypatch.undo()
-        assert other.finish()
-        lock(descriptor, how)
-
-    monkeypatch.setattr(fcntl, "flock", finish_first)
-    late = cache.open_part(ADDRESS)
-    assert late.offset == 0
-    late.append(b"other bytes")
-    late.close()
-    assert cache.find(ADDRESS) == DATA
-
-
-def test_private_parts_of_killed_processes_are_removed(tmp_path: Path) -> None:
-    """No other process can resume them, so they are not kept for a week as shared parts are."""
-    cache = AssetStore(tmp_path)
-    folder = cache.path(ADDRESS).parent
-    folder.mkdir()
-    common, dead, young = (folder / f"{ADDRESS}{end}.part" for end in ("", ".123-0123abcd", ".124-4567abcd"))
-    for path, seconds in ((common, 2 * GRACE_S), (dead, 2 * GRACE_S), (young, 0.0)):
-        path.write_bytes(b"begun")
-        os.utime(path, (time.time() - seconds,) * 2)
-    assert cache.trim() == 10
-    assert [path.exists() for path in (common, dead, young)] == [True, False, True]
-
-
 def test_disk_use_never_exceeds_twice_the_limit(tmp_path: Path) -> None:
     """All assets were just used: a session cannot fill the disk by naming more of them."""
     cache = AssetStore(tmp_path, max_bytes=1 << 20)
@@ -574,18 +416,6 @@ def test_unusable_folder_raises(tmp_path: Path) -> None:
     assert "XDG_CACHE_HOME" in str(caught.value)
     with pytest.raises(ValueError, match="address"):
         AssetStore(tmp_path).path("../../etc/passwd")
-
-
-def test_client_and_session_share_a_folder(tmp_path: Path) -> None:
-    """The client finds what the session stored, and its downloads remove nothing that the session holds."""
-    session, client = AssetStore(tmp_path, max_bytes=2_000), AssetStore(tmp_path, max_bytes=2_000)
-    held, old = session.put(b"h" * 1_000), session.put(b"o" * 1_000)
-    for address in (held, old):
-        set_age(session, address, GRACE_S + 100)
-    with session.hold([held]):
-        fetched = store_part(client, b"f" * 1_000)
-        assert [address in session for address in (held, old, fetched)] == [True, False, True]
-        assert client.find(held) == b"h" * 1_000
 
 
 # --- served assets ---

@@ -64,7 +64,7 @@ def test_pieces_are_bounded_and_each_asset_comes_once(shared: Shared, recorded: 
 
 @pytest.mark.parametrize("fault", ["missing", "damaged", "shorter", "too large"])
 def test_asset_that_cannot_be_read_is_counted(shared: Shared, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    address = max(list_recorded_assets(shared.spec, SCENE), key=shared.store.size)
+    address = max(list_recorded_assets(shared.spec, SCENE), key=lambda one: len(shared.store.view(one)))
     path = shared.store.path(address)
     data = path.read_bytes()
     queue = AssetQueue(SCENE)
@@ -124,8 +124,8 @@ def test_what_waits_at_the_end_is_named(shared: Shared) -> None:
 
 
 def test_limit_of_bytes_leaves_out_what_does_not_fit(shared: Shared) -> None:
-    sizes = {address: shared.store.size(address) for address in list_recorded_assets(shared.spec, SCENE)}
-    room = shared.store.size(shared.scene_hash) + sum(sizes.values()) - 1
+    sizes = {address: len(shared.store.view(address)) for address in list_recorded_assets(shared.spec, SCENE)}
+    room = len(shared.store.view(shared.scene_hash)) + sum(sizes.values()) - 1
     queue = AssetQueue(SCENE, room)
     queue.add_scene(shared.assets, is_patch=False)
     rows = drain(queue)

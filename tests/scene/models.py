@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+import trimesh
 
 #: A closed solid without symmetry, so that MuJoCo finds the same inertial frame for it again.
 WEDGE = "0 0 0  .5 0 0  0 .35 0  0 0 .2"
@@ -95,8 +96,9 @@ def many_objects(n: int, assets: int, triangles: int, side: int, seed: int = 0) 
     files: dict[str, bytes] = {}
     rings = max(3, int((triangles / 2) ** 0.5))
     for k in range(assets):
-        vertices, faces = _ball(rng, rings)
-        spec.add_mesh(name=f"m{k}", uservert=vertices.reshape(-1), userface=faces.reshape(-1))
+        ball = trimesh.creation.uv_sphere(0.1, count=[rings, rings])
+        dents = 1 + 0.1 * rng.normal(size=(len(ball.vertices), 1))
+        spec.add_mesh(name=f"m{k}", uservert=(dents * ball.vertices).reshape(-1), userface=ball.faces.reshape(-1))
         noise = rng.integers(0, 255, (side, side, 3), dtype=np.uint8)
         files[f"t{k}.png"] = png(noise)
         spec.add_texture(name=f"t{k}", type=int(mujoco.mjtTexture.mjTEXTURE_2D), file=f"t{k}.png")
@@ -109,30 +111,6 @@ def many_objects(n: int, assets: int, triangles: int, side: int, seed: int = 0) 
         body.add_geom(type=int(mujoco.mjtGeom.mjGEOM_MESH), meshname=f"m{k}", material=f"a{k}")
     spec.assets = files
     return spec.compile()
-
-
-def _ball(rng: np.random.Generator, rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a dented closed ball of `2 * rings * rings` triangles."""
-    u = np.arange(rings) / rings * 2 * np.pi
-    v = (np.arange(rings) + 0.5) / rings * np.pi
-    radius = 0.1 * (1 + 0.1 * rng.normal(size=(rings, rings)))
-    around, down = np.meshgrid(u, v)
-    points = radius[..., None] * np.stack(
-        [np.sin(down) * np.cos(around), np.sin(down) * np.sin(around), np.cos(down)], axis=-1
-    )
-    points = np.concatenate([points.reshape(-1, 3), [[0, 0, 0.1], [0, 0, -0.1]]])
-    top, bottom = len(points) - 2, len(points) - 1
-    faces = []
-    for r in range(rings):
-        for c in range(rings):
-            a, b = r * rings + c, r * rings + (c + 1) % rings
-            if r == 0:
-                faces.append((top, a, b))
-            if r + 1 < rings:
-                faces += [(a, a + rings, b + rings), (a, b + rings, b)]
-            else:
-                faces.append((bottom, b, a))
-    return points, np.array(faces, np.int32)
 
 
 def flexes() -> mujoco.MjModel:

@@ -9,10 +9,10 @@ import io
 from collections.abc import Iterable
 from xml.sax.saxutils import quoteattr
 
-import cv2
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import Geometry, Material, SceneSpec, decode_scene
@@ -150,10 +150,9 @@ def _shape(geometry: Geometry) -> str:
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:
-    order = [2, 1, 0] if pixels.shape[2] == 3 else [2, 1, 0, 3]
-    ok, data = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, order]))
-    assert ok
-    return bytes(data)
+    out = io.BytesIO()
+    Image.fromarray(pixels).save(out, "PNG")
+    return out.getvalue()
 
 
 def obj(data: bytes) -> bytes:

@@ -201,53 +201,34 @@ BOX = {"half_size": (1, 1, 1)}
     ("method", "arguments", "named"),
     [
         ("add_box", {**BOX, "name": "cup", "movable": True}, "'cup'"),
-        ("add_box", {**BOX, "movable": True}, "name is ''"),
         ("add_box", {**BOX, "name": "world", "movable": True}, "name is 'world'"),
         ("add_box", {**BOX, "name": None}, "name is None"),
         ("add_box", {**BOX, "name": "x" * 65, "movable": True}, "64"),
-        ("add_box", {**BOX, "name": "\ud800", "movable": True}, "name is"),
         ("add_box", {**BOX, "name": "b", "movable": True, "on": "cup"}, "'cup'"),
         ("add_box", {**BOX, "on": "cap"}, "on='cap'"),
-        ("add_box", {"half_size": (1, 1)}, "half_size is (1, 1)"),
         ("add_box", {"half_size": (1, 1, 0)}, "half_size is (1, 1, 0)"),
-        ("add_box", {"half_size": "123"}, "half_size is '123'"),
         ("add_box", {"half_size": ("1", "1", "1")}, "half_size is ('1', '1', '1')"),
         ("add_box", {**BOX, "position": (0, 0)}, "position is (0, 0)"),
         ("add_box", {**BOX, "quaternion": (0, 0, 0, 0)}, "quaternion is (0, 0, 0, 0)"),
-        ("add_box", {**BOX, "quaternion": (1.7e308, 0, 0, 1.7e308)}, "quaternion is"),
         ("add_box", {**BOX, "rgba": (2, 0, 0, 1)}, "rgba is (2, 0, 0, 1)"),
-        ("add_box", {**BOX, "rgba": "red"}, "rgba is 'red'"),
-        ("add_box", {**BOX, "texture": [[0, 1], [0]]}, "texture"),
         ("add_box", {**BOX, "texture": np.zeros((2, 2, 3))}, "float64"),
-        ("add_box", {**BOX, "texture": "/lost.png"}, "/lost.png"),
         ("add_box", {**BOX, "texture": "/tmp"}, "texture is '/tmp'"),
         ("add_sphere", {"radius": float("inf")}, "radius is inf"),
-        ("add_sphere", {"radius": "100"}, "radius is '100'"),
         ("add_sphere", {"radius": 1, "roughness": 5}, "roughness is 5"),
-        ("add_sphere", {"radius": 1, "emission": -1}, "emission is -1"),
         ("add_plane", {"half_size": (-1, 0)}, "half_size"),
         ("add_mesh", {"name": "x", "vertices": SQUARE, "triangles": [[0, 1, 4]]}, "triangles of mesh 'x': vertex 4"),
-        ("add_mesh", {"name": "x", "vertices": SQUARE, "triangles": [[0, 1]]}, "triangles of mesh 'x'"),
         ("add_mesh", {"name": "x", "vertices": SQUARE * np.nan, "triangles": TRIANGLES}, "vertices of mesh 'x'"),
-        ("add_mesh", {"name": "x", "vertices": SQUARE * 1e300, "triangles": TRIANGLES}, "vertices of mesh 'x'"),
-        ("add_mesh", {"name": "x", "vertices": [["1", "2", "3"]], "triangles": TRIANGLES}, "vertices of mesh 'x'"),
-        ("add_mesh", {"name": "x", "vertices": [[1, 2], [3]], "triangles": TRIANGLES}, "vertices of mesh 'x'"),
         ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "uvs": SQUARE[:2, :2]}, "uvs of mesh"),
         ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "colors": SQUARE}, "colors of mesh"),
-        ("add_deformable", {"name": "cup", "vertices": SQUARE, "triangles": TRIANGLES}, "'cup'"),
         ("add_deformable", {"name": "d", "vertices": SQUARE}, "'d'"),
         ("add_deformable", {"name": "d", "vertices": SQUARE, "triangles": TRIANGLES, "radius": 0}, "radius is 0"),
         ("add_deformable", {"name": "d", "vertices": SQUARE, "edges": TRIANGLES}, "edges of deformable 'd'"),
         ("add_light", {"kind": "laser"}, "kind is 'laser'"),
-        ("add_light", {"diffuse": "red"}, "diffuse is 'red'"),
         ("add_light", {"direction": (0, 0, 0)}, "direction"),
-        ("add_camera", {"fovy": 0}, "fovy is 0"),
         ("add_camera", {"fovy": 180}, "fovy is 180"),
         ("set_skybox", {"pixels": np.zeros((5, 2, 3), np.uint8)}, "skybox"),
         ("add_file", {"path": "/lost.glb"}, "/lost.glb"),
-        ("add_file", {"path": None}, "path is None"),
         ("add_file", {"path": "https://x/a.glb"}, "a.glb"),
-        ("add_urdf", {"path": "/lost.urdf"}, "/lost.urdf"),
         ("add_urdf", {"path": "/lost.urdf", "name": "cup"}, "'cup'"),
     ],
 )
@@ -259,25 +240,9 @@ def test_invalid_arguments_are_named_and_add_nothing(
     before = scene.build(store).scene_hash
     with pytest.raises(SceneBuildError, match=re.escape(named)):
         getattr(scene, method)(**arguments)
+    with pytest.raises(TypeError, match="'colour'"):
+        scene.add_box(half_size=(1, 1, 1), colour=(1, 0, 0))
     assert scene.build(store).scene_hash == before
-
-
-@pytest.mark.parametrize(
-    ("method", "arguments", "keyword"),
-    [
-        ("add_box", {**BOX, "color": (1, 0, 0)}, "color"),
-        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "pose": 1}, "pose"),
-        (
-            "add_deformable",
-            {"name": "d", "vertices": SQUARE, "triangles": TRIANGLES, "position": (0, 0, 1)},
-            "position",
-        ),
-        ("add_urdf", {"path": "/lost.urdf", "movable": True}, "movable"),
-    ],
-)
-def test_unknown_keywords_are_refused(method: str, arguments: dict[str, object], keyword: str) -> None:
-    with pytest.raises(TypeError, match=f"'{keyword}'"):
-        getattr(SceneBuilder(), method)(**arguments)
 
 
 def test_scenes_that_clients_would_reject_are_rejected(store: AssetStore, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -309,11 +274,3 @@ def test_number_of_deformables_is_bounded_by_the_streams(store: AssetStore) -> N
     with pytest.raises(SceneBuildError, match="16 are streamed"):
         scene.add_deformable("one more", SQUARE, TRIANGLES)
     assert len(scene.build(store).deformables) == MAX_STREAMS
-
-
-def test_oversized_deformable_is_rejected_when_added() -> None:
-    many = np.zeros((2**18 + 1, 3), np.float32)
-    scene = SceneBuilder()
-    with pytest.raises(SceneBuildError, match=r"'cloth' has 262,145 .* 262,144"):
-        scene.add_deformable("cloth", many, TRIANGLES)
-    scene.add_deformable("cloth", many[1:], TRIANGLES)  # the name is free

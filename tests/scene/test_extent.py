@@ -78,14 +78,6 @@ def test_extent_of_a_model(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.high, (1, 3.5, 0.5))
 
 
-def test_empty_scene_has_no_extent(tmp_path: Path) -> None:
-    scene, store = SceneBuilder(), AssetStore(tmp_path)
-    scene.add_plane()
-    spec = scene.build(store).spec
-    assert compute_extent(spec, store) is None
-    assert spec.environment.extent == 1.0
-
-
 @pytest.mark.parametrize(
     ("side", "expected"),
     [

@@ -100,34 +100,6 @@ def test_dark_lights_are_left_out_and_orthographic_height_is_kept(tmp_path: Path
     assert (camera["orthographic"]["ymag"], camera["orthographic"]["xmag"]) == (4.5, 9.0), "half of 9 m, twice as wide"
 
 
-def test_sky_is_left_out(tmp_path: Path, store: AssetStore) -> None:
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><asset><texture name="c" type="cube" builtin="checker" rgb1="1 .5 0" width="8" height="8"/>'
-        '<texture name="s" type="skybox" builtin="flat" rgb1="1 1 1" width="8" height="8"/>'
-        '<material name="m" texture="c"/></asset><worldbody><geom size="1" material="m"/></worldbody></mujoco>'
-    )
-    spec = parse_mujoco(model, store).spec
-    assert len(exported(spec, store, tmp_path)["images"]) == 1
-    (difference,) = list_glb_differences(spec)
-    assert difference.startswith("the skybox")
-
-
-def test_mesh_with_own_coordinates_is_in_the_file_once(tmp_path: Path, store: AssetStore) -> None:
-    """Whatever the texture repeat of its materials: only the coordinates differ."""
-    scene = SceneBuilder()
-    pixels = np.zeros((4, 4, 3), np.uint8)
-    corners, uvs = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0], [1, 0], [0, 1]]
-    for repeat in ((1, 1), (2, 2)):
-        scene.add_mesh(vertices=corners, triangles=[[0, 1, 2]], uvs=uvs, texture=pixels, repeat=repeat)
-    found = exported(scene.build(store).spec, store, tmp_path)
-    attributes = [mesh["primitives"][0]["attributes"] for mesh in found["meshes"]]
-    assert attributes[0]["POSITION"] == attributes[1]["POSITION"]
-    assert attributes[0]["TEXCOORD_0"] != attributes[1]["TEXCOORD_0"]
-    views = [accessor["bufferView"] for accessor in found["accessors"]]
-    assert len(set(views)) == len(views), "glTF wants a stride where accessors share a view"
-    assert len(found["materials"]) == 2
-
-
 def test_emission_round_trips(tmp_path: Path, store: AssetStore) -> None:
     """Without getting brighter: colours are linear in the file and sRGB in the specification."""
     scene = SceneBuilder()

@@ -39,12 +39,6 @@ def test_jpeg_states_its_error_and_is_small() -> None:
         encode_image(picture(channels=4), "jpeg")
 
 
-def test_flat_drawings_and_photographs_shrink() -> None:
-    checker = (np.indices((256, 256)).sum(axis=0) // 32 % 2 * 255).astype(np.uint8)[..., None].repeat(3, axis=2)
-    assert len(encode_image(checker).data) < 2_000
-    assert len(encode_image(picture(256, 256)).data) < 0.75 * picture(256, 256).nbytes
-
-
 def test_half_size() -> None:
     assert np.array_equal(halve(np.arange(16, dtype=np.uint8).reshape(4, 4, 1))[..., 0], [[3, 5], [11, 13]])
     assert halve(picture(5, 1)).shape == (2, 1, 3)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import mujoco
 import numpy as np
 import pytest
@@ -13,8 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from iris_session.physics import World
-from iris_session.protocol.scene import SceneError, SceneSpec, decode_scene, encode_scene, list_assets
-from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
+from iris_session.protocol.scene import SceneSpec, decode_scene, encode_scene, list_assets
+from iris_session.scene import AssetStore, decode_arrays
 from iris_session.scene.mujoco_scene import ParsedScene, parse_mujoco
 from iris_session.scene.nodes import to_matrix
 from tests.scene.models import every_shape, flexes
@@ -143,7 +142,7 @@ def test_every_shape_and_its_costs(tmp_path: Path) -> None:
     assert (real.focal, real.principal) == (pytest.approx((200, 210)), pytest.approx((9, -7)))
     assert spec.cameras[2].orthographic
     addresses = list_assets(spec)
-    assert all(store.size(address) == size for address, size in addresses.items())
+    assert all(len(store.view(address)) == size for address, size in addresses.items())
     assert spec.totals.asset_bytes == sum(addresses.values())
     assert spec.totals.objects == len(spec.visuals) - 2  # one is transparent, one hidden
     grid = decode_arrays(store.get(spec.hfields[0].address), "grid")["elevation"]
@@ -204,13 +203,6 @@ def test_texture_in_its_own_encoding_is_passed_on(tmp_path: Path) -> None:
     assert "KTX" in parsed.skipped[0]
 
 
-def test_image_based_light(tmp_path: Path) -> None:
-    xml = """<mujoco><asset><texture name="sky" type="skybox" builtin="gradient" width="8" height="48"/></asset>
-    <worldbody><light type="image" texture="sky" intensity="20"/></worldbody></mujoco>"""
-    light = parse(xml, tmp_path).spec.lights[0]
-    assert (light.kind, light.texture, light.intensity) == ("image", 0, 20)
-
-
 WATCHED_CLOTH = """<mujoco><worldbody>
     <body name="hand" mocap="true"><geom size=".1"/><body name="ring" pos="0 0 .2"><geom size=".05"/></body></body>
     <body name="table"><geom size=".1"/></body>
@@ -250,34 +242,6 @@ def test_bodies_agree_with_the_state_stream(tmp_path: Path, older: bool) -> None
     assert decode_scene(encode_scene(spec)) == spec
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"version": 2}, "version"),
-        ({"bodies": ()}, "body"),
-        ({"materials": ()}, "material"),
-        ({"meshes": ()}, "mesh"),
-        ({"textures": ()}, "texture"),
-        ({"hfields": ()}, "height field"),
-    ],
-)
-def test_dangling_references_are_rejected(tmp_path: Path, change: dict[str, Any], named: str) -> None:
-    spec = parse_mujoco(every_shape(), AssetStore(tmp_path), options=EncodeOptions(levels=False)).spec
-    with pytest.raises(SceneError, match=named):
-        decode_scene(encode_scene(msgspec.structs.replace(spec, **change)))
-
-
-def test_cyclic_bodies_are_rejected(tmp_path: Path) -> None:
-    xml = "<mujoco><worldbody><body><geom size='1'/><body><geom size='1'/></body></body></worldbody></mujoco>"
-    spec = parse(xml, tmp_path).spec
-    world, outer, inner = spec.bodies
-    circle = msgspec.structs.replace(spec, bodies=(world, msgspec.structs.replace(outer, parent=2), inner))
-    twice = msgspec.structs.replace(spec, bodies=(world, outer, outer))
-    for wrong in (circle, twice):
-        with pytest.raises(SceneError):
-            decode_scene(encode_scene(wrong))
-
-
 def test_skins_and_flexes_beyond_the_streams_are_reported(tmp_path: Path) -> None:
     ropes = "".join(
         f'<flexcomp name="{k}" type="grid" dim="1" count="2 1 1" spacing=".1 .1 .1" pos="0 {k} 1" radius=".01">'
@@ -290,15 +254,6 @@ def test_skins_and_flexes_beyond_the_streams_are_reported(tmp_path: Path) -> Non
     skins, flexes = parse(xml, tmp_path).skipped
     assert "1 skins" in skins
     assert "2 of 18 flexes" in flexes
-
-
-@given(st.binary(max_size=100))
-def test_random_specifications_raise_scene_errors_only(data: bytes) -> None:
-    for candidate in (data, b"\x80" + data, encode_scene(SceneSpec())[:-1] + data):
-        try:
-            decode_scene(candidate)
-        except SceneError:
-            continue
 
 
 def test_tracking_cameras_have_their_initial_pose(tmp_path: Path) -> None:

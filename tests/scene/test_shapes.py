@@ -18,7 +18,7 @@ from iris_session.scene import AssetStore
 from iris_session.scene.glb import write_glb
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.shapes import build_height_field, build_primitive
-from tests.scene.models import every_shape, flexes
+from tests.scene.models import every_shape
 
 #: How far a face's centre lies below the round surface it stands for, and how far above it a ray begins [m].
 SAG, ABOVE = 0.008, 0.02
@@ -93,14 +93,6 @@ def test_glb_has_every_mesh_and_picture_once(tmp_path: Path) -> None:
     assert any(material.get("alphaMode") == "BLEND" for material in found["materials"])
 
 
-def test_deformables_in_a_glb_have_their_poses(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path)
-    write_glb(parse_mujoco(flexes(), store).spec, store, tmp_path / "a.glb")
-    whole = trimesh.load(tmp_path / "a.glb").to_geometry()
-    assert whole.bounds[1][1] >= 1.0
-    assert {node["name"] for node in document(tmp_path / "a.glb")["nodes"]} >= {"cloth", "soft", "box"}
-
-
 def test_scene_is_exported_in_its_initial_state(tmp_path: Path) -> None:
     """In the keyframe `home`, where joints are not at zero."""
     model = tmp_path / "arm.xml"
@@ -123,11 +115,3 @@ def test_scene_is_exported_in_its_initial_state(tmp_path: Path) -> None:
         T_world_body[:3, :3] = data.body(name).xmat.reshape(3, 3)
         T_world_body[:3, 3] = data.body(name).xpos
         np.testing.assert_allclose(scene.graph[name][0], y_up @ T_world_body, atol=1e-6)
-
-
-def test_scene_that_clients_would_reject_is_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("iris_session.protocol.scene.MAX_SCENE_BYTES", 1_000)
-    assert main(["scene", "inspect", "handover", "--assets", str(tmp_path)]) == 2
-    assert "at most 1000" in capsys.readouterr().err

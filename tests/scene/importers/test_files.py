@@ -84,15 +84,6 @@ def test_geometry_of_every_format(tmp_path: Path, kind: str) -> None:
     assert again.volume == pytest.approx(mesh.volume, rel=1e-5)
 
 
-def test_several_unnamed_parts_are_numbered(tmp_path: Path) -> None:
-    facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 {z}\nvertex 1 0 {z}\nvertex 0 1 {z}\nendloop\nendfacet\n"
-    solids = [f"solid{name}\n{facet.format(z=z)}endsolid{name}\n" for z, name in enumerate(("", " lid", ""))]
-    (tmp_path / "a.stl").write_text("".join(solids))
-    spec = build(tmp_path / "a.stl", tmp_path, name="case")[0].spec
-    assert [visual.name for visual in spec.visuals] == ["case_1", "lid", "case_2"]
-    assert [body.name for body in spec.bodies] == ["world", "case", "case_1", "lid", "case_2"]
-
-
 def test_scale_and_up_axis(tmp_path: Path) -> None:
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "a.stl")
     for up, size in ((None, (1, 2, 3)), ("z", (1, 2, 3)), ("y", (1, 3, 2))):
@@ -157,16 +148,6 @@ def test_missing_material_values_are_not_invented(tmp_path: Path) -> None:
     (node,) = load_file(tmp_path / "bare.obj").nodes
     assert node.surfaces[0].appearance is None
     assert node.surfaces[0].mesh.uv is not None
-
-
-def test_invalid_material_numbers_are_left_out(tmp_path: Path) -> None:
-    """Clients and the picture of a recording would draw nothing of the scene."""
-    path = write_obj(tmp_path)
-    (tmp_path / "parts.mtl").write_text(MTL.replace("d 0.4", "d nan\nNs nan\nKs nan nan nan"))
-    scene, _ = build(path, tmp_path)
-    visual = next(visual for visual in scene.spec.visuals if visual.name == "red")
-    assert visual.rgba == pytest.approx((0.8, 0.2, 0.2, 1.0), abs=0.003)
-    assert visual.material == -1 or scene.spec.materials[visual.material].specular == 0.5
 
 
 def test_missing_references_are_reported(tmp_path: Path) -> None:

@@ -142,14 +142,6 @@ def test_vertex_colours_round_trip(tmp_path: Path, store: AssetStore) -> None:
     assert (mesh.color[:, 3] == 255).all()
 
 
-def test_uniform_vertex_colour_becomes_the_colour(tmp_path: Path, store: AssetStore) -> None:
-    document = Document()
-    green = np.tile(np.array([0, 255, 0, 255], np.uint8), (4, 1))
-    document.square(COLOR_0=document.accessor(green, normalized=True))
-    spec = build(document.write(tmp_path / "a.glb"), store)
-    assert spec.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
-
-
 def test_sparse_quantised_strips_and_strides_are_read(tmp_path: Path, store: AssetStore) -> None:
     document = Document()
     places, values = document.view(np.uint16([2]).tobytes()), document.view(np.float32([5, 6, 7]).tobytes())
@@ -240,9 +232,7 @@ def test_open_meshes_are_drawn_from_both_sides(tmp_path: Path, store: AssetStore
     assert [spec.meshes[v.geometry.mesh].levels[0].triangles for v in spec.visuals] == [4, 2, 12]
 
 
-@pytest.mark.parametrize(
-    ("scale", "movable"), [((1, 1, 1), False), ((-1, 1, 1), True), ((1, 2, -3), False), ((2, 1, 1), True)]
-)
+@pytest.mark.parametrize(("scale", "movable"), [((-1, 1, 1), True), ((1, 2, -3), False)])
 def test_lights_and_cameras_are_placed(
     tmp_path: Path, store: AssetStore, scale: tuple[float, ...], movable: bool
 ) -> None:

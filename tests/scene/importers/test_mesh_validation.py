@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import struct
 from pathlib import Path
 
@@ -77,10 +76,3 @@ def test_comments_in_off_files_are_ignored(tmp_path: Path) -> None:
     (node,) = load_file(written(tmp_path, "a.off", text)).nodes
     mesh = node.surfaces[0].mesh
     assert mesh.position[mesh.index].tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
-
-
-def test_reports_of_the_library_are_not_printed(tmp_path: Path) -> None:
-    """Without a handler Python would print them although no logging was configured."""
-    broken = FACET.replace("normal 0 0 1", "normal 0 zero 1")
-    load_file(written(tmp_path, "a.stl", f"solid x\n{broken}{FACET}endsolid"))
-    assert logging.getLogger("trimesh").handlers

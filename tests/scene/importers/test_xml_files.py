@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from iris_session.scene import SceneBuildError
-from iris_session.scene.importers import xml_files
 from iris_session.scene.importers.files import load_file
 
 
@@ -36,23 +35,15 @@ def doubling(levels: int) -> str:
     return f'<node id="n{levels}"><instance_geometry url="#g"/></node>{"".join(nodes)}'
 
 
-@pytest.mark.parametrize("spelled", ["utf-8", "UTF-8", "utf8"])  # the last one by Python's own writer
-def test_every_spelling_of_utf_8_is_read(tmp_path: Path, spelled: str) -> None:
-    text = dae("", '<node><instance_geometry url="#g"/></node>').replace('"utf-8"', f'"{spelled}"')
-    (tmp_path / "a.dae").write_text(text)
-    assert len(load_file(tmp_path / "a.dae").nodes) == 1
-
-
 def test_few_instances_are_read(tmp_path: Path) -> None:
-    (tmp_path / "a.dae").write_text(dae(doubling(3), '<node id="top"><instance_node url="#n0"/></node>'))
+    text = dae(doubling(3), '<node id="top"><instance_node url="#n0"/></node>')
+    (tmp_path / "a.dae").write_text(text.replace('"utf-8"', '"utf8"'))  # as Python's own writer spells it
     assert len(load_file(tmp_path / "a.dae").nodes) == 8
 
 
-@pytest.mark.parametrize("empty", [False, True])
-def test_exponential_nesting_is_rejected(tmp_path: Path, empty: bool) -> None:
-    """Also of nodes without anything in them: the reader follows them all the same."""
-    nodes = doubling(40)
-    nodes = nodes.replace('<instance_geometry url="#g"/>', "") if empty else nodes
+def test_exponential_nesting_is_rejected(tmp_path: Path) -> None:
+    """Of nodes without anything in them: the reader follows them all the same."""
+    nodes = doubling(40).replace('<instance_geometry url="#g"/>', "")
     (tmp_path / "a.dae").write_text(dae(nodes, '<node id="top"><instance_node url="#n0"/></node>'))
     with pytest.raises(SceneBuildError, match=r"that it draws"):
         load_file(tmp_path / "a.dae")
@@ -75,16 +66,6 @@ def test_copies_of_a_large_geometry_are_counted(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "boxes.dae").write_text(text[:end] + text[begin:end] * 20 + text[end:])
     with pytest.raises(SceneBuildError, match="triangles"):
         load_file(tmp_path / "boxes.dae")
-
-
-def test_library_nodes_are_counted_at_their_instances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    node = '<node id="n"><instance_geometry url="#g"/></node>'
-    (tmp_path / "a.dae").write_text(dae(node, '<node id="top"><instance_node url="#n"/></node>'))
-    monkeypatch.setattr(xml_files, "MAX_TRIANGLES", 3)  # one triangle, one character above its minimum
-    assert len(load_file(tmp_path / "a.dae").nodes) == 1
-    (tmp_path / "b.dae").write_text(dae(node, '<node id="top"><instance_node url="#n"/></node>' * 2))
-    with pytest.raises(SceneBuildError, match="draws 4 triangles"):
-        load_file(tmp_path / "b.dae")
 
 
 def test_broken_dae_is_rejected_without_library_text(tmp_path: Path) -> None:
