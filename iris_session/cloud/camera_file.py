@@ -212,8 +212,8 @@ class _Reader:
         try:
             settings = msgspec.convert(document, CloudSettings)
         except msgspec.ValidationError as error:
-            key, camera, text = _explain(error, document)
-            raise self._error(key, text, camera) from error
+            key, number, text = _explain(error, document)
+            raise self._error(key, text, number) from error
         if not is_stream_name(settings.stream):
             raise self._error("stream", describe_bad_stream_name(settings.stream))
         for index, camera in enumerate(settings.cameras):
