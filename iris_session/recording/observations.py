@@ -127,12 +127,11 @@ class _Roster:
     present: dict[str, AlignmentPeriod] = field(default_factory=dict)
 
 
-@dataclass
-class _StepEntries:
+class _StepEntries(NamedTuple):
     """Joins and jump alarms in the journal of one step, with connections, that no event has been matched to yet."""
 
-    joins: list[tuple[int, Join]] = field(default_factory=list)
-    jumps: list[tuple[int, AlignmentAlarm]] = field(default_factory=list)
+    joins: list[tuple[int, Join]]
+    jumps: list[tuple[int, AlignmentAlarm]]
 
 
 def read_alignment_history(
@@ -184,7 +183,7 @@ def _replay_events(
             said[row.now_ns] = _decode_step(row.entries)
     roster = _Roster()
     for event in events:
-        _apply_event(event, said.get(event.session_time, _StepEntries()), roster, found)
+        _apply_event(event, said.get(event.session_time, _StepEntries([], [])), roster, found)
     found.in_force.extend(roster.present.values())
     found.in_force.sort(key=lambda one: one.since_ns)
     return roster
@@ -195,16 +194,13 @@ def _is_jump(body: object) -> bool:
 
 
 def _decode_step(entries: bytes) -> _StepEntries:
-    said = _StepEntries()
     try:
-        for entry in decode_entries(entries):
-            if isinstance(entry.message, Join):
-                said.joins.append((entry.connection, entry.message))
-            elif isinstance(entry.message, AlignmentAlarm) and _is_jump(entry.message):
-                said.jumps.append((entry.connection, entry.message))
+        said = [(entry.connection, entry.message) for entry in decode_entries(entries)]
     except msgspec.DecodeError:  # damaged: participants that joined in this step stay unknown
-        return _StepEntries()
-    return said
+        said = []
+    joins = [(connection, message) for connection, message in said if isinstance(message, Join)]
+    alarms = [(connection, message) for connection, message in said if isinstance(message, AlignmentAlarm)]
+    return _StepEntries(joins, [alarm for alarm in alarms if _is_jump(alarm[1])])
 
 
 def _apply_event(event: Event, said: _StepEntries, roster: _Roster, found: AlignmentHistory) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -38,16 +38,39 @@ from iris_session.rrd.stream import (
     RrdStream,
     bytes_column,
     duration_index,
-    list_column,
     matrix_column,
     scalar_column,
     sequence_index,
+    table_columns,
 )
 from iris_session.viewer.drawing import SessionDrawing
-from iris_session.viewer.narration import WARN, NarratedEvent, describe_session
+from iris_session.viewer.event_layer import make_log_columns
+from iris_session.viewer.narration import WARN, NarratedEvent, describe_denial, describe_session
 from iris_session.viewer.timelines import MomentTable, to_time_columns
 
 _encode = msgspec.msgpack.Encoder().encode
+#: Columns of tables: those of `JournalRow` behind its times, of raw messages, and of each field of `AssetRows`.
+_NUMBERS: Final = pa.list_(pa.uint32())
+_ROWS: Final = {
+    "n_ticks": pa.int64(),
+    "entries": pa.binary(),
+    "entry_lengths": _NUMBERS,
+    "entry_crcs": _NUMBERS,
+    "digest": pa.binary(),
+    "chain": pa.binary(),
+    "field_crcs": _NUMBERS,
+    "plant": pa.binary(),
+}
+_SAMPLES: Final = {"connection": pa.int64(), "receive_ns": pa.int64(), "data": pa.binary()}
+_SCENES: Final = {"scene_step": pa.int64(), "scene_ns": pa.int64(), "hash": pa.string(), "recorded": pa.string()}
+_PIECES: Final = {
+    "address": pa.string(),
+    "offset": pa.int64(),
+    "total": pa.int64(),
+    "is_scene": pa.bool_(),
+    "data": pa.binary(),
+}
+_FAULTS: Final = {"address": pa.string(), "text": pa.string()}
 
 
 class RrdWriter:
@@ -225,17 +248,9 @@ class RrdWriter:
     def _write_rows(self, rows: Sequence[JournalRow]) -> None:
         if not rows:
             return
-        columns = [
-            scalar_column("n_ticks", [row.n_ticks for row in rows], pa.int64()),
-            bytes_column("entries", [row.entries for row in rows]),
-            list_column("entry_lengths", [row.entry_lengths for row in rows], pa.uint32()),
-            list_column("entry_crcs", [row.entry_crcs for row in rows], pa.uint32()),
-            bytes_column("digest", [row.digest for row in rows]),
-            bytes_column("chain", [row.chain for row in rows]),
-            list_column("field_crcs", [row.field_crcs for row in rows], pa.uint32()),
-        ]
-        if any(row.plant for row in rows):
-            columns.append(bytes_column("plant", [row.plant for row in rows]))
+        columns = table_columns((msgspec.structs.astuple(row)[2:] for row in rows), _ROWS)
+        if not any(row.plant for row in rows):
+            columns.pop()
         times = [
             sequence_index(paths.STEP, [row.step for row in rows]),
             duration_index(paths.SESSION_TIME, [row.now_ns for row in rows]),
@@ -286,7 +301,7 @@ class RrdWriter:
 
     def _write_denials(self, denials: list[DenialRecord]) -> None:
         if denials:
-            columns = self.drawing.events.draw_denials(denials)
+            columns = make_log_columns([describe_denial(record) for record in denials])
             columns.append(bytes_column("denial", [_encode(record) for record in denials]))
             times = self._moments.to_times(paths.DENIALS, [(d.step, d.session_time) for d in denials])
             self._send_columns(paths.DENIALS, times, columns)
@@ -294,38 +309,15 @@ class RrdWriter:
     def _write_samples(self, samples: list[tuple[int, int, bytes]]) -> None:
         if not samples:
             return
-        columns = [
-            scalar_column("connection", [s[0] for s in samples], pa.int64()),
-            scalar_column("receive_ns", [s[1] for s in samples], pa.int64()),
-            bytes_column("data", [s[2] for s in samples]),
-        ]
         times = [self._moments.spread_one(paths.SAMPLES, s[1]) for s in samples]
-        self._send_columns(paths.SAMPLES, [duration_index(paths.SESSION_TIME, times)], columns)
+        self._send_columns(paths.SAMPLES, [duration_index(paths.SESSION_TIME, times)], table_columns(samples, _SAMPLES))
 
     def _write_asset_rows(self, rows: AssetRows, timeout_s: float) -> None:
         """Write rows about assets at the time of the newest row of the journal."""
-        scenes, pieces, faults = rows
-        tables = {
-            paths.ASSET_SCENES: [
-                scalar_column("scene_step", [one.step for one in scenes], pa.int64()),
-                scalar_column("scene_ns", [one.session_time for one in scenes], pa.int64()),
-                scalar_column("hash", [one.hash for one in scenes], pa.string()),
-                scalar_column("recorded", [one.recorded for one in scenes], pa.string()),
-            ],
-            paths.ASSETS: [
-                scalar_column("address", [one.address for one in pieces], pa.string()),
-                scalar_column("offset", [one.offset for one in pieces], pa.int64()),
-                scalar_column("total", [one.total for one in pieces], pa.int64()),
-                scalar_column("is_scene", [one.is_scene for one in pieces], pa.bool_()),
-                bytes_column("data", [one.data for one in pieces]),
-            ],
-            paths.ASSET_FAULTS: [
-                scalar_column("address", [one.address for one in faults], pa.string()),
-                scalar_column("text", [one.text for one in faults], pa.string()),
-            ],
-        }
-        for (entity, columns), n in zip(tables.items(), (len(scenes), len(pieces), len(faults)), strict=True):
-            if n:
-                times = [self._moments.spread_one(entity, self._newest_ns) for _ in range(n)]
-                self._send_columns(entity, [duration_index(paths.SESSION_TIME, times)], columns)
+        tables = ((paths.ASSET_SCENES, _SCENES), (paths.ASSETS, _PIECES), (paths.ASSET_FAULTS, _FAULTS))
+        for (entity, types), table in zip(tables, rows, strict=True):
+            if table:
+                times = [self._moments.spread_one(entity, self._newest_ns) for _ in table]
+                index = [duration_index(paths.SESSION_TIME, times)]
+                self._send_columns(entity, index, table_columns(table, types))
         self._write_stream(timeout_s)

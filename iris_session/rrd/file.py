@@ -82,7 +82,7 @@ def scan_file(path: str | Path) -> Scan:
             raise NotARecordingError(f"{path} is not a Rerun file (it does not begin with {MAGIC.decode()})")
         at = FILE_HEAD
         while at < size:
-            message = _message_at(file, at, size)
+            message = message_at(file, at, size)
             if message is None and (grown := os.fstat(file.fileno()).st_size) > size:
                 size = grown  # the index was added meanwhile, or the recorder still writes
                 continue
@@ -118,7 +118,8 @@ def find_end(data: bytes) -> tuple[int, int]:
     raise ValueError("a Rerun file without an end")
 
 
-def _message_at(file: BinaryIO, at: int, size: int) -> RrdMessage | None:
+def message_at(file: BinaryIO, at: int, size: int) -> RrdMessage | None:
+    """Return the message that begins at an offset of a file of `size` bytes; `None` if there is none, or not whole."""
     file.seek(at)
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
@@ -135,10 +136,10 @@ def _next_message(file: BinaryIO, begin: int, size: int) -> int | None:
         data = file.read(WINDOW_BYTES + overlap)
         at = data.find(_ARROW_HEAD)
         while at >= 0:
-            message = _message_at(file, window + at, size)
+            message = message_at(file, window + at, size)
             if message is not None:
                 end = message.offset + _HEAD.size + message.length
-                if end == size or _message_at(file, end, size) is not None:
+                if end == size or message_at(file, end, size) is not None:
                     return message.offset
             at = data.find(_ARROW_HEAD, at + 1)
     return None

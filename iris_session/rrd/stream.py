@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import time
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
@@ -114,6 +114,15 @@ def scalar_column(name: str, values: Any, kind: Any) -> ArrowColumn:
 def bytes_column(name: str, values: Iterable[bytes]) -> ArrowColumn:
     """Return a column of one byte string per row."""
     return scalar_column(name, list(values), pa.binary())
+
+
+def table_columns(rows: Iterable[Sequence[Any]], types: Mapping[str, Any]) -> list[ArrowColumn]:
+    """Return the columns of rows. `types`: names and Arrow types of their values, in order."""
+    columns = zip(types.items(), zip(*rows, strict=True), strict=True)
+    return [
+        ArrowColumn(name, pa.array(values, kind)) if pa.types.is_list(kind) else scalar_column(name, values, kind)
+        for (name, kind), values in columns
+    ]
 
 
 def list_column(name: str, values: Sequence[Sequence[Any]], kind: Any) -> ArrowColumn:

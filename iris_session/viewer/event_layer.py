@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import rerun as rr
 
-from iris_session.journal.messages import DenialRecord, HoldRecord, MetricRecord
+from iris_session.journal.messages import HoldRecord, MetricRecord
 from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import (
     AnchorMoved,
@@ -26,7 +26,6 @@ from iris_session.viewer.narration import (
     LogLine,
     NarratedEvent,
     Rgb,
-    describe_denial,
 )
 from iris_session.viewer.participant_layer import AnchorLayer, ParticipantLayer
 from iris_session.viewer.plots import INPUT_TO_STEP, STATE_AGE, MetricPlots
@@ -79,11 +78,7 @@ class EventLayer:
             elif isinstance(event.body, SceneChanged) and event.body.cause == "new_scene":
                 self._participants.label_robots({}, moment)
         self._add_lanes(changes)
-        return _make_log_columns([one.line for one in narrated])
-
-    def draw_denials(self, denials: Sequence[DenialRecord]) -> list[Any]:
-        """Return the columns of the log lines of denials."""
-        return _make_log_columns([describe_denial(record) for record in denials])
+        return make_log_columns([one.line for one in narrated])
 
     def add_holds(self, holds: Sequence[HoldRecord]) -> None:
         """Collect why robots hold."""
@@ -147,6 +142,7 @@ class EventLayer:
                 self._participants.label_robot(name, change.state, change.colours.get(change.state, FREE), moment)
 
 
-def _make_log_columns(lines: Sequence[LogLine]) -> list[Any]:
+def make_log_columns(lines: Sequence[LogLine]) -> list[Any]:
+    """Return the columns of lines of the log."""
     columns = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
     return [*columns]

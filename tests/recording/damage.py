@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import random
-import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import suppress
@@ -98,24 +96,6 @@ def check_repair(original: Original, damaged: bytes, fault: int, folder: Path) -
 def check_cut(original: Original, n_bytes: int, folder: Path) -> str:
     """Cut the file after `n_bytes`, repair it, and return what became of it."""
     return check_repair(original, original.path.read_bytes()[:n_bytes], n_bytes, folder)
-
-
-def check_scans(original: Original, folder: Path) -> Iterator[int]:
-    """Cut the file after every byte, from its end to its first message; yield the size that is left.
-
-    Every whole message before must be found, and the cut be said: a repair depends on nothing else of a cut file.
-    """
-    path = folder / "cut.rrd"
-    shutil.copy(original.path, path)
-    whole = list(original.messages)
-    for n_bytes in range(path.stat().st_size - 1, original.messages[0].offset - 1, -1):
-        os.truncate(path, n_bytes)
-        while whole and whole[-1].offset + HEAD_BYTES + whole[-1].length > n_bytes:
-            whole.pop()
-        end = whole[-1].offset + HEAD_BYTES + whole[-1].length if whole else original.messages[0].offset
-        found = scan_file(path)
-        assert (found.messages, found.holes, found.cut) == (whole, [], n_bytes != end), f"byte {n_bytes}"
-        yield n_bytes
 
 
 def flip_bits(original: Original, folder: Path, n: int, seed: int) -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from iris_session.rrd.batches import ROW_ID, get_entity, group_spans, join_pieces
+from iris_session.rrd.batches import ROW_ID, group_spans, join_pieces
 
 COLUMNS = ("a", "b", "c")
 
@@ -57,31 +57,6 @@ def test_rows_out_of_order_within_a_batch_are_sorted() -> None:
     mixed = table(0, 6, ("a", "c")).take(pa.array([3, 1, 0, 5, 4, 2]))
     found = list(group_spans([mixed, table(0, 3, ("b",)), table(3, 3, ("b",))]))
     assert values(list(map(join_pieces, found))) == values([table(0, 6)])
-
-
-def test_repeated_row_of_a_batch_is_merged() -> None:
-    """As when batches of two columns of the same rows were merged."""
-    names = table(0, 1).schema
-    first, second = (pa.Table.from_batches([batch]) for batch in (table(0, 6, ("a", "c")), table(0, 6, ("b",))))
-    merged = (
-        pa.concat_tables([first, second], promote_options="default")
-        .select(names.names)
-        .cast(names)
-        .combine_chunks()
-        .to_batches()
-    )
-    assert merged[0].num_rows == 12
-    (pieces,) = group_spans(merged)
-    assert values([join_pieces(pieces)]) == values([table(0, 6)])
-
-
-def test_entities_are_kept_apart() -> None:
-    mixed = [table(0, 2, entity="/x"), table(1, 3, entity="/y"), table(2, 2, entity="/x")]
-    assert [(get_entity(p[0]), join_pieces(p).num_rows) for p in group_spans(mixed)] == [
-        ("/x", 2),
-        ("/x", 2),
-        ("/y", 3),
-    ]
 
 
 def test_two_values_of_one_row_are_an_error() -> None:

@@ -186,21 +186,6 @@ def test_surfaces_without_a_texture_have_a_checker_pattern() -> None:
     assert build_checker(np.zeros((0, 3), np.float32)).shape == (0, 3)
 
 
-def test_vertices_are_split_where_texture_coordinates_differ(world: World) -> None:
-    (cloth, *_) = world.parsed.spec.deformables
-    arrays = dict(decode_arrays(world.store.get(cloth.address), "deformable"))
-    n = len(arrays["elements"])
-    arrays["uv"] = np.tile(np.array([(0, 0), (1, 0), (0, 1)], np.float32), (n, 1, 1))
-    bending = DrawnDeformable("e", cloth, arrays, np.zeros((2, 2, 3), np.uint8))
-    (mesh,) = bending.build_components()
-    indices = np.array(mesh.triangle_indices.as_arrow_array().to_pylist())
-    uv = np.array(mesh.vertex_texcoords.as_arrow_array().to_pylist())
-    assert np.array_equal(uv[indices], arrays["uv"])
-    positions = np.array(mesh.vertex_positions.as_arrow_array().to_pylist())
-    assert positions[indices] == pytest.approx(arrays["position"][arrays["elements"]])
-    assert len(uv) > cloth.vertices
-
-
 @pytest.mark.parametrize("name", ["elements", "position", "plan"])
 def test_damaged_asset_is_an_asset_error(world: World, name: str) -> None:
     (cloth, *_) = world.parsed.spec.deformables

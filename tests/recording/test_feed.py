@@ -36,7 +36,7 @@ from iris_session.protocol.server_messages import (
     PresenceItem,
     Reply,
 )
-from iris_session.protocol.steps import Command, Decision, OutgoingMessage
+from iris_session.protocol.steps import Decision, OutgoingMessage
 from iris_session.recording import Keyframe, RecorderFeed, make_row
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
@@ -280,21 +280,6 @@ def test_state_has_all_presence_since_the_last(feed: RecorderFeed, played) -> No
     assert set(first.presence) == {newer, bob}
     assert second.presence == ()
     assert third.presence == (bob,), "who has left is not seen again"
-
-
-def test_changed_reasons_to_hold_are_sent_once(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
-    played[0].say(feed, 1, -1, -1)
-    played[0].take(1)
-    for step, reason in enumerate(("no_sample", "no_sample", "", "stale")):
-        kind = "hold" if reason else "pose"
-        feed.add_decision(step, 10 * step, Decision(commands=(Command("left", kind, reason),)))
-    feed.flush()
-    holds = decode_batch(played[0].take(1)[0][2]).holds
-    assert [(h.step, h.session_time, h.robot, h.reason) for h in holds] == [
-        (0, 0, "left", "no_sample"),
-        (2, 20, "left", ""),
-        (3, 30, "left", "stale"),
-    ]
 
 
 def test_recorder_that_starts_later_knows_participants_by_name(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]

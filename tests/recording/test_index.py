@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import errno
-import itertools
 import os
 import random
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
-import rerun.chunk
 
 from iris_session.recording import NotARecordingError, Recording, parts, verify
-from iris_session.rrd import file as rrd_file
-from iris_session.rrd import index as footer
 from iris_session.rrd.file import END_MESSAGE, FILE_TAIL, scan_file
 from iris_session.rrd.index import add_index
 from iris_session.rrd.rerun_tool import find_rerun
@@ -137,16 +130,6 @@ def test_full_disk_leaves_the_file_as_it_was(path: Path, monkeypatch: pytest.Mon
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize(("name", "value"), [("RESERVE_BYTES", 1 << 60), ("MEMORY_SHARE", 0.0)])
-def test_short_disk_or_memory_is_left_alone(
-    path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: float
-) -> None:
-    monkeypatch.setattr(footer, name, value)
-    before = path.read_bytes()
-    assert not add_index(path)
-    assert path.read_bytes() == before
-
-
 def test_kill_during_the_write_leaves_a_finished_file(indexed: Path, tmp_path: Path) -> None:
     path = tmp_path / "session.rrd"
     data = indexed.read_bytes()
@@ -156,26 +139,6 @@ def test_kill_during_the_write_leaves_a_finished_file(indexed: Path, tmp_path: P
         report = verify(path, SmallCore)
         assert report.ok, report.line()
         assert (report.finished, report.steps) == (True, STEPS)
-
-
-def test_file_may_get_its_index_while_its_chunks_are_read(
-    closed: Path, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Rerun reads the size of a file first, and then finds an end message that is longer than the file."""
-    expected = [chunk.id for chunk in rrd_file.read_chunks(closed, "/**")]
-
-    def open_reader(name: str, real: Callable[[str], Any] = rerun.chunk.RrdReader) -> Any:
-        stream = real(name).stream()
-
-        def read(content: str) -> Iterator[Any]:
-            yield from itertools.islice(stream.filter(content=content), 3)
-            assert add_index(path)
-            raise RuntimeError("Message payload exceeds file size")
-
-        return SimpleNamespace(stream=lambda: stream if has_index(path) else SimpleNamespace(filter=read))
-
-    monkeypatch.setattr(rerun.chunk, "RrdReader", open_reader)
-    assert sorted(chunk.id for chunk in rrd_file.read_chunks(path, "/**")) == sorted(expected)
 
 
 def test_file_may_get_its_index_while_it_is_opened(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

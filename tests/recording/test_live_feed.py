@@ -10,19 +10,14 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from iris_session.journal.messages import Batch, StateFrame
-from iris_session.protocol.common import Pose
-from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import NotARecordingError
 from iris_session.recording.live_feed import LiveFeed, MessageTail
-from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.file import KIND_END, read_message, scan_file
 from iris_session.rrd.rerun_tool import find_rerun, make_environment
 from tests.loopback import make_loopback_address
-from tests.recording.support import column, journal, make_header, read, wait_until, write
+from tests.recording.support import column, journal, read, wait_until, write
 
 STEPS = 60
 
@@ -62,14 +57,11 @@ def test_tail_reads_whole_messages_of_a_growing_file_and_its_parts(
     assert max(sizes) < 5000 + max(map(len, expected))
 
 
-def test_other_files_are_not_followed(closed: Path, tmp_path: Path) -> None:
+def test_other_files_are_not_followed(tmp_path: Path) -> None:
     path = tmp_path / "session.rrd"
-    whole = closed.read_bytes()[: scan_file(closed).messages[5].offset]
-    for data in (b"x" * 99, whole + b"\xff" * 99):
-        path.write_bytes(data)
-        tail = MessageTail(str(path))
-        with closing(tail), pytest.raises(NotARecordingError):
-            [*iter(lambda: tail.read(1 << 20), [])]  # noqa: B023 - called here
+    path.write_bytes(b"x" * 99)
+    with closing(MessageTail(str(path))) as tail, pytest.raises(NotARecordingError):
+        tail.read(1 << 20)
 
 
 @contextmanager
@@ -123,35 +115,3 @@ def test_viewer_gets_everything_and_follows(closed: Path, tmp_path: Path) -> Non
         feed.close()
         wait_until(lambda: steps_received(got) == list(range(STEPS)) and len(play_states(got)) == 2)
     assert max(play_states(got))[1] == [3], "following, in place of paused"
-
-
-@pytest.mark.e2e
-@pytest.mark.long
-def test_newest_state_is_drawn_before_its_motion_is_in_the_file(tmp_path: Path) -> None:
-    got, path = tmp_path / "got.rrd", tmp_path / "session.rrd"
-    header = make_header()
-    poses = np.zeros((len(header.bodies), 7))
-    head = PresenceItem("p1", "hand/left", Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)), 5)
-    writer = RrdWriter(path, "id")
-    writer.write_header(header)
-    with receiver(got) as (_, url):
-        feed = LiveFeed(str(path), url)
-        for step in (0, 8, 16):
-            state = StateFrame(step, step, step / 500, step * 2_000_000, (poses + step).tobytes(), (head,))
-            writer.add(Batch(states=[state]))
-            writer.flush()
-            feed.poll()
-        wait_until(lambda: steps_moved(got) == [0, 8, 16])
-        feed.close()
-    assert steps_moved(path) == [0], "the rest is due later"
-    hands = [b for b in read(got)["/presence/p1/hand/left"] if "Transform3D:translation" in b.schema.names]
-    assert {tuple(p) for (p,) in column(hands, "Transform3D:translation")} == {(0.0, 0.0, 1.0)}
-    writer.close()
-
-
-def steps_moved(path: Path) -> list[int]:
-    try:
-        batches = read(path)["/scene/1/bodies/ball"]
-        return sorted(set(column([b for b in batches if "Transform3D:translation" in b.schema.names], "step")))
-    except (OSError, LookupError, ValueError, RuntimeError):
-        return []

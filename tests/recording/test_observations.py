@@ -104,14 +104,6 @@ def test_observation_has_the_nearest_head_pose(played: Played, tmp_path: Path, l
         assert distance(look.p_tracking_head, look.observation.T_tracking_anchor.p) < 0.7
 
 
-def test_head_poses_of_another_tracking_epoch_are_ignored(played: Played, tmp_path: Path) -> None:
-    played.join(1, "p1", "ann")
-    played.look(1, "table", TABLE, HERE, 1, n=1, head_late_ns=S)
-    played.sample(1, (1.0, 2.0, 3.0), played.now_ns, epoch=1)
-    (look,) = read(played, tmp_path).observations[TrackingFrame("p1", 1, 0)]
-    assert look.p_tracking_head is None
-
-
 def test_alignments_hold_until_something_ends_them(played: Played, tmp_path: Path) -> None:
     played.join(1, "p1", "ann")
     played.aligned("p1", 1, HERE, 0.004)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from iris_session.journal.messages import Batch, DenialRecord, MetricRecord, StateFrame
@@ -121,13 +120,6 @@ def _steps(batch: Any) -> list[int]:
     return list(batch.column("step").to_pylist())
 
 
-def _set(batch: Any, column: str, at: int, value: Any) -> Any:
-    i = batch.schema.get_field_index(column)
-    values = batch.column(column).to_pylist()
-    values[at] = value
-    return batch.set_column(i, batch.schema.field(i), pa.array(values, batch.schema.field(i).type))
-
-
 def test_missing_plant_is_found(tmp_path: Path, split: Path) -> None:
     def drop(batch: Any) -> Any:
         return None if "plant" in batch.schema.names and 100 in _steps(batch) else batch
@@ -136,14 +128,6 @@ def test_missing_plant_is_found(tmp_path: Path, split: Path) -> None:
     first = report.problems[0]
     assert (report.ok, first.kind, first.field) == (False, "changed", "plant")
     assert 50 < first.step <= 100
-
-
-def test_missing_rows_are_a_gap(tmp_path: Path, split: Path) -> None:
-    def drop(batch: Any) -> Any:
-        return batch.filter(pa.array([not 100 <= step < 110 for step in _steps(batch)]))
-
-    report = verify(changed(split, tmp_path / "c.rrd", drop), SmallCore)
-    assert (report.ok, report.gaps, report.damage) == (False, [(100, 109)], [])
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import resource
 import shutil
 import signal
 import tempfile
@@ -308,27 +307,6 @@ def test_only_the_session_ends_its_recorder(tmp_path: Path, number: signal.Signa
         assert feed.close(20.0)
         assert process.close()
     assert verify(path, SmallCore).ok
-
-
-@pytest.mark.e2e
-@pytest.mark.long
-def test_full_disk_is_reported_and_the_next_part_continues(tmp_path: Path) -> None:
-    path = tmp_path / "session.rrd"
-    with recorder(path) as (process, feed):
-        session = SmallSession(feed)
-        session.take(50)
-        wait_until(lambda: _status(feed).written >= 4)
-        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (path.stat().st_size + 1000,) * 2)
-        session.take(200, pause_s=0.002)
-        wait_until(lambda: not process.alive)
-        feed.flush()
-        assert "cannot be written" in _status(feed).fault
-        assert "cannot be written" in "".join(process.poll(time.monotonic_ns()))
-        session.take(50)
-        assert feed.close(20.0)
-        assert process.close()
-    report = verify(path, SmallCore)
-    assert (report.ok, report.steps) == (True, 300), report.line()
 
 
 @pytest.mark.e2e

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import random
-import tempfile
 from pathlib import Path
 
 import msgspec
@@ -14,7 +13,6 @@ from iris_session.journal.rows import FORMAT, VERIFIERS
 from iris_session.recording import (
     NotARecordingError,
     Recording,
-    RecordingLock,
     verify,
 )
 from iris_session.recording.writer import RrdWriter
@@ -149,27 +147,6 @@ def test_a_folder_stands_for_the_recording_in_it(path: Path, tmp_path: Path) -> 
     (tmp_path / "empty").mkdir()
     with pytest.raises(NotARecordingError, match="no recording below the folder"):
         Recording.open(tmp_path / "empty")
-
-
-def test_file_removed_during_reading_is_an_error(path: Path) -> None:
-    with Recording.open(path) as recording:
-        path.unlink()
-        with pytest.raises(NotARecordingError, match="read"):
-            list(recording.rows())
-
-
-@pytest.mark.parametrize("state", ["written", "damaged"])
-def test_full_temporary_disk_is_one_line_that_says_so(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
-) -> None:
-    lock = RecordingLock(path, shared=True) if state == "written" else None
-    if state == "damaged":
-        os.truncate(path, path.stat().st_size - 20)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
-    with pytest.raises(NotARecordingError, match=r"temporary copy of session\.rrd cannot be written: No such file"):
-        Recording.open(path)
-    if lock is not None:
-        lock.release()
 
 
 def test_missing_part_is_found(tmp_path: Path) -> None:

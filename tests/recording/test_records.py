@@ -134,10 +134,3 @@ def test_samples_have_their_participant_and_nan_for_what_they_lack(tmp_path: Pat
     assert np.array_equal(hand.hand_joints, [[1.0] * 14, [np.nan] * 14], equal_nan=True)
     assert hand.q.shape == (2, 0)
     assert np.array_equal(leader.q, [[0.1, 0.2, np.nan], [0.1, 0.2, 0.3]], equal_nan=True)
-
-
-def test_a_recording_without_samples_says_so(tmp_path: Path) -> None:
-    with Recording.open(write(tmp_path / "session.rrd", [], [])) as recording:
-        assert not list(iterate_samples(recording))
-        with pytest.raises(RecordingError, match="Samples: none"):
-            read_device_samples(recording, "ann", "head")

@@ -11,10 +11,10 @@ import pytest
 
 from iris_session.journal.errors import RecorderError
 from iris_session.journal.rows import seal_blob
-from iris_session.recording import NotARecordingError, Recording, header_root, verify
+from iris_session.recording import Recording, header_root, verify
 from iris_session.recording.lock import RecordingLock
 from iris_session.recording.repair import RepairReport, repair
-from iris_session.rrd.file import KIND_STORE_INFO, scan_file
+from iris_session.rrd.file import scan_file
 from iris_session.rrd.paths import part_path
 from tests.recording.damage import STEPS, Original, check_cut, check_repair, flip_bits, make_original
 from tests.recording.support import SmallCore, journal, write
@@ -90,21 +90,6 @@ def test_model_of_a_changed_header_is_kept(tmp_path: Path, monkeypatch: pytest.M
         assert recording.damage == ["header: damaged, and read from its copy"]
     found = verify(path, SmallCore)
     assert (found.steps, found.unverified_steps, found.ok) == (STEPS, 0, False)
-
-
-def test_one_of_two_descriptions_of_the_store_is_enough(original: Original, tmp_path: Path) -> None:
-    first, second, *_ = (m for m in original.messages if m.kind == KIND_STORE_INFO)
-    data = bytearray(original.path.read_bytes())
-    data[first.offset + 40 : first.offset + 60] = bytes(20)
-    path = tmp_path / "session.rrd"
-    path.write_bytes(data)
-    report = repair(path, tmp_path / "repaired.rrd")
-    assert (report.steps, report.lost_steps) == (STEPS, 0)
-    assert any(f"at byte {first.offset} is damaged" in line for line in report.damage)
-    data[second.offset + 40 : second.offset + 60] = bytes(20)
-    path.write_bytes(data)
-    with pytest.raises(NotARecordingError):
-        repair(path, tmp_path / "repaired.rrd", overwrite=True)
 
 
 def destroy_rows(original: Path, path: Path, first: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import mujoco
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from iris_session.journal.messages import SceneAssets
 from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import pack_model
-from iris_session.scene import AssetMissingError, AssetStore, EncodeOptions
+from iris_session.scene import AssetMissingError, AssetStore
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.viewer import scene_geometry as scene
@@ -57,15 +56,6 @@ def test_the_small_scene(tmp_path: Path) -> None:
         *["arm/link 1"] * 2,
         *["tip"] * 2,
     ]
-
-
-def test_static_body_is_drawn_in_the_frame_of_its_parent(tmp_path: Path) -> None:
-    model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
-    spec = parse_mujoco(model, store).spec
-    reader = scene.SceneReader(spec, store, [body for body in infos(model) if body.name != "tip"])
-    frame, (p, _) = reader.place_visual(spec.visuals[4])
-    assert frame == "arm/link 1"
-    assert p == pytest.approx((0.4, 0.0, 0.0))
 
 
 def test_nested_fixed_bodies_move_with_their_root(tmp_path: Path) -> None:
@@ -133,27 +123,6 @@ def test_every_shape_has_its_texture(tmp_path: Path) -> None:
         is_large = visual.geometry.kind in ("plane", "cylinder")
         assert (form.kind == scene.MESH) == (is_mesh or worn or is_large)
     assert len(looks) >= len(SHAPES) * len(LOOKS)
-
-
-def test_uniform_cube_map_is_a_colour_and_a_large_one_is_reduced(tmp_path: Path) -> None:
-    """A shape that wears one colour stays the viewer's own; what is worn is in the file every time."""
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><asset>
-        <texture name="f" type="cube" builtin="flat" rgb1="1 .5 0" rgb2="1 .5 0" width="64" height="64"/>
-        <texture name="c" type="cube" builtin="checker" rgb1="1 0 0" rgb2="0 0 1" width="600" height="600"/>
-        <material name="f" texture="f"/><material name="c" texture="c"/></asset>
-        <worldbody><geom size="1" material="f"/><geom size="1" material="c"/></worldbody></mujoco>"""
-    )
-    store = AssetStore(tmp_path)
-    for options in (None, EncodeOptions(levels=False)):
-        spec = parse_mujoco(model, store, options=options).spec
-        reader = scene.SceneReader(spec, store, [])
-        plain, checked = (reader.read_shape(visual) for visual in spec.visuals)
-        assert (plain.kind, plain.texture) == (scene.ELLIPSOID, None)
-        assert plain.tint == pytest.approx((1.0, 0.5, 0.0), abs=0.003)
-        assert checked.kind == scene.MESH
-        assert checked.texture is not None
-        assert scene.CUBE_SIDE < max(checked.texture.shape) <= scene.TEXTURE_SIDE
 
 
 def test_vertex_colours_are_drawn(tmp_path: Path) -> None:
@@ -226,18 +195,3 @@ def test_planes_end_near_the_scene_and_keep_their_texture(tmp_path: Path) -> Non
             per_metre = np.ptp(form.uv, axis=0) / np.ptp(form.mesh.position, axis=0)[:2]
             size = visual.geometry.size[0] or 1.0
             assert per_metre == pytest.approx(np.array((3, 5)) / 2 / size, rel=1e-4)
-
-
-def test_fine_meshes_are_drawn_at_a_coarser_level(tmp_path: Path) -> None:
-    builder, store = SceneBuilder(), AssetStore(tmp_path)
-    builder.add_mesh(vertices=[[0, 0, 0], [1, 0, 0], [0, 1, 0]], triangles=[[0, 1, 2]])
-    builder.add_mesh(vertices=[[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], triangles=[[0, 1, 2], [0, 2, 3]])
-    spec = builder.build(store).spec
-    coarse, fine = (mesh.levels[0] for mesh in spec.meshes)
-    for vertices, drawn in ((scene.ENOUGH_VERTICES - 1, 4), (scene.ENOUGH_VERTICES, 3)):
-        levels = (msgspec.structs.replace(fine, vertices=vertices), coarse)
-        mesh = msgspec.structs.replace(spec.meshes[1], levels=levels)
-        changed = msgspec.structs.replace(spec, meshes=(spec.meshes[0], mesh))
-        form = scene.SceneReader(changed, store, []).read_shape(changed.visuals[1])
-        assert form.mesh is not None
-        assert form.mesh.vertices == drawn

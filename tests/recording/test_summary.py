@@ -35,7 +35,6 @@ from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import Recording, RecordingSummary, summarise
 from iris_session.recording.summary import SummaryBuilder
 from iris_session.recording.writer import RrdWriter
-from iris_session.rrd import file as rrd_file
 from iris_session.rrd.batches import FrameTime, RecordedStream, RowTimes
 from iris_session.rrd.paths import part_path
 from tests.recording.support import TICK_NS, journal
@@ -269,15 +268,3 @@ def test_parts_are_summarised_once(tmp_path: Path) -> None:
     assert (summary.ok, summary.finished, summary.files) == (True, True, ("session.rrd", "session.part2.rrd"))
     assert (summary.steps, summary.drops.denials, len(summary.handovers)) == (200, {"held": 2}, 1)
     assert summary.streams[0].frames == 10
-
-
-def test_a_cut_recording_ends_where_it_was_cut(tmp_path: Path) -> None:
-    path = write_session(tmp_path / "session.rrd")
-    messages = rrd_file.scan_file(path).messages
-    cut = messages[len(messages) // 3]
-    path.write_bytes(path.read_bytes()[: cut.offset + 20])
-    summary = read(path)
-    assert (summary.ok, summary.finished) == (True, False), summary.damage
-    assert 0 < summary.steps < 200
-    assert summary.ending.startswith(f"not closed after {summary.begin_s + summary.duration_s:g} s")
-    assert f"at byte {cut.offset}" in summary.ending

@@ -132,19 +132,6 @@ def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Pa
     assert not any("fixed" in entity for entity in found)
 
 
-def test_static_geometry_is_written_once_per_frame(tmp_path: Path) -> None:
-    header = make_header()
-    writer = begin(tmp_path, header)
-    writer.add(Batch(states=[frame(5, np.zeros((len(header.bodies), 7)))]))
-    found = finish(writer)
-    ball = found["/scene/1/bodies/ball/g\\/ball"]
-    assert column(ball, "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
-    assert column(ball, "step") == [5], "from the first state on, and once"
-    assert column(found["/scene/1/bodies/arm\\/link\\ 1/visual_2"], "Capsules3D:lengths") == [[pytest.approx(0.4)]]
-    assert not any("post" in entity for entity in found), "group 3 is not visible"
-    assert "small" in column(found["/session"], "TextDocument:text")[0][0]
-
-
 def test_picture_begins_with_the_first_row(tmp_path: Path) -> None:
     header, batch = journal(1)
     state = frame(1, np.zeros((len(header.bodies), 7)))  # later than its row, by the duration of the step

@@ -236,28 +236,6 @@ def test_robots_and_objects_have_the_rows_of_their_scenes(changed: tuple[Played,
 # --- samples and events -----------------------------------------------------------------------------------------------
 
 
-def test_samples_of_a_device_are_arrays(closed: Played) -> None:
-    with Recording.open(closed.path) as recording:
-        by_name = recording.device_samples("ann", "desktop")
-        by_id = recording.device_samples("p1", "desktop")
-        with pytest.raises(RecordingError, match=r"no samples of 'bob' 'desktop'\. Samples: ann desktop$"):
-            recording.device_samples("bob", "desktop")
-    assert by_name.poses.tobytes() == by_id.poses.tobytes()
-    assert by_name.seq.tolist() == [entry.message.seq for entry in closed.samples]  # type: ignore[union-attr]
-    assert by_name.clutch.tolist() == [bool(seq >= 50) for seq in by_name.seq]
-    assert by_name.poses[:, 1].tolist() == [entry.message.pose.p[1] for entry in closed.samples]  # type: ignore[union-attr]
-
-
-def test_events_are_records_with_names(closed: Played) -> None:
-    with Recording.open(closed.path) as recording:
-        records = recording.event_records()
-    engaged = next(one for one in records if one["event"] == "engagement_changed")
-    assert engaged["robot"] == "left"
-    assert (engaged["participant"], engaged["participant_name"], engaged["engaged"]) == ("p1", "ann", True)
-    assert engaged["session_time_ns"] == closed.session_time[56], "the first sample with a closed clutch"
-    assert engaged["time_s"] == engaged["session_time_ns"] * 1e-9
-
-
 def test_bodies_of_a_published_world_have_poses(tmp_path: Path) -> None:
     """A kinematic model, moved by frames of a publisher; the rows between them have no plant."""
     carrier = KinematicModel(("crate", "drum"), (Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),) * 2)
