@@ -77,9 +77,6 @@ class FeedStats(msgspec.Struct):
     budget of the recording is used up is in none of them.
     """
 
-    rows: int = 0
-    batches: int = 0
-    bytes: int = 0
     window_bytes: int = 0
     waiting_batches: int = 0
     waiting_bytes: int = 0
@@ -191,7 +188,6 @@ class RecorderFeed:
         batch.rows.append(row)
         self._now = (row.step, row.now_ns)
         self._last_status_ns = self._last_status_ns or row.now_ns  # a resumed session does not begin at time zero
-        self.stats.rows += 1
         if len(batch.rows) >= BATCH_ROWS or row.now_ns - self._batch_since >= BATCH_NS:
             self.flush()
 
@@ -364,8 +360,6 @@ class RecorderFeed:
     def _send_batch(self, body: bytes) -> None:
         number, self._next = self._next, self._next + 1
         self._window.append((number, body))
-        self.stats.batches += 1
-        self.stats.bytes += len(body)
         self.stats.window_bytes += len(body)
         if self._instance and self._header_sent_to == self._instance:
             self._send(messages.BATCH, number, body)

@@ -210,23 +210,21 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     """Status of the recorder, sent after every write and at least every half second.
 
     `instance`: differs for every recorder process. `expecting`: number of the next batch, -1 until a header arrived.
-    `written`: newest batch that is in the file, -1 for none. `bytes`: size of the file. `cpu_ns`: processor time of the
-    recorder so far. `lag_ns`: age of the newest row when it was written. `samples`: number of raw messages received.
-    `samples_refused`: number of invalid messages of the front, and of batches of which only the journal could be read.
-    `vertices_refused`: number of vertex frames that are not in the picture: they do not decode or are of another scene.
-    `fault`: one line if the file can no longer be written; the process then ends.
-    `disk_free`: free bytes on its disk, at least 1; 0 if unknown. `samples_left_out`: raw messages that are not in the
-    file, because time and room of the disk were left to the journal. `media_refused`: frames of point clouds and
-    pictures that do not decode. `assets_left_out`: assets of the scenes that are not in the file. `budget`,
-    `budget_left`: bytes that the recording may have, and that are left of them; 0, 0: any number. `ended`: the budget
-    is used up, the file is closed and the process ends: nothing more is recorded.
+    `written`: newest batch that is in the file, -1 for none. `bytes`: size of the file. `lag_ns`: age of the newest row
+    when it was written. `samples`: number of raw messages received. `samples_refused`: number of invalid messages of
+    the front, and of batches of which only the journal could be read. `fault`: one line if the file can no longer be
+    written; the process then ends. `disk_free`: free bytes on its disk, at least 1; 0 if unknown. `vertices_refused`:
+    number of vertex frames that are not in the picture: they do not decode or are of another scene. `samples_left_out`:
+    raw messages that are not in the file, because time and room of the disk were left to the journal. `media_refused`:
+    frames of point clouds and pictures that do not decode. `assets_left_out`: assets of the scenes that are not in the
+    file. `budget`, `budget_left`: bytes that the recording may have, and that are left of them; 0, 0: any number.
+    `ended`: the budget is used up, the file is closed and the process ends: nothing more is recorded.
     """
 
     instance: int
     expecting: int
     written: int
     bytes: int = 0
-    cpu_ns: int = 0
     lag_ns: int = 0
     samples: int = 0
     samples_refused: int = 0

@@ -336,7 +336,6 @@ class RecorderLoop:
             self._expecting,
             written,
             self._writer.stream.size,
-            time.process_time_ns(),
             self._lag_ns,
             self._samples,
             self._refused,

@@ -314,8 +314,10 @@ class RrdWriter:
 
     def _write_asset_rows(self, rows: AssetRows, timeout_s: float) -> None:
         """Write rows about assets at the time of the newest row of the journal."""
-        tables = ((paths.ASSET_SCENES, _SCENES), (paths.ASSETS, _PIECES), (paths.ASSET_FAULTS, _FAULTS))
-        for (entity, types), table in zip(tables, rows, strict=True):
+        scenes, pieces = (paths.ASSET_SCENES, _SCENES, rows.scenes), (paths.ASSETS, _PIECES, rows.pieces)
+        tables: tuple[tuple[str, dict[str, Any], Sequence[Any]], ...]
+        tables = (scenes, pieces, (paths.ASSET_FAULTS, _FAULTS, rows.faults))
+        for entity, types, table in tables:
             if table:
                 times = [self._moments.spread_one(entity, self._newest_ns) for _ in table]
                 index = [duration_index(paths.SESSION_TIME, times)]

@@ -99,7 +99,10 @@ class SessionDrawing:
 
     def find_moments(self, states: Sequence[StateFrame]) -> list[Moment]:
         """Return the moments of states."""
-        return [self._moments.make(s.step, _to_sim_ns(s), s.session_time) for s in states]
+        # The simulated time is that since the session began, resets included.
+        times_s = [max(-LONGEST_S, min(state.sim_before + state.sim_time, LONGEST_S)) for state in states]
+        pairs = zip(states, times_s, strict=True)
+        return [self._moments.make(state.step, round(sim_s * 1e9), state.session_time) for state, sim_s in pairs]
 
     def draw_states(self, states: Sequence[StateFrame], poses: NDArray[np.float64], begins_ns: int | None) -> None:
         """Draw states of one scene.
@@ -238,8 +241,3 @@ class SessionDrawing:
     def _send_blueprint(self) -> None:
         self._has_views = True
         self._rec.send_blueprint(build_blueprint(self._eye, self._media.pictures, self._plots.robots))
-
-
-def _to_sim_ns(state: StateFrame) -> int:
-    """Return the simulated time of a state since the session began, resets included [ns]."""
-    return round(max(-LONGEST_S, min(state.sim_before + state.sim_time, LONGEST_S)) * 1e9)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -352,7 +352,9 @@ class EventNarration:
                 return LogLine(ERROR, f"no step for {duration_ns * 1e-9:.2f} s ({kind})")
             case _:
                 fields = msgspec.to_builtins(body)
-                return LogLine(INFO, f"{_to_words(fields.pop('event'))}: {_join_fields(fields)}")
+                kind = _to_words(fields.pop("event"))
+                text = " ".join(f"{name}={value}" for name, value in fields.items() if value not in ("", None, [], ()))
+                return LogLine(INFO, f"{kind}: {text}")
 
     def _describe_change(self, info: ParticipantInfo) -> LogLine:
         before = self._people.get(info.id, Person(info.name, info.role, info.worn))
@@ -410,10 +412,6 @@ def _to_device(device: str) -> str:
     """Return `left controller` for `controller/left`."""
     kind, _, side = device.partition("/")
     return f"{side} {kind}" if side else kind
-
-
-def _join_fields(fields: dict[str, Any]) -> str:
-    return " ".join(f"{name}={value}" for name, value in fields.items() if value not in ("", None, [], ()))
 
 
 def find_colour(participant: str) -> Rgb:

@@ -151,11 +151,12 @@ class SceneReader:
         atlas, tint = (None, _WHITE) if cube is None else (cube.atlas, cube.tint)
         texture = self.read_texture(visual.material) if atlas is None else _with_colours(atlas.pixels)
         mesh = self._mesh(geometry)
+        is_cylinder = geometry.kind == GeometryKind.CYLINDER  # its size: radius twice and half length
         if atlas is not None and mesh is not None and mesh.triangles > MOST_BAKED:
             return VisualShape(MESH, mesh=mesh, tint=_mean_colour(atlas.pixels))
         if geometry.kind == GeometryKind.PLANE:
             mesh = self._crop_plane(visual)
-        elif mesh is None and (texture is not None or _is_large_cylinder(geometry)):
+        elif mesh is None and (texture is not None or (is_cylinder and max(geometry.size) > SMALL_CYLINDER_M / 2.0)):
             mesh = build_primitive(geometry)
         if mesh is None:
             return VisualShape(_FORMS.get(geometry.kind, BOX), geometry.size, tint=tint)
@@ -275,8 +276,3 @@ def to_rgba8(rgba: Rgba, tint: tuple[float, float, float] = _WHITE) -> Rgba8:
 
 def _tuple(pose: Pose) -> PoseTuple:
     return pose.p, pose.q
-
-
-def _is_large_cylinder(geometry: Geometry) -> bool:
-    radius, _, half = geometry.size
-    return geometry.kind == GeometryKind.CYLINDER and 2.0 * max(radius, half) > SMALL_CYLINDER_M

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
+import subprocess
 import tempfile
 import time
 import warnings
@@ -38,6 +39,7 @@ from iris_session.recording import (
 )
 from iris_session.recording.process import RecorderLoop
 from iris_session.recording.writer import RrdWriter
+from iris_session.rrd.rerun_tool import find_rerun
 
 TICK_NS = 2_000_000
 XML = """<mujoco><option timestep="0.002"/><worldbody><light pos="0 0 3"/>
@@ -301,6 +303,11 @@ def read(path: Path) -> dict[str, list[Any]]:
         for chunk in RrdReader(str(path)).stream():
             found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
     return found
+
+
+def has_index(path: Path) -> bool:
+    """Return whether Rerun finds a valid index in a file."""
+    return subprocess.run([find_rerun(), "rrd", "verify", path], capture_output=True, check=False).returncode == 0
 
 
 def column(batches: list[Any], name: str) -> list[Any]:

@@ -6,7 +6,6 @@ import errno
 import os
 import random
 import shutil
-import subprocess
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,15 +15,9 @@ from iris_session.recording import NotARecordingError, Recording, parts, verify
 from iris_session.rrd.file import END_MESSAGE, FILE_TAIL, scan_file
 from iris_session.rrd.index import add_index
 from iris_session.rrd.rerun_tool import find_rerun
-from tests.recording.support import SmallCore, journal, write
+from tests.recording.support import SmallCore, has_index, journal, write
 
 STEPS = 200
-
-
-def has_index(path: Path) -> bool:
-    """Return whether Rerun finds a valid index."""
-    done = subprocess.run([find_rerun(), "rrd", "verify", path], capture_output=True, check=False)
-    return done.returncode == 0
 
 
 @pytest.fixture(scope="module")

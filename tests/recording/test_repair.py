@@ -4,20 +4,92 @@ from __future__ import annotations
 
 import random
 import shutil
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import pytest
 
 from iris_session.journal.errors import RecorderError
 from iris_session.journal.rows import seal_blob
-from iris_session.recording import Recording, header_root, verify
+from iris_session.recording import NotARecordingError, Recording, header_root, summarise, verify
 from iris_session.recording.lock import RecordingLock
 from iris_session.recording.repair import RepairReport, repair
-from iris_session.rrd.file import scan_file
+from iris_session.rrd import paths
+from iris_session.rrd.file import KIND_END, KIND_STORE_INFO, RrdMessage, read_message, scan_file
 from iris_session.rrd.paths import part_path
-from tests.recording.damage import STEPS, Original, check_cut, check_repair, flip_bits, make_original
-from tests.recording.support import SmallCore, journal, write
+from iris_session.rrd.rerun_tool import INDEX, rewrite
+from tests.recording.support import SmallCore, has_index, journal, write
+
+HEAD_BYTES = 16  # of a message
+STEPS = 60
+
+
+class Original(NamedTuple):
+    """A whole file. `unmarked`: messages without the recorder's checksums. `n_header`: messages up to its header."""
+
+    path: Path
+    messages: list[RrdMessage]
+    unmarked: frozenset[bytes]
+    n_header: int
+
+    @property
+    def begin(self) -> int:
+        """Offset of the first message behind the file's own head, and those that say what is stored in it."""
+        return next(m.offset for m in self.messages if m.kind != KIND_STORE_INFO)
+
+
+def make_original(folder: Path) -> Original:
+    """Write the file into `folder`."""
+    path = write(folder / "session.rrd", *journal(STEPS), rows_per_chunk=6)
+    with open(folder / "unmarked.rrd", "wb") as file:
+        rewrite(INDEX, [str(path)], file, options=("--drop-entity", paths.MARKS))
+    unmarked = frozenset(list_messages(folder / "unmarked.rrd"))
+    return Original(path, scan_file(path).messages, unmarked, _count_header_messages(path, folder))
+
+
+def _count_header_messages(path: Path, folder: Path) -> int:
+    cut = folder / "cut.rrd"
+    for n, message in enumerate(scan_file(path).messages):
+        cut.write_bytes(path.read_bytes()[: message.offset])
+        with suppress(NotARecordingError), Recording.open(cut):
+            return n
+    raise AssertionError("no header")
+
+
+def list_messages(path: Path) -> list[bytes]:
+    """Return the messages of a file but the last, which ends it."""
+    with open(path, "rb") as file:
+        return [read_message(file, m) for m in scan_file(path).messages if m.kind != KIND_END]
+
+
+def check_repair(original: Original, damaged: bytes, fault: int, folder: Path) -> str:
+    """Repair a file with a fault in byte `fault`; return what became of it: `whole`, `damaged` or `none`."""
+    path, output = folder / "damaged.rrd", folder / "repaired.rrd"
+    path.write_bytes(damaged)
+    n_before = sum(m.offset + HEAD_BYTES + m.length <= fault and m.kind != KIND_END for m in original.messages)
+    expected = list_messages(original.path)[:n_before]
+    is_cut = len(damaged) == fault
+    if n_before < original.n_header if is_cut else fault < original.begin:
+        with suppress(NotARecordingError):  # without a header it is no recording
+            repair(path, output, overwrite=True)
+        return "none"
+    report = repair(path, output, overwrite=True)
+    assert path.read_bytes() == damaged
+    assert scan_file(output).indexed
+    # A changed name of a component decodes, and is kept and reported, though Rerun does not know it.
+    assert has_index(output) or report.damage, f"byte {fault}"
+    kept = list_messages(output)
+    if report.damage:
+        expected = [data for data in expected if data in original.unmarked]
+        kept = [data for data in kept if data in set(expected)]
+    assert kept[: len(expected)] == expected, f"byte {fault}"
+    with Recording.open(path, warn=False) as recording:
+        summary = summarise(recording)
+    assert summary.ok == report.ok, f"byte {fault}"
+    assert set(report.damage) == set(summary.damage)
+    return "whole" if report.ok else "damaged"
 
 
 @pytest.fixture(scope="module")
@@ -25,20 +97,23 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Original:
     return make_original(tmp_path_factory.mktemp("original"))
 
 
-def truncate(original: Original, folder: Path, n: int) -> None:
-    """Cut the file around the beginning of `n` messages, in their heads and bodies."""
-    rng = random.Random(3)
-    for message in rng.sample(original.messages, min(len(original.messages), n)):
-        at = message.offset + rng.choice((0, 1, 8, 15, 16, 17, 16 + message.length // 2))
-        assert check_cut(original, at, folder) != "damaged", "a cut is no damage"
-
-
 def test_truncated_file_is_repaired_up_to_its_last_whole_message(original: Original, tmp_path: Path) -> None:
-    truncate(original, tmp_path, 8)
+    """It is cut around the beginning of messages, in their heads and bodies."""
+    data, rng = original.path.read_bytes(), random.Random(3)
+    for message in rng.sample(original.messages, 6):
+        at = message.offset + rng.choice((0, 1, 8, 15, 16, 17, 16 + message.length // 2))
+        assert check_repair(original, data[:at], at, tmp_path) != "damaged", "a cut is no damage"
 
 
 def test_flipped_bits_cost_one_message(original: Original, tmp_path: Path) -> None:
-    assert [*flip_bits(original, tmp_path, 6, 1)].count("damaged") > 3
+    data, rng = original.path.read_bytes(), random.Random(1)
+    found = []
+    for _ in range(5):
+        at = rng.randrange(len(data))
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << rng.randrange(8)
+        found.append(check_repair(original, bytes(damaged), at, tmp_path))
+    assert found.count("damaged") > 2
 
 
 def test_cut_file_keeps_its_checksums(original: Original, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import shutil
-import subprocess
 from pathlib import Path
 
 import msgspec
@@ -18,9 +17,8 @@ from iris_session.recording.viewer_export import open_view_file
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.file import scan_file
 from iris_session.rrd.index import add_index
-from iris_session.rrd.rerun_tool import find_rerun
 from iris_session.system.files import Replacement
-from tests.recording.support import column, journal, read, write
+from tests.recording.support import column, has_index, journal, read, write
 
 STEPS = 60
 
@@ -37,10 +35,6 @@ def path(closed: Path, tmp_path: Path) -> Path:
 
 def steps_of(path: Path) -> list[int]:
     return sorted(set(column(read(path)["/journal/rows"], "step")))
-
-
-def has_index(path: Path) -> bool:
-    return subprocess.run([find_rerun(), "rrd", "verify", path], capture_output=True, check=False).returncode == 0
 
 
 def write_session(folder: Path) -> None:
@@ -98,24 +92,6 @@ def test_parts_and_resumed_recordings_are_one_recording(tmp_path: Path) -> None:
         assert [file.name for file in view.files] == ["session.rrd", "session.part2.rrd", "session.resume2.rrd"]
     assert steps_of(view.path) == list(range(STEPS))
     assert len(RrdReader(str(view.path)).recordings()) == 1
-
-
-def test_damaged_parts_are_left_out_and_named(tmp_path: Path) -> None:
-    write_session(tmp_path)
-    part = tmp_path / "session.part2.rrd"
-    data = bytearray(part.read_bytes())
-    victim = scan_file(part).messages[-5]
-    data[victim.offset + 60 : victim.offset + victim.length] = bytes(victim.length - 60)
-    part.write_bytes(data)
-    (tmp_path / "session.resume2.rrd").write_bytes(b"nothing")
-    with open_view_file(tmp_path / "session.rrd") as view:
-        assert has_index(view.path)
-        assert len(view.damage) == 2
-        assert "part2" in view.damage[0]
-        assert "resume2" in view.damage[1]
-        damage = view.damage
-    with open_view_file(tmp_path / "session.rrd") as again:
-        assert again.damage == damage
 
 
 def test_copy_is_no_recording(path: Path) -> None:

@@ -130,15 +130,6 @@ def test_what_is_not_asked_for_is_not_written(played: Played, tmp_path: Path, mo
     assert [one.file for one in history.tables] == ["samples.csv", "events.csv"], "nothing is simulated for them"
 
 
-def test_what_is_left_out_is_reported(tmp_path: Path) -> None:
-    gap = play(tmp_path / "session.rrd", 50)
-    del gap.batch.rows[25]
-    gap.write()
-    report = write(gap, tmp_path / "tables", "csv", hz=None)
-    assert report.left_out == ((25, 39),)
-    assert report.tables[0].rows == 35
-
-
 # --- files ------------------------------------------------------------------------------------------------------------
 
 

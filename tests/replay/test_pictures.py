@@ -38,7 +38,7 @@ from iris_session.session.core import CoreConfig, SessionCore
 from tests.replay.support import KEYFRAME_STEPS, Played, damaged, make_drawn_core, play, scene_model, step_ns
 from tests.session.play import host
 
-STEPS = 70
+STEPS = 50
 WIDTH, HEIGHT = 160, 120
 SMALL = PictureOptions(WIDTH, HEIGHT, "operator")
 
@@ -113,7 +113,7 @@ def assert_same(found: Sequence[Image], expected: Sequence[Image]) -> None:
 def test_pictures_are_those_of_mujoco(recording_class: str, tmp_path: Path, reference: Reference) -> None:
     core = make_drawn_core(user_owned_loop=recording_class == OPEN)
     played = play(tmp_path / "session.rrd", STEPS, recording_class=recording_class, core=core)
-    steps = [0, 30, STEPS - 1]
+    steps = [0, STEPS - 1]
     found = draw(played.write(), steps)
     assert_same(found, [reference(played.core.world.model, played.qpos[step]) for step in steps])
     assert len({image.tobytes() for image in found}) == len(steps), "something moves"
@@ -121,8 +121,8 @@ def test_pictures_are_those_of_mujoco(recording_class: str, tmp_path: Path, refe
 
 def test_deformables_are_those_of_mujoco(tmp_path: Path, reference: Reference) -> None:
     core = make_drawn_core("cloth")
-    played = play(tmp_path / "session.rrd", 45, core=core, make_entries=lambda step: [])
-    steps = [0, 44]
+    played = play(tmp_path / "session.rrd", 25, core=core, make_entries=lambda step: [])
+    steps = [0, 24]
     found = draw(played.write(), steps)
     assert_same(found, [reference(core.world.model, played.qpos[step]) for step in steps])
     hidden = copy.copy(core.world.model)
@@ -131,8 +131,9 @@ def test_deformables_are_those_of_mujoco(tmp_path: Path, reference: Reference) -
 
 
 def test_scene_that_was_loaded_later_is_drawn(tmp_path: Path, reference: Reference, cameras: list[Any]) -> None:
-    at = 45
-    arms = n_arms_scene(3, objects=3).compile()
+    at = 25
+    arms = n_arms_scene(1, objects=1).compile()
+    arms.vis.quality.shadowsize, arms.vis.quality.offsamples = 64, 0
     scene = SceneLoaded(compute_scene_hash(encode_model(arms)), find_robots(arms), find_objects(arms))
     first = make_drawn_core()
     core = SessionCore(first.world.model, first.config, lambda _: decode_model(bytes(encode_model(arms))))
@@ -140,21 +141,15 @@ def test_scene_that_was_loaded_later_is_drawn(tmp_path: Path, reference: Referen
     def change(step: int) -> Sequence[Entry]:
         return [host(step_ns(step), scene)] if step == at else []
 
-    played = play(tmp_path / "session.rrd", STEPS, core=core, make_entries=change)
+    played = play(tmp_path / "session.rrd", at + 1, core=core, make_entries=change)
     played.batch.scenes = [scene_model(arms, scene.model_hash, at - 1, core)]
-    times = [step_ns(step) for step in (at - 1, at, STEPS - 1)]
-    found, made = draw_times(played.write(), times)
-    models = (first.world.model, arms, arms)
-    views = ["operator", cameras[-1], cameras[-1]]
-    steps = (at - 1, at, STEPS - 1)
-    expected = [reference(m, played.qpos[step], view) for m, step, view in zip(models, steps, views, strict=True)]
+    found, made = draw_times(played.write(), [step_ns(at - 1), step_ns(at)])
+    expected = [reference(first.world.model, played.qpos[at - 1]), reference(arms, played.qpos[at], cameras[-1])]
     assert_same(found, expected)
     assert made.notes == [
         "in a scene that was loaded later there is no camera 'operator' in the scene, there are none: leave --camera "
         "out: the view of all that moves is drawn"
     ]
-    again, _ = draw_times(played.path, times[1:], SMALL._replace(camera=""))  # begins in that scene
-    assert_same(again, expected[1:])
 
 
 def patched(tmp_path: Path, *ops: Any) -> Played:
@@ -217,9 +212,9 @@ def test_a_late_time_begins_at_a_keyframe(played: Played, monkeypatch: pytest.Mo
         taken.append(now_ns)
         return step(self, now_ns, *arguments, **options)
 
-    whole = draw(played.path, [0, 65])
+    whole = draw(played.path, [0, 45])
     monkeypatch.setattr(SessionCore, "step", count)
-    assert draw(played.path, [65])[0].tobytes() == whole[1].tobytes()
+    assert draw(played.path, [45])[0].tobytes() == whole[1].tobytes()
     assert len(taken) <= KEYFRAME_STEPS
     taken.clear()
     draw(played.path, [KEYFRAME_STEPS - 1])  # that of the keyframe itself
@@ -227,9 +222,9 @@ def test_a_late_time_begins_at_a_keyframe(played: Played, monkeypatch: pytest.Mo
 
 
 def test_a_picture_shows_the_newest_step_at_its_time(played: Played) -> None:
-    at = [step_ns(50), step_ns(50) + 1, step_ns(51) - 1, step_ns(51), step_ns(STEPS - 1) + 10**9]
+    at = [step_ns(30), step_ns(30) + 1, step_ns(31) - 1, step_ns(31), step_ns(STEPS - 1) + 10**9]
     found, _ = draw_times(played.path, at)
-    expected = draw(played.path, [50, 50, 50, 51, STEPS - 1])
+    expected = draw(played.path, [30, 30, 30, 31, STEPS - 1])
     assert_same(found, expected)
 
 
@@ -243,7 +238,7 @@ def test_the_last_picture_stays_where_steps_are_left_out(tmp_path: Path) -> None
     assert made.left_out == [(25, 39)]
 
 
-@pytest.mark.parametrize(("width", "height"), [(160, 120), (60, 200), (300, 50)])
+@pytest.mark.parametrize(("width", "height"), [(60, 200), (300, 50)])
 def test_default_view_shows_all_bodies_that_move(played: Played, cameras: list[Any], width: int, height: int) -> None:
     images = draw(played.path, [0, STEPS - 1], PictureOptions(width, height))
     assert all(image.shape == (height, width, 3) for image in images)

@@ -44,8 +44,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Played:
     return played
 
 
-@pytest.mark.parametrize("recording_class", ["closed", "open"])
-@pytest.mark.parametrize("robot", ["left", "right"])
+@pytest.mark.parametrize(("recording_class", "robot"), [("closed", "left"), ("open", "right")])
 def test_joints_at_the_rate_of_the_session_are_qpos_bit_for_bit(
     recording_class: str, robot: str, closed: Played, opened: Played
 ) -> None:
