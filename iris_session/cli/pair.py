@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.client.address import pairing_uri
     from iris_session.link.discovery import host_port
     from iris_session.security import KeyHome, load_secret
-    from iris_session.web.process import format_page_address
+    from iris_session.web.config import format_page_address
 
     if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
         raise CommandError(f"--web-port {arguments.web_port} is not a port: give 1 to 65535")

@@ -136,7 +136,7 @@ def _find_certificate(arguments: argparse.Namespace, hosts: tuple[str, ...]) -> 
 
 
 def _print_addresses(hosts: tuple[str, ...], port: int, certificate: Certificate | None) -> None:
-    from iris_session.web.process import format_page_address
+    from iris_session.web.config import format_page_address
 
     pages = [format_page_address(host, port, secure=certificate is not None) for host in hosts]
     print(f"in a browser: {'  or  '.join(pages)}", flush=True)

@@ -1,13 +1,17 @@
 """The page of a session: its port, its certificate, and the gateway process that serves it.
 
-Addresses, keys and certificate are put together here; the process and its supervision are in `web.process`. Without the
-extra `web`, or where the port is in use, the session runs without a page and says so in a note.
+The session opens the port, so that it is known from the beginning. Without the extra `web`, or where the port is in
+use, the session runs without a page and says so in a note.
 """
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import select
 import socket
 from collections.abc import Sequence
+from typing import Final
 
 import msgspec
 
@@ -17,17 +21,25 @@ from iris_session.security import KeyHome, KeyPair, KeysError, load_secret
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import StartError
 from iris_session.system.extras import MissingExtraError
+from iris_session.system.process import PIPE, ChildProcess
+from iris_session.system.supervised import SupervisedProcess
 from iris_session.web.certificate import Certificate, load_certificate, load_or_make_certificate
-from iris_session.web.config import WEB_FROM_STATE, GatewayConfig
+from iris_session.web.config import WEB_FROM_STATE, GatewayConfig, GatewayReport, GatewayStart, format_page_address
 from iris_session.web.listener import open_listening_sockets
-from iris_session.web.process import GatewayProcess, format_page_address, has_packages
+
+PACKAGES: Final = ("aiohttp", "cryptography")
+#: Time for browsers to read that the session has ended.
+EXIT_S: Final = 1.5
+_MODULE: Final = "iris_session.web.gateway"
 
 
 class WebPage:
     """The page of one session; without a port when it has none.
 
+    The gateway process is started when a first connection waits: a session that no browser looks at pays nothing.
+
     Attributes:
-        port: TCP port, 0 for no page.
+        port: TCP port, 0 for no page. It stays the same whatever happens to the process.
         public_key: Public key (Z85) of the gateway, which the front admits; empty without encryption.
         address: Address of the page, empty before `start` and without a page.
         certificate: Of HTTPS, `None` without encryption.
@@ -36,11 +48,12 @@ class WebPage:
     def __init__(self, config: SessionConfig, name: str, sockets: Sequence[socket.socket] = (), note: str = "") -> None:
         self._config = config
         self._name = name
-        self._process = GatewayProcess(sockets, lambda: self._gateway) if sockets else None
+        self._sockets = tuple(sockets)
+        self._supervised = SupervisedProcess("the web gateway", self._spawn, GatewayReport)
         self._note = note
         self._gateway = GatewayConfig()
         self._keys = KeyPair.generate() if sockets and needs_encryption(config) else None
-        self.port = 0 if self._process is None else self._process.port
+        self.port = int(sockets[0].getsockname()[1]) if sockets else 0
         self.public_key = "" if self._keys is None else self._keys.public
         self.address = ""
         self.certificate: Certificate | None = None
@@ -55,7 +68,7 @@ class WebPage:
         Raises:
             StartError: The certificate that was given cannot be used.
         """
-        if self._process is None:
+        if not self._sockets:
             return [self._note] if self._note else []
         config = self._config
         names = tuple(filter(None, (*ports.reachable, config.advertise)))
@@ -94,29 +107,41 @@ class WebPage:
     @property
     def pid(self) -> int:
         """Process id of the gateway, 0 while it does not run."""
-        return 0 if self._process is None else self._process.pid
+        return self._supervised.pid
 
     @property
     def restarts(self) -> int:
         """Restarts of the gateway."""
-        return 0 if self._process is None else self._process.restarts
+        return self._supervised.restarts
 
     @property
     def drops(self) -> dict[str, int]:
         """Counters of what the gateway has refused or dropped, by reason."""
-        return {} if self._process is None else self._process.drops
+        return self._supervised.drops
 
     def poll(self, now_ns: int) -> list[str]:
         """Start the process when a browser comes, restart it when it has ended; return what is to be announced."""
-        return [] if self._process is None else self._process.poll(now_ns)
+        if self._supervised.is_started:
+            return self._supervised.poll(now_ns)
+        waiting = select.poll()
+        for one in self._sockets:
+            waiting.register(one, select.POLLIN)
+        if self._sockets and waiting.poll(0):
+            self._supervised.start(now_ns)
+        return []
+
+    def _spawn(self) -> ChildProcess:
+        descriptors = tuple(one.fileno() for one in self._sockets)
+        start = GatewayStart(msgspec.structs.replace(self._gateway, descriptors=descriptors), os.getpid())
+        config = msgspec.msgpack.encode(start)
+        return ChildProcess(_MODULE, config=config, stdout=PIPE, own_session=True, inherited=descriptors)
 
     def close(self) -> None:
-        """End the process and free the port."""
-        if self._process is not None:
-            self._process.close()
-            self._process = None
-            self.port = 0
-            self.address = ""
+        """End the process, after its browsers have read that the session ends, and free the port."""
+        self._supervised.close(EXIT_S)
+        for one in self._sockets:
+            one.close()
+        self._sockets, self.port, self.address = (), 0, ""
 
 
 def open_web_page(config: SessionConfig, name: str) -> WebPage:
@@ -129,7 +154,7 @@ def open_web_page(config: SessionConfig, name: str) -> WebPage:
         return WebPage(config, name)
     if config.web_cert and not needs_encryption(config):
         raise StartError("web_cert: this session is not encrypted, so its page is plain HTTP: add --curve")
-    if not has_packages():
+    if any(importlib.util.find_spec(package) is None for package in PACKAGES):
         return WebPage(config, name, note="no page for browsers: pip install 'iris-session[web]'")
     if config.curve_clients and needs_encryption(config):  # such a folder holds no identities of browsers
         return WebPage(config, name, note="no page for browsers: --curve-clients admits certificates only")

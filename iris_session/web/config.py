@@ -10,6 +10,7 @@ from typing import Final
 
 import msgspec
 
+from iris_session.link.sockets import host_in_address
 from iris_session.web.hub import HubLimits
 
 #: Port of the page by default.
@@ -80,3 +81,8 @@ class GatewayReport(msgspec.Struct, frozen=True):
     fetched_bytes: int = 0
     drops: dict[str, int] = {}
     fault: str = ""
+
+
+def format_page_address(host: str, port: int, *, secure: bool) -> str:
+    """Return the address of the page, as people type it."""
+    return f"{'https' if secure else 'http'}://{host_in_address(host)}:{port}/"
