@@ -217,14 +217,13 @@ class PastSession:
             break
         else:
             raise _UnusableError("; ".join([*problems, "it holds no state to resume from"]))
-        self.step, self.chain, stopped = replay_rows(self.core, keyframe, recording.rows(after=keyframe.step))
-        if stopped.has_stepped:
+        self.step, self.chain, why = replay_rows(self.core, keyframe, recording.rows(after=keyframe.step))
+        if why:  # the core may have taken the step that cannot be used
+            problems.append(why)
             self.core = restore_core(header, keyframe, recording.model)
-            rows = recording.rows(after=keyframe.step)
-            intact = (row for row in rows if row.step < stopped.step)
-            self.step, self.chain, _ = replay_rows(self.core, keyframe, intact)
-        if stopped.text:
-            problems.append(stopped.text)
+            replay_rows(
+                self.core, keyframe, (row for row in recording.rows(after=keyframe.step) if row.step <= self.step)
+            )
         self.now_ns = self.core.authority.now_ns
         if recording.end is not None and recording.end.reason:
             reason = recording.end.reason[:MAX_TEXT]
@@ -297,17 +296,6 @@ class _UnusableError(Exception):
     """The session cannot be resumed from this file, but perhaps from an earlier one."""
 
 
-class ReplayStop(msgspec.Struct, frozen=True):
-    """Reason why a replay ended before the last row; empty when it did not.
-
-    `has_stepped`: the core has taken `step` all the same, with another result.
-    """
-
-    step: int = -1
-    text: str = ""
-    has_stepped: bool = False
-
-
 def find_first_file(path: Path) -> Path:
     """Return the first file of the session that `path` belongs to: any file of it, or its folder."""
     if path.is_dir():
@@ -366,33 +354,30 @@ def list_keyframes(recording: Recording) -> Iterator[Keyframe]:
         yield Keyframe(-1, b"", b"", b"", b"", recording.root)
 
 
-def replay_rows(core: SessionCore, keyframe: Keyframe, rows: Iterator[JournalRow]) -> tuple[int, bytes, ReplayStop]:
+def replay_rows(core: SessionCore, keyframe: Keyframe, rows: Iterator[JournalRow]) -> tuple[int, bytes, str]:
     """Replay the rows after `keyframe` as long as they are intact and give the recorded digest.
 
     Returns:
-        The newest step in whose state `core` is, its chain value, and why it is not the last one.
+        The newest step that did, its chain value, and why it is not the last one, empty when it is. In that case `core`
+        may have taken the next step, too.
     """
     step, chain = keyframe.step, keyframe.chain
     for row in rows:
         if row.step != step + 1:
-            text = f"steps {step + 1} to {row.step - 1} are missing, and what follows"
-            return step, chain, ReplayStop(row.step, text)
+            return step, chain, f"steps {step + 1} to {row.step - 1} are missing, and what follows"
         problem = check_row(chain, row)
         if problem is not None:
-            text = f"step {row.step} was changed ({problem.field}): left out from there"
-            return step, chain, ReplayStop(row.step, text)
+            return step, chain, f"step {row.step} was changed ({problem.field}): left out from there"
         if row.digest == CRASHED:
-            return step, chain, ReplayStop(row.step, f"step {row.step} ended the session with an error: left out")
+            return step, chain, f"step {row.step} ended the session with an error: left out"
         try:
             outcome = core.step(row.now_ns, decode_entries(row.entries), row.n_ticks)
         except Exception as error:
-            text = f"step {row.step} cannot be taken again ({error}): left out from there"
-            return step, chain, ReplayStop(row.step, text, has_stepped=True)
+            return step, chain, f"step {row.step} cannot be taken again ({error}): left out from there"
         if outcome.digest != row.digest:
-            text = f"step {row.step} gives another result here: left out from there"
-            return step, chain, ReplayStop(row.step, text, has_stepped=True)
+            return step, chain, f"step {row.step} gives another result here: left out from there"
         step, chain = row.step, row.chain
-    return step, chain, ReplayStop()
+    return step, chain, ""
 
 
 class Listening(msgspec.Struct, frozen=True):
