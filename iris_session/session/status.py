@@ -16,7 +16,7 @@ import msgspec
 import psutil
 
 from iris_session.physics import Pacer
-from iris_session.protocol.common import MAX_TEXT, Pose
+from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.status import (
     AnchorReport,
     ParticipantReport,
@@ -203,7 +203,7 @@ class StatusReporter:
             memory_bytes=measure_memory_bytes(),
             robots=make_robot_reports(stepper),
             warnings=tuple(collect_warnings(stepper, recorder, self.scheduling, warnings)),
-            anchors=make_anchor_reports(core.authority.anchors, sizes),
+            anchors=tuple(AnchorReport(name, T, sizes.get(name, 0.0)) for name, T in core.authority.anchors.items()),
             cross_checks=core.authority.build_cross_check_reports(),
         )
 
@@ -241,11 +241,6 @@ def make_recorder_report(feed: RecorderFeed | None, recorder: RecorderProcess | 
         stats.waiting_bytes,
         fault[:MAX_TEXT],
     )
-
-
-def make_anchor_reports(poses: Mapping[str, Pose], sizes: Mapping[str, float]) -> tuple[AnchorReport, ...]:
-    """Return the present `T_world_anchor` of every anchor; `sizes`: edges of the printed sheets [m], where known."""
-    return tuple(AnchorReport(name, T, sizes.get(name, 0.0)) for name, T in poses.items())
 
 
 def make_robot_reports(stepper: Stepper) -> tuple[RobotReport, ...]:

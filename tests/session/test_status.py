@@ -15,7 +15,7 @@ from iris_session.protocol.client_messages import Acquire, MoveAnchor, PlaceAlig
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose
 from iris_session.protocol.entries import Bye, Entry, Join
 from iris_session.protocol.names import Role
-from iris_session.protocol.status import AnchorReport, ParticipantReport, RecorderReport
+from iris_session.protocol.status import ParticipantReport, RecorderReport
 from iris_session.session.config import SessionConfig
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.status import (
@@ -24,7 +24,6 @@ from iris_session.session.status import (
     PERIOD_NS,
     StatusReporter,
     collect_warnings,
-    make_anchor_reports,
     make_recorder_report,
     make_robot_reports,
 )
@@ -126,7 +125,7 @@ def test_warnings_of_other_sources_are_reported(session: Session) -> None:
     assert collect_warnings(session.stepper, RecorderReport(), "", ["x" * 5000]) == ["x" * MAX_TEXT]
 
 
-def test_alignments_anchors_and_cross_checks_are_in_the_report(session: Session) -> None:
+def test_alignments_are_in_the_report(session: Session) -> None:
     session.step(bob(TICK_NS))
     row = session.people()["bob"]
     session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
@@ -134,10 +133,6 @@ def test_alignments_anchors_and_cross_checks_are_in_the_report(session: Session)
     (told,) = [r for r in session.stepper.view.make_participant_reports(session.now_ns, reports) if r.id == row.id]
     assert told.alignment_report is not None
     assert (told.alignment_report.version, told.alignment_report.running) == (1, True)
-    assert make_anchor_reports({"table": IDENTITY, "door": IDENTITY}, {"table": 0.16}) == (
-        AnchorReport("table", IDENTITY, 0.16),
-        AnchorReport("door", IDENTITY, 0.0),
-    )
 
 
 def test_new_front_gets_the_current_anchors() -> None:
