@@ -30,7 +30,15 @@ from iris_session.web.listener import open_listening_sockets
 PACKAGES: Final = ("aiohttp", "cryptography")
 #: Time for browsers to read that the session has ended.
 EXIT_S: Final = 1.5
-_MODULE: Final = "iris_session.web.gateway"
+
+
+class _GatewayChild(ChildProcess):
+    """The process, which inherits the listening sockets."""
+
+    def __init__(self, start: GatewayStart) -> None:
+        self.inherited = start.config.descriptors
+        config = msgspec.msgpack.encode(start)
+        super().__init__("iris_session.web.gateway", config=config, stdout=PIPE, own_session=True)
 
 
 class WebPage:
@@ -132,9 +140,7 @@ class WebPage:
 
     def _spawn(self) -> ChildProcess:
         descriptors = tuple(one.fileno() for one in self._sockets)
-        start = GatewayStart(msgspec.structs.replace(self._gateway, descriptors=descriptors), os.getpid())
-        config = msgspec.msgpack.encode(start)
-        return ChildProcess(_MODULE, config=config, stdout=PIPE, own_session=True, inherited=descriptors)
+        return _GatewayChild(GatewayStart(msgspec.structs.replace(self._gateway, descriptors=descriptors), os.getpid()))
 
     def close(self) -> None:
         """End the process, after its browsers have read that the session ends, and free the port."""

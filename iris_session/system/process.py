@@ -100,7 +100,12 @@ class ChildProcess:
         child.close(exit_s=2.0, terminate_s=0.2)
 
     `pid`, `is_running` and `exit_status` may be used from any thread, the rest from one at a time.
+
+    Attributes:
+        inherited: Descriptors of the parent that the child keeps, under the same numbers; set by subclasses.
     """
+
+    inherited: Sequence[int] = ()
 
     def __init__(
         self,
@@ -113,7 +118,6 @@ class ChildProcess:
         environment: Mapping[str, str] | None = None,
         own_session: bool = False,
         own_group: bool = False,
-        inherited: Sequence[int] = (),
     ) -> None:
         """Start the process.
 
@@ -128,7 +132,6 @@ class ChildProcess:
             environment: Variables beside those of this process.
             own_session: Run in a session of its own, so that Ctrl-C of a terminal reaches only the parent.
             own_group: Run in a process group of its own, for the same. The scheduler groups by session, not by this.
-            inherited: Descriptors of this process that the child keeps, under the same numbers.
 
         Raises:
             OSError: No process or memory can be had.
@@ -145,7 +148,7 @@ class ChildProcess:
                 env=child_environment(**(environment or {})),
                 start_new_session=own_session,
                 process_group=0 if own_group else None,
-                pass_fds=tuple(inherited),
+                pass_fds=tuple(self.inherited),
                 bufsize=0,
             )
         self._rest = b""
