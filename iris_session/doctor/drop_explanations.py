@@ -69,7 +69,6 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "key_banned": "connections refused of keys that sent far too much a moment ago",
     "estops_merged": "e-stops merged with the next one of the same key",
     "state_topic_unknown": "subscriptions to topics that do not exist",
-    "state_closed_early": "connections to the state that ended before they subscribed to anything",
     "subscribers_too_many": "connections to the state closed because their key had too many",
     "media_newest_rate": "newest frames sent later to clients that subscribe over and over",
     "media_info_malformed": "descriptions of media streams with values out of range; their frames were taken",

@@ -51,16 +51,7 @@ class Admission:
     """Admit or refuse clients. `channels` learn of an admitted client before it does."""
 
     def __init__(self, context: FrontContext, channels: Sequence[ClientChannel]) -> None:
-        self._config = context.config
-        self._ports = context.ports
-        self._connections = context.connections
-        self._outbox = context.outbox
-        self._drops = context.drops
-        self._tokens = context.tokens
-        self._keyring = context.keyring
-        self._audit = context.audit
-        self._guard = context.guard
-        self._budgets = context.budgets
+        self._context = context
         self._channels = channels
         limits = context.config.limits
         #: A source is a key, an address in a session without keys, or behind a gateway a secret. Each has a few hellos
@@ -74,11 +65,11 @@ class Admission:
         try:
             connection, join = self._accept(route, peer, hello, now_ns)
         except _RefusedError as refused:
-            self._drops.count(f"hello_{refused.answer.code}")
-            self._outbox.send_to_route(route, refused.answer)
+            self._context.drops.count(f"hello_{refused.answer.code}")
+            self._context.outbox.send_to_route(route, refused.answer)
             return None
         connection.last_heard_ns = now_ns
-        self._connections.add(connection)
+        self._context.connections.add(connection)
         return Entry(connection.number, connection.number, now_ns, join)
 
     def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[FrontConnection, Join]:
@@ -87,7 +78,7 @@ class Admission:
         gateway = self._require_gateway(route, peer, now_ns)
         key_id = self._make_key_id(peer, hello, gateway)
         web = gateway is not None and len(hello.secret) == WEB_SECRET_BYTES
-        if self._guard.is_banned(key_id, now_ns):
+        if self._context.guard.is_banned(key_id, now_ns):
             raise _RefusedError(
                 RefusalCode.RATE, "this client was disconnected for flooding", "send less; try again soon"
             )
@@ -101,13 +92,13 @@ class Admission:
         address = peer_of(peer.descriptor)
         resume_of = self._find_resumed(hello, key_id, address[0], now_ns)
         # A resuming client replaces a connection that may still be counted: twice the limit, so that it is bounded.
-        limit = self._config.limits.connections
-        if len(self._connections) >= (2 * limit if resume_of else limit):
+        limit = self._context.config.limits.connections
+        if len(self._context.connections) >= (2 * limit if resume_of else limit):
             raise _RefusedError(RefusalCode.FULL, f"all {limit} connections are in use", "try again later")
         self._check_share(gateway.key_id if gateway else key_id, resumes=bool(resume_of))
         if web:
             self._check_share(key_id, resumes=bool(resume_of))
-        number = self._tokens.allocate_connection()
+        number = self._context.tokens.allocate_connection()
         connection = FrontConnection(
             number, route, peer, address, key_id, hello, gateway.number if gateway else 0, budget
         )
@@ -143,14 +134,14 @@ class Admission:
     def _take_budget(self, key_id: str, hello: Hello, gateway: FrontConnection | None, now_ns: int) -> KeyBudget:
         """Return the budget of a key, less what a hello causes. Raises `_RefusedError` when it is used up."""
         if gateway is not None:
-            budget = self._budgets.find(key_id, now_ns, parent=gateway.budget)
+            budget = self._context.budgets.find(key_id, now_ns, parent=gateway.budget)
         else:
-            encrypted = self._keyring.key is not None
-            is_gateway = self._keyring.may_be_gateway(key_id) if encrypted else hello.role == Role.GATEWAY
-            budget = self._budgets.find(key_id, now_ns, is_gateway=is_gateway)
-        reason = budget.take_request(now_ns, weigh_request(hello), count_events(hello))
+            encrypted = self._context.keyring.key is not None
+            is_gateway = self._context.keyring.may_be_gateway(key_id) if encrypted else hello.role == Role.GATEWAY
+            budget = self._context.budgets.find(key_id, now_ns, is_gateway=is_gateway)
+        reason = budget.take(now_ns, requests=weigh_request(hello), events=count_events(hello))
         if reason:
-            self._drops.count(reason)
+            self._context.drops.count(reason)
             raise _RefusedError(RefusalCode.RATE, "this key joins too often", "try again in some seconds")
         return budget
 
@@ -159,19 +150,19 @@ class Admission:
 
         `resumes`: the connection replaces one that may still be counted, so twice as many are bounded.
         """
-        share = max_connections_per_key(self._config.limits.connections)
-        if self._keyring.key is not None and not self._keyring.may_be_gateway(key_id):
-            share = min(share, self._config.limits.key.connections)
+        share = max_connections_per_key(self._context.config.limits.connections)
+        if self._context.keyring.key is not None and not self._context.keyring.may_be_gateway(key_id):
+            share = min(share, self._context.config.limits.key.connections)
         if self._count_connections(key_id) >= (2 * share if resumes else share):
             advice = "close some of them, or give each device a key of its own"
             raise _RefusedError(RefusalCode.FULL, f"this key has {share} connections already", advice)
-        if not resumes and self._tokens.count_participants(key_id) >= 2 * share:
+        if not resumes and self._context.tokens.count_participants(key_id) >= 2 * share:
             advice = "wait until they have expired, or resume one of them"
             raise _RefusedError(RefusalCode.FULL, f"this key has {2 * share} participants already", advice)
 
     def _count_connections(self, key_id: str) -> int:
         """Return the number of connections of one key, those behind it included."""
-        connections = self._connections.by_number
+        connections = self._context.connections.by_number
         gateways = {number for number, one in connections.items() if one.key_id == key_id}
         return sum(one.gateway in gateways or one.key_id == key_id for one in connections.values())
 
@@ -181,14 +172,14 @@ class Admission:
 
     def find_gateway(self, routing_id: bytes, peer: Peer) -> FrontConnection | None:
         """Return the admitted gateway that this peer is, or `None`."""
-        gateway = self._connections.find(Route(routing_id), peer)
+        gateway = self._context.connections.find(Route(routing_id), peer)
         return gateway if gateway is not None and gateway.admitted and gateway.hello.role == Role.GATEWAY else None
 
     def report_forged_gateway(self, route: Route, peer: Peer, now_ns: int) -> None:
         """Record that a client which is no gateway spoke on behalf of another."""
         address = peer_of(peer.descriptor)[0]
-        sender = self._connections.find(Route(route.routing_id), peer)
-        self._audit.record(
+        sender = self._context.connections.find(Route(route.routing_id), peer)
+        self._context.audit.record(
             AuditKind.GATEWAY_REFUSED,
             now_ns,
             subject=sender.key_id if sender is not None else peer.user_id,
@@ -234,18 +225,18 @@ class Admission:
     def _serves_people(self, gateway: FrontConnection) -> bool:
         """Return whether those behind a gateway need identities of their own: it is that of the session, or shows them
         a certificate to pair with."""
-        if self._keyring.key is None:
+        if self._context.keyring.key is None:
             return False
-        return bool(gateway.hello.certificate_hash) or gateway.key_id == self._keyring.own_gateway
+        return bool(gateway.hello.certificate_hash) or gateway.key_id == self._context.keyring.own_gateway
 
     def _find_roles(self, key_id: str, gateway: FrontConnection | None, *, web: bool) -> tuple[str, ...] | None:
         """Return the roles that the key may join with, empty for any role, `None` if it is not listed (any more).
         Raises `_RefusedError`."""
-        if self._tokens.is_revoked(key_id):
+        if self._context.tokens.is_revoked(key_id):
             return None
         if web:
-            self._keyring.reload_if_changed()  # as at the handshake of a CURVE key
-        roles = self._keyring.find_roles(key_id, gateway.key_id if gateway else "", web=web)
+            self._context.keyring.reload_if_changed()  # as at the handshake of a CURVE key
+        roles = self._context.keyring.find_roles(key_id, gateway.key_id if gateway else "", web=web)
         if web and roles == ():
             text = "no role of this key may be taken behind this gateway"
             raise _RefusedError(DenialReason.ROLE, text, "ask the person who runs the session for another role")
@@ -255,7 +246,7 @@ class Admission:
         """Record that an unknown web identity said hello. An unknown CURVE key does not get that far."""
         if web:
             address = peer_of(peer.descriptor)[0]
-            self._audit.record(
+            self._context.audit.record(
                 AuditKind.KEY_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail="web"
             )
 
@@ -263,9 +254,9 @@ class Admission:
         """Return the participant that a resume token names, empty without a token. Raises `_RefusedError`."""
         if not hello.resume_token:
             return ""
-        participant_id = self._tokens.find_participant(hello.resume_token, key_id)
+        participant_id = self._context.tokens.find_participant(hello.resume_token, key_id)
         if participant_id is None:
-            self._audit.record(
+            self._context.audit.record(
                 AuditKind.TOKEN_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail=hello.role
             )
             raise _RefusedError(
@@ -276,19 +267,21 @@ class Admission:
     def send_welcome(self, admitted: Admitted, now_ns: int, tick_period_ns: int) -> None:
         """Send `Welcome` with a fresh resume token, unless the connection has ended. `tick_period_ns`: of the present
         scene."""
-        connection = self._connections.by_number.get(admitted.connection)
+        connection = self._context.connections.by_number.get(admitted.connection)
         if connection is None:
             return
-        config = self._config
-        gateway = self._connections.by_number.get(connection.gateway)
+        config = self._context.config
+        gateway = self._context.connections.by_number.get(connection.gateway)
         behind = gateway.key_id if gateway is not None else ""
-        token = self._tokens.issue(connection.key_id, admitted.participant_id, connection.hello.resume_token, behind)
+        token = self._context.tokens.issue(
+            connection.key_id, admitted.participant_id, connection.hello.resume_token, behind
+        )
         connection.admitted = True
-        self._keyring.record_join(connection.key_id)
+        self._context.keyring.record_join(connection.key_id)
         connection.participant_id, connection.role = admitted.participant_id, admitted.role
         for channel in self._channels:
             channel.sync_clients()
-        self._outbox.send(
+        self._context.outbox.send(
             connection,
             Welcome(
                 config.session_id,
@@ -304,21 +297,21 @@ class Admission:
                 tick_period_ns,
                 config.state_period_ns,
                 Endpoints(
-                    self._ports.state,
-                    self._ports.media,
-                    self._ports.assets,
+                    self._context.ports.state,
+                    self._context.ports.media,
+                    self._context.ports.assets,
                     config.web_port,
-                    self._ports.media_ingest,
+                    self._context.ports.media_ingest,
                 ),
-                self._ports.key_fingerprint,
+                self._context.ports.key_fingerprint,
             ),
         )
 
     def expire_tokens(self, participant_id: str) -> None:
         """Invalidate the tokens of a participant that has left for good."""
-        self._tokens.remove_participant(participant_id)
+        self._context.tokens.remove_participant(participant_id)
 
     def confirm(self, connection: FrontConnection) -> None:
         """Retire the token that a client resumed with: the client has proved that it has its `Welcome`."""
         if connection.hello.resume_token:
-            self._tokens.use_up(connection.hello.resume_token)
+            self._context.tokens.use_up(connection.hello.resume_token)

@@ -24,6 +24,7 @@ from iris_session.link.tcp_guard import PendingConnection, TcpGuard
 from iris_session.protocol.assets import AssetChunk, AssetRefused
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
 from iris_session.security import KeyPair, compute_fingerprint
 from iris_session.security.zap import ZAP_ENDPOINT, answer_zap_requests, is_curve_request
@@ -62,16 +63,6 @@ class AssetAccess(NamedTuple):
     folders: tuple[AssetFolder, ...] = ()
 
 
-class AssetCounters(NamedTuple):
-    """Counters since the start, and readers with pending requests. `reasons`: refusals and drops."""
-
-    bytes: int
-    chunks: int
-    requests: int
-    pending_readers: int
-    reasons: Mapping[str, int]
-
-
 class AssetSockets:
     """Sockets of the assets channel, in a context of their own. Raises `FrontError`."""
 
@@ -98,10 +89,12 @@ def open_asset_sockets(config: FrontConfig, key: KeyPair | None) -> AssetSockets
 
 
 class AssetServer:
-    """Serve assets in a thread. `set_access`, `read_counters` and `late_until_ns` are for other threads.
+    """Serve assets in a thread. `set_access`, `pending_readers` and the attributes are for other threads.
 
     Attributes:
         late_until_ns: Session time until which the server yields to the front's loop.
+        sent_bytes, requests: Counters since the start.
+        drops: Refusals and drops since the start.
     """
 
     def __init__(self, sockets: AssetSockets, guard: TcpGuard, now_ns: Callable[[], int]) -> None:
@@ -113,9 +106,8 @@ class AssetServer:
         self._files = ServedAssets()
         self._scheduler = ChunkScheduler(self._files.size)
         self._access = self._applied = AssetAccess()
-        self._counts = {"bytes": 0, "chunks": 0, "requests": 0}
-        self._reasons: dict[str, int] = {}
-        self._lock = threading.Lock()  # of the counters
+        self.sent_bytes = self.requests = 0
+        self.drops = Drops()
         self._stopping = False
         self._reported_fault = ""
         self._thread = threading.Thread(target=self._run, name="iris-assets", daemon=True)
@@ -128,13 +120,10 @@ class AssetServer:
         """Set who may fetch what. A request made after this call returns is answered by it."""
         self._access = access
 
-    def read_counters(self) -> AssetCounters:
-        with self._lock:
-            counts = self._counts
-            reasons = dict(self._reasons)
-            return AssetCounters(
-                counts["bytes"], counts["chunks"], counts["requests"], self._scheduler.n_waiting, reasons
-            )
+    @property
+    def pending_readers(self) -> int:
+        """Number of readers with pending requests."""
+        return self._scheduler.n_waiting
 
     def list_pending(self) -> list[PendingConnection]:
         """Return the connections of readers and what is unread of them."""
@@ -215,8 +204,7 @@ class AssetServer:
 
     def _count_reasons(self, reasons: Iterable[str]) -> None:
         for reason in filter(None, reasons):
-            with self._lock:
-                self._reasons[reason] = self._reasons.get(reason, 0) + 1
+            self.drops.count(reason)
 
     # --- requests ---------------------------------------------------------------------------------------------------
 
@@ -246,8 +234,7 @@ class AssetServer:
         """Handle one message. Return whether it was refused."""
         now_ns = self._now_ns()
         request_id, address = 0, ""
-        with self._lock:
-            self._counts["requests"] += 1
+        self.requests += 1
         try:
             request = decode_asset_request(frame.buffer if single else b"")
         except ProtocolVersionError:
@@ -307,9 +294,7 @@ class AssetServer:
             return
         self._scheduler.confirm_sent(reader)
         if chunk is not None:
-            with self._lock:
-                self._counts["bytes"] += pending.length
-                self._counts["chunks"] += 1
+            self.sent_bytes += pending.length
 
 
 def _refusal(request_id: int, address: str, reason: str) -> bytes:

@@ -31,11 +31,6 @@ class AssetService:
 
     def __init__(self, context: FrontContext, server: AssetServer) -> None:
         self._context = context
-        self._connections = context.connections
-        self._keyring = context.keyring
-        self._drops = context.drops
-        self._publisher = context.publisher
-        self._tokens = context.tokens
         self._server = server
         self._previous: SceneInfo | None = None
         self._present: SceneInfo | None = None
@@ -58,10 +53,12 @@ class AssetService:
 
     def sync_clients(self, *, keys: bool = False) -> None:
         """Update the thread's clients and scene. `keys`: also if only the allow-list may have changed."""
-        if self._publisher.scene is not self._present:
-            self._change_scene(self._publisher.scene)
+        if self._context.publisher.scene is not self._present:
+            self._change_scene(self._context.publisher.scene)
         listeners = {
-            n: self._context.find_channel_key(one) for n, one in self._connections.by_number.items() if one.admitted
+            n: self._context.find_channel_key(one)
+            for n, one in self._context.connections.by_number.items()
+            if one.admitted
         }
         if keys or listeners != self._published.clients or self._folders is not self._published.folders:
             self._publish_access(listeners)
@@ -71,21 +68,21 @@ class AssetService:
 
     def report(self) -> AssetsReport:
         """Return the counters for the status."""
-        counters = self._server.read_counters()
+        server = self._server
         return AssetsReport(
             sum(len(addresses) for _, addresses in self._folders[-1:]),
-            counters.bytes,
-            counters.requests,
-            sum(counters.reasons.values()),
-            counters.pending_readers,
+            server.sent_bytes,
+            server.requests,
+            sum(dict(server.drops.by_reason).values()),
+            server.pending_readers,
         )
 
     def _yield_to_state(self, now_ns: int) -> None:
         """Let assets yield if state was late since the last tick, or this tick is."""
         late = 0 < self._ticked_ns < now_ns - LATE_TICK_NS
-        if self._publisher.frames != self._frames:
-            late |= self._publisher.newest_delay_ns > LATE_NS
-        self._frames, self._ticked_ns = self._publisher.frames, now_ns
+        if self._context.publisher.frames != self._frames:
+            late |= self._context.publisher.newest_delay_ns > LATE_NS
+        self._frames, self._ticked_ns = self._context.publisher.frames, now_ns
         if late:
             self._server.late_until_ns = now_ns + YIELD_NS
 
@@ -110,18 +107,18 @@ class AssetService:
         self._folders = (*(store for _, store in self._replaced), *named)
 
     def _publish_access(self, listeners: dict[int, str]) -> None:
-        keyring = self._keyring
+        keyring = self._context.keyring
         keys: frozenset[str] = frozenset()
         if keyring.key is not None:
-            keys = frozenset(key for key in keyring.fingerprints if not self._tokens.is_revoked(key))
+            keys = frozenset(key for key in keyring.fingerprints if not self._context.tokens.is_revoked(key))
         access = AssetAccess(listeners, keys, self._folders)
         if access != self._published:
             self._published = access
             self._server.set_access(access)
 
     def _count_drops(self) -> None:
-        for reason, count in self._server.read_counters().reasons.items():
+        for reason, count in dict(self._server.drops.by_reason).items():
             more = count - self._counted.get(reason, 0)
             if more:
-                self._drops.count(reason, n=more)
+                self._context.drops.count(reason, n=more)
                 self._counted[reason] = count

@@ -64,8 +64,5 @@ class AuditTrail:
             self._send(msgspec.structs.replace(line.newest, count=line.count), now_ns)
             line.newest, line.count, line.due_ns = None, 0, now_ns + PERIOD_NS
 
-    def close(self) -> None:
-        """Do nothing: nothing was opened."""
-
     def _send(self, audit: Audit, now_ns: int) -> None:
         self._offer(Entry(HOST, HOST, now_ns, audit))

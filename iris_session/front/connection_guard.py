@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import zmq
 
@@ -44,55 +44,35 @@ _STATE_REASONS: Final = TcpReasons(
 )
 _SUBSCRIBE: Final = b"\x01"
 _UNSUBSCRIBE: Final = b"\x00"
+#: A peer that was disconnected for a flood may say hello again after this [ns].
+BAN_NS: Final = 3 * SECOND
+#: More new TCP connections of one address in a second are a flood.
+CONNECTIONS_PER_S: Final = 100
+#: Limit of rejected messages before hello, as a share of the limit of an admitted client. A peer that was disconnected
+#: for a flood a moment ago has the same share of that.
+EARLY_SHARE: Final = 0.25
+#: A connection that was disconnected as silent may still stop the session for so long [ns]. Then its TCP connection is
+#: closed, too: a sleeping headset, or a network in between, can keep it open for ever.
+KEPT_NS: Final = 60 * SECOND
+#: So many floods are listed in the status, each for so long [ns]. One that goes on is logged again after `LOG_NS`
+#: without a report, so once.
+MAX_WARNINGS: Final = 8
+WARNING_NS: Final = 60 * SECOND
+LOG_NS: Final = 10 * SECOND
+#: Buffers and queues of libzmq for a connection that has said nothing.
+SILENT_BYTES: Final = 16 * 1024
+#: A topic that is longer exists on no socket, so its sender is closed with the first one.
+MAX_TOPIC_BYTES: Final = 32
+#: A topic that does not exist counts as so many messages towards a flood: libzmq keeps it as long as its connection
+#: lives, at some 50 bytes for every byte. Sixteen are no flood yet.
+UNKNOWN_TOPIC_WEIGHT: Final = 62
+#: Messages of subscribers read in one tick: about half a millisecond.
+MESSAGES_PER_TICK: Final = 128
 
 
 def max_connections_per_key(limit: int) -> int:
     """Return how many of `limit` connections one key, or one gateway, may have: a quarter stays for others."""
     return limit - limit // 4
-
-
-class FloodPolicy(NamedTuple):
-    """Consequences for a peer that exceeds its limits.
-
-    Attributes:
-        ban_ns: A peer that was disconnected for a flood may say hello again after this [ns].
-        connections_per_s: More new TCP connections of one address are a flood.
-        early_share: Limit of rejected messages before hello, as a share of the limit of an admitted client. A peer
-            that was disconnected for a flood a moment ago has the same share of that.
-        kept_ns: A connection that was disconnected as silent may still stop the session for so long [ns]. Then its TCP
-            connection is closed, too: a sleeping headset, or a network in between, can keep it open for ever.
-        warning_ns: A flood is listed in the status for so long [ns].
-        log_ns: A flood that goes on is logged again after so long without a report, so once [ns].
-        max_warnings: Floods that are listed.
-        silent_bytes: Buffers and queues of libzmq for a connection that has said nothing.
-    """
-
-    ban_ns: int = 3 * SECOND
-    connections_per_s: int = 100
-    early_share: float = 0.25
-    kept_ns: int = 60 * SECOND
-    warning_ns: int = 60 * SECOND
-    log_ns: int = 10 * SECOND
-    max_warnings: int = 8
-    silent_bytes: int = 16 * 1024
-
-
-class StatePolicy(NamedTuple):
-    """Limits of what subscribers of the state send.
-
-    Attributes:
-        max_topic_bytes: A topic that is longer exists on no socket, so its sender is closed with the first one.
-        unknown_topic_weight: A topic that does not exist counts as so many messages towards a flood: libzmq keeps it
-            as long as its connection lives, at some 50 bytes for every byte. Sixteen are no flood yet.
-        messages_per_tick: Messages read in one tick: about half a millisecond.
-        early_per_s, early_burst: Connections that end before they subscribed to anything; more are a flood.
-    """
-
-    max_topic_bytes: int = 32
-    unknown_topic_weight: int = 62
-    messages_per_tick: int = 128
-    early_per_s: float = 2.0
-    early_burst: int = 8
 
 
 class StateGuard:
@@ -108,64 +88,39 @@ class StateGuard:
     (`HandshakeLimiter`).
 
     Args:
+        state: The socket; closed by its owner.
+        monitor: Monitor of the socket, closed by `close`.
+        bounds: Bounds of the connections.
         drops: Drop counters.
-        limits: Limits of the front.
         on_flood: Called with the host and key of a peer that floods, and session time.
         on_accept: Called with the host of every new connection, and session time.
-        find_share: Returns how many connections one key may have.
-        policy: What subscribers may send.
     """
 
     def __init__(
         self,
+        state: zmq.Socket[bytes],
+        monitor: zmq.Socket[bytes],
+        bounds: TcpBounds,
         drops: Drops,
-        limits: FrontLimits,
         on_flood: Callable[[str, str, int], None],
         on_accept: Callable[[str, int], None],
-        find_share: Callable[[str], int] | None = None,
-        policy: StatePolicy | None = None,
     ) -> None:
+        self._socket = state
         self._drops = drops
         self._on_flood = on_flood
         self._on_accept = on_accept
-        self._policy = policy = policy or StatePolicy()
-        self._bounds = TcpBounds(
-            unauthenticated=limits.unauthenticated,
-            established=limits.subscribers,
-            find_share=find_share,
-            silence_ns=limits.hello_timeout_ns,
-            unread_bytes_per_s=1024,
-            examined=8,
-            bytes_period_ns=0,
-        )
-        self._socket: zmq.Socket[bytes] | None = None
-        self._tcp = TcpGuard(self._bounds, _STATE_REASONS)
-        self._is_plain = False
-        self._early = TokenBucket(policy.early_per_s, policy.early_burst)
-
-    def __len__(self) -> int:
-        return len(self._tcp)
-
-    def watch(self, state: zmq.Socket[bytes], monitor: zmq.Socket[bytes]) -> None:
-        """Guard this socket from now on, instead of the one before."""
-        self.close()
-        self._is_plain = not state.get(zmq.CURVE_SERVER)
-        traffic = TrafficCounter(curve=not self._is_plain)
-        self._socket, self._tcp = state, TcpGuard(self._bounds, _STATE_REASONS, monitor, traffic=traffic)
+        self._encrypted = bool(state.get(zmq.CURVE_SERVER))
+        self._tcp = TcpGuard(bounds, _STATE_REASONS, monitor, traffic=TrafficCounter(curve=self._encrypted))
 
     def close(self) -> None:
-        """Forget the socket and its connections, and close its monitor. The socket is closed by its owner."""
+        """Close the monitor."""
         self._tcp.close()
-        self._socket, self._tcp = None, TcpGuard(self._bounds, _STATE_REASONS)
 
     def tick(self, now_ns: int) -> None:
         """Read subscriptions, and close connections that do not subscribe, that are too many, or that flood."""
-        if self._socket is None:
-            return
         if self._socket.closed:
-            self.close()
             return
-        self._read_subscriptions(self._socket, now_ns)
+        self._read_subscriptions(now_ns)
         self._read_events(now_ns)
         for reason in self._tcp.tick(now_ns):
             self._drops.count(reason)
@@ -173,27 +128,20 @@ class StateGuard:
             self._on_flood(flood.address, flood.key_id, now_ns)
 
     def _read_events(self, now_ns: int) -> None:
-        """Read which connections were accepted and closed. Without encryption libzmq closes a connection itself when
-        its first message is too large, so many that end before they subscribed are reported. With encryption, keys that
-        are not admitted end like that, too, and are counted as such."""
         for event in self._tcp.read_events(now_ns):
             if event.accepted is not None:
                 self._on_accept(event.accepted.address[0], now_ns)
-            if event.ended is not None and self._is_plain and not event.ended.is_established:
-                self._drops.count("state_closed_early")
-                if not self._early.take(now_ns):
-                    self._on_flood(event.ended.address[0], "", now_ns)
 
-    def _read_subscriptions(self, state: zmq.Socket[bytes], now_ns: int) -> None:
+    def _read_subscriptions(self, now_ns: int) -> None:
         """Read what subscribers sent, and close those that may not."""
-        if not readable(state):  # once: it lets libzmq take in more subscriptions, every time
+        if not readable(self._socket):  # once: it lets libzmq take in more subscriptions, every time
             return
-        for _ in range(self._policy.messages_per_tick):
+        for _ in range(MESSAGES_PER_TICK):
             try:
-                frame = state.recv(zmq.DONTWAIT, copy=False)
+                frame = self._socket.recv(zmq.DONTWAIT, copy=False)
             except zmq.Again:
                 return
-            descriptor, user = read_peer(frame, encrypted=not self._is_plain)
+            descriptor, user = read_peer(frame, encrypted=self._encrypted)
             self._read_events(now_ns)  # after the message: by now libzmq has reported its connection
             if self._tcp.find(descriptor) is not None:
                 self._record_subscription(descriptor, user, frame.bytes)
@@ -204,8 +152,8 @@ class StateGuard:
             self._tcp.establish(descriptor, user)
         elif data[:1] != _UNSUBSCRIBE:
             self._drops.count("state_topic_unknown")
-            is_long = len(topic) > self._policy.max_topic_bytes
-            counts = 1 + self._bounds.counted_messages if is_long else self._policy.unknown_topic_weight
+            is_long = len(topic) > MAX_TOPIC_BYTES
+            counts = 1 + self._tcp.bounds.counted_messages if is_long else UNKNOWN_TOPIC_WEIGHT
         reason = self._tcp.record_message(descriptor, (len(data),), counts)
         if reason:
             self._drops.count(reason)
@@ -225,13 +173,11 @@ class ConnectionGuard:
         limits: FrontLimits,
         traffic: TrafficCounter | None = None,
         find_share: Callable[[str], int] | None = None,
-        policy: FloodPolicy | None = None,
     ) -> None:
         self._connections = connections
         self._drops = drops
         self._audit = audit
         self._limits = limits
-        self._policy = policy = policy or FloodPolicy()
         bounds = TcpBounds(
             unauthenticated=limits.unauthenticated,
             established=0,  # they are limited as connections
@@ -240,11 +186,20 @@ class ConnectionGuard:
             discards_unread=False,
         )
         self._tcp = TcpGuard(bounds, _CONTROL_REASONS, traffic=traffic)
-        self._state = StateGuard(drops, limits, self._report_subscriber_flood, self._count_accepted, find_share)
+        self._state: StateGuard | None = None
+        self._state_bounds = TcpBounds(
+            unauthenticated=limits.unauthenticated,
+            established=limits.subscribers,
+            find_share=find_share,
+            silence_ns=limits.hello_timeout_ns,
+            unread_bytes_per_s=1024,
+            examined=8,
+            bytes_period_ns=0,
+        )
         self._banned: dict[str, int] = {}  # key id -> session time until which it may not say hello
         self._flooded: dict[str, int] = {}  # address -> until when connections without hello have a lower limit
         self._warnings: dict[tuple[str, str], tuple[int, str]] = {}
-        self._accepted = KeyedBuckets(policy.connections_per_s, policy.connections_per_s, 256)
+        self._accepted = KeyedBuckets(CONNECTIONS_PER_S, CONNECTIONS_PER_S, 256)
         self._next_ns = 0
 
     # --- events ------------------------------------------------------------------------------------------------------
@@ -259,7 +214,9 @@ class ConnectionGuard:
 
     def watch_state_socket(self, state: zmq.Socket[bytes], monitor: zmq.Socket[bytes]) -> None:
         """Guard the subscribers of a state socket from now on, instead of those of the one before."""
-        self._state.watch(state, monitor)
+        self.close()
+        on_flood, on_accept = self._report_subscriber_flood, self._count_accepted
+        self._state = StateGuard(state, monitor, self._state_bounds, self._drops, on_flood, on_accept)
 
     def touch(self, descriptor: int, now_ns: int) -> None:
         """Restart the handshake timeout of a connection that pairs, which it may do without hello."""
@@ -288,7 +245,7 @@ class ConnectionGuard:
             if not close_tcp(peer.descriptor, tcp.address):
                 return False
             tcp.is_closed = True
-            remember(self._flooded, tcp.address[0], now_ns + self._policy.ban_ns)
+            remember(self._flooded, tcp.address[0], now_ns + BAN_NS)
         self._drops.count("flood_cut")
         if connection is not None:
             self._ban(connection.key_id, now_ns)
@@ -299,7 +256,7 @@ class ConnectionGuard:
         if connection is not None:
             return connection.budget.rejections
         if tcp.rejections is None:
-            share = self._policy.early_share
+            share = EARLY_SHARE
             if now_ns < self._flooded.get(tcp.address[0], 0):
                 share *= share  # connected again, and again without hello
             limits = self._limits
@@ -318,11 +275,10 @@ class ConnectionGuard:
         self._drops.count("flood")
         peer = " ".join(part for part in (address, f"({name})" if name else "") if part) or "an unknown address"
         text = (warning or f"flood from {peer}: {detail}")[:MAX_TEXT]
-        policy = self._policy
-        if now_ns - self._warnings.pop((address, detail), (-policy.log_ns, ""))[0] >= policy.log_ns:
+        if now_ns - self._warnings.pop((address, detail), (-LOG_NS, ""))[0] >= LOG_NS:
             log.warning("%s", text)
         self._audit.record(AuditKind.FLOOD, now_ns, subject=subject, name=name, address=address, detail=detail)
-        while len(self._warnings) >= policy.max_warnings:
+        while len(self._warnings) >= MAX_WARNINGS:
             del self._warnings[next(iter(self._warnings))]
         self._warnings[address, detail] = (now_ns, text)
 
@@ -336,7 +292,7 @@ class ConnectionGuard:
             self.report_flood(address, "connections", now_ns)
 
     def _ban(self, key_id: str, now_ns: int) -> None:
-        remember(self._banned, key_id, now_ns + self._policy.ban_ns)
+        remember(self._banned, key_id, now_ns + BAN_NS)
 
     def is_banned(self, key_id: str, now_ns: int) -> bool:
         """Return whether this key was disconnected for a flood a moment ago."""
@@ -344,17 +300,18 @@ class ConnectionGuard:
 
     def list_warnings(self, now_ns: int) -> tuple[str, ...]:
         """Return the floods of the last minute, for the status."""
-        return tuple(text for since_ns, text in self._warnings.values() if now_ns - since_ns <= self._policy.warning_ns)
+        return tuple(text for since_ns, text in self._warnings.values() if now_ns - since_ns <= WARNING_NS)
 
     # --- periodic ----------------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
         """Close connections that are silent for too long or too many, and subscribers that send too much."""
-        self._state.tick(now_ns)
+        if self._state is not None:
+            self._state.tick(now_ns)
         if now_ns < self._next_ns:
             return
         self._next_ns = now_ns + self._tcp.bounds.check_period_ns
-        self._connections.expire_kept(now_ns - self._policy.kept_ns)
+        self._connections.expire_kept(now_ns - KEPT_NS)
         owners = self._find_owners()
         for descriptor, connection in self._tcp.table.items():
             connection.is_established = descriptor in owners
@@ -364,7 +321,8 @@ class ConnectionGuard:
             self._drops.count(reason)
 
     def close(self) -> None:
-        self._state.close()
+        if self._state is not None:
+            self._state.close()
 
     def _find_owners(self) -> dict[int, FrontConnection]:
         """Return the connections that said hello by descriptor; of many behind one gateway the gateway's own."""
@@ -393,7 +351,7 @@ class ConnectionGuard:
         ]
         silent = {fd: traffic.pending_bytes(fd) for fd in self._tcp.table if fd not in owners}
         if silent:
-            n_bytes = sum(silent.values()) + self._policy.silent_bytes * len(silent)
+            n_bytes = sum(silent.values()) + SILENT_BYTES * len(silent)
             close = partial(self._close_silent_for_memory, silent)
             pending.append(PendingConnection(BEFORE_HELLO, n_bytes, "connections without hello", close))
         return pending

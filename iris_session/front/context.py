@@ -48,13 +48,11 @@ SEQ_NS = MILLISECOND
 
 
 class Service(Protocol):
-    """A part of the front with periodic work. `tick` never waits; `close` frees what the part opened."""
+    """A part of the front with periodic work. `tick` never waits. A part that opens something has a `close`, too."""
 
     def tick(self, now_ns: int) -> None:
         """Do what is due at session time `now_ns`. Called about every 10 ms, after the link was drained."""
         ...
-
-    def close(self) -> None: ...
 
 
 class WatchedSocket(NamedTuple):

@@ -36,13 +36,8 @@ class DisconnectHandler:
         status: StatusService,
         alignment: AlignmentService,
     ) -> None:
+        self._context = context
         self._monitor = monitor
-        self._guard = context.guard
-        self._connections = context.connections
-        self._outbox = context.outbox
-        self._coalescer = context.coalescer
-        self._drops = context.drops
-        self._now_ns = context.now_ns
         self._admission = admission
         self._status = status
         self._alignment = alignment
@@ -53,11 +48,11 @@ class DisconnectHandler:
         while readable(self._monitor):
             event, descriptor = next_tcp_event(self._monitor)
             if event == zmq.EVENT_ACCEPTED:
-                self._guard.add(descriptor, self._now_ns())
+                self._context.guard.add(descriptor, self._context.now_ns())
             elif event == zmq.EVENT_DISCONNECTED:
-                self._guard.remove(descriptor)
+                self._context.guard.remove(descriptor)
                 self._admission.remove_peer(descriptor)
-                self._closed.append((descriptor, self._now_ns() + LAST_MESSAGES_NS))
+                self._closed.append((descriptor, self._context.now_ns() + LAST_MESSAGES_NS))
 
     def process_disconnects(self, ended: Iterable[tuple[FrontConnection, str]], drained: bool) -> None:
         """Disconnect connections whose TCP connection was closed, that `ended` on their route for the reason beside
@@ -67,13 +62,13 @@ class DisconnectHandler:
         `drained`: no message is.
         """
         if self._closed:
-            now_ns = self._now_ns()
+            now_ns = self._context.now_ns()
             self._closed = [one for one in self._closed if self._is_close_pending(*one, drained, now_ns)]
         for connection, reason in ended:
             self.report_lost(connection, reason)
-        failed, self._outbox.failed = self._outbox.failed, {}
+        failed, self._context.outbox.failed = self._context.outbox.failed, {}
         for number, reason in failed.items():
-            slow = self._connections.by_number.get(number)
+            slow = self._context.connections.by_number.get(number)
             if slow is not None:
                 self.report_lost(slow, reason)
                 if not (slow.gateway and reason == "flood"):  # the others behind the gateway go on
@@ -88,37 +83,37 @@ class DisconnectHandler:
         if not drained and now_ns <= deadline_ns:
             return True
         address = peer_of(descriptor)
-        self._connections.remove_closed(descriptor, address)
-        theirs = [c for c in self._connections.by_number.values() if c.peer.descriptor == descriptor]
+        self._context.connections.remove_closed(descriptor, address)
+        theirs = [c for c in self._context.connections.by_number.values() if c.peer.descriptor == descriptor]
         for connection in theirs:
             if connection.address != address or not address[1]:
                 self.report_lost(connection, "closed")
-        return now_ns <= deadline_ns and any(c.number in self._connections.by_number for c in theirs)
+        return now_ns <= deadline_ns and any(c.number in self._context.connections.by_number for c in theirs)
 
     def disconnect_silent(self, now_ns: int, silence_ns: int) -> None:
         """Disconnect connections that have sent nothing for so long."""
-        for one in [c for c in self._connections.by_number.values() if now_ns - c.last_heard_ns > silence_ns]:
+        for one in [c for c in self._context.connections.by_number.values() if now_ns - c.last_heard_ns > silence_ns]:
             self.report_lost(one, "silent")
 
     def report_lost(self, connection: FrontConnection, reason: str) -> None:
         """Remove a connection and those behind it, and report them to the authority as lost."""
-        for one in (connection, *self._connections.list_behind(connection)):
+        for one in (connection, *self._context.connections.list_behind(connection)):
             self._remove_state(one, reason)
             self._status.record_disconnect(one, reason)
-            self._coalescer.offer(Entry(one.number, one.number, self._now_ns(), Lost(reason)))
+            self._context.coalescer.offer(Entry(one.number, one.number, self._context.now_ns(), Lost(reason)))
 
     def remove(self, connection: FrontConnection, reason: str) -> None:
         """Remove a connection that the authority has ended. Those behind it are disconnected with it."""
-        for one in self._connections.list_behind(connection):
+        for one in self._context.connections.list_behind(connection):
             text = f"the session closed this connection: its gateway has left ({reason})"
-            self._outbox.send(one, ProtocolFault(FaultCode.DROPPED, text, "gateway"))
+            self._context.outbox.send(one, ProtocolFault(FaultCode.DROPPED, text, "gateway"))
             self.report_lost(one, "gateway")
         self._remove_state(connection, reason)
-        self._coalescer.remove_connection(connection.number)
+        self._context.coalescer.remove_connection(connection.number)
 
     def _remove_state(self, connection: FrontConnection, reason: str) -> None:
-        self._connections.remove(connection)
+        self._context.connections.remove(connection)
         if reason in TCP_STAYS_OPEN:
-            self._connections.keep_for_estop(connection)
+            self._context.connections.keep_for_estop(connection)
         self._alignment.remove_connection(connection.number)
-        self._drops.remove(connection.number)
+        self._context.drops.remove(connection.number)

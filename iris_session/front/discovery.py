@@ -15,7 +15,7 @@ import os
 import socket
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, TypeVar
 
 import msgspec
 
@@ -268,22 +268,12 @@ class SessionRegistration:
 # --- all of it -------------------------------------------------------------------------------------------------------
 
 
-class SessionFacts(NamedTuple):
-    """Content of the introduction besides the beacon.
-
-    Attributes:
-        server_key: Z85, empty without encryption.
-        has_open_code: Returns whether a join code can be used now.
-        count_participants: Returns the number of connections.
-    """
-
-    server_key: str
-    has_open_code: Callable[[], bool]
-    count_participants: Callable[[], int]
-
-
 def make_discovery_services(
-    config: FrontConfig, ports: Ports, listeners: Listeners, drops: Drops, facts: SessionFacts
+    config: FrontConfig,
+    ports: Ports,
+    listeners: Listeners,
+    drops: Drops,
+    make_introduction: Callable[[Beacon], Introduction],
 ) -> list[IntroductionServer | BeaconSender]:
     """Make the services that announce a session: the introduction and, where it has a port, the beacon."""
     beacon = Beacon(
@@ -299,11 +289,9 @@ def make_discovery_services(
         web=config.web_port,
         key_fingerprint=ports.key_fingerprint,
     )
-
-    def make_introduction() -> Introduction:
-        return Introduction(beacon, facts.server_key, facts.has_open_code(), facts.count_participants())
-
-    services: list[IntroductionServer | BeaconSender] = [IntroductionServer(listeners, make_introduction)]
+    services: list[IntroductionServer | BeaconSender] = [
+        IntroductionServer(listeners, partial(make_introduction, beacon))
+    ]
     if config.beacon_port:
         services.append(BeaconSender(beacon, config.hosts, config.beacon_port, drops, config.advertise))
     return services

@@ -61,14 +61,8 @@ class Downlink:
         assets: AssetService,
         media: MediaService,
     ) -> None:
+        self._context = context
         self._socket = socket
-        self._config = context.config
-        self._authority = context.authority
-        self._connections = context.connections
-        self._outbox = context.outbox
-        self._publisher = context.publisher
-        self._drops = context.drops
-        self._now_ns = context.now_ns
         self._admission = admission
         self._disconnects = disconnects
         self._revocation = revocation
@@ -84,7 +78,7 @@ class Downlink:
         pending = [self._socket.recv_multipart()]
         while len(pending) < _MAX_MESSAGES and readable(self._socket):
             pending.append(self._socket.recv_multipart())
-        self._authority.heard_ns = self._now_ns()
+        self._context.authority.heard_ns = self._context.now_ns()
         states = [i for i, frames in enumerate(pending) if frames[0] == link.STATE]
         if states:
             # State goes first, unless the scene changes before it.
@@ -93,7 +87,7 @@ class Downlink:
             state = pending.pop(newest)
             pending.insert(first, state)
             if len(states) > 1:
-                self._drops.count("state_superseded", n=len(states) - 1)
+                self._context.drops.count("state_superseded", n=len(states) - 1)
                 pending = [frames for frames in pending if frames[0] != link.STATE or frames is state]
         for frames in pending:
             self._handle(frames)
@@ -101,35 +95,35 @@ class Downlink:
     def _handle(self, frames: list[bytes]) -> None:
         kind = frames[0]
         if kind == link.STATE:
-            if not self._publisher.publish(frames[1], frames[2]):
-                self._drops.count("state_of_other_scene")
+            if not self._context.publisher.publish(frames[1], frames[2]):
+                self._context.drops.count("state_of_other_scene")
         elif kind == link.ACK:
-            self._authority.acknowledged += frames[1][0]
+            self._context.authority.acknowledged += frames[1][0]
         elif kind == link.DECIDED:
             try:
                 decided = link.decode_decided(frames[1])
             except msgspec.ValidationError:  # exceeds a limit of the protocol: a client would not accept it either
-                self._drops.count("decision_invalid")
+                self._context.drops.count("decision_invalid")
                 return
             self._handle_decision(decided)
-            self._authority.step = decided.step
+            self._context.authority.step = decided.step
         elif kind == link.PRESENCE:
-            self._publisher.publish_presence(self._authority.heard_ns, frames[1])
+            self._context.publisher.publish_presence(self._context.authority.heard_ns, frames[1])
         elif kind == link.SCENE:
-            self._publisher.set_scene(link.decode_scene(frames[1]))
+            self._context.publisher.set_scene(link.decode_scene(frames[1]))
             self._assets.sync_clients()  # before a client hears of the scene
         elif kind == link.REPORT:
-            self._authority.report = frames[1]
+            self._context.authority.report = frames[1]
             recorder = _decode_part(frames[1]).recorder
-            self._authority.is_recorded = recorder is None or recorder.state != "ended"
+            self._context.authority.is_recorded = recorder is None or recorder.state != "ended"
         elif kind == link.END:
-            self._authority.ended = True
+            self._context.authority.ended = True
 
     def _handle_decision(self, decided: link.Decided) -> None:
         """Send welcomes, replies, events, then snapshots: those are of the end of the step, with its events.
         Participants get the events first, because a client skips those that its snapshot contains."""
         for admitted in decided.admitted:
-            self._admission.send_welcome(admitted, self._now_ns(), self._publisher.scene.tick_period_ns)
+            self._admission.send_welcome(admitted, self._context.now_ns(), self._context.publisher.scene.tick_period_ns)
         snapshots = [outgoing for outgoing in decided.outgoing if isinstance(outgoing.message, Snapshot)]
         for outgoing in decided.outgoing:
             if not isinstance(outgoing.message, Snapshot):
@@ -144,37 +138,37 @@ class Downlink:
                 self._update_role(event.body.participant)
         for outgoing in snapshots:
             self._send_outgoing(outgoing)
-        heard_ns = self._authority.heard_ns
+        heard_ns = self._context.authority.heard_ns
         for dropped in decided.dropped:
-            connection = self._connections.by_number.get(dropped.connection)
+            connection = self._context.connections.by_number.get(dropped.connection)
             if dropped.reason in REMOVALS and connection is not None:
                 text = f"a director {dropped.reason} this participant"
                 self._revocation.disconnect(connection, text, heard_ns, dropped.reason)
                 self._disconnects.remove(connection, dropped.reason)
             elif connection is not None:
                 text = f"the session closed this connection: {dropped.reason}"
-                self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, dropped.reason))
+                self._context.outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, dropped.reason))
                 self._disconnects.remove(connection, dropped.reason)
             if dropped.key_id:
                 self._revocation.revoke(dropped.key_id, heard_ns)
 
     def _update_role(self, info: ParticipantInfo) -> None:
         """Take over the role that a director gave to a participant."""
-        for connection in tuple(self._connections.by_number.values()):
+        for connection in tuple(self._context.connections.by_number.values()):
             if connection.participant_id == info.id and connection.role != info.role:
                 connection.role = info.role
-                self._revocation.check_role(connection, self._authority.heard_ns)
+                self._revocation.check_role(connection, self._context.authority.heard_ns)
 
     def _send_outgoing(self, outgoing: OutgoingMessage) -> None:
         message: ServerMessage = outgoing.message
-        connection = self._connections.by_number.get(outgoing.connection)
+        connection = self._context.connections.by_number.get(outgoing.connection)
         if connection is None:
             return
         if isinstance(message, Snapshot):
             # The front adds what only it knows: the scene, the poses of the newest state frame, the sizes of anchors.
             self._alignment.process_snapshot(message.participants, message.anchors)
-            state_seq, poses = self._publisher.read_keyframe()
-            scene = self._publisher.scene
+            state_seq, poses = self._context.publisher.read_keyframe()
+            scene = self._context.publisher.scene
             filled = msgspec.structs.replace(
                 message,
                 scene_hash=scene.scene_hash,
@@ -183,21 +177,24 @@ class Downlink:
                 state_seq=state_seq,
                 anchors=tuple(self._describe_anchor(anchor) for anchor in message.anchors),
             )
-            self._outbox.send(connection, filled, poses)
+            self._context.outbox.send(connection, filled, poses)
             return
-        self._outbox.send(connection, message)
+        self._context.outbox.send(connection, message)
         if isinstance(message, Refused):
             self._disconnects.remove(connection, "refused")
 
     def _describe_anchor(self, anchor: AnchorInfo) -> AnchorInfo:
         """Return an anchor with its size, stated error and marks, where they are known."""
-        size, error = self._config.anchor_sizes.get(anchor.id, 0.0), self._config.anchor_errors.get(anchor.id, 0.0)
-        marks = tuple(AnchorMark(*mark) for mark in self._config.anchor_marks.get(anchor.id, {}).items())
+        size, error = (
+            self._context.config.anchor_sizes.get(anchor.id, 0.0),
+            self._context.config.anchor_errors.get(anchor.id, 0.0),
+        )
+        marks = tuple(AnchorMark(*mark) for mark in self._context.config.anchor_marks.get(anchor.id, {}).items())
         return msgspec.structs.replace(anchor, size_m=size, error_m=error, marks=marks)
 
     def broadcast(self, message: Event | ProtocolFault) -> None:
         """Send a message to every admitted connection, encoded once."""
         encoded = encode_message(message)
-        for connection in self._connections.by_number.values():
+        for connection in self._context.connections.by_number.values():
             if connection.admitted:
-                self._outbox.send_encoded(connection, encoded)
+                self._context.outbox.send_encoded(connection, encoded)

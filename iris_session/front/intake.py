@@ -69,16 +69,7 @@ class Intake:
         alignment: AlignmentService,
         raw: RawFeed,
     ) -> None:
-        self._config = context.config
-        self._connections = context.connections
-        self._outbox = context.outbox
-        self._coalescer = context.coalescer
-        self._drops = context.drops
-        self._audit = context.audit
-        self._guard = context.guard
-        self._budgets = context.budgets
-        self._publisher = context.publisher
-        self._now_ns = context.now_ns
+        self._context = context
         self._admission = admission
         self._pairing = pairing
         self._status = status
@@ -90,7 +81,7 @@ class Intake:
 
     def handle_message(self, routing_id: bytes, peer: Peer, data: memoryview, extra_frames: int) -> None:
         """Handle one message of the socket."""
-        now_ns = self._now_ns()
+        now_ns = self._context.now_ns()
         route = Route(routing_id)
         try:
             if extra_frames:
@@ -111,20 +102,20 @@ class Intake:
         return Route(routing_id, name) if is_behind else Route(routing_id)
 
     def _touch_gateway(self, route: Route, peer: Peer, now_ns: int) -> None:
-        gateway = self._connections.find(route, peer)
+        gateway = self._context.connections.find(route, peer)
         if gateway is not None:
             gateway.last_heard_ns = now_ns
 
     def _dispatch(self, route: Route, peer: Peer, envelope: ClientEnvelope, size: int, now_ns: int) -> None:
         message = envelope.message
         if isinstance(message, Pair):
-            self._guard.touch(peer.descriptor, now_ns)
+            self._context.guard.touch(peer.descriptor, now_ns)
             self._handle_pair(route, peer, message, now_ns)
             return
         if parse_pairing_key(peer.user_id):
             self._reject_unpaired(route, peer, message, now_ns)
             return
-        connection = self._connections.by_route.get(route)
+        connection = self._context.connections.by_route.get(route)
         if connection is not None and (connection.peer != peer or isinstance(message, Hello)):
             self._end_connection(connection, "replaced")
             connection = None
@@ -133,7 +124,7 @@ class Intake:
         if isinstance(message, Hello):
             entry = self._admission.handle_hello(route, peer, message, now_ns)
             if entry is not None:
-                self._coalescer.offer(entry)
+                self._context.coalescer.offer(entry)
             else:
                 self._count_unauthenticated(route, peer, now_ns)
         elif route.on_behalf_of and self._admission.find_gateway(route.routing_id, peer) is None:
@@ -160,7 +151,7 @@ class Intake:
 
     def _end_connection(self, connection: FrontConnection, reason: str) -> None:
         self.ended[connection.number] = (connection, reason)
-        self._connections.remove(connection)
+        self._context.connections.remove(connection)
 
     def _handle_disconnected(
         self, route: Route, peer: Peer, message: Disconnected, connection: FrontConnection | None, now_ns: int
@@ -175,7 +166,7 @@ class Intake:
 
     def _forward_late_estop(self, route: Route, peer: Peer, envelope: ClientEnvelope, now_ns: int) -> None:
         """Forward the e-stop of a client that was disconnected and does not know it yet."""
-        kept = self._connections.find_kept(route, peer)
+        kept = self._context.connections.find_kept(route, peer)
         if kept is not None:
             self._offer_estop(kept, envelope, now_ns)
 
@@ -183,25 +174,25 @@ class Intake:
         """Offer an e-stop within the budget of its key. One above it is merged into the next one, half a second later
         at most, and counted. Return whether it was offered."""
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, envelope.message)  # type: ignore[arg-type]
-        if connection.budget.take_estop(now_ns):
-            self._coalescer.offer(entry)
+        if not connection.budget.take(now_ns, estops=1):
+            self._context.coalescer.offer(entry)
             return True
-        self._budgets.hold_estop(connection.key_id, connection.budget, entry)
-        self._drops.count(ESTOPS_MERGED, connection.number)
+        self._context.budgets.hold_estop(connection.key_id, connection.budget, entry)
+        self._context.drops.count(ESTOPS_MERGED, connection.number)
         return False
 
     def _reject_unpaired(self, route: Route, peer: Peer, message: ClientMessage, now_ns: int) -> None:
         """Reject a message other than `Pair` of a key that is not on the list."""
-        self._drops.count("unpaired")
+        self._context.drops.count("unpaired")
         self._count_rejection(peer, None, now_ns)
         mark, name = compute_fingerprint(decode_key(parse_pairing_key(peer.user_id))), getattr(message, "name", "")
         address = peer_of(peer.descriptor)[0]
-        self._audit.record(
+        self._context.audit.record(
             AuditKind.KEY_REFUSED, now_ns, subject=mark, name=name, address=address, detail=get_tag(type(message))
         )
         if self._unknown_peer_faults.take(now_ns):
             text, advice = "this key is not on the session's list", "run `iris-session pair` there, join with its code"
-            self._outbox.send_to_route(route, Refused(RefusalCode.UNPAIRED, text, advice))
+            self._context.outbox.send_to_route(route, Refused(RefusalCode.UNPAIRED, text, advice))
 
     def _handle_from_connection(
         self, connection: FrontConnection, envelope: ClientEnvelope, size: int, now_ns: int
@@ -209,7 +200,7 @@ class Intake:
         message = envelope.message
         connection.last_heard_ns = now_ns
         if not connection.admitted and not isinstance(message, (GetStatus, EStop)):  # anyone may stop, however early
-            self._drops.count("not_admitted", connection.number)
+            self._context.drops.count("not_admitted", connection.number)
             self._count_rejection(connection.peer, connection, now_ns, get_tag(type(message)))
             return
         if not connection.confirmed and envelope.connection_epoch == connection.number:
@@ -240,7 +231,7 @@ class Intake:
             self._handle_samples(connection, envelope.connection_epoch, message, now_ns)
             return
         if isinstance(message, ClockPing):
-            self._outbox.send(connection, ClockPong(message.t0_ns, now_ns, self._now_ns()))
+            self._context.outbox.send(connection, ClockPong(message.t0_ns, now_ns, self._context.now_ns()))
             return
         if isinstance(message, Sample):
             self._offer_sample(connection, envelope.connection_epoch, message, now_ns)
@@ -248,10 +239,10 @@ class Intake:
         if isinstance(message, Observation):
             self._raw.send(connection, now_ns, message)
             self._alignment.process_observation(connection, message, now_ns)
-            if not self._config.forward_observations:
+            if not self._context.config.forward_observations:
                 return
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, message)  # type: ignore[arg-type]
-        if not self._coalescer.offer(entry):
+        if not self._context.coalescer.offer(entry):
             text = f"{get_tag(kind)}: queue to the session full: send less"
             if not self._send_denial(connection, message, text, now_ns):
                 self._send_fault(connection.route, connection, FaultCode.RATE, text, now_ns)
@@ -263,10 +254,10 @@ class Intake:
             late is not None
             and kind is not TrackingEpoch
             and connection.rates.allow(TrackingEpoch, now_ns)
-            and not connection.budget.take_request(now_ns, 0, 1)
+            and not connection.budget.take(now_ns, events=1)
         ):
             connection.late_epoch = None
-            self._coalescer.offer(late)
+            self._context.coalescer.offer(late)
 
     def _check_rate(self, connection: FrontConnection, message: ClientMessage, size: int, now_ns: int) -> str:
         """Return which limit of its type or of its key a message exceeds, or an empty string."""
@@ -275,19 +266,19 @@ class Intake:
             limit = LIMITS[kind]
             return str(RateError(get_tag(kind), limit.per_second, limit.burst))
         n_messages = 1 + len(message.samples) if isinstance(message, Samples) else 1
-        reason = connection.budget.take_message(now_ns, n_messages, size)
+        reason = connection.budget.take(now_ns, bytes=size, messages=n_messages)
         if not reason and not isinstance(message, (Sample, Samples)):
-            scene = self._publisher.scene
+            scene = self._context.publisher.scene
             units, events = weigh_request(message, len(scene.bodies)), count_events(message, len(scene.robots))
-            reason = connection.budget.take_request(now_ns, units, events)
+            reason = connection.budget.take(now_ns, requests=units, events=events)
             if not reason and connection.role == Role.OBSERVER and not isinstance(message, Observation):
                 reason = self._presence.take_request(connection, size, now_ns)
         if not reason:
             return ""
-        self._drops.count(reason, connection.number)
+        self._context.drops.count(reason, connection.number)
         if reason == REQUEST_SHARE:
             return f"the requests of the observers of this key are above {REQUEST_BYTES_PER_S} bytes a second"
-        return describe_excess(reason, self._config.limits.key)
+        return describe_excess(reason, self._context.config.limits.key)
 
     def _reject_excess(self, connection: FrontConnection, envelope: ClientEnvelope, excess: str, now_ns: int) -> None:
         message = envelope.message
@@ -308,9 +299,9 @@ class Intake:
 
     def _allow_clutch_edge(self, connection: FrontConnection, now_ns: int) -> bool:
         """Take an edge that makes something happen and will be undone from the budget of the key."""
-        reason = connection.budget.take_request(now_ns, 0, _EDGE_EVENTS)
+        reason = connection.budget.take(now_ns, events=_EDGE_EVENTS)
         if reason:
-            self._drops.count(reason, connection.number)
+            self._context.drops.count(reason, connection.number)
             self._count_flood(connection, get_tag(Sample), now_ns)
         return not reason
 
@@ -337,7 +328,7 @@ class Intake:
         request_id = getattr(message, "request_id", 0)
         if request_id and connection.denials.take(now_ns):
             denial = Denial(DenialReason.QUOTA, text, "send less, or the same again in a moment")
-            self._outbox.send(connection, Reply(request_id, False, denial))
+            self._context.outbox.send(connection, Reply(request_id, False, denial))
         return bool(request_id)
 
     def _handle_samples(self, connection: FrontConnection, epoch: int, samples: Samples, now_ns: int) -> None:
@@ -346,7 +337,7 @@ class Intake:
             if connection.rates.allow(Sample, now_ns):
                 self._offer_sample(connection, epoch, sample, now_ns)
             else:
-                self._drops.count(FaultCode.RATE, connection.number)
+                self._context.drops.count(FaultCode.RATE, connection.number)
                 self._count_flood(connection, "sample", now_ns)
 
     def _offer_sample(self, connection: FrontConnection, epoch: int, sample: Sample, now_ns: int) -> None:
@@ -361,14 +352,14 @@ class Intake:
                 return
             sample = presence
         self._raw.send(connection, now_ns, sample)
-        self._coalescer.offer(Entry(connection.number, epoch, now_ns, sample))
+        self._context.coalescer.offer(Entry(connection.number, epoch, now_ns, sample))
 
     def _count_rejection(
         self, peer: Peer, connection: FrontConnection | None, now_ns: int, detail: str = BEFORE_HELLO
     ) -> None:
         """Count a rejected message. Too many of them end the connection, and close its TCP connection."""
-        if self._guard.rate_limit(peer, connection, detail, now_ns) and connection is not None:
-            self._outbox.failed.setdefault(connection.number, "flood")
+        if self._context.guard.rate_limit(peer, connection, detail, now_ns) and connection is not None:
+            self._context.outbox.failed.setdefault(connection.number, "flood")
 
     def _count_unauthenticated(self, route: Route, peer: Peer, now_ns: int) -> None:
         """Count a rejected message without a connection: behind a gateway it must not use up what the gateway may send
@@ -382,31 +373,31 @@ class Intake:
             connection.flood_since_ns = now_ns
         connection.flood_last_ns = now_ns
         if now_ns - connection.flood_since_ns > FLOOD_NS:
-            self._guard.report_flood(connection.address[0], tag, now_ns, connection)
+            self._context.guard.report_flood(connection.address[0], tag, now_ns, connection)
 
     def _reject_unreadable(self, route: Route, peer: Peer, error: ProtocolError, now_ns: int) -> None:
         """Reject a message that cannot be decoded; before `hello` with a refusal, as the answer to it."""
-        connection = self._connections.find(route, peer)
+        connection = self._context.connections.find(route, peer)
         counted = connection or (self._admission.find_gateway(route.routing_id, peer) if route.on_behalf_of else None)
         self._count_rejection(peer, counted, now_ns, error.code if connection is not None else BEFORE_HELLO)
         if connection is not None:
             self._send_fault(route, connection, error.code, str(error), now_ns)
             return
-        self._drops.count(f"hello_{error.code}")
+        self._context.drops.count(f"hello_{error.code}")
         if self._unknown_peer_faults.take(now_ns):
             advice = "send the hello of docs/protocol.md"
             if isinstance(error, ProtocolVersionError):
                 advice = f"update {'the client' if error.version < PROTOCOL_VERSION else 'the session'}"
-            self._outbox.send_to_route(route, Refused(error.code, str(error), advice))
+            self._context.outbox.send_to_route(route, Refused(error.code, str(error), advice))
 
     def _send_fault(self, route: Route, connection: FrontConnection | None, code: str, text: str, now_ns: int) -> None:
         """Count a fault, and send it at a bounded rate."""
         fault = ProtocolFault(code, text)
         if connection is None:
-            self._drops.count(f"stranger_{code}")
+            self._context.drops.count(f"stranger_{code}")
             if self._unknown_peer_faults.take(now_ns):
-                self._outbox.send_to_route(route, fault)
+                self._context.outbox.send_to_route(route, fault)
             return
-        self._drops.count(code, connection.number)
+        self._context.drops.count(code, connection.number)
         if connection.faults.take(now_ns):
-            self._outbox.send(connection, fault)
+            self._context.outbox.send(connection, fault)

@@ -20,11 +20,15 @@ from iris_session.security.zap import ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_ST
 K = TypeVar("K")
 V = TypeVar("V")
 
-#: Drop reasons of messages above the budget of their key.
-KEY_MESSAGES: Final = "key_messages"
-KEY_BYTES: Final = "key_bytes"
-KEY_REQUESTS: Final = "key_requests"
-KEY_EVENTS: Final = "key_events"
+#: What a budget counts, each with the field of `KeyLimits` that has its burst. Above it, the drop reason is
+#: `key_messages`, and so on.
+_BURSTS: Final = {
+    "bytes": "byte_burst",
+    "messages": "message_burst",
+    "requests": "request_burst",
+    "events": "event_burst",
+    "estops": "estop_burst",
+}
 #: Connections refused: of a key that opens too many, or was disconnected for a flood a moment ago.
 KEY_CONNECTIONS: Final = "key_connections"
 KEY_BANNED: Final = "key_banned"
@@ -54,7 +58,6 @@ class KeyBudget:
         is_gateway: The key may be a gateway's.
         parent: Budget of the gateway's key of a participant behind a gateway, which pays too.
         rejections: Token bucket of rejected messages of all its connections.
-        late_estop: The newest e-stop above the budget; it is sent as soon as there is a token.
         used_ns: Session time of its last use.
         connections: Connections that use it.
     """
@@ -65,38 +68,22 @@ class KeyBudget:
         key, factor = limits.key, limits.key.gateway_factor if is_gateway else 1
         self.is_gateway = is_gateway
         self.parent = parent
-        self._messages = TokenBucket(key.messages * factor, key.message_burst * factor, now_ns)
-        self._bytes = TokenBucket(key.bytes * factor, key.byte_burst * factor, now_ns)
-        self._requests = TokenBucket(key.requests * factor, key.request_burst * factor, now_ns)
-        self._events = TokenBucket(key.events * factor, key.event_burst * factor, now_ns)
-        self._estops = TokenBucket(key.estops * factor, key.estop_burst * factor, now_ns)
+        self._buckets = {
+            name: TokenBucket(getattr(key, name) * factor, getattr(key, burst) * factor, now_ns)
+            for name, burst in _BURSTS.items()
+        }
         self.rejections = TokenBucket(limits.excess_per_s * factor, limits.excess_burst * factor, now_ns)
-        self.late_estop: Entry | None = None
         self.used_ns = now_ns
         self.connections = 0
 
-    def take_message(self, now_ns: int, n_messages: int, n_bytes: int) -> str:
-        """Take what a message takes. Return the drop reason when it is above the budget, else an empty string."""
+    def take(self, now_ns: int, **amounts: int) -> str:
+        """Take amounts by name, as in `KeyLimits`. Return the drop reason of the first that is above the budget, empty
+        for none."""
         self.used_ns = now_ns
-        if not self._bytes.take(now_ns, n_bytes):
-            return KEY_BYTES
-        if not self._messages.take(now_ns, n_messages):
-            return KEY_MESSAGES
-        return self.parent.take_message(now_ns, n_messages, n_bytes) if self.parent is not None else ""
-
-    def take_request(self, now_ns: int, units: int, events: int) -> str:
-        """Take what a request causes. Return the drop reason when it is above the budget, else an empty string."""
-        self.used_ns = now_ns
-        if units and not self._requests.take(now_ns, units):
-            return KEY_REQUESTS
-        if events and not self._events.take(now_ns, events):
-            return KEY_EVENTS
-        return self.parent.take_request(now_ns, units, events) if self.parent is not None else ""
-
-    def take_estop(self, now_ns: int) -> bool:
-        """Take an e-stop. Return whether it may go to the authority now."""
-        self.used_ns = now_ns
-        return self._estops.take(now_ns) and (self.parent is None or self.parent.take_estop(now_ns))
+        for name, n in amounts.items():
+            if n and not self._buckets[name].take(now_ns, n):
+                return f"key_{name}"
+        return self.parent.take(now_ns, **amounts) if self.parent is not None else ""
 
 
 class KeyBudgets:
@@ -111,7 +98,7 @@ class KeyBudgets:
         self._limits = limits
         self._offer = offer
         self._budgets: dict[str, KeyBudget] = {}  # the most recently found comes last
-        self._late: dict[str, KeyBudget] = {}  # with an e-stop that waits
+        self._late: dict[str, tuple[KeyBudget, Entry]] = {}  # the newest e-stop above the budget of each key
         self._next_ns = 0
 
     def __len__(self) -> int:
@@ -136,23 +123,17 @@ class KeyBudgets:
 
     def hold_estop(self, key_id: str, budget: KeyBudget, entry: Entry) -> None:
         """Keep an e-stop above the budget, in place of an earlier one, until there is a token."""
-        budget.late_estop = entry
-        self._late[key_id] = budget
+        self._late[key_id] = budget, entry
 
     def tick(self, now_ns: int) -> None:
         """Offer e-stops that waited for a token. A stop is delayed and merged, never lost."""
         if not self._late or now_ns < self._next_ns:
             return
         self._next_ns = now_ns + PERIOD_NS
-        for key_id, budget in list(self._late.items()):
-            if budget.late_estop is not None and budget.take_estop(now_ns):
-                entry, budget.late_estop = budget.late_estop, None
+        for key_id, (budget, entry) in list(self._late.items()):
+            if not budget.take(now_ns, estops=1):
                 self._offer(msgspec.structs.replace(entry, receive_ns=now_ns))
-            if budget.late_estop is None:
                 del self._late[key_id]
-
-    def close(self) -> None:
-        """Do nothing: nothing was opened."""
 
     def _forget(self, now_ns: int) -> None:
         """Forget budgets that are full again, and the least recently found ones of keys without connections."""
@@ -164,55 +145,13 @@ class KeyBudgets:
             del self._budgets[key_id]
 
 
-class IngestBackoff:
-    """Refuse new connections to media ingest of keys that flooded it: 1 s, then 2, 4 ... 60 s.
-
-    libzmq names the key of a connection with its first whole message. So when a connection is closed before that, all
-    keys are refused that have connected from its address since it was opened: its own is among them, if it has one.
-    Connections that are open stay. A key that floods no more for as long as it was last refused for, and a minute,
-    begins anew.
-    """
-
-    def __init__(self) -> None:
-        self._handshakes: dict[tuple[str, str], int] = {}  # by network and key; the newest last
-        self._refused: dict[str, tuple[int, int]] = {}  # key -> until when, and for how long
-
-    def record_handshake(self, address: str, key_id: str, now_ns: int) -> None:
-        """Record that a key connects to media ingest."""
-        remember(self._handshakes, (find_network(address), key_id), now_ns)
-
-    def refuse(self, address: str, key_id: str, opened_ns: int, now_ns: int) -> dict[str, int]:
-        """Refuse the key of a connection that was closed for a flood, or those of which it had one.
-
-        Args:
-            address: Of the connection.
-            key_id: Its key, empty where it is not known.
-            opened_ns: Session time at which it was opened.
-            now_ns: Session time.
-
-        Returns:
-            For how long each key is refused [ns], without those that are refused already.
-        """
-        network, since_ns = find_network(address), opened_ns - ACCEPT_SLACK_NS
-        seen = [key for (where, key), at_ns in self._handshakes.items() if where == network and at_ns >= since_ns]
-        refused: dict[str, int] = {}
-        for key in [key_id] if key_id else seen:
-            until_ns, last_ns = self._refused.get(key, (-FORGET_NS, 0))
-            if now_ns < until_ns:
-                continue  # the flood for which it is refused
-            if now_ns - until_ns > FORGET_NS:
-                last_ns = 0
-            refused[key] = min(max(2 * last_ns, FIRST_BACKOFF_NS), MAX_BACKOFF_NS)
-            remember(self._refused, key, (now_ns + refused[key], refused[key]))
-        return refused
-
-    def is_refused(self, key_id: str, now_ns: int) -> bool:
-        """Return whether a key is refused at media ingest now."""
-        return now_ns < self._refused.get(key_id, (0, 0))[0]
-
-
 class HandshakeLimiter:
     """Limit how often a key opens connections to each channel: each costs memory before its first message.
+
+    Keys that flooded media ingest are refused there: for 1 s, then 2, 4 ... 60 s. libzmq names the key of a connection
+    with its first whole message. So when a connection is closed before that, all keys are refused that have connected
+    from its address since it was opened: its own is among them, if it has one. Connections that are open stay. A key
+    that floods no more for as long as it was last refused for, and a minute, begins anew.
 
     Args:
         limits: Of keys.
@@ -220,7 +159,6 @@ class HandshakeLimiter:
         is_gateway: Returns whether a key may be a gateway's.
         is_banned: Returns whether a key was disconnected for a flood a moment ago; it may connect to control, where
             its hello is refused with the reason.
-        backoff: Of keys that flooded media ingest.
     """
 
     def __init__(
@@ -229,19 +167,19 @@ class HandshakeLimiter:
         drops: Drops,
         is_gateway: Callable[[str], bool],
         is_banned: Callable[[str, int], bool],
-        backoff: IngestBackoff,
     ) -> None:
         self._limits = limits
         self._drops = drops
         self._is_gateway = is_gateway
         self._is_banned = is_banned
-        self._backoff = backoff
         self._buckets = KeyedBuckets(limits.handshakes, limits.handshake_burst, MAX_KEYS)
         self._subscribers = KeyedBuckets(limits.subscriber_handshakes, limits.subscriber_handshake_burst, MAX_KEYS)
+        self._sources: dict[tuple[str, str], int] = {}  # handshakes at media ingest by network and key; the newest last
+        self._refused: dict[str, tuple[int, int]] = {}  # key -> until when it is refused there, and for how long
 
     def allow(self, domain: bytes, key_id: str, address: str, now_ns: int) -> bool:
         """Return whether a key may open one more connection to a channel, and use its token."""
-        if domain == ZAP_INGEST and self._backoff.is_refused(key_id, now_ns):
+        if domain == ZAP_INGEST and now_ns < self._refused.get(key_id, (0, 0))[0]:
             self._drops.count(MEDIA_BACKOFF)
             return False
         if domain != ZAP_CONTROL and self._is_banned(key_id, now_ns):
@@ -253,8 +191,33 @@ class HandshakeLimiter:
             self._drops.count(KEY_CONNECTIONS)
             return False
         if domain == ZAP_INGEST:
-            self._backoff.record_handshake(address, key_id, now_ns)
+            remember(self._sources, (find_network(address), key_id), now_ns)
         return True
+
+    def refuse_source(self, address: str, key_id: str, opened_ns: int, now_ns: int) -> dict[str, int]:
+        """Refuse the key of a connection to media ingest that was closed for a flood, or those of which it had one.
+
+        Args:
+            address: Of the connection.
+            key_id: Its key, empty where it is not known.
+            opened_ns: Session time at which it was opened.
+            now_ns: Session time.
+
+        Returns:
+            For how long each key is refused [ns], without those that are refused already.
+        """
+        network, since_ns = find_network(address), opened_ns - ACCEPT_SLACK_NS
+        seen = [key for (where, key), at_ns in self._sources.items() if where == network and at_ns >= since_ns]
+        refused: dict[str, int] = {}
+        for key in [key_id] if key_id else seen:
+            until_ns, last_ns = self._refused.get(key, (-FORGET_NS, 0))
+            if now_ns < until_ns:
+                continue  # the flood for which it is refused
+            if now_ns - until_ns > FORGET_NS:
+                last_ns = 0
+            refused[key] = min(max(2 * last_ns, FIRST_BACKOFF_NS), MAX_BACKOFF_NS)
+            remember(self._refused, key, (now_ns + refused[key], refused[key]))
+        return refused
 
 
 def remember(table: dict[K, V], key: K, value: V) -> None:
@@ -266,11 +229,11 @@ def remember(table: dict[K, V], key: K, value: V) -> None:
 
 
 def describe_excess(reason: str, limits: KeyLimits) -> str:
-    """Return the text of a message that was rejected for `reason`, one of those above."""
+    """Return the text of a message that was rejected for `reason`, that of `KeyBudget.take`."""
     amount = {
-        KEY_MESSAGES: f"{limits.messages:g} messages a second",
-        KEY_BYTES: f"{limits.bytes:g} bytes a second",
-        KEY_REQUESTS: f"requests worth {limits.requests:g} units a second",
-        KEY_EVENTS: f"{limits.events:g} events a second",
+        "key_messages": f"{limits.messages:g} messages a second",
+        "key_bytes": f"{limits.bytes:g} bytes a second",
+        "key_requests": f"requests worth {limits.requests:g} units a second",
+        "key_events": f"{limits.events:g} events a second",
     }[reason]
     return f"this key is above {amount}, over all its connections"

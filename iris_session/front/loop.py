@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import zmq
 
@@ -22,10 +21,15 @@ from iris_session.front.asset_service import AssetService
 from iris_session.front.connections import Peer
 from iris_session.front.context import FrontContext, FrontSockets, Service, find_channel_share, open_front
 from iris_session.front.disconnects import DisconnectHandler
-from iris_session.front.discovery import SessionFacts, SessionRegistration, make_discovery_services
+from iris_session.front.discovery import (
+    BeaconSender,
+    IntroductionServer,
+    SessionRegistration,
+    make_discovery_services,
+)
 from iris_session.front.downlink import Downlink
 from iris_session.front.intake import Intake
-from iris_session.front.key_budgets import HandshakeLimiter, IngestBackoff
+from iris_session.front.key_budgets import HandshakeLimiter
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.recorder import MediaRecorder
 from iris_session.front.media.service import MediaService
@@ -38,10 +42,10 @@ from iris_session.front.uplink import Uplink
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND, FrontStart
 from iris_session.link.sockets import MEDIA_THREAD_NAME, read_peer, readable
-from iris_session.link.tcp_guard import PendingConnection, TcpBounds, TcpGuard, TrafficCounter, make_reasons
+from iris_session.link.tcp_guard import TcpBounds, TcpGuard, TrafficCounter, make_reasons
+from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
-from iris_session.security.zap import Authenticator
 from iris_session.system.priority import lower_named_thread_priority
 from iris_session.system.process import is_parent
 
@@ -77,46 +81,54 @@ class Front:
         self.ended = ""
         self.cut_off = False
         context, sockets = self._context, self._sockets = open_front(start)
+        config, drops, authority = context.config, context.drops, context.authority
         self._link, self._control = sockets.link, sockets.control.socket
         self._authenticator = sockets.authenticator
-        backoff = IngestBackoff()
-        channels = _make_channels(context, sockets, backoff)
-        clients = _make_client_parts(context, sockets, channels)
-        revocation = RevocationService(context, clients.disconnects, self._reopen_state)
-        self._intake, self._disconnects = clients.intake, clients.disconnects
+        # Media are encrypted and decrypted as fast as they come: on a busy machine state, control and clients go first.
+        lower_named_thread_priority(MEDIA_THREAD_NAME)
+        handshakes = HandshakeLimiter(config.limits.key, drops, context.keyring.may_be_gateway, context.guard.is_banned)
+        proxy, server = _make_media_proxy(context, sockets), _make_asset_server(context, sockets)
+        media, assets = MediaService(context, proxy, handshakes), AssetService(context, server)
+        alignment = _make_alignment_service(context)
+        status = StatusService(context, media, assets, alignment)
+        admission, pairing = Admission(context, (media, assets)), PairingService(context)
+        raw = RawFeed(sockets.context, config.recorder_endpoint, drops, lambda: authority.is_recorded)
+        self._intake = Intake(context, admission, pairing, status, alignment, raw)
+        self._disconnects = DisconnectHandler(context, sockets.control.monitor, admission, status, alignment)
+        revocation = RevocationService(context, self._disconnects, self._reopen_state)
         self._downlink = Downlink(
-            context,
-            sockets.link,
-            clients.admission,
-            clients.disconnects,
-            revocation,
-            clients.alignment,
-            channels.assets,
-            channels.media,
+            context, sockets.link, admission, self._disconnects, revocation, alignment, assets, media
         )
         self._uplink = Uplink(context, sockets.link)
         if self._authenticator is not None:
-            _limit_handshakes(self._authenticator, context, backoff)
-        pending = (context.guard.list_pending, *channels.list_pending)
-        max_bytes = context.config.limits.memory_bytes
-        memory = MemoryGuard(max_bytes, pending, channels.release_media, self._report_eviction, context.drops)
+            self._authenticator.is_revoked = context.tokens.is_revoked
+            self._authenticator.is_rate_limited = lambda domain, mark, address: (
+                not handshakes.allow(domain, mark, address, context.now_ns())
+            )
+        pending = (context.guard.list_pending, proxy.list_pending, server.list_pending)
+        memory = MemoryGuard(config.limits.memory_bytes, pending, proxy.release_memory, self._report_eviction, drops)
+        announcements = self._make_announcements(pairing)
         #: In the order of their ticks.
-        self._services: list[Service] = [context.keyring, clients.status, channels.media]
-        self._services += [context.guard, context.budgets, memory, clients.pairing, revocation, context.audit]
-        self._services += [channels.assets, *self._make_announcements(clients.pairing), clients.alignment, clients.raw]
+        self._services: list[Service] = [context.keyring, status, media, context.guard, context.budgets, memory]
+        self._services += [pairing, revocation, context.audit, assets, *announcements, alignment, raw]
+        self._opened = (context.keyring, media, context.guard, revocation, assets, *announcements, alignment, raw)
         self._next_services_ns = self._next_collect_ns = 0
 
-    def _make_announcements(self, pairing: PairingService) -> list[Service]:
+    def _make_announcements(
+        self, pairing: PairingService
+    ) -> list[IntroductionServer | BeaconSender | SessionRegistration]:
         """Make the services by which clients find the session: on the network, and on this machine."""
-        context, sockets = self._context, self._sockets
-        config, keyring = context.config, context.keyring
-        facts = SessionFacts(
-            keyring.key.public if keyring.key else "", lambda: pairing.has_open_code, lambda: len(context.connections)
-        )
-        services: list[Service] = []
+        context, keyring = self._context, self._context.keyring
+
+        def make_introduction(beacon: Beacon) -> Introduction:
+            key = keyring.key.public if keyring.key else ""
+            return Introduction(beacon, key, pairing.has_open_code, len(context.connections))
+
+        services: list[IntroductionServer | BeaconSender | SessionRegistration] = []
         if keyring.home is not None:
-            services.append(SessionRegistration(keyring.home, keyring.files, config, context.ports))
-        services += make_discovery_services(config, context.ports, sockets.listeners, context.drops, facts)
+            services.append(SessionRegistration(keyring.home, keyring.files, context.config, context.ports))
+        listeners = self._sockets.listeners
+        services += make_discovery_services(context.config, context.ports, listeners, context.drops, make_introduction)
         return services
 
     def _reopen_state(self) -> zmq.Socket[bytes]:
@@ -170,7 +182,7 @@ class Front:
 
     def close(self) -> None:
         """Close every socket; sent messages leave within its linger time."""
-        for service in self._services:
+        for service in self._opened:
             service.close()
         self._sockets.close()
 
@@ -233,60 +245,6 @@ class Front:
         authority.stalled = stalled
         if not is_parent(self._start.parent_pid):
             self.end(ORPHANED)
-
-
-class _Channels(NamedTuple):
-    """Media and assets, each with a thread of its own, and what `MemoryGuard` needs of them."""
-
-    media: MediaService
-    assets: AssetService
-    list_pending: tuple[Callable[[], list[PendingConnection]], ...]
-    release_media: Callable[[], str]
-
-
-class _ClientParts(NamedTuple):
-    """The parts that handle clients on the control socket."""
-
-    alignment: AlignmentService
-    status: StatusService
-    admission: Admission
-    pairing: PairingService
-    raw: RawFeed
-    intake: Intake
-    disconnects: DisconnectHandler
-
-
-def _make_channels(context: FrontContext, sockets: FrontSockets, backoff: IngestBackoff) -> _Channels:
-    # Media are encrypted and decrypted as fast as they come: on a busy machine state, control and clients go first.
-    lower_named_thread_priority(MEDIA_THREAD_NAME)
-    proxy = _make_media_proxy(context, sockets)
-    media = MediaService(context, proxy, backoff)
-    server = _make_asset_server(context, sockets)
-    assets = AssetService(context, server)
-    return _Channels(media, assets, (proxy.list_pending, server.list_pending), proxy.release_memory)
-
-
-def _make_client_parts(context: FrontContext, sockets: FrontSockets, channels: _Channels) -> _ClientParts:
-    alignment = _make_alignment_service(context)
-    status = StatusService(context, channels.media, channels.assets, alignment)
-    admission = Admission(context, (channels.media, channels.assets))
-    pairing = PairingService(context)
-    authority = context.authority
-    raw = RawFeed(sockets.context, context.config.recorder_endpoint, context.drops, lambda: authority.is_recorded)
-    intake = Intake(context, admission, pairing, status, alignment, raw)
-    disconnects = DisconnectHandler(context, sockets.control.monitor, admission, status, alignment)
-    return _ClientParts(alignment, status, admission, pairing, raw, intake, disconnects)
-
-
-def _limit_handshakes(authenticator: Authenticator, context: FrontContext, backoff: IngestBackoff) -> None:
-    """Limit how often a key opens connections, and refuse revoked ones."""
-    handshakes = HandshakeLimiter(
-        context.config.limits.key, context.drops, context.keyring.may_be_gateway, context.guard.is_banned, backoff
-    )
-    authenticator.is_revoked = context.tokens.is_revoked
-    authenticator.is_rate_limited = lambda domain, mark, address: (
-        not handshakes.allow(domain, mark, address, context.now_ns())
-    )
 
 
 def _make_alignment_service(context: FrontContext) -> AlignmentService:

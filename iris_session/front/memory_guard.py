@@ -25,8 +25,6 @@ EVICTION_PAUSE_NS: Final = 500 * MILLISECOND
 #: what is too much: more than an honest client on a slow link leaves pending.
 MIN_EVICT_BYTES: Final = MEBIBYTE // 4
 MIN_EVICT_SHARE: Final = 1 / 32  # of the bytes that the front may hold
-
-
 #: Above this many bytes, freed memory is given back to the system from time to time, so that a flood leaves nothing.
 TRIM_BYTES: Final = 16 * MEBIBYTE
 TRIM_PERIOD_NS: Final = 5000 * MILLISECOND
@@ -95,13 +93,10 @@ class MemoryGuard:
         if self._base < 0:  # it could not be read yet
             return
         held = self._read_resident() - self._base
-        if held > min(self._max_bytes, TRIM_BYTES) and now_ns >= self._next_trim_ns:
+        if held > self._max_bytes or (held > TRIM_BYTES and now_ns >= self._next_trim_ns):
             self._next_trim_ns = now_ns + TRIM_PERIOD_NS
-            self._trim()
-        if held <= self._max_bytes:
-            return
-        self._trim()  # freed memory counts until the system has it back
-        held = self._read_resident() - self._base
+            self._trim()  # freed memory counts until the system has it back
+            held = self._read_resident() - self._base
         if held <= self._max_bytes:
             return
         evicted = self._evict(held)
@@ -125,9 +120,6 @@ class MemoryGuard:
         if closed:
             self._drops.count("memory", n=closed)
         return largest.label if closed else ""
-
-    def close(self) -> None:
-        """Do nothing: nothing was opened."""
 
 
 def _make_resident_reader() -> Callable[[], int]:

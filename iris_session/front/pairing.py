@@ -89,10 +89,7 @@ class PairingService:
     """Handle `Pair` messages. A `Service`: answers are sent by `tick`."""
 
     def __init__(self, context: FrontContext) -> None:
-        self._keyring = context.keyring
-        self._outbox = context.outbox
-        self._audit = context.audit
-        self._drops = context.drops
+        self._context = context
         self._pairs = TokenBucket(PER_SECOND, BURST)
         self._refusals = TokenBucket(PER_SECOND, BURST)
         self._pending: deque[_PendingAttempt] = deque()
@@ -112,7 +109,7 @@ class PairingService:
 
     def _list_codes(self) -> tuple[JoinCode, ...]:
         """Return the codes of this session, read again if their file has changed."""
-        home, key = self._keyring.home, self._keyring.key
+        home, key = self._context.keyring.home, self._context.keyring.key
         if home is None or key is None:
             return ()
         signature = home.join_codes.signature
@@ -143,23 +140,25 @@ class PairingService:
             source = _Source(f"gateway {gateway.key_id}", address, GATEWAY_FACTOR)
         allowed = self._allow_source(source, now_ns)
         if self._has_exhausted_attempts(source, now_ns):  # before the limits that clients share
-            self._audit.record(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
-            self._drops.count("pair_shut_out")
+            self._context.audit.record(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
+            self._context.drops.count("pair_shut_out")
             if allowed:
                 self._refuse(route, TOO_MANY_WRONG, "wait ten minutes")
         elif not allowed or not self._pairs.take(now_ns) or len(self._pending) >= MAX_PENDING:
-            self._drops.count("pair_rate")
+            self._context.drops.count("pair_rate")
             if self._refusals.take(now_ns):
                 advice = "try again in a second"
-                self._outbox.send_to_route(route, Refused(RefusalCode.RATE, "too many pairing attempts", advice))
-        elif self._keyring.key is None:
+                self._context.outbox.send_to_route(
+                    route, Refused(RefusalCode.RATE, "too many pairing attempts", advice)
+                )
+        elif self._context.keyring.key is None:
             self._refuse(route, "this session is not encrypted: it has no keys to pair", "say hello")
-        elif self._keyring.home is None:
+        elif self._context.keyring.home is None:
             self._refuse(route, "this session takes its keys from a folder", "ask for your public key to be put there")
         elif gateway is not None:
             self._handle_web_pair(route, source, pair, now_ns, gateway)
         else:
-            known = self._keyring.find_key(peer.user_id)
+            known = self._context.keyring.find_key(peer.user_id)
             key = parse_pairing_key(peer.user_id) if known is None else known.key
             if key:
                 self._handle_known_key(_PendingAttempt(route, source, key, pair, now_ns), now_ns)
@@ -183,13 +182,13 @@ class PairingService:
     def _handle_known_key(self, attempt: _PendingAttempt, now_ns: int) -> None:
         """Answer an attempt whose key is known, or put it in the queue."""
         route, mark = attempt.route, compute_fingerprint(decode_key(attempt.key))
-        entry = self._keyring.find_entry(mark)
-        if mark in self._keyring.pending_revocations:
+        entry = self._context.keyring.find_entry(mark)
+        if mark in self._context.keyring.pending_revocations:
             self._refuse(route, REVOKED, "ask for another join code")
         elif entry is not None and entry.kind != (WEB if attempt.web_key else CURVE):
             self._refuse(route, f"this key is on the list as one of kind {entry.kind}", "make a new one")
         elif (earlier := self._find_earlier_answer(attempt)) is not None:
-            self._outbox.send_to_route(route, earlier)
+            self._context.outbox.send_to_route(route, earlier)
         elif self._trying or self._has_open_code_for(attempt.web_key):
             self._pending.append(attempt)  # the attempt that runs may be of the same key, and has used its code
         else:
@@ -197,7 +196,7 @@ class PairingService:
 
     def _refuse_without_code(self, attempt: _PendingAttempt, now_ns: int) -> None:
         mark = compute_fingerprint(decode_key(attempt.key))
-        self._audit.record(
+        self._context.audit.record(
             AuditKind.CODE_REFUSED, now_ns, subject=mark, name=attempt.pair.name, address=attempt.source.address
         )
         text = NO_WEB_CODE if attempt.web_key and self.has_open_code else "no join code can be used now"
@@ -213,7 +212,7 @@ class PairingService:
         The file of codes keeps it, so a front that was restarted since gives the same answer. `None` for another
         attempt, and for a key that has been taken off the list since.
         """
-        entry = self._keyring.find_entry(compute_fingerprint(decode_key(attempt.key)))
+        entry = self._context.keyring.find_entry(compute_fingerprint(decode_key(attempt.key)))
         for code in self._list_codes() if entry is not None else ():
             paired = code.paired is not None and code.paired.key == attempt.key
             if entry is not None and paired and pairing.is_same_proof(code.proof, attempt.pair.proof):
@@ -225,9 +224,9 @@ class PairingService:
         pending, self._pending = self._pending, deque()
         for one in pending:
             self._recheck_pending(one, now_ns)
-        if self._trying or not self._pending or self._keyring.is_missing:  # a new list would have no other key
+        if self._trying or not self._pending or self._context.keyring.is_missing:  # a new list would have no other key
             return
-        home, key = self._keyring.home, self._keyring.key
+        home, key = self._context.keyring.home, self._context.keyring.key
         assert home is not None
         assert key is not None
         first = self._pending[0]
@@ -235,7 +234,7 @@ class PairingService:
             self._pending.popleft()
             self._refuse_without_code(first, now_ns)
             return
-        self._trying = self._keyring.files.submit(
+        self._trying = self._context.keyring.files.submit(
             partial(_run_attempt, home, key, first), partial(self._on_attempt_done, first)
         )
         if self._trying:
@@ -245,12 +244,12 @@ class PairingService:
         """Keep an attempt pending, or end it because of what happened since it came."""
         if now_ns - one.since_ns > PATIENCE_NS:
             self._refuse_busy(one.route)
-        elif compute_fingerprint(decode_key(one.key)) in self._keyring.pending_revocations:
+        elif compute_fingerprint(decode_key(one.key)) in self._context.keyring.pending_revocations:
             self._refuse(one.route, REVOKED, "ask for another join code")
         elif self._has_exhausted_attempts(one.source, now_ns):
             self._refuse(one.route, TOO_MANY_WRONG, "wait ten minutes")
         elif (earlier := self._find_earlier_answer(one)) is not None:
-            self._outbox.send_to_route(one.route, earlier)  # another process of this user has paired meanwhile
+            self._context.outbox.send_to_route(one.route, earlier)  # another process of this user has paired meanwhile
         else:
             self._pending.append(one)
 
@@ -265,38 +264,35 @@ class PairingService:
             advice = "see the terminal of the session"
             self._refuse(pending.route, "the session cannot change its list of keys", advice)
 
-    def close(self) -> None:
-        """Do nothing: nothing was opened."""
-
     def _answer(self, pending: _PendingAttempt, attempt: RedeemResult, now_ns: int) -> None:
         mark = compute_fingerprint(decode_key(pending.key))
         entry = attempt.entry
         if entry is not None:
             self._wrong.pop(pending.source.name, None)
-            revoked = mark in self._keyring.pending_revocations  # since it asked: the later word counts
-            if revoked or not self._keyring.confirm_pairing(mark):
+            revoked = mark in self._context.keyring.pending_revocations  # since it asked: the later word counts
+            if revoked or not self._context.keyring.confirm_pairing(mark):
                 self._refuse(pending.route, REVOKED, "ask for another join code")
                 return
             roles = ", ".join(entry.roles) or "any role"
-            self._audit.record(
+            self._context.audit.record(
                 AuditKind.PAIRED, now_ns, subject=mark, name=entry.name, address=pending.source.address, detail=roles
             )
-            self._outbox.send_to_route(pending.route, Paired(attempt.answer, entry.roles))
+            self._context.outbox.send_to_route(pending.route, Paired(attempt.answer, entry.roles))
             return
         self._count_wrong(pending.source, now_ns)
         kind = AuditKind.CODE_EXHAUSTED if attempt.exhausted else AuditKind.CODE_REFUSED
-        self._audit.record(kind, now_ns, subject=mark, name=pending.pair.name, address=pending.source.address)
+        self._context.audit.record(kind, now_ns, subject=mark, name=pending.pair.name, address=pending.source.address)
         advice = "run `iris-session pair` again" if not attempt.open_codes else "check the code"
         self._refuse(pending.route, "this join code is wrong, used or expired", advice)
 
     def _refuse_busy(self, route: Route) -> None:
         """Refuse without an attempt: the client may try again, and no attempt of the code is used."""
-        self._drops.count("pair_busy")
-        self._outbox.send_to_route(route, Refused(RefusalCode.RATE, BUSY, "try again"))
+        self._context.drops.count("pair_busy")
+        self._context.outbox.send_to_route(route, Refused(RefusalCode.RATE, BUSY, "try again"))
 
     def _refuse(self, route: Route, message: str, advice: str) -> None:
-        self._drops.count("pair_refused")
-        self._outbox.send_to_route(route, Refused(RefusalCode.CODE, message, advice))
+        self._context.drops.count("pair_refused")
+        self._context.outbox.send_to_route(route, Refused(RefusalCode.CODE, message, advice))
 
     def _allow_source(self, source: _Source, now_ns: int) -> bool:
         """Return whether an address or gateway is within its rate limit, and use a token."""

@@ -48,13 +48,7 @@ class RevocationService:
     def __init__(
         self, context: FrontContext, disconnects: DisconnectHandler, open_state: Callable[[], zmq.Socket[bytes]]
     ) -> None:
-        self._keyring = context.keyring
-        self._connections = context.connections
-        self._outbox = context.outbox
-        self._tokens = context.tokens
-        self._audit = context.audit
-        self._publisher = context.publisher
-        self._coalescer = context.coalescer
+        self._context = context
         self._disconnects = disconnects
         self._open_state = open_state
         self._closing: list[tuple[int, FrontConnection]] = []
@@ -62,18 +56,18 @@ class RevocationService:
         self._reported_error = ""  # of the allow-list, logged last
         self._state_due_ns = 0  # while the state socket is closed: when its port should have been free
         self._next_check_ns = self._next_seen_ns = 0
-        for mark in self._tokens.revoked_keys:  # the front before ended before it wrote that into the list
-            if self._keyring.find_entry(mark) is not None:
-                self._keyring.pending_revocations[mark] = None
+        for mark in self._context.tokens.revoked_keys:  # the front before ended before it wrote that into the list
+            if self._context.keyring.find_entry(mark) is not None:
+                self._context.keyring.pending_revocations[mark] = None
 
     def revoke(self, key_id: str, now_ns: int) -> None:
         """Revoke a key on request of a director: disconnect it, and take it off the list."""
-        self._keyring.pending_revocations[key_id] = None
+        self._context.keyring.pending_revocations[key_id] = None
         self._disconnect_key(key_id, now_ns, "a director revoked this key")
 
     def disconnect(self, connection: FrontConnection, text: str, now_ns: int, reason: str = "revoked") -> None:
         """Send a fault to a participant that was removed, and close its TCP connection a moment later."""
-        self._outbox.send(connection, ProtocolFault(FaultCode.REVOKED, text, reason))
+        self._context.outbox.send(connection, ProtocolFault(FaultCode.REVOKED, text, reason))
         if not connection.gateway:  # else it is one of many on the TCP connection of its gateway
             self._closing.append((now_ns + FAREWELL_NS, connection))
 
@@ -85,22 +79,22 @@ class RevocationService:
         if now_ns >= self._next_check_ns:
             self._next_check_ns = now_ns + CHECK_PERIOD_NS
             self._write_allow_list(now_ns)
-            self._keyring.reload_if_changed()
-        if self._keyring.removed:
-            gone_keys, self._keyring.removed = self._keyring.removed, {}
+            self._context.keyring.reload_if_changed()
+        if self._context.keyring.removed:
+            gone_keys, self._context.keyring.removed = self._context.keyring.removed, {}
             for mark, old in gone_keys.items():
-                now = self._keyring.find_entry(mark)
+                now = self._context.keyring.find_entry(mark)
                 if now is not None and now.kind != old.kind:
                     now = None  # as that kind of key it is not listed any more
-                if now is None and self._tokens.is_revoked(mark):
+                if now is None and self._context.tokens.is_revoked(mark):
                     continue  # a director revoked it: all is done
                 if now is None:
-                    self._audit.record(AuditKind.KEY_REVOKED, now_ns, subject=mark, name=old.name)
+                    self._context.audit.record(AuditKind.KEY_REVOKED, now_ns, subject=mark, name=old.name)
                     self._disconnect_key(mark, now_ns, REVOKED)
                 else:
                     self._apply_roles(mark, now.roles, now_ns)
-        while self._keyring.added:
-            self._tokens.reinstate_key(self._keyring.added.popitem()[0])
+        while self._context.keyring.added:
+            self._context.tokens.reinstate_key(self._context.keyring.added.popitem()[0])
         if self._state_due_ns:
             self._reopen_state(now_ns)
 
@@ -111,22 +105,22 @@ class RevocationService:
 
     def _disconnect_key(self, key_id: str, now_ns: int, text: str) -> None:
         for connection in self._list_connections(key_id):
-            for one in self._connections.list_behind(connection):
+            for one in self._context.connections.list_behind(connection):
                 self.disconnect(one, GATEWAY_REVOKED, now_ns)
             self.disconnect(connection, text, now_ns)
             self._disconnects.report_lost(connection, "revoked")  # and those behind it
-        for participant in self._tokens.revoke_key(key_id):
+        for participant in self._context.tokens.revoke_key(key_id):
             self._remove_participant(participant, "key revoked", now_ns)
-        if key_id in self._keyring.state_subscribers and not self._state_due_ns:
-            self._publisher.replace_socket(None)
-            self._keyring.state_subscribers.clear()
+        if key_id in self._context.keyring.state_subscribers and not self._state_due_ns:
+            self._context.publisher.replace_socket(None)
+            self._context.keyring.state_subscribers.clear()
             self._state_due_ns = now_ns + PORT_FREE_NS
 
     def _apply_roles(self, key_id: str, roles: tuple[str, ...], now_ns: int) -> None:
         """Apply the present roles of a key: connections in a role that it lost, its own or behind it, are removed, and
         refused when they join again."""
         for connection in self._list_connections(key_id):
-            behind = self._connections.list_behind(connection)
+            behind = self._context.connections.list_behind(connection)
             if roles and connection.role not in roles:
                 lost = [*behind, connection]
             else:
@@ -138,9 +132,9 @@ class RevocationService:
     def check_role(self, connection: FrontConnection, now_ns: int) -> None:
         """Remove a connection if its key may not have its role (any more): the authority knows the roles of a key as
         they were when it joined."""
-        gateway = self._connections.by_number.get(connection.gateway)
+        gateway = self._context.connections.by_number.get(connection.gateway)
         behind = gateway.key_id if gateway is not None else ""
-        roles = self._keyring.find_roles(connection.key_id, behind, web=connection.web)
+        roles = self._context.keyring.find_roles(connection.key_id, behind, web=connection.web)
         if roles is not None and (roles or connection.web) and connection.role not in roles:
             self._disconnect_role(connection, now_ns)
 
@@ -149,23 +143,23 @@ class RevocationService:
         if connection.gateway:
             whose = "its key" if connection.web else "its gateway"
             text = f"the session closed this connection: {whose} may not be {role} any more"
-            self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, "role"))
+            self._context.outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, "role"))
         self._disconnects.report_lost(connection, "role")
         if not connection.gateway:
             close_tcp(connection.peer.descriptor, connection.address)
         if participant:
-            self._tokens.remove_participant(participant)
+            self._context.tokens.remove_participant(participant)
             self._remove_participant(participant, ROLE_TAKEN, now_ns)
 
     def _list_connections(self, key_id: str) -> list[FrontConnection]:
-        return [c for c in self._connections.by_number.values() if c.key_id == key_id]
+        return [c for c in self._context.connections.by_number.values() if c.key_id == key_id]
 
     def _remove_participant(self, participant: str, reason: str, now_ns: int) -> None:
-        self._coalescer.offer(Entry(HOST, HOST, now_ns, RemoveParticipant(0, participant, reason=reason)))
+        self._context.coalescer.offer(Entry(HOST, HOST, now_ns, RemoveParticipant(0, participant, reason=reason)))
 
     def _reopen_state(self, now_ns: int) -> None:
         try:
-            self._publisher.replace_socket(self._open_state())
+            self._context.publisher.replace_socket(self._open_state())
         except FrontError as error:
             if now_ns >= self._state_due_ns:
                 self._state_due_ns = now_ns + PORT_FREE_NS
@@ -175,7 +169,7 @@ class RevocationService:
 
     def _write_allow_list(self, now_ns: int) -> None:
         """Write changes to the list. They are in force already, so nothing waits for the file."""
-        keyring = self._keyring
+        keyring = self._context.keyring
         if keyring.home is None:
             keyring.pending_revocations.clear()
             return
@@ -191,7 +185,7 @@ class RevocationService:
 
     def _on_written(self, marks: tuple[str, ...], seen: dict[str, str], outcome: KeysError | None, now_ns: int) -> None:
         self._writing = False
-        keyring = self._keyring
+        keyring = self._context.keyring
         if outcome is None:
             for mark in marks:
                 keyring.pending_revocations.pop(mark, None)

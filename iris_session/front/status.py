@@ -56,13 +56,7 @@ class StatusService:
     def __init__(
         self, context: FrontContext, media: MediaService, assets: AssetService, alignment: AlignmentService
     ) -> None:
-        self._config = context.config
-        self._connections = context.connections
-        self._outbox = context.outbox
-        self._drops = context.drops
-        self._authority = context.authority
-        self._publisher = context.publisher
-        self._guard = context.guard
+        self._context = context
         self._media = media
         self._assets = assets
         self._alignment = alignment
@@ -86,7 +80,7 @@ class StatusService:
         if all(map(math.isfinite, numbers)):
             connection.report, connection.reported_ns = report, now_ns
         else:
-            self._drops.count("report_not_finite", connection.number)
+            self._context.drops.count("report_not_finite", connection.number)
 
     def record_disconnect(self, connection: FrontConnection, reason: str) -> None:
         """Record why a connection was disconnected: its participant may stay in the roster for a while."""
@@ -94,7 +88,7 @@ class StatusService:
         if connection.participant_id:
             self._disconnected.pop(connection.participant_id, None)
             self._disconnected[connection.participant_id] = reason
-            while len(self._disconnected) > self._config.limits.connections:
+            while len(self._disconnected) > self._context.config.limits.connections:
                 del self._disconnected[next(iter(self._disconnected))]
 
     def send_report(self, connection: FrontConnection, question: GetStatus, now_ns: int) -> None:
@@ -102,7 +96,7 @@ class StatusService:
         if self._made is None or now_ns - self._made_ns > REUSE_NS:
             self._made, self._made_ns = self._make_report(now_ns), now_ns
         report = msgspec.structs.replace(self._made, request_id=question.request_id, session_time=now_ns)
-        self._outbox.send(connection, report)
+        self._context.outbox.send(connection, report)
 
     def tick(self, now_ns: int) -> None:
         """Update the rates once a second."""
@@ -110,19 +104,16 @@ class StatusService:
         if elapsed_ns < ROLL_NS:
             return
         self._rolled_ns = now_ns
-        entries = self._authority.entries
+        entries = self._context.authority.entries
         self._entries_per_s = (entries - self._entries) / elapsed_ns * 1e9
         self._entries = entries
-        for number in [n for n in self._stats if n not in self._connections.by_number]:
+        for number in [n for n in self._stats if n not in self._context.connections.by_number]:
             del self._stats[number]
         for stats in self._stats.values():
             stats.samples_per_s = stats.samples / elapsed_ns * 1e9
             stats.samples = 0
             if not stats.samples_per_s:
                 stats.delays_ns.clear()  # measured too long ago
-
-    def close(self) -> None:
-        """Do nothing: nothing was opened."""
 
     def _find_stats(self, connection: int) -> _ConnectionStats:
         stats = self._stats.get(connection)
@@ -131,12 +122,12 @@ class StatusService:
         return stats
 
     def _make_report(self, now_ns: int) -> StatusReport:
-        authority, config = self._authority, self._config
+        authority, config = self._context.authority, self._context.config
         half = _decode_report(authority.report) if authority.report else StatusReport(0, "", "", 0)
-        drops, delays = dict(half.drops), self._publisher.read_recent_delays_ns()
-        for reason, count in self._drops.by_reason.items():
+        drops, delays = dict(half.drops), self._context.publisher.read_recent_delays_ns()
+        for reason, count in self._context.drops.by_reason.items():
             drops[reason] = drops.get(reason, 0) + count
-        by_participant = {c.participant_id: c for c in self._connections.by_number.values() if c.participant_id}
+        by_participant = {c.participant_id: c for c in self._context.connections.by_number.values() if c.participant_id}
         return msgspec.structs.replace(
             half,
             session_id=config.session_id,
@@ -145,8 +136,8 @@ class StatusService:
             step_to_publish=compute_quantiles(delays) if len(delays) >= MIN_DELAYS else None,
             participants=tuple(self._merge_row(row, by_participant.get(row.id), now_ns) for row in half.participants),
             drops=drops,
-            warnings=(*half.warnings, *self._guard.list_warnings(now_ns), *self._media.list_warnings(now_ns)),
-            connections=len(self._connections),
+            warnings=(*half.warnings, *self._context.guard.list_warnings(now_ns), *self._media.list_warnings()),
+            connections=len(self._context.connections),
             entries_per_s=self._entries_per_s,
             authority_silent_ns=now_ns - authority.heard_ns if authority.heard_ns else -1,
             media=self._media.report_streams(),
@@ -168,7 +159,7 @@ class StatusService:
             heard_ns=now_ns - connection.last_heard_ns,
             samples_per_s=stats.samples_per_s,
             capture_to_receive=compute_quantiles(stats.delays_ns),
-            drops=self._drops.by_connection.get(connection.number, 0),
+            drops=self._context.drops.by_connection.get(connection.number, 0),
             reported=report is not None,
             alignment_report=self._alignment.complete_report(connection.number, row.alignment_report, now_ns),
             **measured,

@@ -18,14 +18,9 @@ class Uplink:
     """Send pending entries over the link."""
 
     def __init__(self, context: FrontContext, socket: zmq.Socket[bytes]) -> None:
+        self._context = context
         self._socket = socket
-        self._authority = context.authority
         self._max_unacknowledged = context.config.limits.unacknowledged
-        self._coalescer = context.coalescer
-        self._tokens = context.tokens
-        self._connections = context.connections
-        self._drops = context.drops
-        self._publisher = context.publisher
         self._batches = 0
         self._reported = (-1, -1, -1)
         self._next_beat_ns = self._next_status_ns = 0
@@ -33,19 +28,19 @@ class Uplink:
     def flush(self) -> None:
         """Send pending entries as far as credit goes. Urgent entries have credits of their own."""
         limit = self._max_unacknowledged
-        used = self._batches - self._authority.acknowledged
+        used = self._batches - self._context.authority.acknowledged
         batch: list[Entry] = []
         if used < limit:
-            batch = self._coalescer.take_batch() if self._coalescer else []
-        elif self._coalescer.urgent and used < 2 * limit:
-            batch = self._coalescer.take_batch(urgent_only=True)
-        if self._tokens.changed and (batch or self._is_authority_listening):
-            state = link.TokenState(self._authority.step, self._tokens.encode())
+            batch = self._context.coalescer.take_batch() if self._context.coalescer else []
+        elif self._context.coalescer.urgent and used < 2 * limit:
+            batch = self._context.coalescer.take_batch(urgent_only=True)
+        if self._context.tokens.changed and (batch or self._is_authority_listening):
+            state = link.TokenState(self._context.authority.step, self._context.tokens.encode())
             self._socket.send_multipart((link.HANDBACK, link.encoder.encode(state)), zmq.DONTWAIT)
         if batch:
             self._socket.send_multipart((link.ENTRIES, encode_entries(batch)), zmq.DONTWAIT)
             self._batches += 1
-            self._authority.entries += len(batch)
+            self._context.authority.entries += len(batch)
 
     def tick(self, now_ns: int) -> None:
         """Send the front's heartbeat and its counters when they are due."""
@@ -59,21 +54,21 @@ class Uplink:
     @property
     def _is_authority_listening(self) -> bool:
         """True if the authority reads the link, as far as the front knows."""
-        return self._authority.heard_ns > 0 and not self._authority.stalled
+        return self._context.authority.heard_ns > 0 and not self._context.authority.stalled
 
     def _report(self) -> None:
         """Send the counters if they have changed and the authority is not stalled."""
-        drops, authority = self._drops, self._authority
-        now = (drops.version, len(self._connections), authority.entries)
+        drops, authority = self._context.drops, self._context.authority
+        now = (drops.version, len(self._context.connections), authority.entries)
         if now == self._reported or authority.stalled:
             return
         self._reported = now
         status = link.FrontStatus(
-            len(self._connections),
+            len(self._context.connections),
             drops.by_reason,
             drops.by_connection,
             authority.stalls,
-            self._publisher.frames,
+            self._context.publisher.frames,
             authority.entries,
         )
         self._socket.send_multipart((link.STATUS, link.encoder.encode(status)), zmq.DONTWAIT)

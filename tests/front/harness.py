@@ -25,6 +25,7 @@ from iris_session.front.loop import Front
 from iris_session.link import FrontConfig, Ports, SceneInfo
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND, FrontStart
+from iris_session.link.front_link import FrontLink
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import ClientMessage, GetSnapshot, Hello, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
@@ -173,14 +174,58 @@ class _Sockets:
     def close(self) -> None: ...
 
 
-class RawClient:
-    """A connection to the control socket without any logic; also in place of its socket (`send`, `send_multipart`)."""
+class ClientBase:
+    """A client without any logic: keeps what it is sent."""
 
-    def __init__(self, session: FrontSession, routing_id: bytes = b"", curve: Curve | None = None) -> None:
+    def __init__(self, session: SessionBase) -> None:
         self.session = session
         self.secret = os.urandom(16)
         self.inbox: list[tuple[Message, list[bytes]]] = []
         self.welcome: Welcome | None = None
+
+    @property
+    def epoch(self) -> int:
+        return self.welcome.connection_epoch if self.welcome else 0
+
+    def send(self, message: ClientMessage | bytes, on_behalf_of: str = "", epoch: int | None = None) -> None:
+        if not isinstance(message, bytes):
+            message = encode_client(wrap_message(message, self.epoch if epoch is None else epoch, on_behalf_of))
+        self.send_multipart([message])
+
+    def send_multipart(self, frames: list[bytes]) -> None:
+        raise NotImplementedError
+
+    def deliver(self, frames: list[bytes]) -> None:
+        message = decode_server(frames[0]).message
+        self.inbox.append((message, frames[1:]))
+        if isinstance(message, Welcome):
+            self.welcome = message
+
+    def got(self, kind: type[T]) -> list[T]:
+        return [message for message, _ in self.inbox if isinstance(message, kind)]
+
+    def wait_for(self, kind: type[T], n: int = 1) -> T:
+        """Wait for the `n`-th message of a kind, without those about stalls, which a busy machine makes at any time."""
+
+        def came() -> list[T]:
+            return [one for one in self.got(kind) if getattr(one, "code", "") not in STALLS]
+
+        self.session.pump(lambda: len(came()) >= n, f"{n} {kind.__name__}")
+        return came()[n - 1]
+
+    def join(self, role: str = "operator", name: str = "Ann", **hello: object) -> Welcome:
+        before = len(self.got(Welcome))
+        self.send(Hello(role, name, secret=self.secret, **hello))  # type: ignore[arg-type]
+        return self.wait_for(Welcome, before + 1)
+
+
+class RawClient(ClientBase):
+    """A connection to the control socket; also in place of its socket (`send`, `send_multipart`)."""
+
+    session: FrontSession
+
+    def __init__(self, session: FrontSession, routing_id: bytes = b"", curve: Curve | None = None) -> None:
+        super().__init__(session)
         self.socket = self
         self.user = ""
         self.reads = True
@@ -211,17 +256,8 @@ class RawClient:
             self.send_multipart(frames)
 
     @property
-    def epoch(self) -> int:
-        return self.welcome.connection_epoch if self.welcome else 0
-
-    @property
     def is_connected(self) -> bool:
         return self.is_open and self.descriptor in self.session.network.connections
-
-    def send(self, message: ClientMessage | bytes, on_behalf_of: str = "", epoch: int | None = None) -> None:
-        if not isinstance(message, bytes):
-            message = encode_client(wrap_message(message, self.epoch if epoch is None else epoch, on_behalf_of))
-        self.send_multipart([message])
 
     def send_multipart(self, frames: list[bytes]) -> None:
         if not self.is_admitted:
@@ -232,27 +268,7 @@ class RawClient:
     def deliver(self, frames: list[bytes]) -> None:
         if not self.reads:
             raise zmq.ZMQError(zmq.EAGAIN)
-        message = decode_server(frames[0]).message
-        self.inbox.append((message, frames[1:]))
-        if isinstance(message, Welcome):
-            self.welcome = message
-
-    def got(self, kind: type[T]) -> list[T]:
-        return [message for message, _ in self.inbox if isinstance(message, kind)]
-
-    def wait_for(self, kind: type[T], n: int = 1) -> T:
-        """Wait for the `n`-th message of a kind, without those about stalls."""
-
-        def came() -> list[T]:
-            return [one for one in self.got(kind) if getattr(one, "code", "") not in STALLS]
-
-        self.session.pump(lambda: len(came()) >= n, f"{n} {kind.__name__}")
-        return came()[n - 1]
-
-    def join(self, role: str = "operator", name: str = "Ann", **hello: object) -> Welcome:
-        before = len(self.got(Welcome))
-        self.send(Hello(role, name, secret=self.secret, **hello))  # type: ignore[arg-type]
-        return self.wait_for(Welcome, before + 1)
+        super().deliver(frames)
 
     def close(self, linger: int = 0) -> None:
         self.is_open = False
@@ -290,26 +306,90 @@ class Subscriber:
         return self.frames.popleft()
 
 
-class FrontSession:
-    """A front, and an authority that admits every client and answers snapshots. `entries`: all it received."""
+class SessionBase:
+    """An authority that admits every client and answers snapshots. `entries`: all it received."""
+
+    link: FrontLink
+
+    def __init__(self, **config: object) -> None:
+        settings: dict[str, object] = {"session_name": "test", "silence_ns": LONG_NS, "stall_ns": LONG_NS}
+        self.config = FrontConfig(**{**settings, **config})  # type: ignore[arg-type]
+        self.entries: list[Entry] = []
+        self.step = self.event_seq = 0
+        self.admits = True
+
+    def once(self, decision: Decision | None = None) -> None:
+        """Take one step of the authority."""
+        entries = self.link.poll()
+        self.entries += entries
+        self.step += 1
+        self.link.send_decision(self.step, decision or self._answer(entries))
+        self.run_front()
+
+    def run_front(self) -> None:
+        """Let the front work, and time pass."""
+
+    def _answer(self, entries: list[Entry]) -> Decision:
+        admitted, outgoing = [], []
+        for entry in entries:
+            message = entry.message
+            if isinstance(message, Join) and self.admits:
+                participant = message.resume_of or f"p{entry.connection}"
+                admitted.append(Admitted(entry.connection, participant, message.role, bool(message.resume_of)))
+            elif isinstance(message, GetSnapshot):
+                outgoing.append(OutgoingMessage(entry.connection, self.snapshot(message.request_id)))
+        return Decision((), admitted=tuple(admitted), outgoing=tuple(outgoing))
+
+    def snapshot(self, request_id: int) -> Snapshot:
+        return Snapshot(request_id, self.event_seq, 1, 0, "", 0, 0.0, self.link.now_ns, (), ())
+
+    def notice(self, text: str = "hello") -> Event:
+        self.event_seq += 1
+        return Event(self.event_seq, self.step, 0, Notice("info", text))
+
+    def pump(self, until: Callable[[], object], what: str = "condition", timeout_s: float = 20.0) -> None:
+        """Take steps until the condition holds."""
+        raise NotImplementedError
+
+    def describe(self, clients: Sequence[ClientBase]) -> str:
+        """Return counters of the front, and the newest messages of authority and clients, for a failure."""
+        newest = [[message for message, _ in client.inbox[-5:]] for client in clients]
+        return f"{self.link.status.drops}, authority {self.entries[-5:]}, clients {newest}"
+
+    def wait_entries(self, kind: type, n: int = 1, connection: int | None = None) -> list[Entry]:
+        """Wait for at least `n` entries of a kind. Return all of them."""
+
+        def found() -> list[Entry]:
+            return [e for e in self.entries if isinstance(e.message, kind) and connection in (None, e.connection)]
+
+        self.pump(lambda: len(found()) >= n, f"{n} entries {kind.__name__}")
+        return found()
+
+    def send_state(self, poses: np.ndarray, epoch: int = 1) -> None:
+        self.link.send_state(StateHeader(epoch, 0, self.step, 0.0, self.link.now_ns, 0, 0, 0), poses)
+
+    def wait_drops(self, reason: str, least: int = 1) -> int:
+        """Wait for a status with at least so many drops: those that happened come in the next ones."""
+        self.pump(lambda: self.link.status.drops.get(reason, 0) >= least, f"{least} drops for {reason}")
+        return self.link.status.drops[reason]
+
+
+class FrontSession(SessionBase):
+    """A front in this process, and its authority."""
 
     host = "127.0.0.1"
 
     def __init__(self, *, bodies: int = N_BODIES, **config: object) -> None:
-        settings: dict[str, object] = {"session_name": "test", "silence_ns": LONG_NS, "stall_ns": LONG_NS}
+        super().__init__(**config)
         self.now_ns = 10_000 * MILLISECOND
-        self.config = FrontConfig(**{**settings, **config})  # type: ignore[arg-type]
         self.network = Network(Simulation(0))
         self.routes: dict[bytes, RawClient] = {}
         self.authenticator: _Authenticator | None = None
         self.router: _Router
         self.monitor: Monitor
         self.publisher: _Publisher
-        self.entries: list[Entry] = []
         self.clients: list[RawClient] = []
         self.subscribers: list[Subscriber] = []
-        self.step = self.event_seq = 0
-        self.admits = True
         self._scene = scene(bodies)
         self._patch = pytest.MonkeyPatch()
         install_front(self.network, self._patch)
@@ -319,7 +399,7 @@ class FrontSession:
         self._patch.setattr(keyring, "FileWorker", InlineFileWorker)
         self._patch.setattr(pairing, "ITERATIONS", 1)
         self._patch.setattr(front_loop, "SessionRegistration", lambda *_: SimpleNamespace(tick=id, close=int))
-        self.link = RigLink(self.config, lambda: self.now_ns)
+        self.link: RigLink = RigLink(self.config, lambda: self.now_ns)
         self.process = SimpleNamespace(link=self.link, restart=self.restart)
         self.restarts = 0
         self.restart()
@@ -360,18 +440,7 @@ class FrontSession:
         self.subscribers.append(Subscriber(self, curve))
         return self.subscribers[-1]
 
-    # --- the authority ----------------------------------------------------------------------------------------------
-
-    def once(self, decision: Decision | None = None) -> None:
-        """Take one step of the authority."""
-        entries = self.link.poll()
-        self.entries += entries
-        self.step += 1
-        self.link.send_decision(self.step, decision or self._answer(entries))
-        self.run_front()
-
     def run_front(self) -> None:
-        """Let the front work, and time pass."""
         while self.front._run_once():
             pass
         self.now_ns += STEP_NS
@@ -381,50 +450,12 @@ class FrontSession:
         for one in (*self.clients, *self.subscribers):
             one.admit()
 
-    def _answer(self, entries: list[Entry]) -> Decision:
-        admitted, outgoing = [], []
-        for entry in entries:
-            message = entry.message
-            if isinstance(message, Join) and self.admits:
-                participant = message.resume_of or f"p{entry.connection}"
-                admitted.append(Admitted(entry.connection, participant, message.role, bool(message.resume_of)))
-            elif isinstance(message, GetSnapshot):
-                outgoing.append(OutgoingMessage(entry.connection, self.snapshot(message.request_id)))
-        return Decision((), admitted=tuple(admitted), outgoing=tuple(outgoing))
-
-    def snapshot(self, request_id: int) -> Snapshot:
-        return Snapshot(request_id, self.event_seq, 1, 0, "", 0, 0.0, self.link.now_ns, (), ())
-
-    def notice(self, text: str = "hello") -> Event:
-        self.event_seq += 1
-        return Event(self.event_seq, self.step, 0, Notice("info", text))
-
     def pump(self, until: Callable[[], object], what: str = "condition", timeout_s: float = 20.0) -> None:
-        """Take steps until the condition holds."""
         for _ in range(int(timeout_s * 1000 * MILLISECOND / STEP_NS)):
             if until():
                 return
             self.once()
-        newest = [[message for message, _ in client.inbox[-5:]] for client in self.clients]
-        drops = self.link.status.drops
-        raise AssertionError(f"no {what} in {timeout_s} s; {drops}, authority {self.entries[-5:]}, clients {newest}")
-
-    def wait_entries(self, kind: type, n: int = 1, connection: int | None = None) -> list[Entry]:
-        """Wait for at least `n` entries of a kind. Return all of them."""
-
-        def found() -> list[Entry]:
-            return [e for e in self.entries if isinstance(e.message, kind) and connection in (None, e.connection)]
-
-        self.pump(lambda: len(found()) >= n, f"{n} entries {kind.__name__}")
-        return found()
-
-    def send_state(self, poses: np.ndarray, epoch: int = 1) -> None:
-        self.link.send_state(StateHeader(epoch, 0, self.step, 0.0, self.link.now_ns, 0, 0, 0), poses)
-
-    def wait_drops(self, reason: str, least: int = 1) -> int:
-        """Wait for a status with at least so many drops: those that happened come in the next ones."""
-        self.pump(lambda: self.link.status.drops.get(reason, 0) >= least, f"{least} drops for {reason}")
-        return self.link.status.drops[reason]
+        raise AssertionError(f"no {what} in {timeout_s} s; {self.describe(self.clients)}")
 
     def close(self) -> None:
         self.front.close()

@@ -104,7 +104,7 @@ def test_unavailable_assets_are_refused_with_reason_and_advice(shop: Shop, tmp_p
     assert unknown.answer(unknown.ask(there)) == AssetRefusal.NOT_ALLOWED
     assert all(refused.advice for refused in (*ann.refusals.values(), *unknown.refusals.values()))
     assert ann.answer(ann.ask(shop.addresses[1])) == shop.data[1]
-    reasons = shop.server.read_counters().reasons
+    reasons = shop.server.drops.by_reason
     assert reasons["assets_malformed"] == reasons["assets_version"] == 1
 
 
@@ -204,7 +204,7 @@ def test_fault_of_the_thread_loses_pending_work_and_is_logged_once(
         broken.setattr(ServedAssets, "chunk", fail)
         assert [_fetched(sockets, address) for _ in range(2)] == [None, None]
     assert _fetched(sockets, address) == b"asset"
-    assert server.read_counters().reasons["assets_fault"] == 2
+    assert server.drops.by_reason["assets_fault"] == 2
     assert caplog.text.count("thread of assets, which continues: ZeroDivisionError") == 1
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zmq
 
-from iris_session.front.asset_server import AssetAccess, AssetCounters
+from iris_session.front.asset_server import AssetAccess
 from iris_session.front.asset_service import (
     LATE_NS,
     LATE_TICK_NS,
@@ -17,6 +17,7 @@ from iris_session.front.connections import FrontConnection, Peer, Route
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link.config import SceneInfo
 from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.limits import Drops
 from iris_session.security import AllowedKey, KeyPair
 from iris_session.security.keyring import Keyring
 from tests.front.fakes import make_context
@@ -29,15 +30,13 @@ class FakeServer:
 
     def __init__(self) -> None:
         self.table = AssetAccess()
-        self.late_until_ns = 0
+        self.late_until_ns = self.sent_bytes = self.requests = self.pending_readers = 0
+        self.drops = Drops()
 
     def start(self) -> None: ...
 
     def set_access(self, access: AssetAccess) -> None:
         self.table = access
-
-    def read_counters(self) -> AssetCounters:
-        return AssetCounters(0, 0, 0, 0, {})
 
     @property
     def served(self) -> set[str]:

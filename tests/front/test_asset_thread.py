@@ -34,12 +34,17 @@ class Still:
 
     def take(self, n: int) -> None:
         """Send so many requests, and poll until all are processed."""
-        wanted = self.server.read_counters().requests + n
+        wanted = self.server.requests + n
         for _ in range(n):
             self.dealer.send(encode_asset_request(AssetRequest(1, 1, 1, self.address, 0, 100)))
-        while self.server.read_counters().requests < wanted and self.sockets.socket.poll(30_000):
+        while self.server.requests < wanted and self.sockets.socket.poll(30_000):
             self.server._receive_requests()
-        assert self.server.read_counters().requests == wanted
+        assert self.server.requests == wanted
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks that were sent."""
+        return self.server.sent_bytes // len(b"asset")
 
 
 @pytest.fixture
@@ -50,28 +55,25 @@ def still(tmp_path: Path) -> Iterator[Still]:
     still.server.close()
 
 
-def test_refusal_without_a_connection_is_counted(still: Still) -> None:
+def test_requests_of_closed_connections_are_removed_and_their_refusals_counted(still: Still) -> None:
     still.server._queue_refusal(b"gone", 7, "", AssetRefusal.NOT_ALLOWED)
-    assert still.server.read_counters().reasons == {"assets_not_allowed": 1, "assets_refusal_unsent": 1}
-
-
-def test_requests_of_closed_connections_are_removed(still: Still) -> None:
+    assert still.server.drops.by_reason == {"assets_not_allowed": 1, "assets_refusal_unsent": 1}
     still.take(1)
     assert still.server._scheduler.request(b"gone", 99, "", AssetRequest(1, 1, 7, still.address, 0, 100), 1) == ""
-    assert still.server.read_counters().pending_readers == 2
+    assert still.server.pending_readers == 2
     still.server._send_chunks()
-    assert (still.server.read_counters().chunks, still.server.read_counters().pending_readers) == (1, 0)
+    assert (still.chunks, still.server.pending_readers) == (1, 0)
 
 
 def test_late_loop_sends_one_chunk_per_interval(still: Still) -> None:
     still.take(4)
-    assert still.server.read_counters().reasons == {}, "whoever asks after a table was published is answered by it"
+    assert still.server.drops.by_reason == {}, "whoever asks after a table was published is answered by it"
     still.server.late_until_ns = 2
     still.server._send_chunks()
-    assert (still.server.read_counters().chunks, still.server._poll_timeout_ms()) == (1, YIELD_MS)
+    assert (still.chunks, still.server._poll_timeout_ms()) == (1, YIELD_MS)
     still.server.late_until_ns = 0
     still.server._send_chunks()
-    assert (still.server.read_counters().chunks, still.server._poll_timeout_ms()) == (1 + CHUNKS, 0)
+    assert (still.chunks, still.server._poll_timeout_ms()) == (1 + CHUNKS, 0)
 
 
 def test_only_refused_requests_count_as_a_flood(still: Still) -> None:
@@ -79,5 +81,5 @@ def test_only_refused_requests_count_as_a_flood(still: Still) -> None:
         still.now_ns += 10_000_000  # slower than any rate
         still.take(1)
         still.server._send_chunks()
-        assert still.server.read_counters().chunks == n
-    assert still.server.read_counters().reasons == {}
+        assert still.chunks == n
+    assert still.server.drops.by_reason == {}

@@ -12,10 +12,7 @@ import zmq
 from iris_session.front.connections import Peer
 from iris_session.front.key_budgets import (
     FORGET_NS,
-    KEY_BYTES,
-    KEY_MESSAGES,
     HandshakeLimiter,
-    IngestBackoff,
     KeyBudget,
 )
 from iris_session.front.raw_feed import PRESENCE_HZ
@@ -200,7 +197,7 @@ def test_a_snapshot_of_a_scene_of_many_bodies_costs_more_than_that_of_an_empty_o
     counts = []
     for i, n_bodies in enumerate((0, 5000)):
         hog, kept = KeyRig(rig, 8, b"%d" % i * 16, 100 * (i + 1)), Counter[type]()
-        rig.intake._publisher.scene = SceneInfo("", bodies=(BodyInfo(1, "part", True),) * n_bodies)
+        rig.intake._context.publisher.scene = SceneInfo("", bodies=(BodyInfo(1, "part", True),) * n_bodies)
         for c in range(8):
             for _ in range(8):
                 hog.send(c, GetSnapshot(1))
@@ -303,16 +300,13 @@ def test_all_behind_a_gateway_send_together_what_eight_keys_may(kind: str) -> No
     limits = FrontLimits()
     gateway = KeyBudget(limits, is_gateway=True)
     people = [KeyBudget(limits, parent=gateway) for _ in range(12)]
-    n_messages, n_bytes = (limits.key.message_burst, 1) if kind == "messages" else (1, limits.key.byte_burst)
-    taken = [one.take_message(0, n_messages, n_bytes) for one in people]
-    assert taken == [""] * 8 + [KEY_MESSAGES if kind == "messages" else KEY_BYTES] * 4
+    burst = limits.key.message_burst if kind == "messages" else limits.key.byte_burst
+    assert [one.take(0, **{kind: burst}) for one in people] == [""] * 8 + [f"key_{kind}"] * 4
 
 
 def test_handshakes_of_a_key_are_limited_for_each_channel() -> None:
     drops, limits = Drops(), KeyLimits()
-    limiter = HandshakeLimiter(
-        limits, drops, lambda key: key == "gate", lambda key, _now_ns: key == "flooder", IngestBackoff()
-    )
+    limiter = HandshakeLimiter(limits, drops, lambda key: key == "gate", lambda key, _now_ns: key == "flooder")
 
     def count_allowed(domain: bytes, key: str, now_ns: int = 0) -> int:
         return sum(limiter.allow(domain, key, "10.0.0.1", now_ns) for _ in range(1000))
@@ -336,23 +330,26 @@ def test_handshakes_of_a_key_are_limited_for_each_channel() -> None:
 # --- media ingest after a flood ---
 
 
+def make_limiter(drops: Drops) -> HandshakeLimiter:
+    return HandshakeLimiter(KeyLimits(), drops, lambda _key: False, lambda _key, _now_ns: False)
+
+
 def test_a_key_that_floods_media_ingest_is_refused_for_longer_each_time_and_forgiven() -> None:
-    backoff, now_ns, seconds = IngestBackoff(), 10 * SECOND, []
+    limiter, now_ns, seconds = make_limiter(Drops()), 10 * SECOND, []
     for _ in range(8):
-        refused = backoff.refuse("10.0.0.1", "cam", now_ns, now_ns)
-        assert backoff.refuse("10.0.0.1", "cam", now_ns, now_ns + MS) == {}, "the same flood"
+        refused = limiter.refuse_source("10.0.0.1", "cam", now_ns, now_ns)
+        assert limiter.refuse_source("10.0.0.1", "cam", now_ns, now_ns + MS) == {}, "the same flood"
         seconds.append(refused["cam"] // SECOND)
-        assert backoff.is_refused("cam", now_ns + refused["cam"] - 1)
+        assert not limiter.allow(ZAP_INGEST, "cam", "10.0.0.1", now_ns + refused["cam"] - 1)
         now_ns += refused["cam"]
-        assert not backoff.is_refused("cam", now_ns)
+        assert limiter.allow(ZAP_INGEST, "cam", "10.0.0.1", now_ns)
     assert seconds == [1, 2, 4, 8, 16, 32, 60, 60]
-    assert backoff.refuse("10.0.0.1", "cam", now_ns, now_ns + FORGET_NS + 1) == {"cam": SECOND}
+    assert limiter.refuse_source("10.0.0.1", "cam", now_ns, now_ns + FORGET_NS + 1) == {"cam": SECOND}
 
 
 def test_a_flood_without_a_key_is_of_those_that_connected_from_its_address_meanwhile() -> None:
     drops = Drops()
-    backoff = IngestBackoff()
-    limiter = HandshakeLimiter(KeyLimits(), drops, lambda _key: False, lambda _key, _now_ns: False, backoff)
+    limiter = make_limiter(drops)
     for key, address, at_s in (
         ("honest", "10.0.0.1", 1),
         ("other", "10.0.0.2", 9),
@@ -361,7 +358,7 @@ def test_a_flood_without_a_key_is_of_those_that_connected_from_its_address_meanw
     ):
         assert limiter.allow(ZAP_INGEST, key, address, at_s * SECOND)
     now_ns = 14 * SECOND
-    assert backoff.refuse("10.0.0.1", "", 9 * SECOND, now_ns) == {"mallory": SECOND, "mallory2": SECOND}
+    assert limiter.refuse_source("10.0.0.1", "", 9 * SECOND, now_ns) == {"mallory": SECOND, "mallory2": SECOND}
     assert [limiter.allow(ZAP_INGEST, key, "10.0.0.1", now_ns) for key in ("honest", "mallory")] == [True, False]
     assert limiter.allow(ZAP_MEDIA, "mallory", "10.0.0.1", now_ns)
     assert drops.by_reason == {"media_backoff": 1}

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import psutil
 import pytest
 
-from iris_session.front.connection_guard import FloodPolicy
+from iris_session.front.connection_guard import SILENT_BYTES
 from iris_session.front.memory_guard import (
     EVICTION_PAUSE_NS,
     MEMORY_PERIOD_NS,
@@ -54,7 +54,7 @@ def pending(owner: str, n_bytes: int) -> PendingConnection:
 
 
 def test_room_is_made_by_the_newest_strangers_when_no_client_stands_out(rig: ControlSocketRig) -> None:
-    crowd = [rig.open() for _ in range(4 * MIN_EVICT_BYTES // FloodPolicy().silent_bytes // 3)]
+    crowd = [rig.open() for _ in range(4 * MIN_EVICT_BYTES // SILENT_BYTES // 3)]
     rig.hello(crowd[0][0], 1)
     rig.hello(crowd[-1][0], 2)
     newest_first = [theirs for _, theirs in crowd[-2:0:-1]]

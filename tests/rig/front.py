@@ -14,7 +14,6 @@ import pytest
 from iris_session.alignment.worker import InlineWorker
 from iris_session.front import context as front_context
 from iris_session.front import loop as front_loop
-from iris_session.front.asset_server import AssetCounters
 from iris_session.front.context import WatchedSocket
 from iris_session.front.loop import SERVICES_PERIOD_NS, Front
 from iris_session.front.media.scheduler import MediaScheduler
@@ -22,6 +21,7 @@ from iris_session.link import FrontConfig, Ports, SceneInfo
 from iris_session.link import messages as link
 from iris_session.link.config import FrontStart
 from iris_session.link.front_link import FrontLink
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security.keyring import Keyring
@@ -91,7 +91,10 @@ class NoMedia:
 class NoAssets:
     """In place of the server of assets."""
 
-    late_until_ns = 0
+    late_until_ns = sent_bytes = requests = pending_readers = 0
+
+    def __init__(self) -> None:
+        self.drops = Drops()
 
     def start(self) -> None: ...
 
@@ -101,9 +104,6 @@ class NoAssets:
 
     def list_pending(self) -> list[Any]:
         return []
-
-    def read_counters(self) -> AssetCounters:
-        return AssetCounters(0, 0, 0, 0, {})
 
 
 class RigFrontProcess:

@@ -76,16 +76,12 @@ class DeliveryCounters(NamedTuple):
     due: int = 0
     bytes: int = 0
 
-    def combine(self, other: DeliveryCounters) -> DeliveryCounters:
-        return DeliveryCounters(*(a + b for a, b in zip(self, other, strict=True)))
-
 
 class StreamStats(NamedTuple):
     """Measurements of a stream. `rates`: bytes per second by level. `hz`: frames per second. `encoding`:
     of the newest frame, which was received at `received_ns`. `info`: as of its source, with texts cut to length.
     `frame_bytes`: of the newest frame, class `full`; `None` before the first one, and when it had to be released.
-    `refused_ns`: when something of another source was refused last, `None` for never. `sender`: connection number of
-    its source, `LOCAL` for the session itself, 0 where it is not known."""
+    `sender`: connection number of its source, `LOCAL` for the session itself, 0 where it is not known."""
 
     rates: tuple[float, ...]
     hz: float
@@ -95,7 +91,6 @@ class StreamStats(NamedTuple):
     received_ns: int
     info: StreamInfo = StreamInfo()
     frame_bytes: int | None = None
-    refused_ns: int | None = None
     sender: int = 0
 
     def is_stale(self, now_ns: int) -> bool:
@@ -124,20 +119,16 @@ class _Subscription:
         self.pending = False
         self.seq = -1
         self.readers: set[int] = set()  # descriptors
-        self.due = self.delivered = self.dropped = self.bytes = 0
-
-    @property
-    def counters(self) -> DeliveryCounters:
-        return DeliveryCounters(self.delivered, self.due, self.bytes)
+        self.dropped = 0
 
 
 class _Subscriber:
-    """State of a connection that may subscribe."""
+    """State of a connection that may subscribe, and counters of its frames: delivered, due, bytes delivered."""
 
     def __init__(self, settings: MediaSubscriber, now_ns: int) -> None:
         self.settings = settings
         self.streams: set[str] = set()  # that it is subscribed to
-        self.ended = DeliveryCounters()  # of subscriptions that have ended
+        self.delivered = self.due = self.bytes = 0
         self.newest = TokenBucket(NEWEST_PER_S, MAX_STREAMS, now_ns)
 
 
@@ -151,7 +142,6 @@ class _Stream:
         self.source = source
         self.connection = connection
         self.sender = 0
-        self.refused_ns: int | None = None
         self.seq = seq
         self.received_ns = self.heard_ns = now_ns
         self.info = StreamInfo()
@@ -192,7 +182,8 @@ class MediaScheduler:
         self._pending: deque[tuple[int, str]] = deque()
         self._delayed: dict[tuple[int, str], None] = {}  # whose newest frame waits for the bucket of the connection
         self._paused_until_ns = 0
-        self._refused: dict[tuple[int, str], tuple[int, int]] = {}  # by sender and stream: since when, and when last
+        #: By sender and stream: since when, and when last. Of a sender that is not known the number is 0.
+        self._refused: dict[tuple[int, str], tuple[int, int]] = {}
         self._left: deque[int] = deque(maxlen=MAX_LEFT)
         self._stuck: set[int] = set()
         self._paces: dict[int, float] = {}  # bytes per second by descriptor, where there is a limit
@@ -211,7 +202,11 @@ class MediaScheduler:
             del self._subscribers[number]
         for number, settings in listeners.items():
             self._subscribers.setdefault(number, _Subscriber(settings, now_ns)).settings = settings
-        self._refused = {key: times for key, times in self._refused.items() if key[0] in self._subscribers}
+        self._refused = {
+            (sender, name): at
+            for (sender, name), at in self._refused.items()
+            if name in self._streams and (sender <= 0 or sender in self._subscribers)
+        }
         for key, level in before:
             if self._find_level(*key) < level:
                 self._offer_newest(key, now_ns)
@@ -267,11 +262,8 @@ class MediaScheduler:
 
     def read_counters(self, number: int) -> DeliveryCounters:
         """Return the counters of all subscriptions of a connection."""
-        subscriber = self._subscribers.get(number)
-        total = DeliveryCounters() if subscriber is None else subscriber.ended
-        for stream in self.list_subscriptions(number):
-            total = total.combine(self._subscriptions[stream][number].counters)
-        return total
+        one = self._subscribers.get(number)
+        return DeliveryCounters() if one is None else DeliveryCounters(one.delivered, one.due, one.bytes)
 
     def pop_paces(self) -> dict[int, float]:
         """Return the readers whose rate has changed since the last call, with bytes per second, 0 for no limit."""
@@ -285,10 +277,9 @@ class MediaScheduler:
         return changed | dict.fromkeys(ended, 0.0)
 
     def _end_subscription(self, number: int, stream: str) -> None:
-        subscriber, numbers = self._subscribers[number], self._subscriptions[stream]
-        subscriber.ended = subscriber.ended.combine(numbers.pop(number).counters)
-        subscriber.streams.remove(stream)
-        if not numbers:
+        self._subscribers[number].streams.remove(stream)
+        del self._subscriptions[stream][number]
+        if not self._subscriptions[stream]:
             del self._subscriptions[stream]
 
     def _find_subscription(self, number: int, stream: str) -> _Subscription | None:
@@ -379,13 +370,12 @@ class MediaScheduler:
                 stream.received_ns,
                 stream.info,
                 len(stream.frames[0]) if stream.frames else None,
-                stream.refused_ns,
                 stream.sender,
             )
         return found
 
     def list_refused(self, now_ns: int) -> set[tuple[int, str]]:
-        """Return the senders whose frames are refused now, each with the stream that another source has.
+        """Return the senders whose frames are refused now (0: not known), each with the stream that another source has.
 
         Only where that one has sent something since: a source that has just ended is waited for.
         """
@@ -410,24 +400,20 @@ class MediaScheduler:
 
     def release_frames(self, until_ns: int) -> bool:
         """Release every frame, and drop frames until then. Return whether there were any."""
-        sizes = {name: max(map(len, one.frames.values())) for name, one in self._streams.items() if one.frames}
-        held = [stream for stream in self._streams.values() if stream.frames]
-        for stream in held:
-            stream.push, stream.frames = None, {}
+        held = {name: max(map(len, one.frames.values())) for name, one in self._streams.items() if one.frames}
         for key in self._pending:
             subscription = self._find_subscription(*key)
             if subscription is not None and subscription.pending:
-                subscription.pending = False
-                if sizes.get(key[1], 0) >= STUCK_BYTES:
+                if held.get(key[1], 0) >= STUCK_BYTES:
                     self._stuck |= subscription.readers
                 self.count_drop("media_memory")
-        self._pending.clear()
+        self.reset()
         if held:
             self._paused_until_ns = until_ns
         return bool(held)
 
     def reset(self) -> None:
-        """Release every frame after a fault, and what is due, which may be inconsistent. Subscriptions stay."""
+        """Release every frame, and what is due, which may be inconsistent after a fault. Subscriptions stay."""
         for stream in self._streams.values():
             stream.push, stream.frames = None, {}
         for numbers in self._subscriptions.values():
@@ -487,11 +473,9 @@ class MediaScheduler:
         elif (stream.source, stream.connection) != (source, connection):
             has_ended = stream.source == source and stream.connection is None
             if not has_ended and now_ns - stream.heard_ns < TAKEOVER_NS:
-                stream.refused_ns = now_ns
                 self.count_drop("media_stream_taken")
-                if sender > 0:
-                    since_ns, last_ns = self._refused.get((sender, name), (now_ns, now_ns))
-                    self._refused[sender, name] = since_ns if now_ns - last_ns < TAKEOVER_NS else now_ns, now_ns
+                since_ns, last_ns = self._refused.get((sender, name), (now_ns, now_ns))
+                self._refused[sender, name] = since_ns if now_ns - last_ns < TAKEOVER_NS else now_ns, now_ns
                 return None
             if stream.source != source:
                 stream.source, stream.info, stream.received_ns = source, StreamInfo(), now_ns
@@ -542,7 +526,7 @@ class MediaScheduler:
                     self._mark_due(key, subscription)
 
     def _mark_due(self, key: tuple[int, str], subscription: _Subscription) -> None:
-        subscription.due += 1
+        self._subscribers[key[0]].due += 1
         if subscription.pending:
             subscription.dropped += 1
             self.superseded[key[0]] = self.superseded.get(key[0], 0) + 1
@@ -574,8 +558,9 @@ class MediaScheduler:
         if not send(topic, encode_media_header(header), frame):
             return False
         subscription.seq = stream.seq
-        subscription.delivered += 1
-        subscription.bytes += len(topic) + len(frame)
+        subscriber = self._subscribers[number]
+        subscriber.delivered += 1
+        subscriber.bytes += len(topic) + len(frame)
         return True
 
 

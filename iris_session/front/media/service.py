@@ -12,7 +12,7 @@ import msgspec
 
 from iris_session.front.connections import FrontConnection
 from iris_session.front.context import FrontContext
-from iris_session.front.key_budgets import IngestBackoff
+from iris_session.front.key_budgets import HandshakeLimiter
 from iris_session.front.media.budget import (
     LEVELS,
     MILLISECOND,
@@ -40,8 +40,6 @@ MIN_EXPECTED_FRAMES: Final = 20
 #: its own with every frame.
 DESCRIPTIONS_PER_S: Final = 1.0
 DESCRIPTION_BURST: Final = 4
-#: Two sources of one stream are reported for so long after something was refused.
-REFUSED_NS: Final = 3 * SECOND
 #: More than this is unread only of a peer whose key was accepted: before, libzmq takes one command of a frame's size.
 UNAUTHENTICATED_BYTES: Final = 2 * MAX_MEDIA_FRAME_BYTES
 #: Sources that a warning names.
@@ -67,16 +65,10 @@ class _ClientState:
 class MediaService:
     """Decide who gets which media, and who may hand in frames. A `Service`. With `adapt_media`, slow links get less."""
 
-    def __init__(self, context: FrontContext, proxy: MediaProxy, backoff: IngestBackoff) -> None:
+    def __init__(self, context: FrontContext, proxy: MediaProxy, handshakes: HandshakeLimiter) -> None:
         self._context = context
-        self._connections = context.connections
-        self._outbox = context.outbox
-        self._keyring = context.keyring
-        self._drops = context.drops
-        self._tokens = context.tokens
-        self._publisher = context.publisher
         self._proxy = proxy
-        self._backoff = backoff
+        self._handshakes = handshakes
         self._controller = BudgetController() if context.config.adapt_media else None
         self._states: dict[int, _ClientState] = {}
         self._stats: dict[str, StreamStats] = {}
@@ -96,7 +88,7 @@ class MediaService:
         self.sync_clients()
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + PERIOD_NS
-            self._update_budgets(set(self._states), now_ns)
+            self._update_budgets(now_ns)
         elif not self._connections_changed:
             return
         self._connections_changed = False
@@ -104,15 +96,20 @@ class MediaService:
 
     def sync_clients(self) -> None:
         """Update the thread's clients. Called before a client gets its `Welcome`."""
-        here = {number for number, one in self._connections.by_number.items() if one.admitted}
+        here = {number for number, one in self._context.connections.by_number.items() if one.admitted}
         if here != set(self._states):
             self._connections_changed = True
-            self._sync_table(here)
+            for number in [number for number in self._states if number not in here]:
+                del self._states[number]
+                if self._controller is not None:
+                    self._controller.remove(number)
+            for number in sorted(here - set(self._states)):
+                self._states[number] = _ClientState()
             self._publish_levels()
 
     def end_sources(self, participant_id: str) -> None:
         """Remove the streams of a participant that has left. One that lost its connection has left after its grace."""
-        known = self._senders | self._connections.by_number
+        known = self._senders | self._context.connections.by_number
         with self._proxy.lock:
             for number in [number for number, one in known.items() if one.participant_id == participant_id]:
                 self._proxy.scheduler.end_sender(number)
@@ -143,12 +140,11 @@ class MediaService:
             for name, facts in self._stats.items()
         )
 
-    def list_warnings(self, now_ns: int) -> tuple[str, ...]:
+    def list_warnings(self) -> tuple[str, ...]:
         """Return a warning for every stream that two sources send."""
         return tuple(
             f"another source sends the stream {name!r}, too, and is refused: give it a stream of another name"
-            for name, facts in self._stats.items()
-            if facts.refused_ns is not None and now_ns - facts.refused_ns < REFUSED_NS
+            for name in sorted({stream for _, stream in self._refused})
         )
 
     def report_participant(self, number: int) -> dict[str, Any]:
@@ -165,16 +161,7 @@ class MediaService:
 
     # --- inside ------------------------------------------------------------------------------------------------------
 
-    def _sync_table(self, here: set[int]) -> None:
-        for number in [number for number in self._states if number not in here]:
-            del self._states[number]
-            if self._controller is not None:
-                self._controller.remove(number)
-        for number in sorted(here - set(self._states)):
-            self._states[number] = _ClientState()
-
-    def _update_budgets(self, here: set[int], now_ns: int) -> None:
-        self._sync_table(here)
+    def _update_budgets(self, now_ns: int) -> None:
         proxy = self._proxy
         with proxy.lock:
             proxy.scheduler.sample_rates(now_ns)
@@ -187,9 +174,9 @@ class MediaService:
         self._stop_lost_sources()
         self._note_senders()
         for reason, count in reasons.items():
-            self._drops.count(reason, n=count)
+            self._context.drops.count(reason, n=count)
         for number, count in superseded.items():
-            self._drops.count("media_superseded", number if number in self._states else 0, count)
+            self._context.drops.count("media_superseded", number if number in self._states else 0, count)
             if number in self._states:
                 self._states[number].drops += count
         for number, state in self._states.items():
@@ -202,7 +189,7 @@ class MediaService:
     def _note_senders(self) -> None:
         """Keep who sends each stream: after its connection is lost, until it has left."""
         numbers = {facts.sender for facts in self._stats.values()}
-        known = self._senders | self._connections.by_number
+        known = self._senders | self._context.connections.by_number
         self._senders = {number: known[number] for number in numbers if number in known}
 
     def _name_source(self, facts: StreamStats) -> str:
@@ -231,7 +218,7 @@ class MediaService:
     ) -> None:
         before, state.counters = state.counters, tally
         state.bytes_per_s = (tally.bytes - before.bytes) * 1e9 / PERIOD_NS
-        report, fresh = self._connections.by_number[number].recent_report(now_ns), None
+        report, fresh = self._context.connections.by_number[number].recent_report(now_ns), None
         if report is not None and report is not state.report:
             fresh = StateReport(report.age_ms_p50, self._missed_share(state, report))
         state.report = report or state.report
@@ -248,7 +235,7 @@ class MediaService:
     def _missed_share(self, state: _ClientState, report: ClientReport) -> float:
         """Return the share of state frames that was missed. A client that got none cannot report that, but the
         front knows whether it sent some."""
-        before, state.frames = state.frames, self._publisher.frames
+        before, state.frames = state.frames, self._context.publisher.frames
         expected = report.delivered + report.missed
         if not expected:
             return 1.0 if state.report is not None and state.frames - before >= MIN_EXPECTED_FRAMES else 0.0
@@ -257,7 +244,7 @@ class MediaService:
     def _publish_levels(self) -> None:
         subscribers = {}
         for number, state in self._states.items():
-            key = self._context.find_channel_key(self._connections.by_number[number])
+            key = self._context.find_channel_key(self._context.connections.by_number[number])
             subscribers[number] = MediaSubscriber(
                 key, state.grant.levels, _initial_level(state.grant), state.grant.pace
             )
@@ -267,21 +254,21 @@ class MediaService:
     def _refuse_flooder(self, flood: TcpFlood, now_ns: int) -> None:
         """Refuse new connections of a source that flooded, and report it by the names of the keys that it may have."""
         has_key = bool(flood.key_id) or flood.unread > UNAUTHENTICATED_BYTES
-        if not has_key or self._keyring.key is None:
+        if not has_key or self._context.keyring.key is None:
             self._context.guard.report_flood(flood.address, "media ingest", now_ns)
             return
-        refused = self._backoff.refuse(flood.address, flood.key_id, flood.opened_ns, now_ns)
+        refused = self._handshakes.refuse_source(flood.address, flood.key_id, flood.opened_ns, now_ns)
         names = sorted(name for key in refused if (name := self._find_source_name(key)) is not None)
         if not names:  # reported already, or no source's key any more
             return
-        shown = ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
+        shown = ", ".join(names[:MAX_NAMES])
         seconds = max(refused.values()) // SECOND
         text = f"flood from {flood.address}: media ingest, {shown} refused for {seconds} s"
         self._context.guard.report_flood(flood.address, f"media ingest, {shown}", now_ns, warning=text)
 
     def _stop_lost_sources(self) -> None:
         """Remove the streams of keys that may not hand in frames any more."""
-        if self._keyring.key is None:
+        if self._context.keyring.key is None:
             return
         lost = {facts.source for facts in self._stats.values() if facts.source and not self._is_source(facts.source)}
         if lost:
@@ -293,8 +280,8 @@ class MediaService:
 
     def _find_source_name(self, mark: str) -> str | None:
         """Return the name of a key that may hand in frames, `None` for any other."""
-        entry = self._keyring.find_key(mark)
-        if entry is None or self._tokens.is_revoked(mark) or not self._keyring.may_hand_in_media(mark):
+        entry = self._context.keyring.find_key(mark)
+        if entry is None or self._context.tokens.is_revoked(mark) or not self._context.keyring.may_hand_in_media(mark):
             return None
         return entry.name
 
@@ -328,8 +315,9 @@ class MediaService:
             if content == state.budget:
                 continue
             bound = round(grant.bytes_per_s / MBIT, 3)
-            if self._outbox.send(
-                self._connections.by_number[number], DeliveryBudget(_lowest_class(state), bound, grant.reason, streams)
+            if self._context.outbox.send(
+                self._context.connections.by_number[number],
+                DeliveryBudget(_lowest_class(state), bound, grant.reason, streams),
             ):
                 state.budget = content
 
