@@ -15,7 +15,7 @@ import pytest
 
 from iris_session.assets.errors import AssetMissingError, AssetStoreError
 from iris_session.assets.store import GRACE_S, MAX_MAPPED_FILES, AssetStore, ServedAssets, default_root
-from tests.front.asset_rig import put
+from tests.front.fakes import put
 
 #: Ends with another byte than the wrong copies below.
 DATA = random.Random(1).randbytes(99_999) + b"!"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import functools
 import http.server
 import json
@@ -23,19 +22,16 @@ from numpy.typing import NDArray
 
 from iris_session.bench.chromium import BUILT_PAGE, WEB_CLIENT
 from iris_session.demo.named_scenes import scene_by_name
-from iris_session.protocol.client_messages import Acquire
 from iris_session.protocol.server_messages import (
     Event,
     Gap,
     ParticipantChanged,
     ParticipantJoined,
-    Reply,
 )
 from tests.e2e.browser import Browser, Page, join_as, printed_address
 from tests.e2e.scenario import Hand, Scenario
 from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess
 from tests.scene.pictures import ModelRenderer, graphics, silhouette_iou
-from tests.web.browser import WebBrowser, open_http
 
 pytestmark = pytest.mark.e2e
 
@@ -422,56 +418,3 @@ READY_WITH_ARM: Final = (
     "irisSession.state.phase.phase === 'ready' && irisSession.state.session?.synced"
     " && document.querySelector('[data-robot=arm8] .holder').textContent === 'you'"
 )
-
-
-async def list_holders(browser: WebBrowser) -> dict[str, str]:
-    """Return the participants that hold robots, by robot."""
-    return {lease.target: lease.holder for lease in (await browser.snapshot()).leases if lease.holder}
-
-
-@pytest.mark.long
-def test_all_come_back_with_their_robots(serve: Callable[..., SessionProcess], open_page: Callable[..., Page]) -> None:
-    """A tab and seven browsers without a picture hold a robot each; the gateway is killed, and then the front."""
-    server = serve("arms")
-    page = open_page(server, "dan", width=840, height=480)
-    join_as(page, "dan", "operator")
-    page.click("button", "Take: arm8")
-    page.wait("document.querySelector('[data-robot=arm8] .holder').textContent === 'you'")
-
-    async def work() -> None:
-        async with open_http() as http:
-            tabs = [await WebBrowser(http, printed_address(server), f"tab{i}").join("operator") for i in range(1, 8)]
-            for i, tab in enumerate(tabs, 1):
-                await tab.send(Acquire(1, (f"arm{i}",)))
-                assert (await tab.wait_for(Reply)).denial is None
-            before = await list_holders(tabs[0])
-            assert len(before) == 8
-            for name in ("web.gateway", "front.main"):
-                begin = time.monotonic()
-                server.children()[name].kill()
-                for tab in tabs:
-                    await tab.wait(lambda tab=tab: tab.socket.closed, f"{name} is noticed")
-                assert all(
-                    welcome.resumed for welcome in await asyncio.gather(*(t.come_back("operator") for t in tabs))
-                )
-                seven_s = time.monotonic() - begin
-                await asyncio.to_thread(page.wait, READY_WITH_ARM)
-                print(
-                    f"{name} killed: seven browsers back after {seven_s:.2f} s, the tab {time.monotonic() - begin:.2f}"
-                )
-                assert await list_holders(tabs[0]) == before
-            for tab in tabs:
-                await tab.close()
-
-    asyncio.run(asyncio.wait_for(work(), 3 * DEADLINE_S))
-
-
-@pytest.mark.long
-def test_the_end_of_the_session_is_shown(own_scenario: Scenario, browser: Browser) -> None:
-    page = browser.open("ending", printed_address(own_scenario.server))
-    page.wait_until_ready()
-    own_scenario.server.process.terminate()
-    page.wait("!document.querySelector('.message').hidden")
-    words: str = page.evaluate("document.querySelector('.message').innerText")
-    assert words.strip()
-    page.close()

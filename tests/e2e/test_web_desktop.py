@@ -277,27 +277,6 @@ def test_the_estop_key_is_the_same_while_driving(scenario: Scenario, driver: Pag
 
 
 @pytest.mark.long
-def test_bodies_that_rest_stay_where_they_are_when_the_scene_is_patched(scenario: Scenario, driver: Page) -> None:
-    tip = Tip(scenario)
-    drive_forward(driver, tip, 0.05)
-    driver.let_go("w")
-    driver.let_go("Shift")
-    tip.watch_for(1.0)
-    driver.evaluate("irisSession.view.setScene({...irisSession.view.scene.spec})")  # what a patch does
-    driver.evaluate("irisSession.view.scene.complete.then(() => null)")
-    driver.wait(f"{FARTHEST_BODY} < 1e-3")
-
-
-@pytest.mark.long
-def test_the_estop_key_presses_no_button_while_driving(driver: Page) -> None:
-    assert driver.evaluate("document.activeElement.id") == "scene", "keys are for the robot once it is driven"
-    driver.evaluate("document.querySelector('.drive button').focus()")
-    driver.press("Space")
-    driver.wait("irisSession.state.session.estop")
-    assert not driver.evaluate("document.querySelector('.drive').hidden")
-
-
-@pytest.mark.long
 def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> None:
     """Half a millimetre for a pixel: to the right along +X, and no farther when the button is let go.
 

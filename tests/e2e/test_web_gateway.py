@@ -187,25 +187,6 @@ def test_other_sites_are_refused(page: str, headers: dict[str, str], status: int
     run(work())
 
 
-@pytest.mark.long
-def test_another_version_is_refused_in_words(page: str) -> None:
-    async def work() -> None:
-        async with open_http() as http:
-            for protocols in ([], ["iris-session.2"]):
-                with pytest.raises(aiohttp.WSServerHandshakeError) as error:
-                    await http.ws_connect(f"{page}v1/session", protocols=protocols)
-                assert error.value.status == 400
-            async with http.get(f"{page}v1/session") as answer:
-                assert answer.status == 400
-                assert b"iris-session.1" in await answer.read()
-            ann = await WebBrowser(http, page).open()
-            await ann.socket.send_bytes(wire.encode_frames(wire.CONTROL, [b"\x94\x02\x00\xa0\x80"]))
-            assert await ann.wait_closed() == wire.CLOSE_VERSION
-            await ann.close()
-
-    run(work())
-
-
 def test_hostile_messages_close_their_sender_only(page: str) -> None:
     forged = b"\x94\x01\x00\xa3bob\x81\xa4type\xa9heartbeat"
     hostile: list[tuple[bytes | str, int]] = [
@@ -243,25 +224,6 @@ def test_hostile_messages_close_their_sender_only(page: str) -> None:
             assert ann.close_code is None
             n = len(ann.states)
             await ann.wait(lambda: len(ann.states) > n, "state goes on")
-
-    run(work())
-
-
-@pytest.mark.long
-def test_media_need_a_ticket(page: str) -> None:
-    async def work() -> None:
-        async with browsers(page, "ann") as (ann,):
-            for first in (b"", b"\x05\x01\x01\x00\x00\x00\x80", wire.encode_subscriptions(["cloud"])):
-                media = await ann.http.ws_connect(f"{page}v1/media", protocols=[wire.SUBPROTOCOL])
-                await media.send_bytes(first)
-                message = await media.receive(10.0)
-                assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, wire.CLOSE_NOT_ALLOWED)
-            media = await ann.open_media(ticket="wrong")
-            await ann.wait(lambda: media.close_code is not None, "closed")
-            assert media.close_code == wire.CLOSE_NOT_ALLOWED
-            first_socket = await ann.open_media()
-            await ann.open_media()
-            await ann.wait(lambda: first_socket.close_code is not None, "replaced by the second one")
 
     run(work())
 
@@ -307,22 +269,6 @@ def test_a_thousand_silent_sockets_harm_no_one(page: str) -> None:
                 for one in loris:
                     one.close()
             assert ann.close_code is None
-
-    run(work())
-
-
-@pytest.mark.long
-def test_a_reader_that_stops_gets_the_newest_afterwards(page: str) -> None:
-    async def work() -> None:
-        async with browsers(page, "ann", "slow") as (ann, slow):
-            await slow.wait(lambda: slow.states, "the first state comes")
-            resume = slow.stop_reading()
-            await asyncio.sleep(2.5)
-            begin_ns = time.monotonic_ns()
-            resume()
-            await slow.wait(lambda: slow.states[-1][1] > begin_ns, "state comes")
-            await slow.wait(lambda: slow.states[-1][0].state_seq >= ann.states[-20][0].state_seq, "fresh again")
-            assert slow.close_code is None, "a pause of seconds is no reason to close"
 
     run(work())
 
@@ -375,46 +321,6 @@ def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
 
     run(work())
     assert "web gateway ended" in server.output
-
-
-@pytest.mark.long
-def test_all_browsers_of_a_killed_gateway_resume_and_nothing_leaks(serve: Serve) -> None:
-    server = serve()
-    page = page_of(server)
-    names = [f"tab{i}" for i in range(8)]
-
-    def count_open() -> tuple[int, int]:
-        """Return the open descriptors of session and front."""
-        return psutil.Process(server.process.pid).num_fds(), server.children()["front.main"].num_fds()
-
-    async def work() -> None:
-        async with browsers(page, "warm"):  # the gateway runs
-            pass
-        before = count_open()
-        async with browsers(page, *names) as tabs:
-            welcomes = [tab.welcome for tab in tabs]
-            killed = server.children()["web.gateway"]
-            killed.kill()
-            for tab in tabs:
-                await tab.wait(lambda tab=tab: tab.socket.closed, "the end is noticed")
-            begin = time.monotonic()
-            again = await asyncio.gather(*(tab.come_back() for tab in tabs))
-            took_s = time.monotonic() - begin
-            print(f"eight browsers are back after {took_s:.2f} s")
-            assert all(welcome.resumed for welcome in again)
-            assert [w.participant_id for w in again] == [w.participant_id for w in welcomes if w]
-            assert took_s < DEADLINE_S
-            people = [p for p in (await tabs[0].snapshot()).participants if p.connected]
-            assert sorted(p.name for p in people) == sorted([*names, "web"]), "no one is there twice"
-            for tab in tabs:
-                n = len(tab.states)
-                await tab.wait(lambda tab=tab, n=n: len(tab.states) > n + 5, "state goes on")
-            assert not killed.is_running()
-            assert server.children()["web.gateway"].pid != killed.pid
-        wait_until(lambda: count_open() <= before, f"descriptors as before: {before}", 30.0)
-
-    run(work())
-    server.finish()
 
 
 @pytest.mark.long

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from iris_session.alignment.service import AlignmentService
@@ -78,3 +80,12 @@ class FakeChannel:
 
     def report(self) -> AssetsReport | None:
         return None
+
+
+def put(root: Path, data: bytes) -> str:
+    """Store an asset. Return its address."""
+    address = hashlib.sha256(data).hexdigest()
+    path = root / address[:2] / address
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    return address

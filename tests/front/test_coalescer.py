@@ -11,7 +11,6 @@ from iris_session.front.coalescer import Coalescer
 from iris_session.link.config import FrontLimits
 from iris_session.protocol.client_messages import (
     Acquire,
-    Bye,
     EStop,
     Heartbeat,
     Marker,
@@ -87,29 +86,12 @@ def test_every_edge_is_kept(change: dict[str, object]) -> None:
     assert seqs(waiting.take_batch()) == [1, 2, 4]
 
 
-def test_small_change_of_the_gripper_is_not_an_edge() -> None:
-    waiting, _ = coalescer()
-    waiting.offer(entry(sample(1, gripper=0.1)))
-    waiting.offer(entry(sample(2, gripper=0.4)))
-    assert seqs(waiting.take_batch()) == [2]
-
-
 def test_old_sequence_numbers_and_forged_epochs_replace_nothing() -> None:
     waiting, _ = coalescer()
     waiting.offer(entry(sample(5)))
     waiting.offer(entry(sample(4)))
     waiting.offer(entry(sample(6), epoch=99))
     assert seqs(waiting.take_batch()) == [5, 4, 6]
-
-
-def test_messages_keep_their_order_among_samples() -> None:
-    waiting, _ = coalescer()
-    waiting.offer(entry(sample(1)))
-    waiting.offer(entry(Acquire(1, ("left",))))
-    waiting.offer(entry(sample(2)))
-    waiting.offer(entry(TrackingEpoch(1)))
-    kinds = [type(e.message) for e in waiting.take_batch()]
-    assert kinds == [Acquire, Sample, TrackingEpoch]
 
 
 def test_urgent_comes_first_and_alone_when_credit_is_short() -> None:
@@ -200,14 +182,6 @@ def test_full_batch_leaves_entries_for_the_next() -> None:
         waiting.offer(entry(Marker(i, "x"), 1))
     assert [e.connection for e in waiting.take_batch()] == [3, 3, 3, 1, 1, 1]
     assert not waiting.take_batch()
-
-
-def test_remove_drops_pending_entries_of_one_connection() -> None:
-    waiting, _ = coalescer()
-    waiting.offer(entry(Bye(), 1))
-    waiting.offer(entry(sample(1), 2))
-    waiting.remove_connection(1)
-    assert [e.connection for e in waiting.take_batch()] == [2]
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 3), st.booleans()), max_size=60))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import select
 import socket
 import threading
 from collections.abc import Iterator
@@ -79,12 +79,6 @@ def test_beacons_only_on_the_chosen_interface() -> None:
     assert wire.hosts() == {"127.255.255.255": "127.0.0.1"}
 
 
-def test_advertised_address_is_in_the_beacon() -> None:
-    beacon, wire, _ = sender(["0.0.0.0"], LO, ETH, advertise="lab.example.org")
-    beacon.tick(1)
-    assert wire.hosts() == {"127.255.255.255": "10.1.2.3", "10.1.2.255": "lab.example.org"}
-
-
 def test_beacons_five_times_a_second_also_on_new_networks() -> None:
     have = [LO, ETH]
     beacon = BeaconSender(BEACON, ["0.0.0.0"], 7720, Drops(), "", lambda: list(have))
@@ -112,22 +106,6 @@ def test_failing_network_is_logged_once_and_others_get_beacons(caplog: pytest.Lo
     wire.fails["10.1.2.255"] = BlockingIOError(11, "full")
     beacon.tick(7 * BEACON_PERIOD_NS)
     assert drops.by_reason == {"beacon_unsent": 1}
-
-
-def test_all_listeners_of_the_machine_receive_the_beacon() -> None:
-    listeners = []
-    for _ in range(2):
-        listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.settimeout(30.0)
-        listeners.append(listener)
-    with contextlib.closing(listeners[0]), contextlib.closing(listeners[1]):
-        listeners[0].bind(("", 0))
-        listeners[1].bind(("", listeners[0].getsockname()[1]))
-        real = BeaconSender(BEACON, ["127.0.0.1"], listeners[0].getsockname()[1], Drops())
-        real.tick(1)
-        real.close()
-        assert [decode_beacon(one.recv(2000)).session_name for one in listeners] == ["lab-1", "lab-1"]
 
 
 # --- introduction ----------------------------------------------------------------------------------------------------
@@ -171,8 +149,7 @@ def test_introductions_per_tick_are_bounded_and_peers_hold_nothing(
     visitors[1].sendall(b"GET / HTTP/1.1\r\n" * 100)
     before = threading.active_count()
     service.tick(0)
-    answered = [v for v in visitors[2:] if _has_data(v)]
-    assert len(answered) == ANSWERS_PER_TICK - 2
+    assert len(select.select(visitors[2:], [], [], 1.0)[0]) == ANSWERS_PER_TICK - 2
     service.tick(1)
     service.tick(2)
     assert all(decode_introduction(read(v)) is not None for v in visitors[2:])
@@ -212,11 +189,3 @@ def test_port_in_use_is_an_error_that_closes_opened_sockets() -> None:
 
 def _in_use(port: int) -> int:
     raise PortInUseError(port, "control")
-
-
-def _has_data(visitor: socket.socket) -> bool:
-    visitor.settimeout(0.05)
-    try:
-        return bool(visitor.recv(1, socket.MSG_PEEK))
-    except TimeoutError:
-        return False

@@ -131,9 +131,12 @@ def test_new_scene_is_set_in_the_front_before_clients_are_notified(rig: LinkRig)
 def test_media_of_a_participant_end_when_it_has_left_for_good(rig: LinkRig) -> None:
     bodies = ParticipantLeft("p1", "closed", grace=True), ParticipantLeft("p2", "bye", grace=False)
     events = tuple(Event(n, 1, 0, body) for n, body in enumerate(bodies))
+    passed: list[object] = []
+    rig.downlink._alignment.process_event = passed.append  # type: ignore[method-assign, assignment]
     rig.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=events))))
     rig.downlink.drain()
     assert rig.left == ["p2"]
+    assert passed == list(bodies), "alignment follows every event: anchors that are moved, among others"
 
 
 def test_keyframe_before_the_first_state_has_the_poses_of_the_scene(rig: LinkRig) -> None:
@@ -146,15 +149,6 @@ def test_keyframe_before_the_first_state_has_the_poses_of_the_scene(rig: LinkRig
     rig.state(3, n=2)
     rig.downlink.drain()
     assert rig.publisher.read_keyframe()[0] == 2
-
-
-def test_acknowledgements_and_the_end_are_processed(rig: LinkRig) -> None:
-    assert rig.authority.heard_ns == 0
-    rig.socket.send_multipart((link.ACK, b"\x04"))
-    rig.socket.send_multipart((link.ACK, b"\x03"))
-    rig.socket.send_multipart((link.END, b""))
-    rig.downlink.drain()
-    assert (rig.authority.acknowledged, rig.authority.ended, rig.authority.heard_ns) == (7, True, 77)
 
 
 def test_decision_beyond_the_limits_does_not_end_the_front(rig: LinkRig) -> None:
@@ -175,12 +169,3 @@ def test_delays_cover_the_last_seconds(rig: LinkRig) -> None:
         header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
         assert publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
     assert (publisher.read_recent_delays_ns(), publisher.newest_delay_ns) == ([20, 7], 7)
-
-
-def test_repeated_state_is_not_measured(rig: LinkRig) -> None:
-    """Its source is silent, and it is as old as that."""
-    for session_time in (7, 7, 7, 9):
-        header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
-        assert rig.publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
-    assert rig.publisher.read_recent_delays_ns() == [70, 68]
-    assert [header.session_time for header in rig.headers()] == [7, 7, 7, 9]

@@ -1,39 +1,35 @@
-"""The front against well-behaved clients: join, identity, resume, snapshots, state, alignment."""
+"""The front and its clients: join, identity, resume, snapshots, gateways, and one that is slow."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
 
 import msgspec
 import numpy as np
 
+from iris_session.link import FrontLimits
 from iris_session.protocol.client_messages import (
     Acquire,
     Bye,
-    ClockPing,
     EStop,
     Heartbeat,
     Hello,
     Marker,
-    Observation,
+    Sample,
     wrap_message,
 )
-from iris_session.protocol.codec import decode_presence, decode_state_header, encode_client
-from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.protocol.entries import AlignmentProposal, Join, Lost
+from iris_session.protocol.codec import encode_client
+from iris_session.protocol.common import IDENTITY
+from iris_session.protocol.entries import Join, Lost
 from iris_session.protocol.server_messages import (
-    ClockPong,
     Event,
-    PresenceItem,
     ProtocolFault,
     Refused,
     Snapshot,
     Welcome,
 )
 from iris_session.protocol.steps import Decision, Dropped, OutgoingMessage
-from iris_session.streams.rigid import RigidDecoder
 from tests.front.harness import N_BODIES, FrontSession
 
 OpenSession = Callable[..., FrontSession]
@@ -73,13 +69,6 @@ def test_unsupported_version_is_refused_with_advice(session: FrontSession) -> No
     assert refused.code == "version"
     assert refused.supported_versions == (1,)
     assert "session" in refused.advice
-
-
-def test_hello_without_secret_is_refused(session: FrontSession) -> None:
-    client = session.client()
-    client.send(Hello("operator", "Ann"))
-    assert client.wait_for(Refused).code == "identity"
-    assert not session.entries
 
 
 def test_states_of_another_scene_are_dropped_and_counted(session: FrontSession) -> None:
@@ -122,23 +111,6 @@ def test_lost_welcome_keeps_the_token_valid(session: FrontSession) -> None:
         back = session.client()
         back.secret = first.secret
         assert back.join(resume_token=token).resumed
-
-
-def test_messages_before_hello_are_rejected(session: FrontSession) -> None:
-    client = session.client()
-    client.send(EStop("from a stranger"), epoch=1)
-    assert client.wait_for(ProtocolFault).code == "hello"
-    assert not session.entries
-
-
-def test_clock_ping_is_answered_with_session_time(session: FrontSession) -> None:
-    client = session.client()
-    client.join()
-    before = session.process.link.now_ns
-    client.send(ClockPing(123))
-    pong = client.wait_for(ClockPong)
-    assert pong.t0_ns == 123
-    assert before <= pong.t1_ns <= pong.t2_ns <= session.process.link.now_ns
 
 
 def test_closed_socket_is_a_disconnect_after_its_last_messages(session: FrontSession) -> None:
@@ -222,72 +194,6 @@ def test_snapshot_is_filled_and_comes_after_the_events_of_its_step(session: Fron
     assert not other.got(Snapshot)
 
 
-def test_state_reaches_subscribers_stamped_and_decodable(session: FrontSession) -> None:
-    sub = session.subscriber()
-    poses = np.zeros((N_BODIES, 7))
-    poses[:, 3] = 1.0
-    decoder = RigidDecoder(N_BODIES)
-    frames: list[list[bytes]] = []
-
-    def received() -> bool:
-        poses[:, 0] += 0.01
-        session.send_state(poses)
-        while sub.poll(0):
-            frames.append(sub.recv_multipart())
-        return len(frames) >= 5
-
-    session.pump(received, "state frames")
-    for topic, header_bytes, payload in frames:
-        assert topic == b"rigid"
-        header = decode_state_header(header_bytes)
-        assert header.session_time <= header.published_ns
-        assert decoder.apply(header.state_seq, header.base_seq, payload)
-    assert abs(decoder.poses[0, 0] - poses[0, 0]) < 0.5
-
-
-def test_presence_is_published_latest_per_device(session: FrontSession) -> None:
-    sub = session.subscriber()
-    got: list[bytes] = []
-
-    def received() -> bool:
-        items = tuple(PresenceItem("p1", device, Pose((1.0, 2.0, 3.0), IDENTITY.q)) for device in ("head", "hand/left"))
-        session.once(Decision((), presence=items + items))
-        while sub.poll(0):
-            topic, data = sub.recv_multipart()
-            assert topic == b"presence"
-            got.append(data)
-        return bool(got)
-
-    session.pump(received, "presence")
-    presence = decode_presence(got[0])
-    assert [item.device for item in presence.items] == ["head", "hand/left"]
-    assert presence.items[0].pose.p == (1.0, 2.0, 3.0)
-
-
-def test_observations_become_proposals_not_entries(open_session: OpenSession) -> None:
-    session = open_session(anchors={"table": Pose((1.0, 0.0, 0.8), IDENTITY.q)})
-    client = session.client()
-    client.join()
-    for i in range(8):
-        seen = Pose((0.5, 0.1 * (i % 2) * 0.001, -0.2), IDENTITY.q)
-        client.send(Observation("table", "qr", seen, i, 1, viewpoint_id=i, size_m=0.16))
-    session.pump(
-        lambda: any(not e.message.refused for e in session.entries if isinstance(e.message, AlignmentProposal)),
-        "an accepted proposal",
-    )
-    proposal = session.wait_entries(AlignmentProposal)[-1].message
-    assert isinstance(proposal, AlignmentProposal)
-    assert math.dist(proposal.T_world_tracking.p, (0.5, 0.0, 1.0)) < 0.01
-    assert proposal.tracking_epoch == 1
-    assert len(proposal.covariance) == 36
-    assert not any(isinstance(e.message, Observation) for e in session.entries)
-    client.send(Observation("elsewhere", "qr", IDENTITY, 9, 1))
-    session.pump(
-        lambda: any("table" in e.message.advice for e in session.entries if isinstance(e.message, AlignmentProposal)),
-        "advice that names the known anchors",
-    )
-
-
 def test_gateway_sends_for_participants_and_they_leave_with_it(session: FrontSession) -> None:
     gateway = session.client()
     stranger = session.client()
@@ -328,3 +234,34 @@ def test_silent_gateway_disconnects_its_participants(open_session: OpenSession) 
     gateway.send(EStop("from behind"), on_behalf_of="tab1", epoch=2)
     (stop,) = session.wait_entries(EStop)
     assert stop.connection == 2
+
+
+def test_stalled_authority_gets_a_bounded_batch_with_the_estop_first(session: FrontSession) -> None:
+    client, other = session.client(), session.client()
+    client.join()
+    other.join(name="Bob")
+    for seq in range(500):
+        client.send(Sample("head", "pose", seq, 0, 1, 0, 1, pose=IDENTITY))
+        client.send(Marker(seq, "x"))
+        session.run_front()  # the authority takes nothing, and the credit of the front is used up
+    other.send(EStop())
+    session.run_front()
+    waiting = session.link.poll()
+    assert len(waiting) < 300
+    assert any(isinstance(entry.message, EStop) for entry in waiting), "urgent entries have credit of their own"
+    assert session.wait_drops("rate") > 0
+
+
+def test_client_that_reads_nothing_is_disconnected_as_slow(open_session: OpenSession) -> None:
+    session = open_session(limits=FrontLimits(slow_drops=16))
+    honest, slow = session.client(), session.client()
+    honest.join(name="Ann")
+    slow.join(name="Slow")
+    slow.reads = False
+    for _ in range(20):
+        session.once(Decision((), events=(session.notice("x" * 500),)))
+    (loss,) = session.wait_entries(Lost)
+    assert (loss.connection, loss.message) == (2, Lost("slow"))
+    assert session.wait_drops("send_queue_full", 16) >= 16
+    assert not slow.is_connected, "what waits for it takes no memory any more"
+    assert [event.event_seq for event in honest.got(Event)] == list(range(1, 21))

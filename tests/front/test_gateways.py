@@ -109,17 +109,6 @@ def test_key_without_gateway_role_disconnects_its_participants(lab: Lab) -> None
     assert set(gateway.lost(2).values()) == {"role"}
 
 
-def test_added_roles_end_no_connection(lab: Lab) -> None:
-    gateway = Gateway(lab, "gateway", "observer")
-    gateway.enter("tab1", "observer")
-    lab.home.clients.allow_key("web", gateway.pair.public, ())
-    names = iter(f"tab{i}" for i in range(2, 100))  # the list is looked at a few times a second
-    lab.session.pump(lambda: gateway.enter(next(names), "director").roles == (), "the new roles")
-    gateway.client.send(Marker(1, "still here"), on_behalf_of="tab1", epoch=gateway.numbers["tab1"])
-    lab.session.wait_entries(Marker)
-    assert not [e for e in lab.session.entries if isinstance(e.message, Lost)]
-
-
 @pytest.mark.parametrize("who", ["behind a gateway", "without state", "with state"])
 def test_subscribers_reconnect_only_when_a_subscribed_key_is_revoked(lab: Lab, who: str) -> None:
     bob, _ = lab.allowed("bob")

@@ -24,7 +24,6 @@ from iris_session.protocol.client_messages import (
 from iris_session.protocol.codec import encode_client
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Audit, Entry, Join
-from iris_session.protocol.limits import LIMITS
 from iris_session.protocol.server_messages import ProtocolFault, Refused, Reply
 from tests.front.intake_rig import ANN, EVE, HELLO, ROUTE, IntakeRig
 
@@ -42,20 +41,6 @@ def test_other_tcp_connection_on_the_same_route_is_unknown_and_ends_the_first(ri
     assert rig.last() == ProtocolFault("hello", "this connection has not said hello: say hello (again)")
     assert rig.entries() == []
     assert list(rig.intake.ended) == [epoch]
-
-
-def test_other_key_on_the_same_route_is_unknown(rig: IntakeRig) -> None:
-    epoch = rig.join(Peer(5, "key-of-ann"), secret=b"").connection_epoch
-    rig.take(EStop("as Ann"), Peer(5, "key-of-eve"), epoch)
-    assert rig.entries() == []
-    assert isinstance(rig.last(), ProtocolFault)
-
-
-def test_curve_key_is_the_identity_with_any_secret(rig: IntakeRig) -> None:
-    rig.take(Hello("operator", "Ann", secret=b"x" * 16), Peer(5, "fingerprint"))
-    (entry,) = rig.entries()
-    assert isinstance(entry.message, Join)
-    assert entry.message.key_id == "fingerprint"
 
 
 def test_more_than_one_frame_is_malformed(rig: IntakeRig) -> None:
@@ -85,15 +70,6 @@ def test_messages_above_the_rate_are_dropped_with_occasional_faults(rig: IntakeR
     assert isinstance(rig.entries()[0].message, EStop)
 
 
-def test_an_estop_twice_a_second_is_never_above_a_limit(rig: IntakeRig) -> None:
-    epoch = rig.join().connection_epoch
-    for _ in range(100):
-        rig.take(EStop(), epoch=epoch)
-        (entry,) = rig.entries()
-        assert isinstance(entry.message, EStop)
-        rig.now_ns += 500_000_000
-
-
 def test_estop_before_the_welcome_is_forwarded(rig: IntakeRig) -> None:
     rig.take(Hello("observer", "Ann", secret=b"s" * 16))
     rig.take(Marker(1, "too early"))
@@ -110,14 +86,6 @@ def test_hellos_of_one_peer_are_bounded_until_it_disconnects(rig: IntakeRig) -> 
     rig.admission.remove_peer(ANN.descriptor)
     rig.take(Hello("operator", "Ann"))
     assert rig.last() == rig.sent[0][1]
-
-
-def test_answers_to_participants_of_a_gateway_name_them(rig: IntakeRig) -> None:
-    rig.join(role="gateway")
-    rig.take(Hello("operator", "Tab"), behalf="tab1")
-    route, refused, bulk = rig.sent[-1]
-    assert (route, bulk) == (ROUTE, [b"tab1"])
-    assert isinstance(refused, Refused)
 
 
 def test_one_secret_behind_a_gateway_is_one_key_that_no_client_has(rig: IntakeRig) -> None:
@@ -261,25 +229,6 @@ DEVICES = ("head", "controller/left", "controller/right")
 
 def together(seq: int) -> Samples:
     return Samples(tuple(Sample(device, "pose", seq, 0, 1, 0, 0, pose=IDENTITY) for device in DEVICES))
-
-
-def test_each_sample_is_an_entry() -> None:
-    with zmq.Context() as context:
-        rig = IntakeRig(context)
-        epoch = rig.join().connection_epoch
-        rig.take(together(7), epoch=epoch)
-        entries = rig.entries()
-    assert [e.message for e in entries] == list(together(7).samples)
-    assert {(e.connection, e.connection_epoch) for e in entries} == {(epoch, epoch)}
-
-
-def test_flood_of_samples_is_cut_at_the_rate_limit_and_counted() -> None:
-    with zmq.Context() as context:
-        rig = IntakeRig(context)
-        epoch = rig.join().connection_epoch
-        for seq in range(LIMITS[Samples].burst):
-            rig.take(together(seq), epoch=epoch)
-    assert rig.drops.by_reason["rate"] == 3 * LIMITS[Samples].burst - LIMITS[Sample].burst
 
 
 def test_only_known_fields_of_samples_and_observations_are_recorded() -> None:

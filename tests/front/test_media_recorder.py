@@ -102,14 +102,6 @@ def test_newest_frame_goes_at_the_rate(rig: Rig) -> None:
     assert rig.drops() == {}
 
 
-def test_frame_at_rest_goes_once(rig: Rig) -> None:
-    rig.push("room")
-    for _ in range(20):
-        rig.tick()
-        rig.now_ns += PERIOD_NS
-    assert len(rig.got) == 1
-
-
 def test_descriptions_go_when_they_change_and_the_end_of_a_stream(rig: Rig) -> None:
     def describe(info: StreamInfo) -> None:
         push = MediaPush("room", 3, 0, (), "cloud", info)

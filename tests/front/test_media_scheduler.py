@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable, Mapping
-from types import FrameType
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -95,16 +93,6 @@ def test_coarser_class_is_sent_at_full_rate() -> None:
     assert [frame for _, frame in wire.got[BOB]] == [b"half"] * 2, "every second of the next better one"
 
 
-def test_on_the_slowest_links_the_coarsest_class_is_rare_before_there_is_nothing() -> None:
-    wire = Wire(ann=3, bob=NONE_LEVEL - 1)
-    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
-    wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
-    wire.push(16, frames={"full": b"full", "half": b"half", "quarter": b"quarter"})
-    assert [frame for _, frame in wire.got[ANN]] == [b"quarter"] * 8
-    assert [frame for _, frame in wire.got[BOB]] == [b"quarter"] * 2
-    assert {header.budget_class for who in (ANN, BOB) for header, _ in wire.got[who]} == {"quarter"}
-
-
 def test_full_connection_gets_the_newest_frame_later_and_delays_no_other() -> None:
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
@@ -154,16 +142,6 @@ def test_one_of_two_connections_of_a_client_closes() -> None:
     wire.push()
     assert len(wire.got[ANN]) == 1
     assert wire.hub.read_counters(ANN).delivered == 1
-
-
-def test_unsubscribing_does_not_affect_other_clients() -> None:
-    wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
-    assert not wire.hub.subscribe(ANN, "cloud", "b", 2, SECOND)
-    wire.hub.unsubscribe(ANN, "cloud", 2)
-    wire.hub.remove_reader(2)
-    wire.push()
-    assert len(wire.got[ANN]) == 1
 
 
 def test_memory_shortage_pauses_all_media() -> None:
@@ -234,45 +212,6 @@ def test_streams_and_subscriptions_are_bounded() -> None:
     wire.hub.sample_rates(wire.now_ns)
     assert wire.hub.read_streams() == {}
     assert wire.push(stream="another")
-
-
-def count_lines(action: Callable[[], object]) -> int:
-    """Return how many lines an action runs."""
-    lines, before = 0, sys.gettrace()
-
-    def trace(_frame: FrameType, event: str, _argument: object) -> Any:
-        nonlocal lines
-        lines += event == "line"
-        return trace
-
-    sys.settrace(trace)
-    try:
-        action()
-    finally:
-        sys.settrace(before)
-    return lines
-
-
-def test_work_for_one_client_or_stream_does_not_grow_with_the_others() -> None:
-    """The front's main thread waits for the first two, for every client, four times a second."""
-    wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
-
-    def count() -> list[int]:
-        wire.push()
-        actions = (lambda: wire.hub.list_subscriptions(ANN), lambda: wire.hub.read_counters(ANN), wire.push)
-        return [count_lines(action) for action in actions]
-
-    alone = count()
-    others = range(100, 130)
-    wire.hub.set_subscribers({n: MediaSubscriber("", {}) for n in others} | {ANN: MediaSubscriber("a", {})}, SECOND)
-    for number in others:
-        for n in range(MAX_STREAMS):
-            assert wire.hub.subscribe(number, f"s{n}", "", number, SECOND)
-    assert count() == alone
-    wire.allow()
-    assert all(wire.hub.list_subscriptions(number) == [] for number in others)
-    assert wire.hub.list_subscriptions(ANN) == ["cloud"]
 
 
 def test_stream_belongs_to_its_source_while_it_sends() -> None:
@@ -359,15 +298,6 @@ def test_streams_of_a_sender_that_has_left_end_and_do_not_come_back() -> None:
     assert push("cloud", BOB)
 
 
-def test_another_key_waits_when_a_source_has_ended() -> None:
-    wire = Wire()
-    push = MediaPush("cloud", 3, 0)
-    assert wire.hub.push(push, [b"x"], "camera-1", wire.now_ns, 11)
-    wire.hub.release_streams(11)
-    assert not wire.hub.push(push, [b"x"], "camera-2", wire.now_ns, 12)
-    assert wire.hub.push(push, [b"x"], "camera-1", wire.now_ns, 13)
-
-
 def test_rates_cover_the_last_seconds() -> None:
     wire = Wire()
     for _ in range(12):
@@ -405,18 +335,6 @@ def test_a_link_that_has_room_again_gets_the_newest_frame() -> None:
     wire.allow(ann=0)
     wire.hub.flush(wire.send, wire.now_ns)
     assert len(wire.got[ANN]) == 1
-
-
-def test_last_frame_of_a_stream_comes_with_a_better_level() -> None:
-    wire = Wire(ann=5)
-    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
-    while not wire.got[ANN]:
-        wire.push()
-    wire.push()
-    assert len(wire.got[ANN]) == 1
-    wire.allow(ann=0)
-    wire.hub.flush(wire.send, wire.now_ns)
-    assert [head.seq - wire.got[ANN][0][0].seq for head, _ in wire.got[ANN]] == [0, 1]
 
 
 def test_client_that_has_connected_again_gets_the_newest_frame_again() -> None:
@@ -509,16 +427,6 @@ def test_info_may_come_without_a_frame() -> None:
     assert wire.hub.pop_drops()[0] == {}
     assert not wire.hub.push(MediaPush("cloud", 3, 5, ()), [], "", wire.now_ns)
     assert wire.hub.pop_drops()[0] == {"media_malformed": 1}
-
-
-def test_new_source_does_not_send_frames_of_the_one_before() -> None:
-    wire = Wire()
-    wire.push(source="camera-1")
-    wire.now_ns += 4 * SECOND
-    describe(wire, StreamInfo("another room"), "camera-2")
-    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
-    wire.hub.flush(wire.send, wire.now_ns)
-    assert not wire.got[ANN]
 
 
 @pytest.mark.parametrize(

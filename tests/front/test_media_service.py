@@ -124,14 +124,6 @@ def test_stale_stream_is_told_within_a_second_and_a_quarter() -> None:
     assert not room.service.report_streams()[0].stale
 
 
-def test_report_names_the_fault() -> None:
-    room = Room()
-    room.push(info=msgspec.structs.replace(ROOM, fault="no_depth", detail="covered"))
-    room.tick()
-    (report,) = room.service.report_streams()
-    assert (report.fault, report.detail) == ("no_depth", "covered")
-
-
 def test_two_sources_of_one_stream_are_reported_while_they_are() -> None:
     room = Room()
     for n in range(3):
@@ -207,17 +199,6 @@ def test_changes_with_every_frame_are_sent_at_a_bounded_rate_and_the_last_one_is
     assert (room.find().detail, room.find().encoding) == ("79", "e79")
 
 
-def test_new_stream_is_described_at_once_whatever_others_do() -> None:
-    room = Room()
-    for n in range(20):
-        room.push(info=msgspec.structs.replace(ROOM, detail=str(n)))
-        room.tick()
-    room.push("hand", StreamInfo("Hand", "remote"))
-    room.push(info=msgspec.structs.replace(ROOM, detail="once more"))
-    assert room.tick() == 1
-    assert (room.find("hand").title, room.find("hand").audience) == ("Hand", "remote")
-
-
 def test_longest_descriptions_of_all_streams_fit_a_message() -> None:
     room = Room()
     text = "\N{ROBOT FACE}"
@@ -230,12 +211,3 @@ def test_longest_descriptions_of_all_streams_fit_a_message() -> None:
     assert isinstance(envelope.message, DeliveryBudget)
     assert {len(one.title) for one in envelope.message.streams} == {MAX_TITLE}
     assert {len(one.detail) for one in envelope.message.streams} == {MAX_DETAIL}
-
-
-def test_participants_are_reported_without_descriptions() -> None:
-    room = Room()
-    room.push()
-    room.tick()
-    room.proxy.scheduler.subscribe(7, "room", "", 1, room.now_ns)
-    room.tick()
-    assert room.service.report_participant(7)["media"] == (StreamBudget("room", encoding="cloud"),)

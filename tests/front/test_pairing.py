@@ -226,18 +226,6 @@ def test_pairing_waits_while_the_list_is_missing(rig: PairingRig) -> None:
     assert set(rig.home.clients.read()) == {ann.fingerprint, bob.fingerprint}
 
 
-def test_attempts_of_one_key_with_one_code_are_answered_alike(rig: PairingRig) -> None:
-    """Several programs of one user pair at the same time, as emulated headsets do."""
-    own = KeyPair.generate()
-    code, _ = rig.home.join_codes.create(rig.server)
-    for _ in range(3):
-        rig.asks(own, rig.proof(code, own))
-    turns(rig.turn, lambda: len(rig.answers(own)) == 3)
-    first, *others = rig.answers(own)
-    assert isinstance(first, Paired)
-    assert others == [first, first]
-
-
 def test_key_that_a_front_revoked_before_it_was_killed_leaves_the_list(rig: PairingRig) -> None:
     own, bob = KeyPair.generate(), KeyPair.generate()
     rig.home.clients.allow_key("ann", own.public)

@@ -20,7 +20,6 @@ from iris_session.front.raw_feed import (
     KEY_SHARE,
     LOG_PERIOD_NS,
     NOT_READ,
-    OBSERVER_BYTES_PER_S,
     PRESENCE_BYTES_PER_S,
     PRESENCE_DEVICES,
     PRESENCE_HZ,
@@ -88,16 +87,6 @@ def test_reports_of_participants_go_with_the_samples(rig: Rig) -> None:
     assert msgspec.msgpack.decode(data, type=tuple[str, ClientReport]) == ("p1", report)
 
 
-def test_samples_go_in_batches(rig: Rig) -> None:
-    ann = connection(1, "ann")
-    for i in range(30):
-        rig.feed.send(ann, i, msgspec.structs.replace(LARGE, seq=i))
-    rig.feed.tick(SECOND)
-    rows = rig.receive(30)
-    assert [(number, at) for number, at, _ in rows] == [(1, i) for i in range(30)]
-    assert [msgspec.msgpack.decode(data, type=Sample).seq for *_, data in rows] == list(range(30))
-
-
 def test_one_key_has_its_share_over_all_its_connections(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     """A key that sends all it can (600 samples a second, eight connections) leaves the others theirs."""
     eves = [connection(10 + i, "eve") for i in range(8)]
@@ -159,18 +148,6 @@ def test_after_the_end_of_a_recording_nothing_is_missing(rig: Rig) -> None:
     feed._socket.close(linger=0)  # type: ignore[union-attr]
 
 
-def test_feed_without_recorder_counts_nothing() -> None:
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    drops = Drops()
-    feed = RawFeed(context, "", drops)
-    for _ in range(2000):
-        feed.send(connection(1, "ann"), 0, LARGE)
-    feed.tick(0)
-    feed.close()
-    assert drops.by_reason == {}
-    context.term()
-
-
 def test_of_observers_only_presence_at_display_rate_counts() -> None:
     drops = Drops()
     limiter, eve = PresenceLimiter(drops), connection(1, "eve", "observer")
@@ -218,13 +195,3 @@ def test_requests_of_observers_have_a_share() -> None:
     assert taken <= REQUEST_BYTES_PER_S * (10 + BURST_S)
     assert limiter.take_request(connection(9, "ann", "observer"), 20_000, 10 * SECOND) == ""
     assert limiter.take_request(eves[0], 60_000, 10 * SECOND) == REQUEST_SHARE
-
-
-def test_observers_record_less_than_others(rig: Rig) -> None:
-    eve = connection(1, "eve", "observer")
-    for i in range(6000):
-        rig.feed.send(eve, i * SECOND // 600, LARGE)
-        while rig.recorder.poll(0):
-            rig.recorder.recv()
-    kept = 6000 - rig.drops.by_reason[KEY_SHARE]
-    assert kept * LARGE_BYTES <= OBSERVER_BYTES_PER_S * (10 + BURST_S)

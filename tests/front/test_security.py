@@ -192,46 +192,6 @@ def test_stolen_resume_token_is_refused_and_audited(lab: Lab) -> None:
     lab.session.wait_entries(Marker)
 
 
-def test_only_gateways_may_send_for_others(lab: Lab) -> None:
-    eve, client = lab.allowed("eve")
-    client.send(EStop("forged"), on_behalf_of="ann")
-    assert client.wait_for(ProtocolFault).message == "only a gateway speaks on behalf of others"
-    client.send(Hello("operator", "ann", secret=b"s" * 16), on_behalf_of="ann")
-    assert client.wait_for(Refused).code == RefusalCode.GATEWAY_ONLY
-    audits = lab.audits(AuditKind.GATEWAY_REFUSED, 2)
-    assert {(a.subject, a.detail) for a in audits} == {(eve.fingerprint, "on behalf of ann")}
-    assert not [e for e in lab.session.entries if isinstance(e.message, EStop)]
-
-
-def test_participants_of_a_gateway_have_the_other_roles_of_its_key(lab: Lab) -> None:
-    pair = KeyPair.generate()
-    lab.home.clients.allow_key("web", pair.public, ("gateway", "observer"))
-    gateway = lab.client(pair)
-    gateway.join(role="gateway", name="web")
-    gateway.send(Hello("observer", "tab", secret=b"s" * 16), on_behalf_of="tab1")
-    joins = [e.message for e in lab.session.wait_entries(Join, 2)]
-    assert isinstance(joins[1], Join)
-    assert joins[1].roles == ("observer",)
-    lab.home.clients.allow_key("web", pair.public, ("gateway",))
-    lab.session.pump(lambda: lab.home.clients.read()[pair.fingerprint].roles == ("gateway",))
-    gateway.send(Hello("director", "tab", secret=b"t" * 16), on_behalf_of="tab2")
-    joins = [e.message for e in lab.session.wait_entries(Join, 3)]
-    assert isinstance(joins[2], Join)
-    assert "director" not in (joins[2].roles or ("director",))
-
-
-def test_audits_of_a_flood_are_bounded_and_add_up(lab: Lab) -> None:
-    clients = [lab.client(KeyPair.generate()) for _ in range(5)]
-    for _ in range(40):
-        for client in clients:
-            client.send(Hello("operator", "Eve"))
-    audits = lab.audits(AuditKind.KEY_REFUSED, 200)
-    assert sum(a.count for a in audits) == 200
-    assert len(audits) <= 3, "at most once a second"
-    answers = len([m for client in clients for m in client.got(Refused)])
-    assert answers <= 40, "answers to unknown keys are bounded"
-
-
 def test_list_may_be_edited_during_the_session(lab: Lab) -> None:
     _, ann = lab.allowed("ann")
     _, bob = lab.allowed("bob")

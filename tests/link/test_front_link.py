@@ -243,14 +243,6 @@ def test_last_messages_of_a_dead_front_are_read(pair: Pair) -> None:
     assert heard == [EStop("stop"), FrontRestarted()]
 
 
-def test_entries_right_after_ready_are_kept(pair: Pair) -> None:
-    pair.say(messages.READY, msgspec.msgpack.encode(Ports("127.0.0.1", 1, 2)))
-    pair.say(messages.ENTRIES, encode_entries([Entry(1, 1, 5, Heartbeat())]))
-    while pair.link.ports is None:
-        pair.link.receive()
-    assert [entry.message for entry in pair.poll(1)] == [Heartbeat()]
-
-
 def test_presence_is_not_sent_after_the_participant_left(pair: Pair) -> None:
     pair.ready()
     heads = tuple(PresenceItem(name, "head", IDENTITY) for name in ("p1", "p2"))
@@ -262,12 +254,6 @@ def test_presence_is_not_sent_after_the_participant_left(pair: Pair) -> None:
     pair.link.send_decision(3, Decision(()))
     items = [msgspec.msgpack.decode(f[1], type=list[PresenceItem]) for f in pair.heard() if f[0] == messages.PRESENCE]
     assert items == [[heads[1]]]
-
-
-def test_scene_is_sent_once_the_front_is_ready(pair: Pair) -> None:
-    pair.link.send_scene(SceneInfo("next"))
-    pair.ready()
-    assert [messages.decode_scene(f[1]).scene_hash for f in pair.heard() if f[0] == messages.SCENE] == ["next"]
 
 
 def test_silence_of_a_front_counts_only_while_polling(pair: Pair) -> None:

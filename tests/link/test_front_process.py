@@ -16,20 +16,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 import zmq
 import zmq.auth
 
-from iris_session.link import FrontConfig, FrontError, FrontLimits, FrontProcess
-from iris_session.link.sockets import RESERVED_DESCRIPTORS
+from iris_session.link import FrontConfig, FrontError, FrontProcess
 from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import FrontRestarted, Join
 from iris_session.protocol.server_messages import ProtocolFault, Snapshot
 from iris_session.security import KeyHome
-from tests.front.altered_front import DESCRIPTORS, FEW_DESCRIPTORS, run_altered
-from tests.front.process_harness import LONG_NS, ProcessClient, ProcessSession, scene
+from tests.front.process_harness import ProcessClient, ProcessSession, scene
 from tests.loopback import make_loopback_address
 
 pytestmark = pytest.mark.e2e
@@ -219,66 +216,3 @@ def test_front_ends_with_its_parent(tmp_path: Path) -> None:
     assert codes[-1:] == ["session_ended"]
     assert list(tmp_path.iterdir()) == [], "nobody else can remove the folder of the link"
     context.destroy(linger=0)
-
-
-def test_curve_accepts_only_allowed_keys_and_identifies_clients_by_key(
-    open_process: OpenSession, tmp_path: Path
-) -> None:
-    keys = tmp_path / "clients"
-    keys.mkdir()
-    server_public, _ = _certificate(tmp_path, "server")
-    ann = _certificate(keys, "ann")
-    eve = _certificate(tmp_path, "eve")
-    session = open_process(curve_secret_file=str(tmp_path / "server.key_secret"), curve_clients_dir=str(keys))
-    assert session.ports.key_fingerprint
-    allowed = session.client(curve=(server_public, *ann))
-    again = session.client(curve=(server_public, *ann))
-    allowed.send(Hello("operator", "Ann"))  # no secret: the key is the identity
-    again.send(Hello("operator", "Ann"))
-    first, second = (e.message for e in session.wait_entries(Join, 2))
-    assert isinstance(first, Join)
-    assert isinstance(second, Join)
-    assert first.key_id == second.key_id
-    subs = [session.subscriber(curve=(server_public, *keys)) for keys in (ann, eve)]
-    poses = np.zeros((3, 7))
-
-    def state_comes() -> bool:
-        session.send_state(poses)
-        return bool(subs[0].poll(0))
-
-    session.pump(state_comes, "encrypted state")
-    assert not subs[1].poll(0)
-    unknown = session.client(curve=(server_public, *eve))
-    unknown.send(Hello("operator", "Eve"))
-    assert session.wait_drops("unknown_key") >= 1
-    (keys / "eve.key").write_bytes((tmp_path / "eve.key").read_bytes())
-    late = session.client(curve=(server_public, *eve))
-    late.send(Hello("operator", "Eve"))
-    session.wait_entries(Join, 3)
-    plain = session.client()
-    plain.send(Hello("operator", "Mallory", secret=b"s" * 16))
-    late.send(Heartbeat(), epoch=3)
-    session.wait_entries(Heartbeat)
-    assert len(session.wait_entries(Join)) <= 4
-    assert "Mallory" not in {e.message.name for e in session.wait_entries(Join) if isinstance(e.message, Join)}
-
-
-def _certificate(folder: Path, name: str) -> tuple[bytes, bytes]:
-    zmq.auth.create_certificates(folder, name)
-    (folder / f"{name}.key_secret").chmod(0o600)
-    public, secret = zmq.auth.load_certificate(folder / f"{name}.key_secret")
-    assert secret is not None
-    return public, secret
-
-
-def test_few_descriptors_are_kept_for_clients(open_process: OpenSession, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many connections that say nothing as the system gives descriptors: most are closed, and a client joins."""
-    run_altered(monkeypatch, FEW_DESCRIPTORS)
-    session = open_process(limits=FrontLimits(hello_timeout_ns=LONG_NS))  # they are closed for being too many alone
-    silent = [socket.create_connection((session.host, session.ports.state)) for _ in range(DESCRIPTORS)]
-    session.wait_drops("strangers_too_many")
-    session.client().join()
-    front = psutil.Process(session.process.pid)
-    session.pump(lambda: front.num_fds() < DESCRIPTORS - RESERVED_DESCRIPTORS, "descriptors that are free")
-    for one in silent:
-        one.close()

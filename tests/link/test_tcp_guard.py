@@ -133,14 +133,6 @@ def test_connections_with_a_request_under_way_stay() -> None:
     assert rig.left == [0, 1], "the other was idle"
 
 
-def test_an_owner_has_its_share() -> None:
-    rig = Rig(established=100, find_share=lambda owner: 1 if owner == "hog" else 3)
-    for key in ("hog", "ann", "hog", "ann", "hog"):
-        rig.open(key=key)
-    rig.guard.tick(SECOND)
-    assert rig.left == [0, 1, 3]
-
-
 def test_silent_connections_are_closed_and_established_ones_may_be_silent() -> None:
     rig = Rig(silence_ns=10 * SECOND)
     rig.open()
@@ -210,15 +202,6 @@ def test_a_close_that_fails_is_tried_again() -> None:
         can_close = True
         assert guard.evict(ours.fileno(), "media_silent") == "media_silent"
         assert guard.evict(ours.fileno(), "media_silent") == ""
-
-
-def test_a_new_connection_with_the_same_descriptor_begins_anew() -> None:
-    rig = Rig(counted_messages=16)
-    ann = rig.open(key="ann")
-    rig.guard.record_message(ann, (), 16)
-    rig.guard.add(ann, 2 * SECOND, ("10.0.0.9", 1))
-    assert not rig.guard.table[ann].is_established
-    assert rig.guard.record_message(ann, (), 16) == ""
 
 
 # --- closing one connection of libzmq -------------------------------------------------------------------------------

@@ -71,13 +71,6 @@ def test_secret_key_readable_by_others_is_refused_with_the_command(tmp_path: Pat
     assert load_secret(secret).public == load_public(public)
 
 
-def test_unreadable_key_file_error_has_the_cause(tmp_path: Path) -> None:
-    with pytest.raises(KeysError, match=r"missing.key.*No such file"):
-        load_public(tmp_path / "missing.key")
-    with pytest.raises(KeysError, match="Is a directory"):
-        load_public(tmp_path)
-
-
 def test_key_file_without_permission_names_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def closed(path: Path, *_mode: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))  # root may read everything, so a file cannot show it
@@ -173,12 +166,6 @@ def test_invalid_entry_is_named_by_its_first_line(
     assert number == braces[1]
 
 
-def test_duplicate_key_is_an_error(home: KeyHome, listed: Path) -> None:
-    rows = json.loads(listed.read_text())
-    listed.write_text(json.dumps([*rows, {**rows[0], "name": "eve"}], indent=2))
-    assert read_complaint(home, listed)[1].count("'ann'") == 1
-
-
 def test_session_note_does_not_undo_an_edit(home: KeyHome, listed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Editors do not use the lock."""
     read = home.clients.read
@@ -217,11 +204,5 @@ def test_file_saved_during_reading_is_damaged(
     listed.write_text(json.dumps([*entries, entries[0]]))
     whole, reads = home.folder.read, iter([listed.read_bytes(), saved.encode()])
     monkeypatch.setattr(home.folder, "read", lambda name: next(reads, None) or whole(name))
-    with pytest.raises(KeysError, match="damaged"):
-        home.clients.read()
-
-
-def test_number_of_thousands_of_digits_is_damage(home: KeyHome, listed: Path) -> None:
-    listed.write_text('[{"name": 1' + 5000 * "0" + "}]")
     with pytest.raises(KeysError, match="damaged"):
         home.clients.read()

@@ -88,30 +88,6 @@ def test_empty_list_revokes_all_at_once(listed: List) -> None:
     assert list(listed.keyring.removed) == listed.marks
 
 
-def test_list_that_disappears_while_it_is_read_revokes_nobody(listed: List, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = listed.home.clients.read
-
-    def vanish() -> dict[str, object]:
-        listed.file.rename(listed.file.with_name("clients.json~"))
-        return dict(read())
-
-    listed.file.write_bytes(listed.file.read_bytes() + b"\n")
-    with monkeypatch.context() as patch:
-        patch.setattr(listed.keyring, "_read", vanish)
-        listed.keyring.reload_if_changed()
-    assert list(listed.keyring.fingerprints) == listed.marks
-    listed.file.with_name("clients.json~").rename(listed.file)
-    listed.pass_time(2 * ABSENCE_NS)
-    assert list(listed.keyring.fingerprints) == listed.marks
-    assert not listed.keyring.removed
-
-
-def test_keyring_without_file_has_nothing_missing() -> None:
-    keyring = Keyring()
-    keyring.reload_if_changed()
-    assert not keyring.is_missing
-
-
 def test_own_processes_join_without_the_list_in_their_roles_only(tmp_path: Path) -> None:
     gateway, camera, other = (KeyPair.generate() for _ in range(3))
     KeyHome(tmp_path / "home").load_server_key()

@@ -8,7 +8,6 @@ from iris_session.protocol.client_messages import Bye, Disconnected, Heartbeat, 
 from iris_session.protocol.codec import decode_client, decode_server, encode_client, encode_server
 from iris_session.protocol.common import Message
 from iris_session.protocol.server_messages import Endpoints, ProtocolFault, ServerEnvelope, Welcome
-from iris_session.protocol.status import DeliveryBudget
 from iris_session.web import wire
 from iris_session.web.hub import SECOND, TICKET_BYTES, Browser, Hub, HubLimits
 
@@ -315,20 +314,3 @@ def test_a_full_hub_makes_room_only_by_those_that_have_not_joined() -> None:
         welcome(hub, browser)
     assert hub.open_browser(b"\0\0\0\0\0\x09", "", 0) is None
     assert hub.drops.by_reason == {"web_evicted": 3, "web_full": 1}
-
-
-def test_addresses_of_one_network_make_room_for_others() -> None:
-    hub = Hub(HubLimits(browsers=4))
-    lone = open_from(hub, 1, "10.0.0.2")
-    flood = [open_from(hub, n, f"2001:db8::{n}") for n in range(2, 9)]
-    assert lone.closing is None
-    assert [one.closing is None for one in flood] == [False] * 4 + [True] * 3
-
-
-def test_media_wait_for_the_budget() -> None:
-    hub = Hub()
-    browser = open_browser(hub)
-    welcome(hub, browser)
-    assert not browser.has_budget
-    answer(hub, browser, DeliveryBudget("full"))
-    assert browser.has_budget

@@ -29,16 +29,6 @@ def test_others_send_between_the_pieces_of_a_message() -> None:
     assert turns >= 64
 
 
-def test_message_ends_with_its_socket() -> None:
-    async def act(writer: SocketWriter) -> int:
-        sending = asyncio.create_task(writer.send_pieces(bytes(64 * MEDIA_PIECE)))
-        await asyncio.sleep(0)
-        await writer.socket.close()
-        return await sending
-
-    assert asyncio.run(serve_one(act)) == (None, False)
-
-
 @pytest.mark.parametrize(("first", "code"), [(None, 1013), (wire.encode_gateway_message(wire.Ticket("x")), 4003)])
 def test_late_ticket_is_no_wrong_one(monkeypatch: pytest.MonkeyPatch, first: bytes | None, code: int) -> None:
     monkeypatch.setattr(server, "TICKET_S", 0.05 if first is None else 60.0)

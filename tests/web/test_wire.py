@@ -118,12 +118,6 @@ def test_subscriptions_are_bounded_names() -> None:
             wire.decode_subscriptions(msgspec.msgpack.encode(names))
 
 
-def test_frames_are_counted_in_a_byte() -> None:
-    for frames in ([], [b""] * 256):
-        with pytest.raises(ValueError, match="1 to 255 frames"):
-            wire.encode_frames(wire.CONTROL, frames)
-
-
 def test_types_are_read_without_the_message() -> None:
     assert wire.peek_client_type(encode_client(wrap_message(Bye(), 3, "x"))) == "bye"
     pong = encode_server(ServerEnvelope(1, 9, ClockPong(1, 2, 3)))
