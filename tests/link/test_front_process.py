@@ -172,7 +172,12 @@ def test_hanging_front_is_replaced(process_session: ProcessSession) -> None:
     os.kill(hung, signal.SIGSTOP)
     session.pump(lambda: session.process.poll(time.monotonic_ns()), "notice")
     assert time.monotonic() - before > 1.0, "not at the first silence"
-    session.pump(lambda: session.process.link.ports is not None, "new front")
+
+    def has_new_front() -> bool:
+        session.process.poll(time.monotonic_ns())
+        return session.process.link.ports is not None
+
+    session.pump(has_new_front, "new front")
     assert gone(hung)
     assert client.join(resume_token=token).resumed
 
