@@ -11,7 +11,6 @@ covariance (Birge ratio: chi-square per degree of freedom). Without a majority t
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,6 +20,7 @@ import numpy as np
 
 from anchors.lie import Array, to_vec3
 from anchors.pose import (
+    IDENTITY_POSE,
     PoseTuple,
     Quat,
     Vec3,
@@ -62,8 +62,6 @@ __all__ = [
     "mirror_pose",
     "position_error_p95",
 ]
-
-_NOWHERE: Final[PoseTuple] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -125,6 +123,14 @@ class AlignmentEstimate:
     refused: bool
     advice: str
     moved: tuple[str, ...] = ()
+
+    @classmethod
+    def refusal(
+        cls, tracking_epoch: int, advice: str, n_observations: int = 0, n_viewpoints: int = 0
+    ) -> AlignmentEstimate:
+        """Return a refusal with its advice."""
+        nothing = (IDENTITY_POSE, tracking_epoch, (0.0,) * 36, IDENTITY_POSE[0], math.inf, 0.0)
+        return cls(*nothing, n_observations, n_viewpoints, True, advice)
 
     def covariance_at(self, point_world: Vec3) -> Array:
         """Return the covariance (3, 3) [m^2] of the position error at a point of the world."""
@@ -298,10 +304,9 @@ class AlignmentEstimator:
             s = solve_alignment(b, replace(prior, tilt_sigma_rad=tilt), (s.q, s.t))
         self._near = (s.q, s.t)
         agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
-        moved = find_outvoted(b.anchor, s)
         if agreeing < self.config.min_observations or not self._is_majority(b, s, len(groups)):
             return self._refuse(disagreement_advice(sorted(set(b.anchor))))
-        return self._to_estimate(b, s, tilt, moved)
+        return self._to_estimate(b, s, tilt)
 
     def _merge(self, groups: Mapping[GroupKey, ViewpointGroup]) -> tuple[list[GroupKey], list[MergedObservation]]:
         """Return one merged observation per anchor and viewpoint whose observations agree, with their keys."""
@@ -337,9 +342,9 @@ class AlignmentEstimator:
             return 2 * count_agreeing_anchors(b.anchor, s.inside) > len(anchors)
         return 2 * int(np.count_nonzero(s.inside)) > n_groups
 
-    def _to_estimate(
-        self, b: AlignmentProblem, s: AlignmentSolution, tilt: float, moved: tuple[str, ...]
-    ) -> AlignmentEstimate:
+    def _to_estimate(self, b: AlignmentProblem, s: AlignmentSolution, tilt: float) -> AlignmentEstimate:
+        agreeing = {name for name, ok in zip(b.anchor, s.inside.tolist(), strict=True) if ok}
+        moved = tuple(sorted(set(b.anchor) - agreeing))  # no viewpoint of these agrees with the rest
         wider = s.chi2 / s.freedom if s.freedom > 0.0 and s.chi2 > chi2_quantile(s.freedom, Z99) else 1.0
         pivot = s.inside @ b.p_world / float(s.inside.sum())
         pivot_world = to_vec3(pivot)
@@ -371,39 +376,7 @@ class AlignmentEstimator:
 
     def _refuse(self, advice: str) -> AlignmentEstimate:
         viewpoints = len({viewpoint for _, viewpoint in self._memory.groups})
-        zero = (0.0, 0.0, 0.0)
-        n = len(self._memory)
-        return AlignmentEstimate(
-            _NOWHERE, self.tracking_epoch, (0.0,) * 36, zero, math.inf, 0.0, n, viewpoints, True, advice
-        )
-
-    def snapshot(self) -> bytes:
-        """Return the whole state except anchors, sizes and configuration."""
-        counters = [getattr(self, name) for name in _COUNTERS]
-        near = None if self._near is None else [part.tolist() for part in self._near]
-        plain = {"counters": counters, "misprints": self._misprints, "near": near}
-        return json.dumps({**plain, **self._memory.snapshot()}).encode()
-
-    def restore(self, snapshot: bytes) -> None:
-        """Restore a snapshot: later results equal those of the estimator that wrote it."""
-        data = json.loads(snapshot)
-        for name, value in zip(_COUNTERS, data["counters"], strict=True):
-            setattr(self, name, int(value))
-        self._misprints, near = dict(data["misprints"]), data["near"]
-        self._near = None if near is None else (np.array(near[0]), np.array(near[1]))
-        self._memory.restore(data)
-
-
-_COUNTERS: Final = (
-    *("tracking_epoch", "unknown_anchors", "stale_epochs", "invalid", "wrong_size", "against_gravity", "unmirrored"),
-    "_against_gravity",
-)
-
-
-def find_outvoted(anchor: tuple[str, ...], s: AlignmentSolution) -> tuple[str, ...]:
-    """Return the anchors of which no viewpoint agrees with the rest."""
-    agreeing = {name for name, ok in zip(anchor, s.inside.tolist(), strict=True) if ok}
-    return tuple(sorted(set(anchor) - agreeing))
+        return AlignmentEstimate.refusal(self.tracking_epoch, advice, len(self._memory), viewpoints)
 
 
 def mirror_pose(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:

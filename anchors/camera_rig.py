@@ -1,7 +1,8 @@
 """Joint calibration of cameras that observe the same sheets: poses of all cameras and sheets in one frame.
 
 Sheets of known pose fix the frame; cameras and other sheets follow from the observations, by weighted robust least
-squares over all of them. A sheet that is carried through the room counts as a new one at every instant (`wand@3`).
+squares over all of them (`anchors.constellation`, without gravity). A sheet that is carried through the room counts as
+a new one at every instant (`wand@3`).
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from typing import Final
 
 import numpy as np
 
-from anchors.camera import apply_increment, pose_from_matrix, pose_to_matrix
-from anchors.lie import Array
-from anchors.pose import PoseTuple, compose, inverse
+from anchors.constellation import Edge, ObservationGraph, find_reachable, initial_guess, solve_graph
+from anchors.lie import to_quat, to_vec3
+from anchors.pose import PoseTuple
 from anchors.robot_world import CalibrationError
 
 #: Errors of the print and its pose, in addition to the covariance of a picture: [m], [rad] per axis.
@@ -34,13 +35,11 @@ class SheetView:
 
 @dataclass(frozen=True)
 class CameraRig:
-    """Poses in the common frame, covariances (36 values, common frame) beside them. `residuals`: per view, distance
-    [m] and angle [rad] between the observation and the result."""
+    """Poses in the common frame, and covariances of those of the cameras (36 values, common frame)."""
 
     cameras: dict[str, PoseTuple]
     sheets: dict[str, PoseTuple]
     covariances: dict[str, tuple[float, ...]]
-    residuals: tuple[tuple[float, float], ...]
 
 
 def solve_rig(views: Sequence[SheetView], T_base_sheet: Mapping[str, PoseTuple]) -> CameraRig:
@@ -50,89 +49,37 @@ def solve_rig(views: Sequence[SheetView], T_base_sheet: Mapping[str, PoseTuple])
         views: Observations of sheets by cameras.
         T_base_sheet: Poses of the known sheets.
 
+    Returns:
+        Poses of all cameras and sheets of the views.
+
     Raises:
         CalibrationError: No view, or a camera is not connected with a known sheet.
     """
     if not views:
         raise CalibrationError("no camera saw a sheet: step closer, light the sheet, check its size and id")
-    poses = _initial_guess(views, T_base_sheet)
-    names = [*sorted({("camera", v.camera) for v in views}), *sorted({("sheet", v.sheet) for v in views})]
-    free = [name for name in names if not (name[0] == "sheet" and name[1] in T_base_sheet)]
-    poses, normal, scale = _least_squares(views, poses, free)
-    covariance = np.linalg.inv(normal) * scale
-    blocks = {
-        name[1]: tuple(float(v) for v in covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6].ravel())
-        for k, name in enumerate(free)
-        if name[0] == "camera"
-    }
-    differences = [_view_residual(view, poses) for view in views]
-    return CameraRig(
-        {name: pose_from_matrix(poses[kind, name]) for kind, name in names if kind == "camera"},
-        {name: pose_from_matrix(poses[kind, name]) for kind, name in names if kind == "sheet"},
-        blocks,
-        tuple((float(np.linalg.norm(d[:3])), float(np.linalg.norm(d[3:]))) for d in differences),
-    )
-
-
-_Name = tuple[str, str]
-
-
-def _initial_guess(views: Sequence[SheetView], known: Mapping[str, PoseTuple]) -> dict[_Name, Array]:
-    """Return initial poses, outwards from the known sheets, by one view each."""
-    poses: dict[_Name, PoseTuple] = {("sheet", name): T for name, T in known.items()}
-    waiting = list(views)
-    while waiting:
-        left = []
-        for view in waiting:
-            camera, sheet = ("camera", view.camera), ("sheet", view.sheet)
-            if camera in poses and sheet not in poses:
-                poses[sheet] = compose(poses[camera], view.T_camera_sheet)
-            elif sheet in poses and camera not in poses:
-                poses[camera] = compose(poses[sheet], inverse(view.T_camera_sheet))
-            elif camera not in poses:
-                left.append(view)
-        if len(left) == len(waiting):
-            names = ", ".join(sorted({view.camera for view in left}))
-            raise CalibrationError(
-                f"nothing connects camera {names} with a sheet of known place ({', '.join(sorted(known)) or 'none'}): "
-                "let it see one of those, or a sheet that another camera sees too"
-            )
-        waiting = left
-    return {name: pose_to_matrix(T) for name, T in poses.items()}
-
-
-def _least_squares(
-    views: Sequence[SheetView], poses: dict[_Name, Array], free: list[_Name]
-) -> tuple[dict[_Name, Array], Array, float]:
-    from scipy.optimize import least_squares
-
     floor = np.diag([_FLOOR[0] ** 2] * 3 + [_FLOOR[1] ** 2] * 3)
-    whiteners = [np.linalg.inv(np.linalg.cholesky(np.reshape(view.covariance, (6, 6)) + floor)) for view in views]
-
-    def apply_increments(p: Array) -> dict[_Name, Array]:
-        out = dict(poses)
-        for name, step in zip(free, p.reshape(-1, 6), strict=True):
-            out[name] = apply_increment(poses[name], step)
-        return out
-
-    def residuals(p: Array) -> Array:
-        at = apply_increments(p)
-        return np.concatenate([W @ _view_residual(view, at) for W, view in zip(whiteners, views, strict=True)])
-
-    solved = least_squares(residuals, np.zeros(6 * len(free)), loss="huber", f_scale=3.0, x_scale="jac")
-    freedom = max(6 * (len(views) - len(free)), 1)
-    return (
-        apply_increments(solved.x),
-        np.asarray(solved.jac.T @ solved.jac),
-        max(1.0, 2.0 * float(solved.cost) / freedom),
+    edges = [
+        Edge(v.camera, 0, i, v.sheet, *map(np.array, v.T_camera_sheet), np.reshape(v.covariance, (6, 6)) + floor)
+        for i, v in enumerate(views)
+    ]
+    reached = find_reachable(edges, T_base_sheet)
+    lost = sorted({v.camera for v in views if v.sheet not in reached})
+    if lost:
+        raise CalibrationError(
+            f"nothing connects camera {', '.join(lost)} with a sheet of known place "
+            f"({', '.join(sorted(T_base_sheet)) or 'none'}): let it see one of those, or a sheet that another camera "
+            "sees too"
+        )
+    graph = ObservationGraph(edges, T_base_sheet)
+    solved = solve_graph(graph, initial_guess(graph), np.ones(len(edges)), loss="huber")
+    scale = max(1.0, 2.0 * solved.cost / max(6 * (len(edges) - len(solved.p)), 1))
+    poses = [(to_vec3(p), to_quat(q)) for p, q in zip(solved.p, solved.q, strict=True)]
+    n = len(graph.unknown)
+    names = [camera for camera, _ in graph.headsets]
+    seen = {v.sheet for v in views}
+    blocks = (solved.covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] * scale for k in range(n, len(poses)))
+    return CameraRig(
+        dict(zip(names, poses[n:], strict=True)),
+        {name: T for name, T in (*T_base_sheet.items(), *zip(graph.unknown, poses[:n], strict=True)) if name in seen},
+        {name: tuple(block.ravel().tolist()) for name, block in zip(names, blocks, strict=True)},
     )
-
-
-def _view_residual(view: SheetView, poses: Mapping[_Name, Array]) -> Array:
-    """Return predicted minus observed position [m] and rotation [rad] of a sheet (6,), camera frame."""
-    from scipy.spatial.transform import Rotation
-
-    seen = pose_to_matrix(view.T_camera_sheet)
-    P = np.linalg.inv(poses["camera", view.camera]) @ poses["sheet", view.sheet]
-    turn = Rotation.from_matrix(P[:3, :3] @ seen[:3, :3].T).as_rotvec()
-    return np.concatenate([P[:3, 3] - seen[:3, 3], turn])

@@ -11,10 +11,9 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -34,7 +33,7 @@ from anchors.uncertainty import NoiseModel, isotropic_covariance, length_p95
 from anchors.viewpoints import AnchorObservation, ViewpointGroup
 
 FORMAT: Final = 1
-_F_SCALE: Final = 3.0  # whitened residuals beyond it count less (soft L1)
+_F_SCALE: Final = 3.0  # whitened residuals beyond it count less
 
 
 class ConstellationError(ValueError):
@@ -195,84 +194,41 @@ def solve_constellation(
     names = sorted({e.anchor_id for e in edges})
     if reference not in names:
         raise ConstellationError(f"sheet '{reference}' was not seen; seen: {', '.join(names) or 'none'}")
-    lost = sorted(set(names) - find_reachable(edges, reference))
+    lost = sorted(set(names) - find_reachable(edges, [reference]))
     if lost:
         raise ConstellationError(
             f"sheets not tied to '{reference}': {', '.join(lost)}; look at one of them and at one that is tied, one "
             "after the other, with the same headset"
         )
-    graph = ObservationGraph(edges, [n for n in names if n != reference], reference, T_world_reference)
-    weights = np.ones(len(edges))
-    x = initial_guess(graph)
-    covariance = np.zeros((0, 0))
+    graph = ObservationGraph(edges, {reference: T_world_reference})
+    weights, x = np.ones(len(edges)), initial_guess(graph)
     for _ in range(3):  # outliers are left out for good, otherwise they would still pull
-        x, covariance, distance2 = _least_squares(graph, x, weights, tilt_sigma_rad)
-        now = (distance2 <= 30.0).astype(np.float64)  # chi-square of 6 degrees at 4e-5
+        solved = solve_graph(graph, x, weights, tilt_sigma_rad)
+        x = solved.p, solved.q
+        now = (solved.distance2 <= 30.0).astype(np.float64)  # chi-square of 6 degrees at 4e-5
         if bool(np.all(now == weights)):
             break
         weights = now
     kept = [e for e, weight in zip(edges, weights.tolist(), strict=True) if weight > 0.0]
-    unconnected = sorted(set(names) - find_reachable(kept, reference))
+    unconnected = sorted(set(names) - find_reachable(kept, [reference]))
     if unconnected:  # their poses are undetermined, so no error could be stated
         raise ConstellationError(
             f"what was seen of {', '.join(unconnected)} contradicts itself or the other sheets: were sheets moved "
             "meanwhile? look at each of them again"
         )
-    return _to_solution(graph, x, covariance, weights, sizes or {})
-
-
-def _least_squares(
-    graph: ObservationGraph, x0: tuple[Array, Array], weights: Array, tilt_sigma_rad: float
-) -> tuple[tuple[Array, Array], Array, Array]:
-    """Run robust least squares over increments of all poses; return poses, covariance of the increments, and squared
-    distances of all edges."""
-    from scipy.optimize import least_squares
-
-    p0, q0 = x0
-    n = len(p0)
-
-    def poses(step: Array) -> tuple[Array, Array]:
-        d = step.reshape(n, 6)
-        return p0 + d[:, :3], quat_multiply(quat_exp(d[:, 3:]), q0)
-
-    def residuals(step: Array) -> Array:
-        p, q = poses(step)
-        whitened = _whiten_residuals(graph, p, q) * weights[:, None]
-        tilt = swing(q[graph.n_anchors :]) / tilt_sigma_rad
-        return np.concatenate([whitened.ravel(), tilt.ravel()])
-
-    got = least_squares(
-        residuals, np.zeros(6 * n), loss="soft_l1", f_scale=_F_SCALE, x_scale="jac", method="trf",
-        jac_sparsity=graph.sparsity() if n > 12 else None, max_nfev=60,
-    )  # fmt: skip
-    J = got.jac.toarray() if hasattr(got.jac, "toarray") else got.jac
-    p, q = poses(got.x)
-    covariance = np.linalg.pinv(J.T @ J, hermitian=True)
-    return (p, q), covariance, np.sum(_whiten_residuals(graph, p, q) ** 2, axis=1)
-
-
-def _whiten_residuals(graph: ObservationGraph, p: Array, q: Array) -> Array:
-    """Return observed minus predicted `T_tracking_anchor` in units of their noise, shape (edges, 6)."""
-    pa, qa = graph.anchor_poses(p, q)
-    ph, qh = p[graph.headset_index], q[graph.headset_index]
-    R = quat_to_matrix(quat_conjugate(qh))
-    r_p = graph.p - np.einsum("eij,ej->ei", R, pa - ph)
-    r_q = quat_log(quat_multiply(graph.q, quat_conjugate(quat_multiply(quat_conjugate(qh), qa))))
-    return np.asarray(np.einsum("eij,ej->ei", graph.whitening, np.concatenate([r_p, r_q], axis=1)))
+    return _to_solution(graph, solved, reference, weights, sizes or {})
 
 
 def _to_solution(
-    graph: ObservationGraph, x: tuple[Array, Array], covariance: Array, weights: Array, sizes: Mapping[str, float]
+    graph: ObservationGraph, solved: GraphSolution, reference: str, weights: Array, sizes: Mapping[str, float]
 ) -> ConstellationSolution:
-    p, q = x
-    anchors = {graph.reference: graph.T_world_reference}
-    error = {graph.reference: 0.0}
+    poses = [(to_vec3(p), to_quat(q)) for p, q in zip(solved.p, solved.q, strict=True)]
+    n = len(graph.unknown)
+    anchors = {**graph.known, **dict(zip(graph.unknown, poses[:n], strict=True))}
+    headsets = dict(zip(graph.headsets, poses[n:], strict=True))
+    error = {reference: 0.0}
     for i, name in enumerate(graph.unknown):
-        anchors[name] = (to_vec3(p[i]), to_quat(q[i]))
-        error[name] = length_p95(covariance[6 * i : 6 * i + 3, 6 * i : 6 * i + 3])
-    headsets = {
-        key: (to_vec3(p[graph.n_anchors + i]), to_quat(q[graph.n_anchors + i])) for i, key in enumerate(graph.headsets)
-    }
+        error[name] = length_p95(solved.covariance[6 * i : 6 * i + 3, 6 * i : 6 * i + 3])
     off: dict[str, list[float]] = {}
     rejected = []
     for e, weight in zip(graph.edges, weights.tolist(), strict=True):
@@ -283,7 +239,7 @@ def _to_solution(
         off.setdefault(e.anchor_id, []).append(math.dist(seen, anchors[e.anchor_id][0]))
     rms = {name: math.sqrt(sum(d * d for d in ds) / len(ds)) for name, ds in off.items()}
     known = {name: size for name, size in sizes.items() if name in anchors}
-    return ConstellationSolution(Constellation(graph.reference, anchors, error, known), headsets, rms, tuple(rejected))
+    return ConstellationSolution(Constellation(reference, anchors, error, known), headsets, rms, tuple(rejected))
 
 
 @dataclass(frozen=True)
@@ -325,17 +281,12 @@ def _measure_move(
     saved: Constellation, now: Constellation, a: str, b: str, min_m: float, min_rad: float
 ) -> MovedSheet | None:
     """Return how far `b` moved relative to `a`, `None` if stated errors and the rotation of `a` explain it."""
-    p0, q0 = _relative_to_pose(saved, a, b)
-    p1, q1 = _relative_to_pose(now, a, b)
+    (p0, q0), (p1, q1) = (compose(inverse(c.anchors[a]), c.anchors[b]) for c in (saved, now))
     lever = math.dist(p0, (0.0, 0.0, 0.0))
     far, turn = math.dist(p0, p1), quat_angle(q0, q1)
     errors = (saved.error_m.get(a, 0.0), saved.error_m.get(b, 0.0), now.error_m.get(a, 0.0), now.error_m.get(b, 0.0))
     slack = math.sqrt(sum(e * e for e in errors)) + 0.25 * min_rad * lever
     return MovedSheet(b, far, turn) if far > min_m + slack or turn > min_rad else None
-
-
-def _relative_to_pose(c: Constellation, a: str, b: str) -> PoseTuple:
-    return compose(inverse(c.anchors[a]), c.anchors[b])
 
 
 # --- graph of observations --------------------------------------------------------------------------------------------
@@ -344,8 +295,8 @@ HeadsetKey = tuple[str, int]
 
 @dataclass(frozen=True)
 class Edge:
-    """Merged observation of one sheet by one headset from one viewpoint: `T_tracking_anchor` and its covariance (6,
-    6)."""
+    """Merged observation of one sheet by one headset (or camera) from one viewpoint: `T_tracking_anchor` and its
+    covariance (6, 6)."""
 
     headset: str
     tracking_epoch: int
@@ -360,120 +311,136 @@ def merge_edges(observations: Sequence[SheetObservation], noise: NoiseModel, fal
     """Return one edge per viewpoint and sheet, without invalid poses and viewpoints whose observations disagree."""
     groups: dict[tuple[str, int, int, str], ViewpointGroup] = {}
     for o in observations:
-        if not is_rigid(o.T_tracking_anchor):
-            continue
-        p, q = o.T_tracking_anchor
-        sighting = AnchorObservation(0, p, quat_normalize(q), o.p_tracking_head, (), 1.0, 0.0)
-        groups.setdefault(
-            (o.headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id), ViewpointGroup()
-        ).observations.append(sighting)
-    edges = []
-    for (headset, epoch, viewpoint, anchor_id), group in sorted(groups.items()):
-        merged = group.merge(noise, fallback, 0.6)
-        if merged is not None:
-            edges.append(Edge(headset, epoch, viewpoint, anchor_id, merged.p, merged.q, merged.covariance))
-    return edges
+        if is_rigid(o.T_tracking_anchor):
+            p, q = o.T_tracking_anchor
+            sighting = AnchorObservation(0, p, quat_normalize(q), o.p_tracking_head, (), 1.0, 0.0)
+            key = (o.headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id)
+            groups.setdefault(key, ViewpointGroup()).observations.append(sighting)
+    merged = [(key, group.merge(noise, fallback, 0.6)) for key, group in sorted(groups.items())]
+    return [Edge(*key, one.p, one.q, one.covariance) for key, one in merged if one is not None]
 
 
-def find_reachable(edges: Sequence[Edge], reference: str) -> set[str]:
-    """Return the sheets that are connected with the reference by observations."""
+def find_reachable(edges: Sequence[Edge], known: Collection[str]) -> set[str]:
+    """Return the sheets that are connected with known ones by observations."""
     by_headset: dict[HeadsetKey, set[str]] = {}
     for e in edges:
         by_headset.setdefault((e.headset, e.tracking_epoch), set()).add(e.anchor_id)
-    known, grown = {reference}, True
+    reached, grown = set(known), True
     while grown:
         grown = False
         for sheets in by_headset.values():
-            if sheets & known and not sheets <= known:
-                known |= sheets
+            if sheets & reached and not sheets <= reached:
+                reached |= sheets
                 grown = True
-    return known
+    return reached
 
 
-@dataclass(frozen=True)
 class ObservationGraph:
-    """Edges between headsets and sheets as arrays. Poses are ordered: sheets other than the reference, then
-    headsets."""
+    """Edges between headsets and sheets as arrays. Poses are ordered: unknown sheets, headsets, known sheets."""
 
-    edges: list[Edge]
-    unknown: list[str]
-    reference: str
-    T_world_reference: PoseTuple
+    def __init__(self, edges: Sequence[Edge], known: Mapping[str, PoseTuple]) -> None:
+        """Create a graph.
 
-    @property
-    def n_anchors(self) -> int:
-        return len(self.unknown)
+        Args:
+            edges: Observations.
+            known: Poses of the sheets that fix the frame.
+        """
+        self.edges, self.known = edges, known
+        self.unknown = sorted({e.anchor_id for e in edges} - set(known))
+        self.headsets = sorted({(e.headset, e.tracking_epoch) for e in edges})
+        names: list[Any] = [*self.unknown, *self.headsets, *known]
+        at = {name: i for i, name in enumerate(names)}
+        #: Index of each edge's sheet and headset among all poses.
+        self.sheet_index = np.array([at[e.anchor_id] for e in edges])
+        self.headset_index = np.array([at[e.headset, e.tracking_epoch] for e in edges])
+        self.p, self.q = np.array([e.p for e in edges]), np.array([e.q for e in edges])
+        information = np.linalg.inv(np.array([e.covariance for e in edges]))
+        self.whitening = np.swapaxes(np.linalg.cholesky(information), 1, 2)
+        self._p_known = np.array([p for p, _ in known.values()])
+        self._q_known = np.array([q for _, q in known.values()])
 
-    @cached_property
-    def headsets(self) -> list[HeadsetKey]:
-        return sorted({(e.headset, e.tracking_epoch) for e in self.edges})
+    def compute_residuals(self, p: Array, q: Array) -> Array:
+        """Return observed minus predicted `T_tracking_anchor` in units of their noise, shape (edges, 6).
 
-    @cached_property
-    def headset_index(self) -> np.ndarray[Any, np.dtype[np.intp]]:
-        """Index of each edge's headset among all poses."""
-        at = {key: i + self.n_anchors for i, key in enumerate(self.headsets)}
-        return np.array([at[e.headset, e.tracking_epoch] for e in self.edges], dtype=np.intp)
-
-    @cached_property
-    def anchor_index(self) -> np.ndarray[Any, np.dtype[np.intp]]:
-        """Index of each edge's sheet among all poses followed by the reference."""
-        at = {name: i for i, name in enumerate(self.unknown)}
-        last = self.n_anchors + len(self.headsets)
-        return np.array([at.get(e.anchor_id, last) for e in self.edges], dtype=np.intp)
-
-    @cached_property
-    def p(self) -> Array:
-        return np.array([e.p for e in self.edges])
-
-    @cached_property
-    def q(self) -> Array:
-        return np.array([e.q for e in self.edges])
-
-    @cached_property
-    def whitening(self) -> Array:
-        covariance = np.array([e.covariance for e in self.edges])
-        return np.asarray(np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2))
-
-    def anchor_poses(self, p: Array, q: Array) -> tuple[Array, Array]:
-        """Return the pose of each edge's sheet: positions (edges, 3), quaternions (edges, 4)."""
-        p_ref, q_ref = self.T_world_reference
-        return np.vstack([p, p_ref])[self.anchor_index], np.vstack([q, q_ref])[self.anchor_index]
-
-    def sparsity(self) -> Any:
-        """Return the sparsity pattern of the Jacobian: residuals by increments."""
-        from scipy.sparse import lil_matrix
-
-        n = self.n_anchors + len(self.headsets)
-        S = lil_matrix((6 * len(self.edges) + 2 * len(self.headsets), 6 * n), dtype=np.int8)
-        for i, (a, h) in enumerate(zip(self.anchor_index.tolist(), self.headset_index.tolist(), strict=True)):
-            for k in (a, h):
-                if k < n:
-                    S[6 * i : 6 * i + 6, 6 * k : 6 * k + 6] = 1
-        for j in range(len(self.headsets)):
-            k = self.n_anchors + j
-            S[6 * len(self.edges) + 2 * j : 6 * len(self.edges) + 2 * j + 2, 6 * k : 6 * k + 6] = 1
-        return S
+        Args:
+            p: Positions of unknown sheets, then headsets, shape (n, 3) [m].
+            q: Their rotations, shape (n, 4).
+        """
+        pa, qa = np.vstack([p, self._p_known])[self.sheet_index], np.vstack([q, self._q_known])[self.sheet_index]
+        ph, qh = p[self.headset_index], q[self.headset_index]
+        R = quat_to_matrix(quat_conjugate(qh))
+        r_p = self.p - np.einsum("eij,ej->ei", R, pa - ph)
+        r_q = quat_log(quat_multiply(self.q, quat_conjugate(quat_multiply(quat_conjugate(qh), qa))))
+        return np.asarray(np.einsum("eij,ej->ei", self.whitening, np.concatenate([r_p, r_q], axis=1)))
 
 
 def initial_guess(graph: ObservationGraph) -> tuple[Array, Array]:
-    """Return an initial guess: outwards from the reference, each pose by its most certain edge."""
-    p_ref, q_ref = (np.array(part) for part in graph.T_world_reference)
-    sheets: dict[str, tuple[Array, Array]] = {graph.reference: (p_ref, q_ref)}
-    headsets: dict[HeadsetKey, tuple[Array, Array]] = {}
+    """Return an initial guess: outwards from the known sheets, each pose by its most certain edge."""
+    poses: dict[Any, tuple[Array, Array]] = {name: (np.array(p), np.array(q)) for name, (p, q) in graph.known.items()}
     by_certainty = sorted(graph.edges, key=lambda e: float(np.trace(e.covariance[:3, :3])))
-    while len(headsets) < len(graph.headsets) or len(sheets) <= graph.n_anchors:
+    wanted = [*graph.unknown, *graph.headsets]
+    while not poses.keys() >= set(wanted):
         for e in by_certainty:
             key = (e.headset, e.tracking_epoch)
-            if e.anchor_id in sheets and key not in headsets:
-                p, q = sheets[e.anchor_id]
+            if e.anchor_id in poses and key not in poses:
+                p, q = poses[e.anchor_id]
                 q_h = quat_multiply(q, quat_conjugate(e.q))
-                headsets[key] = (p - quat_to_matrix(q_h) @ e.p, q_h)
+                poses[key] = (p - quat_to_matrix(q_h) @ e.p, q_h)
                 break
-            if key in headsets and e.anchor_id not in sheets:
-                p, q = headsets[key]
-                sheets[e.anchor_id] = (p + quat_to_matrix(q) @ e.p, quat_multiply(q, e.q))
+            if key in poses and e.anchor_id not in poses:
+                p, q = poses[key]
+                poses[e.anchor_id] = (p + quat_to_matrix(q) @ e.p, quat_multiply(q, e.q))
                 break
-        else:
-            break
-    rows = [sheets[name] for name in graph.unknown] + [headsets[key] for key in graph.headsets]
-    return np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
+    return np.array([poses[name][0] for name in wanted]), np.array([poses[name][1] for name in wanted])
+
+
+class GraphSolution(NamedTuple):
+    """Poses `p` (n, 3) [m], `q` (n, 4) of unknown sheets and headsets, covariance (6n, 6n) of their increments
+    (position, rotation on the left), squared distances of all edges in units of their noise, and half the sum of the
+    robust ones."""
+
+    p: Array
+    q: Array
+    covariance: Array
+    distance2: Array
+    cost: float
+
+
+def solve_graph(
+    graph: ObservationGraph,
+    x0: tuple[Array, Array],
+    weights: Array,
+    tilt_sigma_rad: float = math.inf,
+    loss: Literal["soft_l1", "huber"] = "soft_l1",
+) -> GraphSolution:
+    """Run robust least squares over increments of all poses.
+
+    Args:
+        graph: Observations; all its poses must be connected with a known sheet.
+        x0: Initial guess, positions and rotations.
+        weights: Of the edges, shape (edges,).
+        tilt_sigma_rad: Standard deviation of a headset's vertical; infinite: nothing is known of it.
+        loss: How residuals beyond three standard deviations count.
+
+    Returns:
+        The poses.
+    """
+    from scipy.optimize import least_squares
+
+    p0, q0 = x0
+
+    def move(step: Array) -> tuple[Array, Array]:
+        d = step.reshape(-1, 6)
+        return p0 + d[:, :3], quat_multiply(quat_exp(d[:, 3:]), q0)
+
+    def residuals(step: Array) -> Array:
+        p, q = move(step)
+        tilt = swing(q[len(graph.unknown) :]) / tilt_sigma_rad
+        return np.concatenate([(graph.compute_residuals(p, q) * weights[:, None]).ravel(), tilt.ravel()])
+
+    got = least_squares(
+        residuals, np.zeros(6 * len(p0)), loss=loss, f_scale=_F_SCALE, x_scale="jac", method="trf", max_nfev=60
+    )
+    p, q = move(got.x)
+    covariance = np.linalg.pinv(got.jac.T @ got.jac, hermitian=True)
+    return GraphSolution(p, q, covariance, np.sum(graph.compute_residuals(p, q) ** 2, axis=1), float(got.cost))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Set
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
@@ -69,7 +69,6 @@ class CrossCheck:
     noise: NoiseModel = field(default_factory=NoiseModel)
     config: CrossCheckConfig = field(default_factory=CrossCheckConfig)
     unknown_viewpoint_sigma_m: float = 0.005
-    dropped: int = 0
     _observations: dict[tuple[str, str], deque[_TargetObservation]] = field(default_factory=dict)
     _epochs: dict[str, int] = field(default_factory=dict)
 
@@ -82,37 +81,51 @@ class CrossCheck:
         capture_ns: int,
         tracking_epoch: int,
         viewpoint_id: int = 0,
-    ) -> None:
-        """Add a detection of a sheet or a tracked pose of a controller; invalid and late ones are counted in `dropped`.
+    ) -> bool:
+        """Add a detection of a sheet or a tracked pose of a controller.
 
-        `capture_ns`: session time.
+        Args:
+            headset: Name of the headset that observed it.
+            target: Name of the sheet or controller.
+            T_tracking_target: Its pose.
+            p_tracking_head: Position of the head then; `None`: unknown.
+            capture_ns: Session time.
+            tracking_epoch: Tracking frame; a newer one discards the observations of the headset.
+            viewpoint_id: Observations from one viewpoint have common errors.
+
+        Returns:
+            False if it is not used: invalid, late, of an older tracking frame, or of one target too many.
         """
         key = (headset, target)
-        epoch = self._epochs.get(headset, tracking_epoch)
-        if not is_rigid(T_tracking_target) or not is_valid_point(p_tracking_head) or tracking_epoch < epoch:
-            self.dropped += 1
-            return
-        if tracking_epoch > epoch:
-            self.discard_headset(headset)
+        if not is_rigid(T_tracking_target) or not is_valid_point(p_tracking_head):
+            return False
+        if not self.begin_epoch(headset, tracking_epoch):
+            return False
         if key not in self._observations and not self._make_room(capture_ns):
-            self.dropped += 1
-            return
-        self._epochs[headset] = tracking_epoch
+            return False
         looks = self._observations.setdefault(key, deque(maxlen=self.config.max_observations))
         if looks and capture_ns <= looks[-1].capture_ns:
-            self.dropped += 1  # out of order
-            return
+            return False  # out of order
         looks.append(_TargetObservation(capture_ns, T_tracking_target, p_tracking_head, viewpoint_id))
+        return True
+
+    def begin_epoch(self, headset: str, tracking_epoch: int) -> bool:
+        """Discard what a headset observed in an older tracking frame; return false if `tracking_epoch` is older."""
+        epoch = self._epochs.get(headset, tracking_epoch)
+        if tracking_epoch > epoch:
+            self.discard_headset(headset)
+        self._epochs[headset] = max(epoch, tracking_epoch)
+        return tracking_epoch >= epoch
+
+    def list_targets(self, headset: str) -> set[str]:
+        """Return the names of the targets that a headset has observed."""
+        return {target for one, target in self._observations if one == headset}
 
     def _make_room(self, now_ns: int) -> bool:
         """Discard targets not observed for `max_age_ns` if there are too many; return whether one more fits."""
         if len(self._observations) >= self.config.max_targets:
-            fresh = {
-                k: looks
-                for k, looks in self._observations.items()
-                if looks[-1].capture_ns > now_ns - self.config.max_age_ns
-            }
-            self._observations = fresh
+            oldest_ns = now_ns - self.config.max_age_ns
+            self._observations = {k: v for k, v in self._observations.items() if v[-1].capture_ns > oldest_ns}
         return len(self._observations) < self.config.max_targets
 
     def discard_headset(self, headset: str) -> None:
@@ -135,7 +148,7 @@ class CrossCheck:
         )
 
     def compare(
-        self, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: frozenset[str] = frozenset()
+        self, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: Set[str] = frozenset()
     ) -> list[Disagreement]:
         """Compare all pairs of aligned headsets on all targets that both observed. `moving`: targets that move."""
         out = []

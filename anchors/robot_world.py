@@ -4,9 +4,7 @@ Two chains lead to the marker, `T_base_ee T_ee_marker = T_base_camera T_camera_m
 factor, the camera the last one, and many poses determine the other two. (Robot-world and hand-eye calibration: Park and
 Martin 1994 for the initial guess, then weighted least squares over both, as in Dornaika and Horaud 1998, section V.)
 
-The same equation holds for a camera on the hand (`solve_camera_on_hand`), and for a virtual robot that is placed over
-its real twin: there the headset is the camera, and `T_base_world` takes the place of `T_base_camera`
-(`solve_twin_base`).
+The same equation holds for a camera on the hand (`solve_camera_on_hand`).
 """
 
 from __future__ import annotations
@@ -64,11 +62,6 @@ class RobotWorldCalibration:
     residuals: tuple[tuple[float, float], ...]
     left_out: tuple[int, ...]
     spread_rad: float
-    birge: float
-
-    @property
-    def used(self) -> tuple[int, ...]:
-        return tuple(k for k in range(len(self.residuals)) if k not in self.left_out)
 
 
 def solve_robot_world(
@@ -127,7 +120,6 @@ def solve_robot_world(
         tuple((float(m), float(rad)) for m, rad in residuals),
         tuple(k for k in range(len(data.A)) if k not in kept),
         spread,
-        birge,
     )
 
 
@@ -145,15 +137,6 @@ def solve_camera_on_hand(
     if covariances is not None:
         turned = [_invert_covariance(T, cov) for T, cov in zip(T_camera_sheet, covariances, strict=True)]
     return solve_robot_world(T_base_ee, [inverse(T) for T in T_camera_sheet], turned, noise)
-
-
-def solve_twin_base(
-    T_base_ee: Sequence[PoseTuple], T_world_marker: Sequence[PoseTuple], noise: CalibrationNoise | None = None
-) -> tuple[PoseTuple, RobotWorldCalibration]:
-    """Return `T_world_base` of a real robot from a marker on its hand that an aligned headset or camera observed (or a
-    tracked controller held there): the pose for its virtual twin."""
-    solved = solve_robot_world(T_base_ee, T_world_marker, None, noise)
-    return inverse(solved.T_base_camera), solved
 
 
 @dataclass(frozen=True)

@@ -81,8 +81,13 @@ class Sheet:
 
     @cached_property
     def marker_ids(self) -> tuple[int, ...]:
-        """Markers of the frame: upper left, upper right, lower right, lower left. All different."""
-        return compute_marker_ids(self.anchor_id)
+        """Markers of the frame: upper left, upper right, lower right, lower left. All different, by SHA-256 of the id.
+
+        Two sheets have all four in common once in 4e10; a single one in 1.6 % of the pairs, which geometry resolves.
+        """
+        digest = hashlib.sha256(b"iris-session sheet 1\0" + self.anchor_id.encode()).digest()
+        candidates = (int.from_bytes(digest[k : k + 2], "big") % DICTIONARY_SIZE for k in range(0, len(digest), 2))
+        return tuple(dict.fromkeys(candidates))[:MARKERS]
 
     @property
     def marker_edge_m(self) -> float:
@@ -115,51 +120,27 @@ class Sheet:
 
     @cached_property
     def code(self) -> NDArray[np.bool_]:
-        """Modules of the QR code, True where black, first row on top."""
-        return encode_code(self.anchor_id)
+        """Modules of the QR code, True where black, first row on top: the smallest version at error correction M, or
+        better where free."""
+        import segno
+
+        return np.array(segno.make(self.anchor_id, micro=False, error="m").matrix, dtype=np.bool_)
 
     def list_black_rects(self) -> dict[str, list[Rect]]:
         """Return the black rectangles of the `code` and of each marker (`marker 0` to `marker 3`)."""
+        import cv2
+
         shapes = {"code": _merge_runs(self.code, self.code_corners[0], self.edge_m)}
         for number, marker_id in enumerate(self.marker_ids):
             corner = self.marker_corners[number][0]
-            shapes[f"marker {number}"] = _merge_runs(encode_marker(marker_id), corner, self.marker_edge_m)
+            picture: Any = cv2.aruco.generateImageMarker(load_dictionary(), marker_id, MARKER_MODULES)
+            shapes[f"marker {number}"] = _merge_runs(np.asarray(picture) == 0, corner, self.marker_edge_m)
         return shapes
 
 
 def compute_marks(edge_m: float) -> dict[str, Vec3]:
     """Return the positions of the marks of a sheet by id, in the sheet frame [m], to the micrometre."""
     return {name: (round(x * edge_m, 6), round(y * edge_m, 6), 0.0) for name, (x, y) in MARKS.items()}
-
-
-def compute_marker_ids(anchor_id: str) -> tuple[int, ...]:
-    """Return four different markers out of `DICTIONARY_SIZE`, by SHA-256 of the id.
-
-    Two sheets have all four in common once in 4e10; a single one in 1.6 % of the pairs, which geometry resolves.
-    """
-    digest = hashlib.sha256(b"iris-session sheet 1\0" + anchor_id.encode()).digest()
-    ids: list[int] = []
-    for k in range(0, len(digest), 2):
-        candidate = int.from_bytes(digest[k : k + 2], "big") % DICTIONARY_SIZE
-        if candidate not in ids:
-            ids.append(candidate)
-    return tuple(ids[:MARKERS])
-
-
-def encode_code(text: str) -> NDArray[np.bool_]:
-    """Return the modules of the QR code of `text`: the smallest version at error correction M, or better where free."""
-    import segno
-
-    return np.array(segno.make(text, micro=False, error="m").matrix, dtype=np.bool_)
-
-
-def encode_marker(marker_id: int) -> NDArray[np.bool_]:
-    """Return the modules of an ArUco marker with its border, True where black, shape (6, 6)."""
-    import cv2
-
-    picture: Any = cv2.aruco.generateImageMarker(load_dictionary(), marker_id, MARKER_MODULES)
-    black: NDArray[np.bool_] = np.asarray(picture) == 0
-    return black
 
 
 def load_dictionary() -> Any:

@@ -7,8 +7,8 @@ the page until the very end.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
+from xml.sax.saxutils import escape
 
 from anchors.sheet import (
     HALF_HEIGHT,
@@ -38,27 +38,28 @@ POINTS_PER_MM: Final = 72.0 / MM_PER_INCH
 _LINE_MM: Final = 0.2
 
 
-@dataclass(frozen=True)
-class _Text:
+class _Text(NamedTuple):
     x: float  # centre [mm]
     y: float  # base line
     height: float  # of the font [mm]
     text: str
 
 
-@dataclass(frozen=True)
-class _Page:
+class _Page(NamedTuple):
     """Shapes and texts of a page [mm], origin in the upper left corner, y down."""
 
     width: float
     height: float
     shapes: list[list[Rect]]  # each one path; `y` is the upper edge here
     texts: list[_Text]
+    title: str
 
 
 def largest_edge_mm(paper: str, has_marks: bool = False) -> int:
     """Return the edge [mm] of the largest code, in whole millimetres, whose sheet fits on the paper."""
-    width, height = _find_paper(paper)
+    if paper not in PAPERS:
+        raise SheetError(f"no paper {paper!r}: {', '.join(PAPERS)}")
+    width, height = PAPERS[paper]
     half = (MARKED_HALF_WIDTH, MARKED_HALF_HEIGHT) if has_marks else (HALF_WIDTH, HALF_HEIGHT)
     return int(min((width / 2 - MARGIN_MM) / half[0], (height / 2 - MARGIN_MM) / half[1]))
 
@@ -70,7 +71,7 @@ def to_svg(sheet: Sheet, paper: str = "a4") -> str:
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{page.width:g}mm" height="{page.height:g}mm" '
         f'viewBox="0 0 {page.width:g} {page.height:g}">',
-        f"<title>{_escape_xml(_title(sheet))}</title>",
+        f"<title>{escape(page.title)}</title>",
         f'<rect width="{page.width:g}" height="{page.height:g}" fill="white"/>',
     ]
     for shape in page.shapes:
@@ -82,7 +83,7 @@ def to_svg(sheet: Sheet, paper: str = "a4") -> str:
     for text in page.texts:
         lines.append(
             f'<text x="{_format_mm(text.x)}" y="{_format_mm(text.y)}" font-family="Courier, monospace" '
-            f'font-size="{_format_mm(text.height)}" text-anchor="middle">{_escape_xml(text.text)}</text>'
+            f'font-size="{_format_mm(text.height)}" text-anchor="middle">{escape(text.text)}</text>'
         )
     return "\n".join([*lines, "</svg>", ""])
 
@@ -113,7 +114,7 @@ def to_pdf(sheet: Sheet, paper: str = "a4") -> bytes:
         "/Resources << /Font << /F1 5 0 R >> >> >>".encode("ascii"),
         b"<< /Length %d >>\nstream\n%s\nendstream" % (len(stream), stream),
         b"<< /Type /Font /Subtype /Type1 /BaseFont /Courier /Encoding /WinAnsiEncoding >>",
-        f"<< /Title ({_escape_pdf(_title(sheet))}) >>".encode("ascii"),
+        f"<< /Title ({_escape_pdf(page.title)}) >>".encode("ascii"),
     ]
     return _assemble_pdf(objects)
 
@@ -132,16 +133,10 @@ def _assemble_pdf(objects: list[bytes]) -> bytes:
     return out + trailer % (len(objects) + 1, len(objects), start)
 
 
-def _find_paper(name: str) -> tuple[float, float]:
-    if name not in PAPERS:
-        raise SheetError(f"no paper {name!r}: {', '.join(PAPERS)}")
-    return PAPERS[name]
-
-
 def _lay_out(sheet: Sheet, paper: str) -> _Page:
-    width, height = _find_paper(paper)
     edge = 1e3 * sheet.edge_m
     largest = largest_edge_mm(paper, sheet.has_marks)
+    width, height = PAPERS[paper]
     if edge > largest + 1e-9:
         raise SheetError(
             f"a code of {edge:g} mm with its frame {'and marks ' * sheet.has_marks}does not fit on {paper}: at most "
@@ -165,7 +160,8 @@ def _lay_out(sheet: Sheet, paper: str) -> _Page:
         cross, label = _place_cross(x0 + 1e3 * x, y0 - 1e3 * y, MARK_ARM * edge, 1.0 if x < 0.0 else -1.0, name)
         crosses.append(cross)
         texts.append(label)
-    return _Page(width, height, [*shapes, ruler, *crosses], texts)
+    title = f"anchor {sheet.anchor_id}, code {edge:g} mm"
+    return _Page(width, height, [*shapes, ruler, *crosses], texts, title)
 
 
 def _place_cross(x: float, y: float, arm: float, inwards: float, name: str) -> tuple[list[Rect], _Text]:
@@ -206,10 +202,6 @@ def _place_ruler(x: float, y: float, edge: float) -> tuple[list[Rect], list[_Tex
     return rects, [_Text(x, y + 1.5 * height, height, f"{length:g} mm between the long marks")]
 
 
-def _title(sheet: Sheet) -> str:
-    return f"anchor {sheet.anchor_id}, code {1e3 * sheet.edge_m:g} mm"
-
-
 def _text_width(text: str) -> float:
     """Return the width of text over its height: every character of Courier is 0.6 wide."""
     return 0.6 * len(text)
@@ -223,7 +215,3 @@ def _format_mm(value: float) -> str:
 
 def _escape_pdf(text: str) -> str:
     return text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
-
-
-def _escape_xml(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&quot;")

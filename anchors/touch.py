@@ -58,11 +58,6 @@ class TouchNoise:
         object.__setattr__(self, "information", np.asarray(np.linalg.inv(self.covariance)))
 
     @staticmethod
-    def independent(sigma: Array) -> TouchNoise:
-        """Return noise of `sigma` (n,) [m] per axis that no two points share."""
-        return TouchNoise(np.diag(np.repeat(sigma**2, 3)))
-
-    @staticmethod
     def of_touches(touches: Sequence[Sequence[Touch]], tips: Mapping[str, Sequence[float]]) -> TouchNoise:
         """Return the noise of the mean of the touches of each point; `tips`: covariances of tips, 3x3 row-major.
 
@@ -151,7 +146,7 @@ def register_touches(
     residuals = {name: float(r) for name, r in zip(names, np.linalg.norm(fit.residuals, axis=1), strict=True)}
     if not fit.good:
         advice, suspects = _diagnose(names, world, tip, noise, config)
-        return TouchRegistration(_to_refusal(tracking_epoch, advice, len(touches)), residuals, suspects)
+        return TouchRegistration(AlignmentEstimate.refusal(tracking_epoch, advice, len(touches)), residuals, suspects)
     alike = _find_symmetry(names, world, noise, config)
     found = _estimate(fit, world, tracking_epoch, len(touches), config, alike, next_point)
     return TouchRegistration(found, residuals)
@@ -237,16 +232,12 @@ def _fit_yaw(world: Array, tip: Array, sigma: Array) -> Array:
 
 
 def _fit_rotation(world: Array, tip: Array, sigma: Array) -> Array:
-    """Return the best rotation of centred points (Kabsch 1976) as a quaternion (4,) by Horn's eigenvector (1987)."""
+    """Return the best rotation (4,) of centred points (Kabsch 1976)."""
+    from scipy.spatial.transform import Rotation
+
     w = 1.0 / sigma**2
     a, b = world - w @ world / np.sum(w), tip - w @ tip / np.sum(w)
-    S = (a * w[:, None]).T @ b
-    D = np.array([S[1, 2] - S[2, 1], S[2, 0] - S[0, 2], S[0, 1] - S[1, 0]])
-    N = np.zeros((4, 4))
-    N[0, 0] = np.trace(S)
-    N[0, 1:] = N[1:, 0] = D
-    N[1:, 1:] = S + S.T - np.trace(S) * np.eye(3)
-    return np.asarray(np.linalg.eigh(N)[1][:, -1])
+    return np.roll(Rotation.align_vectors(b, a, w)[0].as_quat(), 1)
 
 
 def _describe_collinear(names: Sequence[str], world: Array, next_point: str = "") -> str:
@@ -374,9 +365,5 @@ def _estimate(
     )
 
 
-def _to_refusal(epoch: int, advice: str, n: int = 0) -> AlignmentEstimate:
-    return AlignmentEstimate(IDENTITY_POSE, epoch, (0.0,) * 36, (0.0, 0.0, 0.0), math.inf, 0.0, n, 0, True, advice)
-
-
 def _refuse(epoch: int, advice: str, suspects: Sequence[str] = ()) -> TouchRegistration:
-    return TouchRegistration(_to_refusal(epoch, advice), {}, tuple(suspects))
+    return TouchRegistration(AlignmentEstimate.refusal(epoch, advice), {}, tuple(suspects))

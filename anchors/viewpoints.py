@@ -4,7 +4,7 @@ Errors of observations from one viewpoint are correlated, so each group counts a
 behind `anchors.alignment`. Wrong detections are a minority and far off: observations outside the 99.9 % ellipsoid about
 the median are left out, the others count in full (trimming keeps Gaussian noise efficient). Where observations scatter
 more than stated, the ellipsoid grows with their median distance, and the covariance with the residuals. A group is
-merged at most once per change; the buffer can be saved and restored.
+merged at most once per change.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -160,27 +160,6 @@ class ObservationBuffer:
                 self.outdated += 1
         self.groups, self._order = kept.groups, kept._order
         self.outdated += kept.outdated
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return plain data; floats survive JSON exactly."""
-        return {
-            "counts": [self.forgotten, self.outdated, self._last_ns],
-            "order": [list(key) for key in self._order],
-            "groups": [[*key, [list(s) for s in group.observations]] for key, group in self.groups.items()],
-        }
-
-    def restore(self, data: dict[str, Any]) -> None:
-        self.forgotten, self.outdated, self._last_ns = data["counts"]
-        self._order = deque((str(a), int(v)) for a, v in data["order"])
-        self.groups = {}
-        for anchor_id, viewpoint_id, rows in data["groups"]:
-            group = ViewpointGroup()
-            for capture_ns, p, q, p_head, covariance, quality, size_m in rows:
-                head = None if p_head is None else (p_head[0], p_head[1], p_head[2])
-                group.observations.append(
-                    AnchorObservation(capture_ns, tuple(p), tuple(q), head, tuple(covariance), quality, size_m)
-                )
-            self.groups[anchor_id, viewpoint_id] = group
 
 
 # --- robust mean ------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, KeysView, Mapping, Set
 from itertools import combinations
 from typing import Final
 
@@ -16,7 +16,6 @@ from anchors.alignment import AlignmentEstimate
 from anchors.cross_check import CrossCheck, CrossCheckConfig, Disagreement
 from anchors.pose import PoseTuple, Vec3
 from iris_session.alignment.estimator import NUMERICAL_ERRORS
-from iris_session.alignment.worker import Job
 from iris_session.protocol.entries import CrossChecked, Entry
 
 REPORT_INTERVAL_NS: Final = 5_000_000_000
@@ -29,6 +28,8 @@ _MAX_TARGETS: Final = 512
 _MAX_CLOCK_OFFSET_NS: Final = 5_000_000_000
 
 Pair = tuple[int, int]
+#: A calculation; returns what is to be done with its result.
+Job = Callable[[], Callable[[], None]]
 
 
 class CrossCheckScheduler:
@@ -37,13 +38,11 @@ class CrossCheckScheduler:
     A target is what two headsets observe: an anchor, which stands still, or anything else, which may move.
     """
 
-    def __init__(self, anchors: Collection[str]) -> None:
+    def __init__(self, anchors: KeysView[str]) -> None:
         """Create a scheduler; `anchors`: names of the targets that stand still."""
         self._anchors = anchors
         self._check = CrossCheck(config=CrossCheckConfig(max_targets=_MAX_TARGETS))
         self._n_observations: dict[int, int] = {}  # by connection
-        self._moving: dict[int, set[str]] = {}
-        self._epochs: dict[int, int] = {}  # tracking epochs of `_moving`
         self._reported: dict[Pair, tuple[int, Pair]] = {}  # time, and number of observations of either then
         self._pending: deque[Pair] = deque()
         self._next_scan_ns = 0
@@ -64,27 +63,24 @@ class CrossCheckScheduler:
         targets)."""
         if abs(now_ns - capture_ns) > _MAX_CLOCK_OFFSET_NS:
             return False
-        if tracking_epoch > self._epochs.get(connection, tracking_epoch):
-            self._moving.pop(connection, None)  # targets of the old frame may no longer be there
-        moving = self._moving.get(connection, set()) | (set() if target in self._anchors else {target})
-        if len(moving) > MAX_MOVING:
+        headset = str(connection)
+        self._check.begin_epoch(headset, tracking_epoch)
+        moving = self._list_moving(connection)
+        if target not in self._anchors and target not in moving and len(moving) >= MAX_MOVING:
             return False
-        dropped = self._check.dropped
-        self._check.add_observation(
-            str(connection), target, T_tracking_target, p_tracking_head, capture_ns, tracking_epoch, viewpoint_id
+        used = self._check.add_observation(
+            headset, target, T_tracking_target, p_tracking_head, capture_ns, tracking_epoch, viewpoint_id
         )
-        if self._check.dropped > dropped:
-            return False
-        self._moving[connection], self._epochs[connection] = moving, tracking_epoch
-        self._n_observations[connection] = self._n_observations.get(connection, 0) + 1
-        return True
+        self._n_observations[connection] = self._n_observations.get(connection, 0) + used
+        return used
+
+    def _list_moving(self, connection: int) -> set[str]:
+        return self._check.list_targets(str(connection)) - self._anchors
 
     def discard_observations(self, connection: int) -> None:
         """Discard the observations of a connection whose tracking frame has changed."""
         self._discards += 1
         self._check.discard_headset(str(connection))
-        self._moving.pop(connection, None)
-        self._epochs.pop(connection, None)
 
     def discard_target(self, target: str) -> None:
         """Discard all observations of a target that was moved."""
@@ -118,7 +114,7 @@ class CrossCheckScheduler:
             return None
         check = self._check.copy_headsets((str(a), str(b)))
         alignments = {str(a): in_force[a], str(b): in_force[b]}
-        moving = frozenset(self._moving.get(a, ())) & frozenset(self._moving.get(b, ()))
+        moving = self._list_moving(a) & self._list_moving(b)
         counts, discards = self._count_observations((a, b)), self._discards
 
         def compare() -> Callable[[], None]:
@@ -128,7 +124,8 @@ class CrossCheckScheduler:
         def finish(worst: Disagreement | None) -> None:
             if worst is not None and discards == self._discards:
                 self._reported[a, b] = (now_ns, counts)
-                offer(Entry(a, a, now_ns, _to_message(worst, b)))
+                off = (worst.error_m, worst.error_rad, worst.expected_p95_m)
+                offer(Entry(a, a, now_ns, CrossChecked(b, worst.target, *off, worst.p_world, worst.n)))
 
         return compare
 
@@ -142,7 +139,7 @@ class CrossCheckScheduler:
 
 
 def _find_worst(
-    check: CrossCheck, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: frozenset[str]
+    check: CrossCheck, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: Set[str]
 ) -> Disagreement | None:
     """Return the disagreement furthest beyond its expected error, of all targets that both observed."""
     try:
@@ -151,9 +148,3 @@ def _find_worst(
         return None
     found = [one for one in found if math.isfinite(one.error_m) and one.expected_p95_m > 0.0]
     return max(found, key=lambda one: one.error_m / one.expected_p95_m, default=None)
-
-
-def _to_message(found: Disagreement, other: int) -> CrossChecked:
-    return CrossChecked(
-        other, found.target, found.error_m, found.error_rad, found.expected_p95_m, found.p_world, found.n
-    )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor, Future
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, Protocol
@@ -16,11 +17,10 @@ from typing import Any, Final, Protocol
 from anchors.alignment import AlignmentEstimate
 from anchors.drift import Alarm
 from anchors.pose import PoseTuple, Vec3, is_rigid
-from iris_session.alignment.cross_check import CrossCheckScheduler
+from iris_session.alignment.cross_check import CrossCheckScheduler, Job
 from iris_session.alignment.estimator import NUMERICAL_ERRORS, ConnectionEstimator
 from iris_session.alignment.monitor import AlignmentMonitor
 from iris_session.alignment.touches import MAX_TIPS, solve_tip
-from iris_session.alignment.worker import InlineWorker, Worker
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.entries import AlignmentProposal, Entry, TipSolved
@@ -54,6 +54,39 @@ _MAX_WAITING: Final = 64
 TIP_PERIOD_NS: Final = 500_000_000
 #: Devices of one connection whose tips wait for their calibration.
 MAX_WAITING_TIPS: Final = 4
+
+
+class Worker:
+    """Runs one job at a time: at once, or in a thread beside the loop, which meanwhile sends the state."""
+
+    def __init__(self, executor: Executor | None = None) -> None:
+        """Create a worker; `executor`: has the thread."""
+        self._executor = executor
+        self._running: Future[Callable[[], None]] | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        """True from `submit` until `poll` has done what the job returned."""
+        return self._running is not None
+
+    def submit(self, job: Job) -> None:
+        """Begin a job; without a thread, do also what it returns. The worker must not be busy."""
+        assert not self.is_busy, "one job at a time"
+        if self._executor is None:
+            job()()
+        else:
+            self._running = self._executor.submit(job)
+
+    def poll(self) -> None:
+        """Do what a finished job returned. Raises the exception of a job that failed."""
+        if self._running is not None and self._running.done():
+            finished, self._running = self._running, None
+            finished.result()()
+
+    def close(self) -> None:
+        """End the thread after the job that runs, whose result is discarded."""
+        if self._executor is not None:
+            self._executor.shutdown()
 
 
 class HeadsetConnection(Protocol):
@@ -150,7 +183,7 @@ class AlignmentService:
         """
         self._offer = offer
         self._drops = drops
-        self._worker = InlineWorker() if worker is None else worker
+        self._worker = worker or Worker()
         self._sizes = anchor_sizes
         self._marks = anchor_marks
         self._proposal_period_ns = proposal_period_ns
@@ -158,7 +191,7 @@ class AlignmentService:
         #: `T_world_anchor`, as it is now.
         self.anchors: dict[str, PoseTuple] = {name: (pose.p, pose.q) for name, pose in anchors.items()}
         self._states: dict[int, _HeadsetState] = {}  # by connection; the least recently estimated first
-        self._cross_check = CrossCheckScheduler(self.anchors)
+        self._cross_check = CrossCheckScheduler(self.anchors.keys())
         self._in_force: dict[str, Alignment] = {}  # by participant, also of those who may reconnect
         self._stopped: dict[str, None] = {}  # participants whose run was stopped
         self._tips: dict[str, dict[str, tuple[float, ...]]] = {}  # covariance by participant and device

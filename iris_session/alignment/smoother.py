@@ -6,7 +6,6 @@ session with its model of drift; both are weighted by their covariances (two-fil
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
@@ -18,7 +17,6 @@ from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstim
 from anchors.constellation import Constellation
 from anchors.controller import controller_covariance
 from anchors.pose import (
-    IDENTITY_POSE,
     PoseTuple,
     Vec3,
     apply,
@@ -246,9 +244,7 @@ def estimate_or_refuse(estimator: AlignmentEstimator) -> AlignmentEstimate:
     try:
         return estimator.estimate()
     except NUMERICAL_ERRORS:
-        zero, epoch = (0.0, 0.0, 0.0), estimator.tracking_epoch
-        text = "what was seen cannot be solved"
-        return AlignmentEstimate(IDENTITY_POSE, epoch, (0.0,) * 36, zero, math.inf, 0.0, 0, 0, True, text)
+        return AlignmentEstimate.refusal(estimator.tracking_epoch, "what was seen cannot be solved")
 
 
 def observed_pose(seen: Observation) -> PoseTuple:

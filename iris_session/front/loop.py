@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import gc
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Final
 
 import zmq
 
-from iris_session.alignment.service import AlignmentService
-from iris_session.alignment.worker import ThreadWorker
+from iris_session.alignment.service import AlignmentService, Worker
 from iris_session.front.admission import Admission
 from iris_session.front.asset_server import AssetServer
 from iris_session.front.asset_service import AssetService
@@ -257,7 +257,7 @@ def _make_alignment_service(context: FrontContext) -> AlignmentService:
         anchor_marks=config.anchor_marks,
         proposal_period_ns=config.proposal_period_ns,
         max_connections=config.limits.connections,
-        worker=ThreadWorker(),
+        worker=Worker(ThreadPoolExecutor(1, "estimates")),
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anchors.pose import IDENTITY_POSE, PoseTuple, quat_from_rotvec
+from anchors.pose import IDENTITY_POSE, PoseTuple
 from iris_session.alignment.estimator import ConnectionEstimator
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import IDENTITY, Pose
@@ -39,19 +39,6 @@ def test_size_of_misprinted_sheet_is_reported_when_all_observations_are_excluded
     assert not proposal.refused
 
 
-def test_observations_against_gravity_are_counted_with_advice() -> None:
-    """One sheet hangs although configured as lying; of the other, a few observations are wrong."""
-    on_a_wall = Pose((0.0, 0.0, -0.5), quat_from_rotvec((math.pi / 2.0, 0.0, 0.0)))
-    estimator = ConnectionEstimator(ANCHORS, PERIOD)
-    for i in range(8):
-        estimator.add_observation(observation(i, pose=Pose((0.0, 0.0, -0.5), IDENTITY.q)))
-    assert not estimator.add_observation(observation(8, pose=on_a_wall))
-    estimator.propose(0)
-    report = estimator.complete_report(None, 0)
-    assert report is not None
-    assert "1 against gravity" in report.advice
-
-
 def test_too_few_observations_are_reported_once() -> None:
     estimator = ConnectionEstimator(ANCHORS, PERIOD)
     assert not estimator.is_due(0)
@@ -67,29 +54,6 @@ def test_too_few_observations_are_reported_once() -> None:
     assert estimator.propose(PERIOD) is None, "the same failure again"
 
 
-def test_enough_observations_produce_a_proposal() -> None:
-    estimator = ConnectionEstimator(ANCHORS, PERIOD)
-    for i in range(8):
-        estimator.add_observation(observation(i, pose=Pose((0.0, 0.0, -0.2), IDENTITY.q)))
-    proposal = estimator.propose(0)
-    assert proposal is not None
-    assert not proposal.refused
-    assert math.dist(proposal.T_world_tracking.p, (1.0, 2.0, 1.0)) < 1e-6
-    assert proposal.n_observations == 8
-    assert len(proposal.covariance) == 36
-
-
-def test_unknown_anchor_is_reported_with_known_ones() -> None:
-    estimator = ConnectionEstimator(ANCHORS, PERIOD)
-    assert not estimator.add_observation(observation(anchor="door", epoch=3))
-    proposal = estimator.propose(0)
-    assert proposal is not None
-    assert proposal.refused
-    assert proposal.tracking_epoch == 3
-    assert "door" in proposal.advice
-    assert "table" in proposal.advice
-
-
 def test_invalid_numbers_are_ignored() -> None:
     estimator = ConnectionEstimator(ANCHORS, PERIOD)
     for value in (math.nan, math.inf, 1e308, -1e308):
@@ -102,7 +66,7 @@ def test_invalid_numbers_are_ignored() -> None:
 FLOAT = st.floats() | st.sampled_from([1e308, -1e308, 1e-308, 0.0, 1.0])
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     st.lists(
         st.tuples(

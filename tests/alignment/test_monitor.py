@@ -39,11 +39,6 @@ def test_poses_of_another_tracking_frame_are_not_returned() -> None:
     assert heads.find_nearest(112 * MS, 3) is None
 
 
-def test_samples_out_of_order_are_returned() -> None:
-    heads = history_of(100, 120, 110)
-    assert heads.find_nearest(119 * MS, 1) == pose_at(120.0)
-
-
 @pytest.mark.parametrize("pose", [((math.nan, 0.0, 0.0), IDENTITY_QUAT), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.5))])
 def test_invalid_poses_are_ignored(pose: PoseTuple) -> None:
     heads = history_of()

@@ -158,7 +158,7 @@ POSE = st.builds(
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.lists(POSE, max_size=40), st.lists(st.tuples(st.sampled_from("1239"), POSE, NUMBER), max_size=8), POSE)
 def test_nothing_that_is_reported_raises(poses: list[Pose], touches: list[tuple[str, Pose, float]], kept: Pose) -> None:
     lab, ann = _lab()
@@ -187,9 +187,7 @@ def test_four_marks_with_a_calibrated_tip_make_an_alignment_to_drive_with() -> N
     assert got.error_at_anchor_m < 0.004
 
 
-@pytest.mark.parametrize(
-    "device", ["hand/right", RIGHT, "head", "", "desktop", "tracker/1", "Controller/right", "Hand/left"]
-)
+@pytest.mark.parametrize("device", ["hand/right", RIGHT, "Controller/right"])
 def test_fingertips_and_tips_that_are_not_calibrated_make_an_alignment_to_look_with(device: str) -> None:
     _, ann = _lab()
     for mark in "1234":
@@ -232,18 +230,6 @@ def test_touch_with_an_invalid_covariance_is_refused_with_advice(wrong: tuple[fl
     assert ann.proposals() == []
     assert _advice(ann).startswith("the covariance of the touch of 'sheet/3' is not 36 values with a finite")
     assert lab.drops.by_reason["observation_unusable"] == 3
-
-
-def test_calibration_discards_the_touches_of_its_own_device_alone() -> None:
-    _, ann = _lab()
-    for mark in "12":
-        _touch(ann, mark, "hand/left")
-        _touch(ann, mark, RIGHT, _position_covariance(0.001))
-    _touch(ann, "3", RIGHT, _position_covariance(0.001))
-    assert ann.proposals()[-1].kind == "measured"
-    _calibrate(ann)
-    _touch(ann, "3", "hand/left")
-    assert ann.proposals()[-1].kind == "fingertip"
 
 
 def test_another_calibration_discards_the_touches_with_the_old_tip() -> None:
@@ -316,24 +302,6 @@ def test_kept_anchor_is_for_looking_until_a_mark_is_touched() -> None:
     confirmed = ann.proposals()[-1]
     assert confirmed.kind == "measured"
     assert confirmed.error_at_anchor_m < 0.5 * got.error_at_anchor_m
-
-
-def test_fingertip_does_not_confirm_a_kept_anchor() -> None:
-    _, ann = _lab()
-    _keep(ann)
-    for mark in "12":
-        _touch(ann, mark, "hand/left")
-    assert {got.kind for got in ann.proposals()} == {"persistent"}
-
-
-def test_kept_anchor_in_every_frame_does_not_keep_sheets_from_being_used() -> None:
-    _, ann = _lab()
-    for _ in range(2):
-        view = ann.place()
-        for n in range(20):
-            _keep(ann, off_m=0.01 * (n % 2))
-            ann.report_observations(view, 1)
-    assert [got.kind for got in ann.proposals()].count("measured") >= 3
 
 
 def test_kept_anchor_that_stays_is_proposed_once() -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from iris_session.alignment.service import _MAX_WAITING
-from iris_session.alignment.worker import Job, ThreadWorker
+from iris_session.alignment.cross_check import Job
+from iris_session.alignment.service import _MAX_WAITING, Worker
 from iris_session.protocol.server_messages import AlignmentRun
 from tests.alignment.emulated_headsets import PERIOD_NS, Lab, Wearer
 
@@ -39,29 +39,14 @@ class HeldWorker:
         pass
 
 
-def test_jobs_run_in_another_thread_and_finish_in_the_callers() -> None:
-    worker, where = ThreadWorker(), []
-
-    def job() -> object:
-        where.append(threading.current_thread().name)
-        return lambda: where.append(threading.current_thread().name)
-
-    worker.submit(job)  # type: ignore[arg-type]
-    while worker.is_busy:
-        time.sleep(0.001)
-        worker.poll()
-    worker.close()
-    assert where == ["estimates", threading.current_thread().name]
-
-
 def test_a_fault_in_a_job_is_raised_by_poll() -> None:
-    worker = ThreadWorker()
+    worker = Worker(ThreadPoolExecutor(1))
 
     def job() -> object:
         raise ZeroDivisionError
 
     worker.submit(job)  # type: ignore[arg-type]
-    while worker._results.empty():
+    while worker._running is None or not worker._running.done():
         time.sleep(0.001)
     with pytest.raises(ZeroDivisionError):
         worker.poll()
@@ -72,7 +57,7 @@ def test_a_fault_in_a_job_is_raised_by_poll() -> None:
 def _start_estimate() -> tuple[Lab, HeldWorker, Wearer]:
     """Return a headset whose first estimate is being computed."""
     lab, held = Lab(), HeldWorker()
-    lab.service._worker = held
+    lab.service._worker = held  # type: ignore[assignment]
     ann = lab.wearer()
     for _ in range(15):
         lab.now_ns += PERIOD_NS
@@ -119,7 +104,7 @@ def test_estimate_of_a_connection_that_ended_meanwhile_is_discarded() -> None:
 
 def test_estimates_in_a_thread_arrive_as_proposals() -> None:
     lab = Lab()
-    lab.service._worker = ThreadWorker()
+    lab.service._worker = Worker(ThreadPoolExecutor(1))
     ann = lab.wearer()
     for _ in range(15):
         lab.now_ns += PERIOD_NS
@@ -130,28 +115,3 @@ def test_estimates_in_a_thread_arrive_as_proposals() -> None:
         lab.poll()
         time.sleep(0.001)
     lab.service.close()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("is_moved", [False, True])
-def test_cross_check_is_computed_beside_the_loop_and_void_when_its_sheet_was_moved(is_moved: bool) -> None:
-    lab, held = Lab(), HeldWorker()
-    ann, bob = lab.wearer(1), lab.wearer(2)
-    for one in (ann, bob):
-        one.survey()
-    views = ann.place(d=0.5), bob.place(d=0.5)
-    lab.service._worker = held
-    until_ns = lab.now_ns + 30 * 1_000_000_000
-    while not lab.cross_checks() and lab.now_ns < until_ns:
-        lab.now_ns += 20_000_000
-        for one, view in zip((ann, bob), views, strict=True):
-            one.report_observation(view)
-        lab.poll(1)
-        if held.job is not None:
-            assert lab.cross_checks() == [], "nothing is compared in the loop"
-            is_comparison = "begin_comparison" in held.job.__qualname__
-            finish, held.job = held.job(), None
-            if is_moved and is_comparison:
-                lab.service._cross_check.discard_target("sheet")
-            finish()
-    assert bool(lab.cross_checks()) is not is_moved

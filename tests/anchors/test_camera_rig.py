@@ -45,7 +45,6 @@ def test_chain_of_cameras_is_exact_without_noise() -> None:
     for name, at in CAMERAS.items():
         assert distance(rig.cameras[name][0], at[0]) < 1e-8
     assert distance(rig.sheets["shelf"][0], SHEETS["shelf"][0]) < 1e-8
-    assert max(max(r) for r in rig.residuals) < 1e-8
     assert set(rig.covariances) == set(CAMERAS)
 
 

@@ -51,7 +51,7 @@ def _monitor(
     return alarms
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_change_of_10_mm_at_70_cm_raises_an_alarm_within_2_s(seed: int) -> None:
     rng = np.random.default_rng(seed)
     T_world_tracking = tracking_frame(rng)
@@ -67,7 +67,7 @@ def test_change_of_10_mm_at_70_cm_raises_an_alarm_within_2_s(seed: int) -> None:
     assert len(alarms) == 1, "reported once"
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_slow_drift_and_head_motion_raise_no_alarm(seed: int) -> None:
     """One minute, 3 mm/min, a new viewpoint every 4 s, wrong detections."""
     rng = np.random.default_rng(100 + seed)
@@ -106,20 +106,6 @@ def test_jump_alarm_needs_three_detections() -> None:
     assert [a.kind for a in alarms] == ["jump"]
     assert alarms[0].invalidates
     assert alarms[0].size_m == pytest.approx(0.3, abs=0.02)
-
-
-def test_moved_sheet_is_distinguished_from_sheets_that_stayed() -> None:
-    rng = np.random.default_rng(5)
-    T_world_tracking = tracking_frame(rng)
-    views = {name: Viewpoint(rng, T, viewpoint_around(rng, T[0], 0.6)) for name, T in ANCHORS.items()}
-    monitor, alarms = DriftMonitor(ANCHORS), []
-    for i in range(60):
-        for name, view in views.items():
-            place = shifted(SHEET, (0.02, 0.0, 0.0)) if name == "sheet" and i >= 30 else None
-            p = view.observe(T_world_tracking, place)[0]
-            alarm = monitor.add_observation(name, p, view.head_pose(T_world_tracking), i * PERIOD, 0)
-            alarms += [alarm] if alarm is not None else []
-    assert [(a.anchor_id, a.beside) for a in alarms] == [("sheet", ("other",))]
 
 
 def test_new_tracking_epoch_is_a_jump_and_restarts_monitoring() -> None:
@@ -200,7 +186,7 @@ def _monitor_two_sheets(
     return alarms
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_bump_of_5_cm_is_a_jump_at_the_third_detection(seed: int) -> None:
     rng = np.random.default_rng(seed)
     frame = tracking_frame(rng)
@@ -213,14 +199,14 @@ def test_bump_of_5_cm_is_a_jump_at_the_third_detection(seed: int) -> None:
     assert (alarm.kind, alarm.capture_ns) == ("jump", 30 * PERIOD), "the first that was of the new frame"
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_removed_sheet_is_no_jump_of_the_headset(seed: int) -> None:
     rng = np.random.default_rng(seed)
     alarms = _monitor_two_sheets(DriftMonitor(ANCHORS), rng, tracking_frame(rng), moved=0.3)
     assert [(a.kind, a.anchor_id, a.beside) for _, a in alarms] == [("changed", "sheet", ("other",))]
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_bump_in_sight_of_two_sheets_is_no_moved_sheet(seed: int) -> None:
     rng = np.random.default_rng(seed)
     jump, *_ = _monitor_two_sheets(DriftMonitor(ANCHORS), rng, tracking_frame(rng), bump=(0.03, 0.03, 0.03))
@@ -228,14 +214,3 @@ def test_bump_in_sight_of_two_sheets_is_no_moved_sheet(seed: int) -> None:
     rng = np.random.default_rng(seed)
     alarms = _monitor_two_sheets(DriftMonitor(ANCHORS), rng, tracking_frame(rng), bump=(0.012, 0.0, 0.0))
     assert {(a.kind, a.beside) for _, a in alarms} == {("changed", ())}
-
-
-def test_without_head_poses_the_alarm_threshold_is_larger() -> None:
-    rng = np.random.default_rng(2)
-    frame, monitor = tracking_frame(rng), DriftMonitor(ANCHORS)
-    view, alarms = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.6)), []
-    for i in range(80):
-        p = view.observe(shifted(frame, (0.025 if i >= 40 else 0.0, 0.0, 0.0)))[0]
-        alarm = monitor.add_observation("sheet", p, None, i * PERIOD, 0)
-        alarms += [alarm] if alarm is not None else []
-    assert [a.kind for a in alarms] == ["changed"]

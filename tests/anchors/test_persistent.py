@@ -59,7 +59,7 @@ def test_stated_error_is_honest(marks: str) -> None:
     rng = np.random.default_rng(7)
     inside = {"anchor": 0, "robot": 0}
     points = {"anchor": T_WORLD_ANCHOR[0], "robot": ROBOT}
-    n = 600
+    n = 300
     for _ in range(n):
         tilt = rng.normal(0.0, math.radians(0.2), 2)
         leaning = quat_from_rotvec((float(tilt[0]), float(tilt[1]), 0.0))
@@ -88,7 +88,7 @@ def test_covariance_is_stored_in_the_axes_of_the_anchor(yaw: float) -> None:
     far, T_tracking_now = apply(T_NOW_WORLD, ROBOT), inverse(compose(T_NOW_WORLD, T_WORLD_TRACKING))
     config = PersistentConfig(inflation=1.0, position_sigma_m=1e-4, rotation_sigma_rad=1e-4)
     inside = refused = 0
-    n = 300
+    n = 200
     for _ in range(n):
         d = rng.multivariate_normal(np.zeros(6), np.diag(sigma**2))
         turn = quat_exp(d[3:])

@@ -13,10 +13,8 @@ from anchors.robot_world import (
     CalibrationError,
     CalibrationNoise,
     RobotWorldCalibration,
-    _invert_covariance,
     solve_camera_on_hand,
     solve_robot_world,
-    solve_twin_base,
 )
 
 T_BASE_CAMERA: PoseTuple = ((1.4, -0.3, 0.9), quat_from_rotvec((-1.9, 0.4, 0.3)))
@@ -89,7 +87,9 @@ def test_wrong_pictures_are_named_and_excluded() -> None:
     solved = solve_robot_world(robot, seen, noise=NOISE)
     assert set(solved.left_out) == {4, 9, 10}
     assert _errors(solved)[0] < 0.004
-    assert solved.residuals[4][0] > 5.0 * max(solved.residuals[k][0] for k in solved.used)
+    assert solved.residuals[4][0] > 5.0 * max(
+        m for k, (m, _) in enumerate(solved.residuals) if k not in solved.left_out
+    )
 
 
 def test_camera_on_the_hand() -> None:
@@ -100,35 +100,6 @@ def test_camera_on_the_hand() -> None:
     solved = solve_camera_on_hand(robot, seen, covariance)
     assert distance(solved.T_ee_marker[0], T_ee_camera[0]) < 1e-7
     assert distance(solved.T_base_camera[0], T_base_sheet[0]) < 1e-7
-
-
-@pytest.mark.long
-def test_covariance_of_the_inverse_matches_inverted_samples() -> None:
-    rng = np.random.default_rng(11)
-    root = np.diag([1e-3, 2e-3, 4e-3, 2e-3, 5e-3, 1e-3])
-    samples = []
-    for _ in range(4000):
-        d = root @ rng.normal(size=6)
-        M = pose_to_matrix(T_BASE_CAMERA)
-        M[:3, :3] = pose_to_matrix(pose_from_rvec_tvec(d[3:], np.zeros(3)))[:3, :3] @ M[:3, :3]
-        M[:3, 3] += d[:3]
-        back, true = inverse(pose_from_matrix(M)), inverse(T_BASE_CAMERA)
-        turn = quat_to_rotvec(compose(back, inverse(true))[1])
-        samples.append([*np.subtract(back[0], true[0]), *turn])
-    wanted = np.cov(np.array(samples).T)
-    found = np.reshape(_invert_covariance(T_BASE_CAMERA, (root @ root).ravel().tolist()), (6, 6))
-    scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
-    assert np.allclose(found / scale, wanted / scale, atol=0.08)
-
-
-def test_virtual_robot_over_its_twin() -> None:
-    T_world_base: PoseTuple = ((0.3, 0.8, -0.1), quat_from_rotvec((0.0, 0.01, 1.2)))
-    robot = _robot_poses(np.random.default_rng(6), 6)
-    seen = [compose(T_world_base, compose(T, T_EE_MARKER)) for T in robot]
-    at, solved = solve_twin_base(robot, seen)
-    assert distance(at[0], T_world_base[0]) < 1e-7
-    assert quat_angle(at[1], T_world_base[1]) < 1e-7
-    assert solved.left_out == ()
 
 
 @pytest.mark.parametrize(("turn", "axes"), [(0.01, 3), (0.8, 1)])

@@ -58,28 +58,6 @@ def test_stated_error_is_honest() -> None:
     assert 0.90 <= inside / 100 <= 0.99
 
 
-def test_stated_error_holds_for_touches_that_are_repeated() -> None:
-    """A client that reports a resting tip in five frames has touched once."""
-    inside = 0
-    for seed in range(100):
-        estimate = register_touches(MARKS, 5 * _touches("abc", 0.0015, seed)).estimate
-        at = apply(estimate.T_world_tracking, apply(inverse(T_WORLD_TRACKING), MARKS["c"]))
-        inside += distance(at, MARKS["c"]) <= estimate.error_at(MARKS["c"])
-    assert inside >= 93
-
-
-def test_gravity_determines_the_tilt() -> None:
-    """From points within half a metre alone, the tilt would be wrong by several tenths of a degree."""
-    far: Vec3 = (0.3, 0.2, 3.0)
-    off: dict[int, list[float]] = {4: [], 6: []}
-    for seed in range(30):
-        for dof, errors in off.items():
-            got = register_touches(MARKS, _touches("abcd", 0.0015, seed), config=AlignmentConfig(dof=dof))
-            at = apply(got.estimate.T_world_tracking, apply(inverse(T_WORLD_TRACKING), far))
-            errors.append(distance(at, far))
-    assert np.median(off[4]) < 0.8 * np.median(off[6])
-
-
 def test_too_few_points_lists_the_rest() -> None:
     got = register_touches(MARKS, _touches("ab"))
     assert got.estimate.refused
@@ -101,14 +79,6 @@ def test_swapped_points_are_named() -> None:
     assert got.estimate.refused
     assert got.suspects == ("b", "c")
     assert got.estimate.advice.startswith("points are mixed up: 'b' was touched at 'c', 'c' was touched at 'b'")
-
-
-def test_swapped_pair_of_eight_points_is_named() -> None:
-    rng = np.random.default_rng(5)
-    marks: dict[str, Vec3] = {name: (*rng.uniform(0.0, 1.0, 2).tolist(), 0.0) for name in "abcdefgh"}
-    touches = _touches("abcdefgh", 0.001, marks=marks)
-    swapped = [Touch({"d": "g", "g": "d"}.get(t.point, t.point), t.p_tracking_tip) for t in touches]
-    assert register_touches(marks, swapped).suspects == ("d", "g")
 
 
 def test_point_touched_elsewhere_is_named_with_its_error() -> None:
@@ -157,20 +127,6 @@ def test_invalid_touch_is_ignored(value: float) -> None:
     assert "was not read" in got.estimate.advice
 
 
-@pytest.mark.parametrize("n", [6, 8])
-def test_permutations_excluded_by_distances_are_not_fitted(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fitting all 719 permutations of six points would take a second."""
-    import anchors.touch
-
-    fits, fit = [], anchors.touch._fit
-    monkeypatch.setattr(anchors.touch, "_fit", lambda *args: fits.append(1) or fit(*args))
-    rng = np.random.default_rng(4)
-    marks = {c: to_vec3(rng.uniform(-0.5, 0.5, 3)) for c in "abcdefgh"[:n]}
-    wrong = [Touch(c, to_vec3(rng.uniform(-1.0, 1.0, 3))) for c in marks]
-    assert register_touches(marks, wrong).estimate.refused
-    assert len(fits) <= n + 1
-
-
 # --- tips, printed marks ---
 
 TIP = np.array([0.01, -0.02, -0.12])
@@ -185,19 +141,18 @@ def _calibrate(rng: np.random.Generator, sigma_m: float) -> TipCalibration:
 
 
 @pytest.mark.parametrize("turning", [0.0, 0.8])
-@pytest.mark.parametrize("names", ["123", "1234"])
-def test_stated_error_includes_that_of_the_tip(names: str, turning: float) -> None:
+def test_stated_error_includes_that_of_the_tip(turning: float) -> None:
     """Monte Carlo: a tip calibrated with noise, then marks touched with it, held alike or turned every time."""
     rng = np.random.default_rng(3)
     far: Vec3 = (0.3, 0.4, 0.2)
     inside = {"sheet": 0, "robot": 0}
     errors, stated = [], []
-    n = 400
+    n = 200
     for _ in range(n):
         tip = _calibrate(rng, 0.0015)
         held = rng.uniform(-1.0, 1.0, 3)
         touches = []
-        for name in names:
+        for name in "123":
             q = quat_exp(held + turning * rng.uniform(-1.0, 1.0, 3))
             grip = np.array(apply(inverse(T_WORLD_TRACKING), PRINTED[name])) - quat_to_matrix(q) @ TIP
             at = grip + quat_to_matrix(q) @ np.array(tip.p_controller_tip) + rng.normal(0.0, TOUCH_SIGMA_M, 3)
@@ -220,17 +175,6 @@ def test_common_error_of_a_tip_does_not_average_out() -> None:
     with_tip = register_touches(MARKS, touches, tips={"right": shared}).estimate
     alone = register_touches(MARKS, touches).estimate
     assert with_tip.error_at_anchor_m > 0.003 * 2.7 > 3.0 * alone.error_at_anchor_m
-
-
-def test_fingertips_state_their_larger_error() -> None:
-    inside = 0
-    for seed in range(200):
-        touches = [replace(t, sigma_m=0.01) for t in _touches("1234", 0.01, seed, PRINTED)]
-        got = register_touches(PRINTED, touches).estimate
-        at = apply(got.T_world_tracking, apply(inverse(T_WORLD_TRACKING), PRINTED["2"]))
-        inside += distance(at, PRINTED["2"]) <= got.error_at(PRINTED["2"])
-        assert 0.008 < got.error_at_anchor_m < 0.03
-    assert 0.92 <= inside / 200 <= 0.99
 
 
 def test_printed_marks_look_the_same_in_no_other_order() -> None:

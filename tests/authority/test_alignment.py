@@ -7,13 +7,11 @@ import math
 import random
 from typing import Any
 
-import msgspec
 import pytest
 
-from anchors.pose import quat_angle, quat_from_rotvec, quat_from_yaw, quat_rotate
-from iris_session.authority import AuthorityConfig
+from anchors.pose import quat_from_rotvec, quat_from_yaw, quat_rotate
 from iris_session.authority.alignment import compute_position_p95, widen_covariance
-from iris_session.protocol.client_messages import Grasp, Heartbeat, Observation, PlaceAlignment, TrackingEpoch
+from iris_session.protocol.client_messages import Grasp, Heartbeat, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, Alignment, Pose
 from iris_session.protocol.server_messages import AlignmentChanged, Notice, ParticipantChanged, SamplesRejected
 from iris_session.protocol.status import AlignmentReport
@@ -37,11 +35,11 @@ def test_stated_error_is_the_95_percent_quantile_at_the_robot() -> None:
     for point in ((0.0, -0.5, 0.0), (0.5, 0.0, 0.5), (2.0, 0.3, 0.0)):
         r = tuple(a - b for a, b in zip(point, pivot, strict=True))
         lengths = []
-        for _ in range(20_000):
+        for _ in range(4_000):
             turned = quat_rotate(quat_from_rotvec(tuple(rng.gauss(0.0, 0.01) for _ in range(3))), r)  # type: ignore[arg-type]
             moved = [rng.gauss(0.0, 0.004) + a - b for a, b in zip(turned, r, strict=True)]
             lengths.append(math.hypot(*moved))
-        measured = sorted(lengths)[19_000]
+        measured = sorted(lengths)[3_800]
         assert compute_position_p95(C, pivot, point) == pytest.approx(measured, rel=0.05)
 
 
@@ -124,18 +122,6 @@ def test_first_refusals_are_progress_and_only_later_ones_a_warning() -> None:
     assert t.since(Notice)[0].level == "warning"
 
 
-def test_progress_that_ends_well_is_no_warning() -> None:
-    t = Table()
-    anna = t.join()
-    t.step(anna.says(proposal(refused=True, advice="look longer", n_observations=4)))
-    t.step(anna.says(proposal(n_observations=9)))
-    assert t.last(AlignmentChanged).alignment.kind == "measured"
-    t.events.clear()
-    for _ in range(200):
-        t.step(anna.says(Heartbeat()), dt_ns=20 * MS)
-    assert [e for e in t.events if isinstance(e, Notice)] == []
-
-
 def test_error_counts_at_the_robots_one_holds() -> None:
     lever = covariance(0.001, 0.02)
     t = Table()
@@ -161,25 +147,6 @@ def test_engaging_a_far_robot_with_an_alignment_that_was_good_near_the_sheet_is_
     assert t.hold("right") == "unaligned"
     assert t.last(SamplesRejected).reason == "unaligned"
     assert "right" in t.since(Notice)[0].text
-
-
-def test_a_tilted_anchor_is_a_warning_once() -> None:
-    t = Table()
-    anna = t.join()
-    t.step(anna.says(proposal(residual_tilt_rad=0.02)))
-    t.step(anna.says(proposal(residual_tilt_rad=0.02)))
-    assert [e.level for e in t.events if isinstance(e, Notice)] == ["warning"]
-
-
-def test_advice_on_an_accepted_measurement_is_told_once() -> None:
-    t = Table()
-    anna = t.join()
-    for _ in range(3):
-        t.step(anna.says(proposal(advice="is the sheet printed at the wrong scale?")))
-    assert t.last(AlignmentChanged).participant == anna.id
-    notices = [e for e in t.events if isinstance(e, Notice)]
-    assert [(n.participant, n.reason) for n in notices] == [(anna.id, "")]
-    assert "wrong scale" in notices[0].text
 
 
 def test_a_sheet_on_the_edge_of_a_bound_is_told_every_five_seconds_and_counted() -> None:
@@ -278,13 +245,6 @@ def test_director_places_and_offsets() -> None:
     assert (a.offset, a.T_world_tracking.p) == (True, (3.5, 0.0, 0.0))
 
 
-def test_proposals_for_participants_without_need_and_observations_change_nothing() -> None:
-    t = Table(AuthorityConfig())
-    agent = t.join("agent", alignment="not_needed")
-    t.step(agent.says(proposal()), agent.says(Observation("table", "qr", IDENTITY, t.now_ns, 0)))
-    assert t.decision.events == ()
-
-
 # --- how corrections come into force ---
 
 
@@ -355,14 +315,6 @@ def test_a_small_correction_slides_in_and_says_what_is_still_away() -> None:
     assert (report(t, anna).pending_m, notices(t)) == (0.0, [])
 
 
-def test_a_small_turn_slides_about_the_anchor() -> None:
-    t, anna = settled()
-    t.step(anna.says(at(1.0, math.radians(1.0))))
-    came = rest(t, anna, seconds=5.0)
-    turns = [quat_angle(quat_from_yaw(0.0), a.T_world_tracking.q) for _, a in came]
-    assert turns == pytest.approx([math.radians(0.15 * i) for i in range(1, 7)] + [math.radians(1.0)], rel=2e-3)
-
-
 def test_what_is_still_away_widens_the_stated_error_at_any_lever_arm() -> None:
     away = (0.003, -0.002, 0.0, 0.0, 0.0, 0.02)
     for point in ((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (-1.0, 3.0, 0.5)):
@@ -388,28 +340,6 @@ def test_a_large_turn_is_large() -> None:
     assert ["off by 2.1 degrees: the scene moves" in e.text for e in t.since(Notice)] == [True]
 
 
-def test_what_was_told_is_what_comes() -> None:
-    """The measurement goes on changing: a little is let through, a lot is told anew."""
-    t, anna = settled()
-    t.step(anna.says(at(1.05)))
-    rest(t, anna, seconds=1.0)
-    t.step(anna.says(at(1.055)))
-    assert [a.T_world_tracking.p[0] for _, a in rest(t, anna, seconds=1.1)] == [1.055]
-    t.step(anna.says(at(1.2)))
-    rest(t, anna, seconds=1.0)
-    t.step(anna.says(at(0.8)))
-    assert rest(t, anna, seconds=2.9) == []
-    assert [a.T_world_tracking.p[0] for _, a in rest(t, anna, seconds=0.2)] == [0.8]
-    assert len(notices(t)) == 3
-
-
-def test_wild_measurements_are_told_at_most_every_two_seconds() -> None:
-    t, anna = settled()
-    for i in range(50):  # 10 s at 5 Hz
-        t.step(anna.says(Heartbeat()), anna.says(at(1.5 + 0.3 * (i % 2))), dt_ns=200 * MS)
-    assert 1 <= len(notices(t)) <= 5
-
-
 def test_while_engaged_a_correction_waits_and_is_told_once() -> None:
     t, anna = settled()
     anna.engage("left")
@@ -426,31 +356,6 @@ def test_while_engaged_a_correction_waits_and_is_told_once() -> None:
     assert [e.alignment.T_world_tracking.p[0] for e in t.since(AlignmentChanged)] == [1.054]
 
 
-def test_a_small_correction_that_waits_is_not_worth_a_word() -> None:
-    """It slides in unseen when the clutch opens; one that says the same, but better, is off by nothing at all."""
-    t, anna = settled()
-    anna.engage("left")
-    better = tuple(0.1 * c for c in SMALL)
-    for x in (1.0, 1.006):
-        t.step(anna.says(msgspec.structs.replace(at(x), covariance=better)))
-        for _ in range(20):
-            t.step(anna.says(anna.sample("left", clutch=True)), dt_ns=20 * MS)
-    assert report(t, anna).pending_m == pytest.approx(0.006)
-    assert notices(t) == []
-    anna.sends("left")
-    assert rest(t, anna, seconds=3.0)[-1][1].T_world_tracking.p[0] == pytest.approx(1.006)
-    assert notices(t) == []
-
-
-def test_letting_go_at_once_after_it_was_told_does_not_bring_it_at_once() -> None:
-    t, anna = settled()
-    anna.engage("left")
-    t.step(anna.says(at(1.05)))
-    anna.sends("left")
-    assert len(rest(t, anna, seconds=1.9)) == 0
-    assert len(rest(t, anna, seconds=0.2)) == 1
-
-
 def test_a_hand_on_an_object_is_a_use_too() -> None:
     t = Table()
     anna = t.operator()
@@ -459,31 +364,6 @@ def test_a_hand_on_an_object_is_a_use_too() -> None:
     t.step(anna.says(at(1.005)))
     rest_of_it = [t.step(anna.says(anna.sample("hammer", clutch=True)), dt_ns=20 * MS) for _ in range(40)]
     assert not any(isinstance(e.body, AlignmentChanged) for d in rest_of_it for e in d.events)
-
-
-def test_others_do_not_wait_for_those_who_are_engaged() -> None:
-    t, anna = settled()
-    bert = t.operator("right")
-    anna.engage("left")
-    t.step(bert.says(at(1.3)))
-    assert [e.participant for e in t.since(AlignmentChanged)] == [bert.id]
-
-
-def test_after_a_pause_it_goes_on_sliding_and_does_not_leap() -> None:
-    t, anna = settled()
-    t.step(anna.says(at(1.008)))
-    t.step(dt_ns=100 * SECOND)
-    assert [e.alignment.T_world_tracking.p[0] for e in t.since(AlignmentChanged)] == pytest.approx([1.002])
-
-
-def test_a_correction_of_somebody_with_an_offset_slides_below_the_offset() -> None:
-    t, anna = settled()
-    t.step(t.host(PlaceAlignment(1, anna.id, Pose((0.0, 0.0, 1.0), quat_from_yaw(math.pi / 2)), offset=True)))
-    t.step(anna.says(at(1.003)))
-    came = [a for _, a in rest(t, anna, seconds=2.0)]
-    assert [a.T_world_tracking.p for a in came] == [pytest.approx((0.0, y, 1.0), abs=1e-12) for y in (1.002, 1.003)]
-    assert all(a.offset and not a.covariance and a.error_at_anchor_m == 0.0 for a in came)
-    assert {a.pivot_world for a in came} == {(0.0, 0.0, 0.0)}
 
 
 def test_a_directors_word_waits_for_the_clutch() -> None:
@@ -510,16 +390,3 @@ def test_a_new_frame_forgets_what_waited() -> None:
     assert report(t, anna) == AlignmentReport()
     t.step(anna.says(proposal(tracking_epoch=1)))
     assert len(t.since(AlignmentChanged)) == 1, "nobody has used the new one yet"
-
-
-def test_restore_in_the_middle_of_a_correction_is_invisible() -> None:
-    t, anna = settled()
-    t.step(anna.says(at(1.008)))
-    rest(t, anna, seconds=0.6)
-    again = Table()
-    again.authority.restore(t.authority.snapshot())
-    for _ in range(100):
-        t.now_ns += 20 * MS
-        decisions = [one.authority.step(t.now_ns, (), 0, t.view) for one in (t, again)]
-        assert decisions[0] == decisions[1]
-    assert report(t, anna).pending_m == 0.0

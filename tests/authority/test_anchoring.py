@@ -92,18 +92,6 @@ def test_a_stopped_run_keeps_what_is_in_force_whatever_is_seen() -> None:
     assert not report(t, anna).running
 
 
-def test_stopping_drops_a_correction_that_waits() -> None:
-    t = Table(CONFIG)
-    anna = t.operator("left")
-    anna.engage("left")
-    anna.sends("left")
-    t.step(anna.says(shifted(1.5)))
-    anna.asks(Align(1, "stop"))
-    assert report(t, anna).pending_m == 0.0
-    changes = [t.step(anna.says(Heartbeat()), dt_ns=SECOND) for _ in range(4)]
-    assert not any(isinstance(e.body, AlignmentChanged) for d in changes for e in d.events)
-
-
 def test_measurements_count_again_after_a_placement() -> None:
     t = Table(CONFIG)
     anna = t.operator()
@@ -114,28 +102,6 @@ def test_measurements_count_again_after_a_placement() -> None:
     t.step()
     t.step(anna.says(shifted(4.0)))
     assert [(e.alignment.kind, e.alignment.offset) for e in t.since(AlignmentChanged)] == [("measured", False)]
-
-
-def test_an_offset_ends_with_its_run() -> None:
-    t = Table(CONFIG)
-    anna = t.operator()
-    t.step(t.host(PlaceAlignment(1, anna.id, Pose((0.0, 1.0, 0.0), IDENTITY.q), offset=True)))
-    assert report(t, anna).offset
-    anna.asks(Align(1, "start"))
-    t.step()
-    assert report(t, anna).offset
-    t.step(anna.says(shifted(1.0)))
-    assert [(e.alignment.offset, e.alignment.T_world_tracking.p) for e in t.since(AlignmentChanged)] == [
-        (False, (1.0, 0.0, 0.0))
-    ]
-
-
-def test_without_alignment_a_stopped_run_is_said() -> None:
-    t = Table(CONFIG)
-    anna = t.operator()
-    anna.asks(Align(1, "stop"))
-    anna.does(TrackingEpoch(1))
-    assert "run is stopped" in t.since(Notice)[0].text
 
 
 # --- anchors ----------------------------------------------------------------------------------------------------------
@@ -277,17 +243,6 @@ def test_a_moved_sheet_is_not_answered_by_a_new_alignment_but_by_a_new_place() -
     assert report(t, anna).alarm == ""
 
 
-def test_what_differs_because_a_correction_waits_is_no_alarm() -> None:
-    t = Table(CONFIG)
-    anna = t.operator("left")
-    anna.engage("left")
-    t.step(anna.says(shifted(1.2)))
-    t.step(anna.says(AlignmentAlarm("differs", 0, "table", 0.2)))
-    assert (t.decision.events, report(t, anna).pending_m) == ((), pytest.approx(0.2))
-    t.step(anna.says(AlignmentAlarm("changed", 0, "table", 0.2)))
-    assert report(t, anna).pending_m == 0.0
-
-
 @pytest.mark.parametrize(
     "alarm",
     [
@@ -319,13 +274,6 @@ def test_a_flood_of_its_own_does_not_push_out_what_the_front_says() -> None:
     t.step(*(anna.says(Heartbeat()) for _ in range(20)), anna.says(AlignmentAlarm("jump", 0)))
     assert t.hold() == "rearm"
     assert len(t.since(AlignmentAlarmed)) == 1
-
-
-def test_what_the_front_says_is_no_sign_of_life() -> None:
-    t = Table(CONFIG)
-    anna = t.operator()
-    steps = [t.step(anna.says(proposal()), dt_ns=100 * MS) for _ in range(32)]
-    assert [d.reason for decision in steps for d in decision.dropped] == ["heartbeat"]
 
 
 # --- comparisons ------------------------------------------------------------------------------------------------------
@@ -380,13 +328,3 @@ def test_of_many_pairs_the_newest_are_reported() -> None:
     reports = t.authority.build_cross_check_reports()
     assert len(reports) == 64
     assert reports[0].age_ns == 0
-
-
-def test_the_report_has_those_who_need_an_alignment() -> None:
-    t = Table(CONFIG)
-    anna = t.operator()
-    t.join("agent", alignment="not_needed")
-    assert t.authority.build_alignment_reports().keys() == {anna.id}
-    r = report(t, anna)
-    a = t.last(AlignmentChanged).alignment
-    assert (r.version, r.running, r.error_at_anchor_m, r.error_at_robot_m) == (1, True, 0.002, a.error_at_robot_m)

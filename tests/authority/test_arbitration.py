@@ -13,7 +13,7 @@ from iris_session.authority import AuthorityConfig
 from iris_session.protocol.client_messages import Acquire, Control, Grasp, Heartbeat, Release
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Lost
-from iris_session.protocol.server_messages import EngagementChanged, Feedback, LeaseChanged, ObjectGrasped
+from iris_session.protocol.server_messages import EngagementChanged, Feedback, ObjectGrasped
 from iris_session.protocol.steps import ControlStatus
 
 from .table import MS, Person, Table, make_view
@@ -108,15 +108,6 @@ def test_two_controllers_drive_two_arms_and_neither_takes_the_others() -> None:
     assert t.hold("left") == "rearm"  # it was closed while the first one drove, so it must open first
     op.engage("left", **other)
     assert t.command("left").sources[0].device == "controller/left"
-
-
-def test_one_device_may_drive_two_robots() -> None:
-    t = Table()
-    op = t.operator("left", "right")
-    op.engage("left", "right")
-    assert [c.kind for c in t.decision.commands] == ["pose", "pose"]
-    engagements = [c.sources[0].engagement for c in t.decision.commands]
-    assert engagements == [1, 2]
 
 
 def test_gripper_is_clamped_and_kept_within_an_engagement() -> None:
@@ -226,18 +217,6 @@ def test_the_second_hand_takes_over_without_a_jump() -> None:
     assert t.decision.objects == ()
 
 
-def test_both_hands_of_one_person() -> None:
-    t, anna = holding()
-    anna.asks(Grasp(1, "hammer", "hand/right"))
-    anna.engage("hammer", **RIGHT)
-    move(anna, LEFT, 0.0, "hammer", clutch=False)
-    assert len(t.decision.objects) == 1
-    anna.sends("hammer", device="controller/left")
-    assert anna.told == {}
-    assert anna.asks(Grasp(1, "hammer", "hand/left")).ok  # again: nothing changes
-    assert t.since(LeaseChanged) == []
-
-
 def test_a_hand_without_samples_lets_go() -> None:
     t, _ = holding()
     t.step(dt_ns=149 * MS)
@@ -255,22 +234,6 @@ def test_acquired_objects_take_any_hand_and_a_reset_drops_them() -> None:
     assert [c.object for c in t.decision.objects] == ["hammer", "board"]
     boss.does(Control(1, "reset"))
     assert t.decision.objects == ()
-
-
-def test_an_object_that_everyone_let_go_is_taken_from_where_it_lies() -> None:
-    t, anna = holding()
-    move(anna, LEFT, 0.01, "hammer")
-    bert = t.operator()
-    anna.does(Release())
-    version = t.last(LeaseChanged).lease.lease_version + 1
-    t.view = make_view(objects={"hammer": Pose((0.0, 0.3, 0.0), (1.0, 0.0, 0.0, 0.0))})
-    bert.versions["hammer"] = version
-    hand = {"device": "hand/right", "p": (-0.5, 0.0, 0.0)}
-    bert_opens = bert.says(bert.sample("hammer", **hand))
-    t.step(
-        bert.says(Grasp(1, "hammer", "hand/right")), bert_opens, bert.says(bert.sample("hammer", clutch=True, **hand))
-    )
-    assert t.decision.objects[0].T_world_object.p == pytest.approx((0.0, 0.3, 0.0))
 
 
 def test_nothing_is_taken_hold_of_in_the_step_of_a_reset() -> None:

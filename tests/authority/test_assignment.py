@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, Bye, Release, TrackingEpoch
+from iris_session.protocol.client_messages import Acquire, Bye, Release
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, Join, Lost
 from iris_session.protocol.server_messages import LeaseChanged
@@ -26,18 +26,6 @@ def test_join_order_gives_the_first_free_robot() -> None:
     assert carl.denied(ANY) == "held"
     carl.does(Acquire(2, wait=True))
     assert [e.lease.queue for e in t.since(LeaseChanged)] == [(carl.id,), (carl.id,)]
-    bert.does(Release())
-    assert carl.replies()[0].leases[0].target == "right"
-
-
-def test_a_robot_that_a_pair_waits_for_is_not_given_away() -> None:
-    t = Table()
-    t.operator("left")
-    bert, carl = t.join(), t.join()
-    bert.does(Acquire(1, ("left", "right"), wait=True))
-    assert carl.denied(ANY) == "held"
-    carl.does(Acquire(2, wait=True))
-    assert carl.replies() == []
     bert.does(Release())
     assert carl.replies()[0].leases[0].target == "right"
 
@@ -96,12 +84,6 @@ def test_a_name_that_looks_like_a_key_is_no_key() -> None:
     assert mallory.denied(Acquire(1, ("right",))) == "policy"
 
 
-def test_unassigned_robots_are_free_for_all_under_config() -> None:
-    t = Table(AuthorityConfig(policy="config", assignments={"anna": ("left",)}))
-    assert t.join().acquire("right").ok
-    assert t.join(name="anna").acquire("left").ok
-
-
 def test_director_policy_leaves_it_to_directors() -> None:
     t = Table(AuthorityConfig(policy="director"))
     anna = t.join()
@@ -119,18 +101,6 @@ def test_nearest_to_the_head() -> None:
     assert got(anna) == ["third"]
     assert got(anna) == ["right"]
     assert got(t.join("agent", alignment="not_needed")) == ["left"]
-
-
-def test_waiting_for_the_nearest_while_unaligned_keeps_waiting() -> None:
-    t = Table(AuthorityConfig(policy="nearest"), robots=(robot("left"),))
-    anna, bert = t.operator("left"), t.operator()
-    bert.sends(device="head")
-    bert.does(Acquire(1, wait=True))
-    bert.tracking_epoch = 1
-
-    bert.does(TrackingEpoch(1))
-    anna.does(Release())
-    assert bert.replies() == []
 
 
 def test_no_robots_at_all() -> None:

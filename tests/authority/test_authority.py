@@ -25,7 +25,6 @@ from iris_session.protocol.entries import Entry, Lost
 from iris_session.protocol.server_messages import MarkerAdded, SamplesRejected, Snapshot
 from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.specs import ObjectSpec
-from iris_session.protocol.steps import OutgoingMessage
 
 from .table import Table, make_view, proposal, robot
 
@@ -117,13 +116,6 @@ def follow(t: Table, mirror: SessionMirror) -> None:
         assert mirror.apply_event(event)
 
 
-def test_snapshot_asked_by_one_who_is_gone_by_the_end_of_the_step_is_not_sent() -> None:
-    t = Table(AuthorityConfig(heartbeat_timeout_ns=1))
-    anna = t.join()
-    t.step(Entry(anna.connection, anna.connection, 0, GetSnapshot(1)))
-    assert t.decision.outgoing == ()
-
-
 def test_presence_is_in_the_world_and_only_of_the_aligned() -> None:
     t = Table()
     anna, watcher = t.operator("left"), t.join("observer")
@@ -140,15 +132,6 @@ def test_presence_is_in_the_world_and_only_of_the_aligned() -> None:
     assert shown.keys() == {(watcher.id, "head"), (anna.id, "controller/right")}
     t.step()
     assert t.decision.presence == ()
-
-
-def test_join_order_of_effects_is_that_of_the_entries() -> None:
-    t = Table()
-    anna = t.join()
-    t.step(anna.says(Marker(1, "a")), anna.says(Marker(2, "b")))
-    assert [e.event_seq for e in t.decision.events] == [2, 3]
-    assert t.decision.event_seq == 3
-    assert isinstance(t.decision.outgoing[0], OutgoingMessage)
 
 
 @pytest.mark.parametrize(

@@ -114,15 +114,6 @@ def test_receiver_that_only_tried_is_forgotten() -> None:
     assert [(h.giver, h.receiver, h.duration_ns) for h in handovers(t)] == [("left", "third", 40 * MS)]
 
 
-def test_unknown_objects_and_paused_physics_change_nothing() -> None:
-    t = Table()
-    t.view = msgspec.structs.replace(t.view, contacts=(ObjectContact("ghost", ("left",), ("left",), ()),))
-    t.step()
-    t.step(n_ticks=0)
-    t.step()
-    assert t.authority.snapshot().count(b"ghost") == 0
-
-
 ARMS = ("a1", "a2", "b1", "b2")
 
 
@@ -154,25 +145,3 @@ def test_two_arms_of_one_person_are_one_giver_and_one_receiver(course: list[str]
     assert [(h.giver, h.receiver, h.giver_participant, h.receiver_participant) for h in between] == [
         (*arms, anna, bert)
     ]
-
-
-def test_from_one_arm_to_the_other_of_the_same_person() -> None:
-    t, anna, _ = two_arms_each()
-    for grippers in ("a1", "a1 a2", "a2"):
-        contact(t, 200, grippers)
-    assert [(h.giver, h.receiver, h.giver_participant, h.receiver_participant) for h in handovers(t)] == [
-        ("a1", "a2", anna, anna)
-    ]
-
-
-def test_somebody_else_who_touches_too_makes_it_no_handover() -> None:
-    t = Table(robots=tuple(robot(name) for name in ("left", "right", "third")))
-    t.operator("left")
-    t.operator("right")
-    t.operator("third")
-    contact(t, 200, "left")
-    contact(t, 200, "left right")
-    contact(t, 10, "left right", "left right third")
-    contact(t, 200, "left right")
-    contact(t, 200, "right")
-    assert handovers(t) == []

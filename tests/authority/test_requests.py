@@ -7,7 +7,6 @@ import math
 import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.authority.state import Pending
 from iris_session.protocol.client_messages import (
     Acquire,
     Assign,
@@ -23,8 +22,8 @@ from iris_session.protocol.client_messages import (
     SetScale,
     Withdraw,
 )
-from iris_session.protocol.common import Message, Target
-from iris_session.protocol.entries import FrontRestarted, Lost
+from iris_session.protocol.common import Target
+from iris_session.protocol.entries import Lost
 from iris_session.protocol.server_messages import (
     ConsentRequested,
     Feedback,
@@ -94,13 +93,6 @@ def test_a_waiting_pair_takes_nothing_and_is_not_overtaken() -> None:
     assert [lease.target for lease in bert.replies()[0].leases] == ["left", "right"]
 
 
-def test_who_holds_a_robot_cannot_wait_for_another_so_two_armed_operators_never_deadlock() -> None:
-    t = Table()
-    anna, bert = t.operator("left"), t.operator("right")
-    assert anna.denied(Acquire(1, ("right",), wait=True)) == "held"
-    assert bert.denied(Acquire(1, ("left",), wait=True)) == "held"
-
-
 def test_a_robot_got_otherwise_ends_the_wait() -> None:
     t = Table()
     anna, bert = t.operator("left"), t.join()
@@ -124,16 +116,6 @@ def test_queue_is_bounded_and_one_place_each() -> None:
     assert carl.replies() == []
 
 
-def test_lost_waiters_leave_the_queue() -> None:
-    t = Table()
-    anna, bert = t.operator("left"), t.join()
-    bert.does(Acquire(1, ("left",), wait=True))
-    t.step(bert.says(Lost()))
-    anna.does(Release())
-    assert t.last(LeaseChanged).lease.queue == ()
-    assert t.hold() == "no_lease"
-
-
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
@@ -155,29 +137,6 @@ def test_lost_waiters_leave_the_queue() -> None:
 def test_typed_denials(message: Acquire, reason: str) -> None:
     t = Table()
     assert t.join().denied(message) == reason
-
-
-@pytest.mark.parametrize(
-    ("message", "text", "there_are"),
-    [
-        (Acquire(1, ("lift",)), "no robot 'lift'", "robots: none"),
-        (Acquire(1, (), ("axe",)), "no object 'axe'", "objects: none"),
-        (Acquire(1, ("",)), "no robot ''", "robots: none"),
-        (Grasp(1, "axe", "hand/left"), "no object 'axe'", "objects: none"),
-        (Release(1, (Target("lift", 1),)), "no robot 'lift'", "robots: none"),
-        (Assign(1, ("lift",)), "no robot 'lift'", "robots: none"),
-        (SetMode(1, "lift", "shared"), "no robot 'lift'", "robots: none"),
-        (SetScale(1, ("lift",), 0.5), "no robot 'lift'", "robots: none"),
-    ],
-)
-def test_what_the_scene_has_not_is_quoted_and_nothing_is_called_none(
-    message: Message, text: str, there_are: str
-) -> None:
-    t = Table()
-    t.authority = Authority(AuthorityConfig(), (), ())
-    denial = t.join("director").asks(message).denial
-    assert denial is not None
-    assert (denial.message, denial.advice) == (text, there_are)
 
 
 def test_observers_hold_nothing() -> None:
@@ -214,30 +173,6 @@ def test_a_request_that_is_withdrawn_is_never_granted() -> None:
     assert t.hold() == "no_lease"
 
 
-def test_a_request_for_any_robot_is_withdrawn_with_its_place() -> None:
-    t = Table()
-    anna, bert, carl = t.operator("left"), t.operator("right"), t.join()
-    carl.does(Acquire(3, wait=True))
-    carl.does(Withdraw(4, 3))
-    denial = carl.replies()[0].denial
-    assert denial is not None
-    assert denial.holder == anna.id
-    assert "place 1 of 1" in denial.message
-    bert.does(Release())
-    assert t.hold("right") == "no_lease"
-
-
-def test_a_withdrawn_question_is_over() -> None:
-    t = with_mode("request")
-    anna, bert = t.operator("left"), t.join()
-    bert.does(Acquire(3, ("left",)))
-    asked = t.last(ConsentRequested).consent_id
-    bert.does(Withdraw(4, 3))
-    assert [(r.request_id, r.ok) for r in bert.replies()] == [(3, False), (4, True)]
-    assert bert.replies()[0].denial.holder == anna.id  # type: ignore[union-attr]
-    assert anna.denied(Consent(1, asked, True)) == "unknown_request"
-
-
 def test_a_request_that_was_granted_meanwhile_is_given_back() -> None:
     """The reply with the lease and the withdrawal have crossed on their way."""
     t = Table()
@@ -263,14 +198,6 @@ def test_a_withdrawal_is_of_one_connection() -> None:
     back = t.join(key_id=f"key{anna.connection}", name=anna.name, resume_of=anna.id)
     assert back.asks(Withdraw(2, 1)).leases == ()
     assert t.last(LeaseChanged).lease.holder == anna.id
-
-
-def test_acquire_and_withdraw_in_one_step_leave_nothing() -> None:
-    t = Table()
-    anna = t.operator()
-    t.step(anna.says(Acquire(1, ("left",))), anna.says(Withdraw(2, 1)))
-    assert [(r.request_id, r.ok) for r in anna.replies()] == [(1, True), (2, True)]
-    assert t.hold() == "no_lease"
 
 
 # --- request ---
@@ -316,16 +243,6 @@ def test_consent_refused_by_a_director_times_out_or_resolves_itself() -> None:
     assert anna.replies()[0].denial.reason == "consent_refused"  # type: ignore[union-attr]
 
 
-def test_consented_request_that_met_another_obstacle_is_denied() -> None:
-    t = Table(robots=(robot("left", "request"), robot("right")))
-    anna, bert, carl = t.operator("left"), t.join(), t.join()
-    bert.does(Acquire(1, ("left", "right")))
-    carl.acquire("right")
-    anna.does(Consent(1, t.last(ConsentRequested).consent_id, True))
-    assert bert.replies()[0].denial.reason == "held"  # type: ignore[union-attr]
-    assert anna.acquire("left").leases[0].holder == anna.id
-
-
 def test_one_request_for_consent_each_and_it_is_answered_once() -> None:
     t = with_mode("request")
     anna, bert, carl = t.operator("left"), t.operator("right"), t.join()
@@ -335,18 +252,6 @@ def test_one_request_for_consent_each_and_it_is_answered_once() -> None:
     assert [r.request_id for r in carl.replies()] == [3]
     t.step(anna.says(Release(7)), bert.says(Release(8)))
     assert [(r.request_id, r.ok) for r in carl.replies()] == [(1, True)]
-
-
-def test_a_request_that_ended_another_is_not_answered_again() -> None:
-    t = with_mode("request")
-    anna, bert, carl, dora = t.operator("left"), t.operator("right"), t.join(), t.join()
-    carl.does(Acquire(1, ("left",)))
-    state = t.authority._ctx.state
-    state.consents.append(Pending(carl.id, 2, ("right",), (), 1.0, expires_ns=t.now_ns + SECOND))
-    state.consents[-1].consents[99] = "right"
-    t.step(anna.says(Release(7)), bert.says(Release(8)))
-    assert sorted((r.request_id, r.ok) for r in carl.replies()) == [(1, True), (2, False)]
-    assert dora.acquire("right").ok
 
 
 # --- takeover ---
@@ -529,15 +434,6 @@ def resume(t: Table, human: Person) -> Person:
     return back
 
 
-def test_the_restart_of_the_front_does_not_give_the_robot_back() -> None:
-    t, agent, human = intervened()
-    t.step(t.host(FrontRestarted()))
-    t.wait(5 * SECOND)
-    assert (t.hold(), t.last(Intervention).active) == ("disconnected", True)
-    assert t.last(LeaseChanged).lease.holder == human.id
-    assert agent.id
-
-
 @pytest.mark.parametrize("why", ["untracked", "not_worn", "stale", "estop", "rejected"])
 def test_a_human_who_cannot_drive_is_not_idle(why: str) -> None:
     """Only its own open clutch counts: for two seconds, when something else has ended its engagement."""
@@ -585,14 +481,6 @@ def test_open_clutches_far_apart_are_no_idle_time() -> None:
     assert t.last(Intervention).active
 
 
-def test_an_open_clutch_and_then_silence_is_no_idle_time() -> None:
-    t, agent, human = intervened()
-    human.sends("left", tracked=False)
-    human.sends("left")
-    drive_on(t, agent, 10 * SECOND, human)
-    assert t.last(Intervention).active
-
-
 def test_a_director_gives_the_robot_of_a_lost_human_back() -> None:
     t, agent, human = intervened()
     boss = t.join("director")
@@ -600,20 +488,6 @@ def test_a_director_gives_the_robot_of_a_lost_human_back() -> None:
     assert boss.asks(Assign(1, ("left",), agent.id)).ok
     assert not t.last(Intervention).active
     assert t.last(LeaseChanged).lease.holder == agent.id
-
-
-def test_an_intervention_outlasts_a_standstill_and_a_pause() -> None:
-    t = with_mode("priority")
-    agent, human, boss = t.join("agent", alignment="not_needed"), t.operator(), t.join("director")
-    agent.acquire("left")
-    human.acquire("left")
-    human.engage("left")
-    t.step(dt_ns=5_000 * MS)
-    assert t.last(Intervention).active, "the session stood still, not the human"
-    boss.does(Control(1, "pause"))
-    for _ in range(200):
-        t.step(*(p.says(Heartbeat()) for p in (agent, human, boss)), dt_ns=20 * MS, n_ticks=0)
-    assert t.last(Intervention).active, "who looks and thinks keeps the robot"
 
 
 @pytest.mark.parametrize("stop", ["pause", "estop"])
@@ -649,26 +523,6 @@ def test_a_human_without_a_wish_gets_the_robot_of_an_agent(policy: str) -> None:
     assert other.replies()[0].leases[0].holder == other.id
 
 
-def test_a_free_robot_comes_before_that_of_an_agent() -> None:
-    t = with_mode("priority")
-    agent = t.join("agent", alignment="not_needed")
-    agent.acquire("left")
-    human, other = t.operator(), t.operator()
-    assert [lease.target for lease in human.acquire().leases] == ["right"]
-    assert [lease.target for lease in other.acquire().leases] == ["left"]
-    assert t.join("agent").denied(Acquire(1)) == "held"
-
-
-def test_a_human_who_waits_gets_a_robot_that_an_agent_has_got_meanwhile() -> None:
-    t = Table(robots=(robot("left", "priority"),))
-    agent, first, second, boss = t.join("agent"), t.operator("left"), t.operator(), t.join("director")
-    second.does(Acquire(5, wait=True))
-    assert second.replies() == []
-    boss.asks(Assign(1, ("left",), agent.id))
-    assert second.replies()[0].leases[0].sub_holders == (agent.id, second.id)
-    assert first.denied(Acquire(1, ("left",))) == "held"
-
-
 def test_a_leader_arm_is_a_human_hand() -> None:
     t = with_mode("priority")
     joints = {"device": "joints", "kind": "joints", "pose": None, "q": (0.0,) * 7}
@@ -680,15 +534,6 @@ def test_a_leader_arm_is_a_human_hand() -> None:
     assert t.command().sources[0].participant == leader.id
     assert leader.acquire("right").ok
     assert t.operator().denied(Acquire(1, ("right",))) == "held"
-
-
-def test_humans_and_agents_among_themselves_are_exclusive_in_priority_mode() -> None:
-    t = with_mode("priority")
-    human, agent, other = t.operator("left"), t.join("agent"), t.join("agent")
-    assert agent.denied(Acquire(1, ("left",))) == "held"
-    agent.acquire("right")
-    assert other.denied(Acquire(1, ("right",))) == "held"
-    assert human.acquire("left").ok
 
 
 # --- shared ---
@@ -763,34 +608,6 @@ def test_director_assigns_frees_and_changes_modes() -> None:
     assert bert.denied(Acquire(1, ("left",))) == "held"
 
 
-def test_assigning_a_shared_robot_replaces_everyone() -> None:
-    t = with_mode("shared")
-    anna, bert, boss = t.operator("left"), t.operator("left"), t.join("director")
-    boss.asks(Assign(1, ("left",), bert.id))
-    assert t.last(LeaseChanged).lease.sub_holders == (bert.id,)
-    assert anna.denied(Release(1, (Target("left", anna.versions["left"]),))) == "not_holder"
-
-
-def test_assignment_ends_the_wait_of_the_assigned() -> None:
-    t = Table()
-    anna, bert = t.operator("left"), t.join()
-    bert.does(Acquire(5, ("left",), wait=True))
-    t.step(t.host(Assign(1, ("right",), bert.id)))
-    assert [(r.request_id, r.ok) for r in bert.replies()] == [(5, False)]
-    anna.does(Release())
-    assert t.last(LeaseChanged).lease.holder == ""
-
-
-def test_waiting_for_seconds_keeps_the_reply_for_the_end() -> None:
-    t = Table()
-    anna, bert = t.operator("left"), t.join()
-    bert.does(Acquire(1, ("left",), wait=True))
-    for _ in range(50):
-        t.step(anna.says(anna.sample()), bert.says(bert.sample()), dt_ns=100 * MS)
-        assert bert.replies() == []
-    assert t.now_ns > 5 * SECOND
-
-
 def test_denials_fit_the_wire_in_a_scene_of_many_objects() -> None:
     t = Table(objects=[f"a rather long name of object number {i}" for i in range(300)])
     anna = t.join()
@@ -801,17 +618,6 @@ def test_denials_fit_the_wire_in_a_scene_of_many_objects() -> None:
         assert len(denial.message) <= 512
         assert denial.advice.endswith("more")
         assert len(denial.advice) <= 512
-
-
-def test_a_release_denies_only_what_it_meant() -> None:
-    """The urgent lane applies a release before an acquire that was sent earlier in the same step."""
-    t = Table()
-    anna = t.operator("left")
-    t.step(anna.says(Acquire(1, ("right",))), anna.says(Release(2, (anna.target("left"),))))
-    assert [(r.request_id, r.ok) for r in anna.replies()] == [(2, True), (1, True)]
-    t.step(anna.says(Acquire(3, ("left",))), anna.says(Release(4, (anna.target("right"),))), anna.says(Release(5)))
-    assert [(r.request_id, r.ok) for r in anna.replies()][-1] == (3, False)
-    assert t.hold("left") == t.hold("right") == "no_lease"
 
 
 def test_consent_of_one_holder_takes_nothing_from_another() -> None:
@@ -826,15 +632,6 @@ def test_consent_of_one_holder_takes_nothing_from_another() -> None:
     assert denial is not None
     assert (denial.reason, denial.target, denial.holder) == ("held", "right", carl.id)
     assert t.last(LeaseChanged).lease.holder == carl.id
-
-
-def test_who_waits_for_any_robot_is_not_overtaken_in_the_step_of_the_release() -> None:
-    t = Table(robots=(robot("left"),))
-    anna, bert, carl = t.operator("left"), t.join(), t.join()
-    bert.does(Acquire(1, wait=True))
-    t.step(anna.says(Release(2)), carl.says(Acquire(3, ("left",))))
-    assert bert.replies()[0].leases[0].holder == bert.id
-    assert carl.replies()[0].denial.reason == "held"  # type: ignore[union-attr]
 
 
 # --- motion scaling ---
@@ -873,15 +670,6 @@ def test_a_holder_sets_the_scale_of_its_robot_and_everybody_sees_it() -> None:
     assert t.command("right").scale == 1.0
 
 
-def test_the_same_scale_again_is_no_news() -> None:
-    t = Table()
-    anna = t.operator("left")
-    assert anna.asks(SetScale(1, ("left",), 2)).ok
-    assert t.last(ScaleChanged) == ScaleChanged("left", 2.0, anna.id)
-    assert anna.asks(SetScale(1, ("left",), 2.0)).ok
-    assert t.since(ScaleChanged) == []
-
-
 def test_without_names_every_robot_of_the_sender_is_meant() -> None:
     t = Table(robots=(robot("left"), robot("right"), robot("third")))
     anna, bert = t.operator("left", "right"), t.operator("third")
@@ -901,15 +689,6 @@ def test_a_scale_out_of_range_is_denied_with_the_range(scale: float) -> None:
     assert "0.05" in denial.advice
     assert "5" in denial.advice
     assert lease_scale(t) == 1.0
-
-
-def test_the_range_is_that_of_the_configuration() -> None:
-    t = Table(AuthorityConfig(min_scale=0.1, max_scale=0.5))
-    anna = t.operator("left")
-    anna.engage("left")
-    assert t.command().scale == lease_scale(t) == 0.5, "where 1 is not allowed, the nearest is where everyone begins"
-    assert anna.asks(SetScale(1, ("left",), 0.1)).ok
-    assert anna.denied(SetScale(1, ("left",), 0.6)) == "invalid"
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (0.1, math.inf), (math.nan, 1.0)])
@@ -968,76 +747,6 @@ def test_it_outlives_a_lost_connection_with_the_lease() -> None:
     assert lease_scale(t) == 0.2
 
 
-def test_sharers_have_one_scale() -> None:
-    t = Table(robots=(robot("left", "shared"), robot("right")))
-    anna, bert = t.operator("left"), t.operator("left")
-    bert.does(SetScale(1, ("left",), 0.5))
-    carl = t.operator("left")
-    anna.engage("left")
-    bert.engage("left")
-    assert (len(t.command().sources), t.command().scale) == (2, 0.5)
-    anna.does(Release())
-    assert lease_scale(t) == 0.5, "nobody's motion changes because another one leaves"
-    carl.does(SetScale(1, ("left",), 0.25))
-    assert commanded(t, bert) == 0.25
-
-
-def test_a_human_who_preempts_an_agent_has_a_scale_of_its_own() -> None:
-    t = Table(robots=(robot("left", "priority"), robot("right")))
-    agent = t.join("agent", alignment="not_needed")
-    agent.acquire("left")
-    agent.does(SetScale(1, ("left",), 2.0))
-    agent.engage("left")
-    assert t.command().scale == 2.0
-    human = t.operator("left")
-    assert human.asks(SetScale(1, ("left",), 0.1)).ok
-    assert t.since(ScaleChanged) == [], "it stands by: nothing has changed yet"
-    agent.learn((t.last(LeaseChanged).lease,))
-    human.engage("left")
-    assert (t.command().scale, lease_scale(t)) == (0.1, 0.1)
-    human.sends("left", clutch=False)
-    assert lease_scale(t) == 2.0
-    human.does(Release())
-    assert lease_scale(t) == 2.0
-
-
-def test_a_mode_change_keeps_the_scale_of_the_one_in_charge() -> None:
-    t = Table(robots=(robot("left", "shared"), robot("right")))
-    boss = t.join("director")
-    anna = t.operator("left")
-    t.operator("left")
-    anna.does(SetScale(1, ("left",), 0.5))
-    boss.does(SetMode(1, "left", "exclusive"))
-    assert lease_scale(t) == 0.5
-
-
-def test_a_snapshot_holds_it() -> None:
-    t = Table()
-    anna = t.operator("left")
-    anna.does(SetScale(1, ("left",), 0.3))
-    anna.engage("left")
-    other = Authority(t.config, t.robots, t.objects)
-    other.restore(t.authority.snapshot())
-    entry = anna.says(anna.sample("left", clutch=True))
-    now_ns = t.now_ns + 2 * MS
-    one = t.authority.step(now_ns, (entry,), 1, t.view)
-    two = other.step(now_ns, (entry,), 1, t.view)
-    assert one == two
-    assert two.commands[0].scale == 0.3
-
-
-def test_a_new_participant_of_the_same_name_begins_at_one() -> None:
-    t = Table()
-    anna = t.operator("left", name="anna")
-    anna.does(SetScale(1, ("left",), 0.3))
-    t.step(anna.says(Lost("silent")))
-    t.wait(t.config.grace_ns + 100 * MS)
-    again = t.join(name="anna")
-    t.step(again.says(Acquire(1, ("left",))))
-    assert t.last(LeaseChanged).lease.holder == again.id
-    assert t.last(LeaseChanged).lease.scale == 1.0
-
-
 def test_leases_of_one_request_are_one_event() -> None:
     """Everyone gets every event: a request that names forty targets must not make forty of them."""
     objects = [f"part{i}" for i in range(30)]
@@ -1055,10 +764,3 @@ def test_leases_of_one_request_are_one_event() -> None:
     assert [
         (lease.holder, who) for lease, who in zip(released.body.leases, released.body.previous_holders, strict=True)
     ] == [("", anna.id)] * 40
-
-
-def test_one_lease_of_a_request_is_an_event_of_its_own() -> None:
-    t = Table()
-    anna = t.join()
-    anna.acquire("left")
-    assert [type(e.body) for e in t.decision.events] == [LeaseChanged]

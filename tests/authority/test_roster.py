@@ -157,28 +157,6 @@ def test_who_waited_keeps_the_place_while_the_session_was_down(news: SessionResu
     assert t.last(LeaseChanged).lease.queue == ()
 
 
-def test_who_wants_something_else_gives_up_a_kept_place() -> None:
-    t = Table()
-    ann, bert = t.operator("left", "right"), t.join()
-    bert.does(Acquire(7, ("left",), wait=True))
-    t.step(t.host(SessionResumed(SECOND)), dt_ns=SECOND)
-    ann, bert = rejoin(t, ann), rejoin(t, bert)
-    bert.does(Acquire(1, ("right",), wait=True))
-    assert {event.lease.target: event.lease.queue for event in t.since(LeaseChanged)} == {
-        "left": (),
-        "right": (bert.id,),
-    }
-
-
-def test_grace_goes_on_while_physics_is_paused() -> None:
-    t = Table()
-    anna = t.operator("left")
-    t.step(anna.says(Lost()), n_ticks=0)
-    for _ in range(1500):
-        t.step(dt_ns=20 * MS, n_ticks=0)
-    assert t.hold() == "no_lease"
-
-
 def test_resume_fences_old_tokens_and_drops_the_old_connection() -> None:
     t = Table()
     anna = t.operator("left", capabilities=("run:a",))
@@ -198,39 +176,6 @@ def test_resume_fences_old_tokens_and_drops_the_old_connection() -> None:
     anna.versions = again.versions
     anna.sends("left", clutch=False)
     assert t.command().kind == "pose"
-
-
-def test_a_gateway_that_resumes_over_its_live_connection_takes_its_clients_along() -> None:
-    t = Table()
-    gate = t.join("gateway")
-    anna = t.operator("left", gateway=gate.connection)
-    rejoin(t, gate, role="gateway")
-    assert t.decision.dropped == (Dropped(gate.connection, "replaced"), Dropped(anna.connection, "gateway"))
-    assert t.hold() == "disconnected"
-    assert [e.grace for e in t.since(ParticipantLeft)] == [True, True]
-    assert t.since(ParticipantJoined)[0].resumed
-
-
-def test_what_a_live_connection_waited_for_does_not_survive_its_resume() -> None:
-    t = Table()
-    anna, bert = t.operator("left"), t.join()
-    bert.does(Acquire(9, ("left",), wait=True))
-    again = rejoin(t, bert)
-    assert t.last(LeaseChanged).lease.queue == ()
-    anna.does(Release())
-    assert again.replies() == []
-
-
-def test_who_comes_back_is_told_the_state_of_its_robot_anew() -> None:
-    t = Table()
-    anna = t.operator("left")
-    t.wait(200 * MS)
-    assert anna.told["left"].hold_reason == "no_sample"
-    for _ in range(3):
-        t.step(anna.says(Lost()))
-        anna = rejoin(t, anna, key_id="key1")
-        t.wait(100 * MS)
-        assert anna.told["left"].hold_reason == "rearm"
 
 
 def test_resume_after_lost_keeps_the_lease() -> None:
@@ -345,10 +290,3 @@ def test_worn_is_shown_and_a_gateway_takes_its_clients_along() -> None:
     t.operator("right", gateway=gate.connection)
     gate.does(Bye())
     assert t.hold("right") == "disconnected"
-
-
-def test_join_and_bye_in_one_step_leave_no_ghost() -> None:
-    t = Table()
-    join = Join("k", "operator", "anna")
-    t.step(Entry(1, 1, t.now_ns, join), Entry(1, 1, t.now_ns, Bye()))
-    assert t.decision.admitted == ()

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Grasp, Sample
+from iris_session.protocol.client_messages import Grasp
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.server_messages import Notice, SamplesRejected
@@ -203,14 +203,6 @@ def test_unaligned_holder_holds_unaligned() -> None:
     assert told == ["person1 is not aligned and moves nothing: look at an anchor sheet"], "once, not with every sample"
 
 
-def test_too_fast_counts_from_the_last_counted_sample() -> None:
-    t, op = engaged()
-    op.sends("left", clutch=True, p=(0.5, 0.0, 1.0))
-    t.step(dt_ns=60 * MS)
-    op.engage("left", p=(0.5, 0.0, 1.0))
-    assert t.command().kind == "pose"
-
-
 def test_objects_take_poses_only_and_leaders_the_right_number_of_joints() -> None:
     t = Table(objects=("hammer",))
     leader = t.join("leader", alignment="not_needed")
@@ -257,30 +249,6 @@ def test_untracked_and_unworn_samples_need_no_payload() -> None:
         assert t.hold() == reason
         op.sends("left", clutch=True)
         assert t.command().kind == "hold"
-
-
-def test_float_fields_may_hold_whole_numbers_of_a_host_program() -> None:
-    t = Table()
-    agent = t.join("agent", alignment="not_needed")
-    agent.acquire("left")
-    pose = Pose((0, 0, 1), (1, 0, 0, 0))
-    s = Sample("target", "pose", 1, t.now_ns, 1, 0, 0, (agent.target("left"),), pose=pose)
-    agent.does(s)
-    agent.seq = 1
-    agent.sends("left", device="target", pose=pose, clutch=True, gripper=1)
-    source = t.command().sources[0]
-    assert source.absolute
-    assert all(isinstance(c, float) for c in (*source.pose_world.p, *source.pose_world.q, t.command().gripper))
-
-
-def test_a_rejected_device_does_not_speak_for_another_that_is_ready() -> None:
-    t = Table()
-    anna = t.operator("left")
-    anna.sends("left", clutch=False)
-    anna.sends("left", device="hand/left", scene_epoch=9)
-    assert t.hold() == "clutch_open"
-    anna.sends("left", clutch=True)
-    assert t.command().kind == "pose"
 
 
 def test_capture_times_that_go_back_and_forth_make_no_time_for_a_jump() -> None:
@@ -331,16 +299,6 @@ def test_a_hand_that_was_not_tracked_for_a_while_may_be_elsewhere() -> None:
         t.step(dt_ns=20 * MS)
     op.engage("left", p=(0.9, 0.0, 1.0))
     assert t.command().kind == "pose"
-
-
-def test_the_last_poses_of_a_device_survive_a_restart_of_the_authority() -> None:
-    t, op = engaged()
-    op.sends(kind="twist", pose=None, twist=(0.0,) * 6)
-    snapshot = t.authority.snapshot()
-    t.authority = Table(objects=("hammer",)).authority
-    t.authority.restore(snapshot)
-    op.sends(p=(0.9, 0.0, 1.0))
-    assert t.since(SamplesRejected)[0].reason == "too_fast"
 
 
 def test_a_robot_that_is_nowhere_is_not_near_its_leader() -> None:

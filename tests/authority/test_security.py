@@ -7,7 +7,6 @@ import pytest
 from iris_session.protocol.client_messages import (
     Acquire,
     Assign,
-    ClearEStop,
     Control,
     EStop,
     RemoveParticipant,
@@ -15,11 +14,11 @@ from iris_session.protocol.client_messages import (
 )
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.entries import Audit, Entry, Join, Lost
-from iris_session.protocol.names import AuditKind, DenialReason, RefusalCode
+from iris_session.protocol.names import AuditKind, DenialReason
 from iris_session.protocol.server_messages import Audited, LeaseChanged, ParticipantLeft, Refused
 from iris_session.protocol.steps import Dropped
 
-from .table import SECOND, Person, Table
+from .table import Person, Table
 
 
 def rejoined(t: Table, old: Person) -> Person:
@@ -104,28 +103,6 @@ def test_a_key_joins_in_its_roles_only(role: str, roles: tuple[str, ...], allowe
         assert t.since(Audited) == [Audited(AuditKind.ROLE_REFUSED, "key1", "person1", "", role)]
 
 
-def test_a_resumed_participant_needs_its_role_still() -> None:
-    t = Table()
-    ann = t.operator("left", roles=("operator",))
-    t.step(ann.says(Lost("role")))
-    t.people += 1
-    join = Join("key1", "operator", "person1", resume_of=ann.id, roles=("observer",))
-    t.step(Entry(t.people, t.people, t.now_ns, join))
-    assert t.decision.admitted == ()
-    (refused,) = [o.message for o in t.decision.outgoing if isinstance(o.message, Refused)]
-    assert refused.code == DenialReason.ROLE
-
-
-def test_a_resume_with_another_key_is_refused() -> None:
-    t = Table()
-    ann = t.operator("left")
-    t.people += 1
-    t.step(Entry(t.people, t.people, t.now_ns, Join("key-of-eve", "operator", "person1", resume_of=ann.id)))
-    (refused,) = [o.message for o in t.decision.outgoing if isinstance(o.message, Refused)]
-    assert refused.code == RefusalCode.RESUME_TOKEN
-    assert t.decision.dropped == ()
-
-
 def test_audits_of_the_front_become_events_and_those_of_others_nothing() -> None:
     t = Table()
     ann = t.join()
@@ -157,12 +134,3 @@ def test_two_directors_at_once_both_act_and_the_last_word_wins() -> None:
     assert [d.connection for d in t.decision.dropped] == [two.connection], "who was removed first removes nobody"
     (denied,) = two.replies()
     assert denied.denial.reason == DenialReason.NOT_JOINED
-
-
-def test_two_directors_stop_and_start_without_deadlock() -> None:
-    t = Table()
-    one, two = t.join("director"), t.join("director")
-    t.step(one.says(EStop("stop")), two.says(ClearEStop(1, 0)))
-    t.wait(SECOND)
-    assert one.asks(ClearEStop(2, 1)).ok
-    assert not t.decision.estop

@@ -12,9 +12,7 @@ from iris_session.protocol.client_messages import (
     Control,
     Episode,
     EStop,
-    GetSnapshot,
     Grasp,
-    Heartbeat,
     Release,
 )
 from iris_session.protocol.entries import (
@@ -37,7 +35,6 @@ from iris_session.protocol.server_messages import (
     PauseChanged,
     Reply,
     SceneChanged,
-    Snapshot,
 )
 from iris_session.protocol.specs import ObjectSpec
 
@@ -134,17 +131,6 @@ def test_a_clear_lifts_no_stop_that_its_sender_has_not_seen() -> None:
     assert t.since(EStopChanged) == [EStopChanged(True, op.id, "again", 3)], "numbers go on"
 
 
-def test_stops_are_in_snapshots_and_survive_a_restore() -> None:
-    t, op, _ = playing()
-    op.does(EStop("sparks"))
-    op.does(GetSnapshot(1))
-    (snapshot,) = [o.message for o in t.decision.outgoing if isinstance(o.message, Snapshot)]
-    assert (snapshot.estop, snapshot.stop_seq) == (True, 1)
-    twin = Authority(t.config, t.robots, t.objects)
-    twin.restore(t.authority.snapshot())
-    assert twin.build_stop_reports() == t.authority.build_stop_reports()
-
-
 def test_the_stops_on_the_list_are_bounded_and_each_sender_is_there_once() -> None:
     t, op, boss = playing()
     crowd = [t.join("observer") for _ in range(20)]
@@ -206,12 +192,6 @@ def test_one_command_mends_physics_that_diverged(action: str) -> None:
     op.scene_epoch = 2
     op.engage("left")
     assert t.command().kind == "pose"
-
-
-def test_an_episode_that_is_reset_mends_physics_that_diverged() -> None:
-    t, op, _ = diverged()
-    op.asks(Episode(1, "reset"))
-    assert (t.decision.reset, t.decision.paused) == (True, False)
 
 
 def test_physics_that_diverged_takes_no_ticks_and_stays_paused_when_a_director_wants_it() -> None:
@@ -278,16 +258,6 @@ def test_an_owner_that_listens_is_asked_to_reset() -> None:
     assert t.since(EpisodeChanged) == []
 
 
-def test_an_episode_that_starts_by_hand_is_not_started_again_by_the_reset() -> None:
-    t = Table(AuthorityConfig(user_owned_loop=True))
-    boss = t.join("director")
-    t.step(t.host(OwnerListens()))
-    for message in (Episode(1, "start"), Episode(2, "rerecord"), Episode(3, "start", "mine")):
-        assert boss.asks(message).ok
-    t.step(t.host(ExternalReset()))
-    assert t.last(EpisodeChanged) == EpisodeChanged(2, "running", "mine", boss.id)
-
-
 def test_a_gap_between_steps_holds_until_clutched_again() -> None:
     t, op, _ = playing()
     t.step(op.says(op.sample("left", clutch=True)), t.host(StalledGap(SECOND)), dt_ns=151 * MS)
@@ -325,16 +295,6 @@ def test_where_every_step_is_a_gap_the_silent_and_the_lost_expire_all_the_same()
     assert gone[(op.id, True)] == pytest.approx(3.3, abs=0.3)
     assert gone[(lost.id, False)] == pytest.approx(30.2, abs=0.5)
     assert gone[(op.id, False)] == pytest.approx(33.3, abs=0.5)
-
-
-def test_who_speaks_in_a_session_of_slow_steps_stays() -> None:
-    t, op, _ = playing()
-    for _ in range(60):
-        t.step(op.says(Heartbeat()), dt_ns=200 * MS)
-    assert t.hold() == "gap"
-    t.step(dt_ns=3 * SECOND)
-    op.sends("left")
-    assert t.hold() == "clutch_open"
 
 
 def test_recording_gap_is_announced_and_only_by_the_host() -> None:
@@ -468,24 +428,6 @@ def test_who_waits_for_what_is_no_more_is_answered_and_the_others_wait_on() -> N
     assert stays.connection not in answers
     assert answers[any_robot.connection].ok, "a robot has become free"
     assert answers[any_robot.connection].leases[0].target == "third"
-
-
-def test_who_asked_for_consent_to_a_robot_that_is_gone_is_answered() -> None:
-    t = Table(robots=(robot("left", "request"), robot("right")))
-    t.operator("left")
-    bob = t.operator()
-    bob.does(Acquire(9, ("left",)))
-    assert not bob.replies()
-    load(t, other("right"))
-    assert [r.denial.reason for r in bob.replies() if r.denial] == ["unknown_target"]
-
-
-def test_a_robot_that_the_configuration_assigns_may_be_missing() -> None:
-    t = Table(AuthorityConfig(policy="config", assignments={"ann": ("left", "right")}))
-    ann = t.operator(name="ann")
-    load(t, other("left"))
-    reply = ann.asks(Acquire(1))
-    assert [lease.target for lease in reply.leases] == ["left"]
 
 
 def test_nobody_but_the_owner_of_the_session_loads_a_scene() -> None:

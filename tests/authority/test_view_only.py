@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from iris_session.protocol.client_messages import Align, Grasp, PlaceAlignment, TrackingEpoch
+from iris_session.protocol.client_messages import Align, Grasp, TrackingEpoch
 from iris_session.protocol.entries import TipSolved
 from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentChanged, Notice, SamplesRejected, TipCalibrated
-from tests.authority.table import MS, Table, proposal
+from tests.authority.table import Table, proposal
 from tests.authority.test_alignment import covariance, rest, yawed
 
 KINDS = sorted(AlignmentKind.VIEW_ONLY)
@@ -94,37 +94,12 @@ def test_errors_are_bounded_too() -> None:
     assert "at most 200 mm is allowed" in t.last(Notice).text
 
 
-def test_an_offset_makes_it_no_better() -> None:
-    t = Table()
-    anna, boss = t.join(name="anna"), t.join("director")
-    t.step(anna.says(view_only("fingertip")))
-    assert boss.asks(PlaceAlignment(1, "anna", yawed(0.0, 0.1), offset=True)).ok
-    assert (t.last(AlignmentChanged).alignment.kind, t.last(AlignmentChanged).alignment.offset) == ("fingertip", True)
-    t.step(anna.says(view_only("fingertip", T_world_tracking=yawed(0.0, 1.3))))
-    assert t.last(AlignmentChanged).alignment.kind == "fingertip"
-    assert boss.asks(PlaceAlignment(1, "anna", yawed(0.0, 1.0))).ok
-    assert t.last(AlignmentChanged).alignment.kind == "placed", "the word of a director"
-
-
 def test_kinds_that_are_not_known_are_no_measurement() -> None:
     t = Table()
     anna = t.join(name="anna")
     for kind in ("placed", "not_needed", "none", "better"):
         t.step(anna.says(proposal(kind=kind)))
     assert t.since(AlignmentChanged) == []
-
-
-def test_a_snapshot_keeps_it() -> None:
-    t = Table()
-    anna = t.join(name="anna")
-    t.step(anna.says(view_only("persistent")))
-    anna.acquire("left")
-    again = Table()
-    again.authority.restore(t.authority.snapshot())
-    entry = anna.says(anna.sample("left", clutch=False))
-    decisions = [one.authority.step(t.now_ns + 20 * MS, (entry,), 1, t.view) for one in (t, again)]
-    assert decisions[0] == decisions[1]
-    assert decisions[0].commands[0].hold_reason == HoldReason.VIEW_ONLY
 
 
 def test_a_solved_tip_is_published_to_all_and_invalid_numbers_are_not() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from functools import cache
 
 import msgspec
 import mujoco
@@ -45,7 +47,8 @@ def panda_spec(prefix: str = "", kind: str = "position") -> RobotSpec:
     )
 
 
-def panda_model(kind: str = "position", timestep: float = 0.002) -> mujoco.MjModel:
+@cache
+def _compile_panda(kind: str, timestep: float) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_file(str(PANDA))
     spec.option.timestep = timestep
     for key in list(spec.keys):
@@ -55,29 +58,41 @@ def panda_model(kind: str = "position", timestep: float = 0.002) -> mujoco.MjMod
     return spec.compile()
 
 
+def panda_model(kind: str = "position", timestep: float = 0.002) -> mujoco.MjModel:
+    return copy.copy(_compile_panda(kind, timestep))
+
+
 def panda_arms(places: list[Vec3], yaws: list[float] | None = None) -> tuple[mujoco.MjModel, list[RobotSpec]]:
     """Several position-controlled panda arms in one scene, at `places` turned by `yaws` [rad]."""
+    model = copy.copy(_compile_arms(tuple(places), tuple(yaws or [0.0] * len(places))))
+    return model, [panda_spec(f"r{i}/") for i in range(len(places))]
+
+
+@cache
+def _compile_arms(places: tuple[Vec3, ...], yaws: tuple[float, ...]) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.002
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10  # as of the arm
-    robots = []
-    for i, place in enumerate(places):
+    for i, (place, yaw) in enumerate(zip(places, yaws, strict=True)):
         arm = mujoco.MjSpec.from_file(str(PANDA))
         for key in list(arm.keys):
             arm.delete(key)
         for mesh in arm.meshes:
             mesh.file = str(PANDA.parent / "assets" / mesh.file)
-        yaw = yaws[i] if yaws else 0.0
         frame = spec.worldbody.add_frame(pos=place, quat=[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)])
         spec.attach(arm, prefix=f"r{i}/", frame=frame)
-        robots.append(panda_spec(f"r{i}/"))
-    return spec.compile(), robots
+    return spec.compile()
+
+
+@cache
+def _compile_aloha() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_path(str(ALOHA))
 
 
 def aloha_model() -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_path(str(ALOHA))
+    return copy.copy(_compile_aloha())
 
 
 def aloha_robots() -> list[RobotSpec]:

@@ -164,17 +164,6 @@ def test_closing_is_as_fast_as_allowed_and_ends_exactly() -> None:
     assert data.ctrl[right] == 0.037
 
 
-def test_a_stopped_gripper_stays_bitwise() -> None:
-    grippers, data, left, _ = aloha()
-    grippers.set_goal(0, 1.0)
-    grippers.tick(data)
-    grippers.stop(0)
-    before = data.ctrl[left]
-    for _ in range(10):
-        grippers.tick(data)
-    assert data.ctrl[left] == before
-
-
 def test_nothing_is_asked_of_robots_without_gripper_or_by_no_number() -> None:
     grippers, data, left, right = aloha()
     grippers.set_goal(1, 1.0)
@@ -187,13 +176,3 @@ def test_nothing_is_asked_of_robots_without_gripper_or_by_no_number() -> None:
     for _ in range(200):
         grippers.tick(data)
     assert data.ctrl[right] == 0.002
-
-
-def test_no_grippers_at_all() -> None:
-    model = aloha_model()
-    data = mujoco.MjData(model)
-    before = data.ctrl.copy()
-    grippers = Grippers(model, [], ControlConfig(), 0.002)
-    grippers.reset(data)
-    grippers.tick(data)
-    assert (data.ctrl == before).all()

@@ -46,16 +46,6 @@ def test_back_at_the_latch_the_target_is_the_base_exactly() -> None:
     assert state.target == BASE
 
 
-def test_two_sources_are_blended_by_weight() -> None:
-    a, b = source("a", (0.0, 0.0, 0.0), weight=0.75), source("b", (5.0, 0.0, 0.0), weight=0.25)
-    state = clutch.latch_sources(command(a, b), 1.0, BASE)
-    clutch.follow_poses(
-        state, [source("a", (0.1, 0.0, 0.0), weight=0.75), source("b", (5.0, 0.2, 0.0), TURN, weight=0.25)], None
-    )
-    assert state.target[0] == pytest.approx((0.575, 0.15, 0.8))
-    assert quat_angle(state.target[1], BASE[1]) == pytest.approx(0.1)
-
-
 def test_joining_and_leaving_moves_nothing_and_loses_nothing() -> None:
     state = clutch.latch_sources(command(source("a", (0.0, 0.0, 0.0))), 1.0, BASE)
     clutch.follow_poses(state, [source("a", (0.1, 0.0, 0.0))], None)
@@ -93,15 +83,6 @@ def test_absolute_poses_are_the_target_themselves() -> None:
     assert state.target == ((0.2, 0.3, 0.4), TURN)
 
 
-def test_the_motion_of_an_absolute_source_is_blended_without_the_scale() -> None:
-    hand, policy = source("a", (0.0, 0.0, 0.0), weight=0.5), source("b", (2.0, 0.0, 0.0), weight=0.5, absolute=True)
-    state = clutch.latch_sources(command(hand, policy), 4.0, BASE)
-    clutch.follow_poses(state, [hand, source("b", (2.2, 0.0, 0.0), weight=0.5, absolute=True)], None)
-    assert state.target[0] == pytest.approx((0.6, 0.1, 0.8))
-    clutch.follow_poses(state, [source("a", (0.0, 0.1, 0.0), weight=0.5), policy], None)
-    assert state.target[0] == pytest.approx((0.5, 0.3, 0.8))
-
-
 def test_the_workspace_bounds_the_target_and_never_throws_it_in() -> None:
     box = ((0.0, 0.0, 0.0), (0.4, 1.0, 0.9))  # the robot stands outside in x
     state = clutch.latch_sources(command(source("a", (0.0, 0.0, 0.0))), 1.0, BASE)
@@ -124,14 +105,6 @@ def test_twists_are_integrated_within_their_limits() -> None:
     assert quat_angle(state.target[1], BASE[1]) == pytest.approx(0.4)
     clutch.follow_poses(state, [CommandSource("a", "desktop", 1, 2, 0, 0, twist_world=(0.0,) * 6)], None)
     assert not clutch.integrate_twists(state, 0.002, 1.0, 2.0, None)
-
-
-def test_toward_stops_on_the_way_and_arrives() -> None:
-    goal: PoseTuple = ((0.5, 0.1, 1.8), quat_mul(quat_from_rotvec((0.0, 0.5, 0.0)), BASE[1]))
-    part = clutch.step_toward(BASE, goal, 0.1, 1.0)
-    assert clutch.measure_separation(BASE, part) == pytest.approx((0.1, 0.05))
-    assert clutch.measure_separation(BASE, clutch.step_toward(BASE, goal, 10.0, 0.05)) == pytest.approx((0.1, 0.05))
-    assert clutch.step_toward(BASE, goal, 2.0, 1.0) == goal
 
 
 def test_scales_are_kept_within_limits() -> None:
@@ -185,44 +158,11 @@ def test_a_leader_that_is_far_is_caught_up_with_slowly() -> None:
     assert made.data.ctrl == pytest.approx(goal)
 
 
-def test_velocity_predicts_across_the_interpolation_delay() -> None:
-    def lag(with_velocity: bool) -> float:
-        made, speed, error = rig(), np.full(7, 0.4), 0.0
-        for k in range(300):
-            now = HOME + speed * 0.002 * k
-            made.step(decision([lead(made, now, speed if with_velocity else None, new=k % 7 == 0)]))
-            error = float(np.abs(made.data.ctrl - now).max())
-        return error
-
-    assert lag(True) < 0.6 * lag(False)
-
-
 def test_joint_limits_bound_the_leader() -> None:
     made = rig()
     for k in range(3000):
         made.step(decision([lead(made, np.full(7, 9.0), new=k % 7 == 0)]))
     assert (made.data.ctrl <= made.model.jnt_range[:, 1]).all()
-
-
-def test_several_leaders_are_blended_without_a_jump() -> None:
-    made = rig()
-
-    def both(a: float, b: float) -> Command:
-        one = lead(made, HOME + a, participant="a", weight=0.75).sources[0]
-        two = lead(made, HOME + b, participant="b", weight=0.25).sources[0]
-        return Command("panda", "joints", sources=(one, two))
-
-    made.step(decision([both(0.0, 0.5)]))
-    for _ in range(100):
-        made.step(decision([both(0.0, 0.5)]))
-    assert made.data.ctrl == pytest.approx(HOME)
-    for _ in range(300):
-        made.step(decision([both(0.04, 0.54)]))
-    assert made.data.ctrl == pytest.approx(HOME + 0.04)
-    # One leaves, and the other goes on without a jump.
-    for _ in range(300):
-        made.step(decision([both(0.04, 0.62)]))
-    assert made.data.ctrl == pytest.approx(HOME + 0.06)
 
 
 @pytest.mark.parametrize("sizes", [(6, 0), (7, 3)])

@@ -14,7 +14,7 @@ from anchors.pose import quat_from_rotvec
 from iris_session.control import ControlConfig, ControlError, Controller
 from iris_session.control.arm_model import read_site_pose
 from iris_session.protocol.common import Pose
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.specs import ObjectSpec
 from iris_session.protocol.steps import Command, FixedView, ObjectCommand
 from tests.control.rigs import (
     PANDA_HOME,
@@ -102,17 +102,6 @@ def test_steps_without_ticks_take_samples_but_move_nothing() -> None:
     now = rig.controller.get_status()[0].applied
     assert now is not None
     assert (now.seq, now.step_ns) == (last.seq, rig.steps * 2_000_000)
-
-
-def test_an_engagement_during_a_pause_is_applied_with_the_first_tick() -> None:
-    rig = panda()
-    source = rig.source((0.0, 0.0, 0.0))
-    rig.step(decision([pose_command("panda", source)]), n_ticks=0)
-    assert rig.controller.get_status()[0].applied is None
-    rig.step(decision([pose_command("panda", old(source))]))
-    applied = rig.controller.get_status()[0].applied
-    assert applied is not None
-    assert applied.seq == source.seq
 
 
 def test_the_gripper_follows_and_stays_in_hold() -> None:
@@ -239,15 +228,6 @@ def test_a_successor_without_a_hold_between_does_not_inherit_the_motion(successo
     assert np.abs(rig.controller._joints.v).max() < 0.02  # no more than the elbow on its way to the rest posture
 
 
-def test_changing_the_kind_while_engaged_does_not_jump() -> None:
-    rig = panda()
-    for _ in range(60):
-        drive(rig, rig.source((0.05, 0.0, 0.0)), steps=7)
-    before = rig.data.ctrl.copy()
-    rig.step(decision([Command("panda", "joints", sources=(rig.source((0.0,) * 3, pose_world=None, q=PANDA_HOME),))]))
-    assert np.abs(rig.data.ctrl - before).max() < 1e-6
-
-
 def test_the_workspace_is_kept_and_reported() -> None:
     tip = panda().target()[0]
     box = ((-2.0, -2.0, tip[2] - 0.02), (2.0, 2.0, 2.0))
@@ -349,16 +329,6 @@ def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: 
     assert (rig.data.ctrl == ctrl).all()
 
 
-def test_targets_need_no_actuators_that_control_could_drive() -> None:
-    bare = RobotSpec("panda", panda_spec().joints, (), "attachment_site", "link0", gripper_actuator="none")
-    rig = Rig(panda_model("torque"), [bare], TARGETS, home=PANDA_HOME)
-    joints = {"pose_world": None, "q": (9.0,) * 7}
-    for _ in range(2000):
-        rig.step(decision([Command("panda", "joints", sources=(rig.source((0.0,) * 3, **joints),), gripper=1.0)]))
-    assert rig.controller._joints.goal == pytest.approx(rig.model.jnt_range[:, 1])
-    assert not rig.data.ctrl.any()
-
-
 def test_a_snapshot_of_other_robots_is_refused() -> None:
     two, one = Rig(aloha_model(), aloha_robots()), Rig(aloha_model(), aloha_robots()[:1])
     with pytest.raises(ControlError, match="snapshot is of 1 robots with 6 joints; this controller has 2 with 12"):
@@ -377,9 +347,3 @@ def test_no_robots_at_all() -> None:
     assert controller.get_status() == ()
     assert controller.get_targets() == {}
     controller.restore(controller.snapshot())
-
-
-def test_a_robot_that_control_cannot_drive_is_refused_at_construction() -> None:
-    bare = RobotSpec("panda", panda_spec().joints, panda_spec().actuators, "attachment_site", "link0")
-    with pytest.raises(ControlError, match="declare hold = 'gravity_pd'"):
-        Controller(panda_model("torque"), [bare])

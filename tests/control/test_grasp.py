@@ -110,14 +110,6 @@ def test_let_go_clears_the_wrench_once_and_leaves_others_alone() -> None:
     assert (data.body("ball").xfrc_applied == 7.0).all()
 
 
-def test_reset_lets_go() -> None:
-    _, data, grasps = scene()
-    grasps.set_goals(to("box", (0.0, 0.0, 1.2)))
-    grasps.tick(data)
-    grasps.reset(data)
-    assert not data.body("box").xfrc_applied.any()
-
-
 def test_unknown_and_fixed_objects_are_refused() -> None:
     model, _, grasps = scene()
     with pytest.raises(ControlError, match=r"object 'cup' is not known. Available objects: box, ball"):

@@ -25,7 +25,7 @@ def make(velocity: float = 2.0, acceleration: float = 30.0) -> JointInterpolator
 goals = st.lists(st.tuples(*[st.floats(-1.5, 1.5)] * 3), min_size=1, max_size=12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @example([(1.0, 0.0, 0.0)] * 2 + [(0.0, 0.0, 0.0)] * 5 + [(1.0, 0.0, 0.0)], 1, 1.0, 2.0, False)  # back at once
 @given(goals, st.integers(1, 12), st.floats(0.3, 4.0), st.floats(2.0, 60.0), st.booleans())
 def test_limits_hold_for_any_goals(
@@ -71,16 +71,6 @@ def test_regular_goals_give_even_motion() -> None:
     settled = np.array(speeds[200:])
     assert abs(settled.mean() - 0.8) < 0.01
     assert settled.std() < 0.04
-
-
-def test_at_rest_nothing_changes() -> None:
-    joints = make()
-    joints.set_goal(ALL, np.full(3, 0.01), 0.014)
-    while joints.moving:
-        joints.advance()
-    before = joints.save_state()
-    joints.advance()
-    assert joints.save_state() == before
 
 
 def test_a_stop_while_standing_or_moving_away_stays_near() -> None:

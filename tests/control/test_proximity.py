@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.control import ControlConfig, Controller
+from iris_session.control import ControlConfig
 from iris_session.control.proximity import ProximityLimiter, compute_box_bounds
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Command
@@ -81,22 +81,6 @@ def test_leaders_that_send_at_every_step_do_not_lift_the_bound() -> None:
     assert lean(free, 700) < 0.0, "without the bound they would have collided"
 
 
-def test_the_bound_survives_a_restart_of_control() -> None:
-    model, robots = panda_arms(*FACING)
-    rig = Rig(model, robots, home=PANDA_HOME)
-    rig.hold(200)
-    lean(rig, 403)  # between two checks
-    assert (rig.controller._joints.near < rig.controller._joints.velocity).any()
-    again = Controller(model, robots)
-    again.restore(rig.controller.snapshot())
-    assert (again._joints.near == rig.controller._joints.near).all()
-    other = mujoco.MjData(model)
-    mujoco.mj_copyData(other, model, rig.data)
-    rig.controller.tick(rig.data)
-    again.tick(other)
-    assert (rig.data.ctrl == other.ctrl).all()
-
-
 def test_without_the_margin_they_collide() -> None:
     """The test above can fail: the same push with the check off ends in contact."""
     model, robots = panda_arms(*FACING)
@@ -104,15 +88,6 @@ def test_without_the_margin_they_collide() -> None:
     rig.hold(200)
     push(rig, 0.2, 600)
     assert gap(rig, ProximityLimiter(model, robots, ControlConfig())) < 0.005
-
-
-def test_a_blocked_robots_solution_does_not_run_away_from_its_joints() -> None:
-    model, robots = panda_arms(*FACING)
-    rig = Rig(model, robots, ControlConfig(lead_s=0.02), home=PANDA_HOME)
-    rig.hold(200)
-    push(rig, 0.6, 800)
-    ahead = np.abs(rig.controller._joints.goal - rig.controller._joints.q)
-    assert 0.04 < ahead.max() <= 2.5 * 0.02 + 1e-9
 
 
 SLIDERS = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/>
@@ -169,10 +144,6 @@ def test_fingers_are_exempt() -> None:
     assert guarded.compute_speed_factors(data, [np.array([1.0]), np.array([0.0]), np.array([0.0])])[0] == 0.0
 
 
-def test_coincident_centres_give_no_direction_and_no_crash() -> None:
-    assert factors(0.0, 1.0, 0.0)[2] == 1.0
-
-
 def test_nothing_to_check_for_one_robot_or_without_geoms() -> None:
     model, _, robots = sliders(0.5)
     assert not ProximityLimiter(model, robots[:1], ControlConfig()).active
@@ -216,7 +187,7 @@ def test_the_nearest_pair_cannot_hide_behind_49_others() -> None:
 def test_box_bounds_are_no_greater_than_the_distance() -> None:
     rng = np.random.default_rng(0)
     shapes = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
-    for _ in range(200):
+    for _ in range(60):
         geoms = ""
         for name in ("a", "b"):
             p, q = rng.uniform(-0.3, 0.3, 3), rng.normal(size=4)

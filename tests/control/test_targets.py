@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import pytest
 
-from anchors.pose import IDENTITY_QUAT
 from iris_session.control import ControlConfig
 from iris_session.protocol.steps import Command
 from tests.control.rigs import PANDA_HOME, Rig, decision, panda_model, panda_spec, pose_command
-from tests.control.test_diverged import on_a_rail
 
 #: Nothing recomputes the tip here, so that the target may lead it by any distance; see `test_hold` for the bound.
 TARGETS = ControlConfig(output="targets", target_lead_m=9.0, target_lead_rad=9.0)
@@ -47,13 +44,3 @@ def test_the_workspace_of_a_leader_starts_where_the_arm_was_taken_by_others() ->
     assert rig.controller._joints.goal == pytest.approx(PANDA_HOME)
     lead(rig, np.add(PANDA_HOME, 0.05), 3, engagement=3)
     assert rig.controller.get_status()[0].limits == ()
-
-
-def test_the_target_of_a_leader_stands_on_the_base_as_it_moves() -> None:
-    rig = on_a_rail(TARGETS)
-    rig.data.joint("rail").qpos[:] = 0.5
-    mujoco.mj_forward(rig.model, rig.data)
-    rig.hold(1)
-    p, q = rig.controller._states[0].T_world_root
-    assert p[0] == pytest.approx(0.5, abs=1e-3)
-    assert q == IDENTITY_QUAT

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.protocol import codec
-from iris_session.protocol.client_messages import Acquire, Bye, ClientEnvelope, Hello, Sample, wrap_message
+from iris_session.protocol.client_messages import Hello, Sample, wrap_message
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import (
@@ -69,11 +69,6 @@ def test_state_channel_round_trips(make: object) -> None:
     header, presence = make(StateHeader), make(Presence)  # type: ignore[operator]
     assert codec.decode_state_header(codec.encode_state_header(header)) == header
     assert codec.decode_presence(codec.encode_presence(presence)) == presence
-
-
-def test_beacon_round_trips() -> None:
-    beacon = msgspec.structs.replace(make_full(Beacon), protocol=1)
-    assert codec.decode_beacon(codec.encode_beacon(beacon)) == beacon
 
 
 def test_introduction_round_trips_and_waits_for_its_end() -> None:
@@ -175,11 +170,6 @@ def test_other_versions_are_reported_before_the_schema(version: int) -> None:
         codec.decode_server(pack([version, 0, {"type": "clock_pong", "t0_ns": 1, "t1_ns": 2, "t2_ns": 3}]))
 
 
-def test_peek_version_rejects_other_bytes() -> None:
-    with pytest.raises(MalformedError, match="the version"):
-        codec.peek_version(pack({"version": 1}))
-
-
 @pytest.mark.parametrize("tag", codec.CLIENT_TYPES)
 def test_size_limit_of_each_type(tag: str) -> None:
     kind = codec.CLIENT_TYPES[tag]
@@ -251,7 +241,7 @@ def decode_all(data: bytes) -> None:
         assert codec.decode_server(codec.encode_server(answer)) == answer
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.binary(max_size=300))
 def test_random_bytes_raise_protocol_errors_only(data: bytes) -> None:
     decode_all(data)
@@ -269,7 +259,7 @@ values = st.recursive(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.sampled_from(sorted(codec.CLIENT_TYPES)), st.data())
 def test_random_fields_raise_protocol_errors_only(tag: str, data: st.DataObject) -> None:
     message = msgspec.to_builtins(make_full(codec.CLIENT_TYPES[tag]), builtin_types=(bytes,))
@@ -278,7 +268,7 @@ def test_random_fields_raise_protocol_errors_only(tag: str, data: st.DataObject)
     decode_all(pack([data.draw(st.just(1) | values), data.draw(st.just(1) | values), "", message]))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.sampled_from(sorted(codec.CLIENT_TYPES)),
     st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 255)), max_size=5),
@@ -296,12 +286,6 @@ def test_long_foreign_texts_are_truncated() -> None:
         codec.decode_client(pack([1, 0, "", {"type": "é" * 5000}]))
     assert len(str(caught.value)) <= 400
     assert len(str(MalformedError("x" * 401))) == 400
-
-
-def test_equal_values_give_equal_bytes() -> None:
-    one = ClientEnvelope(1, 2, "", Acquire(1, ("a", "b")))
-    assert codec.encode_client(one) == codec.encode_client(ClientEnvelope(1, 2, "", Acquire(1, ("a", "b"))))
-    assert codec.get_tag(Bye) == "bye"
 
 
 def _camera(**changes: Any) -> StreamCamera:
@@ -344,16 +328,6 @@ def test_invalid_media_are_rejected_at_publishing(given: dict[str, object], expe
     assert data == [b"points"]
     with pytest.raises(ValueError, match=expected):
         codec.encode_media_frames(**(good | given))  # type: ignore[arg-type]
-
-
-def test_media_info_of_any_allowed_length_is_encoded() -> None:
-    text = "\N{ROBOT FACE}" * 512
-    camera = _camera(body=text[:64], distortion=(0.1,) * 8)
-    info = StreamInfo(text, text[:64], camera, 30.0, text[:64], text)
-    largest = {"info": info, "sent_ns": 2**62, "connection_epoch": 2**62}
-    header, _ = codec.encode_media_frames("x" * 48, b"", 2**62, 2**62, text[:64], **largest)  # type: ignore[arg-type]
-    push = codec.decode_media_push(header)
-    assert (push.info, push.sent_ns, push.connection_epoch) == (info, 2**62, 2**62)
 
 
 def test_media_arrays_are_encoded_in_row_order() -> None:

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import EStop, Hello, Sample
-from iris_session.protocol.errors import RateError
 from iris_session.protocol.limits import (
     LIMITS,
     SERVER_LIMITS,
@@ -16,7 +15,6 @@ from iris_session.protocol.limits import (
     KeyedBuckets,
     Limit,
     RateLimiter,
-    TokenBucket,
     find_network,
 )
 from iris_session.protocol.server_messages import Snapshot
@@ -96,11 +94,6 @@ def test_key_that_was_not_used_for_longest_is_forgotten() -> None:
     assert buckets.take("b", 0)
 
 
-def test_unknown_type_raises() -> None:
-    with pytest.raises(KeyError):
-        RateLimiter({}).allow(Sample, 0)
-
-
 @given(st.lists(st.integers(0, SECOND // 50), max_size=300), st.integers(1, 200), st.integers(1, 20))
 def test_accepted_messages_never_exceed_rate_and_burst(gaps: list[int], per_second: int, burst: int) -> None:
     limiter = RateLimiter({Sample: Limit(1, per_second=per_second, burst=burst)})
@@ -109,26 +102,6 @@ def test_accepted_messages_never_exceed_rate_and_burst(gaps: list[int], per_seco
         now += gap
         passed += limiter.allow(Sample, now)
     assert passed <= burst + now * per_second / SECOND
-
-
-def test_rate_error_states_the_limit() -> None:
-    limit = LIMITS[Sample]
-    error = RateError(codec.get_tag(Sample), limit.per_second, limit.burst)
-    assert error.code == "rate"
-    assert str(error).endswith("at most 600 per second, 200 at once")
-
-
-def test_bucket_allows_burst_then_rate() -> None:
-    bucket = TokenBucket(rate=10.0, burst=3)
-    now = 5 * SECOND
-    assert [bucket.take(now) for _ in range(4)] == [True, True, True, False]
-    taken = sum(bucket.take(now + i * SECOND // 100) for i in range(1, 201))
-    assert taken == 20
-
-
-def test_bucket_is_capped_at_its_burst() -> None:
-    bucket = TokenBucket(rate=1000.0, burst=2)
-    assert [bucket.take(3600 * SECOND) for _ in range(3)] == [True, True, False]
 
 
 def test_drops_are_counted_by_reason_and_connection() -> None:

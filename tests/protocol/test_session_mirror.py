@@ -85,28 +85,6 @@ def synced() -> SessionMirror:
     return mirror
 
 
-def test_scale_of_a_robot_is_kept_until_its_lease_changes() -> None:
-    mirror = synced()
-    lease = Lease("left", "robot", "exclusive", "p1", 3)
-    for seq, body, scale in (
-        (1, LeaseChanged(lease, "acquired"), 1.0),
-        (2, ScaleChanged("left", 0.25, "p2"), 0.25),
-        (3, ScaleChanged("right", 0.5, "p2"), 0.25),
-        (4, LeaseChanged(lease, "assigned", "p1"), 1.0),
-    ):
-        mirror.apply_event(event(seq, body))
-        assert mirror.leases["left"].scale == scale
-        assert list(mirror.leases) == ["left"]
-
-
-def test_anchors_are_where_they_were_moved() -> None:
-    mirror = synced()
-    before, there = mirror.mirror_hash(), Pose((1.0, 2.0, 3.0), IDENTITY.q)
-    mirror.apply_event(event(1, AnchorMoved("a", there)))
-    assert mirror.anchors == {"a": AnchorInfo("a", there, 0.16, 0.002), "b": ANCHORS[1]}
-    assert mirror.mirror_hash() != before
-
-
 def test_hash_of_a_session_without_anchors_is_as_it_always_was() -> None:
     """Conversations of other implementations hold such hashes."""
     mirror = SessionMirror()
@@ -115,7 +93,7 @@ def test_hash_of_a_session_without_anchors_is_as_it_always_was() -> None:
 
 
 @given(st.lists(bodies, max_size=30), st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_any_join_time_and_any_loss_give_the_same_state(kinds: list[EventKind], data: st.DataObject) -> None:
     events = [event(i + 1, kind) for i, kind in enumerate(kinds)]
     truth = synced()
@@ -156,7 +134,7 @@ def test_gap_waits_for_a_snapshot_and_continues_with_later_events() -> None:
 
 
 @given(st.lists(st.sampled_from(["come", "lost", "twice", "snapshot"]), max_size=60), st.integers(0, 5))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 def test_every_event_after_the_first_snapshot_is_delivered_or_reported_missed(fates: list[str], before: int) -> None:
     """In order, at any loss, repetition and timing of snapshots."""
     mirror, truth = SessionMirror(), synced()
@@ -253,20 +231,3 @@ def test_pending_events_are_bounded() -> None:
     for i in range(1000):
         mirror.apply_event(event(i + 1, Notice("info", "x")))
     assert mirror.held_overflow == 1000 - 256
-
-
-def test_one_event_carries_the_leases_of_a_request() -> None:
-    leases = (Lease("left", "robot", "exclusive", "p1", 4), Lease("hammer", "object", "exclusive", "p1", 2))
-    together, apart = SessionMirror(), SessionMirror()
-    for mirror in (together, apart):
-        mirror.apply_snapshot(snapshot())
-    body = LeasesChanged(leases, "acquired", ("", "p2"))
-    together.apply_event(event(1, body))
-    assert body.to_single_changes() == (
-        LeaseChanged(leases[0], "acquired"),
-        LeaseChanged(leases[1], "acquired", "p2"),
-    )
-    for seq, change in enumerate(body.to_single_changes(), 1):
-        apart.apply_event(event(seq, change))
-    assert together.leases == apart.leases == {"left": leases[0], "hammer": leases[1]}
-    assert together.find_lease_version("hammer", "p1") == 2

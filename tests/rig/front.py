@@ -11,7 +11,6 @@ from typing import Any
 import msgspec
 import pytest
 
-from iris_session.alignment.worker import InlineWorker
 from iris_session.front import context as front_context
 from iris_session.front import loop as front_loop
 from iris_session.front.context import WatchedSocket
@@ -204,7 +203,7 @@ def install_front(network: Network, patch: pytest.MonkeyPatch) -> None:
     patch.setattr(front_context, "FrontSockets", _RigSockets)
     patch.setattr(front_loop, "_make_media_proxy", lambda context, sockets: NoMedia())
     patch.setattr(front_loop, "_make_asset_server", lambda context, sockets: NoAssets())
-    patch.setattr(front_loop, "ThreadWorker", InlineWorker)
+    patch.setattr(front_loop, "ThreadPoolExecutor", lambda *_: None)
     patch.setattr(front_loop, "make_discovery_services", lambda *_: [])
     patch.setattr(front_loop, "lower_named_thread_priority", lambda _: None)
     patch.setattr(front_loop, "is_parent", lambda _: True)

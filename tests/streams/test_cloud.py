@@ -122,20 +122,6 @@ def test_a_point_at_rest_stays_in_its_class_while_others_come_and_go() -> None:
     assert stayed.mean() > 0.85  # a tenth is gone; of a random quarter a quarter would be left
 
 
-def test_the_order_of_the_source_does_not_matter() -> None:
-    points, colors = make_room(500)
-    mixed = np.random.default_rng(2).permutation(500)
-    first, second = (
-        decode_cloud(encode_cloud(points[rows], colors[rows], voxel_m=0.001, classes=["half"])["half"])
-        for rows in (np.arange(500), mixed)
-    )
-    assert {tuple(p) for p in first.positions.tolist()} == {tuple(p) for p in second.positions.tolist()}
-
-
-def test_an_error_beyond_all_bounds_is_not_known() -> None:
-    assert decode_cloud(encode_cloud(*make_room(1), error_m=1e200)["full"]).error_m == math.inf
-
-
 def test_points_that_are_not_finite_are_left_out() -> None:
     points, colors = make_room(10)
     points[3, 1], points[7] = np.nan, np.inf
@@ -193,7 +179,7 @@ def test_frames_that_no_encoder_makes_are_refused() -> None:
             decode_cloud(bad)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.binary(max_size=200), st.integers(0, 40))
 def test_random_bytes_raise_nothing_else(noise: bytes, at: int) -> None:
     payload = encode_cloud(*make_room(5))["full"]

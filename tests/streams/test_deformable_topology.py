@@ -96,22 +96,6 @@ def test_plans() -> None:
     assert make_shell(4)[0].plan == TREE
 
 
-def test_tree_predicts_almost_every_vertex_across_a_triangle() -> None:
-    topology, _ = make_shell(7)
-    assert topology.parents is not None
-    a, b, c = topology.parents
-    assert np.count_nonzero((a != b) & (b != c)) > 0.9 * topology.n_vertices
-    assert len(topology.levels) < 3 * np.sqrt(topology.n_vertices)
-
-
-def test_pieces_loose_vertices_and_degenerate_triangles() -> None:
-    faces = [(4, 5, 6), (5, 6, 7), (10, 11, 12), (11, 12, 13), (6, 6, 14), (2, 2, 2)]
-    topology = DeformableTopology(16, faces)
-    assert topology.plan == TREE
-    assert topology.order is not None
-    assert sorted(topology.order.tolist()) == list(range(16))
-
-
 def test_long_ribbon_uses_a_walk_instead_of_a_deep_tree() -> None:
     n = 4 * MAX_LEVELS
     shuffled = np.random.default_rng(0).permutation(n)
@@ -122,12 +106,6 @@ def test_long_ribbon_uses_a_walk_instead_of_a_deep_tree() -> None:
     frames = DeformableEncoder(topology).encode(vertices)
     assert frames is not None
     assert np.linalg.norm(DeformableDecoder(topology).decode(frames["full"]) - vertices, axis=1).max() <= 0.0005
-
-
-def test_used_vertices() -> None:
-    used, faces = used_vertices(10, [(7, 2, 9), (9, 2, 4)])
-    assert used.tolist() == [2, 4, 7, 9]
-    assert faces.tolist() == [[2, 0, 3], [3, 0, 1]]
 
 
 @pytest.mark.parametrize("made", [make_cloth(5, 4), make_shell(3), make_rope(9)], ids=["cloth", "shell", "rope"])
@@ -153,7 +131,7 @@ def test_topology_without_tables_has_only_the_plan() -> None:
     assert np.linalg.norm(DeformableDecoder(client).decode(frames["full"]) - vertices, axis=1).max() <= 0.0005
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(
     st.sampled_from([make_shell(3)[0].to_bytes(), make_rope(6)[0].to_bytes(), make_cloth(3, 3)[0].to_bytes()]),
     st.data(),

@@ -12,7 +12,6 @@ from iris_session.streams.errors import StreamError
 from iris_session.streams.quantise import (
     LATTICE_M,
     POSITION_QUANTUM_ERROR_M,
-    ROTATION_BITS,
     ROTATION_CENTRE,
     ROTATION_QUANTUM_ERROR_RAD,
     Floats,
@@ -41,12 +40,8 @@ def test_lattice_points_are_exact_and_the_bound_is_half_a_cell() -> None:
     np.testing.assert_array_equal(index * LATTICE_M / LATTICE_M, index)
 
 
-def test_levels_fit_their_bits() -> None:
-    assert 2 * ROTATION_CENTRE < 2**ROTATION_BITS
-
-
 def test_rotation_error_is_bounded_everywhere() -> None:
-    q = random_poses(np.random.default_rng(1), 200_000)[:, 3:]
+    q = random_poses(np.random.default_rng(1), 50_000)[:, 3:]
     assert rotation_errors(q, round_trip(q)).max() <= ROTATION_QUANTUM_ERROR_RAD
 
 
@@ -68,11 +63,6 @@ def test_axes_and_half_turns_are_exact_or_bounded() -> None:
     one = np.eye(4)
     np.testing.assert_array_equal(np.abs(round_trip(one)), one)
     np.testing.assert_array_equal(round_trip(-one[:1]), one[:1])
-
-
-def test_decoded_quaternions_have_unit_length() -> None:
-    q = round_trip(random_poses(np.random.default_rng(4), 10_000)[:, 3:])
-    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("levels", [(2 * ROTATION_CENTRE + 1, 8191, 8191), (0, 0, 0), (2**16 - 1,) * 3])
