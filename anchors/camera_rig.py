@@ -59,8 +59,9 @@ def solve_rig(views: Sequence[SheetView], T_base_sheet: Mapping[str, PoseTuple])
         raise CalibrationError("no camera saw a sheet: step closer, light the sheet, check its size and id")
     floor = np.diag([_FLOOR[0] ** 2] * 3 + [_FLOOR[1] ** 2] * 3)
     edges = [
-        Edge(v.camera, 0, i, v.sheet, *map(np.array, v.T_camera_sheet), np.reshape(v.covariance, (6, 6)) + floor)
+        Edge(v.camera, 0, i, v.sheet, np.array(p), np.array(q), np.reshape(v.covariance, (6, 6)) + floor)
         for i, v in enumerate(views)
+        for p, q in [v.T_camera_sheet]
     ]
     reached = find_reachable(edges, T_base_sheet)
     lost = sorted({v.camera for v in views if v.sheet not in reached})

@@ -37,7 +37,7 @@ from anchors.pose import (
 )
 from iris_session.authority import engagement
 from iris_session.authority.config import KEY_PREFIX
-from iris_session.authority.context import Context
+from iris_session.authority.context import Context, build_absent_denial
 from iris_session.authority.state import Correction, Participant, Placement, WarningState
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
@@ -168,8 +168,7 @@ def place_alignment(ctx: Context, p: Participant, m: PlaceAlignment) -> None:
     """Apply a director's placement: the whole alignment, or an offset in the world on top of the measured one."""
     person = ctx.find_participant(m.participant)
     if person is None:
-        text = f"no participant {m.participant}"
-        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster"))
+        return ctx.deny(p, m.request_id, build_absent_denial(m.participant))
     if not person.needs_alignment or not is_valid_pose(ctx, m.T_world_tracking):
         text = f"{person.name} needs no alignment, or the pose is not finite with a unit quaternion"
         return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text))

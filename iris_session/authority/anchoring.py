@@ -6,7 +6,13 @@ import math
 from typing import Final
 
 from iris_session.authority import alignment
-from iris_session.authority.context import Context, build_unknown_denial, join_names
+from iris_session.authority.context import (
+    Context,
+    build_absent_denial,
+    build_unknown_denial,
+    build_value_denial,
+    join_names,
+)
 from iris_session.authority.state import HOST_ID, AlarmState, CrossCheckState, Participant
 from iris_session.protocol.client_messages import Align, MoveAnchor, TrackingEpoch
 from iris_session.protocol.common import Denial, Pose
@@ -28,17 +34,14 @@ MAX_REPORTED: Final = 64
 def control_alignment_run(ctx: Context, p: Participant, m: Align) -> None:
     """Start or stop an alignment run: a director's (or the host's) for everyone, others for themselves."""
     if m.action not in AlignAction.ALL:
-        known = f"actions: {', '.join(sorted(AlignAction.ALL))}"
-        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown action {m.action}", known))
+        return ctx.deny(p, m.request_id, build_value_denial("action", m.action, AlignAction.ALL))
     person = ctx.find_participant(m.participant) if m.participant else p
     if person is not p and p.role != Role.DIRECTOR:
         text = f"role {p.role} may align only itself"
-        return ctx.deny(
-            p, m.request_id, Denial(DenialReason.ROLE, text, "leave `participant` empty, or ask a director")
-        )
+        denial = Denial(DenialReason.ROLE, text, "leave `participant` empty, or ask a director")
+        return ctx.deny(p, m.request_id, denial)
     if person is None:
-        text = f"no participant {m.participant}"
-        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster"))
+        return ctx.deny(p, m.request_id, build_absent_denial(m.participant))
     if not person.needs_alignment:
         return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, f"{person.name} needs no alignment"))
     if m.action == AlignAction.START:

@@ -11,6 +11,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+import msgspec
+
 from anchors.pose import compose, inverse, quat_rotate
 from iris_session.authority import engagement, roster, samples
 from iris_session.authority.context import HUMAN, Context
@@ -212,7 +214,7 @@ class CommandBuilder:
         if not engaged:
             return self._get_hold_command(lease.target, HoldReason.ESTOP if ctx.state.estop else lease.grants[0].hold)
         total = sum(g.weight for g in engaged)
-        sources = tuple(_weigh_source(_age_source(ctx, g), g.weight / total) for g in engaged)
+        sources = tuple(msgspec.structs.replace(_age_source(ctx, g), weight=g.weight / total) for g in engaged)
         gripping = [(g.weight, g.gripper) for g in engaged if g.gripper is not None]
         gripper = sum(w * v for w, v in gripping) / sum(w for w, _ in gripping) if gripping else None
         return Command(lease.target, engaged[0].kind, "", sources, gripper, ctx.get_scale(lease))
@@ -223,30 +225,8 @@ def _age_source(ctx: Context, g: LeaseGrant) -> CommandSource:
     s = g.source
     assert s is not None
     if s.new and g.counted_step != ctx.state.step:
-        s = g.source = _copy_source(s, s.weight, False)
+        s = g.source = msgspec.structs.replace(s, new=False)
     return s
-
-
-def _weigh_source(s: CommandSource, weight: float) -> CommandSource:
-    return _copy_source(s, weight, s.new)
-
-
-def _copy_source(s: CommandSource, weight: float, new: bool) -> CommandSource:
-    return CommandSource(
-        s.participant,
-        s.device,
-        s.engagement,
-        s.seq,
-        s.capture_ns,
-        s.receive_ns,
-        weight,
-        new,
-        s.pose_world,
-        s.twist_world,
-        s.q,
-        s.qd,
-        s.absolute,
-    )
 
 
 # --- held objects ---
@@ -260,12 +240,8 @@ def _is_finite_pose(T: Pose) -> bool:
 
 def build_object_commands(ctx: Context) -> tuple[ObjectCommand, ...]:
     """Return one command per object that an engaged hand holds, in the order of the specification."""
-    commands = []
-    for lease in ctx.held_objects:
-        command = _build_object_command(ctx, lease)
-        if command is not None:
-            commands.append(command)
-    return tuple(commands)
+    commands = [_build_object_command(ctx, lease) for lease in ctx.held_objects]
+    return tuple(command for command in commands if command is not None)
 
 
 def _build_object_command(ctx: Context, lease: LeaseState) -> ObjectCommand | None:

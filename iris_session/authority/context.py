@@ -204,6 +204,17 @@ def build_unknown_denial(kind: str, name: str, known: Iterable[str]) -> Denial:
     return Denial(DenialReason.UNKNOWN_TARGET, f"no {kind} {name!r}", format_names(f"{kind}s", known), name)
 
 
+def build_absent_denial(participant: str) -> Denial:
+    """Return the denial for a participant that the session does not have."""
+    text = f"no participant {participant}"
+    return Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster")
+
+
+def build_value_denial(kind: str, value: str, known: Iterable[str]) -> Denial:
+    """Return the denial for an unknown value of an enumeration, such as an action or a device."""
+    return Denial(DenialReason.UNKNOWN_VALUE, f"unknown {kind} {value}", f"{kind}s: {', '.join(sorted(known))}")
+
+
 def format_names(kinds: str, names: Iterable[str]) -> str:
     """Return `robots: left, right`, or `robots: none`."""
     return f"{kinds}: {join_names(names) or 'none'}"

@@ -15,7 +15,15 @@ from collections.abc import Sequence
 from typing import Final
 
 from iris_session.authority import alignment, assignment, engagement, leases
-from iris_session.authority.context import HUMAN, Context, build_unknown_denial, find_grant, join_names
+from iris_session.authority.context import (
+    HUMAN,
+    Context,
+    build_absent_denial,
+    build_unknown_denial,
+    build_value_denial,
+    find_grant,
+    join_names,
+)
 from iris_session.authority.leases import build_held_denial
 from iris_session.authority.state import NO_CONNECTION, NO_REPLY, LeaseGrant, LeaseState, Participant, Pending
 from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, SetMode, SetScale, Withdraw
@@ -171,7 +179,7 @@ def _grant_request(ctx: Context, p: Participant, pending: Pending, cause: str) -
 
 def _enqueue_request(ctx: Context, p: Participant, pending: Pending, denial: Denial | None) -> None:
     state = ctx.state
-    held = [lease.target for lease in state.robots.values() if any(g.participant == p.id for g in lease.grants)]
+    held = _list_held_robots(ctx, p)
     if held:
         text = f"who holds a robot cannot wait for another: you hold {join_names(held)}"
         denial = Denial(
@@ -193,15 +201,12 @@ def _resume_kept_place(ctx: Context, pending: Pending) -> bool:
     kept = next((w for w in ctx.state.queue if w.participant == pending.participant and w.request_id == NO_REPLY), None)
     if kept is None:
         return False
-    if _get_request_key(kept) == _get_request_key(pending):
+    keys = [(w.any_robot, () if w.any_robot else w.robots, w.objects) for w in (kept, pending)]
+    if keys[0] == keys[1]:
         kept.request_id, kept.weight = pending.request_id, pending.weight
         return True
     leases.remove_request(ctx, kept)
     return False
-
-
-def _get_request_key(pending: Pending) -> tuple[object, ...]:
-    return (pending.any_robot, () if pending.any_robot else pending.robots, pending.objects)
 
 
 def advance_requests(ctx: Context) -> None:
@@ -345,8 +350,7 @@ def grasp_object(ctx: Context, p: Participant, m: Grasp) -> None:
     if denial is None and lease is None:
         denial = build_unknown_denial("object", m.object, ctx.objects)
     if denial is None and m.device not in Device.ALL:
-        known = f"devices: {', '.join(sorted(Device.ALL))}"
-        denial = Denial(DenialReason.UNKNOWN_VALUE, f"unknown device {m.device}", known)
+        denial = build_value_denial("device", m.device, Device.ALL)
     if denial is None and p.alignment is None:
         denial = Denial(DenialReason.UNALIGNED, "your headset is not aligned", "look at an anchor sheet", m.object)
     if denial is None and p.alignment is not None and p.alignment.kind in AlignmentKind.VIEW_ONLY:
@@ -368,8 +372,7 @@ def assign_robots(ctx: Context, p: Participant, m: Assign) -> None:
     """Assign robots to a participant for a director, or free them."""
     person = ctx.find_participant(m.participant) if m.participant else None
     if m.participant and person is None:
-        text = f"no participant {m.participant}"
-        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster"))
+        return ctx.deny(p, m.request_id, build_absent_denial(m.participant))
     denial = _check_role(person) if person is not None else None
     unknown = next((name for name in m.robots if name not in ctx.robots), None)
     if unknown is not None:
@@ -397,8 +400,7 @@ def set_mode(ctx: Context, p: Participant, m: SetMode) -> None:
     if lease is None:
         return ctx.deny(p, m.request_id, build_unknown_denial("robot", m.robot, ctx.robots))
     if m.mode not in LeaseMode.ALL:
-        known = f"modes: {', '.join(sorted(LeaseMode.ALL))}"
-        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown mode {m.mode}", known))
+        return ctx.deny(p, m.request_id, build_value_denial("mode", m.mode, LeaseMode.ALL))
     if m.mode != lease.mode:
         in_charge = ctx.get_holder(lease)
         if lease.override:
@@ -422,7 +424,7 @@ def set_scale(ctx: Context, p: Participant, m: SetScale) -> None:
     if not low <= m.scale <= high:  # a scale that is no number is in no range
         advice = f"use a scale from {low:g} to {high:g}"
         return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, f"scale {m.scale:g} is out of range", advice))
-    names = tuple(dict.fromkeys(m.robots)) or _list_held_robots(ctx, p)
+    names = tuple(dict.fromkeys(m.robots)) or tuple(_list_held_robots(ctx, p))
     denial = _check_scale_targets(ctx, p, names)
     if denial is not None:
         return ctx.deny(p, m.request_id, denial)
@@ -436,8 +438,8 @@ def set_scale(ctx: Context, p: Participant, m: SetScale) -> None:
     return ctx.accept(p, m.request_id, chosen)
 
 
-def _list_held_robots(ctx: Context, p: Participant) -> tuple[str, ...]:
-    return tuple(n for n, lease in ctx.state.robots.items() if any(g.participant == p.id for g in lease.grants))
+def _list_held_robots(ctx: Context, p: Participant) -> list[str]:
+    return [n for n, lease in ctx.state.robots.items() if any(g.participant == p.id for g in lease.grants)]
 
 
 def _check_scale_targets(ctx: Context, p: Participant, names: Sequence[str]) -> Denial | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from iris_session.authority import alignment, anchoring, assignment, engagement, leases
-from iris_session.authority.context import HUMAN, Context
+from iris_session.authority.context import HUMAN, Context, build_absent_denial, build_value_denial
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
 from iris_session.protocol.client_messages import RemoveParticipant, Rename, SetRole
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
@@ -177,11 +177,9 @@ def process_bye(ctx: Context, p: Participant, reason: str) -> None:
 
 def process_removal(ctx: Context, p: Participant, m: RemoveParticipant) -> None:
     """Remove a participant for a director, at once and without grace."""
-    gone = ctx.find_participant(m.participant)
-    if gone is None or gone.id == HOST_ID:
-        text = f"no participant {m.participant}"
-        denial = Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster")
-        return ctx.deny(p, m.request_id, denial)
+    gone = _find_person(ctx, p, m)
+    if gone is None:
+        return None
     ctx.accept(p, m.request_id)
     kind = AuditKind.KEY_REVOKED if m.revoke else AuditKind.REMOVED
     ctx.emit(Audited(kind, gone.id, gone.name, "", f"{p.name}: {m.reason}"[:MAX_TEXT]))
@@ -245,19 +243,18 @@ def set_role(ctx: Context, p: Participant, m: SetRole) -> None:
     return ctx.accept(p, m.request_id)
 
 
-def _find_person(ctx: Context, p: Participant, m: Rename | SetRole) -> Participant | None:
+def _find_person(ctx: Context, p: Participant, m: RemoveParticipant | Rename | SetRole) -> Participant | None:
     """Return the participant that a director's request names; deny the request when there is none."""
     person = ctx.find_participant(m.participant)
     if person is None or person.id == HOST_ID:
-        text = f"no participant {m.participant}"
-        ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster"))
+        ctx.deny(p, m.request_id, build_absent_denial(m.participant))
         return None
     return person
 
 
 def _check_new_role(ctx: Context, person: Participant, role: str) -> Denial | None:
     if role not in Role.ALL:
-        return Denial(DenialReason.UNKNOWN_VALUE, f"unknown role {role}", f"roles: {', '.join(sorted(Role.ALL))}")
+        return build_value_denial("role", role, Role.ALL)
     if role != person.role and Role.GATEWAY in (role, person.role):
         text = f"{person.name} is {person.role}: a role cannot be changed to or from gateway while connected"
         return Denial(DenialReason.ROLE, text, f"let it join anew as {role}")

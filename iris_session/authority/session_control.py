@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Final
 
 from iris_session.authority import engagement, leases
-from iris_session.authority.context import Context, format_names, join_names
+from iris_session.authority.context import Context, build_value_denial, format_names, join_names
 from iris_session.authority.state import (
     HOST_ID,
     NO_CONNECTION,
@@ -110,8 +110,7 @@ def build_stop_reports(ctx: Context) -> tuple[StopReport, ...]:
 def control_session(ctx: Context, p: Participant, m: Control) -> None:
     """Process a director's pause, resume, step or reset."""
     if m.action not in ControlAction.ALL:
-        known = f"actions: {', '.join(sorted(ControlAction.ALL))}"
-        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown action {m.action}", known))
+        return ctx.deny(p, m.request_id, build_value_denial("action", m.action, ControlAction.ALL))
     if ctx.config.user_owned_loop:
         if m.action == ControlAction.RESET and ctx.state.owner_listens:
             return ctx.accept(p, m.request_id)  # the owner hears of it, and resets
@@ -214,8 +213,7 @@ def control_episode(ctx: Context, p: Participant, m: Episode) -> None:
     once; in a user loop whose owner listens, the next number starts when the owner has reset the scene.
     """
     if m.action not in EpisodeAction.ALL:
-        known = f"actions: {', '.join(sorted(EpisodeAction.ALL))}"
-        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown action {m.action}", known))
+        return ctx.deny(p, m.request_id, build_value_denial("action", m.action, EpisodeAction.ALL))
     if p.role not in Role.DRIVING:
         denial = Denial(DenialReason.ROLE, f"role {p.role} may not control episodes", "ask an operator or director")
         return ctx.deny(p, m.request_id, denial)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -38,8 +38,7 @@ _DYN_NONE, _DYN_INTEGRATOR = int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtDyn.mj
 _DYN_FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 
 
-@dataclass
-class _Group:
+class _Group(NamedTuple):
     """Actuators of one type. `columns`: their joints among all commanded joints; `ctrl = x * scale + offset`."""
 
     columns: NDArray[np.intp]
@@ -48,26 +47,6 @@ class _Group:
     offset: Floats
     qpos: NDArray[np.intp]
     dof: NDArray[np.intp]
-
-
-@dataclass
-class _Rows:
-    columns: list[int] = field(default_factory=list)
-    actuators: list[int] = field(default_factory=list)
-    scale: list[float] = field(default_factory=list)
-    offset: list[float] = field(default_factory=list)
-    joints: list[int] = field(default_factory=list)
-
-    def build_group(self, model: mujoco.MjModel) -> _Group:
-        joints = np.array(self.joints, dtype=np.intp)
-        return _Group(
-            np.array(self.columns, dtype=np.intp),
-            np.array(self.actuators, dtype=np.intp),
-            np.array(self.scale),
-            np.array(self.offset),
-            np.asarray(model.jnt_qposadr, dtype=np.intp)[joints],
-            np.asarray(model.jnt_dofadr, dtype=np.intp)[joints],
-        )
 
 
 class ActuatorLaws:
@@ -79,7 +58,7 @@ class ActuatorLaws:
         """Raise `ControlError` for an actuator that has no law."""
         self._model = model
         self._config = config
-        rows = {POSITION: _Rows(), VELOCITY: _Rows(), TORQUE: _Rows()}
+        rows: list[tuple[str, int, int, float, float]] = []  # type, actuator, joint, scale and offset
         bounds: list[tuple[float, float]] = []
         servos: list[tuple[float, ...]] = []
         for robot in robots:
@@ -92,23 +71,16 @@ class ActuatorLaws:
                 actuator = find_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name, "actuator")
                 joint = find_id(model, mujoco.mjtObj.mjOBJ_JOINT, joint_name, "joint")
                 kind, scale, offset = _find_law(model, robot, actuator, joint)
-                row = rows[kind]
-                row.columns.append(len(bounds))
-                row.actuators.append(actuator)
-                row.scale.append(scale)
-                row.offset.append(offset)
-                row.joints.append(joint)
+                rows.append((kind, actuator, joint, scale, offset))
                 bounds.append(_find_bounds(model, kind, actuator, joint, scale, offset))
                 servos.append(_find_servo(model, kind, actuator, joint, config))
         limits = np.array(bounds, dtype=np.float64).reshape(-1, 2)
         self.lower, self.upper = limits[:, 0].copy(), limits[:, 1].copy()
         #: Actuator of every joint, shape (n,).
-        self.actuators: NDArray[np.intp] = np.zeros(len(bounds), dtype=np.intp)
-        for row in rows.values():
-            self.actuators[row.columns] = row.actuators
-        self._position = rows[POSITION].build_group(model)
-        self._velocity = rows[VELOCITY].build_group(model)
-        self._torque = rows[TORQUE].build_group(model)
+        self.actuators: NDArray[np.intp] = np.array([row[1] for row in rows], dtype=np.intp)
+        self._position, self._velocity, self._torque = (
+            _make_group(model, rows, kind) for kind in (POSITION, VELOCITY, TORQUE)
+        )
         # Integrated velocity actuators: their rows in the velocity group, and their activations.
         dynamics = np.asarray(model.actuator_dyntype)[self._velocity.actuators]
         self._integrators = np.flatnonzero(dynamics == _DYN_INTEGRATOR)
@@ -174,6 +146,14 @@ class ActuatorLaws:
         mujoco.mj_mulM(self._model, data, self._force, self._acceleration)
         torque = self._force + data.qfrc_bias - data.qfrc_gravcomp
         data.ctrl[g.actuators] = torque[g.dof] * g.scale
+
+
+def _make_group(model: mujoco.MjModel, rows: list[tuple[str, int, int, float, float]], kind: str) -> _Group:
+    own = [(column, *row[1:]) for column, row in enumerate(rows) if row[0] == kind]
+    columns, actuators, joints = (np.array([row[k] for row in own], dtype=np.intp) for k in range(3))
+    scale, offset = (np.array([row[k] for row in own], dtype=np.float64) for k in (3, 4))
+    qpos, dof = (np.asarray(one, dtype=np.intp)[joints] for one in (model.jnt_qposadr, model.jnt_dofadr))
+    return _Group(columns, actuators, scale, offset, qpos, dof)
 
 
 def _find_law(model: mujoco.MjModel, robot: RobotSpec, actuator: int, joint: int) -> tuple[str, float, float]:

@@ -6,9 +6,9 @@ carries gravity where the arm stands (from `data`), and `lag * v`, the lead of f
 
 Anti-windup, in every mode: min(droop, 0) - B <= lead <= max(droop, 0) + B with B = static + lag * |v|. `static` is
 where the actuator's force limit is reached (further it adds no force), within 20 to 60 ms at the joint's speed limit:
-enough for the lead that accelerates a weak servo, and for a measurement that is one sample old. Measured in motion at
-up to 2.4 rad/s: at most 0.65 of the bound on the KUKA iiwa 14 and the demo arms, 0.73 on ALOHA, whose weak wrist
-reached the bound in a drag at 0.4 m/s (187 of 700 ticks).
+enough for the lead that accelerates a weak servo, and for a measurement that is one sample old. Measured in drags at up
+to 2.5 rad/s: at most 0.82 of the bound on a Panda, with position, velocity and torque actuators; on ALOHA 0.72 at
+0.15 m/s, while its weak wrist reached the bound at 0.4 m/s (151 of 700 ticks).
 
 Hold, once whenever a robot enters it: the joint decelerates at its limit from where it is measured, at its measured
 speed; its command is that motion plus `lag * speed` plus the offset that it had beyond (droop, friction), so a joint

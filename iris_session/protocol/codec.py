@@ -32,6 +32,7 @@ from iris_session.protocol.limits import (
     MAX_SERVER_BYTES,
     MAX_STATE_HEADER_BYTES,
     SERVER_LIMITS,
+    Limit,
 )
 from iris_session.protocol.media import (
     CLASSES,
@@ -57,6 +58,7 @@ BAD_BYTES: Final = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, Ov
 K = TypeVar("K")
 T = TypeVar("T")
 A = TypeVar("A", AssetRequest, AssetChunk, AssetRefused)
+E = TypeVar("E", ClientEnvelope, ServerEnvelope)
 
 
 def make_decoder(kind: type[K]) -> Callable[[Bytes], K]:
@@ -161,16 +163,7 @@ def encode_client(envelope: ClientEnvelope) -> bytes:
 
 def decode_client(data: Bytes) -> ClientEnvelope:
     """Decode a message to the session. Raises `ProtocolVersionError`, `TooLargeError` or `MalformedError`."""
-    _check_size("message", data, MAX_CLIENT_BYTES)
-    try:
-        envelope = _client.decode(data)
-    except BAD_BYTES as error:
-        raise _explain_failure(error, data, _client_tags, CLIENT_TYPES) from None
-    if envelope.version != PROTOCOL_VERSION:
-        raise ProtocolVersionError(envelope.version)
-    kind = type(envelope.message)
-    _check_size(get_tag(kind), data, LIMITS[kind].max_bytes)
-    return envelope
+    return _decode_envelope(_client, _client_tags, CLIENT_TYPES, LIMITS, data, MAX_CLIENT_BYTES)
 
 
 def encode_server(envelope: ServerEnvelope) -> bytes:
@@ -180,16 +173,7 @@ def encode_server(envelope: ServerEnvelope) -> bytes:
 
 def decode_server(data: Bytes) -> ServerEnvelope:
     """Decode a message to a client. Raises `ProtocolVersionError`, `TooLargeError` or `MalformedError`."""
-    _check_size("message", data, MAX_SERVER_BYTES)
-    try:
-        envelope = _server.decode(data)
-    except BAD_BYTES as error:
-        raise _explain_failure(error, data, _server_tags, SERVER_TYPES) from None
-    if envelope.version != PROTOCOL_VERSION:
-        raise ProtocolVersionError(envelope.version)
-    kind = type(envelope.message)
-    _check_size(get_tag(kind), data, SERVER_LIMITS[kind].max_bytes)
-    return envelope
+    return _decode_envelope(_server, _server_tags, SERVER_TYPES, SERVER_LIMITS, data, MAX_SERVER_BYTES)
 
 
 def peek_version(data: Bytes) -> int:
@@ -331,13 +315,7 @@ def encode_beacon(beacon: Beacon) -> bytes:
 
 def decode_beacon(data: Bytes) -> Beacon:
     """Decode a beacon. Raises `ProtocolVersionError`, `TooLargeError` or `MalformedError`."""
-    _check_size("beacon", data, MAX_BEACON_BYTES)
-    try:
-        version = _beacon_version.decode(data).protocol
-    except BAD_BYTES as error:
-        raise MalformedError(f"no beacon: {error}") from None
-    if version != PROTOCOL_VERSION:
-        raise ProtocolVersionError(version)
+    _require_version(_decode("beacon", _beacon_version, data, MAX_BEACON_BYTES).protocol)
     return _decode("beacon", _beacon, data, MAX_BEACON_BYTES)
 
 
@@ -362,12 +340,7 @@ def decode_introduction(data: Bytes) -> Introduction | None:
         return None
     if len(body) > length:
         raise MalformedError(f"no introduction: {len(body) - length} bytes after its end")
-    try:
-        version = _introduction_version.decode(body).beacon.protocol
-    except BAD_BYTES as error:
-        raise MalformedError(f"no introduction: {error}") from None
-    if version != PROTOCOL_VERSION:
-        raise ProtocolVersionError(version)
+    _require_version(_decode("introduction", _introduction_version, body, MAX_INTRODUCTION_BYTES).beacon.protocol)
     return _decode("introduction", _introduction, body, MAX_INTRODUCTION_BYTES)
 
 
@@ -382,10 +355,32 @@ def _decode(what: str, decoder: msgspec.msgpack.Decoder[T], data: Bytes, limit: 
 def _decode_asset(what: str, decoder: msgspec.msgpack.Decoder[A], data: Bytes, limit: int) -> A:
     """Decode a struct that begins with the version, which is checked first."""
     _check_size(what, data, limit)
-    version = peek_version(data)
+    _require_version(peek_version(data))
+    return _decode(what, decoder, data, limit)
+
+
+def _decode_envelope(
+    decoder: msgspec.msgpack.Decoder[E],
+    tags: msgspec.msgpack.Decoder[_ClientTags] | msgspec.msgpack.Decoder[_ServerTags],
+    known: Mapping[str, type[Message]],
+    limits: Mapping[type[Message], Limit],
+    data: Bytes,
+    max_bytes: int,
+) -> E:
+    _check_size("message", data, max_bytes)
+    try:
+        envelope = decoder.decode(data)
+    except BAD_BYTES as error:
+        raise _explain_failure(error, data, tags, known) from None
+    _require_version(envelope.version)
+    kind = type(envelope.message)
+    _check_size(get_tag(kind), data, limits[kind].max_bytes)
+    return envelope
+
+
+def _require_version(version: int) -> None:
     if version != PROTOCOL_VERSION:
         raise ProtocolVersionError(version)
-    return _decode(what, decoder, data, limit)
 
 
 def _check_size(what: str, data: Bytes, limit: int) -> None:
