@@ -63,7 +63,12 @@ class CameraModel:
         return np.array(self.distortion if self.distortion else (0.0,) * 4)
 
     def scaled(self, width: int, height: int) -> CameraModel:
-        """Return the same camera read out at another resolution with the same field of view."""
+        """Return the same camera read out at another resolution with the same field of view.
+
+        Args:
+            width: Width of its pictures [px].
+            height: Their height [px].
+        """
         sx, sy = width / self.width, height / self.height
         # Pixel centres are whole numbers: the image's left edge is at -0.5.
         return CameraModel(
@@ -77,13 +82,29 @@ class CameraModel:
         )
 
     def project(self, points: Array, T_camera_points: PoseTuple | None = None) -> Array:
-        """Project points (n, 3) [m] to pixels (n, 2)."""
+        """Project points to pixels.
+
+        Args:
+            points: Shape (n, 3) [m].
+            T_camera_points: Pose of their frame in the optical frame; None: they are in the optical frame.
+
+        Returns:
+            Pixels, shape (n, 2).
+        """
         pose = T_camera_points if T_camera_points is not None else ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
         return self.project_with_jacobian(points, *to_rvec_tvec(pose))[0]
 
     def project_with_jacobian(self, points: Array, rvec: Array, tvec: Array) -> tuple[Array, Array]:
-        """Project points to pixels (n, 2); return also their derivatives by rotation vector and translation (2 n,
-        6)."""
+        """Project points to pixels.
+
+        Args:
+            points: Shape (n, 3) [m].
+            rvec: Rotation vector (3,) [rad] from their frame to the optical frame.
+            tvec: Position (3,) [m] of their frame in the optical frame.
+
+        Returns:
+            Pixels (n, 2), and their derivatives by rotation vector and translation (2 n, 6).
+        """
         import cv2
 
         found: Any = cv2.projectPoints(
@@ -92,7 +113,7 @@ class CameraModel:
         return np.asarray(found[0]).reshape(-1, 2), np.asarray(found[1])[:, :6]
 
     def undistort(self, pixels: Array) -> Array:
-        """Return undistorted coordinates (x / z, y / z) of pixels, shape (n, 2)."""
+        """Return undistorted coordinates (x / z, y / z), shape (n, 2), of pixels (n, 2)."""
         import cv2
 
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)

@@ -331,11 +331,6 @@ def test_command_parses(where: str, arguments: tuple[str, ...]) -> None:
             pytest.fail(f"{where}: iris-session {shlex.join(arguments)}: {errors.getvalue().splitlines()[-1]}")
 
 
-def test_command_search_finds_commands() -> None:
-    found = {arguments[0] for _, arguments in commands()}
-    assert found == set(_commands())
-
-
 def test_make_targets_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     shown = [line.split()[1] for block in SHELL for line in block.text.splitlines() if line.startswith("make ")]
@@ -420,14 +415,6 @@ def test_named_files_exist(page: Path) -> None:
         # Modules are named from the root or, in short, from the package.
         folders = (ROOT, ROOT / "iris_session")
         assert any((folder / name).is_file() for folder in folders), f"{page.name}: {name}"
-
-
-def test_file_search_finds_files() -> None:
-    assert any(FILE.findall(prose(page)) for page in PAGES)
-
-
-def test_picture_is_small() -> None:
-    assert (ROOT / "docs" / "img" / "handover.gif").stat().st_size <= 1_000_000
 
 
 # --- reasons ---

@@ -10,10 +10,16 @@ from iris_session.protocol.common import Name
 class RobotSpec(msgspec.Struct, frozen=True):
     """A named group of joints, actuators, end-effector site and gripper that is controlled as one.
 
-    `joints` and `actuators` have the same order (one actuator per arm joint). `gripper_actuator` is empty without a
-    gripper; `gripper_open` and `gripper_closed` are its ctrl values. `finger_bodies`: bodies whose geoms count as the
-    gripper (contacts, handover). `base_body`: root of the robot's subtree. `hold`: declared hold law for torque
-    actuators (`gravity_pd`), empty for none (then torque actuators are refused at start).
+    Attributes:
+        name: Name of the robot.
+        joints, actuators: Names in the model, in the same order: one actuator per arm joint.
+        site: Site of the end effector.
+        base_body: Root of the robot's subtree.
+        gripper_actuator: Empty without a gripper.
+        gripper_open, gripper_closed: Values of its `ctrl`.
+        finger_bodies: Bodies whose geoms count as the gripper (contacts, handover).
+        mode: Lease mode (`LeaseMode`).
+        hold: Declared hold law of torque actuators (`gravity_pd`); empty: none, and torque actuators are refused.
     """
 
     name: Name
@@ -30,7 +36,12 @@ class RobotSpec(msgspec.Struct, frozen=True):
 
 
 class ObjectSpec(msgspec.Struct, frozen=True):
-    """A free body that people or robots can take. `body` is its name in the model."""
+    """A free body that people or robots can take.
+
+    Attributes:
+        name: Name of the object.
+        body: Name of the body in the model.
+    """
 
     name: Name
     body: Name

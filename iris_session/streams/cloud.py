@@ -149,7 +149,17 @@ def encode_cloud(
 
 
 def decode_cloud(payload: bytes | memoryview) -> CloudFrame:
-    """Decode a frame. Raises `StreamError`."""
+    """Decode a frame.
+
+    Args:
+        payload: Payload of any class, as `encode_cloud` makes it.
+
+    Returns:
+        Points in the world frame, and what their source states of them.
+
+    Raises:
+        StreamError: The bytes are no frame.
+    """
     header = read_header(payload)
     n = 4 * header.n_points
     # Whole points at once, colours too: a row of numbers is several times faster than a column. All sums are exact.

@@ -71,8 +71,15 @@ def exponent_for(bound_m: float) -> int:
 class DeformableEncoder:
     """Encoder of one mesh. Deterministic: the same calls give the same bytes (with one version of zstd).
 
-    `bound_m`: every vertex of every frame is at most so far from where it is (Euclidean), also while nothing is sent.
-    `repeat_after`: calls after which what rests is sent again, for those who joined meanwhile.
+    Args:
+        topology: Triangles and lines of the mesh.
+        bound_m: Every vertex of every frame is at most so far from where it is (Euclidean) [m], also while nothing is
+            sent.
+        repeat_after: Calls after which what rests is sent again, for those who joined meanwhile.
+        level: Level of the compression.
+
+    Raises:
+        ValueError: A bound or interval that cannot work.
     """
 
     def __init__(
@@ -99,11 +106,17 @@ class DeformableEncoder:
     def encode(
         self, vertices: npt.NDArray[np.floating], classes: Sequence[str] = (BudgetClass.FULL,)
     ) -> dict[str, bytes] | None:
-        """Return payloads by class, for `Session.publish_media`; None while nothing has moved.
+        """Encode the vertices if they have moved.
 
-        `vertices`: (n, 3) [m], world frame; any value is accepted. The bound of `half` is twice that of `full`, of
-        `quarter` four times.
-        Raises `ValueError` for another shape or class.
+        Args:
+            vertices: (n, 3) [m], world frame; any value is accepted.
+            classes: Classes to make. The bound of `half` is twice that of `full`, of `quarter` four times.
+
+        Returns:
+            Payloads by class, for `Session.publish_media`; None while nothing has moved.
+
+        Raises:
+            ValueError: Another shape, or an unknown class.
         """
         if vertices.shape != (self.topology.n_vertices, 3):
             raise ValueError(f"vertices have shape {vertices.shape}, expected ({self.topology.n_vertices}, 3)")
@@ -173,7 +186,17 @@ class DeformableDecoder:
         self._decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
 
     def decode(self, payload: bytes | memoryview) -> Positions:
-        """Return vertices (n, 3) [m], world frame, in a new array. Raises `StreamError` for another mesh's frame."""
+        """Decode a frame.
+
+        Args:
+            payload: Payload of any class, as `DeformableEncoder.encode` makes it.
+
+        Returns:
+            Vertices (n, 3) [m], world frame, in a new array.
+
+        Raises:
+            StreamError: The bytes are no frame of this mesh.
+        """
         header = read_header(payload)
         topology = self.topology
         if header.n_vertices != topology.n_vertices or header.identity != topology.identity:

@@ -48,9 +48,17 @@ class _Plan(NamedTuple):
 
 
 class DeformableTopology:
-    """Triangles `faces` (m, 3) and lines `edges` (k, 2) of vertex numbers, of a mesh of `n_vertices`; read-only.
+    """Triangles and lines of a mesh; read-only.
 
-    `identity`: in every frame, so that no frame is decoded with another mesh. Raises `ValueError` for an invalid mesh.
+    `identity`: in every frame, so that no frame is decoded with another mesh.
+
+    Args:
+        n_vertices: Number of vertices.
+        faces: Triangles of vertex numbers, shape (m, 3).
+        edges: Lines of vertex numbers, shape (k, 2).
+
+    Raises:
+        ValueError: The mesh is invalid.
     """
 
     def __init__(self, n_vertices: int, faces: npt.ArrayLike = (), edges: npt.ArrayLike = ()) -> None:
@@ -90,7 +98,11 @@ class DeformableTopology:
 
     @classmethod
     def from_bytes(cls, data: bytes | memoryview) -> DeformableTopology:
-        """Decode the bytes of `to_bytes`. Raises `StreamError` for any other bytes."""
+        """Decode the bytes of `to_bytes`.
+
+        Raises:
+            StreamError: Any other bytes.
+        """
         if len(data) < _HEADER.size:
             raise StreamError(f"topology of {len(data)} bytes, shorter than its header of {_HEADER.size}")
         form, plan, flags, n, rows, cols, n_faces, n_edges = _HEADER.unpack_from(data)
