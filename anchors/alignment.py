@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from anchors.lie import Array, to_vec3
+from anchors.lie import Array, to_quat, to_vec3
 from anchors.pose import (
     IDENTITY_POSE,
     PoseTuple,
@@ -40,7 +40,6 @@ from anchors.solver import (
     count_agreeing_anchors,
     median_tilt,
     solve_alignment,
-    to_inverse_pose,
     to_world_covariance,
 )
 from anchors.uncertainty import (
@@ -361,7 +360,7 @@ class AlignmentEstimator:
         else:
             advice = size_advice(self._memory.groups, self.config.size_tolerance) or self._misprint_advice()
         return AlignmentEstimate(
-            to_inverse_pose(s.t, s.q),
+            inverse((to_vec3(s.t), to_quat(s.q))),
             self.tracking_epoch,
             covariance,
             pivot_world,

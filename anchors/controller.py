@@ -48,7 +48,6 @@ class TipCalibration:
     """
 
     p_controller_tip: Vec3
-    p_tracking_pivot: Vec3
     sigma_m: float
     residual_m: float
     n_used: int
@@ -112,7 +111,7 @@ def calibrate_tip(
     elif tip_sigma > max_sigma_m:
         advice = f"the tip is known to {tip_sigma * 1e3:.1f} mm only: turn further, in every direction"
     stated = () if advice else tuple(covariance[:3, :3].ravel().tolist())
-    return TipCalibration(to_vec3(x[:3]), to_vec3(x[3:]), tip_sigma, residual, n, bool(advice), advice, stated)
+    return TipCalibration(to_vec3(x[:3]), tip_sigma, residual, n, bool(advice), advice, stated)
 
 
 def _correlated_covariance(A: Array, q: Array, squares: float) -> tuple[Array, float]:
@@ -142,4 +141,4 @@ def _second_axis_rotation(q: Array) -> float:
 
 
 def _refuse(advice: str) -> TipCalibration:
-    return TipCalibration(_ZERO, _ZERO, math.inf, math.inf, 0, True, advice)
+    return TipCalibration(_ZERO, math.inf, math.inf, 0, True, advice)

@@ -21,6 +21,7 @@ from anchors.alignment import AlignmentEstimate
 from anchors.lie import Array, quat_to_matrix, to_vec3
 from anchors.pose import PoseTuple, Vec3, apply, distance, is_rigid, is_valid_point, quat_angle
 from anchors.uncertainty import NoiseModel, isotropic_covariance
+from anchors.viewpoints import fast_median
 
 AlarmKind = Literal["changed", "differs", "jump", "epoch"]
 
@@ -200,7 +201,7 @@ class DriftMonitor:
             later = [s.p for s in self._detections[other] if s.capture_ns >= since_ns]
             if other == anchor_id or kept is None or kept[2] is None or len(later) < _MIN_BESIDE:
                 continue
-            if float(np.linalg.norm(_median(later) - kept[2].p)) < 0.5 * size_m:
+            if float(np.linalg.norm(fast_median(np.array(later)) - kept[2].p)) < 0.5 * size_m:
                 stayed.append(other)
         return tuple(stayed)
 
@@ -231,7 +232,7 @@ class DriftMonitor:
         return self._summarize(rows)
 
     def _summarize(self, rows: list[_Detection]) -> _Window:
-        p = _median([s.p for s in rows])
+        p = fast_median(np.array([s.p for s in rows]))
         p_head = rows[len(rows) // 2].p_head
         if p_head is None:
             common, each = self.noise.split_covariance(isotropic_covariance(self.config.unknown_viewpoint_sigma_m, 0.0))
@@ -286,13 +287,6 @@ class DriftMonitor:
         self._quiet_until_ns.clear()
         self._steady_ns.clear()
         self._head = None
-
-
-def _median(points: list[Vec3]) -> Array:
-    """Return the median (3,) per coordinate. For a few dozen points sorting is several times as fast as numpy."""
-    half, odd = divmod(len(points), 2)
-    columns = [sorted(column) for column in zip(*points, strict=True)]
-    return np.array([c[half] if odd else 0.5 * (c[half - 1] + c[half]) for c in columns])
 
 
 def _significant(d: Array, C: Array, least_m: float) -> float:

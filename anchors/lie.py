@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.pose import Quat, Vec3, quat_from_rotvec, quat_mul, quat_normalize
+from anchors.pose import Quat, Vec3, quat_from_rotvec, quat_normalize
 
 Array = NDArray[np.float64]
 
@@ -45,13 +45,6 @@ def quat_exp(r: Array) -> Array:
     safe = np.maximum(angle, _SMALL)
     scale = np.where(angle < _SMALL, 0.5, np.sin(0.5 * safe) / safe)
     return np.concatenate((np.cos(0.5 * angle), scale * r), axis=-1)
-
-
-def quat_perturb(q: Array, r: Array) -> Array:
-    """Return `exp(r) * q` for one quaternion (4,) and rotation vector (3,) [rad], in plain floats, which are faster."""
-    x, y, z = r.tolist()
-    w, i, j, k = q.tolist()
-    return np.array(quat_mul(quat_from_rotvec((x, y, z)), (w, i, j, k)))
 
 
 def quat_log(q: Array) -> Array:

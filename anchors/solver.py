@@ -20,16 +20,13 @@ from numpy.typing import NDArray
 from anchors.lie import (
     Array,
     quat_conjugate,
+    quat_exp,
     quat_log,
     quat_multiply,
-    quat_perturb,
     quat_to_matrix,
     skew,
     swing,
-    to_quat,
-    to_vec3,
 )
-from anchors.pose import PoseTuple
 from anchors.uncertainty import Z999, chi2_quantile
 from anchors.viewpoints import MergedObservation, circular_median
 
@@ -142,7 +139,7 @@ def solve_alignment(
     if count_agreeing_anchors(b.anchor, found.inside) > _MIN_SURE and _is_likely(found):
         return found
     others = [one for one in _solve_without_sheet(b, solution, prior) if _is_likely(one)]
-    return max([found, *others], key=lambda one: _rank_key(b, one))
+    return max([found, *others], key=lambda one: _votes(b, one.inside, one.chi2))
 
 
 def _solve_without_sheet(
@@ -181,11 +178,6 @@ def _refine_inliers(
             break
         inside, start = now, (solution.q, solution.t)
     return solution
-
-
-def _rank_key(b: AlignmentProblem, s: AlignmentSolution) -> tuple[int, int, float]:
-    """Return a sort key, larger is better: agreeing sheets, agreeing groups, negative chi-square."""
-    return count_agreeing_anchors(b.anchor, s.inside), int(np.count_nonzero(s.inside)), -s.chi2
 
 
 def median_tilt(b: AlignmentProblem) -> float:
@@ -239,7 +231,7 @@ def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: A
         inverse = np.asarray(np.linalg.inv(H), dtype=np.float64)
         step = inverse @ g
         t, drift = t + step[:3], drift + step[6:]
-        q = quat_perturb(q, step[3:6])
+        q = quat_multiply(quat_exp(step[3:6]), q)
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
     r = r - J @ step  # the last step was small: its linear effect is all there is
@@ -298,6 +290,7 @@ def _consensus(b: AlignmentProblem, prior: AlignmentPrior) -> tuple[Mask, tuple[
 
 
 def _votes(b: AlignmentProblem, agree: Mask, misfit: float) -> tuple[int, int, float]:
+    """Return a sort key, larger is better: agreeing sheets, agreeing groups, negative misfit."""
     return count_agreeing_anchors(b.anchor, agree), int(np.count_nonzero(agree)), -misfit
 
 
@@ -320,10 +313,3 @@ def to_world_covariance(q: Array, covariance: Array, pivot_world: Array) -> Arra
     J[:3, 3:] = -skew(pivot_world) @ R_world_tracking
     S = J @ covariance @ J.T
     return np.asarray(0.5 * (S + S.T))
-
-
-def to_inverse_pose(t: Array, q: Array) -> PoseTuple:
-    """Return `T_b_a` as plain floats from `T_a_b` (translation (3,), quaternion (4,))."""
-    q_inv = quat_conjugate(q)
-    p = -(quat_to_matrix(q_inv) @ t)
-    return to_vec3(p), to_quat(q_inv)

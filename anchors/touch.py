@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 
 from anchors.alignment import AlignmentConfig, AlignmentEstimate
-from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, skew, swing, to_vec3
-from anchors.pose import IDENTITY_POSE, Quat, Vec3, distance
-from anchors.solver import to_inverse_pose, to_world_covariance
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, skew, swing, to_quat, to_vec3
+from anchors.pose import IDENTITY_POSE, Quat, Vec3, distance, inverse
+from anchors.solver import to_world_covariance
 from anchors.uncertainty import Z99, chi2_quantile, position_error_p95
 
 _CHI2_3_999: Final = 16.266
@@ -352,7 +352,7 @@ def _estimate(
     refused = not error <= config.max_error_m
     mend = f"touch '{next_point}' next" if next_point else "touch more points, further apart"
     return AlignmentEstimate(
-        to_inverse_pose(fit.t, fit.q),
+        inverse((to_vec3(fit.t), to_quat(fit.q))),
         epoch,
         covariance,
         at,

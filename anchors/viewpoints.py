@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_perturb
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply
 from anchors.pose import Quat, Vec3
 from anchors.uncertainty import Z999, NoiseModel, chi2_quantile
 
@@ -213,7 +213,7 @@ def merge_poses(p: Array, q: Array, common: Array, each: Array, min_agreeing: fl
     if wider is not None:
         covariance = covariance * wider[:, None] * wider
     mean += about
-    return MergedObservation(mean[0], quat_perturb(centre, mean[1]), covariance, n, count)
+    return MergedObservation(mean[0], quat_multiply(quat_exp(mean[1]), centre), covariance, n, count)
 
 
 def fast_median(x: Array) -> Array:

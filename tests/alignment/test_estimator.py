@@ -158,20 +158,6 @@ def test_advice_about_many_sheets_fits_into_a_proposal() -> None:
     assert decode_entry(encode_entry(Entry(1, 1, 0, proposal))).message == proposal
 
 
-def test_failed_solution_is_reported_in_the_epoch_of_its_observations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The authority ignores proposals of older epochs, so the wearer would never get the reason."""
-    estimator = ConnectionEstimator(ANCHORS, PERIOD)
-    estimator.add_observation(observation(epoch=3))
-
-    def fail(_: object) -> None:
-        raise ArithmeticError
-
-    monkeypatch.setattr("anchors.alignment.AlignmentEstimator.estimate", fail)
-    proposal = estimator.propose(0)
-    assert proposal is not None
-    assert (proposal.refused, proposal.tracking_epoch) == (True, 3)
-
-
 def test_second_failure_is_reported_after_the_rate_limit() -> None:
     """The authority sends one reason a second; the second reason must not be lost."""
     estimator = ConnectionEstimator(ANCHORS, PERIOD, {"table": 0.16})

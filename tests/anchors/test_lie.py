@@ -84,11 +84,6 @@ def test_matrix_to_quaternion_at_half_a_turn(axis: tuple[float, float, float]) -
     assert _is_same_rotation(lie.quat_from_matrix(lie.quat_to_matrix(q)), q)
 
 
-@given(vectors, vectors)
-def test_skew_is_the_cross_product(a: Array, b: Array) -> None:
-    assert np.allclose(lie.skew(a) @ b, np.cross(a, b), atol=1e-12)
-
-
 @given(axes, st.floats(0.0, 3.0), axes)
 def test_left_jacobian_is_the_derivative_of_exp(axis: Array, angle: float, way: Array) -> None:
     r, h = axis * angle, 1e-6

@@ -43,14 +43,6 @@ def test_stated_error_is_the_95_percent_quantile_at_the_robot() -> None:
         assert compute_position_p95(C, pivot, point) == pytest.approx(measured, rel=0.05)
 
 
-def test_stated_error_of_degenerate_covariances() -> None:
-    zero = (0.0,) * 36
-    assert compute_position_p95(zero, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)) == 0.0
-    assert compute_position_p95((1e300,) * 36, (0.0, 0.0, 0.0), (1e9, 0.0, 0.0)) == math.inf
-    line = tuple(1e-6 if i == 0 else 0.0 for i in range(36))
-    assert compute_position_p95(line, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) == pytest.approx(1.96e-3, rel=0.03)
-
-
 def test_a_good_measurement_is_accepted_with_its_error() -> None:
     t = Table()
     anna = t.operator()
@@ -147,18 +139,6 @@ def test_engaging_a_far_robot_with_an_alignment_that_was_good_near_the_sheet_is_
     assert t.hold("right") == "unaligned"
     assert t.last(SamplesRejected).reason == "unaligned"
     assert "right" in t.since(Notice)[0].text
-
-
-def test_a_sheet_on_the_edge_of_a_bound_is_told_every_five_seconds_and_counted() -> None:
-    t = Table()
-    anna = t.join()
-    for i in range(60):  # 12 s of proposals at 5 Hz
-        tilted = proposal(residual_tilt_rad=0.02 if i % 2 else 0.0)
-        t.step(anna.says(Heartbeat()), anna.says(tilted), dt_ns=200 * MS)
-    notices = [e.text for e in t.events if isinstance(e, Notice)]
-    assert len(notices) == 3
-    assert "more of these" not in notices[0]
-    assert "(12 more of these meanwhile)" in notices[1]
 
 
 def test_advice_that_changes_with_every_measurement_is_told_every_five_seconds() -> None:
@@ -332,12 +312,6 @@ def test_a_large_correction_is_announced_and_comes_in_one_go() -> None:
     assert 2 * SECOND <= when - told_ns <= 2 * SECOND + 20 * MS
     assert alignment.T_world_tracking.p[0] == 1.05
     assert len(notices(t)) == 1
-
-
-def test_a_large_turn_is_large() -> None:
-    t, anna = settled()
-    t.step(anna.says(at(1.0, math.radians(2.1))))
-    assert ["off by 2.1 degrees: the scene moves" in e.text for e in t.since(Notice)] == [True]
 
 
 def test_while_engaged_a_correction_waits_and_is_told_once() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.protocol.client_messages import Align, Bye, Heartbeat, MoveAnchor, PlaceAlignment, TrackingEpoch
+from iris_session.protocol.client_messages import Align, Bye, Heartbeat, MoveAnchor, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import AlignmentAlarm, CrossChecked, Entry, Lost, SessionResumed
 from iris_session.protocol.server_messages import (
@@ -90,18 +90,6 @@ def test_a_stopped_run_keeps_what_is_in_force_whatever_is_seen() -> None:
     t.step(anna.says(proposal(refused=True, advice="closer")))
     assert t.since(AlignmentChanged) == t.since(Notice) == []
     assert not report(t, anna).running
-
-
-def test_measurements_count_again_after_a_placement() -> None:
-    t = Table(CONFIG)
-    anna = t.operator()
-    t.step(t.host(PlaceAlignment(1, anna.id, Pose((4.0, 0.0, 0.0), IDENTITY.q))))
-    t.step(anna.says(shifted(1.5)))
-    assert t.since(AlignmentChanged) == []
-    anna.asks(Align(1, "start"))
-    t.step()
-    t.step(anna.says(shifted(4.0)))
-    assert [(e.alignment.kind, e.alignment.offset) for e in t.since(AlignmentChanged)] == [("measured", False)]
 
 
 # --- anchors ----------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, Control, Grasp, Heartbeat, Release
+from iris_session.protocol.client_messages import Acquire, Control, Grasp, Release
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Lost
 from iris_session.protocol.server_messages import EngagementChanged, Feedback, ObjectGrasped
@@ -61,14 +61,6 @@ def test_150_ms_without_a_counted_sample_holds_until_clutched_again() -> None:
     assert t.hold() == "stale"
     op.engage("left")
     assert t.command().sources[0].engagement == 2
-
-
-def test_headset_taken_off_holds() -> None:
-    t = Table()
-    op = t.operator("left")
-    op.engage("left")
-    op.does(Heartbeat(worn=False))
-    assert t.hold() == "not_worn"
 
 
 def test_any_device_that_says_not_worn_holds_everything_of_its_wearer() -> None:

@@ -104,16 +104,6 @@ def test_what_is_no_handover(between: str) -> None:
     assert handovers(t) == []
 
 
-def test_receiver_that_only_tried_is_forgotten() -> None:
-    t = Table(robots=(robot("left"), robot("right"), robot("third")))
-    contact(t, 200, "left")
-    contact(t, 50, "left", "left right")
-    contact(t, 100, "left")
-    contact(t, 50, "left third")
-    contact(t, 200, "third")
-    assert [(h.giver, h.receiver, h.duration_ns) for h in handovers(t)] == [("left", "third", 40 * MS)]
-
-
 ARMS = ("a1", "a2", "b1", "b2")
 
 

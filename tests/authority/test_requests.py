@@ -93,16 +93,6 @@ def test_a_waiting_pair_takes_nothing_and_is_not_overtaken() -> None:
     assert [lease.target for lease in bert.replies()[0].leases] == ["left", "right"]
 
 
-def test_a_robot_got_otherwise_ends_the_wait() -> None:
-    t = Table()
-    anna, bert = t.operator("left"), t.join()
-    bert.does(Acquire(3, ("left",), wait=True))
-    bert.does(Acquire(4, ("right",)))
-    assert [(r.request_id, r.ok) for r in bert.replies()] == [(4, True), (3, False)]
-    anna.does(Release())
-    assert t.hold("left") == "no_lease"
-
-
 def test_queue_is_bounded_and_one_place_each() -> None:
     t = Table(AuthorityConfig(max_queue=1))
     t.operator("left")
@@ -241,17 +231,6 @@ def test_consent_refused_by_a_director_times_out_or_resolves_itself() -> None:
         if anna.replies():
             break
     assert anna.replies()[0].denial.reason == "consent_refused"  # type: ignore[union-attr]
-
-
-def test_one_request_for_consent_each_and_it_is_answered_once() -> None:
-    t = with_mode("request")
-    anna, bert, carl = t.operator("left"), t.operator("right"), t.join()
-    carl.does(Acquire(1, ("left",)))
-    assert carl.denied(Acquire(2, ("right",))) == "consent_pending"
-    carl.does(Acquire(3, ("right", "left"), wait=True))
-    assert [r.request_id for r in carl.replies()] == [3]
-    t.step(anna.says(Release(7)), bert.says(Release(8)))
-    assert [(r.request_id, r.ok) for r in carl.replies()] == [(1, True)]
 
 
 # --- takeover ---
@@ -479,15 +458,6 @@ def test_open_clutches_far_apart_are_no_idle_time() -> None:
         human.sends("left")
         drive_on(t, agent, SECOND, human)
     assert t.last(Intervention).active
-
-
-def test_a_director_gives_the_robot_of_a_lost_human_back() -> None:
-    t, agent, human = intervened()
-    boss = t.join("director")
-    t.step(human.says(Lost()))
-    assert boss.asks(Assign(1, ("left",), agent.id)).ok
-    assert not t.last(Intervention).active
-    assert t.last(LeaseChanged).lease.holder == agent.id
 
 
 @pytest.mark.parametrize("stop", ["pause", "estop"])
@@ -734,17 +704,6 @@ def test_it_ends_with_the_lease() -> None:
     anna.acquire("left")
     anna.engage("left")
     assert t.command().scale == 1.0, "nor does it come back to whoever had set it"
-
-
-def test_it_outlives_a_lost_connection_with_the_lease() -> None:
-    t = Table()
-    anna = t.operator("left", devices=("controller/right",))
-    anna.does(SetScale(1, ("left",), 0.2))
-    t.step(anna.says(Lost("silent")))
-    assert t.last(LeaseChanged).lease.scale == 0.2
-    t.join(key_id="key1", resume_of=anna.id)
-    assert t.last(LeaseChanged).lease.holder == anna.id
-    assert lease_scale(t) == 0.2
 
 
 def test_leases_of_one_request_are_one_event() -> None:

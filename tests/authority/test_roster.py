@@ -7,11 +7,10 @@ from typing import Any
 import pytest
 
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, Align, Bye, GetSnapshot, Heartbeat, Release
+from iris_session.protocol.client_messages import Acquire, Bye, GetSnapshot, Heartbeat, Release
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.entries import Entry, FrontRestarted, Join, Lost, SessionResumed
 from iris_session.protocol.server_messages import (
-    AlignmentRun,
     LeaseChanged,
     ParticipantChanged,
     ParticipantJoined,
@@ -178,36 +177,12 @@ def test_resume_fences_old_tokens_and_drops_the_old_connection() -> None:
     assert t.command().kind == "pose"
 
 
-def test_resume_after_lost_keeps_the_lease() -> None:
-    t = Table()
-    anna = t.operator("left")
-    t.step(anna.says(Lost()))
-    again = rejoin(t, anna)
-    assert t.last(LeaseChanged).lease.expires_ns == 0
-    t.wait(2 * SECOND)
-    assert again.id == anna.id
-    assert t.hold() == "rearm"
-
-
 @pytest.mark.parametrize(("run", "kept"), [("run:a", True), ("run:b", False), ("other", False)])
 def test_alignment_survives_a_resume_only_within_one_run_of_the_app(run: str, kept: bool) -> None:
     t = Table()
     anna = t.operator("left", capabilities=("run:a",))
     rejoin(t, anna, capabilities=(run,))
     assert (t.last(ParticipantJoined).participant.alignment is not None) == kept
-
-
-@pytest.mark.parametrize(("run", "running"), [("run:a", False), ("run:b", True)])
-def test_a_stopped_alignment_run_is_told_to_a_new_front_and_ends_with_the_run_of_the_app(
-    run: str, running: bool
-) -> None:
-    """Else nobody would measure who starts the app anew: there is nothing in force that could be kept."""
-    t = Table()
-    anna = t.operator("left", capabilities=("run:a",))
-    t.step(anna.says(Align(1, "stop")))
-    rejoin(t, anna, capabilities=(run,))
-    assert t.last(AlignmentRun).running is running
-    assert t.last(AlignmentRun).participant == anna.id
 
 
 def test_resume_needs_the_same_key_and_role() -> None:

@@ -58,13 +58,6 @@ def test_desks_and_policies_need_no_alignment(role: str, device: str) -> None:
     assert t.command().kind == "pose"
 
 
-def test_presence_needs_no_alignment() -> None:
-    t = Table()
-    anna = t.join("observer", alignment="not_needed", devices=("head", "controller/right"))
-    anna.sends()
-    assert [item.participant for item in t.decision.presence] == [anna.id]
-
-
 @pytest.mark.parametrize("entry", ["operator", "controller/right", "key:key1"])
 def test_the_configuration_decides_who_may_be_unaligned(entry: str) -> None:
     t = Table(AuthorityConfig(unaligned=(entry,)))
@@ -277,18 +270,6 @@ def test_nothing_sent_in_between_makes_a_jump_possible(between: dict[str, Any]) 
     assert t.last(SamplesRejected).reason == "too_fast"
     op.engage("left")
     assert t.command().kind == "pose"
-
-
-def test_joints_of_another_number_do_not_make_a_jump_possible() -> None:
-    t = Table()
-    leader = t.join("leader", alignment="not_needed")
-    leader.acquire("left")
-    joints: dict[str, Any] = {"device": "joints", "kind": "joints", "pose": None}
-    leader.engage("left", **joints, q=(0.1,) * 7)
-    leader.sends(**joints, q=(0.0,) * 3)
-    leader.sends("left", **joints, q=(1.5,) * 7, clutch=True)
-    assert t.last(SamplesRejected).reason == "too_fast"
-    assert t.hold() == "rejected"
 
 
 def test_a_hand_that_was_not_tracked_for_a_while_may_be_elsewhere() -> None:

@@ -326,14 +326,6 @@ def test_episode_life() -> None:
     assert t.decision.reset
 
 
-@pytest.mark.parametrize(("action", "state"), [("failure", "failure"), ("discard", "discarded")])
-def test_episode_verdicts(action: str, state: str) -> None:
-    t, op, _ = playing()
-    op.asks(Episode(1, "start"))
-    op.asks(Episode(1, action))
-    assert t.last(EpisodeChanged).state == state
-
-
 def test_release_acts_before_an_acquire_that_was_sent_earlier() -> None:
     t = Table()
     other = t.join()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -107,12 +105,6 @@ def test_twists_are_integrated_within_their_limits() -> None:
     assert not clutch.integrate_twists(state, 0.002, 1.0, 2.0, None)
 
 
-def test_scales_are_kept_within_limits() -> None:
-    assert clutch.clip_scale(100.0, 0.1, 5.0) == 5.0
-    assert clutch.clip_scale(-1.0, 0.1, 5.0) == 0.1
-    assert clutch.clip_scale(math.nan, 0.1, 5.0) == 1.0
-
-
 # --- leader robots ---
 
 
@@ -160,7 +152,7 @@ def test_a_leader_that_is_far_is_caught_up_with_slowly() -> None:
 
 def test_joint_limits_bound_the_leader() -> None:
     made = rig()
-    for k in range(3000):
+    for k in range(1500):
         made.step(decision([lead(made, np.full(7, 9.0), new=k % 7 == 0)]))
     assert (made.data.ctrl <= made.model.jnt_range[:, 1]).all()
 
@@ -171,14 +163,6 @@ def test_samples_of_the_wrong_length_are_refused(sizes: tuple[int, int]) -> None
     made.step(decision([lead(made, HOME)]))
     with pytest.raises(ControlError, match=f"has {sizes[0]} joints; it must have 7"):
         made.step(decision([lead(made, np.zeros(sizes[0]), np.zeros(sizes[1]) if sizes[1] else None)]))
-
-
-def test_the_ramp_has_hysteresis() -> None:
-    from iris_session.control.clutch import is_ramping
-
-    config = ControlConfig()
-    assert [is_ramping(False, 0.19, config), is_ramping(False, 0.21, config)] == [False, True]
-    assert [is_ramping(True, 0.19, config), is_ramping(True, 0.01, config)] == [True, False]
 
 
 def test_a_leader_does_not_take_the_follower_out_of_its_workspace() -> None:

@@ -15,7 +15,7 @@ from iris_session.control import ControlConfig, ControlError, Controller
 from iris_session.control.arm_model import read_site_pose
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec
-from iris_session.protocol.steps import Command, FixedView, ObjectCommand
+from iris_session.protocol.steps import Command, ObjectCommand
 from tests.control.rigs import (
     PANDA_HOME,
     Rig,
@@ -143,7 +143,7 @@ def test_a_twist_moves_at_its_speed_and_stops_with_hold() -> None:
 def test_a_twist_target_does_not_run_away_from_an_arm_that_cannot_follow() -> None:
     rig = panda()
     command = twist(rig, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    for _ in range(3000):
+    for _ in range(1500):
         rig.step(decision([command]))
     state = rig.controller._states[0]
     assert state.latch is not None
@@ -167,28 +167,6 @@ def test_an_absolute_target_is_reached_at_bounded_speed_from_one_sample() -> Non
     assert 0.02 < rig.target()[0][1] - start[0][1] < 0.3 * 0.25 + 0.02
     drive(rig, old(rig.source(*goal, absolute=True, device="target")), steps=1000)
     assert apart(rig.controller._ik.compute_tip(0, rig.controller._states[0]), goal)[0] < 3e-5
-
-
-def test_sharing_blends_and_nobody_joining_or_leaving_moves_the_robot() -> None:
-    rig = panda()
-    start = rig.target()
-    alone = rig.source((0.0, 0.0, 0.0), participant="a")
-    drive(rig, alone, steps=5)
-
-    def both(a: float, b: float, steps: int) -> None:
-        one = rig.source((a, 0.0, 0.0), participant="a", weight=0.5)
-        two = rig.source((9.0, b, 0.0), participant="b", weight=0.5)
-        drive(rig, one, two, steps=steps)
-
-    for _ in range(20):
-        both(0.0, 3.0, 5)
-    assert apart(start, rig.target())[0] < 1e-12
-    for _ in range(60):
-        both(0.1, 3.1, 7)
-    assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.05, 0.05, 0.0), abs=1e-12)
-    for _ in range(60):
-        drive(rig, rig.source((9.0, 3.1, 0.0), participant="b"), steps=7)
-    assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.05, 0.05, 0.0), abs=1e-12)
 
 
 def test_shared_twists_are_weighted() -> None:
@@ -335,15 +313,3 @@ def test_a_snapshot_of_other_robots_is_refused() -> None:
         two.controller.restore(one.controller.snapshot())
     with pytest.raises(msgspec.DecodeError):
         two.controller.restore(b"\x00")
-
-
-def test_no_robots_at_all() -> None:
-    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
-    data = mujoco.MjData(model)
-    controller = Controller(model, [])
-    controller.reset(data)
-    controller.begin(0, 1, decision([]), FixedView())
-    controller.tick(data)
-    assert controller.get_status() == ()
-    assert controller.get_targets() == {}
-    controller.restore(controller.snapshot())

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from anchors.pose import PoseTuple, quat_from_rotvec
+from iris_session.protocol.steps import FixedView
 from tests.control.rigs import (
     PANDA_HOME,
     Rig,
@@ -15,6 +16,8 @@ from tests.control.rigs import (
     aloha_robots,
     apart,
     decision,
+    hold_command,
+    old,
     panda_model,
     panda_spec,
     pose_command,
@@ -31,7 +34,7 @@ def panda(kind: str) -> Rig:
 
 def aloha() -> Rig:
     rig = Rig(aloha_model(), aloha_robots())
-    rig.hold(2500)
+    rig.hold(1500)
     return rig
 
 
@@ -45,14 +48,8 @@ def drag(rig: Rig, steps: int, engagement: int, speed: float = 0.15) -> None:
             q = quat_from_rotvec((0.0, 0.2 * math.sin(t), 0.3 * math.sin(1.3 * t)))
             commands = [pose_command(r.name, rig.source(p, q, engagement=engagement)) for r in rig.robots]
         else:
-            commands = [pose_command(c.robot, *(_old(s) for s in c.sources)) for c in commands]
+            commands = [pose_command(c.robot, *(old(s) for s in c.sources)) for c in commands]
         rig.step(decision(commands))
-
-
-def _old(source):  # type: ignore[no-untyped-def]
-    from tests.control.rigs import old
-
-    return old(source)
 
 
 def engage_jump(rig: Rig, engagement: int) -> tuple[float, float]:
@@ -85,9 +82,6 @@ def panda_after_one_more_hold(rig: Rig) -> bytes:
     """`ctrl` that the same state gets from one more step of hold; the rig itself is left as it was."""
     snapshot, ctrl = rig.controller.snapshot(), rig.data.ctrl.copy()
     held = rig.data.ctrl.copy()
-    from iris_session.protocol.steps import FixedView
-    from tests.control.rigs import hold_command
-
     rig.controller.begin(0, 1, decision([hold_command("panda")]), FixedView())
     rig.controller.tick(rig.data)
     held[:] = rig.data.ctrl
@@ -139,7 +133,7 @@ def test_no_drift_in_hold_after_a_drag(make: str, bound: float) -> None:
     drag(rig, 700, 1)
     rig.hold(2000)
     start, ctrl = [rig.tip(i) for i in range(len(rig.robots))], rig.data.ctrl.copy()
-    rig.hold(5000)  # 10 s
+    rig.hold(2500)  # 5 s
     for i, tip in enumerate(start):
         assert apart(tip, rig.tip(i))[0] < bound
     if make in ("position", "aloha"):

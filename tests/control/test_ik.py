@@ -140,7 +140,7 @@ def test_crowded_steps_solve_less_and_starve_nobody_if_all_of_them_are() -> None
         assert np.diff([t for t, robot in solves if robot == i]).max() <= 8  # 62 Hz
 
 
-@pytest.mark.parametrize(("n", "tick_s", "interval_ticks"), [(3, 0.01, 1), (4, 0.005, 2), (12, 0.002, 5)])
+@pytest.mark.parametrize(("n", "tick_s", "interval_ticks"), [(4, 0.005, 2), (12, 0.002, 5)])
 def test_long_ticks_and_many_robots_starve_nobody(n: int, tick_s: float, interval_ticks: int) -> None:
     """A robot that is solved less often than its device sends moves slower than its hand."""
     model, robots = panda_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(n)])

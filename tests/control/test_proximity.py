@@ -81,15 +81,6 @@ def test_leaders_that_send_at_every_step_do_not_lift_the_bound() -> None:
     assert lean(free, 700) < 0.0, "without the bound they would have collided"
 
 
-def test_without_the_margin_they_collide() -> None:
-    """The test above can fail: the same push with the check off ends in contact."""
-    model, robots = panda_arms(*FACING)
-    rig = Rig(model, robots, ControlConfig(proximity_margin=0.0), home=PANDA_HOME)
-    rig.hold(200)
-    push(rig, 0.2, 600)
-    assert gap(rig, ProximityLimiter(model, robots, ControlConfig())) < 0.005
-
-
 SLIDERS = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/>
 <body name="a"><body><joint name="a" type="slide" axis="1 0 0"/>
   <geom size=".1" pos="0 0 1"/><site name="a" pos="0 0 1"/>

@@ -115,13 +115,3 @@ def test_every_kind_of_command_was_in_such_a_session(model: mujoco.MjModel) -> N
     assert kinds == {"hold", "pose", "twist", "joints"}
     assert np.isfinite(rig.data.qpos).all()
     assert rig.controller.get_status()[0].applied is not None
-
-
-def test_a_lost_piece_of_state_would_be_seen(model: mujoco.MjModel) -> None:
-    """The property above can fail: one joint goal off by the smallest amount changes what is observed later."""
-    journal = session(make(model), 11, 80)
-    honest, cheating = make(model), make(model)
-    play(honest, journal[:30])
-    play(cheating, journal[:30])
-    cheating.controller._joints.goal[2] += 1e-12
-    assert play(honest, journal[30:]) != play(cheating, journal[30:])
