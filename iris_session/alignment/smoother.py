@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstimator
 from anchors.constellation import Constellation
 from anchors.controller import controller_covariance
+from anchors.persistent import covariance_at_anchor
 from anchors.pose import (
+    IDENTITY_QUAT,
     PoseTuple,
     Vec3,
     apply,
@@ -187,7 +189,8 @@ def fuse_estimates(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstim
     p_b = apply(b.T_world_tracking, p_tracking)
     turn = quat_to_rotvec(quat_mul(b.T_world_tracking[1], quat_conj(a.T_world_tracking[1])))
     x = np.array([*(p_b[i] - a.pivot_world[i] for i in range(3)), *turn])
-    C_a, C_b = np.reshape(a.covariance, (6, 6)), _move_covariance(b, p_b)
+    C_a = np.reshape(a.covariance, (6, 6))
+    C_b = np.reshape(covariance_at_anchor(b.covariance, b.pivot_world, (p_b, IDENTITY_QUAT)), (6, 6))
     gain = C_a @ np.linalg.inv(C_a + C_b)
     step, C = gain @ x, C_a - gain @ C_a
     misfit = float(x @ np.linalg.solve(C_a + C_b, x))
@@ -209,14 +212,6 @@ def fuse_estimates(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstim
         advice=a.advice or b.advice,
         moved=tuple(sorted({*a.moved, *b.moved})),
     )
-
-
-def _move_covariance(e: AlignmentEstimate, p_world: Vec3) -> Array:
-    """Return the covariance (6, 6) of an estimate at another point: d(point) = d(pivot) + rot x (point - pivot)."""
-    x, y, z = (p_world[i] - e.pivot_world[i] for i in range(3))
-    J = np.eye(6)
-    J[:3, 3:] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(J @ np.reshape(e.covariance, (6, 6)) @ J.T)
 
 
 def add_observation(estimator: AlignmentEstimator, look: RecordedObservation, capture_ns: int) -> bool:
