@@ -13,7 +13,7 @@ specification.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Final, Protocol
+from typing import Annotated, Final
 
 import msgspec
 
@@ -352,22 +352,6 @@ class SceneError(IrisError, ValueError):
     """The bytes are not a scene specification that this package reads."""
 
 
-class Identified(Protocol):
-    """Anything with an id."""
-
-    @property
-    def id(self) -> int: ...
-
-
-class Placed(Protocol):
-    """Anything on a body."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def body(self) -> int: ...
-
-
 _encoder: Final = msgspec.msgpack.Encoder()
 _decode: Final = make_decoder(SceneSpec)
 
@@ -462,14 +446,14 @@ _MOST: Final = {
 }
 
 
-def _check_ids(what: str, things: Sequence[Identified]) -> set[int]:
+def _check_ids(what: str, things: Sequence[Body | Site | Visual]) -> set[int]:
     found = {thing.id for thing in things}
     if len(found) != len(things):
         raise SceneError(f"two {what} have the same id")
     return found
 
 
-def _check_bodies(what: str, things: Sequence[Placed], bodies: set[int]) -> None:
+def _check_bodies(what: str, things: Sequence[Visual | Site | Light | Camera], bodies: set[int]) -> None:
     for thing in things:
         if thing.body not in bodies:
             raise SceneError(f"{what} {thing.name!r} is on body {thing.body}: no such body")
