@@ -34,7 +34,7 @@ def panda(kind: str) -> Rig:
 
 def aloha() -> Rig:
     rig = Rig(aloha_model(), aloha_robots())
-    rig.hold(1500)
+    rig.hold(2500)
     return rig
 
 
