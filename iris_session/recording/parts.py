@@ -28,6 +28,7 @@ from iris_session.rrd.rerun_tool import is_readable
 from iris_session.rrd.salvage import salvage
 
 _T = TypeVar("_T")
+Entities = str | Sequence[str]
 #: Maximum number of lines in `damage`: a file may be damaged in any number of places.
 MOST_DAMAGE: Final = 200
 MORE_DAMAGE: Final = "and more of it is damaged than is listed here"
@@ -41,7 +42,7 @@ class RecordingParts:
     Attributes that are not described here are those of `Recording`.
 
     Attributes:
-        readable: Files that the parts are read from: a temporary copy of a damaged part.
+        readable_files: Files that the parts are read from, in order: a temporary copy of a damaged part.
     """
 
     def __init__(self, files: Sequence[str]) -> None:
@@ -53,7 +54,7 @@ class RecordingParts:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.files: list[str] = []
         self.unreadable_files: list[str] = []
-        self.readable: list[str] = []
+        self.readable_files: list[str] = []
         self.damage: list[str] = []
         self.missing: list[str] = []
         self.notes: list[str] = []
@@ -74,15 +75,15 @@ class RecordingParts:
             self._folder.cleanup()
             self._folder = None
 
-    def iterate_unique(
-        self, entities: str | Sequence[str], decode: Callable[[Any], Iterator[_T]], key: Callable[[_T], Hashable]
+    def _iterate_unique(
+        self, entities: Entities, decode: Callable[[Any], Iterator[_T]], key: Callable[[_T], Hashable]
     ) -> Iterator[_T]:
         """Yield the items of all parts, each once: a part repeats the end of the one before, and a file that Rerun's
         tools have written may hold several parts.
         """
         newest: deque[Hashable] = deque()
         seen: set[Hashable] = set()
-        for _, item in self.iterate(entities, decode):
+        for _, item in self._iterate(entities, decode):
             name = key(item)
             if name in seen:
                 continue
@@ -92,7 +93,7 @@ class RecordingParts:
             newest.append(name)
             yield item
 
-    def iterate(self, entities: str | Sequence[str], decode: Callable[[Any], Iterator[_T]]) -> Iterator[tuple[int, _T]]:
+    def _iterate(self, entities: Entities, decode: Callable[[Any], Iterator[_T]]) -> Iterator[tuple[int, _T]]:
         """Yield part number and item. Undecodable items are skipped with the rest of their chunk, see `damage`."""
         for i, pieces in self._iterate_spans(entities):
             try:
@@ -101,13 +102,13 @@ class RecordingParts:
                 place = f"{os.path.basename(self.files[i])}: {get_entity(pieces[0])}"
                 self._record_damage(f"{place} holds something damaged, which is left out: {_format_error(error)}")
 
-    def count_rows(self, entity: str) -> int:
+    def _count_rows(self, entity: str) -> int:
         """Return the number of rows of an entity; those that are repeated or split by Rerun's tools count again."""
         return sum(piece.num_rows for _, pieces in self._iterate_spans(entity) for piece in pieces)
 
-    def _iterate_spans(self, entities: str | Sequence[str]) -> Iterator[tuple[int, list[Any]]]:
+    def _iterate_spans(self, entities: Entities) -> Iterator[tuple[int, list[Any]]]:
         """Yield part number (from 0) and the record batches of some rows of one entity, over all parts in order."""
-        for i, path in enumerate(self.readable):
+        for i, path in enumerate(self.readable_files):
             for pieces in group_spans(chunk.to_record_batch() for chunk in rrd_file.read_chunks(path, entities)):
                 yield i, pieces
 
@@ -119,7 +120,7 @@ class RecordingParts:
                 self.notes.append(f"{os.path.basename(path)}: nothing was written into it")
                 return
             if self.is_being_written:
-                self.readable.append(self._copy_start(path, found.good_bytes))
+                self.readable_files.append(self._copy_start(path, found.good_bytes))
                 self.files.append(path)
                 return
             if found.cut:
@@ -133,7 +134,7 @@ class RecordingParts:
         except OSError as error:
             self._record_damage(f"{path} cannot be read: {error.strerror or error}")
             return
-        self.readable.append(readable)
+        self.readable_files.append(readable)
         self.files.append(path)
 
     def _copy_start(self, path: str, n_bytes: int) -> str:
@@ -177,7 +178,7 @@ class RecordingParts:
 
     def _iterate_blobs(self, entity: str) -> Iterator[tuple[int, bytes, bool]]:
         """Yield part, header and whether its bytes are as written. It is near the beginning, so reading is short."""
-        for i, path in enumerate(self.readable):
+        for i, path in enumerate(self.readable_files):
             chunk = next(rrd_file.read_chunks(path, entity), None)
             if chunk is not None:
                 with suppress(*UNREADABLE):
@@ -242,7 +243,7 @@ class RecordingParts:
         for i, blob, intact in reversed(list(self._iterate_blobs(paths.HEADER))):
             if intact and blob_root(blob) != root:
                 self._record_damage(f"{os.path.basename(self.files[i])} is of another session, and left out")
-                del self.files[i], self.readable[i]
+                del self.files[i], self.readable_files[i]
 
 
 def _is_readable(path: str, found: rrd_file.Scan) -> bool:

@@ -50,7 +50,7 @@ _OUTLINE: Final = (
 )
 
 
-class Recording:
+class Recording(RecordingParts):
     """A recording open for reading, all parts in order. Make it with `Recording.open`.
 
     Use it as a context manager, or call `close`: damaged parts have temporary copies. All times are session time in
@@ -76,13 +76,9 @@ class Recording:
     """
 
     def __init__(self, files: list[str]) -> None:
-        self._parts = parts = RecordingParts(files)
-        self.header, self.root = parts.header, parts.root
-        self.files, self.unreadable_files = parts.files, parts.unreadable_files
-        self.damage, self.missing, self.notes, self.cuts = parts.damage, parts.missing, parts.notes, parts.cuts
-        self.is_being_written = parts.is_being_written
+        super().__init__(files)
         try:
-            marks = list(parts.iterate((paths.HEADER, paths.END), _decode_end))
+            marks = list(self._iterate((paths.HEADER, paths.END), _decode_end))
         except BaseException:
             self.close()
             raise
@@ -98,11 +94,6 @@ class Recording:
     def finished(self) -> bool:
         """True if the recorder closed the last part; otherwise the last 0.25 s of the session may be missing."""
         return self.end is not None
-
-    @property
-    def readable_files(self) -> tuple[str, ...]:
-        """Files that the parts are read from, in order, until `close`: a temporary copy of a damaged part."""
-        return tuple(self._parts.readable)
 
     @classmethod
     def open(cls, path: str | Path, *, warn: bool = True) -> Self:
@@ -163,24 +154,24 @@ class Recording:
             NotARecordingError: A file can no longer be read.
         """
         if after is None:
-            return self._parts.iterate_unique(paths.ROWS, batches.decode_rows, lambda row: row.chain)
+            return self._iterate_unique(paths.ROWS, batches.decode_rows, lambda row: row.chain)
 
         def later(batch: Any) -> Iterator[JournalRow]:
             return batches.decode_rows(batch) if max(batches.read_index(batch, paths.STEP)) > after else iter(())
 
-        return (row for row in self._parts.iterate_unique(paths.ROWS, later, lambda row: row.chain) if row.step > after)
+        return (row for row in self._iterate_unique(paths.ROWS, later, lambda row: row.chain) if row.step > after)
 
     def count_rows(self) -> int:
         """Return the number of journal rows in the files, for progress reports; repeated rows count again."""
-        return self._parts.count_rows(paths.ROWS)
+        return self._count_rows(paths.ROWS)
 
     def count_samples(self) -> int:
         """Return the number of raw messages in the files, for progress reports."""
-        return self._parts.count_rows(paths.SAMPLES)
+        return self._count_rows(paths.SAMPLES)
 
     def keyframes(self) -> Iterator[Keyframe]:
         """Yield the keyframes in order of steps, each once."""
-        return self._parts.iterate_unique(
+        return self._iterate_unique(
             paths.KEYFRAMES, batches.decode_keyframes, lambda keyframe: (keyframe.step, keyframe.chain)
         )
 
@@ -198,12 +189,12 @@ class Recording:
         """
         # By steps, not times: the state of the row before a scene is later than that row, by the duration of the step.
         # A scene that was loaded before the first row has time 0.
-        scenes = (scene for _, scene in self._parts.iterate(paths.MODELS, batches.decode_models))
+        scenes = (scene for _, scene in self._iterate(paths.MODELS, batches.decode_models))
         loaded = [(scene.step if scene.session_time else -1, scene.bodies) for scene in scenes]
         loaded.sort(key=lambda scene: scene[0])
         before = [step for step, _ in loaded]  # for each scene, the newest step before it was loaded
         bodies = [self.header.bodies, *(bodies for _, bodies in loaded)]
-        for state in self._parts.iterate_unique(paths.STATE, batches.decode_states, lambda state: state.session_time):
+        for state in self._iterate_unique(paths.STATE, batches.decode_states, lambda state: state.session_time):
             yield state._replace(bodies=bodies[bisect_left(before, state.step)])
 
     def model(self, model_hash: str) -> bytes:
@@ -219,7 +210,7 @@ class Recording:
             LookupError: The recording holds no such model.
             zlib.error: The stored model is damaged.
         """
-        for _, scene in self._parts.iterate(paths.MODELS, batches.decode_models):
+        for _, scene in self._iterate(paths.MODELS, batches.decode_models):
             if scene.model_hash == model_hash:
                 return unpack_model(scene.model)
         raise LookupError(f"the recording does not hold the model {model_hash[:12]} of a scene that was loaded")
@@ -233,7 +224,7 @@ class Recording:
         Raises:
             NotARecordingError: A file can no longer be read.
         """
-        return self._parts.iterate_unique(paths.ASSET_SCENES, batches.decode_asset_scenes, lambda scene: scene)
+        return self._iterate_unique(paths.ASSET_SCENES, batches.decode_asset_scenes, lambda scene: scene)
 
     def assets(self) -> Iterator[tuple[str, bytes]]:
         """Yield hash and bytes of the assets of the scenes that are whole, each once, in one pass over the files.
@@ -242,7 +233,7 @@ class Recording:
             NotARecordingError: A file can no longer be read.
         """
         joiner = AssetJoiner()
-        for _, piece in self._parts.iterate(paths.ASSETS, batches.decode_asset_pieces):
+        for _, piece in self._iterate(paths.ASSETS, batches.decode_asset_pieces):
             data = joiner.add(piece)
             if data is not None:
                 yield piece.address, data
@@ -267,20 +258,18 @@ class Recording:
 
     def events(self) -> Iterator[Event]:
         """Yield the events of the shared history in order of `event_seq`, each once."""
-        return self._parts.iterate_unique(paths.EVENTS, batches.decode_events, lambda event: event.event_seq)
+        return self._iterate_unique(paths.EVENTS, batches.decode_events, lambda event: event.event_seq)
 
     def denials(self) -> Iterator[DenialRecord]:
         """Yield the denials that participants received, in order, each once."""
         return (
             record
-            for _, record in self._parts.iterate_unique(
-                paths.DENIALS, batches.numbered_denial_decoder(), lambda pair: pair
-            )
+            for _, record in self._iterate_unique(paths.DENIALS, batches.numbered_denial_decoder(), lambda pair: pair)
         )
 
     def samples(self) -> Iterator[RawSample]:
         """Yield the raw messages of clients, undecoded, in the order of receipt."""
-        return (sample for _, sample in self._parts.iterate(paths.SAMPLES, batches.decode_samples))
+        return (sample for _, sample in self._iterate(paths.SAMPLES, batches.decode_samples))
 
     def clouds(self, stream: str = "") -> Iterator[RecordedCloud]:
         """Yield the recorded frames of point clouds, exactly as they were sent.
@@ -313,11 +302,11 @@ class Recording:
         Raises:
             NotARecordingError: A file can no longer be read.
         """
-        return (one for _, one in self._parts.iterate(f"{paths.STREAMS}/{stream or '**'}", batches.decode_streams))
+        return (one for _, one in self._iterate(f"{paths.STREAMS}/{stream or '**'}", batches.decode_streams))
 
     def _media(self, folder: str, stream: str, decode: Callable[[Any], Iterator[_Frame]]) -> Iterator[_Frame]:
         entity = f"{folder}/{stream or '**'}"
-        return self._parts.iterate_unique(entity, decode, lambda frame: (frame.stream, frame.seq, frame.capture_ns))
+        return self._iterate_unique(entity, decode, lambda frame: (frame.stream, frame.seq, frame.capture_ns))
 
     def metrics(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Return the plotted values by name.
@@ -330,7 +319,7 @@ class Recording:
             NotARecordingError: A file can no longer be read.
         """
         found: dict[str, tuple[list[int], list[float]]] = {}
-        for _, scalar in self._parts.iterate(f"{paths.METRICS}/**", batches.decode_scalars):
+        for _, scalar in self._iterate(f"{paths.METRICS}/**", batches.decode_scalars):
             times, values = found.setdefault(scalar.entity.removeprefix(paths.METRICS + "/"), ([], []))
             times.append(scalar.session_time)
             values.append(scalar.value)
@@ -347,7 +336,7 @@ class Recording:
         Raises:
             NotARecordingError: A file can no longer be read.
         """
-        return (item for _, item in self._parts.iterate_unique(_OUTLINE, _outline_decoder(), lambda pair: pair[0]))
+        return (item for _, item in self._iterate_unique(_OUTLINE, _outline_decoder(), lambda pair: pair[0]))
 
     def changed_spans(self) -> list[str]:
         """Compare the bytes of all parts with the recorder's checksums.
@@ -360,18 +349,14 @@ class Recording:
             NotARecordingError: A file can no longer be read.
         """
         marks: dict[int, list[rrd_file.Mark]] = {}
-        for part, mark in self._parts.iterate(paths.MARKS, batches.decode_marks):
+        for part, mark in self._iterate(paths.MARKS, batches.decode_marks):
             marks.setdefault(part, []).append(mark)
-        closed = {part for part, _ in self._parts.iterate(paths.END, batches.decode_ends)}
+        closed = {part for part, _ in self._iterate(paths.END, batches.decode_ends)}
         return [
             f"{os.path.basename(self.files[part])}: {line}"
             for part, noted in marks.items()
             for line in rrd_file.changed_spans(self.files[part], noted, closed=part in closed)
         ]
-
-    def close(self) -> None:
-        """Remove the temporary copies of damaged parts. May be called twice."""
-        self._parts.close()
 
     def __enter__(self) -> Self:
         return self
@@ -394,7 +379,7 @@ def check_assets(recording: Recording) -> AssetCollector:
         NotARecordingError: A file can no longer be read.
     """
     collector = AssetCollector()
-    for _, item in recording._parts.iterate_unique(_ASSETS, _outline_decoder(), lambda pair: pair[0]):
+    for _, item in recording._iterate_unique(_ASSETS, _outline_decoder(), lambda pair: pair[0]):
         collector.add(item)
     return collector
 

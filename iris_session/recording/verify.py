@@ -76,14 +76,10 @@ def verify(
         report.files = [os.path.basename(file) for file in recording.files]
         if header.continues is not None:
             _compare_past(run, header.continues)
-        for line in recording.missing:
-            run.add_problem(Problem(run.last_step, "missing", "file", line))
-        for line in recording.damage:
-            run.add_problem(Problem(run.last_step, "unreadable", "file", line))
-        for line in changed:
-            run.add_problem(Problem(run.last_step, "changed", "file", line))
-        for line in lost:
-            run.add_problem(Problem(run.last_step, "changed", "asset", line))
+        found = (("missing", "file", recording.missing), ("unreadable", "file", recording.damage))
+        for kind, field, lines in (*found, ("changed", "file", changed), ("changed", "asset", lost)):
+            for line in lines:
+                run.add_problem(Problem(run.last_step, kind, field, line))
     report.wall_s = round(time.perf_counter() - began, 3)
     report.ok = not report.problems and report.steps > 0 and not report.unverified_steps
     return report

@@ -253,7 +253,7 @@ class SessionRecording(RecordedFile):
     def _require(self, kind: str, name: str) -> None:
         """Raise `UnknownNameError` at once where only the first scene can have the name."""
         known = self._list_names(kind)
-        if name not in known and next(self._parts.iterate(paths.MODELS, record_batches.decode_models), None) is None:
+        if name not in known and next(self._iterate(paths.MODELS, record_batches.decode_models), None) is None:
             raise UnknownNameError(kind, name, known)
 
     def _read_series(self, target: str, name: str, kind: str, hz: float | None) -> TimeSeries:

@@ -45,9 +45,6 @@ ASSET_SCENES: Final = "/assets/scenes"
 ASSETS: Final = "/assets/data"
 ASSET_FAULTS: Final = "/assets/faults"
 
-_RESUME: Final = re.compile(r"(?P<stem>.*)\.resume(?P<number>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)
-_PART: Final = re.compile(r"(?P<stem>.*)\.part(?P<part>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)
-
 STEP: Final = "step"
 SIM_TIME: Final = "sim_time"
 SESSION_TIME: Final = "session_time"
@@ -56,30 +53,34 @@ WALL_TIME: Final = "wall_time"
 
 def split_part(path: str) -> tuple[str, int]:
     """Split a path made by `part_path` into the path of the first file and the number of the part."""
-    found = _PART.fullmatch(path)
-    return (found["stem"] + (found["suffix"] or ""), int(found["part"])) if found else (path, 1)
+    return _split_number(path, "part")
 
 
 def part_path(path: str, part: int) -> str:
     """Return the file of part `part` (1, 2, ...) of the recording `path`: `session.rrd`, `session.part2.rrd`."""
-    if part == 1:
-        return path
-    stem, dot, suffix = path.rpartition(".")
-    return f"{stem}.part{part}.{suffix}" if dot else f"{path}.part{part}"
+    return _add_number(path, "part", part)
 
 
 def split_resume(path: str) -> tuple[str, int]:
     """Split a path made by `resume_path` into the first file of the session and the number of the recording."""
-    found = _RESUME.fullmatch(path)
-    return (found["stem"] + (found["suffix"] or ""), int(found["number"])) if found else (path, 1)
+    return _split_number(path, "resume")
 
 
 def resume_path(path: str, number: int) -> str:
     """Return the first file of the `number`-th recording of a session that began with `path`: `session.resume2.rrd`."""
+    return _add_number(path, "resume", number)
+
+
+def _split_number(path: str, kind: str) -> tuple[str, int]:
+    found = re.fullmatch(rf"(.*)\.{kind}([1-9][0-9]*)(\.[^./]*)?", path, re.DOTALL)
+    return (found[1] + (found[3] or ""), int(found[2])) if found else (path, 1)
+
+
+def _add_number(path: str, kind: str, number: int) -> str:
     if number == 1:
         return path
     stem, dot, suffix = path.rpartition(".")
-    return f"{stem}.resume{number}.{suffix}" if dot else f"{path}.resume{number}"
+    return f"{stem}.{kind}{number}.{suffix}" if dot else f"{path}.{kind}{number}"
 
 
 def view_path(path: str) -> str:

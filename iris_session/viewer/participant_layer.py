@@ -19,7 +19,7 @@ from iris_session.protocol.server_messages import PresenceItem
 from iris_session.rrd import paths
 from iris_session.viewer.narration import FREE, EventNarration, Rgb, find_colour
 from iris_session.viewer.scene_layer import escape_entity_part
-from iris_session.viewer.timelines import Moment, set_moment
+from iris_session.viewer.timelines import Moment, log_at
 
 #: A device without a pose for so long is not drawn: it is not tracked any more [ns].
 STALE_NS: Final = 250_000_000
@@ -71,9 +71,7 @@ class ParticipantLayer:
     def label_robots(self, bases: Mapping[str, Base], moment: Moment) -> None:
         """Label all robots by their names, without holders. Others have no label any more."""
         if self._bases:
-            set_moment(self._rec, moment)
-            self._rec.log(paths.ROBOTS, rr.Clear(recursive=True), strict=True)
-            self._rec.reset_time()
+            log_at(self._rec, moment, paths.ROBOTS, rr.Clear(recursive=True))
         self._bases = dict(bases)
         for robot in bases if self._is_first else ():
             self.label_robot(robot, "", FREE, moment)
@@ -85,9 +83,7 @@ class ParticipantLayer:
             return
         label = f"{robot}: {holder}" if holder else robot
         point = rr.Points3D([base.position], colors=[colour], radii=[0.01], labels=[label], show_labels=True)
-        set_moment(self._rec, moment)
-        self._rec.log(base.entity, point, strict=True)
-        self._rec.reset_time()
+        log_at(self._rec, moment, base.entity, point)
 
     def draw(self, states: Sequence[StateFrame], moments: Sequence[Moment]) -> list[DeviceRow]:
         """Draw devices that appear in `states`, clear those that are stale, and return the poses that are new."""
@@ -122,24 +118,21 @@ class ParticipantLayer:
         """Draw a box for a head, with an arrow in the direction of view, and a ball for a hand."""
         colours = [find_colour(key[0])]
         solid = rr.components.FillMode.Solid
-        set_moment(self._rec, moment)
+        entity = get_device_entity(*key)
         if key[1] == Device.HEAD:
             box: Any = rr.Boxes3D(
                 half_sizes=[HEAD_HALF_M], colors=colours, labels=[label], show_labels=True, fill_mode=solid
             )
             arrow = rr.Arrows3D(vectors=[(VIEW_M, 0.0, 0.0)], colors=colours, radii=[0.008])
-            self._rec.log(get_device_entity(*key), box, strict=True)
-            self._rec.log(f"{get_device_entity(*key)}/view", arrow, strict=True)
+            log_at(self._rec, moment, entity, box)
+            log_at(self._rec, moment, f"{entity}/view", arrow)
         else:
             ball = rr.Ellipsoids3D(half_sizes=[HAND_HALF_M], colors=colours, fill_mode=solid)
-            self._rec.log(get_device_entity(*key), ball, strict=True)
-        self._rec.reset_time()
+            log_at(self._rec, moment, entity, ball)
 
     def _clear(self, key: _Key, moment: Moment) -> None:
         del self._shown[key]
-        set_moment(self._rec, moment)
-        self._rec.log(get_device_entity(*key), rr.Clear(recursive=True), strict=True)
-        self._rec.reset_time()
+        log_at(self._rec, moment, get_device_entity(*key), rr.Clear(recursive=True))
 
 
 class AnchorLayer:
@@ -181,23 +174,18 @@ class AnchorLayer:
 
     def _draw_axes(self, anchor: str, pose: Pose, moment: Moment) -> None:
         w, x, y, z = pose.q
-        set_moment(self._rec, moment)
         transform = rr.Transform3D(translation=pose.p, quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
         entity = f"{paths.ANCHORS}/{escape_entity_part(anchor)}"
-        self._rec.log(entity, transform, rr.TransformAxes3D(AXES_M), strict=True)
-        self._rec.reset_time()
+        log_at(self._rec, moment, entity, transform, rr.TransformAxes3D(AXES_M))
 
     def _draw_error(self, anchor: str, moment: Moment) -> None:
         label = f"{anchor}: {self._error_m * 1e3:.1f} mm (95 %)" if self._error_m else anchor
         point = rr.Points3D([(0.0, 0.0, 0.0)], colors=[LABEL_COLOUR], radii=[0.003], labels=[label], show_labels=True)
-        parts: list[Any] = [point]
         solid = rr.components.FillMode.Solid
-        size = [self._error_m] * 3
-        parts.append(rr.Ellipsoids3D(half_sizes=[size], colors=[ERROR_COLOUR], fill_mode=solid))
-        set_moment(self._rec, moment)
-        for part, component in zip(("label", "error"), parts, strict=True):
-            self._rec.log(f"{paths.ANCHORS}/{escape_entity_part(anchor)}/{part}", component, strict=True)
-        self._rec.reset_time()
+        ball = rr.Ellipsoids3D(half_sizes=[[self._error_m] * 3], colors=[ERROR_COLOUR], fill_mode=solid)
+        entity = f"{paths.ANCHORS}/{escape_entity_part(anchor)}"
+        log_at(self._rec, moment, f"{entity}/label", point)
+        log_at(self._rec, moment, f"{entity}/error", ball)
 
 
 def get_device_entity(participant: str, device: str) -> str:

@@ -28,7 +28,7 @@ from iris_session.scene import SceneBuildError
 from iris_session.viewer import scene_geometry
 from iris_session.viewer.deformables import DrawnDeformable
 from iris_session.viewer.scene_geometry import SceneReader, VisualShape
-from iris_session.viewer.timelines import Moment, set_moment, to_time_columns
+from iris_session.viewer.timelines import Moment, log_at, set_moment, to_time_columns
 
 #: Number of escaped names that are kept: Rerun takes longer for one than the recorder for all else of a row.
 MAX_ESCAPED: Final = 8192
@@ -87,8 +87,7 @@ class SceneLayer:
         begun = not self._waits and self._source is not None
         self.set_scene(source)
         if begun:
-            set_moment(self._rec, moment)
-            self._rec.log(self._folder, rr.Clear(recursive=True), strict=True)
+            log_at(self._rec, moment, self._folder, rr.Clear(recursive=True))
             self.draw(moment)
 
     def patch_scene(self, assets: SceneAssets, moment: Moment) -> None:

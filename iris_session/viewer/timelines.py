@@ -43,6 +43,13 @@ def set_moment(recording: rr.RecordingStream, moment: Moment) -> None:
     recording.set_time(paths.WALL_TIME, timestamp=np.datetime64(moment.wall_ns, "ns"))
 
 
+def log_at(recording: rr.RecordingStream, moment: Moment, entity: str, *components: Any) -> None:
+    """Log components of an entity at a moment."""
+    set_moment(recording, moment)
+    recording.log(entity, *components, strict=True)
+    recording.reset_time()
+
+
 def to_time_columns(times: NDArray[np.int64]) -> list[Any]:
     """Return the time columns. `times` (4, rows): the fields of `Moment`."""
     step, sim_ns, session_ns, wall_ns = times

@@ -19,7 +19,7 @@ from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
 from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
-from iris_session.viewer.deformables import CHECKERS, DARK, DrawnDeformable, build_checker
+from iris_session.viewer.deformables import DrawnDeformable
 from tests.recording.support import column, read
 from tests.recording.test_writer import frame
 from tests.scene.models import flexes
@@ -172,18 +172,6 @@ def test_invalid_frames_are_rejected_and_counted(world: World) -> None:
     found = world.read()
     assert len(told(found[CLOTH], "Mesh3D:vertex_positions")) == 1
     assert world.writer.drawing.vertices_refused == 3
-
-
-def test_surfaces_without_a_texture_have_a_checker_pattern() -> None:
-    """Fields of two by two vertices on a cloth of a metre that is not at the origin."""
-    n = 2 * CHECKERS
-    x, y = np.meshgrid(np.linspace(3.0, 4.0, n), np.linspace(-1.0, 0.0, n))
-    grey = build_checker(np.stack([x, y, 0.7 + 0 * x], axis=-1).reshape(-1, 3).astype(np.float32))
-    fields = grey[:, 0].reshape(n, n)
-    assert set(fields.ravel().tolist()) == {255, DARK}
-    assert fields[0, :6].tolist() == [255, 255, DARK, DARK, 255, 255]
-    assert fields[2, :6].tolist() == [DARK, DARK, 255, 255, DARK, DARK]
-    assert build_checker(np.zeros((0, 3), np.float32)).shape == (0, 3)
 
 
 @pytest.mark.parametrize("name", ["elements", "position", "plan"])

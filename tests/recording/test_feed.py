@@ -12,7 +12,6 @@ import zmq
 
 from iris_session.journal.feed import BATCH_ROWS, JOURNAL_SHARE
 from iris_session.journal.messages import (
-    BATCH,
     FRAME,
     HEADER,
     Batch,
@@ -21,7 +20,6 @@ from iris_session.journal.messages import (
     SceneAssets,
     SceneModel,
     decode_batch,
-    decode_header,
     encode_status,
 )
 from iris_session.journal.rows import check_keyframe
@@ -95,17 +93,6 @@ def steps(feed: RecorderFeed, first: int, n: int) -> None:
 
 def numbers(batch: Batch) -> list[int]:
     return [row.step for row in batch.rows]
-
-
-def test_nothing_is_sent_before_a_recorder_requests_it(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
-    steps(feed, 0, 30)
-    assert played[0].is_quiet()
-    played[0].say(feed, 1, -1, -1)
-    kinds = played[0].take(4)
-    assert [k for k, _, _ in kinds] == [HEADER, BATCH, BATCH, BATCH]
-    assert decode_header(kinds[0][2]) == make_header()
-    assert kinds[0][1] == kinds[1][1] == 0
-    assert [step for _, _, body in kinds[1:] for step in numbers(decode_batch(body))] == list(range(30))
 
 
 def test_rows_are_sent_within_twenty_milliseconds(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]

@@ -25,18 +25,15 @@ from iris_session.protocol.scene import list_assets
 from iris_session.protocol.status import ClientReport
 from iris_session.recording import (
     RecorderError,
-    RecorderProcess,
     Recording,
     RecordingLock,
     summarise,
-    supervise,
     verify,
 )
 from iris_session.recording import process as process_module
 from iris_session.recording.process import DRAIN_S, FLUSH_S, RecorderLoop
 from iris_session.rrd.assets import ALL, list_recorded_assets
 from iris_session.rrd.paths import part_path
-from iris_session.system.process import ChildProcess
 from tests.recording.support import (
     TICK_NS,
     LoopRecorder,
@@ -292,30 +289,6 @@ def test_killed_process_has_written_acknowledged_rows_and_the_next_part_the_rest
         assert (feed.stats.recorders, feed.stats.dropped_rows) == (2, 0)
     report = verify(path, SmallCore)
     assert (report.ok, report.parts, report.steps) == (True, 2, session.step_count), report.line()
-
-
-@pytest.mark.e2e
-@pytest.mark.long
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_only_the_session_ends_its_recorder(tmp_path: Path, number: signal.Signals) -> None:
-    """Of Ctrl-C and of a service manager's SIGTERM every process hears, and a file that ends early is not finished."""
-    path = tmp_path / "session.rrd"
-    with recorder(path) as (process, feed):
-        session = SmallSession(feed)
-        os.kill(process.pid, number)
-        session.take(100)
-        assert feed.close(20.0)
-        assert process.close()
-    assert verify(path, SmallCore).ok
-
-
-@pytest.mark.e2e
-@pytest.mark.long
-def test_failed_starts_are_said_and_may_be_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(supervise, "ChildProcess", lambda _, **options: ChildProcess("iris_session.none", **options))
-        with pytest.raises(RecorderError, match=r"iris_session\.none"):
-            RecorderProcess(tmp_path / "session.rrd", 0).start()
 
 
 def _status(feed: RecorderFeed) -> Any:

@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from iris_session.physics import UnknownNameError
 from iris_session.recording import RecordingError
 from iris_session.replay import export
 from iris_session.replay.export import (
@@ -170,18 +169,3 @@ def test_names_of_files_are_safe_and_each_once(tmp_path: Path) -> None:
     assert sorted(files) == sorted(os.listdir(tmp_path / "tables"))
     assert {"object-.._.._etc_passwd.csv", "object-a_b.csv", "object-a_b~2.csv", "object-A_B~3.csv"} <= set(files)
     assert os.listdir(tmp_path) == ["tables"]
-
-
-def test_what_cannot_be_asked_for_is_refused_at_once(
-    played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delattr(SessionCore, "step")
-    with pytest.raises(UnknownNameError, match=r"robot 'lift' does not exist .* left, right"):
-        write(played, tmp_path / "tables", "csv", robots=("lift",))
-    with pytest.raises(UnknownNameError, match=r"object 'cup' does not exist .* hammer, board"):
-        write(played, tmp_path / "tables", "csv", objects=("cup",))
-    with pytest.raises(ValueError, match="give one of"):
-        write(played, tmp_path / "tables", "xlsx")
-    with pytest.raises(ValueError, match="give a rate above 0"):
-        write(played, tmp_path / "tables", "csv", hz=-1.0)
-    assert os.listdir(tmp_path) == []

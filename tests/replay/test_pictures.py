@@ -31,7 +31,6 @@ from iris_session.replay.pictures import (
     PictureOptions,
     RecordingPictures,
     Timeline,
-    list_cameras,
     open_gl,
 )
 from iris_session.session.core import CoreConfig, SessionCore
@@ -258,14 +257,6 @@ def project(camera: Any, model: Any, positions: NDArray[np.float64], aspect: flo
     depth = at @ forward * np.tan(np.radians(model.vis.global_.fovy) / 2.0)
     assert depth.min() > 0.0
     return at @ right / depth / aspect, at @ np.cross(right, forward) / depth
-
-
-def test_cameras_are_listed_and_others_are_refused(played: Played) -> None:
-    with Recording.open(played.path) as recording:
-        assert list_cameras(recording) == ("operator", "side")
-    with pytest.raises(PictureError, match=r"there is no camera 'top' in the scene, there are 'operator', 'side'$"):
-        draw(played.path, [0], SMALL._replace(camera="top"))
-    assert draw(played.path, [0], SMALL._replace(camera="1")) is not None
 
 
 def test_published_worlds_are_refused(tmp_path: Path) -> None:

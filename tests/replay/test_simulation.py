@@ -151,9 +151,3 @@ def test_the_rate_of_the_session_is_every_step(hz: float | None) -> None:
 def test_a_fraction_of_the_rate_is_every_nth_step(hz: float, every: int) -> None:
     assert select(hz, iter(range(0, 4000 * TICK_NS, TICK_NS))) == list(range(0, 4000, every))
     assert select(hz, jittered(4000)) == list(range(0, 4000, every)), "within half a tick"
-
-
-@pytest.mark.parametrize("hz", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_rate_that_is_none_is_refused(hz: float) -> None:
-    with pytest.raises(ValueError, match="give a rate above 0"):
-        StepSelector(hz, TICK_NS)
