@@ -6,8 +6,10 @@ Clients join directly, or over an impaired link: then the impairment proxy of `n
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
+import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +25,7 @@ from numpy.typing import NDArray
 
 from iris_session.authority.config import UNALIGNED, AuthorityConfig
 from iris_session.bench.clients import ClientJob, Job, make_web_secret
-from iris_session.bench.intervals import Log
+from iris_session.bench.intervals import Interval, Log
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchError
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
@@ -31,7 +33,6 @@ from iris_session.physics import PacerStats
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import Role
-from iris_session.protocol.server_messages import StateHeader
 from iris_session.security import WEB, KeyHome, KeyPair, encode_key
 from iris_session.session.config import SessionConfig
 from iris_session.session.session import Session
@@ -42,6 +43,8 @@ WARM_UP_S: Final = 3.0
 #: Time in which clients have joined, and in which they have written their logs after the window [s].
 JOIN_S: Final = 60.0
 EXIT_S: Final = 60.0
+#: Period of asking client processes whether they have answered.
+ASK_NS: Final = 50_000_000
 #: Time in which client processes leave the session [s].
 LEAVE_S: Final = 5.0
 #: Plug-ins of clients.
@@ -161,6 +164,34 @@ def make_session_config(
 Action = tuple[float, Callable[[BenchRun], None]]
 
 
+def plan_stalls(
+    plan: Sequence[Interval], stalls: Mapping[str, Callable[[BenchRun, bool], None]], resumed: dict[Interval, int]
+) -> list[Action]:
+    """Return the actions that begin and end the stalls of a plan.
+
+    Args:
+        plan: Intervals of the window.
+        stalls: By kind of interval, a function that begins a stall (True) or ends it.
+        resumed: Filled with the session time at which each stall ended [ns].
+    """
+
+    def end(run: BenchRun, interval: Interval) -> None:
+        resumed[interval] = run.session.clock()
+        stalls[interval.kind](run, False)
+
+    actions: list[Action] = []
+    for one in plan:
+        if one.kind in stalls:
+            actions.append((one.stall_s, lambda run, begin=stalls[one.kind]: begin(run, True)))  # type: ignore[misc]
+            actions.append((one.resume_s, functools.partial(end, interval=one)))
+    return actions
+
+
+def stop_client(name: str) -> Callable[[BenchRun, bool], None]:
+    """Return a stall of the process of a client, by SIGSTOP."""
+    return lambda run, begins: run.by_client[name].send_signal(signal.SIGSTOP if begins else signal.SIGCONT)
+
+
 def measure(
     model: mujoco.MjModel,
     groups: Mapping[str, Sequence[Group]],
@@ -240,23 +271,30 @@ def _run_session(
     progress(f"warm-up, then measuring {seconds:g} s")
     truth: dict[int, NDArray[np.float64]] = {}
     received: dict[tuple[int, str], list[tuple[int, int]]] = {}
+
+    def store_receipts(entries: Sequence[Entry]) -> None:
+        for entry in entries:
+            if isinstance(entry.message, Sample):
+                key = (entry.connection, entry.message.device)
+                received.setdefault(key, []).append((entry.message.seq, entry.receive_ns))
+
     if keep_poses:
-        session.stepper.on_state = lambda header, poses: _store_poses(truth, header, poses)
-    session.stepper.on_entries = lambda entries: _store_receipts(received, entries)
+        session.stepper.on_state = lambda header, poses: truth.update({header.tick: poses.copy()})
+    session.stepper.on_entries = store_receipts
     connections, names = dict(session.stepper.view.connections), session.stepper.view.names_by_id()
     begin = session.clock() + round(WARM_UP_S * 1e9)
     end = begin + round(seconds * 1e9)
     for worker in workers:
         worker.send("measure", begin, end)
-    # The times of link profiles count from the beginning of the window.
-    proxy = run.proxy
-    restart: list[Action] = [] if proxy is None else [(0.0, lambda _: proxy.send("start"))]
-    meter = _Meter(session, begin, end)
-    script = _Schedule(run, begin, [*restart, *actions])
+    meter, pending = _Meter(session, begin, end), list(actions)
+    if run.proxy is not None:  # the times of link profiles count from the beginning of the window
+        pending.insert(0, (0.0, lambda run: run.proxy.send("start")))  # type: ignore[union-attr]
 
     def until() -> bool:
         on_tick(session)
-        return script.run_due() or meter.is_window_over()
+        while pending and session.clock() >= begin + round(pending[0][0] * 1e9):
+            pending.pop(0)[1](run)
+        return meter.is_window_over()
 
     session.run(until=until)
     _raise_if_stopped(session)
@@ -285,9 +323,16 @@ def _run_session(
 
 def _run_until_answered(session: Session, workers: Sequence[ClientProcess], seconds: float) -> bool:
     """Run the session until every worker has answered its call, at most some seconds. Return whether all have."""
-    session.run(
-        seconds=seconds, until=_limit_rate(0.05, session.clock, lambda: all(one.has_answered() for one in workers))
-    )
+    due_ns = 0
+
+    def until() -> bool:
+        nonlocal due_ns
+        if session.clock() < due_ns:  # asking must not disturb the measured ticks
+            return False
+        due_ns = session.clock() + ASK_NS
+        return all(one.has_answered() for one in workers)
+
+    session.run(seconds=seconds, until=until)
     _raise_if_stopped(session)
     return all(one.has_answered() for one in workers)
 
@@ -296,20 +341,6 @@ def _raise_if_stopped(session: Session) -> None:
     """Raise `KeyboardInterrupt` if the session was stopped by Ctrl-C: the benchmark has no result then."""
     if session.stopping:
         raise KeyboardInterrupt
-
-
-class _Schedule:
-    """Calls the actions of a window at their times."""
-
-    def __init__(self, run: BenchRun, begin_ns: int, actions: Sequence[Action]) -> None:
-        self._run = run
-        self._actions = [(begin_ns + round(at_s * 1e9), action) for at_s, action in actions]
-
-    def run_due(self) -> bool:
-        """Call the actions that are due. Return False, for `Session.run(until=...)`."""
-        while self._actions and self._run.session.clock() >= self._actions[0][0]:
-            self._actions.pop(0)[1](self._run)
-        return False
 
 
 class _Meter:
@@ -347,32 +378,6 @@ class _Meter:
             ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
         )
         return stats, (cpu1 - cpu0) / window_s, (recorder1 - recorder0) / window_s
-
-
-def _limit_rate(period_s: float, clock: Callable[[], int], check: Callable[[], bool]) -> Callable[[], bool]:
-    """Limit calls of `check` to one per `period_s`: it must not disturb the measured ticks."""
-    due = 0
-
-    def until() -> bool:
-        nonlocal due
-        now = clock()
-        if now < due:
-            return False
-        due = now + round(period_s * 1e9)
-        return check()
-
-    return until
-
-
-def _store_poses(truth: dict[int, NDArray[np.float64]], header: StateHeader, poses: NDArray[np.float64]) -> None:
-    truth[header.tick] = poses.copy()
-
-
-def _store_receipts(received: dict[tuple[int, str], list[tuple[int, int]]], entries: Sequence[Entry]) -> None:
-    for entry in entries:
-        if isinstance(entry.message, Sample):
-            key = (entry.connection, entry.message.device)
-            received.setdefault(key, []).append((entry.message.seq, entry.receive_ns))
 
 
 @contextlib.contextmanager

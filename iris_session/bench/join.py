@@ -7,7 +7,6 @@ program of the same priority that only copies memory.
 from __future__ import annotations
 
 import math
-import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -24,10 +23,9 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure
 from iris_session.bench.intervals import Log, compute_age_p99_ms
 from iris_session.bench.join_clients import CopyInterval, JoinJob, JoinResult
-from iris_session.bench.join_scene import PreparedScene, make_join_model
+from iris_session.bench.join_scene import PreparedScene, SceneJob, make_join_model
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
-from iris_session.system.process import PIPE, child_environment, module_command
 
 #: Time from the beginning of the window to the join; the baseline of the others is measured first.
 BEGIN_S: Final = 4.0
@@ -136,11 +134,9 @@ def _make_bars(results: dict[str, Any], sent: int) -> list[Any]:
 
 
 def _prepare_scene(model: Path, store: Path) -> PreparedScene:
-    command = module_command("iris_session.bench.join_scene", str(model), str(store))
-    done = subprocess.run(command, stdout=PIPE, env=child_environment(), check=False, process_group=0)
-    if done.returncode:
-        raise BenchError(f"preparing the scene failed with status {done.returncode}")
-    return msgspec.json.decode(done.stdout, type=PreparedScene)
+    with PluginProcess("iris_session.bench.join_scene:ScenePreparer", SceneJob(str(model), str(store))) as process:
+        process.read()  # it is made
+        return msgspec.convert(process.ask("prepare"), PreparedScene)
 
 
 def _compute_age_p99_ms(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:

@@ -1,13 +1,10 @@
 """Scene of `bench join`: moving bodies with meshes and textures, and a process that prepares it as a server does.
 
-    python -m iris_session.bench.join_scene MODEL.mjb STORE     prints a `PreparedScene` as one JSON object
-
-It runs in a process of its own: the memory of a scene can only be measured in a process that did nothing else.
+The memory of a scene can only be measured in a process that did nothing else.
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +14,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
+from iris_session.bench.plugins import Plugin
 from iris_session.demo.scenes import free_bodies_scene
 
 MESHES: Final = 60
@@ -104,32 +102,39 @@ def _make_stone(
     return points.reshape(-1, 3), np.concatenate([faces, *caps]), np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
-def prepare_scene(model_path: str, store_path: str) -> PreparedScene:
-    """Prepare a compiled model as a server does at its start."""
-    from iris_session.assets.store import AssetStore
-    from iris_session.physics.load import load_model
-    from iris_session.protocol.scene import encode_scene, list_assets
-    from iris_session.scene.mujoco_scene import parse_mujoco
+class SceneJob(msgspec.Struct, frozen=True):
+    """Files of a compiled model and of the store of its assets."""
 
-    model = load_model(model_path)
-    store = AssetStore(Path(store_path))
-    process = psutil.Process()
-    before = process.memory_info().rss
-    Path("/proc/self/clear_refs").write_text("5")  # the peak of memory is counted from now on (Linux)
-    began_s = time.perf_counter()
-    parsed = parse_mujoco(model, store)
-    data = encode_scene(parsed.spec)
-    scene = store.put(data)
-    seconds = time.perf_counter() - began_s
-    sizes = {scene: len(data), **list_assets(parsed.spec)}
-    return PreparedScene(seconds, (_read_peak_rss() - before) / 2**20, parsed.built, scene, sizes)
+    model: str
+    store: str
+
+
+class ScenePreparer(Plugin):
+    """Plug-in that prepares a compiled model as a server does at its start."""
+
+    job_type = SceneJob
+
+    def prepare(self) -> PreparedScene:
+        """Prepare the scene, and measure it."""
+        from iris_session.assets.store import AssetStore
+        from iris_session.physics.load import load_model
+        from iris_session.protocol.scene import encode_scene, list_assets
+        from iris_session.scene.mujoco_scene import parse_mujoco
+
+        model = load_model(self.job.model)
+        store = AssetStore(Path(self.job.store))
+        before = psutil.Process().memory_info().rss
+        Path("/proc/self/clear_refs").write_text("5")  # the peak of memory is counted from now on (Linux)
+        began_s = time.perf_counter()
+        parsed = parse_mujoco(model, store)
+        data = encode_scene(parsed.spec)
+        scene = store.put(data)
+        seconds = time.perf_counter() - began_s
+        sizes = {scene: len(data), **list_assets(parsed.spec)}
+        return PreparedScene(seconds, (_read_peak_rss() - before) / 2**20, parsed.built, scene, sizes)
 
 
 def _read_peak_rss() -> int:
     """Return the peak resident memory of this process [bytes] since the last reset of the peak."""
     line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) * 1024
-
-
-if __name__ == "__main__":
-    sys.stdout.buffer.write(msgspec.json.encode(prepare_scene(sys.argv[1], sys.argv[2])))

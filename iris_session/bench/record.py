@@ -18,10 +18,8 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
 
-import msgspec
 import numpy as np
 import psutil
 
@@ -29,14 +27,13 @@ from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.harness import CLIENTS, Measurement, group_clients, measure
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.record_naive import LOG_BATCH_S, LONG_BATCH_S, write_naive_log
-from iris_session.bench.record_session import BODIES, OPERATORS, BenchSession, SessionJob, make_record_scene
+from iris_session.bench.record_session import BODIES, OPERATORS, SessionJob, make_record_scene
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.recording import NotARecordingError, Recording
 from iris_session.rrd import paths
 from iris_session.rrd.file import scan_file
 from iris_session.rrd.paths import part_path
-from iris_session.system.process import PIPE, ChildProcess
 
 #: Rounds with a recording, and as many without; and the shortest of them.
 ROUNDS: Final = 3
@@ -52,7 +49,7 @@ KILL_AFTER_S: Final = (0.5, 1.0)
 POLL_S: Final = 0.02
 START_S: Final = 60.0
 END_S: Final = 30.0
-_SESSION: Final = "iris_session.bench.record_session"
+SESSION: Final = "iris_session.bench.record_session:RecordedSession"
 _RECORDER: Final = "iris_session.recording.process"
 
 
@@ -231,7 +228,7 @@ def _kill_sessions(folder: Path, kills: int, seed: int, progress: Callable[[str]
         pair = kinds[i : i + 2]
         progress(f"kill {i + 1} of {kills}: {', then '.join(pair)}")
         path = folder / f"killed{i}" / paths.FIRST_FILE
-        with RecordedSession(path, seed) as session:
+        with KilledSession(path, seed) as session:
             killed = [(kind, session.kill(kind, random_of.uniform(*KILL_AFTER_S))) for kind in pair]
         lost, gaps = read_losses(path, killed)
         losses += lost
@@ -264,7 +261,7 @@ def read_losses(path: Path, kills: Sequence[tuple[str, int]]) -> tuple[list[Kill
     return losses, gaps
 
 
-class RecordedSession:
+class KilledSession:
     """A session with its operators in other processes, all of which end with this context.
 
     Args:
@@ -275,24 +272,19 @@ class RecordedSession:
     def __init__(self, path: Path, seed: int) -> None:
         self._started: list[psutil.Process] = []
         with ExitStack() as stack:
-            self._session = ChildProcess(_SESSION, stdout=PIPE, own_group=True)
+            self._session = PluginProcess(SESSION, SessionJob(str(path), seed))
             stack.callback(self._end)
-            self._session.write(msgspec.json.encode(SessionJob(str(path), seed)) + b"\n")
-            try:
-                listening = msgspec.json.decode(self._session.read_line(START_S), type=BenchSession)
-            except (EOFError, TimeoutError) as error:
-                raise BenchError(f"a session that is to be killed did not start: {error}") from None
-            self._origin_ns = listening.origin_ns
-            job = Job(listening.address, listening.origin_ns, "", tuple(_make_operators()))
+            self._session.read(START_S)
+            self._origin_ns: int
+            address, self._origin_ns = self._session.ask("describe", timeout_s=START_S)
+            job = Job(address, self._origin_ns, "", tuple(_make_operators()))
             stack.enter_context(PluginProcess(CLIENTS, job)).read(START_S)
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def kill(self, kind: str, after_s: float) -> int:
@@ -305,7 +297,9 @@ class RecordedSession:
         Returns:
             The session time of the kill [ns].
         """
-        self._wait_for_rows()
+        if not self._session.ask("wait_until_written", START_S):
+            raise BenchError("the recorder of a session that is to be killed is not up to date")
+        self._started = psutil.Process(self._session.pid).children(recursive=True)
         time.sleep(after_s)
         recorder = self._find_recorder()
         victims = {RECORDER: [recorder], AUTHORITY: [self._session.pid], BOTH: [recorder, self._session.pid]}[kind]
@@ -315,14 +309,6 @@ class RecordedSession:
         for pid in victims:
             os.kill(pid, signal.SIGKILL)
         return now_ns - self._origin_ns
-
-    def _wait_for_rows(self) -> None:
-        """Wait until the recorder has written the rows that waited for it."""
-        try:
-            self._session.read_line(START_S)
-        except (EOFError, TimeoutError) as error:
-            raise BenchError(f"the recorder of a session that is to be killed is not up to date: {error}") from None
-        self._started = psutil.Process(self._session.pid).children(recursive=True)
 
     def _find_recorder(self) -> int:
         """Return the process id of the recorder, 0 if there is none."""
@@ -336,7 +322,7 @@ class RecordedSession:
         """End the session, and wait for its processes: a recorder whose session was killed writes the rest first."""
         with suppress(psutil.Error):
             self._started = psutil.Process(self._session.pid).children(recursive=True) or self._started
-        self._session.close(terminate_s=END_S)
+        self._session.close(exit_s=END_S)
         _, alive = psutil.wait_procs(self._started, timeout=END_S)
         for process in alive:
             with suppress(psutil.Error):

@@ -1,22 +1,14 @@
-"""Scene of `bench record`, and a session of it in a process of its own, which the benchmark kills.
-
-    python -m iris_session.bench.record_session
-
-Reads its job from standard input, prints one JSON line when it listens, then `written` whenever a new recorder has
-written the rows that waited for it, and runs until SIGTERM or the end of its parent.
-"""
+"""Scene of `bench record`, and a session of it in a process of its own, which the benchmark kills."""
 
 from __future__ import annotations
 
-import signal
-import sys
-from io import RawIOBase
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
 from iris_session.bench.harness import make_session_config
+from iris_session.bench.plugins import Plugin
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.demo.scenes.generators import (
     ARM_FILE,
@@ -28,12 +20,13 @@ from iris_session.demo.scenes.generators import (
     place_arm,
 )
 from iris_session.session.session import Session
-from iris_session.system.process import die_with_parent, take_stdout
 
 #: Moving bodies: those that fly, and ten of each of the two arms.
 BODIES: Final = 50
 OPERATORS: Final = 2
 POLL_NS: Final = 20_000_000
+#: How long the session runs between two looks for a call [s].
+RUN_S: Final = 0.1
 #: Age of the newest row at its write [ns] from which on a recorder has caught up.
 CURRENT_NS: Final = 250_000_000
 _FREE: Final = BODIES - 10 * OPERATORS
@@ -44,13 +37,6 @@ class SessionJob(msgspec.Struct, frozen=True):
 
     path: str
     seed: int
-
-
-class BenchSession(msgspec.Struct, frozen=True):
-    """A session that listens. `origin_ns`: session time zero on CLOCK_MONOTONIC."""
-
-    address: str
-    origin_ns: int
 
 
 def make_record_scene(seed: int) -> Any:
@@ -71,38 +57,46 @@ def make_record_scene(seed: int) -> Any:
     return spec
 
 
-class _Reporter:
-    """Says when a recorder has caught up."""
+class RecordedSession(Plugin):
+    """Plug-in that runs a recorded session of the scene."""
 
-    def __init__(self, session: Session, out: RawIOBase) -> None:
-        self._session, self._out = session, out
-        self._due_ns = 0
+    job_type = SessionJob
+
+    def __init__(self, job: SessionJob) -> None:
+        super().__init__(job)
+        model = make_record_scene(job.seed).compile()
+        self._session = Session(model, config=make_session_config(record=Path(job.path)))
+        self._session.start()
         self._known = 0
 
-    def poll(self) -> bool:
-        """Report a recorder that is new, now and then. Return False, for `Session.run(until=...)`."""
-        feed, now_ns = self._session.processes.feed, self._session.clock()
-        if now_ns < self._due_ns or feed is None:
-            return False
-        self._due_ns = now_ns + POLL_NS
-        last = feed.stats.recorder
-        if last is not None and last.instance != self._known and last.written >= 0 and 0 < last.lag_ns < CURRENT_NS:
+    def poll(self) -> None:
+        """Run the session for a moment."""
+        self._session.run(seconds=RUN_S)
+
+    def describe(self) -> tuple[str, int]:
+        """Return the address of the session, and its origin: session time zero on CLOCK_MONOTONIC [ns]."""
+        return self._session.address, self._session.origin_ns
+
+    def wait_until_written(self, timeout_s: float) -> bool:
+        """Run until a recorder that is new has written the rows that waited for it; return whether it has."""
+        due_ns = 0
+
+        def is_written() -> bool:
+            nonlocal due_ns
+            feed, now_ns = self._session.processes.feed, self._session.clock()
+            if now_ns < due_ns or feed is None:
+                return False
+            due_ns = now_ns + POLL_NS
+            last = feed.stats.recorder
+            if last is None or last.instance == self._known or last.written < 0 or not 0 < last.lag_ns < CURRENT_NS:
+                return False
             self._known = last.instance
-            self._out.write(b"written\n")
-        return False
+            return True
 
+        before = self._known
+        self._session.run(seconds=timeout_s, until=is_written)
+        return self._known != before
 
-def main() -> None:
-    """Run the session."""
-    die_with_parent(signal.SIGTERM)
-    with open(take_stdout(), "wb", buffering=0) as out:
-        job = msgspec.json.decode(sys.stdin.readline(), type=SessionJob)
-        with Session(
-            make_record_scene(job.seed).compile(), config=make_session_config(record=Path(job.path))
-        ) as session:
-            out.write(msgspec.json.encode(BenchSession(session.address, session.origin_ns)) + b"\n")
-            session.run(until=_Reporter(session, out).poll)
-
-
-if __name__ == "__main__":
-    main()
+    def close(self) -> None:
+        """Close the session."""
+        self._session.close()

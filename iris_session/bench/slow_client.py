@@ -6,7 +6,6 @@ stopped, SIGSTOP), `stalled` (the link of another client passes nothing). Below 
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -16,11 +15,12 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
     CLIENTS,
     CLIENTS_PER_PROCESS,
-    Action,
     BenchRun,
     assign_links,
     group_clients,
     measure,
+    plan_stalls,
+    stop_client,
 )
 from iris_session.bench.intervals import (
     SHORTEST_STALL_S,
@@ -73,7 +73,7 @@ def run_slow_client(
     plan = plan_rounds((BASELINE, STOPPED, STALLED), seconds, ROUNDS, SHORTEST_STALL_S)
     total_s = plan[-1].end_s
     resumed: dict[Interval, int] = {}  # session time [ns] at which the stall ended
-    actions = _plan_actions(plan, stalled, resumed)
+    actions = plan_stalls(plan, {STOPPED: stop_client(STOPPED), STALLED: _stall_link(stalled)}, resumed)
     got = measure(model, groups, total_s, links=links, seed=seed, actions=actions, curve=curve, progress=progress)
     results: dict[str, Any] = {}
     for kind, prefix in ((STOPPED, ""), (STALLED, "link_")):
@@ -89,30 +89,14 @@ def run_slow_client(
     return make_link_report("slow-client", params, results, _make_bars(results), profile, REFERENCE)
 
 
-def _plan_actions(plan: list[Interval], link: str, resumed: dict[Interval, int]) -> list[Action]:
-    """Return the actions that begin and end stalls; their ends are stored in `resumed` [session time, ns]."""
-    actions: list[Action] = []
-    for interval in plan:
-        if interval.kind == STOPPED:
-            actions.append((interval.stall_s, lambda run: run.by_client[STOPPED].send_signal(signal.SIGSTOP)))
-        elif interval.kind == STALLED:
-            actions.append((interval.stall_s, lambda run: _post_link_command(run, "stall", link)))
-        if interval.kind != BASELINE:
-            actions.append((interval.resume_s, lambda run, s=interval: _end_stall(run, s, link, resumed)))  # type: ignore[misc]
-    return actions
+def _stall_link(link: str) -> Callable[[BenchRun, bool], None]:
+    """Return a stall of a link, which passes nothing meanwhile."""
 
+    def stall(run: BenchRun, begins: bool) -> None:
+        assert run.proxy is not None
+        run.proxy.send(f"{'stall' if begins else 'resume'} @{link}")
 
-def _end_stall(run: BenchRun, interval: Interval, link: str, resumed: dict[Interval, int]) -> None:
-    resumed[interval] = run.session.clock()
-    if interval.kind == STOPPED:
-        run.by_client[STOPPED].send_signal(signal.SIGCONT)
-    else:
-        _post_link_command(run, "resume", link)
-
-
-def _post_link_command(run: BenchRun, command: str, link: str) -> None:
-    assert run.proxy is not None
-    run.proxy.send(f"{command} @{link}")
+    return stall
 
 
 def _make_bars(results: dict[str, Any]) -> list[Any]:

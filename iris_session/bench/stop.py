@@ -192,53 +192,11 @@ class StopScenario:
         return command.kind != CommandKind.HOLD and self.core.world.data.ncon > 0
 
 
-def _open_clutch(run: StopScenario) -> None:
-    run.changes["clutch"] = False
-
-
-def _fall_silent(run: StopScenario) -> None:
-    run.sends = False
-
-
-def _lose_tracking(run: StopScenario) -> None:
-    run.changes["tracked"] = False
-
-
-def _take_off(run: StopScenario) -> None:
-    run.changes["worn"] = False
-
-
-def _stop(run: StopScenario) -> None:
-    run.step([run.submit(EStop())])
-
-
-def _disconnect(run: StopScenario) -> None:
-    run.sends = False
-    run.step([run.submit(Lost("timeout"))])
-
-
-def _release(run: StopScenario) -> None:
-    run.step([run.submit(Release(0, (Target("arm", 1),)))])
-
-
-def _recentre(run: StopScenario) -> None:
-    run.step([run.submit(TrackingEpoch(1))])
-
-
-def _send_late(run: StopScenario) -> None:
-    run.changes["capture_ns"] = 0
-
-
 def _pause(run: StopScenario) -> None:
     run.step([run.submit(Control(0, "pause"), HOST)], 0)
     run.sends = False
     run.run(0.2, n_ticks=0)
     run.step([run.submit(Control(0, "resume"), HOST)])
-
-
-def _stand_still(run: StopScenario) -> None:
-    run.step_number += 500
-    run.sends = False
 
 
 def _resume(run: StopScenario) -> None:
@@ -249,19 +207,30 @@ def _resume(run: StopScenario) -> None:
     run.step([run.submit(SessionResumed(1_000_000_000), HOST)])
 
 
+def _disconnect(run: StopScenario) -> None:
+    run.sends = False
+    run.step([run.submit(Lost("timeout"))])
+
+
+def _stop_sending(run: StopScenario, steps: int = 0) -> None:
+    """Send no samples any more. `steps`: for which the loop stands still first."""
+    run.step_number += steps
+    run.sends = False
+
+
 #: What makes a hold begin, by cause.
 CAUSES: Final[dict[str, Callable[[StopScenario], None]]] = {
-    "clutch_open": _open_clutch,
-    "stale": _fall_silent,
-    "estop": _stop,
+    "clutch_open": lambda run: run.changes.update(clutch=False),
+    "stale": _stop_sending,
+    "estop": lambda run: run.step([run.submit(EStop())]),
     "disconnected": _disconnect,
-    "untracked": _lose_tracking,
-    "not_worn": _take_off,
-    "released": _release,
-    "tracking_epoch": _recentre,
-    "rejected": _send_late,
+    "untracked": lambda run: run.changes.update(tracked=False),
+    "not_worn": lambda run: run.changes.update(worn=False),
+    "released": lambda run: run.step([run.submit(Release(0, (Target("arm", 1),)))]),
+    "tracking_epoch": lambda run: run.step([run.submit(TrackingEpoch(1))]),
+    "rejected": lambda run: run.changes.update(capture_ns=0),
     "paused": _pause,
-    "gap": _stand_still,
+    "gap": lambda run: _stop_sending(run, 500),
     "resumed": _resume,
 }
 

@@ -8,7 +8,6 @@ tab presses the e-stop. Without Chromium, or with `tab=False`, all browsers are 
 from __future__ import annotations
 
 import math
-import signal
 import time
 from collections.abc import Callable, Sequence
 from itertools import accumulate
@@ -23,12 +22,13 @@ from iris_session.bench.harness import (
     BROWSERS,
     CLIENTS,
     TABS,
-    Action,
     BenchRun,
     Group,
     Measurement,
     group_clients,
     measure,
+    plan_stalls,
+    stop_client,
 )
 from iris_session.bench.intervals import (
     SHORTEST_STALL_S,
@@ -140,7 +140,7 @@ def run_web(
             [
                 (0.0, gateway.read),
                 (0.0, stops.attach),
-                *_plan_actions(plan, resumed),
+                *plan_stalls(plan, {FROZEN: stop_client(SPECIAL)}, resumed),
                 (max(0.0, total_s - _CPU_END_S), gateway.read),
             ],
             key=lambda action: action[0],
@@ -277,21 +277,6 @@ def _find_missing_tool() -> str:
     except MissingToolError as error:
         return str(error)
     return ""
-
-
-def _plan_actions(plan: list[Interval], resumed: dict[Interval, int]) -> list[Action]:
-    """Return the actions that freeze the special browser; `resumed`: ends of freezing [ns]."""
-    actions: list[Action] = []
-    for interval in plan:
-        if interval.kind == FROZEN:
-            actions.append((interval.stall_s, lambda run: run.by_client[SPECIAL].send_signal(signal.SIGSTOP)))
-            actions.append((interval.resume_s, lambda run, s=interval: _resume(run, s, resumed)))  # type: ignore[misc]
-    return actions
-
-
-def _resume(run: BenchRun, interval: Interval, resumed: dict[Interval, int]) -> None:
-    resumed[interval] = run.session.clock()
-    run.by_client[SPECIAL].send_signal(signal.SIGCONT)
 
 
 class _StopMeter:

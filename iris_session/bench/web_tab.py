@@ -67,8 +67,8 @@ _PROBE: Final = """
     const set = window[name];
     window[name] = (callback, ...rest) => set.call(window, measured(callback), ...rest);
   }
-  const { get, set } = Object.getOwnPropertyDescriptor(PluginProcess.prototype, "onmessage");
-  Object.defineProperty(PluginProcess.prototype, "onmessage", { configurable: true, get, set(listener) {
+  const { get, set } = Object.getOwnPropertyDescriptor(Worker.prototype, "onmessage");
+  Object.defineProperty(Worker.prototype, "onmessage", { configurable: true, get, set(listener) {
     set.call(this, measured(function (event) {
       if (event.data.type === "frame") {
         if (states < most) bench.ages[states] = event.data.age_ms;

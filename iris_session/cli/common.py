@@ -186,8 +186,8 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
     A client would wait for the session to start. A session given by name is not checked: it has no address yet.
     """
     from iris_session.client.address import Address
+    from iris_session.client.discovery import resolve_host
     from iris_session.client.endpoint_resolver import LOCAL_ADDRESS
-    from iris_session.client.host_lookup import resolve_host
 
     if arguments.session:
         return

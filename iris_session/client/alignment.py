@@ -1,18 +1,19 @@
-"""`client.alignment`: the alignment of this client, observations of anchors, and measurements that a director runs."""
+"""`client.alignment`: the alignment of this client, observations of anchors and images, and what a director does."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 from numpy.typing import NDArray
 
-from anchors.pose import PoseTuple
+from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_rotate
 from iris_session.client.arguments import Numbers, PoseLike, to_numbers, to_pose
 from iris_session.client.core.connection import ClientConnection
-from iris_session.client.errors import InvalidMessageError
-from iris_session.client.sheet_observer import CAMERA_SIGMA, SheetObserver, to_observation
+from iris_session.client.errors import ClientError, InvalidMessageError
 from iris_session.protocol.client_messages import (
     MAX_TIP_POSES,
     Align,
@@ -22,7 +23,7 @@ from iris_session.protocol.client_messages import (
     PlaceAlignment,
     TrackingEpoch,
 )
-from iris_session.protocol.common import IDENTITY, Alignment
+from iris_session.protocol.common import IDENTITY, Alignment, Pose
 from iris_session.protocol.names import AlignAction, AnchorKind
 from iris_session.protocol.server_messages import Reply
 
@@ -32,19 +33,30 @@ if TYPE_CHECKING:
     from anchors.sheet import Sheet
 
 
-class AlignmentClient(Protocol):
-    """The parts of a `Client` that its alignment uses."""
+#: From further away, or after such a turn, the errors of lens and light are others: a new viewpoint.
+VIEWPOINT_M: Final = 0.15
+VIEWPOINT_RAD: Final = 0.26
+#: How well the camera's own pose is known, per axis: what a headset says of itself over a few seconds.
+CAMERA_SIGMA: Final = (0.001, 0.001)  # [m], [rad]
 
-    connection: ClientConnection
 
-    def send(self, message: ClientMessage) -> bool:
-        """See `Client.send`."""
+class ViewpointCounter:
+    """Numbers of viewpoints: the same number until the camera was moved elsewhere or its tracking frame jumped."""
 
-    def request(self, message: Any) -> Reply:
-        """See `Client.request`."""
+    def __init__(self) -> None:
+        self._number = 0
+        self._from: tuple[int, PoseTuple] | None = None
 
-    def session_now_ns(self) -> int:
-        """See `Client.session_now_ns`."""
+    def number_at(self, tracking_epoch: int, T_tracking_camera: PoseTuple) -> int:
+        """Return the number of the viewpoint that the camera is at now."""
+        if self._from is not None and self._from[0] == tracking_epoch:
+            p, q = self._from[1]
+            near = distance(p, T_tracking_camera[0]) <= VIEWPOINT_M
+            if near and quat_angle(q, T_tracking_camera[1]) <= VIEWPOINT_RAD:
+                return self._number
+        self._number += 1
+        self._from = (tracking_epoch, T_tracking_camera)
+        return self._number
 
 
 class ClientAlignment:
@@ -53,21 +65,28 @@ class ClientAlignment:
     A client in role `director` also measures, places and moves those of others.
     """
 
-    def __init__(self, client: AlignmentClient) -> None:
-        self._client = client
-        self._sheets = SheetObserver()
+    def __init__(
+        self,
+        connection: ClientConnection,
+        send: Callable[[ClientMessage], bool],
+        request: Callable[[ClientMessage], Reply],
+    ) -> None:
+        self._connection = connection
+        self._send = send
+        self._request = request
+        self._viewpoints = ViewpointCounter()
         self._lock = threading.Lock()  # of the numbers of viewpoints
+        self._detector: Any = None  # of the camera and sheets of the newest image
 
     @property
     def current(self) -> Alignment | None:
         """Our own `T_world_tracking` as accepted by the session, `None` before."""
-        connection = self._client.connection
-        return connection.mirror.find_alignment(connection.participant_id)
+        return self._connection.mirror.find_alignment(self._connection.participant_id)
 
     @property
     def tracking_epoch(self) -> int:
         """Number of jumps of our tracking frame so far; `report_tracking_jump` counts one more."""
-        return self._client.connection.tracking_epoch
+        return self._connection.tracking_epoch
 
     # --- our own ------------------------------------------------------------------------------------------------------
 
@@ -77,10 +96,9 @@ class ClientAlignment:
         Returns:
             The new tracking epoch.
         """
-        connection = self._client.connection
-        epoch = connection.tracking_epoch = connection.tracking_epoch + 1
-        if connection.is_joined:  # else it follows the next welcome
-            self._client.send(TrackingEpoch(epoch))
+        epoch = self._connection.tracking_epoch = self._connection.tracking_epoch + 1
+        if self._connection.is_joined:  # else it follows the next welcome
+            self._send(TrackingEpoch(epoch))
         return epoch
 
     def observe(
@@ -124,12 +142,12 @@ class ClientAlignment:
         values = to_numbers("covariance", covariance)
         if len(values) not in (0, 36):
             raise InvalidMessageError(f"covariance: expected 36 numbers, 6x6 row-major, or none, got {len(values)}")
-        self._client.send(
+        self._send(
             Observation(
                 anchor_id=anchor_id,
                 kind=kind,
                 T_tracking_anchor=to_pose("T_tracking_anchor", T_tracking_anchor),
-                capture_ns=self._client.session_now_ns() if capture_ns is None else capture_ns,
+                capture_ns=self._session_now_ns() if capture_ns is None else capture_ns,
                 tracking_epoch=self.tracking_epoch if tracking_epoch is None else tracking_epoch,
                 viewpoint_id=viewpoint_id,
                 size_m=size_m,
@@ -156,12 +174,12 @@ class ClientAlignment:
         """
         n = len(T_tracking_grip)
         kept = min(n, MAX_TIP_POSES)
-        self._client.send(
+        self._send(
             Observation(
                 anchor_id="",
                 kind=AnchorKind.TIP,
                 T_tracking_anchor=IDENTITY,
-                capture_ns=self._client.session_now_ns(),
+                capture_ns=self._session_now_ns(),
                 tracking_epoch=self.tracking_epoch,
                 device=device,
                 grip_poses=tuple(to_pose("T_tracking_grip", T_tracking_grip[k * n // kept]) for k in range(kept)),
@@ -207,26 +225,45 @@ class ClientAlignment:
             ClientError: OpenCV or SciPy is missing.
         """
         epoch = self.tracking_epoch if tracking_epoch is None else tracking_epoch  # before the detection
-        now_ns = self._client.session_now_ns() if capture_ns is None else capture_ns
+        now_ns = self._session_now_ns() if capture_ns is None else capture_ns
         pose = to_pose("T_tracking_camera", T_tracking_camera)
         T: PoseTuple = (pose.p, pose.q)
-        found = self._sheets.detect(image, camera, sheets)
+        found = [one for one in self._detect(image, camera, sheets) if not one.ambiguous]
         if viewpoint_id is None:
             with self._lock:
-                viewpoint_id = self._sheets.viewpoints.number_at(epoch, T)
-        for sighting in found:
-            self._client.send(
-                to_observation(
-                    sighting,
-                    T,
-                    capture_ns=now_ns,
-                    tracking_epoch=epoch,
-                    viewpoint_id=viewpoint_id,
+                viewpoint_id = self._viewpoints.number_at(epoch, T)
+        for one in found:
+            covariance = to_tracking_covariance(one.covariance, T, one.T_camera_sheet, camera_sigma)
+            self._send(
+                Observation(
+                    one.anchor_id,
+                    one.kind,
+                    Pose(*compose(T, one.T_camera_sheet)),
+                    now_ns,
+                    epoch,
+                    viewpoint_id,
+                    one.edge_m,
                     device=device,
-                    camera_sigma=camera_sigma,
+                    covariance=covariance,
                 )
             )
         return found
+
+    def _detect(self, image: NDArray[Any], camera: CameraModel, sheets: Sequence[Sheet]) -> list[SheetDetection]:
+        """Return the sheets in an image; OpenCV and SciPy are imported with the first."""
+        try:
+            from anchors.camera import CameraError
+            from anchors.detection import DetectionError, SheetDetector
+        except ImportError as error:
+            raise _missing_package(error) from error
+        try:
+            if self._detector is None or (self._detector.camera, self._detector.sheets) != (camera, tuple(sheets)):
+                self._detector = SheetDetector(sheets, camera)
+            return list(self._detector.detect(np.asarray(image)))
+        except ImportError as error:  # OpenCV is imported where it is used
+            raise _missing_package(error) from error
+        except (DetectionError, CameraError) as error:
+            raise InvalidMessageError(f"observe_image: {error}") from error
 
     # --- measurements, and those of others ----------------------------------------------------------------------------
 
@@ -239,7 +276,7 @@ class ClientAlignment:
         Raises:
             DeniedError: We may not.
         """
-        self._client.request(Align(0, AlignAction.START, participant))
+        self._request(Align(0, AlignAction.START, participant))
 
     def stop_run(self, participant: str = "") -> None:
         """Stop the measurement of an alignment, and keep the one in force.
@@ -250,7 +287,7 @@ class ClientAlignment:
         Raises:
             DeniedError: We may not.
         """
-        self._client.request(Align(0, AlignAction.STOP, participant))
+        self._request(Align(0, AlignAction.STOP, participant))
 
     def place(self, participant: str, T_world_tracking: PoseLike, *, offset: bool = False) -> None:
         """As director, align a participant by hand.
@@ -263,7 +300,7 @@ class ClientAlignment:
         Raises:
             DeniedError: We are not a director, or there is no such participant.
         """
-        self._client.request(PlaceAlignment(0, participant, to_pose("T_world_tracking", T_world_tracking), offset))
+        self._request(PlaceAlignment(0, participant, to_pose("T_world_tracking", T_world_tracking), offset))
 
     def move_anchor(self, anchor_id: str, T_world_anchor: PoseLike, *, force: bool = False) -> None:
         """As director, set the pose of an anchor; the scene moves for every participant aligned to it.
@@ -276,4 +313,32 @@ class ClientAlignment:
         Raises:
             DeniedError: We are not a director, or it is too far (`too_far`).
         """
-        self._client.request(MoveAnchor(0, anchor_id, to_pose("T_world_anchor", T_world_anchor), force))
+        self._request(MoveAnchor(0, anchor_id, to_pose("T_world_anchor", T_world_anchor), force))
+
+    def _session_now_ns(self) -> int:
+        return self._connection.clock.session_ns(time.monotonic_ns())
+
+
+def _missing_package(error: ImportError) -> ClientError:
+    return ClientError(
+        f"finding sheets needs OpenCV and SciPy ({error.name} is missing): pip install 'iris-session[anchors]'"
+    )
+
+
+def to_tracking_covariance(
+    covariance: Sequence[float],
+    T_tracking_camera: PoseTuple,
+    T_camera_sheet: PoseTuple,
+    camera_sigma: tuple[float, float],
+) -> tuple[float, ...]:
+    """Covariance of `T_tracking_sheet` (36 values, tracking axes) from that of `T_camera_sheet` in camera axes and how
+    well the camera's own pose is known: a camera that is turned by w puts the sheet off by w x lever."""
+    q = T_tracking_camera[1]
+    R = np.array([quat_rotate(q, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]).T
+    turn = np.kron(np.eye(2), R)
+    x, y, z = quat_rotate(q, T_camera_sheet[0])  # from the camera to the sheet, tracking axes
+    J = np.eye(6)
+    J[:3, 3:] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    own = np.diag([camera_sigma[0] ** 2] * 3 + [camera_sigma[1] ** 2] * 3)
+    C = turn @ np.asarray(covariance, dtype=np.float64).reshape(6, 6) @ turn.T + J @ own @ J.T
+    return tuple(float(v) for v in (0.5 * (C + C.T)).ravel())

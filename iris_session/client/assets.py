@@ -264,8 +264,10 @@ class ClientAssets:
         return self._workers is not None
 
     def poll(self) -> bool:
-        """Process results of the workers and received chunks, and request more. Return true when there was
-        something.
+        """Process results of the workers and received chunks, and request more.
+
+        Returns:
+            True when there was something.
         """
         workers, loader = self._workers, self._loader
         if workers is None:
@@ -297,7 +299,8 @@ class ClientAssets:
     def close(self) -> AssetWorkers | None:
         """Fail all pending assets, because the client is closed.
 
-        Returns the workers, to be closed without the lock: their decode functions may wait for it.
+        Returns:
+            The workers, to be closed without the lock: their decode functions may wait for it.
         """
         workers, self._workers = self._workers, None
         error = AssetError("", "closed", "the client was closed")

@@ -169,7 +169,7 @@ class Client:
         arrivals = ArrivalMeter()
         self.media = ClientMedia(self.connection, self._sockets, self._lock, lambda: self._loop.polls_here, arrivals)
         self.assets = ClientAssets(self.connection, self._sockets, self._lock)
-        self.alignment = ClientAlignment(self)
+        self.alignment = ClientAlignment(self.connection, self.send, self.request)
         self._loop = ClientLoop(self, self._sockets, self._joiner, self._lock, arrivals)
 
     # --- life ---------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Find sessions: listen for beacons on UDP, and request the introduction of one address over TCP.
+"""Find sessions: listen for beacons on UDP, resolve host names, and request the introduction of one address over TCP.
 
 Beacons and introductions are public and unauthenticated: `server_trust` decides what to trust of them.
 """
@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import ipaddress
 import socket
+import threading
 import time
 from collections.abc import Generator
+from concurrent.futures import Future
 from typing import Final
 
 from iris_session.client.errors import ClientError
-from iris_session.client.host_lookup import resolve_host
 from iris_session.link.discovery import BeaconListener, DiscoveryError, FoundSession
 from iris_session.protocol.codec import INTRODUCTION_PREFIX, decode_introduction
 from iris_session.protocol.discovery import DISCOVERY_PORT, INTRODUCTION_OFFSET, Introduction
@@ -23,6 +25,8 @@ from iris_session.protocol.limits import MAX_INTRODUCTION_BYTES
 LISTEN_S: Final = 1.0
 #: Error numbers by which different systems report a connection that is not established yet.
 _NOT_YET: Final = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.EINPROGRESS, errno.ENOTCONN})
+#: Names that the system is being asked for: it may take many seconds, and all who ask meanwhile share the answer.
+_lookups: dict[str, Future[str]] = {}
 
 
 def open_listener(port: int = DISCOVERY_PORT) -> BeaconListener:
@@ -94,3 +98,43 @@ def request_introduction(host: str, control_port: int, timeout_s: float) -> Gene
                 raise ConnectionError(errno.ECONNRESET, "closed before the end")
             data += more
     return introduction
+
+
+def resolve_host(host: str, until_s: float) -> Generator[None, None, str]:
+    """Resolve the network address of a host without blocking: a thread asks the system. Yields wherever it would wait.
+
+    Names are resolved to IPv4 only, as on the sockets of the session. An answer that comes after the timeout serves the
+    next attempt.
+
+    Args:
+        host: Name or address.
+        until_s: When to give up, by `time.monotonic()` [s].
+
+    Returns:
+        The address.
+
+    Raises:
+        OSError: No such name, or no answer in time.
+    """
+    with contextlib.suppress(ValueError):
+        return str(ipaddress.ip_address(host))
+    if host not in _lookups:
+        _lookups[host] = Future()
+        threading.Thread(target=_look_up, args=(host, _lookups[host]), name=f"iris-resolve-{host}", daemon=True).start()
+    lookup = _lookups[host]
+    while not lookup.done():
+        if time.monotonic() > until_s:
+            raise TimeoutError(errno.ETIMEDOUT, f"the name {host} is still looked up")
+        yield
+    _lookups.pop(host, None)
+    return lookup.result()
+
+
+def _look_up(host: str, lookup: Future[str]) -> None:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        lookup.set_result(str(socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)[0][4][0]))
+    except OSError as error:
+        lookup.set_exception(error)
+    except ValueError as error:  # the system's resolver does not accept it as a name
+        lookup.set_exception(OSError(errno.EINVAL, str(error)))

@@ -2,7 +2,7 @@
 
     name --beacons--> address --introduction--> key --known?--> (join code: pair, store the key) --> hello
 
-`EndpointResolver` takes these steps: `server_trust` decides on keys, `key_pairing` pairs. `SessionJoiner` drives a
+`EndpointResolver` takes these steps: `server_trust` decides on keys and pairs. `SessionJoiner` drives a
 resolver for a connection and checks which session answers.
 """
 
@@ -18,8 +18,7 @@ from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.discovery import LISTEN_S, open_listener, request_introduction
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
-from iris_session.client.key_pairing import default_key_name, pair_key
-from iris_session.client.server_trust import ServerTrust
+from iris_session.client.server_trust import ServerTrust, default_key_name, pair_key
 from iris_session.client.sockets import ClientSockets, CurveKeys
 from iris_session.link.config import is_loopback
 from iris_session.link.discovery import FoundSession, is_plausible

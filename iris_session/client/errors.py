@@ -38,7 +38,16 @@ class NotConnectedError(ClientError):
 
 
 class RefusedError(ClientError):
-    """The session refused `hello`. `code` is a `RefusalCode` or a `DenialReason`."""
+    """The session refused `hello`.
+
+    Args:
+        refused: Its answer.
+
+    Attributes:
+        code: A `RefusalCode` or a `DenialReason`.
+        message: What is wrong, in words.
+        advice: What to do.
+    """
 
     def __init__(self, refused: Refused) -> None:
         super().__init__(f"refused ({refused.code}): {join_parts(refused.message, refused.advice)}")
@@ -48,7 +57,14 @@ class RefusedError(ClientError):
 
 
 class VersionError(RefusedError):
-    """The session speaks other protocol versions than this client."""
+    """The session speaks other protocol versions than this client.
+
+    Args:
+        refused: Its answer.
+
+    Attributes:
+        supported_versions: Versions that it speaks.
+    """
 
     def __init__(self, refused: Refused) -> None:
         super().__init__(refused)
@@ -56,7 +72,14 @@ class VersionError(RefusedError):
 
 
 class DeniedError(ClientError):
-    """The session denied a request, and changed nothing."""
+    """The session denied a request, and changed nothing.
+
+    Args:
+        denial: Its answer.
+
+    Attributes:
+        denial: The answer: reason, message, holder and advice.
+    """
 
     def __init__(self, denial: Denial) -> None:
         super().__init__(f"denied ({denial.reason}): {self.describe(denial)}")
@@ -64,7 +87,14 @@ class DeniedError(ClientError):
 
     @staticmethod
     def describe(denial: Denial) -> str:
-        """Return message, holder and advice of a denial in one line."""
+        """Return a denial in one line.
+
+        Args:
+            denial: The denial.
+
+        Returns:
+            Its message, holder and advice.
+        """
         name = denial.holder_name or denial.holder
         who = "" if not name or name in denial.message.split() else f"held by {name}"
         return join_parts(denial.message, who, denial.advice)
@@ -73,7 +103,12 @@ class DeniedError(ClientError):
 class RequestTimeoutError(ClientError, TimeoutError):
     """No answer came in time. The request may still take effect: check the leases before you ask again.
 
-    An `acquire` is withdrawn; `denial` then is the session's answer to it, with its place in the queue and the holder.
+    Args:
+        text: What was waited for, and for how long.
+        denial: The session's answer to an `acquire` that was withdrawn.
+
+    Attributes:
+        denial: That answer, with the place in the queue and the holder; `None` for other requests.
     """
 
     def __init__(self, text: str, denial: Denial | None = None) -> None:
@@ -100,9 +135,15 @@ class SessionNameError(ClientError):
 class AssetError(ClientError):
     """An asset could not be fetched.
 
-    `address`: content hash; empty when the error concerns all assets. `reason`: an `AssetRefusal`, `hash` (the bytes
-    did not match the hash twice), `protocol`, `decode`, `cache` (the folder of the cache cannot be used), `gone`
-    (removed since), `no_channel`, `cancelled` or `closed`.
+    Args:
+        address: Content hash.
+        reason: See the attribute.
+        text: The message.
+
+    Attributes:
+        address: Content hash; empty when the error concerns all assets.
+        reason: An `AssetRefusal`, `hash` (the bytes did not match the hash twice), `protocol`, `decode`, `cache` (the
+            folder of the cache cannot be used), `gone` (removed since), `no_channel`, `cancelled` or `closed`.
     """
 
     def __init__(self, address: str, reason: str, text: str) -> None:
@@ -112,5 +153,12 @@ class AssetError(ClientError):
 
     @classmethod
     def from_store(cls, error: AssetStoreError) -> AssetError:
-        """Return the client's error for an error of its asset store."""
+        """Return the client's error for an error of its asset store.
+
+        Args:
+            error: The store's error.
+
+        Returns:
+            An error with the same address, reason and text.
+        """
         return cls(error.address, error.reason, str(error))

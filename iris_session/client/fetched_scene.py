@@ -29,10 +29,10 @@ from iris_session.scene.images import Pixels
 EVERYTHING: Final = Budget()
 #: Default timeout of a fetch [s], sized for slow networks.
 DEFAULT_TIMEOUT_S: Final = 60.0
-#: Time for which a session may refuse the specification that it names itself as unknown, and the first pause before
-#: the next request [s]. Each pause is twice the one before.
+#: Time for which a session may refuse the specification that it names itself as unknown, and the pause before the next
+#: request [s].
 REFUSED_S: Final = 2.0
-FIRST_PAUSE_S: Final = 0.01
+RETRY_S: Final = 0.1
 #: Time for which a complete scene that was patched meanwhile is updated before it is returned as it is [s]: a scene may
 #: be patched faster than its specification travels over the network.
 CATCH_UP_S: Final = 1.0
@@ -92,7 +92,7 @@ def fetch_scene(
             "Budget(triangles=100_000)"
         )
     until = time.monotonic() + timeout_s
-    refused = _RefusalRetry()
+    refused, refused_until = "", 0.0
     whole: tuple[int, float] | None = None  # scene epoch of the first complete scene, and the time of its arrival
     made: Mapping[str, MeshArrays | Pixels] = {}
     while True:
@@ -101,11 +101,17 @@ def fetch_scene(
             scene, made = _fetch(client, scene_hash, budget, until, on_progress, made)
         except ClientError as error:
             now = time.monotonic()
-            replaced = client.mirror.scene_hash != scene_hash
-            if now >= until or not (replaced or refused.should_retry(error, scene_hash, now)):
+            if now >= until:
                 raise
-            if not replaced:
-                client.wait_for(_named_another(scene_hash), min(refused.pause_s, until - now))
+            if client.mirror.scene_hash != scene_hash:
+                continue
+            if not isinstance(error, AssetError) or error.reason != AssetRefusal.UNKNOWN:
+                raise
+            if refused != scene_hash:  # a session may name it moments before it serves it
+                refused, refused_until = scene_hash, now + REFUSED_S
+            if now >= refused_until:
+                raise
+            client.wait_for(lambda c, named=scene_hash: c.mirror.scene_hash != named, min(RETRY_S, until - now))  # type: ignore[misc]
             continue
         now = time.monotonic()
         if whole is None or whole[0] != epoch:
@@ -113,31 +119,6 @@ def fetch_scene(
         patched = client.mirror.scene_epoch == epoch and now - whole[1] > CATCH_UP_S
         if client.mirror.scene_hash == scene_hash or patched:
             return scene
-
-
-class _RefusalRetry:
-    """Retries after refusals of one specification: a session may name it moments before it serves it.
-
-    `pause_s`: time until the next request [s].
-    """
-
-    def __init__(self) -> None:
-        self.pause_s = 0.0
-        self._scene_hash = ""
-        self._until = 0.0
-
-    def should_retry(self, error: ClientError, scene_hash: str, now: float) -> bool:
-        """Return whether to ask again, after one more refusal."""
-        if not isinstance(error, AssetError) or error.reason != AssetRefusal.UNKNOWN:
-            return False
-        if scene_hash != self._scene_hash:
-            self._scene_hash, self._until, self.pause_s = scene_hash, now + REFUSED_S, FIRST_PAUSE_S / 2
-        self.pause_s *= 2
-        return now < self._until
-
-
-def _named_another(scene_hash: str) -> Callable[[Client], bool]:
-    return lambda client: client.mirror.scene_hash != scene_hash
 
 
 def _fetch(

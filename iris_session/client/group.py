@@ -19,8 +19,6 @@ _ROUNDS: Final = 3
 class ClientGroup:
     """Several clients polled by one loop; closed ones are skipped.
 
-    Keeps its poller from wait to wait: making one anew costs more than waiting. Shares the loops of its clients.
-
         group = ClientGroup(clients)
         while running:
             group.poll(0.1)
@@ -31,9 +29,6 @@ class ClientGroup:
 
     def __init__(self, clients: Sequence[Client]) -> None:
         self.clients = tuple(clients)
-        self._poller = zmq.Poller()
-        self._owners: dict[int, tuple[Client, bool]] = {}  # by socket; whether only state comes by it
-        self._registered: list[tuple[int, bool]] = []
 
     def wait(self, timeout_s: float) -> list[Client]:
         """Wait until a client has something to do, without polling any.
@@ -67,27 +62,23 @@ class ClientGroup:
     def _wait(self, timeout_s: float) -> tuple[list[Client], list[Client]]:
         """Return the clients for which state came, and those for which anything else came or a timer is due."""
         now = time.monotonic_ns()
-        clients = [client for client in self.clients if client.connection.phase is not ConnectionPhase.CLOSED]
-        due = [client.connection.next_deadline_ns(now) for client in clients]
-        deadline = min((now + int(timeout_s * 1e9), *due))
-        registered = [client._loop.registration for client in self.clients]
-        if registered != self._registered:
-            self._register(registered)
-        woken = [self._owners[_poller_key(sock)] for sock, _ in self._poller.poll(to_milliseconds(deadline - now))]
-        now = time.monotonic_ns()
-        rest = [c for c, due_ns in zip(clients, due, strict=True) if due_ns <= now]
-        rest += [c for c, only_state in woken if not only_state and c not in rest]
-        return [c for c, only_state in woken if only_state], rest
-
-    def _register(self, registered: list[tuple[int, bool]]) -> None:
-        self._registered = registered
-        self._poller = zmq.Poller()
-        self._owners = {}
+        deadline = now + int(timeout_s * 1e9)
+        poller = zmq.Poller()
+        owners: dict[int, tuple[Client, bool]] = {}  # by socket; whether only state comes by it
+        due: list[tuple[Client, int]] = []
         for client in self.clients:
-            first = len(self._poller.sockets)
-            state = client._loop.register(self._poller)
-            for sock, _ in self._poller.sockets[first:]:
-                self._owners[_poller_key(sock)] = client, sock is state
+            if client.connection.phase is ConnectionPhase.CLOSED:
+                continue
+            due.append((client, client.connection.next_deadline_ns(now)))
+            first = len(poller.sockets)
+            state = client._loop.register(poller)
+            owners |= {_poller_key(sock): (client, sock is state) for sock, _ in poller.sockets[first:]}
+        deadline = min((deadline, *(due_ns for _, due_ns in due)))
+        woken = [owners[_poller_key(sock)] for sock, _ in poller.poll(to_milliseconds(deadline - now))]
+        now = time.monotonic_ns()
+        rest = [client for client, due_ns in due if due_ns <= now]
+        rest += [client for client, only_state in woken if not only_state and client not in rest]
+        return [client for client, only_state in woken if only_state], rest
 
 
 def _poller_key(sock: zmq.Socket[bytes] | int) -> int:

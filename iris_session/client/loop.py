@@ -69,7 +69,6 @@ class ClientLoop:
         self._lock = lock
         self._arrivals = arrivals
         self._generation = 0
-        self._just_progressed = False
         self._thread: threading.Thread | None = None
         self._stopping = False
 
@@ -78,12 +77,8 @@ class ClientLoop:
     def poll(self, timeout_s: float) -> bool:
         """Run rounds until anything came or the phase changed, at most for `timeout_s`; see `Client.poll`."""
         deadline = time.monotonic_ns() + int(timeout_s * 1e9)
-        # Assets arrive all the time: one round per call is enough, and anything that came since ends the wait.
-        skip_round = self._just_progressed and timeout_s > 0.0
         while True:
-            progressed = not skip_round and self._run_round()
-            self._just_progressed = progressed and self._connection.is_joined and self._client.assets.is_loading
-            skip_round = False
+            progressed = self._run_round()
             now = time.monotonic_ns()
             if progressed or now >= deadline:
                 break
@@ -109,19 +104,12 @@ class ClientLoop:
         """True when state has arrived that `poll_state` would take."""
         return self._sockets.has_state
 
-    @property
-    def registration(self) -> tuple[int, bool]:
-        """Changes when `register` would add something else than before."""
-        return self._sockets.version, self._connection.peek_outgoing() is not None
-
     def register(self, poller: zmq.Poller) -> zmq.Socket[bytes] | None:
         """Add our sockets to a poller; `poll` is due when they wake it and at `connection.next_deadline_ns`.
 
         Returns:
             The state socket: `poll_state` is enough when only that wakes.
         """
-        if self._connection.phase is ConnectionPhase.CLOSED:
-            return None
         return self._sockets.register(poller, sending=self._connection.peek_outgoing() is not None)
 
     def send_pending(self) -> None:

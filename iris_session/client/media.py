@@ -148,7 +148,11 @@ class ClientMedia:
     # --- for the client, which holds the lock ----------------------------------------------------------------------
 
     def poll(self) -> bool:
-        """Subscribe anew with every connection, once the session has reported our budget. True when frames came."""
+        """Subscribe anew with every connection, once the session has reported our budget, and take what has come.
+
+        Returns:
+            True when frames came.
+        """
         if self._generation != self._connection.generation:
             self._generation = self._connection.generation
             self._sockets.close_media()

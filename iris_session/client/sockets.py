@@ -6,9 +6,9 @@ No protocol here.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import socket
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeGuard
@@ -110,7 +110,6 @@ class ClientSockets:
         self._host = ""
         self._control_port = 0
         self._curve: CurveKeys | None = None
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self._control: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._state: zmq.Socket[bytes] | None = None
@@ -120,8 +119,6 @@ class ClientSockets:
         self._published: set[str] = set()
         self._assets: zmq.Socket[bytes] | None = None
         self._assets_monitor: zmq.Socket[bytes] | None = None
-        #: Changes whenever a socket is opened or closed.
-        self.version = 0
         self._wakes_anybody = False
         self._wake_out, self._wake_in = socket.socketpair()
         self._wake_out.setblocking(False)
@@ -129,15 +126,12 @@ class ClientSockets:
 
     def set_target(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
         """Set address and keys of the sockets that are opened from now on."""
-        self._host = host
-        self._control_port = control_port
-        self._curve = curve
+        self._host, self._control_port, self._curve = host, control_port, curve
         self.close_media()
         self.close_assets()
-        if self._state is not None:
-            self._state.close(linger=0)
-            self._state = None
-            self.version += 1
+        self._close_state()
+
+    # --- control ------------------------------------------------------------------------------------------------------
 
     def open_control(self) -> None:
         """Open a fresh control socket; the old one is closed at once with everything in it."""
@@ -147,9 +141,21 @@ class ClientSockets:
         control.setsockopt(zmq.SNDHWM, CONTROL_HWM)
         control.setsockopt(zmq.RCVHWM, 1024)  # events; a slow reader is disconnected by the front, never silently cut
         self._monitor = control.get_monitor_socket(zmq.EVENT_DISCONNECTED)
-        control.connect(f"tcp://{host_port(self._host, self._control_port)}")
-        self._control = control
-        self.version += 1
+        self._control = self._connect(control, self._control_port)
+
+    def send_control(self, data: bytes) -> bool:
+        """Send without waiting. False: the socket is full."""
+        return _send(self._control, (data,))
+
+    def drain_control(self) -> list[list[bytes]]:
+        """Return messages of the control channel, in order, at most `MAX_DRAIN`."""
+        return _drain(self._control)
+
+    def poll_disconnect(self) -> bool:
+        """Return true once after the control socket lost its peer."""
+        return _poll_monitor(self._monitor)
+
+    # --- state --------------------------------------------------------------------------------------------------------
 
     def open_state(self, port: int, generation: int) -> None:
         """Subscribe to the state channel, again with every `generation` of the control connection.
@@ -159,16 +165,24 @@ class ClientSockets:
         """
         if self._state is not None and self._state_of == (port, generation):
             return
-        if self._state is not None:
-            self._state.close(linger=0)
+        self._close_state()
         state = self._new_socket(zmq.SUB)
         state.setsockopt(zmq.RCVHWM, STATE_HWM)
         state.setsockopt(zmq.RCVBUF, STATE_RCVBUF)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_RIGID)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_PRESENCE)
-        state.connect(f"tcp://{host_port(self._host, port)}")
-        self._state, self._state_of = state, (port, generation)
-        self.version += 1
+        self._state, self._state_of = self._connect(state, port), (port, generation)
+
+    def drain_state(self) -> list[list[bytes]]:
+        """Return messages of the state channel, oldest first."""
+        return _drain(self._state)
+
+    @property
+    def has_state(self) -> bool:
+        """True when a message has come on the state channel."""
+        return _readable(self._state)
+
+    # --- media --------------------------------------------------------------------------------------------------------
 
     @property
     def has_media(self) -> bool:
@@ -178,11 +192,10 @@ class ClientSockets:
     def subscribe_media(self, port: int, topics: Sequence[bytes]) -> None:
         """Add subscriptions. Port 0: the session has no media."""
         if self._media is None and port:
-            media = self._media = self._new_socket(zmq.SUB, bulk_context())
+            media = self._new_socket(zmq.SUB, bulk_context())
             media.setsockopt(zmq.RCVHWM, MEDIA_HWM)
             media.setsockopt(zmq.RCVBUF, MEDIA_RCVBUF)
-            media.connect(f"tcp://{host_port(self._host, port)}")
-            self.version += 1
+            self._media = self._connect(media, port)
         for topic in topics:
             if self._media is not None:
                 self._media.setsockopt(zmq.SUBSCRIBE, topic)
@@ -200,26 +213,27 @@ class ClientSockets:
     def send_media(self, port: int, stream: str, frames: Sequence[bytes]) -> bool:
         """Publish a frame of a source. False: the socket is full. It has room for `MEDIA_HWM` times as many
         frames as it has streams, whichever they are of."""
-        if self._ingest is None:
+        ingest = self._ingest
+        if ingest is None:
             if not port:
                 return False
-            self._ingest = self._new_socket(zmq.PUSH, bulk_context())
-            self._ingest.setsockopt(zmq.IMMEDIATE, 1)
-            self._published.clear()
-            self._reserve_ingest(stream)
-            self._ingest.connect(f"tcp://{host_port(self._host, port)}")
-        self._reserve_ingest(stream)
-        try:
-            self._ingest.send_multipart(frames, zmq.NOBLOCK)
-        except zmq.Again:
-            return False
-        return True
-
-    def _reserve_ingest(self, stream: str) -> None:
-        """Give the ingest socket room for frames of a stream that it did not have before."""
-        if self._ingest is not None and stream not in self._published and len(self._published) < MAX_STREAMS:
+            ingest = self._new_socket(zmq.PUSH, bulk_context())
+            ingest.setsockopt(zmq.IMMEDIATE, 1)
+            ingest.setsockopt(zmq.SNDHWM, MEDIA_HWM)
+            self._ingest, self._published = self._connect(ingest, port), {stream}
+        elif stream not in self._published and len(self._published) < MAX_STREAMS:
             self._published.add(stream)
-            self._ingest.setsockopt(zmq.SNDHWM, MEDIA_HWM * len(self._published))
+            ingest.setsockopt(zmq.SNDHWM, MEDIA_HWM * len(self._published))
+        return _send(ingest, frames)
+
+    def close_media(self) -> None:
+        """Close the subscriptions and the ingest socket, which belong to one connection."""
+        for one in (self._media, self._ingest):
+            if one is not None:
+                one.close(linger=0)
+        self._media = self._ingest = None
+
+    # --- assets -------------------------------------------------------------------------------------------------------
 
     @property
     def has_assets(self) -> bool:
@@ -229,23 +243,16 @@ class ClientSockets:
     def open_assets(self, port: int) -> None:
         """Connect to the assets channel unless it is open."""
         if self._assets is None:
-            assets = self._assets = self._new_socket(zmq.DEALER, bulk_context())
+            assets = self._new_socket(zmq.DEALER, bulk_context())
             assets.setsockopt(zmq.MAXMSGSIZE, MAX_ASSET_CHUNK_BYTES)
             assets.setsockopt(zmq.SNDHWM, ASSETS_SEND_HWM)
             assets.setsockopt(zmq.RCVHWM, ASSETS_HWM)
             self._assets_monitor = assets.get_monitor_socket(zmq.EVENT_DISCONNECTED)
-            assets.connect(f"tcp://{host_port(self._host, port)}")
-            self.version += 1
+            self._assets = self._connect(assets, port)
 
     def send_assets(self, data: bytes) -> bool:
         """Request a chunk without waiting. False: the socket is full."""
-        if self._assets is None:
-            return False
-        try:
-            self._assets.send(data, zmq.NOBLOCK)
-        except zmq.Again:
-            return False
-        return True
+        return _send(self._assets, (data,))
 
     def drain_assets(self) -> list[list[memoryview]]:
         """Return messages of the assets channel, in order, at most `MAX_DRAIN`, without a copy."""
@@ -263,42 +270,8 @@ class ClientSockets:
         if self._assets is not None:
             _close_watched(self._assets, self._assets_monitor, linger_ms=0)
             self._assets = self._assets_monitor = None
-            self.version += 1
 
-    def close_media(self) -> None:
-        """Close the subscriptions and the ingest socket, which belong to one connection."""
-        for one in (self._media, self._ingest):
-            if one is not None:
-                one.close(linger=0)
-                self.version += 1
-        self._media = self._ingest = None
-
-    def send_control(self, data: bytes) -> bool:
-        """Send without waiting. False: the socket is full."""
-        if self._control is None:
-            return False
-        try:
-            self._control.send(data, zmq.NOBLOCK)
-        except zmq.Again:
-            return False
-        return True
-
-    def drain_control(self) -> list[list[bytes]]:
-        """Return messages of the control channel, in order, at most `MAX_DRAIN`."""
-        return _drain(self._control)
-
-    def drain_state(self) -> list[list[bytes]]:
-        """Return messages of the state channel, oldest first."""
-        return _drain(self._state)
-
-    @property
-    def has_state(self) -> bool:
-        """True when a message has come on the state channel."""
-        return _readable(self._state)
-
-    def poll_disconnect(self) -> bool:
-        """Return true once after the control socket lost its peer."""
-        return _poll_monitor(self._monitor)
+    # --- all ----------------------------------------------------------------------------------------------------------
 
     def register(self, poller: zmq.Poller, *, sending: bool) -> zmq.Socket[bytes] | None:
         """Add the sockets that peers can wake to `poller`; `sending`: also wake when the control socket has room.
@@ -334,7 +307,6 @@ class ClientSockets:
     def enable_wake_registration(self) -> None:
         """Let `wake` end waits for our sockets in other loops too, not only in our own `poll`."""
         self._wakes_anybody = True
-        self.version += 1
 
     def wake(self) -> None:
         """End a wait that includes `register_wake`, from any thread."""
@@ -347,26 +319,16 @@ class ClientSockets:
             while self._wake_in.recv(4096):
                 pass
 
-    def disconnect(self) -> None:
-        """Disconnect after a session has refused us: libzmq would reconnect for ever."""
-        if self._control is not None or self._state is not None:
-            self.version += 1
-            self.close_media()
-            self.close_assets()
-            self._close_control(linger_ms=0)
-            if self._state is not None:
-                self._state.close(linger=0)
-                self._state = None
+    def disconnect(self, linger_ms: int = 0) -> None:
+        """Close all connections, also after a session has refused us: libzmq would reconnect for ever."""
+        self.close_media()
+        self.close_assets()
+        self._close_control(linger_ms)
+        self._close_state()
 
     def close(self) -> None:
         """Close everything; a last bye has `LINGER_MS` to be sent."""
-        self.version += 1
-        self.close_media()
-        self.close_assets()
-        self._close_control(linger_ms=LINGER_MS)
-        if self._state is not None:
-            self._state.close(linger=0)
-            self._state = None
+        self.disconnect(LINGER_MS)
         self._wake_out.close()
         self._wake_in.close()
 
@@ -375,8 +337,17 @@ class ClientSockets:
             _close_watched(self._control, self._monitor, linger_ms)
             self._control = self._monitor = None
 
+    def _close_state(self) -> None:
+        if self._state is not None:
+            self._state.close(linger=0)
+            self._state = None
+
     def _new_socket(self, kind: int, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> zmq.Socket[bytes]:
-        return open_socket(context or self._context, kind, self._host, self._curve)
+        return open_socket(context or zmq.Context.instance(), kind, self._host, self._curve)
+
+    def _connect(self, sock: zmq.Socket[bytes], port: int) -> zmq.Socket[bytes]:
+        sock.connect(f"tcp://{host_port(self._host, port)}")
+        return sock
 
 
 def _readable(sock: zmq.Socket[bytes] | None) -> TypeGuard[zmq.Socket[bytes]]:
@@ -399,41 +370,42 @@ def _close_watched(watched: zmq.Socket[bytes], monitor: zmq.Socket[bytes] | None
     watched.close(linger=linger_ms)
 
 
+def _send(sock: zmq.Socket[bytes] | None, frames: Sequence[bytes]) -> bool:
+    """Send without waiting. Return false for a socket that is full, or not open."""
+    if sock is None:
+        return False
+    try:
+        sock.send_multipart(frames, _NOBLOCK)
+    except zmq.Again:
+        return False
+    return True
+
+
 def _drain(sock: zmq.Socket[bytes] | None) -> list[list[bytes]]:
-    """Return the messages that have come."""
+    """Return the messages that have come. Frames are received one by one: `recv_multipart` takes twice as long, as it
+    checks again whether more frames follow."""
     messages: list[list[bytes]] = []
     while len(messages) < MAX_DRAIN and _readable(sock):
-        messages.append(_receive(sock))
-    return messages
-
-
-def _receive(sock: zmq.Socket[bytes]) -> list[bytes]:
-    """Return the available message. Half the time of `recv_multipart`, which checks again whether more frames
-    follow.
-    """
-    frame = sock.recv(_NOBLOCK, copy=False)
-    frames = [frame.bytes]
-    while frame.more:
         frame = sock.recv(_NOBLOCK, copy=False)
-        frames.append(frame.bytes)
-    return frames
-
-
-_lock = threading.Lock()
-_context: tuple[int, zmq.Context[zmq.Socket[bytes]]] | None = None
+        frames = [frame.bytes]
+        while frame.more:
+            frame = sock.recv(_NOBLOCK, copy=False)
+            frames.append(frame.bytes)
+        messages.append(frames)
+    return messages
 
 
 def bulk_context() -> zmq.Context[zmq.Socket[bytes]]:
     """Return the ZeroMQ context of assets and media, one per process; a forked child gets its own. State and control
     do not wait in its thread while megabytes are read or deciphered."""
-    global _context  # noqa: PLW0603
-    with _lock:
-        if _context is None or _context[0] != os.getpid():
-            _context = os.getpid(), run_at_low_priority(_opened)
-        return _context[1]
+    return _make_bulk_context(os.getpid())
 
 
-def _opened() -> zmq.Context[zmq.Socket[bytes]]:
-    made: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    made.socket(zmq.DEALER).close(linger=0)  # with the first socket libzmq starts its threads
-    return made
+@functools.cache
+def _make_bulk_context(_pid: int) -> zmq.Context[zmq.Socket[bytes]]:
+    def make() -> zmq.Context[zmq.Socket[bytes]]:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        context.socket(zmq.DEALER).close(linger=0)  # with the first socket libzmq starts its threads
+        return context
+
+    return run_at_low_priority(make)

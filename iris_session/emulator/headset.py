@@ -1,4 +1,4 @@
-"""An emulated XR headset: its own tracking frame, its detections of a printed sheet, and its sampling.
+"""An emulated XR headset: its own tracking frame, its detections of a printed sheet, its sampling, and its link.
 
 It knows the true poses (`T_world_...`) and reports only what a real headset would: poses in its tracking frame, with
 noise. Random numbers come from one seeded generator, time is passed in: the same calls give the same readings.
@@ -10,7 +10,8 @@ Z out of it towards the viewer. The tracking frame is gravity-aligned but for a 
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections import deque
+from typing import Final, Generic, TypeVar
 
 import msgspec
 import numpy as np
@@ -31,13 +32,26 @@ from anchors.pose import (
     quat_rotate,
 )
 from iris_session.emulator.sheet_noise import SheetNoise, mix_viewpoint_noise
-from iris_session.netsim.latency import LinkModel
 
 #: Pose of the sheet in the demo scene: on the table in front of the operators, facing up (body `sheet`).
 DEFAULT_T_WORLD_ANCHOR: Final[PoseTuple] = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
 DEFAULT_ANCHOR_ID: Final = "table"
 DEFAULT_SHEET_M: Final = 0.16
+T = TypeVar("T")
 MAX_VIEWPOINTS: Final = 256  # viewpoints whose systematic error is remembered
+
+
+class LinkModel(msgspec.Struct, frozen=True):
+    """Delay of one direction of a wireless link.
+
+    `latency_s`: tracking run time and radio, least. `jitter_s`: mean of the exponential part on top. `stall_every_s`:
+    mean time between stalls (0: none), in which nothing passes for `stall_s`; then everything arrives at once.
+    """
+
+    latency_s: float = 0.008
+    jitter_s: float = 0.002
+    stall_every_s: float = 0.0
+    stall_s: float = 0.03
 
 
 class HeadsetModel(msgspec.Struct, frozen=True):
@@ -157,7 +171,8 @@ class EmulatedHeadset:
             return False
         forward, normal = quat_rotate(T_world_head[1], (1.0, 0.0, 0.0)), quat_rotate(T_world_anchor[1], (0.0, 0.0, 1.0))
         view = _direction(T_world_head[0], T_world_anchor[0])
-        return _dot(forward, view) >= math.cos(0.5 * self.model.field_of_view_rad) and -_dot(normal, view) >= math.cos(
+        ahead, facing = float(np.dot(forward, view)), -float(np.dot(normal, view))
+        return ahead >= math.cos(0.5 * self.model.field_of_view_rad) and facing >= math.cos(
             self.model.max_incidence_rad
         )
 
@@ -174,7 +189,10 @@ class EmulatedHeadset:
         else:
             d = distance(T_world_head[0], T_world_anchor[0])
             units, scale_unit = self._draw_sheet_units(viewpoint_id)
-            p, q = noise.observe(p, q, np.array((view, *_compute_perpendiculars(view))), d, units[None], scale_unit)
+            e1 = np.array(view)
+            e2 = np.cross(e1, (0.0, 0.0, 1.0) if abs(view[2]) < 0.9 else (1.0, 0.0, 0.0))
+            e2 /= np.linalg.norm(e2)
+            p, q = noise.observe(p, q, np.array((e1, e2, np.cross(e1, e2))), d, units[None], scale_unit)
         (x, y, z), (w, a, b, c) = p[0].tolist(), q[0].tolist()
         return compose(inverse(self.get_T_world_tracking(now_ns)), ((x, y, z), quat_normalize((w, a, b, c))))
 
@@ -219,23 +237,61 @@ def compute_look_at(eye: Vec3, target: Vec3) -> PoseTuple:
     return (eye, quat_mul(quat_from_yaw(yaw), down))
 
 
-def _dot(a: Vec3, b: Vec3) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _direction(a: Vec3, b: Vec3) -> Vec3:
     d = distance(a, b)
     return ((b[0] - a[0]) / d, (b[1] - a[1]) / d, (b[2] - a[2]) / d)
 
 
-def _cross(a: Vec3, b: Vec3) -> Vec3:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+# --- the link ---------------------------------------------------------------------------------------------------------
 
 
-def _compute_perpendiculars(e1: Vec3) -> tuple[Vec3, Vec3]:
-    """Return two unit vectors perpendicular to `e1`."""
-    helper: Vec3 = (0.0, 0.0, 1.0) if abs(e1[2]) < 0.9 else (1.0, 0.0, 0.0)
-    c = _cross(e1, helper)
-    n = math.sqrt(_dot(c, c))
-    e2 = (c[0] / n, c[1] / n, c[2] / n)
-    return e2, _cross(e1, e2)
+class DelayLine(Generic[T]):
+    """A queue that releases items when they arrive, in order: a late item delays those behind it."""
+
+    def __init__(self, model: LinkModel, rng: np.random.Generator) -> None:
+        self.model = model
+        self.stalls = 0
+        self._rng = rng
+        self._items: deque[tuple[int, T]] = deque()
+        self._last_ns = 0
+        self._next_stall_ns: int | None = None
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def push(self, item: T, now_ns: int) -> None:
+        """Send an item at `now_ns`."""
+        model = self.model
+        arrives = now_ns + int((model.latency_s + self._rng.exponential(1.0) * model.jitter_s) * 1e9)
+        arrives = max(arrives, self._last_ns, self._compute_stall_end_ns(now_ns))
+        self._last_ns = arrives
+        self._items.append((arrives, item))
+
+    def pop(self, now_ns: int) -> list[T]:
+        """Return and remove the items that have arrived by `now_ns`."""
+        arrived: list[T] = []
+        while self._items and self._items[0][0] <= now_ns:
+            arrived.append(self._items.popleft()[1])
+        return arrived
+
+    @property
+    def next_arrival_ns(self) -> int | None:
+        """Arrival time of the next item, `None` when the line is empty."""
+        return self._items[0][0] if self._items else None
+
+    def _compute_stall_end_ns(self, now_ns: int) -> int:
+        model = self.model
+        if model.stall_every_s <= 0.0:
+            return 0
+        if self._next_stall_ns is None:
+            self._next_stall_ns = now_ns + self._draw_wait_ns()
+        if now_ns < self._next_stall_ns:
+            return 0
+        end = self._next_stall_ns + int(model.stall_s * 1e9)
+        if now_ns >= end:
+            self._next_stall_ns = now_ns + self._draw_wait_ns()
+            self.stalls += 1
+        return end
+
+    def _draw_wait_ns(self) -> int:
+        return int(self._rng.exponential(self.model.stall_every_s) * 1e9)

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_from_yaw
 from iris_session.client import Client, CurveKeys, PoseBuffer, SceneState, ShownPoses
-from iris_session.client.core.scene_follower import pose_at
+from iris_session.client.core.scene_follower import SceneFollower
+from iris_session.client.core.state_stream import Poses
 from iris_session.client.deformables import Deformables
 from iris_session.client.stream_meter import StreamMeter
 from iris_session.emulator.behaviours import Behaviour, CombinedBehaviour, HandInput, make_behaviour
 from iris_session.emulator.gaze import Gaze, interpolate_pose
-from iris_session.emulator.headset import EmulatedHeadset
+from iris_session.emulator.headset import DelayLine, EmulatedHeadset
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
-from iris_session.netsim.latency import DelayLine
 from iris_session.protocol.client_messages import Acquire, Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.names import (
@@ -428,19 +428,19 @@ class EmulatedOperator:
             self.report.alarms += alarm
 
 
-class HeadsetDisplay:
+class HeadsetDisplay(SceneFollower):
     """The displayed state in the world frame: `OperatorView` of the behaviours. Its delay is deliberate."""
 
     def __init__(self, client: Client, delay_s: float) -> None:
-        self._client = client
+        super().__init__(client.connection)
         self.buffer = PoseBuffer(int(delay_s * 1e9))
         self.hands: dict[str, PoseTuple] = {}
-        self._vertices: dict[str, tuple[NDArray[np.floating], int]] = {}
         #: Set when a behaviour has asked for a vertex: the caller must then add vertices.
         self.wants_vertices = False
+        self.session_time_ns = 0
+        self._vertices: dict[str, tuple[NDArray[np.floating], int]] = {}
         self._epoch = 0
         self._shown: ShownPoses | None = None
-        self._now_ns = 0
 
     def add_state(self, state: SceneState) -> None:
         """Add a new state."""
@@ -456,29 +456,21 @@ class HeadsetDisplay:
 
     def refresh(self, session_ns: int) -> None:
         """Advance to the frame displayed at `session_ns`."""
-        self._now_ns = max(self._now_ns, session_ns)
-        self._shown = self.buffer.poses_at(self._now_ns)
+        self.session_time_ns = max(self.session_time_ns, session_ns)
+        self._shown = self.buffer.poses_at(self.session_time_ns)
 
     @property
     def ready(self) -> bool:
         return self._shown is not None
 
     @property
-    def session_time_ns(self) -> int:
-        return self._now_ns
+    def estop(self) -> bool:
+        return self._connection.mirror.estop
 
     @property
-    def estop(self) -> bool:
-        return self._client.mirror.estop
-
-    def body_pose(self, name: str) -> PoseTuple | None:
-        index = self._client.mirror.body_index.get(name)
-        return None if index is None else self._get_pose(index)
-
-    def tip_pose(self, robot: str) -> PoseTuple | None:
-        tip = self._client.mirror.find_tip(robot)
-        body = None if tip is None else self._get_pose(tip[0])
-        return None if tip is None or body is None else compose(body, (tip[1].p, tip[1].q))
+    def poses(self) -> Poses | None:
+        """Displayed poses (n, 7) of the bodies in the mirror."""
+        return None if self._shown is None else self._shown.poses
 
     def vertex(self, deformable: str, index: int) -> Vec3 | None:
         self.wants_vertices = True
@@ -489,18 +481,13 @@ class HeadsetDisplay:
         return (x, y, z)
 
     def vertices_ns(self, deformable: str) -> int:
-        shown = self._vertices.get(deformable)
-        return 0 if shown is None else shown[1]
+        return self._vertices[deformable][1] if deformable in self._vertices else 0
 
     def lease_version(self, robot: str) -> int | None:
-        return self._client.lease_version(robot)
+        return self._connection.lease_version(robot)
 
     def device_pose(self, device: str) -> PoseTuple:
         return self.hands[device]
-
-    def _get_pose(self, index: int) -> PoseTuple | None:
-        shown = self._shown
-        return None if shown is None or index >= len(shown.poses) else pose_at(shown.poses, index)
 
 
 RECLUTCH_AFTER_S: Final = 0.25  # clutch closed but the robot holds: open it ...

@@ -20,8 +20,7 @@ import selectors
 import signal
 import sys
 from collections.abc import Mapping, Sequence
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from iris_session.netsim.profiles import Profile, ProfileError, load_profile
 from iris_session.netsim.proxy import ImpairedLink
@@ -42,14 +41,22 @@ class ImpairmentError(IrisError):
     """The proxy cannot run. The message is one line that says why."""
 
 
-class ImpairmentProcess:
-    """A proxy in its own process, as a context. `links`: address -> profile (a name or a file).
+class ImpairmentProcess(ChildProcess):
+    """A proxy in its own process, as a context.
 
         with ImpairmentProcess({"127.0.0.2": "busy-wifi"}, ports=[7721, 7722]) as proxy:
             ...  # clients join at 127.0.0.2:7721
             proxy.execute("stall")
 
-    Raises `ImpairmentError` when a port is in use or a profile unknown.
+    Args:
+        links: Profile (a name or a file) by address.
+        ports: TCP ports to forward.
+        target: Address of the session.
+        seed: Of everything random.
+        udp: UDP ports to forward.
+
+    Raises:
+        ImpairmentError: A port is in use, or a profile is not known.
     """
 
     def __init__(
@@ -60,17 +67,13 @@ class ImpairmentProcess:
         command += ["--udp", ",".join(map(str, udp))] if udp else []
         for address, profile in links.items():
             command += ["--link", f"{address}={profile}"]
-        self._process = ChildProcess(__name__, command, stdout=PIPE, stderr=PIPE, own_session=True)
+        super().__init__(__name__, command, stdout=PIPE, stderr=PIPE, own_session=True)
         self._unanswered = 1
         try:
             self._read_answer("start")
         except BaseException:
             self.close()
             raise
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
 
     def execute(self, command: str) -> dict[str, Any]:
         """Send a command and return its answer."""
@@ -83,29 +86,21 @@ class ImpairmentProcess:
         """Send a command without waiting for its answer."""
         self._unanswered += 1
         try:
-            self._process.write(command.encode() + b"\n")
+            self.write(command.encode() + b"\n")
         except OSError as error:
-            raise ImpairmentError(f"the proxy has ended with status {self._process.exit_status}") from error
+            raise ImpairmentError(f"the proxy has ended with status {self.exit_status}") from error
 
-    def close(self) -> None:
+    def close(self, *, exit_s: float = 2.0, terminate_s: float = 0.0) -> int:
         """End the process. May be called twice."""
-        self._process.close(exit_s=2.0)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
-    ) -> None:
-        self.close()
+        return super().close(exit_s=exit_s, terminate_s=terminate_s)
 
     def _read_answer(self, command: str) -> dict[str, Any]:
         try:
-            line = self._process.read_line(ANSWER_TIMEOUT_S)
+            line = self.read_line(ANSWER_TIMEOUT_S)
         except TimeoutError:
             raise ImpairmentError(f"the proxy did not answer {command!r} within {ANSWER_TIMEOUT_S:g} s") from None
         except EOFError:
-            messages = self._process.read_stderr().strip().splitlines()
+            messages = self.read_stderr().strip().splitlines()
             raise ImpairmentError(messages[-1] if messages else f"the proxy ended at {command!r}") from None
         self._unanswered -= 1
         answer: dict[str, Any] = json.loads(line)

@@ -2,13 +2,16 @@
 
 A client that joins at a link's address (127.0.0.2) has that link between itself and the session, which listens on the
 same ports of another address (127.0.0.1). Connections over one link share its rate and its stalls. TCP: bytes are
-never lost and keep their order; a sender is blocked when `window_kib` are in flight. `process` runs the links.
+never lost and keep their order; a sender is blocked when `window_kib` are in flight. UDP: datagrams are lost,
+duplicated and reordered. `process` runs the links.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import heapq
+import itertools
 import socket
 import struct
 import time
@@ -16,7 +19,6 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any, Final
 
-from iris_session.netsim.datagrams import DatagramPort
 from iris_session.netsim.profiles import DIRECTIONS, DOWN, UP, LinkConditions, Profile
 
 CHUNK: Final = 16_384
@@ -25,6 +27,11 @@ BUFFER_BYTES: Final = 32_768
 #: `select` takes 1024 files, a connection needs two. Its timeouts are exact to 50 us, those of `epoll` to 1 ms.
 MAX_CONNECTIONS: Final = 300
 OWN_DELAYS_KEPT: Final = 20_000
+MAX_DATAGRAM: Final = 65_507
+#: Clients of one UDP port, and datagrams in flight per client and direction; more are dropped and counted.
+MAX_FLOWS: Final = 64
+MAX_QUEUED: Final = 512
+Address = tuple[str, int]
 _RESET: Final = struct.pack("ii", 1, 0)  # SO_LINGER 0: close sends RST
 
 
@@ -316,3 +323,104 @@ def _close(end: socket.socket, *, reset: bool) -> None:
         if reset:
             end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         end.close()
+
+
+# --- datagrams --------------------------------------------------------------------------------------------------------
+
+
+class DatagramPort:
+    """A forwarded UDP port. Each client gets its own socket towards the session."""
+
+    def __init__(self, link: ImpairedLink, port: int) -> None:
+        self.lost = self.duplicated = self.reordered = self.dropped = 0
+        self._link, self._port = link, port
+        self._loop = asyncio.get_running_loop()
+        self._near = _open_socket(link.address)
+        self._near.bind((link.address, port))
+        self._flows: dict[Address, _Flow] = {}
+        self._loop.add_reader(self._near.fileno(), self._receive_from_client)
+
+    def _receive_from_client(self) -> None:
+        with contextlib.suppress(BlockingIOError, ConnectionError):
+            data, client = self._near.recvfrom(MAX_DATAGRAM)
+            flow = self._flows.pop(client, None)
+            if flow is None:
+                if len(self._flows) >= MAX_FLOWS:
+                    self._flows.pop(next(iter(self._flows))).close()  # the one that has been silent for longest
+                flow = _Flow(self, self._link, self._near, client, self._port)
+            self._flows[client] = flow
+            flow.queue(UP, data)
+
+
+class _Flow:
+    """The datagrams of one client, in both directions."""
+
+    def __init__(
+        self, port: DatagramPort, link: ImpairedLink, near: socket.socket, client: Address, number: int
+    ) -> None:
+        self._port, self._link, self._near, self._client = port, link, near, client
+        self._far = _open_socket(link.target)
+        self._far.connect((link.target, number))
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self._far.fileno(), self._receive_from_session)
+        self._queued: list[tuple[int, int, str, bytes]] = []
+        self._order = itertools.count()
+        self._number = {UP: 0, DOWN: 0}
+        self._timer: asyncio.TimerHandle | None = None
+
+    def queue(self, direction: str, data: bytes) -> None:
+        """Queue one datagram. Loss, order and copies depend on seed and number alone."""
+        link, port = self._link, self._port
+        part, weather = link.conditions.phase.get_direction(direction), link.conditions
+        number = self._number[direction]
+        self._number[direction] += 1
+        now_ns = time.monotonic_ns()
+        if link.is_stalled(direction, now_ns) or weather.draw(direction, number, 0) < part.loss:
+            port.lost += 1
+            return
+        arrival_ns = link.schedule_arrival_ns(direction, len(data), now_ns)
+        if weather.draw(direction, number, 1) < part.reorder:
+            port.reordered += 1
+            arrival_ns += round(part.reorder_ms * 1e6)
+        copies = 1
+        if weather.draw(direction, number, 2) < part.duplicate:
+            port.duplicated += 1
+            copies = 2
+        for _ in range(copies):
+            if len(self._queued) >= MAX_QUEUED:
+                port.dropped += 1
+                return
+            heapq.heappush(self._queued, (arrival_ns, next(self._order), direction, data))
+        self._deliver()
+
+    def close(self) -> None:
+        """Drop the datagrams in flight and close the socket."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._loop.remove_reader(self._far.fileno())
+        self._far.close()
+
+    def _receive_from_session(self) -> None:
+        with contextlib.suppress(BlockingIOError, ConnectionError):  # refused: the session does not listen on that port
+            self.queue(DOWN, self._far.recv(MAX_DATAGRAM))
+
+    def _deliver(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        now_ns = time.monotonic_ns()
+        while self._queued and self._queued[0][0] <= now_ns:
+            _, _, direction, data = heapq.heappop(self._queued)
+            with contextlib.suppress(OSError):  # a datagram that the socket rejects is lost
+                if direction == UP:
+                    self._far.send(data)
+                else:
+                    self._near.sendto(data, self._client)
+        if self._queued:
+            self._timer = self._loop.call_at(self._queued[0][0] * 1e-9, self._deliver)
+
+
+def _open_socket(address: str) -> socket.socket:
+    made = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM)
+    made.setblocking(False)
+    return made

@@ -50,11 +50,24 @@ class MissedEvents(NamedTuple):
 class SessionMirror:
     """Roster, leases, alignments, robots, bodies and anchors of the session.
 
-    `body_index` and `index_of_id` give the row of a body in state frames, by name and by `BodyInfo.id`. `synced` is
-    false before the first snapshot and after a gap; the other attributes then show the last known state. `bodies` are
-    those of the epochs from `bodies_since` to `bodies_until`, as far as is known. `stop_seq`: number of the newest
-    stop, which `ClearEStop` names. Counters: `gaps`, `discarded` (events older than the snapshot or repeated),
-    `held_overflow`.
+    Attributes:
+        synced: False before the first snapshot and after a gap; the others then show the last known state.
+        event_seq: Number of the newest event that was applied.
+        participants: By id, also those that are in their grace period.
+        leases: By name of the robot or object.
+        robots: By name.
+        anchors: By id, with their poses in the world [m].
+        bodies: Bodies in the order of the rows of state frames, as in the epochs from `bodies_since` to `bodies_until`.
+        body_index, index_of_id: Row of a body, by its name and by `BodyInfo.id`.
+        scene_hash, scene_epoch, scene_revision: Content hash of the scene, and numbers that grow with every jump of
+            the scene and every patch.
+        tick_period_ns: Simulated time of one tick [ns].
+        paused, estop: Whether physics is paused, and whether the session is stopped.
+        stop_seq: Number of the newest stop, which `ClearEStop` names.
+        episode: The present episode, `None` before the first.
+        gaps: Gaps in the numbers of events.
+        discarded: Events older than the snapshot, or repeated.
+        held_overflow: Events that came while too many waited for a snapshot.
     """
 
     def __init__(self) -> None:
@@ -90,9 +103,12 @@ class SessionMirror:
     def apply_snapshot(self, snapshot: Snapshot) -> list[Event | MissedEvents]:
         """Apply a snapshot and the held events after it.
 
-        Returns, in order, the events since the last one that was applied: each one that arrived, and `MissedEvents` for
-        those that did not. Events before the first snapshot are neither. An older snapshot than the known state
-        (`event_seq`) is discarded unless a gap is open.
+        Args:
+            snapshot: The snapshot; one that is older than the known state is discarded unless a gap is open.
+
+        Returns:
+            In order, the events since the last one that was applied: each one that arrived, and `MissedEvents` for
+            those that did not. Events before the first snapshot are neither.
         """
         if self.synced and snapshot.event_seq < self.event_seq:
             self.discarded += 1
@@ -139,8 +155,13 @@ class SessionMirror:
         return covered
 
     def apply_event(self, event: Event) -> bool:
-        """Apply the next event. Return false when it was discarded, or held until a snapshot comes (`synced` is then
-        false).
+        """Apply the next event.
+
+        Args:
+            event: The event.
+
+        Returns:
+            False when it was discarded, or is held until a snapshot comes; `synced` is false then.
         """
         if not self.synced:
             self._hold_event(event)
@@ -163,20 +184,40 @@ class SessionMirror:
         return frozenset(info.id for info in self.participants.values() if info.connected)
 
     def find_alignment(self, participant: str) -> Alignment | None:
-        """Return the alignment of one participant, `None` while it has none."""
+        """Return `T_world_tracking` of a participant, with its version and stated error.
+
+        Args:
+            participant: Id of the participant.
+
+        Returns:
+            The alignment, `None` while it has none.
+        """
         info = self.participants.get(participant)
         return None if info is None else info.alignment
 
     def find_tip(self, robot: str) -> tuple[int, Pose] | None:
-        """Return the row of the body that carries the robot's end-effector site, and `T_body_site`; `None`: no such
-        robot.
+        """Return where the end effector of a robot is.
+
+        Args:
+            robot: Name of the robot.
+
+        Returns:
+            Row of the body that carries its site, and `T_body_site` [m]; `None`: there is no such robot.
         """
         info = self.robots.get(robot)
         index = None if info is None else self.index_of_id.get(info.site_body)
         return None if info is None or index is None else (index, info.T_body_site)
 
     def find_lease_version(self, target: str, participant: str) -> int | None:
-        """Return the fencing token of `target` when `participant` holds it (alone or with others), else `None`."""
+        """Return the fencing token of a participant.
+
+        Args:
+            target: Name of the robot or object.
+            participant: Id of the participant.
+
+        Returns:
+            The token, `None` when the participant does not hold it, alone or with others.
+        """
         lease = self.leases.get(target)
         if lease is None or not (lease.holder == participant or participant in lease.sub_holders):
             return None

@@ -17,18 +17,16 @@ from iris_session.client import (
     Client,
     ClientError,
     CurveKeys,
-    DeniedError,
     IdentityError,
     NotConnectedError,
     RefusedError,
-    RequestTimeoutError,
     SceneState,
 )
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.protocol.client_messages import Acquire, EStop, Sample
 from iris_session.protocol.common import IDENTITY
-from iris_session.protocol.names import DenialReason, Device, HoldReason
-from iris_session.protocol.server_messages import Event, LeaseChanged, PresenceItem
+from iris_session.protocol.names import DenialReason, Device
+from iris_session.protocol.server_messages import PresenceItem
 from tests.client.session import BODIES, ClientSession
 from tests.client.threads import ThreadedClient
 
@@ -85,44 +83,6 @@ def test_state_that_has_become_old_while_it_was_decoded_is_not_passed_on(
     assert states == []
 
 
-def test_leases_pass_between_two_participants(join: Join) -> None:
-    events: list[Event] = []
-    ann, bob = join(on_event=events.append), join("bob")
-    (lease,) = ann.acquire(["left"])
-    assert lease.holder == ann.participant_id
-    assert ann.lease_version("left") == lease.lease_version  # at once, before or after the event
-    with pytest.raises(DeniedError) as denied:
-        bob.acquire(["left", "right"])
-    assert denied.value.denial.reason == DenialReason.HELD
-    assert denied.value.denial.holder == ann.participant_id
-    assert bob.lease_version("right") is None  # all or none
-    ann.release("left")
-    assert ann.wait_for(lambda c: c.lease_version("left") is None)
-    assert bob.acquire(["left"])[0].holder == bob.participant_id
-    assert ann.wait_for(lambda c: c.mirror.leases["left"].holder == bob.participant_id)
-    assert any(isinstance(event.body, LeaseChanged) for event in events)
-
-
-def test_samples_engage_the_robot_and_estop_stops_it(session: ClientSession, join: Join) -> None:
-    ann = join(role="agent", devices=(Device.TARGET,))
-    ann.acquire(["left"])
-
-    def stream_until(kind: str) -> None:
-        for _ in range(100):
-            if session.commands.get("left") == kind:
-                return
-            assert ann.send_sample(Device.TARGET, HERE, robots=["left"], clutch=True)
-            ann.sleep(0.01)
-        pytest.fail(f"{session.commands}")
-
-    ann.send_sample(Device.TARGET, HERE, robots=["left"], clutch=False)
-    stream_until("pose")
-    assert ann.wait_for(lambda c: "left" in c.feedback)
-    ann.estop("test")
-    stream_until("hold")
-    assert ann.wait_for(lambda c: c.mirror.estop and c.feedback["left"].hold_reason == HoldReason.ESTOP)
-
-
 def test_samples_have_epochs_versions_and_tokens(join: Join) -> None:
     ann = join(devices=(Device.HEAD, Device.CONTROLLER_RIGHT))
     first = ann.make_sample(Device.CONTROLLER_RIGHT, HERE, robots=["left"], clutch=True)
@@ -136,52 +96,6 @@ def test_samples_have_epochs_versions_and_tokens(join: Join) -> None:
     assert ann.make_sample(Device.HEAD, HERE).tracking_epoch == 1
 
 
-def test_reset_changes_the_epoch_and_state_continues(session: ClientSession, join: Join) -> None:
-    ann = join()
-    ann.wait_for(has_state)
-    session.reset()
-    assert ann.wait_for(lambda c: c.mirror.scene_epoch == 2)
-    assert ann.wait_for(lambda c: c.scene.state is not None and c.scene.state.header.scene_epoch == 2)
-    assert ann.counters()["control"]["snapshots"] == 1
-
-
-def test_late_joiner_has_the_same_mirror(join: Join) -> None:
-    early = join()
-    early.acquire(["left"])
-    join("gone").close()
-    late = join("late", role="observer")
-    assert early.wait_for(lambda c: c.mirror.event_seq >= late.mirror.event_seq)
-    assert late.wait_for(lambda c: c.mirror.event_seq >= early.mirror.event_seq)
-    assert early.mirror.mirror_hash() == late.mirror.mirror_hash()
-
-
-def test_killed_front_is_replaced_and_everything_kept(session: ClientSession, join: Join) -> None:
-    ann = join()
-    (lease,) = ann.acquire(["left"])
-    participant = ann.participant_id
-    session.kill_front()
-    assert ann.wait_for(lambda c: not c.ready)
-    assert not ann.send_sample(Device.HEAD, HERE)
-    assert ann.counters()["control"]["samples_not_sent"] == 1
-    ann.estop("while the front restarts")
-    assert ann.wait_for(lambda c: c.ready and c.mirror.estop)
-    assert ann.participant_id == participant
-    assert ann.connection.welcome is not None
-    assert ann.connection.welcome.resumed
-    assert (ann.lease_version("left") or 0) > lease.lease_version  # same holder, new fencing token
-    seen = ann.scene.state
-    assert ann.wait_for(lambda c: c.scene.state is not seen and c.connection.pending_estop.message is None)
-
-
-def test_restarted_process_resumes_with_its_identity_file(session: ClientSession, join: Join, tmp_path: Path) -> None:
-    killed = join(identity=tmp_path / "identity")
-    killed.acquire(["left"])
-    session.kill_client(killed)
-    again = join(identity=tmp_path / "identity")
-    assert again.participant_id == killed.participant_id
-    assert again.wait_for(lambda c: c.lease_version("left") is not None)
-
-
 def test_second_client_with_the_same_identity_takes_over_permanently(join: Join, tmp_path: Path) -> None:
     first = join(identity=tmp_path / "identity")
     second = join(identity=tmp_path / "identity")
@@ -190,17 +104,6 @@ def test_second_client_with_the_same_identity_takes_over_permanently(join: Join,
     assert second.participant_id == first.participant_id
     first.close()
     assert second.acquire(["left"])[0].holder == second.participant_id, "it took nothing back"
-
-
-def test_stalled_session_is_detected_and_recovers(session: ClientSession, join: Join) -> None:
-    ann = join()
-    session.paused = True
-    assert ann.wait_for(lambda c: c.connection.stalled)
-    with pytest.raises(RequestTimeoutError):
-        ann.request(Acquire(0, ("left",)), timeout_s=0.2)
-    session.paused = False
-    assert ann.wait_for(lambda c: not c.connection.stalled)
-    assert ann.ready
 
 
 def test_first_state_after_a_client_stall_is_fresh_and_the_lease_is_kept() -> None:

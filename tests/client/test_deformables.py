@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -11,8 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from iris_session.client import Client
-from iris_session.client.deformables import FIRST_PAUSE_S, MAX_ASSET_BYTES, Deformables, _Mesh, deformable_keys
+from iris_session.client.deformables import MAX_ASSET_BYTES, Deformables, _Mesh, deformable_keys
 from iris_session.protocol.names import ArrayKind, MediaEncoding
 from iris_session.protocol.scene import Deformable, SceneSpec, encode_scene, list_assets
 from iris_session.scene import AssetDecodeError, AssetStore
@@ -104,16 +102,6 @@ def live(shared: SharedScene, watch: Callable[..., Watched]) -> Watched:
     return watch(shared.spec.deformables)
 
 
-def test_equal_or_empty_names_have_distinct_keys(shared: SharedScene, watch: Callable[..., Watched]) -> None:
-    names = ("", "rope", "rope")
-    parts = [msgspec.structs.replace(p, name=n) for p, n in zip(shared.spec.deformables, names, strict=True)]
-    live = watch(parts)
-    live.step_until(lambda: len(live.shapes.vertices) == len(parts))
-    assert set(live.shapes.vertices) == {"flex-0", "flex-1", "flex-2"}
-    assert [len(live.shapes.vertices[f"flex-{i}"]) for i in range(3)] >= [20, 6, 50]
-    assert live.faults == {""}
-
-
 def test_mesh_data_is_fetched_with_each_deformable(live: Watched) -> None:
     """Triangles and lines name rows of the vertices; no triangle names the inner vertices of a soft body."""
     parts, shapes = live.parts, live.shapes
@@ -146,8 +134,10 @@ def test_mesh_data_is_fetched_with_each_deformable(live: Watched) -> None:
         ("elements", np.array([[0, 1, 20]], np.uint32)),  # it has 20 vertices
         ("elements", np.zeros((4, 2), np.uint32)),
         ("uv", np.zeros((3, 3, 2), np.float32)),
+        ("vertex", np.zeros(3, np.uint32)),
+        ("vertex", np.full(20, 2**31, np.uint32)),
     ],
-    ids=["none", "beyond the vertices", "lines of a cloth", "uv of other triangles"],
+    ids=["none", "beyond the vertices", "lines", "uv of other triangles", "other vertices", "large numbers"],
 )
 def test_invalid_triangles_are_rejected(tmp_path: Path, name: str, values: np.ndarray | None) -> None:
     store = AssetStore(tmp_path)
@@ -202,21 +192,6 @@ def test_deformables_continue_until_a_late_patch_arrives(live: Watched, shared: 
     assert live.shapes.vertices.keys() == names
 
 
-def test_patches_faster_than_their_assets_interrupt_nothing(live: Watched, shared: SharedScene) -> None:
-    names = set(deformable_keys(live.parts))
-    live.step_until_moved(names)
-    for number in range(5):  # none of them is served
-        address = f"{number:064x}"
-        live.session.change_scene(address, ())
-        live.step_until(lambda address=address: live.client.mirror.scene_hash == address)  # type: ignore[misc]
-        assert live.shapes.vertices.keys() == names
-    address, assets = shared.store_variant(live.parts, "the last one")
-    live.session.change_scene(address, assets)
-    live.step_until(lambda: live.shapes.scene_hash == address)
-    live.step_until_moved(names)
-    assert live.shapes.fault == ""
-
-
 def test_new_scene_shows_nothing_before_it_is_loaded(live: Watched, shared: SharedScene) -> None:
     """Nor frames of the previous scene, in any order of arrival."""
     first, second, third = deformable_keys(live.parts)
@@ -250,26 +225,6 @@ def test_unique_names_are_kept_as_keys() -> None:
     assert deformable_keys([part("", "x"), part("", "x")]) == ["x", "x'"]
 
 
-@pytest.mark.parametrize(
-    "numbers",
-    [np.zeros(3, np.float32), np.zeros(3, np.uint32), np.full(1000, 2**31, np.uint32)],
-    ids=["fractions", "another length", "too large"],
-)
-def test_invalid_vertex_counts_are_a_fault(
-    shared: SharedScene, watch: Callable[..., Watched], numbers: np.ndarray
-) -> None:
-    good = shared.spec.deformables[0]
-    arrays = decode_arrays(shared.store.get(good.address), ArrayKind.DEFORMABLE)
-    kept = [StoredArray(name, values) for name, values in arrays.items() if name != "vertex"]
-    bad = encode_arrays(ArrayKind.DEFORMABLE, [*kept, StoredArray("vertex", numbers[: max(3, good.vertices)])])
-    live = watch([good])
-    parts = [good, msgspec.structs.replace(good, address=shared.store.put(bad), bytes=len(bad))]
-    live.session.change_scene(*shared.store_variant(parts, "bad"))
-    live.step_until(lambda: bool(live.shapes.fault))
-    assert "vert" in live.shapes.fault
-    assert live.client.media._feeds.keys() <= {good.stream}, "nothing else is subscribed to"
-
-
 def test_small_asset_that_decompresses_large_is_rejected(tmp_path: Path) -> None:
     """A few kilobytes of zeros, which `poll` would unpack for a second and keep."""
     store = AssetStore(tmp_path)
@@ -280,55 +235,3 @@ def test_small_asset_that_decompresses_large_is_rejected(tmp_path: Path) -> None
     assert len(bomb) < 100_000
     with pytest.raises(AssetDecodeError, match=str(MAX_ASSET_BYTES)):
         _Mesh("a", part, memoryview(bomb))
-
-
-def test_new_session_shows_nothing_of_the_previous_one() -> None:
-    """A server restarted at the same address: both count their scenes from 1."""
-    client = Client("127.0.0.1:1", role="observer", name="screen")
-    shapes = Deformables(client)
-    shapes._follow("one", ("a", 1))
-    shapes.vertices["cloth"], shapes.capture_ns["cloth"] = np.zeros((4, 3), np.float32), 5
-    shapes._follow("patched", ("a", 1))
-    assert shapes.vertices.keys() == shapes.capture_ns.keys() == {"cloth"}
-    shapes._follow("other", ("b", 1))
-    assert shapes.vertices == shapes.capture_ns == {}
-    client.close()
-
-
-def test_remaining_deformable_of_a_shared_stream_continues(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path)
-    part = parse_mujoco(flexes(), store).spec.deformables[0]
-    client = Client("127.0.0.1:1", role="observer", name="screen")
-    shapes = Deformables(client)
-    both = [_Mesh(key, part, memoryview(store.get(part.address))) for key in ("one", "two")]
-    shapes._show_meshes(both, "1" * 64)
-    feed = client.media.subscribe(part.stream)
-    shapes._show_meshes(both[:1], "2" * 64)
-    assert client.media._feeds == {part.stream: feed}
-    assert both[0].feed is feed
-    shapes._show_meshes([], "3" * 64)
-    assert client.media._feeds == {}
-    client.close()
-
-
-def test_repeated_scene_is_shown_and_a_failed_one_is_retried_after_a_pause(tmp_path: Path) -> None:
-    client = Client("127.0.0.1:1", role="observer", name="screen")
-    client.assets.cache = AssetStore(tmp_path)
-    shapes, (one, two, three) = Deformables(client), ("1" * 64, "2" * 64, "3" * 64)
-    shapes._show_meshes([], one)
-    shapes._follow(one, ("a", 1))
-    shapes._follow(two, ("a", 2))
-    assert shapes._parked
-    shapes._follow(one, ("a", 3))
-    assert (shapes._parked, shapes._fetch) == (False, None)
-    shapes._follow(two, ("a", 3))
-    client.mirror.scene_hash = three
-    shapes._failed(AssetDecodeError("of a scene that is no more"))
-    assert shapes.fault == ""
-    client.mirror.scene_hash = two
-    for pause_s in (FIRST_PAUSE_S, 2 * FIRST_PAUSE_S):
-        before = time.monotonic()
-        shapes._failed(AssetDecodeError("unknown"))
-        assert shapes._retry_s >= before + pause_s
-    assert shapes.fault == "unknown"
-    client.close()

@@ -1,20 +1,19 @@
-"""Beacons from any sender, and introductions from any host."""
+"""Beacons from any sender, introductions from any host, and names of hosts."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import resource
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from typing import Any
 
 import msgspec
 import pytest
 
-from iris_session.client import ClientError, FoundSession, find_sessions
-from iris_session.client.discovery import request_introduction
+from iris_session.client import ClientError, FoundSession, discovery, find_sessions
+from iris_session.client.discovery import request_introduction, resolve_host
 from iris_session.link.discovery import MAX_ADDRESSES, MAX_SESSIONS, BeaconListener
 from iris_session.protocol.codec import encode_beacon, encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
@@ -76,22 +75,6 @@ def test_foreign_beacon_cannot_redirect_to_a_local_port() -> None:
         assert listener.ignored == {"foreign_loopback": 2}
 
 
-def test_discovery_works_with_a_thousand_open_files() -> None:
-    wanted = 1100
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    assert hard == resource.RLIM_INFINITY or hard > wanted, "this test needs more open files"
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, wanted + 100), hard))
-    with BeaconListener(0) as listener, contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
-        port = listener._socket.getsockname()[1]
-        high = fcntl.fcntl(listener._socket.fileno(), fcntl.F_DUPFD, wanted)
-        listener._socket.close()
-        listener._socket = socket.socket(fileno=high)
-        sender.sendto(other_session(), ("127.0.0.1", port))
-        listener.wait(30.0)
-        assert [one.name for one in listener.poll_sessions()] == ["lab-1"]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
 def test_unavailable_port_is_an_error() -> None:
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as greedy:
         greedy.bind(("", 0))  # without sharing it
@@ -129,13 +112,16 @@ class Host:
 
 
 def ask(host: str, port: int, timeout_s: float = 30.0) -> Introduction:
-    steps = request_introduction(host, port, timeout_s)
+    return end(request_introduction(host, port, timeout_s))
+
+
+def end(steps: Generator[None, None, Any]) -> Any:
+    """Take steps until there is a result."""
     while True:
         try:
             next(steps)
         except StopIteration as done:
-            introduction: Introduction = done.value
-            return introduction
+            return done.value
         time.sleep(0.001)
 
 
@@ -168,3 +154,33 @@ def test_closed_port_and_silence_time_out() -> None:
         closed.bind(("127.0.0.1", 0))  # without listening: no other process gets the port
         with pytest.raises(ConnectionRefusedError):
             ask("127.0.0.1", closed.getsockname()[1] + 1)
+
+
+def test_names_are_looked_up_without_blocking(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a name server that hangs all ask once, and a late answer serves the next attempt."""
+    may_answer, asked = threading.Event(), []
+
+    def getaddrinfo(host: str, *_: object) -> list[Any]:
+        asked.append(host)
+        assert may_answer.wait(30.0)
+        if host == "unknown":
+            raise socket.gaierror(socket.EAI_NONAME, "not known")
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("192.0.2.1", 0))]
+
+    monkeypatch.setattr(discovery.socket, "getaddrinfo", getaddrinfo)
+    until_s = time.monotonic() + 30.0
+    assert [end(resolve_host(host, until_s)) for host in ("10.0.0.5", "::1")] == ["10.0.0.5", "::1"]
+    assert asked == []
+    first, second = resolve_host("lab", until_s), resolve_host("lab", until_s)
+    for _ in range(5):
+        next(first)  # would not return if it waited
+        next(second)
+    with pytest.raises(TimeoutError, match="name lab"):
+        end(resolve_host("lab", 0.0))
+    may_answer.set()
+    assert end(first) == end(second) == "192.0.2.1"
+    assert asked == ["lab"]
+    for n in (1, 2):
+        with pytest.raises(OSError, match="not known"):
+            end(resolve_host("unknown", until_s))
+        assert asked == ["lab", *["unknown"] * n], "and it is asked for again"

@@ -20,7 +20,7 @@ from iris_session.client import (
     SessionNameError,
     TrustError,
     endpoint_resolver,
-    key_pairing,
+    server_trust,
 )
 from iris_session.client.address import Address, pairing_uri
 from iris_session.client.core.status import ConnectionPhase
@@ -306,8 +306,8 @@ def test_refusal_without_a_code_is_final(network: Network, home: KeyHome) -> Non
 @pytest.fixture
 def router(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[zmq.Socket[bytes], Address]]:
     """The control socket of a session, with its address."""
-    monkeypatch.setattr(key_pairing, "PAIR_RETRY_S", 0.001)
-    monkeypatch.setattr(key_pairing, "ANSWER_S", 0.2)
+    monkeypatch.setattr(server_trust, "PAIR_RETRY_S", 0.001)
+    monkeypatch.setattr(server_trust, "ANSWER_S", 0.2)
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     router = context.socket(zmq.ROUTER)
@@ -331,7 +331,7 @@ def pair(router: zmq.Socket[bytes], address: Address, own: KeyPair, *answers: Pa
     thread = threading.Thread(target=answer)
     thread.start()
     try:
-        deque(key_pairing.pair_key(address, SERVER.public, own, CODE, "ann"), maxlen=0)
+        deque(server_trust.pair_key(address, SERVER.public, own, CODE, "ann"), maxlen=0)
     finally:
         thread.join()
     return requests

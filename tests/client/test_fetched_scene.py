@@ -110,39 +110,6 @@ def test_refused_scene_is_retried_and_permanent_refusal_raises(
     assert session.simulation.now_ns - began_ns >= fetched_scene.REFUSED_S * 0.5e9
 
 
-def test_replaced_scene_is_abandoned_for_the_newest(
-    store: AssetStore,
-    join: Callable[..., Client],
-    session: ClientSession,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
-    plain = msgspec.structs.replace(parsed.spec, visuals=parsed.spec.visuals[:2])
-    newest, refused = store.put(encode_scene(plain)), "1" * 64
-    client = join(parsed.scene_hash, *parsed.addresses)
-    fetches: list[AssetFetch] = []
-    wait = fetched_scene._wait
-
-    def replace_meanwhile(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
-        fetches.append(fetch)
-        if fetch.addresses == (refused,):
-            session.change_scene(newest, (newest, *parsed.addresses))
-            assert client.wait_for(lambda c: c.mirror.scene_hash == newest)
-        result = wait(client, fetch, until)
-        if len(fetches) == 2:  # the meshes are stored
-            session.change_scene(refused, parsed.addresses)
-            assert client.wait_for(lambda c: c.mirror.scene_hash == refused)
-        return result
-
-    monkeypatch.setattr(fetched_scene, "_wait", replace_meanwhile)
-    scene = fetch_scene(client)
-    assert (scene.spec, scene.scene_hash) == (plain, newest)
-    assert (scene.meshes.keys(), scene.textures.keys()) == ({0}, {0})
-    asked = [fetch.addresses for fetch in fetches]
-    assert asked == [(parsed.scene_hash,), asked[1], (refused,), (newest,), ()]
-    assert len(asked[1]) == 2, "a mesh and a texture, which are not fetched and decoded again"
-
-
 @pytest.mark.parametrize("cause", ["patch", "new_scene"])
 def test_endlessly_patched_scene_arrives_and_endlessly_replaced_one_does_not(
     store: AssetStore,

@@ -21,7 +21,6 @@ class OneClient:
         self.name, self._log = name, log
         self.due_ns = time.monotonic_ns() + 60_000_000_000
         self.connection = SimpleNamespace(phase=ConnectionPhase.READY, next_deadline_ns=lambda _: self.due_ns)
-        self.registration = (1, False)
         self._loop = self
         self.ends = {}
         self.state, self.control = (self._open(context, kind) for kind in ("state", "control"))
@@ -89,7 +88,7 @@ def test_closed_clients_are_skipped(clients: list[Any], log: list[str]) -> None:
     ann, closed, _ = clients
     group = ClientGroup(clients)
     group.poll(0.0)
-    closed.connection.phase, closed.registration, closed.due_ns = ConnectionPhase.CLOSED, (2, False), 0
+    closed.connection.phase, closed.due_ns = ConnectionPhase.CLOSED, 0
     closed.ends["state"].send(b"")
     ann.ends["state"].send(b"")
     group.poll(30.0)

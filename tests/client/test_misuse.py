@@ -40,13 +40,6 @@ def assert_no_faults(client: Client) -> None:
     assert client.connection.counters.faults == {}
 
 
-def test_estop_with_a_numeric_reason_stops(session: ClientSession, join: Join) -> None:
-    ann = join()
-    ann.estop(5)
-    assert ann.wait_for(lambda c: c.mirror.estop)
-    assert_no_faults(ann)
-
-
 def test_invalid_requests_raise_at_once_and_name_the_field(session: ClientSession, join: Join) -> None:
     ann = join(role="director")
     calls: list[tuple[str, Callable[[], object]]] = [

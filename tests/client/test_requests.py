@@ -18,7 +18,6 @@ from iris_session.protocol.server_messages import (
     MarkerAdded,
     ObjectGrasped,
     Reply,
-    ScaleChanged,
 )
 from tests.client.session import ClientSession
 
@@ -62,39 +61,6 @@ def test_director_requests_are_executed(session: ClientSession, join: Join) -> N
     assert bodies(events, MarkerAdded) == [MarkerAdded(boss.participant_id, "look here")]
 
 
-def test_holder_scales_the_motion_of_its_robot(session: ClientSession, join: Join) -> None:
-    events: list[Event] = []
-    ann, bob = join(), join("bob", on_event=events.append)
-    ann.acquire(["left"])
-    (lease,) = ann.set_scale(["left"], 0.25)
-    assert (lease.target, lease.scale) == ("left", 0.25)
-    assert bob.wait_for(lambda c: c.mirror.leases["left"].scale == 0.25)
-    assert bodies(events, ScaleChanged) == [ScaleChanged("left", 0.25, ann.participant_id)]
-    late = join("late")
-    assert late.mirror.leases["left"].scale == 0.25
-    seq = late.mirror.event_seq
-    hashes = []
-    for client in (ann, bob, late):
-        assert client.wait_for(lambda c: c.mirror.event_seq >= seq)
-        hashes.append((client.mirror.event_seq, client.mirror.mirror_hash()))
-    assert len(set(hashes)) == 1
-    with pytest.raises(DeniedError):
-        ann.set_scale(["left"], 100.0)
-    with pytest.raises(DeniedError) as denied:
-        bob.set_scale(["left"], 0.5)
-    assert (denied.value.denial.reason, denied.value.denial.holder) == (DenialReason.NOT_HOLDER, ann.participant_id)
-    ann.release("left")
-    assert bob.wait_for(lambda c: c.mirror.leases["left"].scale == 1.0)
-
-
-def test_operator_requests_of_a_director_are_denied(session: ClientSession, join: Join) -> None:
-    ann = join()
-    for forbidden in (lambda: ann.control("pause"), lambda: ann.assign(["left"]), ann.clear_estop):
-        with pytest.raises(DeniedError) as denied:
-            forbidden()
-        assert denied.value.denial.reason == DenialReason.ROLE
-
-
 def answer_of(client: Client, request: int) -> Reply:
     """Return the reply to a submitted request."""
     replies: list[Reply] = []
@@ -125,16 +91,6 @@ def test_holder_may_refuse_or_consent_to_a_handover(session: ClientSession, join
         assert (reply.denial is None) == grant
     assert bob.lease_version("left") is not None
     assert ann.wait_for(lambda c: c.lease_version("left") is None)
-
-
-def test_queued_request_is_granted_when_the_lease_ends(session: ClientSession, join: Join) -> None:
-    ann, bob = join(), join("bob")
-    ann.acquire(["left"])
-    request = bob.submit(Acquire(0, ("left",), wait=True))
-    assert ann.wait_for(lambda c: c.mirror.leases["left"].queue == (bob.participant_id,))
-    ann.release()
-    assert answer_of(bob, request).ok
-    assert bob.lease_version("left") is not None
 
 
 def test_who_gives_up_waiting_is_never_granted_the_robot(join: Join) -> None:
@@ -184,16 +140,6 @@ def test_acquire_waits_as_long_as_a_holder_may_take_to_consent(
     )
     with pytest.raises(RequestTimeoutError):
         bob.acquire(["right", "left"], timeout_s=0.1)
-
-
-def test_release_of_a_foreign_robot_is_denied(session: ClientSession, join: Join) -> None:
-    ann = join()
-    ann.acquire(["left"])
-    for name in ("right", "nothing"):
-        with pytest.raises(DeniedError):
-            ann.release(name)
-    ann.marker("after")
-    assert ann.lease_version("left") is not None
 
 
 def test_hand_grasps_an_object(session: ClientSession, join: Join) -> None:

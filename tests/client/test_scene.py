@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import threading
-import time
 from collections.abc import Callable
 
-import pytest
-
-from iris_session.client import Client, SceneState, SessionMirror
-from iris_session.client.deformables import Deformables
-from iris_session.protocol.server_messages import Event, SceneChanged, Snapshot
+from iris_session.client import Client, SceneState
 from tests.client.session import BODIES, ClientSession, make_scene
-from tests.client.threads import ThreadedClient
 
 ORDERS = list(itertools.permutations(BODIES))[1:]
 #: `ClientSession` places them there from its second scene on.
@@ -69,45 +62,3 @@ def test_bodies_keep_their_poses_after_a_reset_until_the_next_state(
         return state is not None and state.header.scene_epoch == client.mirror.scene_epoch == 2
 
     assert client.wait_for(both)
-
-
-class Slow(SessionMirror):
-    """Lets another thread run whenever the hash is read."""
-
-    meanwhile: Callable[[], None] | None = None
-    _hash = ""
-
-    @property
-    def scene_hash(self) -> str:  # type: ignore[override]
-        seen, meanwhile, self.meanwhile = self._hash, self.meanwhile, None
-        if meanwhile is not None:
-            threading.Thread(target=meanwhile, daemon=True).start()
-            time.sleep(0.02)
-        return seen
-
-    @scene_hash.setter
-    def scene_hash(self, scene_hash: str) -> None:
-        self._hash = scene_hash
-
-
-def test_hash_and_epoch_of_a_scene_are_consistent_in_any_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    with ThreadedClient() as ann:
-        client = ann.client
-        mirror, changed = Slow(), threading.Event()
-        mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "first", 0, 0.0, 0, (), ()))
-        client.connection.mirror = mirror
-
-        def hear() -> None:
-            with client._lock:  # as `poll` does
-                mirror.apply_event(Event(1, 0, 0, SceneChanged(2, 0, "new_scene")))
-                mirror.apply_snapshot(Snapshot(0, 1, 2, 0, "second", 0, 0.0, 0, (), ()))
-            changed.set()
-
-        followed: list[tuple[str, int]] = []
-        shapes = Deformables(client)
-        monkeypatch.setattr(shapes, "_follow", lambda scene_hash, epoch: followed.append((scene_hash, epoch[1])))
-        mirror.meanwhile = hear
-        shapes.update()
-        assert changed.wait(30.0)
-        shapes.update()
-        assert followed == [("first", 1), ("second", 2)]

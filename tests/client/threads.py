@@ -42,7 +42,6 @@ class ScriptedSockets:
     """
 
     has_state = has_media = False
-    version = 0
 
     def __init__(self) -> None:
         self.sent: list[ClientMessage] = []

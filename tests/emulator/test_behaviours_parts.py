@@ -27,10 +27,8 @@ from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.emulator.behaviours.hand import (
     LONGEST_STEP_S,
     REARM_S,
-    TRIGGER_S,
     ClutchedHand,
     HandMovement,
-    compute_min_jerk,
 )
 from iris_session.emulator.behaviours.objects import (
     COMMON_OBJECTS,
@@ -91,15 +89,6 @@ class PerfectRobot:
         return clutches
 
 
-def test_min_jerk_starts_and_ends_at_rest() -> None:
-    assert compute_min_jerk(-1.0) == compute_min_jerk(0.0) == 0.0
-    assert compute_min_jerk(1.0) == compute_min_jerk(2.0) == 1.0
-    assert compute_min_jerk(0.5) == pytest.approx(0.5)
-    h = 1e-4
-    for s in (0.0, 1.0):
-        assert abs(compute_min_jerk(s + h) - compute_min_jerk(s - h)) / (2 * h) < 1e-6
-
-
 @settings(max_examples=60, deadline=None)
 @given(_poses, _poses)
 def test_reach_keeps_its_speed_limits(start: PoseTuple, goal: PoseTuple) -> None:
@@ -133,17 +122,6 @@ def test_hand_brings_the_tip_to_the_goal_from_any_pose(tip: PoseTuple, hand_at: 
     assert hand.reclutches == 0
 
 
-def test_engaging_moves_nothing() -> None:
-    robot, hand = (
-        PerfectRobot(((0.1, 0.2, 0.3), IDENTITY_QUAT), ((1.0, 1.0, 1.0), quat_from_yaw(1.0))),
-        ClutchedHand("controller/right", "left"),
-    )
-    before = robot.hand
-    clutches = robot.run(hand, 0.5)
-    assert clutches[-1]
-    assert robot.hand == before
-
-
 def test_hand_clutches_again_when_the_robot_does_not_follow() -> None:
     robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
     hand.move_to(((0.3, 0.0, 0.0), IDENTITY_QUAT))
@@ -154,16 +132,6 @@ def test_hand_clutches_again_when_the_robot_does_not_follow() -> None:
     assert hand.reclutches == 1
     assert open_s == pytest.approx(REARM_S, abs=0.05)
     assert distance(robot.tip[0], (0.3, 0.0, 0.0)) < 1e-3
-
-
-def test_short_moves_that_are_not_followed_are_detected() -> None:
-    robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
-    robot.run(hand, 0.2)
-    robot.holds = True
-    hand.move_to(((0.03, 0.0, 0.0), IDENTITY_QUAT), correct=False)
-    robot.run(hand, 6.0)
-    assert hand.reclutches == 1
-    assert distance(robot.tip[0], (0.03, 0.0, 0.0)) < 1e-3
 
 
 def test_estop_and_lost_lease_open_the_clutch() -> None:
@@ -190,18 +158,6 @@ def test_hand_does_not_jump_after_a_stall() -> None:
     robot.session_time_ns += 2_000_000_000
     robot.run(hand, 0.02)
     assert distance(before[0], robot.hand[0]) <= 0.4 * LONGEST_STEP_S + 0.4 * STEP_NS * 1e-9
-
-
-def test_trigger_moves_gradually() -> None:
-    robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
-    robot.run(hand, 0.1)
-    hand.trigger_goal = 1.0
-    robot.run(hand, TRIGGER_S / 2)
-    assert hand.make_input().gripper == pytest.approx(0.5, abs=0.1)
-    assert not hand.is_trigger_done()
-    robot.run(hand, TRIGGER_S)
-    assert hand.make_input().gripper == 1.0
-    assert hand.is_trigger_done()
 
 
 def test_perceived_pose_is_smoothed_and_follows() -> None:

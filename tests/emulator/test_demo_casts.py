@@ -21,14 +21,6 @@ def test_every_object_is_handed_over() -> None:
     assert rig.fastest_hand < 0.5
 
 
-@pytest.mark.long
-@pytest.mark.usefixtures("untraced")
-def test_eight_arms_around_a_table() -> None:
-    rig = demo(make_demo("handover", 8), seed=3)
-    rig.run(40.0, until=over)
-    assert demo_verdict(rig) == ""
-
-
 class ScriptedHand:
     """One hand that is done after some updates."""
 

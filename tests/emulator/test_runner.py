@@ -8,10 +8,8 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
-from typing import Any
 
 import msgspec
-import numpy as np
 import pytest
 
 from iris_session import SceneBuilder, ScenePublisher, SessionConfig
@@ -19,14 +17,13 @@ from iris_session.client import Client
 from iris_session.emulator import runner
 from iris_session.emulator.__main__ import _LinePrinter, main
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR
-from iris_session.emulator.operator import REACT_S, EmulatedOperator
+from iris_session.emulator.operator import EmulatedOperator
 from iris_session.emulator.runner import run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
-from iris_session.protocol.client_messages import Observation, Sample, TrackingEpoch
+from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import AlignmentAlarm, Entry, decode_entries
-from iris_session.protocol.names import CommandKind, Device
+from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import Event, Notice
-from tests.rig.front import RigFrontProcess
 from tests.rig.owned import simulate_sessions
 from tests.rig.session import ADDRESS, Rig
 from tests.rig.simulation import Simulation
@@ -49,16 +46,9 @@ def wait_in(simulation: Simulation) -> Callable[[Sequence[Client], float], list[
     return wait_any
 
 
-class PeopleRig(Rig):
-    """A rig whose journal has the observations of anchors, too."""
-
-    def _make_front(self, config: Any, scene: Any) -> RigFrontProcess:
-        return super()._make_front(msgspec.structs.replace(config, forward_observations=True), scene)
-
-
 @pytest.fixture
 def session(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    with PeopleRig(timestep=0.01) as rig:
+    with Rig(timestep=0.01) as rig:
         monkeypatch.setattr(runner, "wait_any", wait_in(rig.simulation))
         yield rig
 
@@ -67,10 +57,6 @@ def messages_of(session: Rig, kind: type) -> list[Entry]:
     """Return the entries with messages of a type that the journal has."""
     entries = [entry for row in session.journal.rows for entry in decode_entries(row.entries)]
     return [entry for entry in entries if isinstance(entry.message, kind)]
-
-
-def samples_of(session: Rig, device: str) -> list[Sample]:
-    return [e.message for e in messages_of(session, Sample) if e.message.device == device]  # type: ignore[union-attr]
 
 
 def run_until(
@@ -113,83 +99,6 @@ def test_two_people_align_and_drive_while_one_observes(session: Rig) -> None:
     assert len(heads & hands) > 50  # samples of one time are sent in one message
 
 
-def test_jump_of_the_tracking_frame_raises_an_alarm_and_restarts_alignment(session: Rig) -> None:
-    spec = HeadsetSpec(name="ann", behaviour="wander", robot="left", **QUICK)
-    began: list[str] = []
-    jumped: list[tuple[str, str]] = []
-
-    def note(report: HeadsetReport) -> None:
-        if not began or began[-1] != report.phase:
-            began.append(report.phase)
-
-    def orders() -> list[tuple[str, str]]:
-        if jumped or "work" not in began:
-            return []
-        jumped.append(("recentre", "ann"))
-        return jumped
-
-    (report,) = run_headsets(ADDRESS, [spec], 40.0, note, lambda: began.count("work") == 2, orders=orders)
-    assert [p for p in began if p in ("look", "work")] == ["look", "work", "look", "work"]
-    assert report.alignment_error_mm < 5.0
-    assert [e.message.tracking_epoch for e in messages_of(session, TrackingEpoch)] == [1]  # type: ignore[union-attr]
-    epochs = [e.message.tracking_epoch for e in messages_of(session, Observation)]  # type: ignore[union-attr]
-    assert epochs == sorted(epochs)
-    assert set(epochs) == {0, 1}
-
-
-def test_observations_are_sent_with_the_head_pose_of_their_time(session: Rig) -> None:
-    jumped: list[tuple[str, str]] = []
-
-    def orders() -> list[tuple[str, str]]:
-        if jumped or not messages_of(session, Observation):
-            return []
-        jumped.append(("recentre", "eve"))
-        return jumped
-
-    run_until([HeadsetSpec(name="eve", **QUICK)], "watch", orders=orders)
-    heads = np.array([s.capture_ns for s in samples_of(session, Device.HEAD)])
-    epochs = np.array([s.tracking_epoch for s in samples_of(session, Device.HEAD)])
-    seen: list[Any] = [entry.message for entry in messages_of(session, Observation)]
-    assert {one.tracking_epoch for one in seen} == {0, 1}
-    for one in seen:
-        assert np.abs(heads - one.capture_ns).min() < 50_000_000
-        if one.tracking_epoch == 0:
-            assert one.capture_ns < heads[epochs == 1].min()
-        else:
-            assert one.capture_ns > heads[epochs == 0].max()
-
-
-def test_bump_moves_head_and_hand_and_the_hand_returns(session: Rig) -> None:
-    """An idle hand jumps with the tracking frame and returns to its shown place. No alarm is raised."""
-    spec = HeadsetSpec(name="ann", behaviour="idle", robot="left", bump_m=(0.0, 0.0, 0.05), **QUICK)
-    phase: list[str] = [""]
-    bumped_ns: list[int] = []
-
-    def orders() -> list[tuple[str, str]]:
-        if phase[0] != "work" or bumped_ns:
-            return []
-        bumped_ns.append(session.session.clock())
-        return [("bump", "ann")]
-
-    def over() -> bool:
-        return bool(bumped_ns) and session.session.clock() - bumped_ns[0] > 1_500_000_000
-
-    def note(report: HeadsetReport) -> None:
-        phase[0] = report.phase
-
-    (report,) = run_headsets(ADDRESS, [spec], 40.0, note, over, orders=orders)
-    assert over(), report
-    assert not messages_of(session, TrackingEpoch)
-    at = report.disturbed_ns["bump"]
-    hand = [s for s in samples_of(session, Device.CONTROLLER_RIGHT) if s.capture_ns > at - 200_000_000]
-    up = [s.pose.p[2] for s in hand if s.pose is not None]  # the frame rose: what is tracked sank
-    before = np.mean([z for s, z in zip(hand, up, strict=True) if s.capture_ns < at])
-    shown_ns, first = next((s.capture_ns, z) for s, z in zip(hand, up, strict=True) if s.capture_ns >= at)
-    left = 1.0 - (shown_ns - at) / (REACT_S * 1e9)  # by the first sample after it, which a busy machine takes late
-    assert first - before == pytest.approx(-0.05 * left, abs=0.008)
-    assert up[-1] - before == pytest.approx(0.0, abs=0.003)
-
-
 @pytest.mark.parametrize("beside", [(), ("shelf",)], ids=["headset", "sheet"])
 def test_person_looks_at_the_sheet_after_an_alarm(session: Rig, beside: tuple[str]) -> None:
     """Unless the sheet itself was moved."""
@@ -223,28 +132,6 @@ def test_person_looks_at_the_sheet_after_an_alarm(session: Rig, beside: tuple[st
     phases = [phase for phase in began if phase in ("look", "work")]
     assert phases == (["look", "work"] if beside else ["look", "work", "look", "work"])
     assert report.alarms == (0 if beside else 1)
-
-
-def test_killed_front_costs_only_a_reconnect(session: Rig) -> None:
-    phases: list[str] = []
-
-    def note(report: HeadsetReport) -> None:
-        if report.phase == "work" and not phases:
-            session.kill_front()
-        if phases or report.phase == "work":
-            phases.append(report.phase if report.reconnects else "")
-
-    def is_driven() -> bool:
-        if phases[-1:] != ["work"]:
-            return False
-        last = session.session.stepper.last
-        assert last is not None
-        return last.decision.commands[0].kind == CommandKind.POSE
-
-    spec = HeadsetSpec(name="ann", behaviour="wander", robot="left", **QUICK)
-    (report,) = run_headsets(ADDRESS, [spec], 40.0, note, is_driven)
-    assert is_driven(), report
-    assert (report.reconnects, report.failed) == (1, "")
 
 
 def test_lost_session_is_shown_and_fails(session: Rig) -> None:

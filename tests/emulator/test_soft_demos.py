@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import random
 
-import numpy as np
 import pytest
 
-from anchors.pose import IDENTITY_POSE, IDENTITY_QUAT
+from anchors.pose import IDENTITY_POSE
 from iris_session.demo.demos import make_demo
 from iris_session.emulator.behaviours import Folder, Stower, make_behaviour
-from iris_session.emulator.behaviours.deformables import CORNERS, SEEN_S
-from iris_session.emulator.behaviours.perception import TrackedPose
+from iris_session.emulator.behaviours.deformables import SEEN_S
 from iris_session.emulator.behaviours.phases import SEARCH_S
-from iris_session.emulator.behaviours.stower import BOX_INSIDE
 from tests.emulator.deformable_rig import SoftRig, soft_demo
 from tests.emulator.handover_rig import LateView
 
@@ -40,20 +37,6 @@ def test_two_people_stow_soft_bodies_and_recover_dropped_ones() -> None:
     rig.run(40.0, until=SoftRig.over)
     assert rig.verdict() == ""
     assert left.attempts == 2  # type: ignore[attr-defined]
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("untraced")
-def test_soft_body_beside_the_box_is_picked_up_again() -> None:
-    rig = soft_demo(make_demo("soft"), seed=2)
-    left = rig.behaviours["left"]
-    assert isinstance(left, Stower)
-    rig.run(20.0, until=lambda rig: left.phase == "lift")
-    place, left._place = left._place, left._grip[0][:2]
-    rig.run(20.0, until=lambda rig: left.attempts == 2)
-    left._place = place
-    rig.run(40.0, until=SoftRig.over)
-    assert (rig.verdict(), left.attempts) == ("", 2)
 
 
 @pytest.mark.parametrize("name", ["folder", "stower"])
@@ -98,28 +81,3 @@ def test_old_picture_is_not_used_for_a_newer_phase(monkeypatch: pytest.MonkeyPat
     eyes.captured_s += 0.01
     assert one._check_slip("lost")
     assert (one.phase, one.attempts) == ("back_off", 2)
-
-
-def test_soft_body_is_held_between_the_fingers_and_stowed_inside_all_walls(monkeypatch: pytest.MonkeyPatch) -> None:
-    one = stower(monkeypatch)
-    for away_m, held in ((0.0, True), (0.1, False)):
-        one.perception._vertices = {
-            index: TrackedPose(((away_m, 0.0, 0.0), IDENTITY_QUAT), 0.0) for index in CORNERS["rose"]
-        }
-        assert one._is_holding() == held
-    x, y, z = BOX_INSIDE
-    for sign in (1.0, -1.0):
-        assert one._is_inside_box((sign * 0.9 * x, sign * 0.9 * y, 0.9 * z))
-        assert not one._is_inside_box((sign * 1.1 * x, 0.0, 0.0))
-        assert not one._is_inside_box((0.0, sign * 1.1 * y, 0.0))
-    assert not one._is_inside_box((0.0, 0.0, 1.1 * z))
-
-
-def test_rig_moves_deformables_rigidly() -> None:
-    """Otherwise it would play with a stretched cloth."""
-    play = make_demo("cloth")
-    moved = soft_demo(play, 5).world.flexes.read_vertices("cloth")
-    still = soft_demo(play, 5, shift=False).world.flexes.read_vertices("cloth")
-    assert np.linalg.norm(moved - still, axis=1).max() > 0.01
-    for a, b in ((0, 16), (0, 272), (0, 288), (16, 272)):
-        np.testing.assert_allclose(np.linalg.norm(moved[a] - moved[b]), np.linalg.norm(still[a] - still[b]), atol=1e-9)

@@ -20,11 +20,10 @@ from typing import Any
 
 import pytest
 
-from iris_session.netsim import datagrams, proxy
-from iris_session.netsim.datagrams import DatagramPort
+from iris_session.netsim import proxy
 from iris_session.netsim.process import ImpairmentError, ImpairmentProcess
 from iris_session.netsim.profiles import UP, Direction, Profile, ProfilePhase
-from iris_session.netsim.proxy import CHUNK, ImpairedLink, _Pipe
+from iris_session.netsim.proxy import CHUNK, DatagramPort, ImpairedLink, _Pipe
 from tests.loopback import make_loopback_address
 from tests.rig.simulation import Simulation
 
@@ -120,8 +119,7 @@ def loop(monkeypatch: pytest.MonkeyPatch) -> Loop:
     simulation = Simulation(1)
     loop = Loop(simulation)
     monkeypatch.setattr(asyncio, "get_running_loop", lambda: loop)
-    for module in (proxy, datagrams):
-        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic_ns=lambda: simulation.now_ns))
+    monkeypatch.setattr(proxy, "time", SimpleNamespace(monotonic_ns=lambda: simulation.now_ns))
     return loop
 
 
@@ -211,7 +209,7 @@ def test_datagrams_are_lost_duplicated_and_reordered(loop: Loop, monkeypatch: py
             opened.append(End(loop))
             return opened[-1]
 
-        monkeypatch.setattr(datagrams, "_open_socket", open_socket)
+        monkeypatch.setattr(proxy, "_open_socket", open_socket)
         phase = ProfilePhase(loss=0.2, duplicate=0.2, reorder=0.1, reorder_ms=30.0)
         port = DatagramPort(ImpairedLink(LINK, "127.0.0.1", Profile(phases=(phase,)), seed), 7720)
         for number in range(n):

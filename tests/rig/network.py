@@ -261,7 +261,6 @@ class RigClientSockets:
         self._simulation = network.simulation
         self.link = Link(network.simulation, profile, seed)
         self.host_address = f"192.0.2.{1 + seed % 250}"
-        self.version = 0
         self.connection: Connection | None = None
         self.subscribed: FrontEnd | None = None
         self.states_in_flight = 0
@@ -283,7 +282,6 @@ class RigClientSockets:
         self._end_connection()
         self._control, self._is_lost = [], False
         self.connection = self._network.connect(self)
-        self.version += 1
 
     def open_state(self, port: int, generation: int) -> None:
         if self.connection is not None:

@@ -6,22 +6,11 @@ from iris_session.protocol.server_messages import Handover
 from tests.rig.session import Rig
 
 
-def test_hammer_is_handed_over_over_busy_wifi() -> None:
-    with Rig(profile="busy-wifi", timestep=0.004) as rig:
-        ann = rig.emulate(name="ann", behaviour="giver", robot="left", seed=1)
-        bob = rig.emulate(name="bob", behaviour="receiver", robot="right", seed=2)
-        rig.join("watcher", "observer")
-        rig.run_until(lambda: ann.finished and bob.finished, "both are done", 60.0)
-        assert (ann.report.phase, bob.report.phase) == ("done", "done"), (ann.report.failed, bob.report.failed)
-        (event,) = [e.body for e in rig.events["watcher"] if isinstance(e.body, Handover)]
-        assert (event.object, event.giver_participant) == ("hammer", ann.client.participant_id)
-        assert event.receiver_participant == bob.client.participant_id
-
-
-def test_hammer_is_handed_over_although_the_front_was_killed_while_it_was_in_the_air() -> None:
-    with Rig(timestep=0.004) as rig:
-        ann = rig.emulate(name="ann", behaviour="giver", robot="left", seed=1)
-        bob = rig.emulate(name="bob", behaviour="receiver", robot="right", seed=2)
+def test_hammer_is_handed_over_over_busy_wifi_although_the_front_was_killed_while_it_was_in_the_air() -> None:
+    with Rig(profile="busy-wifi", timestep=0.006) as rig:
+        quick = {"viewpoints": 3, "observations_per_viewpoint": 4}
+        ann = rig.emulate(name="ann", behaviour="giver", robot="left", seed=1, **quick)
+        bob = rig.emulate(name="bob", behaviour="receiver", robot="right", seed=2, **quick)
         watcher = rig.join("watcher", "observer")
 
         def height() -> float:
@@ -34,4 +23,6 @@ def test_hammer_is_handed_over_although_the_front_was_killed_while_it_was_in_the
         rig.kill_front()
         rig.run_until(lambda: ann.finished and bob.finished, "both are done", 60.0)
         assert (ann.report.phase, bob.report.phase) == ("done", "done"), (ann.report.failed, bob.report.failed)
-        assert [e.body.object for e in rig.events["watcher"] if isinstance(e.body, Handover)] == ["hammer"]
+        (event,) = [e.body for e in rig.events["watcher"] if isinstance(e.body, Handover)]
+        assert (event.object, event.giver_participant) == ("hammer", ann.client.participant_id)
+        assert event.receiver_participant == bob.client.participant_id

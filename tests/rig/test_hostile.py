@@ -142,14 +142,14 @@ def test_flood_of_hellos_is_cut_and_reported() -> None:
         rig.join("late", "observer")
 
 
-def test_thousand_connections_without_hello_are_closed() -> None:
+def test_many_connections_without_hello_are_closed() -> None:
     with Rig(timestep=TICK) as rig:
         both = Undisturbed(rig)
-        peers = [rig.connect_raw() for _ in range(1000)]
+        peers = [rig.connect_raw() for _ in range(400)]
         rig.join("late", "observer")
         assert {audit.detail for _, audit in both.list_floods()} == {"connections"}
         rig.run(9.0)
-        assert sum(one.connection is not None for one in peers) > 900, "ten seconds for a hello"
+        assert sum(one.connection is not None for one in peers) > 300, "ten seconds for a hello"
         rig.run(2.0)
         assert all(one.connection is None for one in peers)
         both.check()

@@ -18,12 +18,16 @@ def pose_at(poses: Poses, index: int) -> PoseTuple:
 
 
 class SceneFollower:
-    """Newest state of a connection, with the bodies of its mirror."""
+    """Newest state of a connection, with the bodies of its mirror. Everything is in the world frame.
+
+    Attributes:
+        state: The newest state: header, poses (n, 7), and its age when it was passed to the application.
+    """
 
     def __init__(self, connection: ClientConnection) -> None:
+        self.state: SceneState | None = None
         self._connection = connection
         self._session_id = ""
-        self.state: SceneState | None = None
 
     def on_state(self, state: SceneState) -> None:
         """Take the newest state."""
@@ -37,7 +41,7 @@ class SceneFollower:
 
     @property
     def version(self) -> tuple[str, str, int] | None:
-        """Session id, scene hash and scene epoch of one moment.
+        """Session id, scene hash and scene epoch, all of one moment.
 
         `None` while they are not known, as between the event of another scene and its snapshot.
         """
@@ -48,25 +52,49 @@ class SceneFollower:
 
     @property
     def tick_period_ns(self) -> int:
-        """Simulated time of one tick of the present scene [ns], 0 before the first welcome."""
+        """Simulated time of one tick of the present scene [ns], 0 before the first welcome.
+
+        Another scene that is loaded may have another.
+        """
         welcome = self._connection.welcome
         return self._connection.mirror.tick_period_ns or (0 if welcome is None else welcome.tick_period_ns)
 
     @property
     def poses(self) -> Poses | None:
-        """Newest poses (n, 7) of the bodies in the mirror, `None` while the newest are of the bodies before them."""
+        """Newest poses (n, 7) `x y z qw qx qy qz` of `mirror.bodies`, world frame, read-only.
+
+        `None` without state, and for a moment after another scene was loaded.
+        """
         state = self.state
         if state is None or state.header.scene_epoch < self._connection.mirror.bodies_since:
             return None
         return state.poses
 
     def body_pose(self, body: str) -> PoseTuple | None:
-        """Return `T_world_body` in the newest state, `None` when it is not known."""
+        """Return `T_world_body` in the newest state.
+
+        Bodies with poses are those in `client.mirror.bodies`: all of a MuJoCo scene, of a publisher's only those that
+        can move. Poses of the others are in the specification: `fetch_scene(client).spec.bodies`.
+
+        Args:
+            body: Name of the body.
+
+        Returns:
+            `((x, y, z) [m], (w, x, y, z))`, or `None` when there is no such body or no state yet, as for a moment
+            after another scene was loaded.
+        """
         poses, index = self.poses, self._connection.mirror.body_index.get(body)
         return None if poses is None or index is None or index >= len(poses) else pose_at(poses, index)
 
     def tip_pose(self, robot: str) -> PoseTuple | None:
-        """Return `T_world_site` of a robot's end effector in the newest state, `None` when it is not known."""
+        """Return `T_world_site` of a robot's end effector in the newest state.
+
+        Args:
+            robot: Name of the robot.
+
+        Returns:
+            `((x, y, z) [m], (w, x, y, z))`, or `None` when there is no such robot or no state yet.
+        """
         poses, tip = self.poses, self._connection.mirror.find_tip(robot)
         if poses is None or tip is None or tip[0] >= len(poses):
             return None

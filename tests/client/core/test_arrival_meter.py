@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from iris_session.client import Client, NotConnectedError
-from iris_session.client.core.arrival_meter import MAX_AGES, PERIOD_NS, ArrivalMeter
+from iris_session.client.core.arrival_meter import PERIOD_NS, ArrivalMeter
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.state_stream import SceneState
 from iris_session.client.core.status import ConnectionPhase
@@ -66,41 +66,6 @@ def test_repeated_states_are_not_measured(connection: ClientConnection) -> None:
     report = meter.poll_report(connection, 6 * PERIOD_NS)
     assert report is not None
     assert report.age_ms_p50 == 7.0
-
-
-def test_joining_while_the_source_is_silent_is_no_slow_link(connection: ClientConnection) -> None:
-    meter = ArrivalMeter()
-    meter.poll_report(connection, 0)
-    for seq in range(4):
-        header = msgspec.structs.replace(frame(1, 0).header, state_seq=seq + 1)
-        meter.record(SceneState(header, np.zeros((0, 7)), 0, 4 * 10**9))
-    report = meter.poll_report(connection, PERIOD_NS)
-    assert report is not None
-    assert (report.age_ms_p50, report.age_ms_p99, report.delivered) == (0.0, 0.0, 4)
-
-
-def test_new_session_restarts_the_sequence(connection: ClientConnection) -> None:
-    meter = ArrivalMeter()
-    meter.record(frame(900, MS))
-    connection.phase = ConnectionPhase.WAITING
-    assert meter.poll_report(connection, 0) is None
-    connection.phase = ConnectionPhase.READY
-    meter.poll_report(connection, 0)
-    meter.record(frame(2000, MS))
-    report = meter.poll_report(connection, PERIOD_NS)
-    assert report is not None
-    assert report.missed == 0
-
-
-def test_memory_is_bounded(connection: ClientConnection) -> None:
-    meter = ArrivalMeter()
-    meter.poll_report(connection, 0)
-    for seq in range(3 * MAX_AGES):
-        meter.record(frame(seq, MS))
-    assert len(meter._ages_ns) == MAX_AGES
-    report = meter.poll_report(connection, PERIOD_NS)
-    assert report is not None
-    assert report.delivered == 3 * MAX_AGES
 
 
 def test_status_of_a_session(session: ClientSession, join: Callable[..., Client]) -> None:

@@ -133,13 +133,6 @@ def test_requests_lost_with_a_connection_are_repeated() -> None:
     assert refuse(loader, again[5], AssetRefusal.UNKNOWN) != ""
 
 
-def test_refusal_shows_that_earlier_requests_are_lost() -> None:
-    loader = started("a", "b")
-    _, other = loader.next_requests(0)
-    assert isinstance(refuse(loader, other, AssetRefusal.UNKNOWN), FailedAsset)
-    assert [(ask.address, ask.offset) for ask in loader.next_requests(0)] == [("a", 0)]
-
-
 def test_number_of_small_assets_is_bounded() -> None:
     loader = AssetLoader()
     names = [f"{i}" for i in range(AT_ONCE + 10)]
@@ -153,17 +146,6 @@ def test_number_of_small_assets_is_bounded() -> None:
         loader.on_missing(name, 0)
     asks = list(loader.next_requests(0))
     assert len(asks) == min(WINDOW_REQUESTS, WINDOW_BYTES // CHUNK_BYTES)
-
-
-def test_lost_connection_keeps_received_chunks() -> None:
-    loader = started("a", offset=1000)
-    (ask,) = loader.next_requests(0)
-    assert ask.offset == 1000
-    assert answer(loader, ask, 3 * CHUNK_BYTES) is True
-    pending = list(loader.next_requests(0))
-    loader.on_link_closed()
-    assert answer(loader, pending[0], 3 * CHUNK_BYTES) is False  # of the previous connection
-    assert [ask.offset for ask in loader.next_requests(0)] == [ask.offset for ask in pending]
 
 
 def test_temporary_refusals_are_retried_with_growing_delay() -> None:
@@ -184,39 +166,6 @@ def test_temporary_refusals_are_retried_with_growing_delay() -> None:
     assert loader.is_complete("a")
 
 
-def test_new_connection_does_not_wait_for_an_earlier_refusal() -> None:
-    loader = started("a")
-    (ask,) = loader.next_requests(0)
-    assert refuse(loader, ask, AssetRefusal.BUSY) == ""
-    assert list(loader.next_requests(0)) == []
-    loader.on_link_closed()
-    assert [again.offset for again in loader.next_requests(0)] == [0]
-
-
-def test_refusal_in_the_middle_leaves_no_gap() -> None:
-    loader = started("a")
-    (ask,) = loader.next_requests(0)
-    answer(loader, ask, 4 * CHUNK_BYTES)
-    first, second, third = loader.next_requests(0)
-    assert answer(loader, first, 4 * CHUNK_BYTES) is True
-    assert refuse(loader, second, AssetRefusal.RATE) == ""
-    assert answer(loader, third, 4 * CHUNK_BYTES) is None  # there is a gap before it
-    again = list(loader.next_requests(FIRST_PAUSE_NS))
-    assert [ask.offset for ask in again] == [second.offset, third.offset]
-    assert [answer(loader, ask, 4 * CHUNK_BYTES) for ask in again] == [True, True]
-    assert loader.is_complete("a")
-
-
-def test_short_chunk_leaves_no_gap() -> None:
-    loader = started("a")
-    (ask,) = loader.next_requests(0)
-    answer(loader, ask, 3 * CHUNK_BYTES)
-    first, second = loader.next_requests(0)
-    assert answer(loader, first, 3 * CHUNK_BYTES, 10) is True
-    assert answer(loader, second, 3 * CHUNK_BYTES) is None
-    assert next(iter(loader.next_requests(0))).offset == CHUNK_BYTES + 10
-
-
 @pytest.mark.parametrize("reason", [AssetRefusal.UNKNOWN, AssetRefusal.VERSION, "of a later version"])
 def test_permanent_refusals_end_the_asset(reason: str) -> None:
     loader = started("a", "b")
@@ -227,16 +176,6 @@ def test_permanent_refusals_end_the_asset(reason: str) -> None:
     assert answer(loader, asks[1], 5) is True
     loader.remove("b")
     assert loader.idle
-
-
-def test_part_of_other_content_is_discarded_once() -> None:
-    loader = started("a", offset=1000)
-    (ask,) = loader.next_requests(0)
-    assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
-    loader.on_missing("a", 0)
-    (ask,) = loader.next_requests(0)
-    assert ask.offset == 0
-    assert isinstance(refuse(loader, ask, AssetRefusal.BAD_RANGE), FailedAsset)
 
 
 def test_wrong_bytes_are_requested_once_more() -> None:
@@ -266,22 +205,6 @@ def test_part_is_discarded_once_in_all() -> None:
     loader.on_missing("a", 1000)
     (ask,) = loader.next_requests(0)
     assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
-
-
-def test_wrong_bytes_of_a_cancelled_asset_are_not_requested_again() -> None:
-    loader = started("a")
-    (ask,) = loader.next_requests(0)
-    assert answer(loader, ask, 5) is True
-    loader.remove("a")  # cancelled while it is hashed
-    assert loader.restart_asset("a")
-    assert loader.idle
-    assert list(loader.next_requests(0)) == []
-    loader.add("a")
-    assert list(loader.next_lookups()) == ["a"]
-    assert loader.restart_asset("a"), "the one before"
-    assert list(loader.next_requests(0)) == [], "how much of it is there is still looked for"
-    loader.on_missing("a", 3)
-    assert [ask.offset for ask in loader.next_requests(0)] == [3]
 
 
 def test_contradicting_answers_are_rejected() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.client.core.clock import BURST, JUMP, LARGE_NS, SLEW, SLEW_LARGE, ClockSync
+from iris_session.client.core.clock import BURST, JUMP, LARGE_NS, SLEW, ClockSync
 
 SECOND = 1_000_000_000
 OFFSET = 5 * SECOND  # session time - local time
@@ -54,25 +54,6 @@ def test_error_stays_within_the_stated_bound(seed: int, drift: float, delay_ms: 
         now = clock.session_ns(local)
         assert last is None or now >= last
         last = now
-
-
-def test_slow_exchange_hardly_moves_the_estimate() -> None:
-    clock = ClockSync()
-    local = 0
-    for _ in range(16):
-        local = exchange(clock, local, 300_000, 300_000) + SECOND
-    local = exchange(clock, local, 300_000, 80_000_000)  # alone it would be 40 ms off
-    assert abs(clock.session_ns(local + 10 * SECOND) - (local + 10 * SECOND + OFFSET)) < 1000
-
-
-def test_wrong_start_is_slewed_not_stepped() -> None:
-    clock = ClockSync()
-    local = exchange(clock, 0, 100_000, 60_100_000)  # error 30 ms
-    before = clock.session_ns(local)
-    for _ in range(8):
-        local = exchange(clock, local, 100_000, 100_000)
-    assert abs(clock.session_ns(local) - before - 1_600_000) < SLEW_LARGE * 1_700_000 + 10  # still nearly 30 ms off
-    assert abs(clock.session_ns(local + 4 * SECOND) - (local + 4 * SECOND + OFFSET)) < 1000
 
 
 def test_start_on_a_busy_link_does_not_leave_samples_in_the_future_for_seconds() -> None:
@@ -127,15 +108,6 @@ def test_suspended_machine_is_synchronised_after_four_exchanges() -> None:
         assert abs(clock.session_ns(local) - truth) <= clock.error_bound_ns(local), "the bound is honest throughout"
         assert i == JUMP - 1 or clock.poll_ping(local), "found out quickly"
     assert abs(clock.session_ns(local) - local - OFFSET - slept) < 1_000_000
-    assert clock.error_bound_ns(local) < 1_000_000
-
-
-def test_single_outlier_is_ignored() -> None:
-    clock = ClockSync()
-    local = synchronise(clock)
-    local = exchange(clock, local, 300_000, 300_000, OFFSET + SECOND)
-    local = exchange(clock, local, 300_000, 300_000)
-    assert clock.session_ns(local) == local + OFFSET
     assert clock.error_bound_ns(local) < 1_000_000
 
 

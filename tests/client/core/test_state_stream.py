@@ -135,23 +135,6 @@ def test_slow_link_delivers_the_newest_available_frame(server: Server) -> None:
     assert handed[-1] is not None
 
 
-@pytest.mark.parametrize("period", [66 * MS, 100 * MS, 400 * MS])
-def test_slow_link_with_few_frames_shows_a_scene_to_a_slow_poller(server: Server, period: int) -> None:
-    stream = StateStream()
-    server.frame(0)
-    server.join(stream)
-    handed = [drain(stream, [server.frame(t - 90 * MS)], t) for t in range(0, 10_000 * MS, period)]
-    assert all(state is not None for state in handed[len(handed) // 2 :])
-
-
-def test_few_frames_on_a_slow_link_are_all_delivered(server: Server) -> None:
-    stream = StateStream()
-    server.frame(0)
-    server.join(stream)
-    for t in range(0, 1000 * MS, 100 * MS):
-        assert drain(stream, [server.frame(t - 90 * MS)], t) is not None
-
-
 @pytest.mark.parametrize("polling", [True, False])
 def test_stall_of_link_or_client_is_detected(server: Server, polling: bool) -> None:
     """The link stalled while the client polled, or the client stalled while waiting for frames."""
@@ -202,43 +185,6 @@ def test_link_that_becomes_slow_still_delivers(server: Server) -> None:
     handed = [drain(stream, [server.frame(t - 1000 * MS)], t) for t in range(1250 * MS, 4000 * MS, 250 * MS)]
     assert handed[0] is None
     assert all(state is not None for state in handed[1:])
-
-
-def test_late_frame_without_a_stall_is_delivered(server: Server) -> None:
-    """Jitter: frames keep arriving, some are late."""
-    stream = StateStream()
-    server.frame(0)
-    server.join(stream)
-    for i in range(20):
-        t = i * 20 * MS
-        assert drain(stream, [server.frame(t - (100 if i % 7 == 3 else 5) * MS)], t) is not None
-
-
-def test_jump_of_session_time_is_no_stall(server: Server) -> None:
-    stream = StateStream()
-    server.frame(0)
-    server.join(stream)
-    assert stream.drain([server.frame(-90 * MS)], 0, 5) is not None
-    assert stream.drain([server.frame(3600_000 * MS)], 3600_090 * MS, MS) is not None
-
-
-def test_new_session_has_no_earlier_stall(server: Server) -> None:
-    stream = StateStream()
-    server.join(stream)
-    server.frame(0)
-    drain(stream, [server.frame(0)], 0)
-    stream.reset()
-    server.frame(0)
-    server.join(stream)
-    assert drain(stream, [server.frame(2900 * MS)], 3001 * MS) is not None
-
-
-def test_presence_of_unknown_participants_is_ignored() -> None:
-    stream = StateStream()
-    items = (PresenceItem("p1", "head", IDENTITY), PresenceItem("p2", "head", IDENTITY))
-    drain(stream, [[TOPIC_PRESENCE, encode_presence(Presence(10, 11, items))]], 12)
-    stream.retain_presence({"p2"})
-    assert set(stream.presence) == {("p2", "head")}
 
 
 def test_presence_keeps_the_latest_per_device_and_removes_participants_that_left() -> None:

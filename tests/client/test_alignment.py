@@ -18,7 +18,7 @@ from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_from_rot
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
 from iris_session.client import Client, ClientError, InvalidMessageError
-from iris_session.client.sheet_observer import CAMERA_SIGMA, ViewpointCounter, to_tracking_covariance
+from iris_session.client.alignment import CAMERA_SIGMA, ViewpointCounter, to_tracking_covariance
 from iris_session.protocol.client_messages import Align, ClientMessage, MoveAnchor, Observation
 from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import Reply
@@ -48,9 +48,6 @@ class FakeClient(Client):
     def request(self, message: Any, timeout_s: float = 5.0) -> Reply:
         self.sent.append(message)
         return Reply(1, True)
-
-    def session_now_ns(self) -> int:
-        return 7_000
 
 
 @pytest.fixture
@@ -131,24 +128,17 @@ def test_observations_belong_to_the_tracking_frame_of_their_picture(
     ann: FakeClient, picture: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Finding sheets takes tenths of a second, and the frame may jump meanwhile."""
-    honest = ann.alignment._sheets._sightings
+    honest = ann.alignment._detect
 
     def slow(*given: Any) -> Any:
         ann.alignment.report_tracking_jump()
         return honest(*given)
 
-    monkeypatch.setattr(ann.alignment._sheets, "_sightings", slow)
+    monkeypatch.setattr(ann.alignment, "_detect", slow)
     ann.alignment.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA)
     ann.alignment.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA, tracking_epoch=0)
     assert ann.connection.tracking_epoch == 2
     assert [(one.tracking_epoch, one.viewpoint_id) for one in ann.sent] == [(0, 1), (0, 1)]
-
-
-def test_observations_of_an_earlier_tracking_epoch(ann: FakeClient) -> None:
-    ann.alignment.report_tracking_jump()
-    ann.alignment.observe("table", ZERO, tracking_epoch=0)
-    ann.alignment.observe("table", ZERO)
-    assert [one.tracking_epoch for one in ann.sent] == [0, 1]
 
 
 def test_viewpoints_are_counted_by_camera_motion() -> None:
