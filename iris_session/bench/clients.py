@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from anchors.pose import PoseTuple
 from iris_session.bench.plugins import POLL_S, Plugin
 from iris_session.client import Client, ClientGroup, CurveKeys, SceneState
-from iris_session.protocol.common import Applied
+from iris_session.client.core.state_stream import StateStream
 from iris_session.protocol.names import Device
+from iris_session.protocol.server_messages import StateHeader
 
 SAMPLE_NS: Final = round(1e9 / 72.0)
 DEVICES: Final = (Device.HEAD, Device.CONTROLLER_LEFT, Device.CONTROLLER_RIGHT)
@@ -102,6 +103,41 @@ def make_web_secret(secret: str, name: str) -> bytes:
     return hashlib.sha256(f"{secret} {name}".encode()).digest()
 
 
+class StateLog:
+    """Log of the states of one client, at most `MAX_FRAMES`; the rest is counted in `overflow`."""
+
+    def __init__(self) -> None:
+        self.overflow = 0
+        self._rows: list[tuple[int, int, int, int, int]] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, header: StateHeader, handed_ns: int, robot: str = "", most: int = MAX_FRAMES) -> bool:
+        """Log a state. Return false when the log is full.
+
+        Args:
+            header: Its header.
+            handed_ns: Session time when the application had it [ns].
+            robot: Robot that the client drives.
+            most: Rows that there is room for.
+        """
+        if len(self._rows) >= most:
+            self.overflow += 1
+            return False
+        applied = next((a.seq for a in header.applied if a.robot == robot), -1) if robot else -1
+        self._rows.append((header.tick, handed_ns, header.session_time, header.published_ns, applied))
+        return True
+
+    def to_columns(self, stream: StateStream, sent: int = 0) -> dict[str, NDArray[Any]]:
+        """Return the columns, with counts: samples sent, states not logged, superseded, messages, and their bytes."""
+        counters = stream.counters
+        counts = [sent, self.overflow, counters.superseded, counters.rigid_messages, counters.rigid_bytes]
+        rows = np.array(self._rows, np.int64).reshape(-1, 5)
+        names = ("ticks", "handed_ns", "state_ns", "published_ns", "applied_seq")
+        return {**dict(zip(names, rows.T, strict=True)), "counts": np.array(counts, np.int64)}
+
+
 class BenchClient:
     """One client with its log."""
 
@@ -119,31 +155,19 @@ class BenchClient:
             on_state=self._on_state,
         )
         self.recording = False
-        self.ticks: list[int] = []
-        self.handed_ns: list[int] = []
-        self.state_ns: list[int] = []
-        self.published_ns: list[int] = []
-        self.applied_seq: list[int] = []
+        self.log = StateLog()
         self.poses = np.empty((0, 0, 7))
         self.sent = 0
-        self.overflow = 0
         self._phase = zlib.crc32(spec.name.encode()) / 2**32
         self._next_ns = 0
         self._open_samples = 5
 
     def _on_state(self, state: SceneState) -> None:
-        if not self.recording:
+        most = len(self.poses) if self._job.keep_poses else MAX_FRAMES
+        if not self.recording or not self.log.add(state.header, self._job.session_time_ns(), self.spec.robot, most):
             return
-        if len(self.ticks) >= (len(self.poses) if self._job.keep_poses else MAX_FRAMES):
-            self.overflow += 1
-            return
-        self.handed_ns.append(self._job.session_time_ns())
-        self.ticks.append(state.header.tick)
-        self.state_ns.append(state.header.session_time)
-        self.published_ns.append(state.header.published_ns)
-        self.applied_seq.append(_find_applied_seq(state.header.applied, self.spec.robot))
         if self._job.keep_poses:
-            self.poses[len(self.ticks) - 1] = state.poses
+            self.poses[len(self.log) - 1] = state.poses
 
     def prepare(self, seconds: float) -> None:
         """Allocate and touch memory for the poses of a window: new pages in every frame would cost time."""
@@ -188,16 +212,8 @@ class BenchClient:
 
     def to_columns(self) -> dict[str, NDArray[Any]]:
         """Return the log."""
-        counters = self.client.connection.stream.counters
-        counts = [self.sent, self.overflow, counters.superseded, counters.rigid_messages, counters.rigid_bytes]
-        names = ("ticks", "handed_ns", "state_ns", "published_ns", "applied_seq")
-        columns = {name: np.array(getattr(self, name), np.int64) for name in names}
-        columns["counts"] = np.array(counts, np.int64)
-        return columns | ({"poses": self.poses[: len(self.ticks)]} if self._job.keep_poses else {})
-
-
-def _find_applied_seq(applied: tuple[Applied, ...], robot: str) -> int:
-    return next((a.seq for a in applied if a.robot == robot), -1) if robot else -1
+        columns = self.log.to_columns(self.client.connection.stream, self.sent)
+        return columns | ({"poses": self.poses[: len(self.log)]} if self._job.keep_poses else {})
 
 
 class StateClients(Plugin):

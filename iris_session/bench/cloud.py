@@ -14,8 +14,7 @@ from typing import Any, Final
 
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloud_camera import CloudCase, CloudJob
-from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure
-from iris_session.bench.intervals import plan_rounds
+from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure, plan_rounds
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchReport, make_bar
 from iris_session.demo.scenes import n_arms_scene

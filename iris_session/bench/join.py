@@ -6,9 +6,11 @@ program of the same priority that only copies memory.
 
 from __future__ import annotations
 
+import gc
 import math
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -16,16 +18,23 @@ from typing import Any, Final
 
 import msgspec
 import mujoco
+import numpy as np
+import psutil
 import zmq
+from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure
-from iris_session.bench.intervals import Log, compute_age_p99_ms
-from iris_session.bench.join_clients import CopyInterval, JoinJob, JoinResult
-from iris_session.bench.join_scene import PreparedScene, SceneJob, make_join_model
-from iris_session.bench.plugins import PluginProcess
+from iris_session.bench.harness import CLIENTS, Action, BenchRun, Log, compute_age_p99_ms, group_clients, measure
+from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
+from iris_session.client import Client
+from iris_session.demo.scenes import free_bodies_scene
+from iris_session.physics.load import load_model
+from iris_session.protocol.scene import SceneSpec, decode_scene, encode_scene, list_assets
+from iris_session.scene import decode_image, decode_mesh
+from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.system.priority import lower_thread_priority
 
 #: Time from the beginning of the window to the join; the baseline of the others is measured first.
 BEGIN_S: Final = 4.0
@@ -70,9 +79,7 @@ def run_join(
             raise BenchError(f"{ready.built} assets were encoded again although the cache is warm")
         paths = [store.path(address) for address in ready.sizes]
         port = stack.enter_context(_serve_in_bulk(paths))
-        joiner = stack.enter_context(
-            PluginProcess("iris_session.bench.join_clients:Joiner", JoinJob(str(folder / "cache")))
-        )
+        joiner = stack.enter_context(PluginProcess("iris_session.bench.join:Joiner", JoinJob(str(folder / "cache"))))
         joiner.read()  # it is made
 
         def start_join(run: BenchRun) -> None:
@@ -134,7 +141,7 @@ def _make_bars(results: dict[str, Any], sent: int) -> list[Any]:
 
 
 def _prepare_scene(model: Path, store: Path) -> PreparedScene:
-    with PluginProcess("iris_session.bench.join_scene:ScenePreparer", SceneJob(str(model), str(store))) as process:
+    with PluginProcess("iris_session.bench.join:ScenePreparer", SceneJob(str(model), str(store))) as process:
         process.read()  # it is made
         return msgspec.convert(process.ask("prepare"), PreparedScene)
 
@@ -167,3 +174,253 @@ def _serve_in_bulk(paths: list[Path]) -> Iterator[int]:
         finally:
             context.destroy(linger=0)
             thread.join()
+
+
+# --- the process that joins -------------------------------------------------------------------------------------------
+
+
+JOIN_S: Final = 60.0
+#: Time of copying memory, after a pause in which work of the join ends, with as many threads as a client has for
+#: assets.
+COPY_S: Final = 2.0
+PAUSE_S: Final = 0.5
+COPY_THREADS: Final = 2
+COPY_BYTES: Final = 16 << 20
+
+
+class JoinJob(msgspec.Struct, frozen=True):
+    """Job of the process. `cache`: folder of assets, empty at first."""
+
+    cache: str
+
+
+class JoinResult(msgspec.Struct, frozen=True):
+    """Times of one join from `connect` on [s].
+
+    `first_picture_s`: specification and the coarsest level of every shape are decoded. `complete_s`: all assets are
+    verified by hash and decoded. `begin_ns`, `end_ns`: session time.
+    """
+
+    first_picture_s: float
+    complete_s: float
+    bytes: int
+    assets: int
+    cpu_s: float
+    begin_ns: int
+    end_ns: int
+
+
+class CopyInterval(msgspec.Struct, frozen=True):
+    """Interval in which memory was copied, in session time."""
+
+    begin_ns: int
+    end_ns: int
+
+
+class Joiner(Plugin):
+    """Plug-in that joins. It is started before it is needed: starting Python is not part of joining."""
+
+    job_type = JoinJob
+
+    def __init__(self, job: JoinJob) -> None:
+        super().__init__(job)
+        gc.collect()
+        gc.freeze()  # Python and its libraries are not part of joining
+
+    def join(self, address: str, origin_ns: int) -> JoinResult:
+        """Join with one client and fetch the whole scene. Raises what the client raises."""
+        begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
+        with Client(address, role="observer", name="joiner", alignment="not_needed") as client:
+            client.assets.cache = AssetStore(self.job.cache)
+            scene = client.connection.mirror.scene_hash
+            first = client.assets.fetch([scene], decode=lambda _, data: decode_scene(data))
+            client.wait_for(lambda _: first.done, JOIN_S)
+            first.check()
+            spec: SceneSpec = first.decoded[scene]
+            sizes, decode = list_assets(spec), _make_decoder(spec)
+            shapes = {mesh.levels[-1].address for mesh in spec.meshes} | {field.address for field in spec.hfields}
+            rest = client.assets.fetch(sizes, decode=decode)
+            client.wait_for(lambda _: shapes.isdisjoint(rest.pending), JOIN_S)
+            picture_ns = time.monotonic_ns()
+            client.wait_for(lambda _: rest.done, JOIN_S)
+            end_ns = time.monotonic_ns()
+            rest.check()
+            assert len(rest.decoded) == len(sizes)
+            return JoinResult(
+                (picture_ns - begin_ns) * 1e-9,
+                (end_ns - begin_ns) * 1e-9,
+                first.bytes_received + rest.bytes_received,
+                1 + len(sizes),
+                time.process_time() - cpu_s,
+                begin_ns - origin_ns,
+                end_ns - origin_ns,
+            )
+
+    def copy_memory(self, origin_ns: int) -> CopyInterval:
+        """Copy memory at the priority of a client's asset threads.
+
+        This is the cost of any program that leaves no core idle. numpy copies without holding Python's lock.
+        """
+        time.sleep(PAUSE_S)
+        begin_ns = time.monotonic_ns()
+        end_ns = begin_ns + round(COPY_S * 1e9)
+
+        def copy_until_end() -> None:
+            lower_thread_priority()
+            source, target = np.ones(COPY_BYTES, np.uint8), np.zeros(COPY_BYTES, np.uint8)
+            while time.monotonic_ns() < end_ns:
+                np.copyto(target, source)
+
+        threads = [threading.Thread(target=copy_until_end) for _ in range(COPY_THREADS)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return CopyInterval(begin_ns - origin_ns, end_ns - origin_ns)
+
+    def transfer_in_bulk(self, port: int) -> float:
+        """Return the seconds for all bytes in one ZeroMQ message: nothing is checked, stored or decoded."""
+        with zmq.Context() as context, context.socket(zmq.REQ) as asking:
+            asking.linger = 0
+            asking.connect(f"tcp://127.0.0.1:{port}")
+            began_s = time.perf_counter()
+            asking.send(b"everything")
+            if not asking.poll(round(JOIN_S * 1e3)):
+                raise TimeoutError("the bulk transfer did not arrive")
+            asking.recv_multipart(copy=False)
+            return time.perf_counter() - began_s
+
+
+def _make_decoder(spec: SceneSpec) -> Callable[[str, memoryview], Any]:
+    """Return the decoder of a viewer for the assets of a scene: meshes and images."""
+    meshes = {level.address for mesh in spec.meshes for level in mesh.levels}
+    images = {level.address: level.encoding for texture in spec.textures for level in texture.levels}
+
+    def decode(address: str, data: memoryview) -> Any:
+        if address in meshes:
+            return decode_mesh(data)
+        return decode_image(data, images[address])
+
+    return decode
+
+
+# --- the scene --------------------------------------------------------------------------------------------------------
+
+
+MESHES: Final = 60
+TEXTURES: Final = 60
+#: Share of the bytes in textures; meshes have the rest.
+TEXTURE_SHARE: Final = 0.8
+#: Measured ratios with coarser levels: bytes of a texture per byte of raw pixels, bytes of a mesh per vertex.
+_LEVELS: Final = 1.228
+_VERTEX_BYTES: Final = 35.5
+
+
+class PreparedScene(msgspec.Struct, frozen=True):
+    """Result of preparing a scene.
+
+    Attributes:
+        seconds: From the compiled model to assets that can be fetched.
+        rss_mib: Peak memory meanwhile, above that of the process with the model.
+        built: Assets that were encoded.
+        scene: Content hash of the specification.
+        sizes: Bytes of all assets by content hash.
+    """
+
+    seconds: float
+    rss_mib: float
+    built: int
+    scene: str
+    sizes: dict[str, int]
+
+
+def make_join_model(objects: int, assets_mb: float, seed: int) -> Any:
+    """Return an `mujoco.MjSpec` of moving bodies that share 60 meshes and 60 textures, about `assets_mb` MB."""
+    spec = free_bodies_scene(objects, seed)
+    rng = np.random.default_rng(seed)
+    side = max(16, round((assets_mb * 1e6 * TEXTURE_SHARE / TEXTURES / 3 / _LEVELS) ** 0.5))
+    vertices = max(100, round(assets_mb * 1e6 * (1.0 - TEXTURE_SHARE) / MESHES / _VERTEX_BYTES))
+    for i in range(TEXTURES):
+        pixels = rng.integers(0, 256, (side, side, 3), np.uint8)  # noise does not compress
+        spec.add_texture(
+            name=f"texture{i}",
+            type=mujoco.mjtTexture.mjTEXTURE_2D,
+            width=side,
+            height=side,
+            nchannel=3,
+            data=pixels.ravel().tolist(),
+        )
+        material = spec.add_material(name=f"material{i}")
+        material.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = f"texture{i}"
+    for i in range(MESHES):
+        points, faces, uv = _make_stone(rng, vertices)
+        spec.add_mesh(
+            name=f"mesh{i}",
+            uservert=points.ravel().tolist(),
+            userface=faces.ravel().tolist(),
+            usertexcoord=uv.ravel().tolist(),
+            userfacetexcoord=faces.ravel().tolist(),
+        )
+    for i, body in enumerate(body for body in spec.bodies if body.name.startswith("body")):
+        geom = body.first_geom()
+        geom.type = mujoco.mjtGeom.mjGEOM_MESH
+        geom.meshname = f"mesh{i % MESHES}"
+        geom.material = f"material{i % TEXTURES}"
+    return spec
+
+
+def _make_stone(
+    rng: np.random.Generator, vertices: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Return points [m] of a rough ball of 6 cm, triangles and texture coordinates."""
+    rows = max(4, round((vertices / 2) ** 0.5))
+    columns = 2 * rows
+    v, u = np.meshgrid(np.linspace(0.0, 1.0, rows), np.linspace(0.0, 1.0, columns, endpoint=False), indexing="ij")
+    theta, phi = np.pi * (0.02 + 0.96 * v), 2 * np.pi * u
+    radius = 0.06 * rng.uniform(0.97, 1.0, theta.shape)
+    points = radius[..., None] * np.stack(
+        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1
+    )
+    at = np.arange(rows * columns).reshape(rows, columns)
+    right = np.roll(at, -1, axis=1)
+    a, b, c, d = at[:-1], at[1:], right[1:], right[:-1]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    top, bottom = np.full((columns,), at[0, 0]), np.full((columns,), at[-1, 0])
+    caps = [np.stack([top, at[0], right[0]], -1)[1:-1], np.stack([bottom, right[-1], at[-1]], -1)[1:-1]]
+    return points.reshape(-1, 3), np.concatenate([faces, *caps]), np.stack([u, v], axis=-1).reshape(-1, 2)
+
+
+class SceneJob(msgspec.Struct, frozen=True):
+    """Files of a compiled model and of the store of its assets."""
+
+    model: str
+    store: str
+
+
+class ScenePreparer(Plugin):
+    """Plug-in that prepares a compiled model as a server does at its start.
+
+    The memory of a scene can only be measured in a process that did nothing else.
+    """
+
+    job_type = SceneJob
+
+    def prepare(self) -> PreparedScene:
+        """Prepare the scene, and measure it."""
+        model = load_model(self.job.model)
+        store = AssetStore(Path(self.job.store))
+        before = psutil.Process().memory_info().rss
+        Path("/proc/self/clear_refs").write_text("5")  # the peak of memory is counted from now on (Linux)
+        began_s = time.perf_counter()
+        parsed = parse_mujoco(model, store)
+        data = encode_scene(parsed.spec)
+        scene = store.put(data)
+        seconds = time.perf_counter() - began_s
+        sizes = {scene: len(data), **list_assets(parsed.spec)}
+        return PreparedScene(seconds, (_read_peak_rss() - before) / 2**20, parsed.built, scene, sizes)
+
+
+def _read_peak_rss() -> int:
+    """Return the peak resident memory of this process [bytes] since the last reset of the peak."""
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024

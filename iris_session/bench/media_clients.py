@@ -71,7 +71,7 @@ class MediaClient(BenchClient):
         if not self.recording:
             return
         if len(self.rows) >= MAX_FRAMES:
-            self.overflow += 1
+            self.log.overflow += 1
             return
         topic = len(make_topic(self.client.connection.connection_epoch, self.feed.stream))
         self.heads += topic + len(header.budget_class) + len(encode_media_header(header))
@@ -82,7 +82,7 @@ class MediaClient(BenchClient):
     def to_columns(self) -> dict[str, NDArray[Any]]:
         """Return the log. Columns of `frames`: `MediaColumn`. The last of `counts`: bytes of topics and headers."""
         feed = self.feed
-        counts = [feed.superseded, feed.dropped, self.client.media.malformed, self.overflow, self.heads]
+        counts = [feed.superseded, feed.dropped, self.client.media.malformed, self.log.overflow, self.heads]
         return super().to_columns() | {
             "frames": np.array(self.rows, np.int64).reshape(-1, len(MediaColumn)),
             "levels": np.array(self.levels, np.int64).reshape(-1, 2),

@@ -12,28 +12,46 @@ from __future__ import annotations
 
 import os
 import random
+import select
 import signal
+import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
+import msgspec
+import mujoco
 import numpy as np
 import psutil
+import rerun as rr
+from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.harness import CLIENTS, Measurement, group_clients, measure
-from iris_session.bench.plugins import PluginProcess
-from iris_session.bench.record_naive import LOG_BATCH_S, LONG_BATCH_S, write_naive_log
-from iris_session.bench.record_session import BODIES, OPERATORS, SessionJob, make_record_scene
+from iris_session.bench.harness import CLIENTS, Measurement, group_clients, make_session_config, measure
+from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
-from iris_session.demo.scenes.generators import arm_names
-from iris_session.recording import NotARecordingError, Recording
+from iris_session.demo.scenes import free_bodies_scene
+from iris_session.demo.scenes.generators import (
+    ARM_FILE,
+    ARM_HOME,
+    FINGER_OPEN,
+    arm_names,
+    compute_bearing,
+    compute_circle_radius,
+    place_arm,
+)
+from iris_session.protocol.common import Pose
+from iris_session.recording import NotARecordingError, RecordedState, Recording
 from iris_session.rrd import paths
-from iris_session.rrd.file import scan_file
+from iris_session.rrd.batches import read_index
+from iris_session.rrd.file import read_chunks, scan_file
 from iris_session.rrd.paths import part_path
+from iris_session.session.session import Session
+from iris_session.viewer.scene_layer import SceneLayer, SceneSource, escape_entity_part
+from iris_session.viewer.timelines import Moment, to_time_columns
 
 #: Rounds with a recording, and as many without; and the shortest of them.
 ROUNDS: Final = 3
@@ -49,7 +67,7 @@ KILL_AFTER_S: Final = (0.5, 1.0)
 POLL_S: Final = 0.02
 START_S: Final = 60.0
 END_S: Final = 30.0
-SESSION: Final = "iris_session.bench.record_session:RecordedSession"
+SESSION: Final = "iris_session.bench.record:RecordedSession"
 _RECORDER: Final = "iris_session.recording.process"
 
 
@@ -327,3 +345,181 @@ class KilledSession:
         for process in alive:
             with suppress(psutil.Error):
                 process.kill()
+
+
+# --- naive logs of the same values ------------------------------------------------------------------------------------
+
+
+#: Session time of a batch: of a program that collects for `rerun.send_columns` as long as a recorder does, and of one
+#: that calls `rerun.log`, whose batcher writes after 0.2 s (`ChunkBatcherConfig.flush_tick`).
+LONG_BATCH_S: Final = 8.0
+LOG_BATCH_S: Final = 0.2
+_SCALARS: Final = "Scalars:scalars"
+_TIMELINES: Final = (paths.STEP, paths.SIM_TIME, paths.SESSION_TIME, paths.WALL_TIME)
+_Rows = dict[str, list[tuple[Moment, list[float]]]]
+
+
+def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
+    """Log the values of a recording to `output`, as Rerun's own calls do. Return its size [bytes].
+
+    There is one entity per body, device and series, one row per state, on the four timelines of a recording, without a
+    journal and raw messages; the geometry of the scene is in the file once. The length of the batches [s of session
+    time] decides about the size, since a short chunk is mostly its schema.
+    """
+    log = rr.RecordingStream("naive", recording_id="naive")
+    log.set_log_time_enabled(False)
+    log.save(output)
+    states = list(recording.states())
+    if states:
+        header, first = recording.header, _make_moment(states[0], recording.header.origin_utc_ns)
+        picture = SceneLayer(log)
+        picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
+        picture.draw(first)
+    for rows in _split(_list_poses(states, recording.header.origin_utc_ns), batch_s):
+        for entity, taken in rows.items():
+            poses = np.array([pose for _, pose in taken], np.float32)
+            columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]])
+            _send(log, entity, [moment for moment, _ in taken], columns)
+    for rows in _split(sorted(_list_scalars(recording), key=lambda row: row[1].session_ns), batch_s):
+        for entity, taken in rows.items():
+            values = np.array([row for _, row in taken], np.float64)
+            columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
+            _send(log, entity, [moment for moment, _ in taken], columns)
+    for event in recording.events():
+        log.set_time(paths.SESSION_TIME, duration=np.timedelta64(event.session_time, "ns"))
+        log.log("events", rr.TextLog(repr(event.body)))
+    log.disconnect()
+    return output.stat().st_size
+
+
+def _list_poses(states: list[RecordedState], origin_utc_ns: int) -> Iterator[tuple[str, Moment, list[float]]]:
+    """Yield entity, time and pose (`x y z qw qx qy qz`) of every moving body and device at every state."""
+    for state in states:
+        moment = _make_moment(state, origin_utc_ns)
+        for body, pose in zip(state.bodies, state.poses.tolist(), strict=True):
+            if body.moving:
+                yield f"bodies/{escape_entity_part(body.name)}", moment, pose
+        for item in state.presence:
+            yield f"people/{item.participant}/{item.device}", moment, _list_numbers(item.pose)
+
+
+def _list_scalars(recording: Recording) -> Iterator[tuple[str, Moment, list[float]]]:
+    """Yield entity, time and values of what the recording plots: joints, grippers, speeds, delays."""
+    for file in recording.readable_files:
+        for chunk in read_chunks(file, (f"{paths.ROBOTS}/**", f"{paths.METRICS}/**")):
+            batch = chunk.to_record_batch()
+            if _SCALARS not in batch.schema.names:
+                continue
+            times = zip(*(read_index(batch, timeline) for timeline in _TIMELINES), strict=True)
+            for moment, values in zip(times, batch.column(_SCALARS).to_pylist(), strict=True):
+                yield str(chunk.entity_path), Moment(*moment), values
+
+
+def _split(rows: Iterable[tuple[str, Moment, list[float]]], batch_s: float) -> Iterator[_Rows]:
+    """Collect rows in order of time by entity, in batches."""
+    begin_ns: int | None = None
+    batch: _Rows = {}
+    for entity, moment, values in rows:
+        if begin_ns is None or not 0 <= moment.session_ns - begin_ns < batch_s * 1e9:
+            if batch:
+                yield batch
+            begin_ns, batch = moment.session_ns, {}
+        batch.setdefault(entity, []).append((moment, values))
+    if batch:
+        yield batch
+
+
+def _make_moment(state: RecordedState, origin_utc_ns: int) -> Moment:
+    time_ns = state.session_time
+    return Moment(state.step, round(state.sim_time * 1e9), time_ns, time_ns + origin_utc_ns)
+
+
+def _list_numbers(pose: Pose) -> list[float]:
+    return [*pose.p, *pose.q]
+
+
+def _send(log: rr.RecordingStream, entity: str, moments: list[Moment], columns: Any) -> None:
+    times: NDArray[np.int64] = np.array(moments, np.int64).T
+    rr.send_columns(entity, to_time_columns(times), [*columns], recording=log, strict=True)
+
+
+# --- the session that is killed ---------------------------------------------------------------------------------------
+
+
+#: Moving bodies: those that fly, and ten of each of the two arms.
+BODIES: Final = 50
+OPERATORS: Final = 2
+POLL_NS: Final = 20_000_000
+#: Age of the newest row at its write [ns] from which on a recorder has caught up.
+CURRENT_NS: Final = 250_000_000
+_FREE: Final = BODIES - 10 * OPERATORS
+
+
+class SessionJob(msgspec.Struct, frozen=True):
+    """Job of the process. `path`: first file of the recording."""
+
+    path: str
+    seed: int
+
+
+def make_record_scene(seed: int) -> Any:
+    """Return an `mujoco.MjSpec` with two arms and as many flying bodies as make `BODIES` that move."""
+    spec = free_bodies_scene(_FREE, seed)
+    home = spec.key("home")
+    qpos, qvel = list(home.qpos), list(home.qvel)
+    spec.delete(home)
+    for i, name in enumerate(arm_names(OPERATORS)):
+        arm = mujoco.MjSpec.from_file(str(ARM_FILE))
+        frame = place_arm(spec, compute_circle_radius(OPERATORS), compute_bearing(i, OPERATORS))
+        frame.attach_body(arm.body("base"), f"{name}/", "")
+        qpos += [*ARM_HOME, FINGER_OPEN, FINGER_OPEN]
+        qvel += [0.0] * (len(ARM_HOME) + 2)
+    spec.add_key(name="home", qpos=qpos, qvel=qvel, ctrl=[*ARM_HOME, FINGER_OPEN] * OPERATORS)
+    return spec
+
+
+class RecordedSession(Plugin):
+    """Plug-in that runs a recorded session of the scene."""
+
+    job_type = SessionJob
+
+    def __init__(self, job: SessionJob) -> None:
+        super().__init__(job)
+        model = make_record_scene(job.seed).compile()
+        self._session = Session(model, config=make_session_config(record=Path(job.path)))
+        self._session.start()
+        self._known = 0
+        self._calls = select.poll()
+        self._calls.register(sys.stdin.fileno(), select.POLLIN)
+
+    def poll(self) -> None:
+        """Run the session until the next call: every begin of a run costs it a moment."""
+        self._session.run(until=lambda: self._calls.poll(0))
+
+    def describe(self) -> tuple[str, int]:
+        """Return the address of the session, and its origin: session time zero on CLOCK_MONOTONIC [ns]."""
+        return self._session.address, self._session.origin_ns
+
+    def wait_until_written(self, timeout_s: float) -> bool:
+        """Run until a recorder that is new has written the rows that waited for it; return whether it has."""
+        due_ns = 0
+
+        def is_written() -> bool:
+            nonlocal due_ns
+            feed, now_ns = self._session.processes.feed, self._session.clock()
+            if now_ns < due_ns or feed is None:
+                return False
+            due_ns = now_ns + POLL_NS
+            last = feed.stats.recorder
+            if last is None or last.instance == self._known or last.written < 0 or not 0 < last.lag_ns < CURRENT_NS:
+                return False
+            self._known = last.instance
+            return True
+
+        before = self._known
+        self._session.run(seconds=timeout_s, until=is_written)
+        return self._known != before
+
+    def close(self) -> None:
+        """Close the session."""
+        self._session.close()

@@ -15,19 +15,17 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
     CLIENTS,
     CLIENTS_PER_PROCESS,
-    BenchRun,
-    assign_links,
-    group_clients,
-    measure,
-    plan_stalls,
-    stop_client,
-)
-from iris_session.bench.intervals import (
     SHORTEST_STALL_S,
     STALL_S,
+    BenchRun,
     Interval,
+    assign_links,
     compute_age_p99_ms,
+    group_clients,
+    measure,
     plan_rounds,
+    plan_stalls,
+    stop_client,
     summarize_runs,
     summarize_stalls,
 )

@@ -16,31 +16,28 @@ from typing import Any, Final
 import numpy as np
 import psutil
 
-from iris_session.bench.chromium import MissingToolError, find_tools
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
     BROWSERS,
     CLIENTS,
+    SHORTEST_STALL_S,
     TABS,
     BenchRun,
     Group,
+    Interval,
+    Log,
     Measurement,
+    compute_age_p99_ms,
     group_clients,
     measure,
     plan_stalls,
     stop_client,
-)
-from iris_session.bench.intervals import (
-    SHORTEST_STALL_S,
-    Interval,
-    Log,
-    compute_age_p99_ms,
     summarize_runs,
     summarize_stalls,
 )
 from iris_session.bench.report import Bar, BenchError, BenchReport, compute_percentile, make_bar
 from iris_session.bench.slow_client import BASELINE
-from iris_session.bench.web_tab import STOPS_S
+from iris_session.bench.web_tab import STOPS_S, MissingToolError, find_tools
 from iris_session.demo.scenes.aloha import aloha_scene
 from iris_session.protocol.client_messages import EStop
 from iris_session.protocol.entries import Entry

@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import gc
 import time
-from collections.abc import Sequence
 from http import HTTPStatus
 from typing import Any, Final
 
@@ -18,10 +17,9 @@ import aiohttp
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import JOIN_S, MAX_FRAMES, ClientJob, Job, make_web_secret
+from iris_session.bench.clients import JOIN_S, ClientJob, Job, StateLog, make_web_secret
 from iris_session.bench.plugins import POLL_S, Plugin
 from iris_session.client.core.connection import ClientConnection
-from iris_session.client.core.state_stream import SceneState
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.identity import Identity
 from iris_session.protocol.client_messages import Hello
@@ -51,12 +49,8 @@ class BenchBrowser:
         self._ticket = ""
         self._socket: aiohttp.ClientWebSocketResponse | None = None
         self.begin_ns = self.end_ns = 0
-        self.ticks: list[int] = []
-        self.handed_ns: list[int] = []
-        self.state_ns: list[int] = []
-        self.published_ns: list[int] = []
+        self.log = StateLog()
         self.loads: list[tuple[int, int, int]] = []
-        self.overflow = 0
 
     async def join(self, http: aiohttp.ClientSession) -> None:
         """Open the WebSocket and start to join the session."""
@@ -80,8 +74,9 @@ class BenchBrowser:
             if channel == wire.STATE:
                 received = [bytes(frame) for frame in frames]
                 state = self.connection.stream.drain([received], now_ns - self._job.origin_ns, now_ns)
-                if state is not None:
-                    self._log(state)
+                handed_ns = self._job.session_time_ns()
+                if state is not None and self.begin_ns <= handed_ns < self.end_ns:
+                    self.log.add(state.header, handed_ns)
             elif channel == wire.CONTROL:
                 self.connection.receive([bytes(frame) for frame in frames], now_ns)
                 self.connection.inbox.clear()
@@ -140,25 +135,9 @@ class BenchBrowser:
             self.connection.pop_outgoing(sent=True)
             await self._socket.send_bytes(wire.encode_frames(wire.CONTROL, [outgoing[1]]))
 
-    def _log(self, state: SceneState) -> None:
-        now_ns = self._job.session_time_ns()
-        if not self.begin_ns <= now_ns < self.end_ns:
-            return
-        if len(self.ticks) >= MAX_FRAMES:
-            self.overflow += 1
-            return
-        self.handed_ns.append(now_ns)
-        self.ticks.append(state.header.tick)
-        self.state_ns.append(state.header.session_time)
-        self.published_ns.append(state.header.published_ns)
-
     def to_columns(self) -> dict[str, NDArray[Any]]:
-        """Return the log, with the columns of `bench.clients`."""
-        counters = self.connection.stream.counters
-        counts = [0, self.overflow, counters.superseded, counters.rigid_messages, counters.rigid_bytes]
-        names = ("ticks", "handed_ns", "state_ns", "published_ns", "loads")
-        columns: dict[str, Sequence[Any]] = {"counts": counts, **{name: getattr(self, name) for name in names}}
-        return {key: np.array(column, np.int64) for key, column in columns.items()}
+        """Return the log."""
+        return self.log.to_columns(self.connection.stream) | {"loads": np.array(self.loads, np.int64)}
 
 
 class Browsers(Plugin):

@@ -10,10 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from iris_session.bench.cloud_camera import CloudCase, make_rig
-from iris_session.bench.cloud_room import BOXES, ROOM, make_room_camera, make_room_pose, render_room
-from iris_session.bench.cloud_source import MovingCloud
-from iris_session.bench.cloud_stream import Interval, _compare, summarize
+from iris_session.bench.cloud_camera import (
+    BOXES,
+    ROOM,
+    CloudCase,
+    make_rig,
+    make_room_camera,
+    make_room_pose,
+    render_room,
+)
+from iris_session.bench.cloud_stream import Interval, MovingCloud, _compare, summarize
 from iris_session.bench.report import BenchError
 from iris_session.cloud.voxels import make_rays
 from iris_session.streams.cloud import read_header

@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 from iris_session.bench import cloth_motion as motion_module
-from iris_session.bench.cloth_motion import ClothMotion, load_cloth_motion, simulate_cloth
-from iris_session.bench.deformable import _ClothSource, _compute_max_error_m
+from iris_session.bench.deformable import (
+    ClothMotion,
+    _ClothSource,
+    _compute_max_error_m,
+    load_cloth_motion,
+    simulate_cloth,
+)
 from iris_session.bench.media_clients import MediaColumn
 from iris_session.bench.report import BenchError
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from iris_session.bench.cloud_stream import plan_stream
-from iris_session.bench.intervals import (
+from iris_session.bench.harness import (
     SHORTEST_STALL_S,
     Interval,
     compute_age_p99_ms,

@@ -9,19 +9,20 @@ import pytest
 
 from iris_session.bench.record import (
     AUTHORITY,
+    BODIES,
     BOTH,
     RECORDER,
     FileSize,
     Kill,
     Round,
     make_record_bars,
+    make_record_scene,
     measure_size,
     read_losses,
     summarize_kills,
     summarize_rounds,
     summarize_sizes,
 )
-from iris_session.bench.record_session import BODIES, make_record_scene
 from iris_session.journal.messages import StateFrame
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.paths import part_path

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from iris_session.bench.chromium import BrowserError, BrowserTools, Chromium, MissingToolError, find_tools
+from iris_session.bench.web_tab import BrowserError, BrowserTools, Chromium, MissingToolError, find_tools
 from tests.e2e.session_process import DEADLINE_S, END_WITH_PARENT, SessionProcess, skip_unless_ci, wait_until
 
 

@@ -24,7 +24,7 @@ from anchors.pose import (
     quat_mul,
     quat_rotate,
 )
-from iris_session.bench.chromium import WEB_CLIENT
+from iris_session.bench.web_tab import WEB_CLIENT
 from iris_session.client import Client
 from iris_session.protocol.names import HoldReason
 from iris_session.protocol.server_messages import EngagementChanged, ParticipantInfo

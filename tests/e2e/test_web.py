@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from iris_session.bench.chromium import BUILT_PAGE, WEB_CLIENT
+from iris_session.bench.web_tab import BUILT_PAGE, WEB_CLIENT
 from iris_session.demo.named_scenes import scene_by_name
 from iris_session.protocol.server_messages import (
     Event,
