@@ -392,10 +392,21 @@ class EmulatedOperator:
         return alignment if alignment.tracking_epoch == self.headset.tracking_epoch else None
 
     def _update_errors(self, now_ns: int) -> None:
-        """Compare the alignment in force with the true pose."""
-        update_alignment_errors(
-            self.report, self._get_alignment(), self.headset.get_T_world_tracking(now_ns), self.spec.T_world_anchor[0]
-        )
+        """Compare the alignment in force with the true pose. Without one, the last values stay."""
+        report, alignment = self.report, self._get_alignment()
+        if alignment is None:
+            report.T_true_shown = None
+            return
+        true, p_sheet = self.headset.get_T_world_tracking(now_ns), self.spec.T_world_anchor[0]
+        believed: PoseTuple = (alignment.T_world_tracking.p, alignment.T_world_tracking.q)
+        shown = report.T_true_shown = compose(true, inverse(believed))
+        x, y, z = p_sheet
+        around: list[Vec3] = [(x + 1, y, z), (x - 1, y, z), (x, y + 1, z), (x, y - 1, z), (x, y, z + 1)]
+        report.alignment_version = alignment.version
+        report.alignment_error_mm = 1e3 * distance(apply(shown, p_sheet), p_sheet)
+        report.alignment_error_1m_mm = 1e3 * max(distance(apply(shown, p), p) for p in around)
+        report.alignment_error_deg = math.degrees(quat_angle(believed[1], true[1]))
+        report.stated_error_mm = 1e3 * alignment.error_at_anchor_m
 
     def _count_rejected(self) -> dict[str, int]:
         total: dict[str, int] = {}
@@ -535,25 +546,6 @@ class HandClutch:
             self.open_briefly()
             self.reclutches += 1
         return hand.clutch
-
-
-def update_alignment_errors(
-    report: HeadsetReport, alignment: Alignment | None, T_world_tracking_true: PoseTuple, p_world_sheet: Vec3
-) -> None:
-    """Fill in the errors of `alignment`. Without one, the last values stay and `T_true_shown` is `None`."""
-    if alignment is None:
-        report.T_true_shown = None
-        return
-    believed: PoseTuple = (alignment.T_world_tracking.p, alignment.T_world_tracking.q)
-    shown = compose(T_world_tracking_true, inverse(believed))
-    x, y, z = p_world_sheet
-    around: list[Vec3] = [(x + 1, y, z), (x - 1, y, z), (x, y + 1, z), (x, y - 1, z), (x, y, z + 1)]
-    report.T_true_shown = shown
-    report.alignment_version = alignment.version
-    report.alignment_error_mm = 1e3 * distance(apply(shown, p_world_sheet), p_world_sheet)
-    report.alignment_error_1m_mm = 1e3 * max(distance(apply(shown, p), p) for p in around)
-    report.alignment_error_deg = math.degrees(quat_angle(believed[1], T_world_tracking_true[1]))
-    report.stated_error_mm = 1e3 * alignment.error_at_anchor_m
 
 
 def make_spec_behaviour(spec: HeadsetSpec, robot: str) -> Behaviour | None:

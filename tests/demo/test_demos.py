@@ -8,9 +8,8 @@ import pytest
 
 from iris_session.demo.demos import Demo, make_demo
 from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW
-from iris_session.emulator.behaviours.arms import get_arm_kind
 from iris_session.emulator.behaviours.deformables import CORNERS
-from iris_session.emulator.behaviours.objects import find_object
+from iris_session.emulator.behaviours.objects import find_object, get_arm_kind
 from iris_session.emulator.behaviours.stower import BOX, BOX_INSIDE
 from iris_session.physics import World, find_objects, find_robots
 from iris_session.session.errors import ConfigError

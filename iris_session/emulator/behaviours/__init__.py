@@ -1,17 +1,16 @@
 """Scripted operators: closed loops from what a headset shows to what the hands do. No MuJoCo, no network, no clock.
 
 `base` (the interface), `phases` (task phases), `handover` (giver and receiver), `folder` (folds a cloth with a
-partner),
-`stower` (stows a soft body), `wander` (motion without a task), `hand` (clutched motion), `perception`, `objects`,
-`arms`.
+partner), `stower` (stows a soft body), `wander` (motion without a task), `hand` (clutched motion), `perception`,
+`objects` (objects and arms).
 """
 
 from __future__ import annotations
 
-from iris_session.emulator.behaviours.arms import get_arm_kind
 from iris_session.emulator.behaviours.base import Behaviour, CombinedBehaviour, HandInput, OperatorView
 from iris_session.emulator.behaviours.folder import Folder
 from iris_session.emulator.behaviours.handover import Giver, Receiver
+from iris_session.emulator.behaviours.objects import get_arm_kind
 from iris_session.emulator.behaviours.stower import Stower
 from iris_session.emulator.behaviours.wander import Idle, Wander
 from iris_session.protocol.names import Device

@@ -8,13 +8,14 @@ model: a MuJoCo grid counts its last axis fastest.
 from __future__ import annotations
 
 import itertools
+import math
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from anchors.pose import IDENTITY_QUAT, PoseTuple, Vec3
-from iris_session.emulator.behaviours.arms import ARM, ArmKind
+from anchors.pose import IDENTITY_QUAT, PoseTuple, Quat, Vec3, quat_angle, quat_from_yaw, quat_mul
 from iris_session.emulator.behaviours.base import OperatorView
+from iris_session.emulator.behaviours.objects import ARM, CLEAR_ABOVE, DOWN, ArmKind
 from iris_session.emulator.behaviours.perception import Perception, TrackedPose
 from iris_session.emulator.behaviours.phases import PhasedTask
 
@@ -112,9 +113,11 @@ SEEN_S: float = 0.6
 class DeformableTask(PhasedTask):
     """Phases of a task with what `eyes` watch."""
 
+    perception: DeformablePerception
+
     def __init__(self, robot: str, device: str, eyes: DeformablePerception, arm: ArmKind) -> None:
-        self.perception = eyes
         super().__init__(robot, device, eyes, arm)
+        self._steps["back_off"] = lambda: self._rise(CLEAR_ABOVE, "look", trigger=0.0)
         self._lost_s: float | None = None  # session time since which it seems to stay behind
         self._phase_s = 0.0  # session time of the start of the phase
 
@@ -125,6 +128,20 @@ class DeformableTask(PhasedTask):
     def _is_shown_for(self, seconds: float) -> bool:
         """Return True if the vertices show the first `seconds` of this phase, or are too late for that."""
         return self.perception.captured_s > self._phase_s + seconds or self._has_lasted(seconds + PICTURE_LATE_S)
+
+    def _open(self, trigger: float) -> None:
+        """Open the fingers, and continue with `leave`."""
+        if self._entering_now:
+            self.hand.hold_still()
+            self.hand.trigger_goal = trigger
+        if self.hand.is_trigger_done() and self._has_lasted(0.8):
+            self._enter("leave")
+
+    def _turn_down(self, yaw: float) -> Quat:
+        """Return the rotation of a tip that points down and closes across `yaw` [rad], with the least wrist turn."""
+        home = (self._home or self.perception.get_tip(self.robot))[1]
+        turns = [quat_mul(quat_from_yaw(yaw + half), DOWN) for half in (0.0, math.pi)]
+        return min(turns, key=lambda turn: quat_angle(turn, home))
 
     @abstractmethod
     def _is_holding(self) -> bool:

@@ -6,10 +6,9 @@ from __future__ import annotations
 
 import math
 
-from anchors.pose import PoseTuple, Vec3, distance, quat_angle, quat_from_yaw, quat_mul
-from iris_session.emulator.behaviours.arms import ARM, ArmKind
+from anchors.pose import PoseTuple, Vec3, distance
 from iris_session.emulator.behaviours.deformables import DeformablePerception, DeformableTask
-from iris_session.emulator.behaviours.objects import DOWN, raise_pose
+from iris_session.emulator.behaviours.objects import ARM, ArmKind
 from iris_session.protocol.names import Device
 
 #: Distance of the pinch from the corner of the cloth, along both edges, in cells of 22.5 mm.
@@ -79,7 +78,6 @@ class Folder(DeformableTask):
         self._alone = False  # the partner does not take part any more
         self._diagonal = 0.0  # yaw from my corner to the middle [rad]
         self._steps |= {
-            "wait": self._wait,
             "look": self._choose_pinch,
             "approach": self._approach,
             "descend": self._descend,
@@ -93,17 +91,12 @@ class Folder(DeformableTask):
             "aim": self._aim,
             "lower": self._lower,
             "ready": self._wait_for_release,
-            "open": self._open,
-            "leave": self._leave,
+            "open": lambda: self._open(TRIGGER_AFTER),
+            "leave": lambda: self._rise(CLEAR_ABOVE, "judge", 0.12),
             "judge": self._judge,
             "watch": self._watch,
             "shake": self._shake,
-            "back_off": self._back_off,
         }
-
-    def _wait(self) -> None:
-        self._home = self.perception.get_tip(self.robot)
-        self._enter("look")
 
     def _choose_pinch(self) -> None:
         """Wait until the cloth lies still, and choose the corners on the own side."""
@@ -129,13 +122,15 @@ class Folder(DeformableTask):
         self._outward, self._ahead = _compute_direction(other, mine), _compute_direction(mine, onto)
 
     def _approach(self) -> None:
-        if self._entering_now:
-            self.hand.trigger_goal = TRIGGER_BEFORE
-            self.hand.move_to(self._compute_tip(self._pinch, CLEAR_ABOVE))
-        if self.hand.has_arrived(0.006, 0.06) and self.hand.is_trigger_done():
-            self._enter("descend")
-        elif self._has_lasted(8.0):
-            self._retry(f"{self.robot} cannot reach the corner of the {self.cloth}")
+        fault = f"{self.robot} cannot reach the corner of the {self.cloth}"
+        self._reach(
+            lambda: self._compute_tip(self._pinch, CLEAR_ABOVE),
+            "descend",
+            (0.006, 0.06),
+            8.0,
+            fault,
+            trigger=TRIGGER_BEFORE,
+        )
 
     def _descend(self) -> None:
         """Move down to a finger's breadth above the cloth."""
@@ -253,19 +248,6 @@ class Folder(DeformableTask):
         if low or self.perception.compute_gap(self.partner) > SHUT or self._has_lasted(TOGETHER_S):
             self._enter("open")
 
-    def _open(self) -> None:
-        if self._entering_now:
-            self.hand.hold_still()
-            self.hand.trigger_goal = TRIGGER_AFTER
-        if self.hand.is_trigger_done() and self._has_lasted(0.8):
-            self._enter("leave")
-
-    def _leave(self) -> None:
-        if self._entering_now:
-            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), 0.12, correct=False)
-        if self.hand.has_moved():
-            self._enter("judge")
-
     def _judge(self) -> None:
         """Check that the corner stayed where it was laid."""
         if self.perception.corners_still_s < 0.3 and not self._is_shown_for(5.0):
@@ -311,18 +293,7 @@ class Folder(DeformableTask):
         if self.hand.has_moved() and self.hand.is_trigger_done() and self._has_lasted(1.2):
             self._enter("leave")
 
-    def _back_off(self) -> None:
-        if self._entering_now:
-            self.hand.trigger_goal = 0.0
-            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), correct=False)
-        if self.hand.has_moved() and self.hand.is_trigger_done() and self._has_lasted(1.5):
-            self._enter("look")
-
     # --- geometry as seen ---------------------------------------------------------------------------------------------
-
-    def _compute_table_height(self) -> float:
-        """Return the height of the table [m], world frame."""
-        return self.perception.get_base(self.robot)[0][2] - self.arm.above_table
 
     def _is_holding(self) -> bool:
         """Return True if the corner moves with the fingers."""
@@ -336,9 +307,7 @@ class Folder(DeformableTask):
         """Return a tip pose `height` above the table, fingers down, closing across the diagonal, with the least
         wrist turn.
         """
-        home = (self._home or self.perception.get_tip(self.robot))[1]
-        turns = [quat_mul(quat_from_yaw(self._diagonal + half), DOWN) for half in (0.0, math.pi)]
-        q = min(turns, key=lambda turn: quat_angle(turn, home))
+        q = self._turn_down(self._diagonal)
         return ((place[0], place[1], self._compute_table_height() + height), q)
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 
 from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_rotate
-from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.objects import (
+    ARM,
+    CLEAR_ABOVE,
     COMMON_OBJECTS,
+    ArmKind,
     HandoverObject,
     compute_grasps,
     compute_tilt,
@@ -21,8 +22,6 @@ from iris_session.emulator.behaviours.perception import Perception
 from iris_session.emulator.behaviours.phases import PhasedTask
 from iris_session.protocol.names import Device
 
-#: Distance above a grasp at which the approach begins, and distance of the retreat afterwards [m].
-CLEAR_ABOVE = 0.11
 #: Speed of the last centimetres before a grasp [m/s].
 CAREFUL_SPEED = 0.16
 
@@ -31,19 +30,16 @@ class HandoverTask(PhasedTask):
     """Base of both tasks: it grasps an object, and has a partner. A subclass adds its phases to `self._steps`."""
 
     def __init__(self, robot: str, object: str, partner: str, device: str, arm: ArmKind = ARM) -> None:
-        self.perception = Perception(
-            (object,), (robot, partner), tuple(name for name in COMMON_OBJECTS if name != object), arm
-        )
-        super().__init__(robot, device, self.perception, arm)
+        others = tuple(name for name in COMMON_OBJECTS if name != object)
+        super().__init__(robot, device, Perception((object,), (robot, partner), others, arm), arm)
         self.object, self.partner = object, partner
         self.object_model: HandoverObject = find_object(object)
         self._steps |= {
-            "wait": self._wait,
             "approach": self._approach,
             "descend": self._descend,
             "close": self._close,
             "back_off": self._back_off,
-            "rise": self._rise,
+            "rise": lambda: self._rise(CLEAR_ABOVE, "step_back"),
             "step_back": self._step_back,
         }
         self._clutched_again = 0
@@ -52,22 +48,11 @@ class HandoverTask(PhasedTask):
 
     # --- phases that both know ----------------------------------------------------------------------------------------
 
-    @abstractmethod
-    def _first_phase(self) -> str:
-        """Return the phase in which grasping the object begins, also after a failed attempt."""
-
-    def _wait(self) -> None:
-        self._home = self.perception.get_tip(self.robot)
-        self._enter(self._first_phase())
-
     def _approach(self) -> None:
-        if self._entering_now:
-            self.hand.trigger_goal = 0.0
-            self.hand.move_to(raise_pose(self._compute_grasp(), CLEAR_ABOVE))
-        if self.hand.has_arrived(0.008, 0.06) and self.hand.is_trigger_done():
-            self._enter("descend")
-        elif self._has_lasted(8.0):
-            self._retry(f"{self.robot} cannot reach the {self.object}")
+        fault = f"{self.robot} cannot reach the {self.object}"
+        self._reach(
+            lambda: raise_pose(self._compute_grasp(), CLEAR_ABOVE), "descend", (0.008, 0.06), 8.0, fault, trigger=0.0
+        )
 
     def _descend(self) -> None:
         if self._entering_now:
@@ -93,19 +78,11 @@ class HandoverTask(PhasedTask):
             self.hand.trigger_goal = 0.0
             self.hand.move_to(self.perception.get_tip(self.robot))
         if self.hand.is_trigger_done() and self._has_lasted(0.8):
-            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), correct=False)
             self._enter("rise")
-
-    def _rise(self) -> None:
-        if self.hand.has_moved():
-            self._enter("step_back")
 
     def _step_back(self) -> None:
         """Move back to where the hand began: there nothing leans on the arm, and both operators can see the object."""
-        if self._entering_now and self._home is not None:
-            self.hand.move_to(self._home)
-        if self.hand.has_arrived(0.02, 0.1) or self._has_lasted(4.0):
-            self._enter(self._first_phase())
+        self._reach(lambda: self._home or self.perception.get_tip(self.robot), self.first_phase, (0.02, 0.1), 4.0)
 
     def _open_gripper(self, then: str) -> None:
         """Open the gripper and continue with `then`. If it does not follow, the engagement was lost: clutch again."""
@@ -161,10 +138,6 @@ class HandoverTask(PhasedTask):
         place = ((ax + bx) / 2.0 + inward * (fx + gx), (ay + by) / 2.0 + inward * (fy + gy))
         return (*place, (az + bz) / 2.0 + self.arm.exchange_height), ((bx - ax) / apart, (by - ay) / apart, 0.0)
 
-    def _compute_table_height(self) -> float:
-        """Return the height of the table [m], world frame."""
-        return self.perception.get_base(self.robot)[0][2] - self.arm.above_table
-
 
 #: Time for which the partner must be seen to hold the object before the giver opens [s].
 SURE_S = 0.35
@@ -197,11 +170,8 @@ class Giver(HandoverTask):
             "present": self._present,
             "offer": self._offer,
             "release": self._release,
-            "retreat": self._retreat,
+            "retreat": lambda: self._rise(CLEAR_ABOVE + 0.02, "return", 0.3),
         }
-
-    def _first_phase(self) -> str:
-        return "look"
 
     def _choose_grasp(self) -> None:
         """Wait until the object lies still, and choose the end to grasp: the one that turns the wrist least."""
@@ -281,12 +251,6 @@ class Giver(HandoverTask):
     def _release(self) -> None:
         self._open_gripper("retreat")
 
-    def _retreat(self) -> None:
-        if self._entering_now:
-            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE + 0.02), 0.3, correct=False)
-        if self.hand.has_moved():
-            self._enter("return")
-
 
 #: An object closer to the place of exchange than this is offered [m].
 OFFERED_M = 0.10
@@ -300,6 +264,8 @@ class Receiver(HandoverTask):
     `place`: position (x, y [m], world); default: in front of the robot, on its freer side. `patience_s`: time to wait
     for an offer before it fails [s].
     """
+
+    first_phase = "watch"
 
     def __init__(
         self,
@@ -327,9 +293,6 @@ class Receiver(HandoverTask):
             "leave": self._leave,
         }
 
-    def _first_phase(self) -> str:
-        return "watch"
-
     def _watch(self) -> None:
         if self._entering_now and self._home is not None:
             self.hand.move_to(self._home)
@@ -347,12 +310,12 @@ class Receiver(HandoverTask):
 
     def _raise_hand(self) -> None:
         """Move straight up to the start of the approach: on a slant, the fingers could push the object away."""
-        if self._entering_now:
+
+        def goal() -> PoseTuple:
             (x, y, z), q = self.perception.get_tip(self.robot)
-            height = self._compute_grasp()[0][2] + CLEAR_ABOVE
-            self.hand.move_to(((x, y, max(z, height)), q))
-        if self.hand.has_arrived(0.03, 0.1) or self._has_lasted(4.0):
-            self._enter("approach")
+            return ((x, y, max(z, self._compute_grasp()[0][2] + CLEAR_ABOVE)), q)
+
+        self._reach(goal, "approach", (0.03, 0.1), 4.0)
 
     def _find_free_end(self) -> float:
         """Return where to grasp the object [m along its x]: for a symmetric thing the end away from the giver's

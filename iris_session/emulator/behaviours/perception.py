@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from anchors.pose import PoseTuple, Vec3, apply, distance, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
-from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.base import OperatorView
+from iris_session.emulator.behaviours.objects import ARM, ArmKind
 
 #: Smoothing time of vision [s]: averages 1 mm of noise at 60-90 Hz to about 0.4 mm.
 SMOOTHING_S = 0.07

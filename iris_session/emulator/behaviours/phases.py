@@ -3,61 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from anchors.pose import PoseTuple
-from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.base import HandInput, OperatorView
 from iris_session.emulator.behaviours.hand import ClutchedHand
+from iris_session.emulator.behaviours.objects import ARM, ArmKind, raise_pose
+from iris_session.emulator.behaviours.perception import Perception
 
 #: Time to wait for a robot or object that is not in the scene [s].
 SEARCH_S = 10.0
 
 
-class ScenePerception(Protocol):
-    """The part of perception that the state machine uses."""
-
-    missing: tuple[str, ...]
-
-    @property
-    def is_complete(self) -> bool: ...
-
-    def observe(self, view: OperatorView) -> None: ...
-
-    def get_tip(self, robot: str) -> PoseTuple: ...
-
-
 class PhasedTask:
     """`done` and not `failed`: it succeeded. A subclass fills `self._steps`: phase -> method called once per update.
 
-    `back_off`: the phase in which a new attempt begins. `max_attempts`: attempts before the task fails.
+    `first_phase`: the phase after `wait`. `max_attempts`: attempts, each of which begins with the phase `back_off`,
+    before the task fails.
     """
 
-    back_off = "back_off"
+    first_phase = "look"
     max_attempts = 8
 
-    def __init__(self, robot: str, device: str, eyes: ScenePerception, arm: ArmKind = ARM) -> None:
+    def __init__(self, robot: str, device: str, eyes: Perception, arm: ArmKind = ARM) -> None:
         self.phase = "wait"
         self.done = False
         self.failed = ""
         self.attempts = 1
         self.robot, self.arm = robot, arm
         self.hand = ClutchedHand(device, robot, arm.speed)
-        self._perception = eyes
+        self.perception = eyes
         self._entering, self._entering_now = True, False
         self._entered_s = 0.0
         self._search_since_ns: int | None = None
         self._home: PoseTuple | None = None
-        self._steps: dict[str, Callable[[], None]] = {"return": self._return}
+        self._steps: dict[str, Callable[[], None]] = {"wait": self._wait, "return": self._return}
 
     def update(self, view: OperatorView) -> tuple[HandInput, ...]:
         """Process one frame and return one hand input; see `Behaviour.update`."""
-        self._perception.observe(view)
-        if not self._perception.is_complete:
+        self.perception.observe(view)
+        if not self.perception.is_complete:
             self._search(view)
         if self.done:
             return (self.hand.release_robot(view),)
-        can_act = self.hand.update(view, self._perception.get_tip(self.robot) if self._perception.is_complete else None)
+        can_act = self.hand.update(view, self.perception.get_tip(self.robot) if self.perception.is_complete else None)
         if can_act:
             self._entering_now, self._entering = self._entering, False
             self._steps[self.phase]()
@@ -68,7 +56,55 @@ class PhasedTask:
         if self._search_since_ns is None:
             self._search_since_ns = view.session_time_ns
         if view.session_time_ns - self._search_since_ns > SEARCH_S * 1e9:
-            self._fail(f"missing in the scene: {', '.join(self._perception.missing)}")
+            self._fail(f"missing in the scene: {', '.join(self.perception.missing)}")
+
+    def _wait(self) -> None:
+        self._home = self.perception.get_tip(self.robot)
+        self._enter(self.first_phase)
+
+    def _reach(
+        self,
+        goal: Callable[[], PoseTuple],
+        then: str,
+        within: tuple[float, float],
+        limit_s: float,
+        fault: str = "",
+        *,
+        speed: float | None = None,
+        trigger: float | None = None,
+    ) -> None:
+        """Move the tip to a goal, and continue.
+
+        Args:
+            goal: Computes the tip pose at the beginning of the phase.
+            then: Phase after it has arrived.
+            within: How near the tip must be ([m], [rad]).
+            limit_s: Time after which another attempt begins with `fault`; without one, the task continues with `then`.
+            fault: Reason of another attempt.
+            speed: Peak speed [m/s], by default that of free movements.
+            trigger: Where to move the trigger meanwhile, which then must be there, too.
+        """
+        if self._entering_now:
+            self.hand.trigger_goal = self.hand.trigger_goal if trigger is None else trigger
+            self.hand.move_to(goal(), speed)
+        if self.hand.has_arrived(*within) and (trigger is None or self.hand.is_trigger_done()):
+            self._enter(then)
+        elif self._has_lasted(limit_s) and fault:
+            self._retry(fault)
+        elif self._has_lasted(limit_s):
+            self._enter(then)
+
+    def _rise(self, height: float, then: str, speed: float | None = None, trigger: float | None = None) -> None:
+        """Move the tip straight up, without a look at where it gets, and continue."""
+        if self._entering_now:
+            self.hand.trigger_goal = self.hand.trigger_goal if trigger is None else trigger
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), height), speed, correct=False)
+        if self.hand.has_moved() and (trigger is None or (self.hand.is_trigger_done() and self._has_lasted(1.5))):
+            self._enter(then)
+
+    def _compute_table_height(self) -> float:
+        """Return the height of the table [m], world frame."""
+        return self.perception.get_base(self.robot)[0][2] - self.arm.above_table
 
     def _return(self) -> None:
         """Move the hand back to its initial pose."""
@@ -94,7 +130,7 @@ class PhasedTask:
             self._fail(f"{reason} (after {self.attempts} attempts)")
             return
         self.attempts += 1
-        self._enter(self.back_off)
+        self._enter("back_off")
 
     def _fail(self, reason: str) -> None:
         self.phase, self.failed, self.done = "failed", reason, True

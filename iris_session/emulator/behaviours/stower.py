@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 
-from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_angle, quat_from_yaw, quat_mul
-from iris_session.emulator.behaviours.arms import ARM, ArmKind
+from anchors.pose import PoseTuple, Vec3, apply, distance, inverse
 from iris_session.emulator.behaviours.deformables import CORNERS, DeformablePerception, DeformableTask, compute_mean
-from iris_session.emulator.behaviours.handover import CAREFUL_SPEED, CLEAR_ABOVE
-from iris_session.emulator.behaviours.objects import DOWN, raise_pose
+from iris_session.emulator.behaviours.handover import CAREFUL_SPEED
+from iris_session.emulator.behaviours.objects import ARM, CLEAR_ABOVE, DOWN, ArmKind, raise_pose
 from iris_session.protocol.names import Device
 
 #: The body of the box; its origin is in the middle of the inner floor.
@@ -41,7 +40,6 @@ class Stower(DeformableTask):
         self._place = place
         self._grip: PoseTuple = ((0.0, 0.0, 0.0), DOWN)
         self._steps |= {
-            "wait": self._wait,
             "look": self._choose_grip,
             "approach": self._approach,
             "descend": self._descend,
@@ -49,15 +47,10 @@ class Stower(DeformableTask):
             "lift": self._lift,
             "carry": self._carry,
             "lower": self._lower,
-            "open": self._open,
-            "leave": self._leave,
+            "open": lambda: self._open(0.0),
+            "leave": lambda: self._rise(CLEAR_ABOVE, "judge", 0.25),
             "judge": self._judge,
-            "back_off": self._back_off,
         }
-
-    def _wait(self) -> None:
-        self._home = self.perception.get_tip(self.robot)
-        self._enter("look")
 
     def _choose_grip(self) -> None:
         """Wait until the body lies still, and choose the grip."""
@@ -66,21 +59,12 @@ class Stower(DeformableTask):
             self._enter("approach")
 
     def _approach(self) -> None:
-        if self._entering_now:
-            self.hand.trigger_goal = 0.0
-            self.hand.move_to(raise_pose(self._grip, CLEAR_ABOVE))
-        if self.hand.has_arrived(0.008, 0.06) and self.hand.is_trigger_done():
-            self._enter("descend")
-        elif self._has_lasted(8.0):
-            self._retry(f"{self.robot} cannot reach the {self.soft}")
+        fault = f"{self.robot} cannot reach the {self.soft}"
+        self._reach(lambda: raise_pose(self._grip, CLEAR_ABOVE), "descend", (0.008, 0.06), 8.0, fault, trigger=0.0)
 
     def _descend(self) -> None:
-        if self._entering_now:
-            self.hand.move_to(self._grip, CAREFUL_SPEED)
-        if self.hand.has_arrived(0.004, 0.04):
-            self._enter("close")
-        elif self._has_lasted(6.0):
-            self._retry(f"{self.robot} cannot reach down to the {self.soft}")
+        fault = f"{self.robot} cannot reach down to the {self.soft}"
+        self._reach(lambda: self._grip, "close", (0.004, 0.04), 6.0, fault, speed=CAREFUL_SPEED)
 
     def _close(self) -> None:
         if self._entering_now:
@@ -118,19 +102,6 @@ class Stower(DeformableTask):
         elif self._has_lasted(8.0):
             self._retry(f"{self.robot} cannot move the {self.soft}")
 
-    def _open(self) -> None:
-        if self._entering_now:
-            self.hand.hold_still()
-            self.hand.trigger_goal = 0.0
-        if self.hand.is_trigger_done() and self._has_lasted(0.8):
-            self._enter("leave")
-
-    def _leave(self) -> None:
-        if self._entering_now:
-            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), 0.25, correct=False)
-        if self.hand.has_moved():
-            self._enter("judge")
-
     def _judge(self) -> None:
         """Check that it lies in the box."""
         if self.perception.corners_still_s < 0.3 and not self._is_shown_for(5.0):
@@ -140,13 +111,6 @@ class Stower(DeformableTask):
         else:
             self._retry(f"the {self.soft} does not lie in the box")
 
-    def _back_off(self) -> None:
-        if self._entering_now:
-            self.hand.trigger_goal = 0.0
-            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE), correct=False)
-        if self.hand.has_moved() and self.hand.is_trigger_done() and self._has_lasted(1.5):
-            self._enter("look")
-
     # --- geometry as seen ---------------------------------------------------------------------------------------------
 
     def _compute_grip_turn(self, corners: dict[int, Vec3]) -> tuple[float, float, float, float]:
@@ -155,10 +119,7 @@ class Stower(DeformableTask):
         """
         order = CORNERS[self.soft]
         (ax, ay, _), (bx, by, _) = (compute_mean(corners[i] for i in end) for end in (order[:4], order[4:]))
-        yaw = math.atan2(by - ay, bx - ax)
-        home = (self._home or self.perception.get_tip(self.robot))[1]
-        turns = [quat_mul(quat_from_yaw(yaw + half), DOWN) for half in (0.0, math.pi)]
-        return min(turns, key=lambda turn: quat_angle(turn, home))
+        return self._turn_down(math.atan2(by - ay, bx - ax))
 
     def _compute_goal(self) -> tuple[float, float]:
         """Return where to lay it: the given place, else the half of the box on this side."""
