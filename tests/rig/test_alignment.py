@@ -23,7 +23,7 @@ from iris_session.protocol.server_messages import AlignmentAlarmed, HeadsetsComp
 from tests.rig.session import Rig, is_driven
 
 SECOND = 1_000_000_000
-TICK = 0.01  # [s]
+TICK = 0.02  # [s]
 STEADY: Final = HeadsetModel(drift_m_per_min=0.0, drift_rad_per_min=0.0)
 #: A pair may differ by this multiple of its p95 by chance (`anchors.cross_check.Disagreement.as_expected`).
 CHANCE_FACTOR: Final = 2.0
@@ -60,7 +60,8 @@ class Tips:
 
 
 def emulate_driver(rig: Rig, name: str, robot: str, seed: int, **spec: object) -> EmulatedOperator:
-    return rig.emulate(name=name, behaviour="wander", robot=robot, seed=seed, **spec)
+    quick = {"viewpoints": 4, "observations_per_viewpoint": 4}
+    return rig.emulate(name=name, behaviour="wander", robot=robot, seed=seed, **quick, **spec)
 
 
 def run_until_driven(rig: Rig, watcher: Client, *robots: str) -> None:

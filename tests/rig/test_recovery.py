@@ -128,7 +128,9 @@ def test_headset_that_sleeps_resumes_its_lease() -> None:
     """An aligned headset stands still for longer than the heartbeat timeout, and drives again by itself."""
     with Rig(timestep=TICK) as rig:
         watcher = rig.join("watcher", "observer")
-        ann = rig.emulate(name="ann", behaviour="wander", robot="left").client
+        ann = rig.emulate(
+            name="ann", behaviour="wander", robot="left", viewpoints=3, observations_per_viewpoint=4
+        ).client
         rig.run_until(lambda: is_driven(watcher, "left"), "ann moves the left robot")
         me, version = ann.participant_id, watcher.mirror.leases["left"].lease_version
         rig.hang(ann, 4.0)

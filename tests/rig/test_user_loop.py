@@ -26,7 +26,7 @@ def reset(rig: Rig) -> None:
 
 
 def test_a_participant_drives_and_a_director_cannot_pause_the_program() -> None:
-    with Rig(user_loop=True, timestep=0.01) as rig:
+    with Rig(user_loop=True, timestep=0.02) as rig:
         hand = rig.drive("ann", "left")
         before = hand.tip
         hand.velocity = (0.0, 0.1, 0.0)
@@ -40,7 +40,7 @@ def test_a_participant_drives_and_a_director_cannot_pause_the_program() -> None:
 
 
 def test_policy_drives_until_a_participant_engages_and_after_the_release() -> None:
-    with Rig(user_loop=True, timestep=0.01) as rig:
+    with Rig(user_loop=True, timestep=0.02) as rig:
         home = rig.session.model.key_ctrl[0].copy()
 
         def policy(data: mujoco.MjData) -> None:
@@ -72,7 +72,7 @@ def test_policy_drives_until_a_participant_engages_and_after_the_release() -> No
 
 def test_a_loop_that_blocks_keeps_leases_and_the_estop() -> None:
     """Afterwards the robot holds until the clutch was opened."""
-    with Rig(user_loop=True, timestep=0.01) as rig:
+    with Rig(user_loop=True, timestep=0.02) as rig:
         hand = rig.drive("ann", "left", (0.0, 0.05, 0.0))
         ann, director = hand.client, rig.join("director", "director")
         rest(rig, hand)
@@ -103,7 +103,7 @@ def test_a_loop_that_blocks_keeps_leases_and_the_estop() -> None:
 
 def test_reset_by_the_program_begins_a_scene_epoch() -> None:
     """The robot holds where the reset put it; the clutch must be opened and closed."""
-    with Rig(user_loop=True, timestep=0.01) as rig:
+    with Rig(user_loop=True, timestep=0.02) as rig:
         watcher = rig.join("watcher", "observer")
         rig.run(0.5)
         start = watcher.scene.tip_pose("left")
@@ -123,7 +123,7 @@ def test_reset_by_the_program_begins_a_scene_epoch() -> None:
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_diverged_physics_does_not_end_the_session() -> None:
     """Clients are told; MuJoCo's own reset in `mj_step` begins a scene epoch."""
-    with Rig(user_loop=True, timestep=0.01) as rig:
+    with Rig(user_loop=True, timestep=0.02) as rig:
         watcher = rig.join("watcher", "observer")
         assert rig.session.data is not None
         rig.session.data.qvel[:] = np.nan
