@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from msgspec import inspect
 
-from iris_session.client.address import Address
+from iris_session.client.discovery import Address
 from iris_session.client.errors import ClientError
 from iris_session.front.media.scheduler import MediaScheduler, MediaSubscriber
 from iris_session.journal import messages

@@ -185,8 +185,7 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
 
     A client would wait for the session to start. A session given by name is not checked: it has no address yet.
     """
-    from iris_session.client.address import Address
-    from iris_session.client.discovery import resolve_host
+    from iris_session.client.discovery import Address, resolve_host
     from iris_session.client.endpoint_resolver import LOCAL_ADDRESS
 
     if arguments.session:

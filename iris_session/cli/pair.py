@@ -103,7 +103,7 @@ def parse_roles(names: list[str] | None) -> tuple[str, ...]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Create a code, print it, and wait. Exit status 1 if the code was not used."""
-    from iris_session.client.address import pairing_uri
+    from iris_session.client.discovery import pairing_uri
     from iris_session.link.discovery import host_port
     from iris_session.security import KeyHome, load_secret
     from iris_session.web.config import format_page_address
@@ -167,7 +167,7 @@ def _find_addresses(
 
     The port is 0 for a session without a page.
     """
-    from iris_session.client.address import Address
+    from iris_session.client.discovery import Address
 
     here = [note for note in home.sessions.read() if note.server == key.fingerprint]
     found = [note for note in here if arguments.session in ("", note.name)]

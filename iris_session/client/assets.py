@@ -10,7 +10,8 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from functools import partial
+from typing import Any, Final
 
 from iris_session.assets.errors import AssetStoreError
 from iris_session.assets.store import AssetPart, AssetStore, default_root
@@ -109,7 +110,10 @@ class AssetFetch:
         Raises:
             AssetError: It has not come yet, or will not.
         """
-        self._check_here(address)
+        if address in self.failed:
+            raise self.failed[address]
+        if address in self.pending:
+            raise AssetError(address, "gone", f"asset {address} has not come yet")
         try:
             return self._cache.view(address)
         except AssetStoreError as error:
@@ -123,12 +127,6 @@ class AssetFetch:
         """
         for error in self.failed.values():
             raise error
-
-    def _check_here(self, address: str) -> None:
-        if address in self.failed:
-            raise self.failed[address]
-        if address in self.pending:
-            raise AssetError(address, "gone", f"asset {address} has not come yet")
 
     # --- for the client ----------------------------------------------------------------------------------------------
 
@@ -224,8 +222,9 @@ class ClientAssets:
                     raise AssetError(
                         "", "cache", "assets.cache was exchanged while assets were on their way into another"
                     )
-                self._close_workers()
-                self._workers = AssetWorkers(self.cache, self._sockets.wake)
+                if self._workers is not None:
+                    self._workers.close()
+                self._workers = AssetWorkers(self, self._sockets.wake)
                 self._sockets.enable_wake_registration()
             fetch = AssetFetch(self.cache, addresses, sizes, on_progress, decode)
             self._fetches.append(fetch)
@@ -276,8 +275,8 @@ class ClientAssets:
             self._generation = self._connection.generation
             self._close_link()
         progressed = False
-        for result in workers.poll_results():
-            self._process_result(result)
+        for apply_result in workers.poll_results():
+            apply_result()
             progressed = True
         for address in loader.next_lookups():
             workers.look_up(address, self._pending_decodes(address))
@@ -317,7 +316,7 @@ class ClientAssets:
         if not welcome.endpoints.assets:
             error = AssetError("", "no_channel", "this session has no channel for assets")
             for address in {address for fetch in self._fetches for address in fetch.pending}:
-                self._fail(address, error)
+                self.on_failed(address, error)
             return True
         now_ns = time.monotonic_ns()
         if self._loader.is_paused(now_ns) and not self._sockets.has_assets:
@@ -351,7 +350,7 @@ class ClientAssets:
             for fetch in self._fetches:
                 fetch.refusal = loader.refusal
             if isinstance(outcome, FailedAsset):
-                self._fail(outcome.address, AssetError(*outcome))
+                self.on_failed(outcome.address, AssetError(*outcome))
             elif outcome:
                 workers.restart(outcome)
             return
@@ -359,7 +358,7 @@ class ClientAssets:
         chunk = decode_asset_chunk(head, len(data))
         accepted = loader.process_chunk(chunk, len(data), now_ns)
         if isinstance(accepted, FailedAsset):
-            self._fail(accepted.address, AssetError(*accepted))
+            self.on_failed(accepted.address, AssetError(*accepted))
             return
         if not accepted:
             self.malformed += accepted is False
@@ -372,26 +371,33 @@ class ClientAssets:
         if loader.is_complete(chunk.address):
             workers.finish(chunk.address, self._pending_decodes(chunk.address))
 
-    def _process_result(self, result: Result) -> None:
-        loader = self._loader
-        if isinstance(result, BytesStored):
-            loader.on_stored(result.size)
-        elif isinstance(result, AssetFound):
-            loader.remove(result.address)
-            self._note_progress(result.address)
-            for fetch in self._fetches:
-                fetch.on_found(result.address, result.size, result.decoded, fetched=result.fetched)
-            if any(result.address in fetch.pending for fetch in self._fetches):
-                loader.add(result.address, result.size)  # a new fetch decodes it by another function
-        elif isinstance(result, AssetMissing):
-            loader.on_missing(result.address, result.offset)
-        elif isinstance(result, AssetFailed):
-            self._fail(result.address, result.error)
-        elif not loader.restart_asset(result.address):
-            text = f"the session sent other bytes than those of asset {result.address}, twice"
-            self._fail(result.address, AssetError(result.address, "hash", text))
+    # --- results of the workers ---------------------------------------------------------------------------------------
 
-    def _fail(self, address: str, error: AssetError) -> None:
+    def on_stored(self, size: int) -> None:
+        """Note that received bytes are written, or dropped."""
+        self._loader.on_stored(size)
+
+    def on_missing(self, address: str, offset: int) -> None:
+        """Note that an asset is not complete in the cache; its first `offset` bytes are there."""
+        self._loader.on_missing(address, offset)
+
+    def on_found(self, address: str, size: int, decoded: Sequence[tuple[Decode, Any]], *, fetched: bool) -> None:
+        """Note that an asset is in the cache, with the results of decode functions. `fetched`: stored just now."""
+        self._loader.remove(address)
+        self._note_progress(address)
+        for fetch in self._fetches:
+            fetch.on_found(address, size, decoded, fetched=fetched)
+        if any(address in fetch.pending for fetch in self._fetches):
+            self._loader.add(address, size)  # a new fetch decodes it by another function
+
+    def on_mismatch(self, address: str) -> None:
+        """Note that the received bytes do not have the hash of the address; they were removed."""
+        if not self._loader.restart_asset(address):
+            text = f"the session sent other bytes than those of asset {address}, twice"
+            self.on_failed(address, AssetError(address, "hash", text))
+
+    def on_failed(self, address: str, error: AssetError) -> None:
+        """Note that an asset will not come."""
         self._loader.remove(address)
         if self._workers is not None:
             self._workers.release(address)
@@ -405,66 +411,18 @@ class ClientAssets:
 
     def _pending_decodes(self, address: str) -> list[Decode]:
         """Return the decode functions of the fetches that wait for an asset, each once."""
-        found: list[Decode] = []
-        for fetch in self._fetches:
-            if address in fetch.pending and fetch.decode is not None and fetch.decode not in found:
-                found.append(fetch.decode)
-        return found
+        return list(dict.fromkeys(f.decode for f in self._fetches if address in f.pending and f.decode is not None))
 
     def _close_link(self) -> None:
         self._sockets.close_assets()
         self._loader.on_link_closed()
 
-    def _close_workers(self) -> None:
-        if self._workers is not None:
-            self._workers.close()
-            self._workers = None
-
 
 # --- the threads ------------------------------------------------------------------------------------------------------
 
 
-class AssetFound(NamedTuple):
-    """An asset is in the cache.
-
-    `decoded`: decode functions, each with its result or the `AssetError` that it raised. `fetched`: it was stored just
-    now.
-    """
-
-    address: str
-    size: int
-    decoded: tuple[tuple[Decode, Any], ...]
-    fetched: bool
-
-
-class AssetMissing(NamedTuple):
-    """An asset is not complete in the cache; its first `offset` bytes are there."""
-
-    address: str
-    offset: int
-
-
-class BytesStored(NamedTuple):
-    """This many bytes were written."""
-
-    size: int
-
-
-class HashMismatch(NamedTuple):
-    """The received bytes do not have the hash of the address; they were removed. `size`: number of bytes."""
-
-    address: str
-    size: int
-
-
-class AssetFailed(NamedTuple):
-    """The asset cannot be stored or read."""
-
-    error: AssetError
-    address: str
-
-
-Result = AssetFound | AssetMissing | BytesStored | HashMismatch | AssetFailed
+#: What a job leaves to be done in the thread that polls.
+Result = Callable[[], None]
 _Job = tuple[str, Callable[[], Result], int]
 
 
@@ -476,12 +434,17 @@ class AssetWorkers:
     of assets at once.
 
     Args:
-        cache: Where assets are kept.
+        owner: Gets the results, when it calls what `poll_results` yields.
         wake: Called from the threads when there is a result.
+        threads: Number of threads.
+
+    Attributes:
+        cache: Where assets are kept.
     """
 
-    def __init__(self, cache: AssetStore, wake: Callable[[], None], threads: int = THREADS) -> None:
-        self.cache = cache
+    def __init__(self, owner: ClientAssets, wake: Callable[[], None], threads: int = THREADS) -> None:
+        self.cache = owner.cache
+        self._owner = owner
         self._wake = wake
         self._parts: dict[str, AssetPart] = {}
         self._closing = False
@@ -500,47 +463,46 @@ class AssetWorkers:
             yield self._results.get_nowait()
 
     def look_up(self, address: str, decodes: Iterable[Decode]) -> None:
-        """Search an asset in the cache; the result is `AssetFound` or `AssetMissing`."""
+        """Search an asset in the cache; the result is `on_found` or `on_missing`."""
 
         def work() -> Result:
             view = self.cache.find(address)
             if view is not None:
-                return _decode_found(address, view, decodes, fetched=False)
+                return partial(self._owner.on_found, address, *_decode(address, view, decodes), fetched=False)
             part = self._parts[address] = self.cache.open_part(address)
-            return AssetMissing(address, part.offset)
+            return partial(self._owner.on_missing, address, part.offset)
 
         self._submit(address, work)
 
     def write(self, address: str, data: memoryview) -> None:
-        """Write the next bytes of a missing asset; the result is `BytesStored`."""
+        """Write the next bytes of a missing asset; the result is `on_stored`."""
 
         def work() -> Result:
             part = self._parts.get(address)
             if part is not None:
                 part.append(data)
-            return BytesStored(len(data))
+            return partial(self._owner.on_stored, len(data))
 
         self._submit(address, work, len(data))
 
     def finish(self, address: str, decodes: Iterable[Decode]) -> None:
-        """Check an asset whose bytes are all written; the result is `AssetFound` or `HashMismatch`."""
+        """Check an asset whose bytes are all written; the result is `on_found` or `on_mismatch`."""
 
         def work() -> Result:
-            part = self._parts[address]
-            size = part.offset
-            if not part.finish():
-                return HashMismatch(address, size)
+            if not self._parts[address].finish():
+                return partial(self._owner.on_mismatch, address)
             del self._parts[address]
-            return _decode_found(address, self.cache.view(address), decodes, fetched=True)
+            view = self.cache.view(address)
+            return partial(self._owner.on_found, address, *_decode(address, view, decodes), fetched=True)
 
         self._submit(address, work)
 
     def restart(self, address: str) -> None:
-        """Remove the stored bytes of an asset; the result is `AssetMissing`."""
+        """Remove the stored bytes of an asset; the result is `on_missing`."""
 
         def work() -> Result:
             self._parts[address].restart()
-            return AssetMissing(address, 0)
+            return partial(self._owner.on_missing, address, 0)
 
         self._submit(address, work)
 
@@ -549,7 +511,7 @@ class AssetWorkers:
 
         def work() -> Result:
             self._close(address)
-            return BytesStored(0)
+            return partial(self._owner.on_stored, 0)
 
         self._submit(address, work)
 
@@ -570,12 +532,10 @@ class AssetWorkers:
             address, work, size = job
             if self._closing and not size:
                 continue  # while closing, only received bytes are still written
-            result = self._run_job(address, work, size)
-            self._results.put(result)
+            self._results.put(self._run_job(address, work, size))
             untold += size
             now_ns = time.monotonic_ns()
-            news = untold >= WAKE_BYTES or (not isinstance(result, BytesStored) and now_ns - woken_ns >= WAKE_NS)
-            if news or jobs.empty():
+            if untold >= WAKE_BYTES or (not size and now_ns - woken_ns >= WAKE_NS) or jobs.empty():
                 untold, woken_ns = 0, now_ns
                 self._wake()
 
@@ -592,8 +552,8 @@ class AssetWorkers:
             failure.__cause__ = error
         self._close(address)
         if size:
-            self._results.put(BytesStored(size))
-        return AssetFailed(failure, address)
+            self._results.put(partial(self._owner.on_stored, size))
+        return partial(self._owner.on_failed, address, failure)
 
     def _close(self, address: str) -> None:
         part = self._parts.pop(address, None)
@@ -604,7 +564,8 @@ class AssetWorkers:
         self._jobs[int(address[:8], 16) % len(self._jobs)].put((address, work, size))
 
 
-def _decode_found(address: str, view: memoryview, decodes: Iterable[Decode], *, fetched: bool) -> Result:
+def _decode(address: str, view: memoryview, decodes: Iterable[Decode]) -> tuple[int, list[tuple[Decode, Any]]]:
+    """Return the size of an asset, and every function with its result, or with the `AssetError` that it raised."""
     decoded: list[tuple[Decode, Any]] = []
     for decode in decodes:
         try:
@@ -614,4 +575,4 @@ def _decode_found(address: str, view: memoryview, decodes: Iterable[Decode], *, 
             failure = AssetError(address, "decode", text)
             failure.__cause__ = error
             decoded.append((decode, failure))
-    return AssetFound(address, len(view), tuple(decoded), fetched)
+    return len(view), decoded

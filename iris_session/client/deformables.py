@@ -10,7 +10,7 @@ while True:
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from iris_session.client.assets import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.errors import ClientError
-from iris_session.client.feeds import MediaFeed
+from iris_session.client.media import MediaFeed
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.names import ArrayKind, ArrayName, MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene
@@ -229,24 +229,29 @@ class Deformables:
             fetch.check()
             if self._parts is None:
                 self._parts = decode_scene(fetch.view(self._asked)).deformables
-                here = {_identity(mesh.key, mesh) for mesh in self._meshes}
-                named = zip(deformable_keys(self._parts), self._parts, strict=True)
-                if new := [part.address for key, part in named if _identity(key, part) not in here]:
+                if new := [part.address for key, part in self._name_parts() if self._find_mesh(key, part) is None]:
                     self._fetch = self._client.assets.fetch(new)
                     return
-            self._show_meshes(self._build_meshes(self._parts, fetch), self._asked)
+            self._show_meshes(self._build_meshes(fetch), self._asked)
         except (ClientError, AssetDecodeError, StreamError, KeyError, ValueError) as error:
             self._failed(error)
         self._parts = None
 
-    def _build_meshes(self, parts: Sequence[Deformable], fetch: AssetFetch) -> list[_Mesh]:
+    def _name_parts(self) -> Iterable[tuple[str, Deformable]]:
+        """Return the deformables of the scene that is asked for, by their keys."""
+        return zip(deformable_keys(self._parts or ()), self._parts or (), strict=True)
+
+    def _find_mesh(self, key: str, part: Deformable) -> _Mesh | None:
+        """Return the mesh that is here of a deformable that may be of another specification."""
+        wanted = (key, part.stream, part.address)
+        return next((mesh for mesh in self._meshes if (mesh.key, mesh.stream, mesh.address) == wanted), None)
+
+    def _build_meshes(self, fetch: AssetFetch) -> list[_Mesh]:
         """Return the meshes of a scene; those that are here already are kept."""
-        here = {_identity(mesh.key, mesh): mesh for mesh in self._meshes}
         found = []
-        for key, part in zip(deformable_keys(parts), parts, strict=True):
-            mesh = here.get(_identity(key, part))
-            found.append(_Mesh(key, part, fetch.view(part.address)) if mesh is None else mesh)
-        for mesh, part in zip(found, parts, strict=True):  # nothing of it has failed
+        for key, part in self._name_parts():
+            found.append(self._find_mesh(key, part) or _Mesh(key, part, fetch.view(part.address)))
+        for mesh, (_, part) in zip(found, self._name_parts(), strict=True):  # nothing of it has failed
             mesh.shape = mesh.shape.with_look(part)
         return found
 
@@ -289,11 +294,6 @@ class Deformables:
         self.capture_ns[mesh.key] = frame.header.capture_ns
         mesh.fault = ""
         return True
-
-
-def _identity(key: str, part: Deformable | _Mesh) -> tuple[str, str, str]:
-    """Return the key that is equal for the same deformable in two specifications."""
-    return key, part.stream, part.address
 
 
 def deformable_keys(parts: Sequence[Deformable]) -> list[str]:

@@ -13,10 +13,9 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Final
 
-from iris_session.client.address import DEFAULT_CONTROL_PORT, Address
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.status import ConnectionPhase
-from iris_session.client.discovery import LISTEN_S, open_listener, request_introduction
+from iris_session.client.discovery import DEFAULT_CONTROL_PORT, LISTEN_S, Address, open_listener, request_introduction
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
 from iris_session.client.server_trust import ServerTrust, default_key_name, pair_key
 from iris_session.client.sockets import ClientSockets, CurveKeys

@@ -69,6 +69,7 @@ class ClientLoop:
         self._lock = lock
         self._arrivals = arrivals
         self._generation = 0
+        self._just_progressed = False
         self._thread: threading.Thread | None = None
         self._stopping = False
 
@@ -77,8 +78,12 @@ class ClientLoop:
     def poll(self, timeout_s: float) -> bool:
         """Run rounds until anything came or the phase changed, at most for `timeout_s`; see `Client.poll`."""
         deadline = time.monotonic_ns() + int(timeout_s * 1e9)
+        # Assets arrive all the time: one round per call is enough, and anything that came since ends the wait.
+        skip_round = self._just_progressed and timeout_s > 0.0
         while True:
-            progressed = self._run_round()
+            progressed = not skip_round and self._run_round()
+            self._just_progressed = progressed and self._connection.is_joined and self._client.assets.is_loading
+            skip_round = False
             now = time.monotonic_ns()
             if progressed or now >= deadline:
                 break

@@ -14,7 +14,7 @@ from typing import Final
 
 import zmq
 
-from iris_session.client.address import Address
+from iris_session.client.discovery import Address
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, TrustError
 from iris_session.client.sockets import CurveKeys, open_socket
 from iris_session.protocol import pairing

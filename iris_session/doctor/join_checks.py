@@ -8,8 +8,8 @@ from itertools import pairwise
 from typing import Final
 
 from iris_session.client import Client, ClientError, RefusedError, VersionError
-from iris_session.client.address import Address
 from iris_session.client.core.state_stream import SceneState
+from iris_session.client.discovery import Address
 from iris_session.client.errors import NotConnectedError, RequestTimeoutError, SessionNameError, TrustError
 from iris_session.doctor import network_checks
 from iris_session.doctor.findings import Finding, failed, ok, warning

@@ -10,8 +10,7 @@ from typing import Final
 
 import psutil
 
-from iris_session.client.address import Address
-from iris_session.client.discovery import request_introduction
+from iris_session.client.discovery import Address, request_introduction
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.link.discovery import BeaconListener, DiscoveryError, FoundSession
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction

@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 import psutil
 
-from iris_session.client.address import Address
+from iris_session.client.discovery import Address
 from iris_session.client.errors import ClientError
 from iris_session.doctor import join_checks, network_checks, session_checks
 from iris_session.doctor.findings import OK, Findings, failed, ok

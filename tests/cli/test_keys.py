@@ -16,7 +16,7 @@ from zmq.auth import create_certificates
 
 from iris_session.cli.common import CommandError, check_session_reachable, describe_own_sessions
 from iris_session.cli.main import main
-from iris_session.client.address import Address
+from iris_session.client.discovery import Address
 from iris_session.doctor.runner import LOCAL, find_default_address
 from iris_session.protocol import pairing
 from iris_session.security import KeyHome, KeyPair, RegisteredSession

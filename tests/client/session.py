@@ -122,8 +122,8 @@ class MemoryAssets:
 class InlineWorkers(assets.AssetWorkers):
     """Does the work of the threads at once, in the thread that polls."""
 
-    def __init__(self, cache: AssetStore, wake: Callable[[], None]) -> None:
-        super().__init__(cache, wake, threads=0)
+    def __init__(self, owner: assets.ClientAssets, wake: Callable[[], None]) -> None:
+        super().__init__(owner, wake, threads=0)
 
     def _submit(self, address: str, work: Callable[[], assets.Result], size: int = 0) -> None:
         self._results.put(self._run_job(address, work, size))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from iris_session.client import ClientError
-from iris_session.client.address import Address, pairing_uri
+from iris_session.client.discovery import Address, pairing_uri
 from iris_session.link.discovery import host_port, is_host
 
 KEY = "rY5P4[G=Mu()uIR1{6xjIHL7utHv9:LKIMvLkp?v"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import mmap
 import random
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +15,6 @@ from iris_session.client import AssetError, AssetFetch, AssetStore, Client, Inva
 from iris_session.client.core import asset_loader
 from iris_session.protocol.assets import AssetRequest
 from iris_session.protocol.names import AssetRefusal
-from tests.assets.test_store import store_part
 from tests.client.session import ClientSession, MemoryAssets, make_chunk
 from tests.client.threads import ThreadedClient
 
@@ -121,17 +119,6 @@ def test_lost_connection_costs_only_data_under_way(shared: Shared) -> None:
     most = fetch.bytes_total + n_cuts * asset_loader.WINDOW_BYTES
     assert channel.bytes_sent <= most, "nothing came more often than it was lost"
     assert client.connection.counters.reconnects == 0
-
-
-def test_connection_without_answers_is_replaced(shared: Shared) -> None:
-    client = shared.join()
-    channel = shared.channel_of(client)
-    address = shared.addresses[0]
-    channel.answers = lambda request: [] if channel.opened == 1 else shared.session.answer_asset(request)
-    fetch = client.assets.fetch([address])
-    assert client.wait_for(lambda _: fetch.done, 2 * asset_loader.PATIENCE_NS * 1e-9)
-    assert read_all(fetch) == {address: shared.data[address]}
-    assert channel.opened == 2
 
 
 def test_failed_assets_have_a_reason_and_the_rest_arrives(shared: Shared) -> None:
@@ -309,20 +296,3 @@ def test_decode_function_may_use_the_client_until_it_is_closed(threaded: Threade
 
 
 # --- results ----------------------------------------------------------------------------------------------------------
-
-
-def test_assets_are_mapped_and_errors_raised_when_they_are_read(tmp_path: Path) -> None:
-    cache = AssetStore(tmp_path)
-    here = store_part(cache, bytes(MIB))
-    lost, awaited = "1" * 64, "2" * 64
-    fetch = AssetFetch(cache, [here, lost, awaited], {}, None, None)
-    fetch.on_found(here, MIB, (), fetched=True)
-    fetch.fail(lost, AssetError(lost, AssetRefusal.UNKNOWN, "nobody has it"))
-    assert fetch.read(here) == fetch.view(here) == bytes(MIB)
-    assert isinstance(fetch.view(here).obj, mmap.mmap), "a large one is not in memory twice"
-    for access in (fetch.read, fetch.view):
-        for address, reason in ((lost, AssetRefusal.UNKNOWN), (awaited, "gone")):
-            with pytest.raises(AssetError) as raised:
-                access(address)
-            assert raised.value.reason == reason
-    assert not fetch.done

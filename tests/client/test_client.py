@@ -24,9 +24,7 @@ from iris_session.client import (
 )
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.protocol.client_messages import Acquire, EStop, Sample
-from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.names import DenialReason, Device
-from iris_session.protocol.server_messages import PresenceItem
 from tests.client.session import BODIES, ClientSession
 from tests.client.threads import ThreadedClient
 
@@ -72,40 +70,6 @@ def test_state_is_fresh_decoded_and_aged_at_delivery(join: Join) -> None:
     assert ann.scene.body_pose("nothing") is None
 
 
-def test_state_that_has_become_old_while_it_was_decoded_is_not_passed_on(
-    join: Join, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    states: list[SceneState] = []
-    ann = join(on_state=states.append)
-    monkeypatch.setattr(ann.connection.stream, "check_fresh", lambda _: False)
-    states.clear()
-    ann.sleep(0.1)
-    assert states == []
-
-
-def test_samples_have_epochs_versions_and_tokens(join: Join) -> None:
-    ann = join(devices=(Device.HEAD, Device.CONTROLLER_RIGHT))
-    first = ann.make_sample(Device.CONTROLLER_RIGHT, HERE, robots=["left"], clutch=True)
-    assert first.targets == ()  # not our robot: presence only
-    (lease,) = ann.acquire(["left"])
-    second = ann.make_sample(Device.CONTROLLER_RIGHT, HERE, robots=["left", "right"], gripper=0.5)
-    assert [(t.name, t.lease_version) for t in second.targets] == [("left", lease.lease_version)]
-    assert second.seq == first.seq + 1
-    assert second.scene_epoch == ann.mirror.scene_epoch
-    assert ann.alignment.report_tracking_jump() == 1
-    assert ann.make_sample(Device.HEAD, HERE).tracking_epoch == 1
-
-
-def test_second_client_with_the_same_identity_takes_over_permanently(join: Join, tmp_path: Path) -> None:
-    first = join(identity=tmp_path / "identity")
-    second = join(identity=tmp_path / "identity")
-    with pytest.raises(RefusedError):
-        first.wait_for(lambda c: False)
-    assert second.participant_id == first.participant_id
-    first.close()
-    assert second.acquire(["left"])[0].holder == second.participant_id, "it took nothing back"
-
-
 def test_first_state_after_a_client_stall_is_fresh_and_the_lease_is_kept() -> None:
     states: list[SceneState] = []
     with ClientSession(silence_ns=2_000_000_000) as session:
@@ -118,17 +82,6 @@ def test_first_state_after_a_client_stall_is_fresh_and_the_lease_is_kept() -> No
         assert all(state.age_ns < 100_000_000 for state in states)
         assert ann.wait_for(lambda c: c.ready and (c.lease_version("left") or 0) > lease.lease_version)
         assert ann.counters()["control"]["reconnects"] == 1
-
-
-def test_bye_frees_robots_at_once(join: Join) -> None:
-    ann, bob = join(), join("bob")
-    ann.acquire(["left"])
-    ann.close()
-    assert bob.wait_for(
-        lambda c: c.mirror.leases["left"].holder == "" and ann.participant_id not in c.mirror.participants
-    )
-    with pytest.raises(NotConnectedError):
-        ann.connect()
 
 
 def test_refused_clients_raise_and_close_everything(session: ClientSession) -> None:
@@ -148,23 +101,6 @@ def test_unreachable_session_raises() -> None:
         with pytest.raises(NotConnectedError):
             client.connect(0.01)
         client.close()
-
-
-def test_estop_into_a_dead_connection_arrives_after_reconnect(session: ClientSession, join: Join) -> None:
-    ann = join()
-    connection = session.sockets_of(ann).connection
-    assert connection is not None
-    session.network.close(connection, notify=False)  # the network is cut, and not detected yet
-    ann.estop("into the void")
-    ann.connection.handle_disconnect(session.simulation.now_ns)
-    assert ann.wait_for(lambda c: c.mirror.estop)
-
-
-def test_presence_shows_connected_participants_only(join: Join) -> None:
-    ann = join()
-    ann.connection.stream._presence["p99", "head"] = PresenceItem("p99", "head", IDENTITY)
-    assert ann.scene.presence == {}
-    assert ann.scene.presence is not ann.scene.presence
 
 
 # --- the thread of `start` --------------------------------------------------------------------------------------------

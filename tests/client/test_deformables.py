@@ -178,20 +178,6 @@ def test_patch_keeps_unchanged_deformables_subscribed(live: Watched, shared: Sha
     assert live.faults == {""}
 
 
-def test_deformables_continue_until_a_late_patch_arrives(live: Watched, shared: SharedScene) -> None:
-    names = set(deformable_keys(live.parts))
-    live.step_until_moved(names)
-    address, assets = shared.store_variant(live.parts, "patched")
-    live.session.change_scene(address, assets[1:])
-    live.step_until(lambda: bool(live.shapes.fault))
-    live.step_until_moved(names)
-    assert live.shapes.scene_hash != address
-    live.session.change_scene(address, assets, "")
-    live.step_until(lambda: not live.shapes.fault)
-    assert live.shapes.scene_hash == address
-    assert live.shapes.vertices.keys() == names
-
-
 def test_new_scene_shows_nothing_before_it_is_loaded(live: Watched, shared: SharedScene) -> None:
     """Nor frames of the previous scene, in any order of arrival."""
     first, second, third = deformable_keys(live.parts)

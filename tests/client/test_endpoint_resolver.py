@@ -22,8 +22,8 @@ from iris_session.client import (
     endpoint_resolver,
     server_trust,
 )
-from iris_session.client.address import Address, pairing_uri
 from iris_session.client.core.status import ConnectionPhase
+from iris_session.client.discovery import Address, pairing_uri
 from iris_session.client.endpoint_resolver import (
     Endpoint,
     EndpointResolver,

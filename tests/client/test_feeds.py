@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from iris_session.client import Client, InvalidMessageError
-from iris_session.client.feeds import CloudFeed, MediaFeed, MediaFrame
+from iris_session.client.media import CloudFeed, MediaFeed, MediaFrame
 from iris_session.client.stream_meter import STAGES, StreamMeter
 from iris_session.protocol.codec import decode_media_push
 from iris_session.protocol.media import MediaHeader, StreamBudget, StreamInfo
@@ -51,16 +51,6 @@ def test_cloud_is_decoded_once_and_polled_once() -> None:
     assert np.allclose(np.sort(cloud.positions, axis=0), POINTS, atol=1e-3)
     assert (cloud.error_m, cloud.voxel_m) == pytest.approx((0.01, 0.02))
     assert cloud.colors.tolist() == [[255] * 4] * 10
-
-
-def test_times_and_ages() -> None:
-    rig = Rig()
-    rig.receive()
-    cloud = rig.cloud.poll()
-    assert cloud is not None
-    assert tuple(cloud.times) == (100, 200, 300, 400, 500, 1_000)
-    rig.now_ns = 5_000
-    assert (cloud.age_ns, rig.cloud.age_ns) == (900, 4_900)
 
 
 def test_frames_that_were_not_looked_at_in_time_are_counted() -> None:
@@ -116,20 +106,6 @@ def test_what_comes_of_a_cloud_is_measured() -> None:
     assert (found.age_ms, found.age_ms_p99) == pytest.approx((900e-6, 900e-6))
     assert found.ages_ms == pytest.approx(dict(zip(STAGES, (1e-4, 1e-4, 1e-4, 1e-4, 5e-4), strict=True)))
     assert (found.title, found.stale, found.fault, found.detail) == ("Room", False, "slow", "3 of 10")
-
-
-def test_what_comes_of_a_picture_is_measured() -> None:
-    found = measure(Rig(), "jpeg", 1)
-    assert (found.frames, found.hz, found.encoding, found.age_ms) == (1, 0.5, "jpeg", pytest.approx(400e-6))
-    assert (found.points, found.voxel_m) == (None, None)
-    assert list(found.ages_ms) == list(STAGES[:-1])  # a picture is not decoded here
-
-
-def test_a_frame_that_is_no_cloud_is_a_fault_of_the_measured_stream() -> None:
-    rig = Rig()
-    rig.receive(b"", "cloud")
-    found = measure(rig, "cloud", 0)
-    assert (found.frames, found.points, found.fault) == (0, None, "malformed")
 
 
 def test_a_stream_that_the_session_has_no_more_is_stale() -> None:

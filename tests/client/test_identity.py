@@ -11,11 +11,6 @@ import pytest
 from iris_session.client import Identity, IdentityError
 
 
-def test_identities_in_memory_differ() -> None:
-    assert Identity.in_memory().secret != Identity.in_memory().secret
-    assert len(Identity.in_memory().secret) == 16
-
-
 def test_file_keeps_the_newest_token(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "identity.json"
     first = Identity.from_file(path)
@@ -64,9 +59,3 @@ def test_damaged_file_is_reported_with_advice(tmp_path: Path, content: bytes) ->
     path.chmod(0o600)
     with pytest.raises(IdentityError):
         Identity.from_file(path)
-
-
-def test_unwritable_folder_is_a_typed_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(IdentityError, match="cannot be"):
-        Identity.from_file(tmp_path / "file" / "identity.json")

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from anchors.pose import PoseTuple
-from iris_session.client import Client, ClientError, DeniedError, InvalidMessageError
+from iris_session.client import Client, ClientError, InvalidMessageError
 from iris_session.client.arguments import to_names, to_numbers, to_pose, to_text
 from iris_session.client.core.outbox import encode_checked
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.protocol.client_messages import Acquire, Control, EStop, Marker, Observation, PlaceAlignment, Sample
 from iris_session.protocol.codec import decode_client
-from iris_session.protocol.common import Denial, Pose
-from iris_session.protocol.names import FaultCode, SampleKind
+from iris_session.protocol.common import Pose
+from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from tests.client.session import ClientSession
 
@@ -109,15 +109,6 @@ def test_arrays_and_numpy_scalars_are_accepted(session: ClientSession, join: Joi
     assert_no_faults(ann)
 
 
-def test_kind_of_sample_follows_from_its_arguments(session: ClientSession, join: Join) -> None:
-    ann = join()
-    assert ann.make_sample("target", HERE).kind == SampleKind.POSE
-    assert ann.make_sample("joints", q=(1.0,)).kind == SampleKind.JOINTS
-    assert ann.make_sample("joints", q=np.zeros(7)).kind == SampleKind.JOINTS
-    assert ann.make_sample("target", twist=[0.0] * 6).kind == SampleKind.TWIST
-    assert ann.make_sample("target", HERE, q=(1.0,), kind=SampleKind.POSE).kind == SampleKind.POSE
-
-
 def test_single_name_and_foreign_robots(session: ClientSession, join: Join) -> None:
     ann = join()
     assert ann.make_sample("target", HERE, robots="left").targets == ()
@@ -161,30 +152,6 @@ def test_stalled_or_dead_session_is_visible(session: ClientSession, join: Join) 
     session.paused = False
     assert ann.wait_for(lambda c: c.ready and "left" in c.feedback)
     assert ann.wait_for(lambda c: (c.scene.data_age_ns() or 10**9) < 100_000_000)
-
-
-def test_sleep_polls_for_the_whole_time(session: ClientSession, join: Join) -> None:
-    states: list[object] = []
-    ann = join(on_state=states.append)
-    began_ns = session.now_ns
-    ann.sleep(0.3)
-    assert session.now_ns - began_ns == pytest.approx(0.3e9, abs=5e6)
-    assert len(states) >= 10
-    ann.sleep(-1.0)
-
-
-def test_denials_have_a_readable_text(session: ClientSession, join: Join) -> None:
-    ann, bob = join(), join("bob")
-    ann.acquire("left")
-    assert bob.wait_for(lambda c: c.mirror.leases["left"].holder == ann.participant_id)
-    with pytest.raises(DeniedError) as held:
-        bob.acquire("left")
-    assert (held.value.denial.reason, held.value.denial.holder) == ("held", ann.participant_id)
-    assert str(held.value).count("ann") == 1, "by name"
-    with pytest.raises(DeniedError) as not_ours:
-        bob.release("left")
-    assert (not_ours.value.denial.reason, not_ours.value.denial.holder) == ("not_holder", ann.participant_id)
-    assert str(DeniedError(Denial("role", "no"))) == "denied (role): no"
 
 
 @pytest.mark.parametrize("address", [7721, None, ("127.0.0.1", 7721), b"127.0.0.1:7721"])

@@ -47,18 +47,3 @@ def test_poses_by_name_never_belong_to_another_body(session: ClientSession, join
     tip = client.scene.tip_pose("left")
     assert tip is not None
     assert tip[0][1] == Y["left/hand"]
-
-
-def test_bodies_keep_their_poses_after_a_reset_until_the_next_state(
-    session: ClientSession, join: Callable[..., Client]
-) -> None:
-    client = join()
-    assert client.wait_for(lambda c: c.scene.state is not None)
-    session.reset()
-
-    def both(_: Client) -> bool:
-        assert client.scene.body_pose(BODIES[0]) is not None
-        state = client.scene.state
-        return state is not None and state.header.scene_epoch == client.mirror.scene_epoch == 2
-
-    assert client.wait_for(both)

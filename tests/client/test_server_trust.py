@@ -8,8 +8,8 @@ import pytest
 from zmq.utils import z85
 
 from iris_session.client import TrustError
-from iris_session.client.address import Address
-from iris_session.client.server_trust import ServerTrust, known_fingerprints
+from iris_session.client.discovery import Address
+from iris_session.client.server_trust import ServerTrust
 from iris_session.security import KeyHome
 
 A, B = (z85.encode(bytes([first] * 32)).decode() for first in (1, 2))
@@ -81,14 +81,3 @@ def test_known_name_with_another_key_is_not_trusted_on_first_use(home: KeyHome) 
     ServerTrust(home, LAB).check_name(B)  # not requested by name
     with pytest.raises(TrustError, match="another key"):
         ServerTrust(home, LAB, "lab-1").check_name(B)
-
-
-def test_known_server_is_found_by_any_address(home: KeyHome) -> None:
-    assert known_fingerprints() == frozenset()
-    stored = home.known_servers.pin("10.0.0.7:7721", "lab-1", A)
-    trust = ServerTrust(home, LAB)
-    assert (trust.stored, trust.is_known(A), trust.is_known(B)) == ("", True, False)
-    assert known_fingerprints() == {stored.fingerprint}
-    (home.path / "known_servers.json").write_text("[")
-    with pytest.raises(TrustError, match="damaged"):
-        known_fingerprints()

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iris_session.client.address import Address
 from iris_session.client.core.state_stream import SceneState
+from iris_session.client.discovery import Address
 from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
 from iris_session.doctor.join_checks import (
     attempt_join,

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import pytest
 
-from iris_session.client.address import Address
+from iris_session.client.discovery import Address
 from iris_session.doctor import network_checks
 from iris_session.doctor.findings import failed, ok
 from iris_session.doctor.runner import run_checks

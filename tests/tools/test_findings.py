@@ -8,8 +8,8 @@ import msgspec
 import pytest
 import zmq
 
-from iris_session.client.address import Address
 from iris_session.client.core.connection import ClientConnection
+from iris_session.client.discovery import Address
 from iris_session.client.errors import ClientError
 from iris_session.client.identity import Identity
 from iris_session.front.state_publisher import StatePublisher

@@ -19,6 +19,7 @@ from iris_session.client.core.samples import SampleBuilder
 from iris_session.client.core.scene_follower import SceneFollower
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.errors import RefusedError
+from iris_session.client.identity import Identity
 from iris_session.protocol.assets import AssetChunk, AssetRequest
 from iris_session.protocol.client_messages import Acquire, EStop, Hello, Marker
 from iris_session.protocol.codec import (
@@ -69,24 +70,11 @@ SECRET: Final = bytes(range(16))
 REQUESTS: Final = {"acquire": Acquire, "marker": Marker}
 
 
-class _MemoryIdentity:
-    """Secret and resume token in memory."""
-
-    def __init__(self, secret: bytes, resume_token: bytes) -> None:
-        self.secret = secret
-        self.resume_token = resume_token
-
-    def remember(self, token: bytes) -> bool:
-        """Set the token."""
-        self.resume_token = token
-        return True
-
-
 class ConversationPlayer:
     """A client core that takes steps of a conversation. `do` returns the outcome of a step, as JSON."""
 
     def __init__(self, secret: str, resume_token: str) -> None:
-        self._identity = _MemoryIdentity(bytes.fromhex(secret), bytes.fromhex(resume_token))
+        self._identity = Identity(bytes.fromhex(secret), bytes.fromhex(resume_token))
         hello = Hello(Role.OPERATOR, "ann", "conversation", devices=("right",), capabilities=("run:0011223344556677",))
         self._connection = ClientConnection(hello, self._identity)
         self._follower = SceneFollower(self._connection)

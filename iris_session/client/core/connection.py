@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -56,6 +56,9 @@ from iris_session.protocol.server_messages import (
 from iris_session.protocol.session_mirror import MissedEvents, SessionMirror
 from iris_session.protocol.status import DeliveryBudget, GetStatus, StatusReport
 
+if TYPE_CHECKING:  # this room has no files
+    from iris_session.client.identity import Identity
+
 #: Time to wait for the reply to hello, at first and at most: a handshake takes five round trips, so over a slow link
 #: the first attempts are too short.
 HELLO_TIMEOUT_NS: Final = 1_000_000_000
@@ -81,25 +84,10 @@ REPLACED: Final = "replaced"
 InboxMessage = Event | MissedEvents | Feedback | ProtocolFault | Reply
 
 
-class IdentityStore(Protocol):
-    """Secret and last resume token of a client; see `iris_session.client.identity.Identity`."""
-
-    @property
-    def secret(self) -> bytes:
-        """128 bits that stand for the key on plain loopback."""
-
-    @property
-    def resume_token(self) -> bytes:
-        """Token of the last `Welcome`, single use; empty: join as a new participant."""
-
-    def remember(self, token: bytes) -> bool:
-        """Set `resume_token`; false when it could not be stored for another process."""
-
-
 class ClientConnection:
     """One participant's connection, over any number of sockets."""
 
-    def __init__(self, hello: Hello, identity: IdentityStore) -> None:
+    def __init__(self, hello: Hello, identity: Identity) -> None:
         self.hello = hello
         self.identity = identity
         self.phase = ConnectionPhase.IDLE
@@ -349,7 +337,7 @@ class ClientConnection:
         self.counters.identity_unwritten += not self.identity.remember(welcome.resume_token)
         self.phase = ConnectionPhase.SYNCING
         self._joined_at = now_ns
-        self._heartbeat_ns = bounded_heartbeat_ns(welcome)
+        self._heartbeat_ns = min(max(welcome.heartbeat_ns, HEARTBEAT_MIN_NS), HEARTBEAT_MAX_NS)
         self._heartbeat_at = now_ns + self._heartbeat_ns // 2
         self._snapshot_at = now_ns
         if self.pending_estop.message is not None:
@@ -486,11 +474,6 @@ class ClientConnection:
 
     def _queue(self, message: ClientMessage) -> bool:
         return self._outbox.push(message, encode_client(wrap_message(message, self.connection_epoch)))
-
-
-def bounded_heartbeat_ns(welcome: Welcome) -> int:
-    """Return the heartbeat period that the session asks for [ns], within `HEARTBEAT_MIN_NS`..`HEARTBEAT_MAX_NS`."""
-    return min(max(welcome.heartbeat_ns, HEARTBEAT_MIN_NS), HEARTBEAT_MAX_NS)
 
 
 def final_refusal(fault: ProtocolFault) -> Refused | None:

@@ -34,19 +34,6 @@ def frame(seq: int, age_ns: int) -> SceneState:
     return SceneState(StateHeader(1, 0, 0, 0.0, seq * MS, 0, seq, 0), np.zeros((0, 7)), age_ns, age_ns)
 
 
-def test_one_report_per_second(connection: ClientConnection) -> None:
-    meter = ArrivalMeter()
-    assert meter.poll_report(connection, 0) is None
-    for n, seq in enumerate((1, 2, 5, 6)):
-        meter.record(frame(seq, (n + 1) * MS))
-    connection.stream.counters.bytes_received = 4000
-    assert meter.poll_report(connection, PERIOD_NS - 1) is None
-    report = meter.poll_report(connection, 2 * PERIOD_NS)
-    assert report == ClientReport(3.0, 4.0, 4, 2, 0.0, 2000.0), "the first may have been sent before"
-    assert meter.poll_report(connection, 2 * PERIOD_NS) is None
-    assert meter.poll_report(connection, 3 * PERIOD_NS) == ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0)
-
-
 def test_repeated_states_are_not_measured(connection: ClientConnection) -> None:
     """Their source is silent and they grow old: no reason to reduce this client's rate or to blame its link."""
     meter = ArrivalMeter()
@@ -82,3 +69,16 @@ def test_status_of_a_session(session: ClientSession, join: Callable[..., Client]
     unopened = session.make_client()
     with pytest.raises(NotConnectedError):
         unopened.status(0.2)
+
+
+def test_one_report_per_second(connection: ClientConnection) -> None:
+    meter = ArrivalMeter()
+    assert meter.poll_report(connection, 0) is None
+    for n, seq in enumerate((1, 2, 5, 6)):
+        meter.record(frame(seq, (n + 1) * MS))
+    connection.stream.counters.bytes_received = 4000
+    assert meter.poll_report(connection, PERIOD_NS - 1) is None
+    report = meter.poll_report(connection, 2 * PERIOD_NS)
+    assert report == ClientReport(3.0, 4.0, 4, 2, 0.0, 2000.0), "the first may have been sent before"
+    assert meter.poll_report(connection, 2 * PERIOD_NS) is None
+    assert meter.poll_report(connection, 3 * PERIOD_NS) == ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from random import Random
 
-import pytest
-
 from iris_session.client.core.asset_loader import (
     AT_ONCE,
     CHUNK_BYTES,
@@ -46,21 +44,6 @@ def refuse(loader: AssetLoader, ask: ChunkRequest, reason: str, now_ns: int = 0)
     return loader.process_refusal(AssetRefused(1, ask.request_id, ask.address, reason, "advice"), now_ns)
 
 
-def test_first_a_chunk_of_each_asset_then_the_rest_in_order() -> None:
-    loader = started("a", "b", "c")
-    first = list(loader.next_requests(0))
-    assert [(ask.address, ask.offset, ask.length) for ask in first] == [(name, 0, CHUNK_BYTES) for name in "abc"]
-    total = 2 * CHUNK_BYTES + 10
-    assert answer(loader, first[0], total) is True
-    assert [(ask.address, ask.offset, ask.length) for ask in loader.next_requests(0)] == [
-        ("a", CHUNK_BYTES, CHUNK_BYTES),
-        ("a", 2 * CHUNK_BYTES, 10),
-    ]
-    assert answer(loader, first[1], 7) is True
-    assert loader.is_complete("b")
-    assert not loader.is_complete("a")
-
-
 def test_window_counts_bytes_that_are_not_stored() -> None:
     loader = started("a")
     (ask,) = loader.next_requests(0)
@@ -89,20 +72,6 @@ def test_chunk_size_follows_the_link_rate() -> None:
     assert lengths[8:] == [MIN_CHUNK_BYTES] * 2
     (ask,) = list(loader.next_requests(now_ns))[:1]
     assert ask.length == 2 * MIN_CHUNK_BYTES
-
-
-def test_known_sizes_are_requested_exactly() -> None:
-    loader = AssetLoader()
-    for name in "abc":
-        loader.add(name, 1000)
-    for name in loader.next_lookups():
-        loader.on_missing(name, 400 if name == "b" else 2000 if name == "c" else 0)
-    a, b, c = loader.next_requests(0)
-    assert [(ask.offset, ask.length) for ask in (a, b)] == [(0, 1000), (400, 600)]
-    assert (c.offset, c.length) == (2000, CHUNK_BYTES), "the session states less than is cached: the session decides"
-    assert answer(loader, a, 3000, 1000) is True, "so does it where there is more"
-    (rest,) = loader.next_requests(0)
-    assert (rest.offset, rest.length) == (1000, 2000)
 
 
 def test_asset_above_the_maximum_is_not_requested() -> None:
@@ -164,29 +133,6 @@ def test_temporary_refusals_are_retried_with_growing_delay() -> None:
     (ask,) = loader.next_requests(now_ns + FIRST_PAUSE_NS)  # the first delay again, after a chunk arrived
     assert answer(loader, ask, CHUNK_BYTES + 5) is True
     assert loader.is_complete("a")
-
-
-@pytest.mark.parametrize("reason", [AssetRefusal.UNKNOWN, AssetRefusal.VERSION, "of a later version"])
-def test_permanent_refusals_end_the_asset(reason: str) -> None:
-    loader = started("a", "b")
-    asks = list(loader.next_requests(0))
-    failed = refuse(loader, asks[0], reason)
-    assert isinstance(failed, FailedAsset)
-    assert (failed.address, failed.reason) == ("a", reason)
-    assert answer(loader, asks[1], 5) is True
-    loader.remove("b")
-    assert loader.idle
-
-
-def test_wrong_bytes_are_requested_once_more() -> None:
-    loader = started("a")
-    for expected in (True, False):
-        (ask,) = loader.next_requests(0)
-        assert answer(loader, ask, 5) is True
-        assert loader.is_complete("a")
-        loader.on_stored(5)
-        assert loader.restart_asset("a") is expected
-    assert loader.idle
 
 
 def test_part_is_discarded_once_in_all() -> None:
@@ -271,3 +217,18 @@ def test_all_assets_complete_despite_random_faults() -> None:
             if loader.idle:
                 break
         assert got == sizes
+
+
+def test_first_a_chunk_of_each_asset_then_the_rest_in_order() -> None:
+    loader = started("a", "b", "c")
+    first = list(loader.next_requests(0))
+    assert [(ask.address, ask.offset, ask.length) for ask in first] == [(name, 0, CHUNK_BYTES) for name in "abc"]
+    total = 2 * CHUNK_BYTES + 10
+    assert answer(loader, first[0], total) is True
+    assert [(ask.address, ask.offset, ask.length) for ask in loader.next_requests(0)] == [
+        ("a", CHUNK_BYTES, CHUNK_BYTES),
+        ("a", 2 * CHUNK_BYTES, 10),
+    ]
+    assert answer(loader, first[1], 7) is True
+    assert loader.is_complete("b")
+    assert not loader.is_complete("a")

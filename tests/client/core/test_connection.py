@@ -11,15 +11,12 @@ from hypothesis import strategies as st
 
 from iris_session.client.core.clock import SETTLED
 from iris_session.client.core.connection import (
-    BACKOFF_MAX_NS,
-    HELLO_TIMEOUT_MAX_NS,
-    HELLO_TIMEOUT_NS,
     MAX_INBOX,
     ClientConnection,
 )
 from iris_session.client.core.outbox import MAX_OUTGOING, MAX_PENDING
 from iris_session.client.core.status import ConnectionPhase
-from iris_session.client.errors import IdentityError, NotConnectedError, VersionError
+from iris_session.client.errors import IdentityError, NotConnectedError
 from iris_session.client.identity import Identity
 from iris_session.protocol.client_messages import (
     Acquire,
@@ -27,7 +24,6 @@ from iris_session.protocol.client_messages import (
     ClientMessage,
     ClockPing,
     EStop,
-    GetSnapshot,
     Heartbeat,
     Hello,
     Marker,
@@ -35,8 +31,7 @@ from iris_session.protocol.client_messages import (
     TrackingEpoch,
 )
 from iris_session.protocol.codec import decode_client, encode_server
-from iris_session.protocol.common import Denial, Lease
-from iris_session.protocol.names import PROTOCOL_VERSION, DenialReason, RefusalCode
+from iris_session.protocol.names import PROTOCOL_VERSION, RefusalCode
 from iris_session.protocol.server_messages import (
     BodyInfo,
     ClockPong,
@@ -110,37 +105,6 @@ def wire() -> Wire:
     return Wire()
 
 
-def test_join_sends_hello_then_requests_clock_and_snapshot(wire: Wire) -> None:
-    assert wire.connection.phase is ConnectionPhase.IDLE
-    wire.connection.open(0)
-    (hello,) = wire.sent()
-    assert isinstance(hello, Hello)
-    assert hello.secret == b"s" * 16
-    wire.welcome(10 * MS)
-    assert wire.connection.identity.resume_token == b"token"
-    assert {type(m) for m in wire.sent()} == {ClockPing, GetSnapshot}
-    wire.snapshot(20 * MS)
-    assert wire.connection.phase is ConnectionPhase.SYNCING  # no clock yet
-    wire.clock(20 * MS)
-    assert wire.connection.phase is ConnectionPhase.READY
-
-
-def test_unanswered_hello_is_repeated_on_a_new_socket_with_back_off(wire: Wire) -> None:
-    wire.connection.open(0)
-    hellos, now = [0], 0
-    while now < 60 * SECOND:
-        generation = wire.connection.generation
-        now = max(now + MS, wire.connection.next_deadline_ns(now))
-        wire.connection.tick(now)
-        if wire.connection.generation != generation:
-            hellos.append(now)
-            assert [type(m) for m in wire.sent()] == [Hello]
-    gaps = np.diff(hellos)
-    assert (np.diff(gaps) >= 0).all()
-    assert gaps[0] < HELLO_TIMEOUT_NS + 200 * MS
-    assert gaps[-1] == HELLO_TIMEOUT_MAX_NS + BACKOFF_MAX_NS
-
-
 def test_timers_keep_an_idle_connection_alive(wire: Wire) -> None:
     wire.join()
     kinds: list[type] = []
@@ -168,60 +132,6 @@ def test_silence_ends_the_connection_and_the_token_resumes_it(wire: Wire) -> Non
     hello = wire.sent()[-1]
     assert isinstance(hello, Hello)
     assert hello.resume_token == b"token"
-
-
-def test_stalled_client_first_reads_pending_messages(wire: Wire) -> None:
-    wire.join()
-    wire.connection.tick(60 * SECOND)
-    assert wire.connection.phase is ConnectionPhase.READY
-    assert {type(message) for message in wire.sent()} == {ClockPing, Heartbeat}
-    wire.connection.tick(60 * SECOND + 500 * MS)
-    wire.receive(ProtocolFault("hello", "say hello"), 60 * SECOND + 600 * MS)
-    assert [type(message) for message in wire.sent()][-1] is Hello
-
-
-def test_used_token_is_dropped_and_hello_repeated(wire: Wire) -> None:
-    wire.connection.identity.resume_token = b"old"
-    wire.connection.open(0)
-    wire.sent()
-    wire.receive(Refused(RefusalCode.RESUME_TOKEN, "used"), MS, epoch=0)
-    (hello,) = wire.sent()
-    assert isinstance(hello, Hello)
-    assert hello.resume_token == b""
-    assert wire.connection.generation == 2
-
-
-def test_permanent_refusals_end_the_connection(wire: Wire) -> None:
-    wire.join()
-    wire.connection.handle_disconnect(SECOND)
-    wire.receive(Refused(DenialReason.SESSION_FULL, "full"), 2 * SECOND, epoch=0)
-    assert wire.connection.phase is ConnectionPhase.WAITING
-    wire.connection.tick(5 * SECOND)
-    wire.receive(Refused(RefusalCode.VERSION, "other version", supported_versions=(7, 8)), 5 * SECOND, epoch=0)
-    assert wire.connection.phase is ConnectionPhase.REFUSED
-    assert isinstance(wire.connection.failure, VersionError)
-    assert wire.connection.failure.supported_versions == (7, 8)
-    wire.connection.open(6 * SECOND)
-    assert wire.connection.phase is ConnectionPhase.JOINING
-    assert wire.connection.failure is None
-
-
-def test_rate_limited_hello_is_repeated_with_back_off(wire: Wire) -> None:
-    wire.connection.open(0)
-    now, waits = 0, []
-    for _ in range(8):
-        wire.sent()
-        wire.receive(Refused(RefusalCode.RATE, "too many hellos at once", "try again in a second"), now, epoch=0)
-        assert wire.connection.phase is ConnectionPhase.WAITING
-        assert "too many hellos" in wire.connection.describe()
-        waits.append(wire.connection.next_deadline_ns(now) - now)
-        now = wire.connection.next_deadline_ns(now)
-        wire.connection.tick(now)
-    assert waits == sorted(waits)
-    assert waits[-1] == BACKOFF_MAX_NS
-    wire.welcome(now)
-    assert wire.connection.retryable_refusal is None
-    assert wire.connection.failure is None
 
 
 @pytest.mark.parametrize(
@@ -275,53 +185,6 @@ def test_urgent_messages_are_sent_first_and_the_queue_is_bounded(wire: Wire) -> 
     assert sent[0] == EStop("now")
     assert len(sent) == MAX_OUTGOING
     assert wire.connection.counters.samples_not_sent == MAX_OUTGOING + 1
-
-
-def test_replies_match_their_requests_and_leases_apply_at_once(wire: Wire) -> None:
-    wire.join()
-    number = wire.connection.request(Acquire(0, ("left",)))
-    assert wire.sent() == [Acquire(number, ("left",))]
-    lease = Lease("left", "robot", "exclusive", "p1", 4)
-    wire.receive(Reply(number, True, leases=(lease,)), MS)
-    wire.receive(Reply(number, True), MS)
-    assert wire.connection.counters.unexpected_replies == 1
-    reply = wire.connection.requests.pop_reply(number)
-    assert reply is not None
-    assert reply.ok
-    assert wire.connection.requests.pop_reply(number) is None
-    assert wire.connection.lease_version("left") == 4
-    wire.connection.handle_disconnect(SECOND)
-    assert wire.connection.lease_version("left") is None
-
-
-def test_messages_of_an_earlier_connection_are_counted_not_applied(wire: Wire) -> None:
-    wire.join()
-    wire.receive(Event(1, 0, 0, Notice("info", "x")), MS, epoch=99)
-    assert wire.connection.mirror.event_seq == 0
-    assert wire.connection.counters.other_connection == 1
-
-
-def test_event_gap_requests_a_snapshot_until_it_arrives(wire: Wire) -> None:
-    wire.join()
-    wire.receive(Event(1, 0, 0, Notice("info", "x")), MS)
-    wire.receive(Event(3, 0, 0, Notice("info", "y")), MS)
-    now, asked = MS, 0
-    while now < 3 * SECOND:
-        now = max(now + MS, wire.connection.next_deadline_ns(now))
-        wire.connection.tick(now)
-        for message in wire.sent():
-            asked += isinstance(message, GetSnapshot)
-            if isinstance(message, ClockPing):
-                wire.receive(ClockPong(message.t0_ns, now, now), now)
-    assert 4 <= asked <= 7
-    wire.snapshot(now, event_seq=2)
-    assert wire.connection.mirror.event_seq == 3
-    delivered = [
-        e if isinstance(e, MissedEvents) else e.event_seq
-        for e in wire.connection.inbox
-        if isinstance(e, Event | MissedEvents)
-    ]
-    assert delivered == [1, MissedEvents(2, 2), 3]
 
 
 def test_snapshot_ahead_of_events_reports_missed_events(wire: Wire) -> None:
@@ -408,14 +271,6 @@ def test_request_that_cannot_be_queued_raises(wire: Wire) -> None:
         wire.connection.send(Marker(0, "x"))
     with pytest.raises(NotConnectedError, match="queue full"):
         wire.connection.request(Acquire(0))
-
-
-def test_denial_without_a_waiting_request_is_delivered(wire: Wire) -> None:
-    wire.join()
-    denied = Reply(0, False, Denial(DenialReason.UNALIGNED, "no"))
-    wire.receive(denied, MS)
-    assert list(wire.connection.inbox) == [denied]
-    assert wire.connection.counters.unasked_denials == 1
 
 
 def test_full_disk_stops_neither_joining_nor_closing(
