@@ -75,9 +75,9 @@ def run_join(
         cold = _prepare_scene(file, store.root)
         progress("and warm")
         ready = _prepare_scene(file, store.root)
-        if ready.built:
-            raise BenchError(f"{ready.built} assets were encoded again although the cache is warm")
-        paths = [store.path(address) for address in ready.sizes]
+        if ready["built"]:
+            raise BenchError(f"{ready['built']} assets were encoded again although the cache is warm")
+        paths = [store.path(address) for address in ready["addresses"]]
         port = stack.enter_context(_serve_in_bulk(paths))
         joiner = stack.enter_context(PluginProcess("iris_session.bench.join:Joiner", JoinJob(str(folder / "cache"))))
         joiner.read()  # it is made
@@ -97,40 +97,41 @@ def run_join(
             seed=seed,
             progress=progress,
         )
-        first, second = (msgspec.convert(joiner.read(), JoinResult) for _ in range(2))
-        copied = msgspec.convert(joiner.read(), CopyInterval)
+        (first, begin_ns, _), (second, _, end_ns), copied = (joiner.read() for _ in range(3))
         bare_s: float = joiner.ask("transfer_in_bulk", port)
     results = {
         **_summarize(cold, ready, first, second),
-        "others_age_ms_p99": _compute_age_p99_ms(got.logs, first.begin_ns, second.end_ns),
-        "others_age_ms_p99_baseline": _compute_age_p99_ms(got.logs, got.begin_ns, first.begin_ns),
+        "others_age_ms_p99": _compute_age_p99_ms(got.logs, begin_ns, end_ns),
+        "others_age_ms_p99_baseline": _compute_age_p99_ms(got.logs, got.begin_ns, begin_ns),
         **got.summarize("late_tick_share", "scheduling", "drops"),
     }
     params = {"objects": objects, "assets_mb": assets_mb, "clients": clients, "seconds": seconds, "seed": seed}
     reference = {
         "bare_transfer_s": round(bare_s, 3),
-        "others_age_ms_p99_memory_copied": _compute_age_p99_ms(got.logs, copied.begin_ns, copied.end_ns),
+        "others_age_ms_p99_memory_copied": _compute_age_p99_ms(got.logs, *copied),
     }
-    return BenchReport("join", params, results, tuple(_make_bars(results, first.bytes)), reference)
+    return BenchReport("join", params, results, tuple(_make_bars(results, first["bytes"])), reference)
 
 
-def _summarize(cold: PreparedScene, ready: PreparedScene, first: JoinResult, second: JoinResult) -> dict[str, Any]:
+def _summarize(
+    cold: dict[str, Any], ready: dict[str, Any], first: dict[str, float], second: dict[str, float]
+) -> dict[str, Any]:
     return {
-        "ready_s": round(ready.seconds, 3),
-        "server_rss_mib": round(ready.rss_mib, 1),
-        "first_picture_s": round(first.first_picture_s, 3),
-        "complete_s": round(first.complete_s, 3),
-        "bytes": first.bytes,
-        "warm_complete_s": round(second.complete_s, 3),
-        "warm_bytes": second.bytes,
-        "assets": first.assets,
-        "client_cpu_s": round(first.cpu_s, 3),
-        "ready_cold_s": round(cold.seconds, 3),
-        "server_rss_cold_mib": round(cold.rss_mib, 1),
+        "ready_s": round(ready["seconds"], 3),
+        "server_rss_mib": round(ready["rss_mib"], 1),
+        "first_picture_s": first["first_picture_s"],
+        "complete_s": first["complete_s"],
+        "bytes": first["bytes"],
+        "warm_complete_s": second["complete_s"],
+        "warm_bytes": second["bytes"],
+        "assets": first["assets"],
+        "client_cpu_s": first["client_cpu_s"],
+        "ready_cold_s": round(cold["seconds"], 3),
+        "server_rss_cold_mib": round(cold["rss_mib"], 1),
     }
 
 
-def _make_bars(results: dict[str, Any], sent: int) -> list[Any]:
+def _make_bars(results: dict[str, Any], sent: float) -> list[Any]:
     return [
         make_bar(results, "ready_s", "<=", 2.0),
         make_bar(results, "server_rss_mib", "<=", 150.0),
@@ -140,10 +141,11 @@ def _make_bars(results: dict[str, Any], sent: int) -> list[Any]:
     ]
 
 
-def _prepare_scene(model: Path, store: Path) -> PreparedScene:
+def _prepare_scene(model: Path, store: Path) -> dict[str, Any]:
     with PluginProcess("iris_session.bench.join:ScenePreparer", SceneJob(str(model), str(store))) as process:
         process.read()  # it is made
-        return msgspec.convert(process.ask("prepare"), PreparedScene)
+        prepared: dict[str, Any] = process.ask("prepare")
+        return prepared
 
 
 def _compute_age_p99_ms(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:
@@ -194,29 +196,6 @@ class JoinJob(msgspec.Struct, frozen=True):
     cache: str
 
 
-class JoinResult(msgspec.Struct, frozen=True):
-    """Times of one join from `connect` on [s].
-
-    `first_picture_s`: specification and the coarsest level of every shape are decoded. `complete_s`: all assets are
-    verified by hash and decoded. `begin_ns`, `end_ns`: session time.
-    """
-
-    first_picture_s: float
-    complete_s: float
-    bytes: int
-    assets: int
-    cpu_s: float
-    begin_ns: int
-    end_ns: int
-
-
-class CopyInterval(msgspec.Struct, frozen=True):
-    """Interval in which memory was copied, in session time."""
-
-    begin_ns: int
-    end_ns: int
-
-
 class Joiner(Plugin):
     """Plug-in that joins. It is started before it is needed: starting Python is not part of joining."""
 
@@ -227,8 +206,14 @@ class Joiner(Plugin):
         gc.collect()
         gc.freeze()  # Python and its libraries are not part of joining
 
-    def join(self, address: str, origin_ns: int) -> JoinResult:
-        """Join with one client and fetch the whole scene. Raises what the client raises."""
+    def join(self, address: str, origin_ns: int) -> tuple[dict[str, float], int, int]:
+        """Join with one client and fetch the whole scene. Raises what the client raises.
+
+        Returns:
+            The results, and the session times of the begin and the end [ns]. Results are times from `connect` on [s]:
+            at `first_picture_s` specification and the coarsest level of every shape are decoded, at `complete_s` all
+            assets are verified by hash and decoded.
+        """
         begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
         with Client(address, role="observer", name="joiner", alignment="not_needed") as client:
             client.assets.cache = AssetStore(self.job.cache)
@@ -246,18 +231,17 @@ class Joiner(Plugin):
             end_ns = time.monotonic_ns()
             rest.check()
             assert len(rest.decoded) == len(sizes)
-            return JoinResult(
-                (picture_ns - begin_ns) * 1e-9,
-                (end_ns - begin_ns) * 1e-9,
-                first.bytes_received + rest.bytes_received,
-                1 + len(sizes),
-                time.process_time() - cpu_s,
-                begin_ns - origin_ns,
-                end_ns - origin_ns,
-            )
+            results = {
+                "first_picture_s": round((picture_ns - begin_ns) * 1e-9, 3),
+                "complete_s": round((end_ns - begin_ns) * 1e-9, 3),
+                "bytes": first.bytes_received + rest.bytes_received,
+                "assets": 1 + len(sizes),
+                "client_cpu_s": round(time.process_time() - cpu_s, 3),
+            }
+            return results, begin_ns - origin_ns, end_ns - origin_ns
 
-    def copy_memory(self, origin_ns: int) -> CopyInterval:
-        """Copy memory at the priority of a client's asset threads.
+    def copy_memory(self, origin_ns: int) -> tuple[int, int]:
+        """Copy memory at the priority of a client's asset threads; return session times of begin and end [ns].
 
         This is the cost of any program that leaves no core idle. numpy copies without holding Python's lock.
         """
@@ -276,7 +260,7 @@ class Joiner(Plugin):
             thread.start()
         for thread in threads:
             thread.join()
-        return CopyInterval(begin_ns - origin_ns, end_ns - origin_ns)
+        return begin_ns - origin_ns, end_ns - origin_ns
 
     def transfer_in_bulk(self, port: int) -> float:
         """Return the seconds for all bytes in one ZeroMQ message: nothing is checked, stored or decoded."""
@@ -314,24 +298,6 @@ TEXTURE_SHARE: Final = 0.8
 #: Measured ratios with coarser levels: bytes of a texture per byte of raw pixels, bytes of a mesh per vertex.
 _LEVELS: Final = 1.228
 _VERTEX_BYTES: Final = 35.5
-
-
-class PreparedScene(msgspec.Struct, frozen=True):
-    """Result of preparing a scene.
-
-    Attributes:
-        seconds: From the compiled model to assets that can be fetched.
-        rss_mib: Peak memory meanwhile, above that of the process with the model.
-        built: Assets that were encoded.
-        scene: Content hash of the specification.
-        sizes: Bytes of all assets by content hash.
-    """
-
-    seconds: float
-    rss_mib: float
-    built: int
-    scene: str
-    sizes: dict[str, int]
 
 
 def make_join_model(objects: int, assets_mb: float, seed: int) -> Any:
@@ -405,19 +371,24 @@ class ScenePreparer(Plugin):
 
     job_type = SceneJob
 
-    def prepare(self) -> PreparedScene:
-        """Prepare the scene, and measure it."""
+    def prepare(self) -> dict[str, Any]:
+        """Prepare the scene, and measure it.
+
+        Returns:
+            `seconds` from the compiled model to assets that can be fetched, `rss_mib`: peak memory meanwhile, above
+            that of the process with the model, `built`: number of assets that were encoded, `addresses` of all assets.
+        """
         model = load_model(self.job.model)
         store = AssetStore(Path(self.job.store))
         before = psutil.Process().memory_info().rss
         Path("/proc/self/clear_refs").write_text("5")  # the peak of memory is counted from now on (Linux)
         began_s = time.perf_counter()
         parsed = parse_mujoco(model, store)
-        data = encode_scene(parsed.spec)
-        scene = store.put(data)
+        scene = store.put(encode_scene(parsed.spec))
         seconds = time.perf_counter() - began_s
-        sizes = {scene: len(data), **list_assets(parsed.spec)}
-        return PreparedScene(seconds, (_read_peak_rss() - before) / 2**20, parsed.built, scene, sizes)
+        rss_mib = (_read_peak_rss() - before) / 2**20
+        addresses = [scene, *list_assets(parsed.spec)]
+        return {"seconds": seconds, "rss_mib": rss_mib, "built": parsed.built, "addresses": addresses}
 
 
 def _read_peak_rss() -> int:

@@ -163,7 +163,7 @@ class Client:
         self._samples = SampleBuilder(self.connection)
         self._sockets = ClientSockets()
         self._lock = threading.RLock()
-        self._requests = ClientRequests(self, self._lock)
+        self._requests = ClientRequests(self.connection, self._lock, self.submit, self.answer, self.wait_for)
         self._joiner = SessionJoiner(request, self.connection, self._sockets)
         self.scene = ClientScene(self.connection, self._lock)
         arrivals = ArrivalMeter()

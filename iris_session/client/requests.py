@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
@@ -27,21 +27,6 @@ CONSENT_TIMEOUT_S: Final = 15.0
 WITHDRAW_TIMEOUT_S: Final = 1.0
 
 
-class RequestingClient(Protocol):
-    """The parts of a `Client` that its requests use."""
-
-    connection: ClientConnection
-
-    def submit(self, message: Any) -> int:
-        """See `Client.submit`."""
-
-    def answer(self, request_id: int) -> Reply | None:
-        """See `Client.answer`."""
-
-    def wait_for(self, condition: Callable[[Any], bool], timeout_s: float = ...) -> bool:
-        """See `Client.wait_for`."""
-
-
 class SentRequest(NamedTuple):
     """A request that was sent: its kind and number, the connection, and the last protocol fault before it."""
 
@@ -52,11 +37,27 @@ class SentRequest(NamedTuple):
 
 
 class ClientRequests:
-    """Sends requests of a client and waits for the replies. `lock`: that of the client's connection."""
+    """Sends requests of a client and waits for the replies.
 
-    def __init__(self, client: RequestingClient, lock: threading.RLock) -> None:
-        self._client = client
+    Args:
+        connection: Its connection.
+        lock: Of the connection.
+        submit, answer, wait_for: Methods of the client.
+    """
+
+    def __init__(
+        self,
+        connection: ClientConnection,
+        lock: threading.RLock,
+        submit: Callable[[Any], int],
+        answer: Callable[[int], Reply | None],
+        wait_for: Callable[[Callable[[Any], bool], float], bool],
+    ) -> None:
+        self._connection = connection
         self._lock = lock
+        self._submit = submit
+        self._answer = answer
+        self._wait_for = wait_for
 
     def request(self, message: Any, timeout_s: float) -> Reply:
         """Send a request and wait for its reply; see `Client.request`."""
@@ -77,7 +78,7 @@ class ClientRequests:
 
     def compute_consent_s(self, message: Acquire) -> float:
         """Return the time [s] that the holders of the wanted robots have to consent, 0 when none is asked."""
-        mirror = self._client.connection.mirror
+        mirror = self._connection.mirror
         wanted = message.robots or tuple(mirror.leases)
         if not any(mirror.leases[name].mode == LeaseMode.REQUEST for name in wanted if name in mirror.leases):
             return 0.0
@@ -88,7 +89,7 @@ class ClientRequests:
         text, denial = f"no robots or objects within {timeout_s:g} s: ", None
         try:
             answer = self._wait(self._send(Withdraw(0, sent.request_id)), WITHDRAW_TIMEOUT_S)
-            reply = self._client.answer(sent.request_id)
+            reply = self._answer(sent.request_id)
         finally:
             self._discard(sent)
         if reply is not None and reply.denial is not None:
@@ -106,9 +107,8 @@ class ClientRequests:
 
     def _send(self, message: Any) -> SentRequest:
         with self._lock:
-            connection = self._client.connection
-            fault, request_id = connection.last_protocol_fault, self._client.submit(message)
-            return SentRequest(type(message).__name__, request_id, connection.generation, fault)
+            fault, request_id = self._connection.last_protocol_fault, self._submit(message)
+            return SentRequest(type(message).__name__, request_id, self._connection.generation, fault)
 
     def _wait(self, sent: SentRequest, timeout_s: float) -> Reply | None:
         """Wait for a reply; `None`: there is none yet.
@@ -117,19 +117,19 @@ class ClientRequests:
             InvalidMessageError: The session rejected the message.
             NotConnectedError: The connection was lost.
         """
-        connection = self._client.connection
+        connection = self._connection
         replies: list[Reply] = []
 
         def is_lost() -> bool:
             return connection.generation != sent.generation or not connection.is_joined
 
-        def is_over(client: RequestingClient) -> bool:
-            reply = client.answer(sent.request_id)
+        def is_over(_: object) -> bool:
+            reply = self._answer(sent.request_id)
             if reply is not None:
                 replies.append(reply)
             return bool(replies) or connection.last_protocol_fault is not sent.fault_before or is_lost()
 
-        self._client.wait_for(is_over, timeout_s)
+        self._wait_for(is_over, timeout_s)
         if replies:
             return replies[0]
         fault = connection.last_protocol_fault
@@ -143,7 +143,7 @@ class ClientRequests:
 
     def _discard(self, sent: SentRequest) -> None:
         with self._lock:
-            self._client.connection.requests.discard(sent.request_id)
+            self._connection.requests.discard(sent.request_id)
 
     def _require_granted(self, reply: Reply) -> Reply:
         """Return a reply that is not a denial. Raises `DeniedError`."""
@@ -152,7 +152,7 @@ class ClientRequests:
         return reply
 
     def _add_holder_name(self, denial: Denial) -> Denial:
-        holder = self._client.connection.mirror.participants.get(denial.holder)
+        holder = self._connection.mirror.participants.get(denial.holder)
         if holder is None or denial.holder_name:
             return denial
         return msgspec.structs.replace(denial, holder_name=holder.name)

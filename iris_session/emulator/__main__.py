@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
@@ -90,7 +91,7 @@ def _parse_specs(options: argparse.Namespace) -> list[HeadsetSpec]:
     if options.specs == "-" and options.orders:
         raise ValueError("--specs - and --orders both read standard input: write the specs into a file")
     if options.specs:
-        data = sys.stdin.buffer.read() if options.specs == "-" else _read(options.specs)
+        data = sys.stdin.buffer.read() if options.specs == "-" else Path(options.specs).read_bytes()
         specs += msgspec.json.decode(data, type=list[HeadsetSpec])
     for text in options.headset:
         pairs: dict[str, Any] = dict(part.partition("=")[::2] for part in text.split(","))
@@ -112,11 +113,10 @@ def _nest_fields(pairs: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in pairs.items():
         *path, name = key.split(".")
         inner = nested
-        for depth, part in enumerate(path, 1):
-            whole = ".".join(path[:depth])
-            if whole in pairs:
-                raise ValueError(f"--headset: {key!r} and {whole!r} cannot both be given")
+        for part in path:
             inner = inner.setdefault(part, {})
+            if type(inner) is not dict:
+                raise ValueError(f"--headset: {part!r} and {key!r} cannot both be given")
         inner[name] = value
     return nested
 
@@ -129,16 +129,8 @@ def _check_fields(pairs: Mapping[str, Any], kind: type[msgspec.Struct], path: st
             known = ", ".join(f"{path}{one}" for one in sorted(fields))
             raise ValueError(f"--headset: unknown field '{path}{name}'; fields: {known}")
         inner = fields[name]
-        whole = not (isinstance(inner, type) and issubclass(inner, msgspec.Struct))
-        if whole and isinstance(value, Mapping):
-            raise ValueError(f"--headset: '{path}{name}' has no fields of its own")
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and isinstance(inner, type) and issubclass(inner, msgspec.Struct):
             _check_fields(value, inner, f"{path}{name}.")
-
-
-def _read(path: str) -> bytes:
-    with open(path, "rb") as file:
-        return file.read()
 
 
 def _print_json(report: HeadsetReport, *, final: bool = False) -> None:

@@ -13,8 +13,6 @@ import pytest
 from iris_session.bench.cloud_camera import (
     BOXES,
     ROOM,
-    CloudCase,
-    make_rig,
     make_room_camera,
     make_room_pose,
     render_room,
@@ -43,13 +41,6 @@ def test_pictures_show_the_room_with_noise_and_holes() -> None:
     again, other = render_room(camera, pose, 1), render_room(camera, pose, 2)
     assert np.array_equal(picture.depth, again.depth)
     assert not np.array_equal(picture.depth, other.depth)
-
-
-def test_cameras_share_the_pixels_of_a_cloud() -> None:
-    for n in (1, 2):
-        rig = make_rig(CloudCase("room", n, 40_000, 50_000, 0.01), 0)
-        assert len(rig.pictures) == n
-        assert sum(shown[0].depth.size for shown in rig.pictures) == pytest.approx(40_000, rel=0.05)
 
 
 def test_a_cloud_other_than_that_of_the_source_is_found() -> None:
@@ -82,13 +73,6 @@ def test_clouds_of_a_coarser_class_do_not_count_as_delivered(level: int, hz: flo
     got: Any = SimpleNamespace(logs={"a": log}, begin_ns=0, summarize=lambda *_: {})
     runs: Any = [{"captures": {str(n): n for n in frames}, "encode_ms": [1.0], "refused": 0}]
     assert summarize(got, plan, runs, cloud, 30)["delivered_hz_min"] == hz
-
-
-def test_points_move_and_depend_on_the_seed_only() -> None:
-    one, same, other = MovingCloud(100, 1), MovingCloud(100, 1), MovingCloud(100, 2)
-    assert np.array_equal(one.compute_positions(0.5), same.compute_positions(0.5))
-    assert not np.array_equal(one.compute_positions(0.5), other.compute_positions(0.5))
-    assert np.abs(one.compute_positions(0.5) - one.compute_positions(0.0)).max() > 0.05
 
 
 def test_without_recorded_frames_the_rest_is_measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iris_session.bench import cloth_motion as motion_module
+from iris_session.bench import deformable as motion_module
 from iris_session.bench.deformable import (
     ClothMotion,
     _ClothSource,

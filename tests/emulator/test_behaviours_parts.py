@@ -31,7 +31,6 @@ from iris_session.emulator.behaviours.hand import (
     HandMovement,
 )
 from iris_session.emulator.behaviours.objects import (
-    COMMON_OBJECTS,
     HandoverObject,
     compute_grasps,
     compute_tilt,
@@ -289,10 +288,3 @@ def test_grasps_come_from_above_with_either_face_up(yaw: float, flipped: bool, g
     assert abs(closing[1]) == pytest.approx(1.0)  # across the handle
     assert quat_angle(pose[1], like) <= math.pi / 2 + 1e-9
     assert pose[0][2] == pytest.approx(0.019)
-
-
-def test_described_objects_are_complete() -> None:
-    assert set(COMMON_OBJECTS) >= {"hammer", "board", "object1"}
-    assert find_object("object3") is find_object("hammer")
-    with pytest.raises(ValueError, match="Known objects"):
-        find_object("objective")

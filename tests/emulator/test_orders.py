@@ -38,14 +38,6 @@ def test_invalid_orders_are_reported(pipe: tuple[int, int], capsys: pytest.Captu
     assert len(error) < 2000
 
 
-def test_endless_line_is_discarded(pipe: tuple[int, int]) -> None:
-    orders = DisturbanceReader(pipe[0], ["ann"])
-    for _ in range(50):
-        os.write(pipe[1], b"x" * 4000)
-        assert orders() == []
-    assert len(orders._rest) <= MAX_LINE
-
-
 def test_end_of_file_ends_the_orders() -> None:
     reader, writer = os.pipe()
     orders = DisturbanceReader(reader, ["ann"])
