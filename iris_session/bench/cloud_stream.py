@@ -31,7 +31,7 @@ from iris_session.bench.harness import (
     plan_intervals,
     plan_rounds,
 )
-from iris_session.bench.media_clients import UNCHECKED
+from iris_session.bench.media_clients import UNCHECKED, sum_counts
 from iris_session.bench.media_clients import MediaColumn as Column
 from iris_session.bench.plugins import POLL_S, Plugin, PluginProcess
 from iris_session.bench.report import Bar, BenchError, BenchReport, compute_percentile, make_bar
@@ -277,8 +277,7 @@ def summarize(
     fast = [one[one[:, Column.LEVEL] == 0] for one in fast]  # a coarser class is less than was asked for
     rows = np.concatenate(fast)
     length_s = sum(one.length_s for one in streamed)
-    counts = np.sum([log["counts"] for log in logs], axis=0).tolist()
-    superseded, dropped, malformed, overflow, heads = counts
+    counts, heads = sum_counts(logs)
     whole = clouds[clouds[:, Column.LEVEL] == 0]
     encode_ms = np.concatenate([run["encode_ms"] for run in runs])
     errors_m, stated_m = _compare(clouds, runs, cloud, hz)
@@ -308,10 +307,7 @@ def summarize(
         results["state_age_ms_p99_slow_lowered"] = compute_age_p99_ms(logs, got.begin_ns, lowered_s, slow.end_s)
     return results | {
         "frames_refused": sum(run["refused"] for run in runs),
-        "frames_superseded": superseded,
-        "frames_dropped": dropped,
-        "frames_malformed": malformed,
-        "frames_not_logged": overflow,
+        **counts,
         **got.summarize("late_tick_share", "scheduling", "drops"),
     }
 
@@ -351,15 +347,13 @@ def _make_bars(results: dict[str, Any], hz: int, mbit: float) -> list[Bar]:
     if mbit:
         bars.append(make_bar(results, "lower_class_after_s", "<=", MAX_LOWER_S))
         bars.append(make_bar(results, "longest_gap_s", "<=", MAX_LOWER_S))
-        compared = (("state_age_ms_p99_slow_lowered", "state_age_ms_p99_slow_without"),)
+        key, without = "state_age_ms_p99_slow_lowered", "state_age_ms_p99_slow_without"
     else:
         bars.append(make_bar(results, "delivered_hz_min", ">=", hz * 58.0 / 60.0))
         bars.append(make_bar(results, "decode_ms_p50", "<", MAX_DECODE_MS))
-        compared = (("state_age_ms_p99", "state_age_ms_p99_without"),)
-    for key, without in compared:
-        alone = results[without]
-        bars.append(make_bar(results, key, "<=", round(alone + max(0.2 * alone, 1.0), 3)))
-    return bars
+        key, without = "state_age_ms_p99", "state_age_ms_p99_without"
+    alone = results[without]
+    return [*bars, make_bar(results, key, "<=", round(alone + max(0.2 * alone, 1.0), 3))]
 
 
 # --- evaluation -------------------------------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import Log, Measurement, assign_links, group_clients, measure
 from iris_session.bench.media_clients import MediaColumn as Column
+from iris_session.bench.media_clients import sum_counts
 from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, make_link_report
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.names import BudgetClass
@@ -149,7 +150,7 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
     ages, decode = (frames[:, Column.HANDED] - frames[:, Column.CAPTURE]) * 1e-6, frames[:, Column.DECODED] * 1e-6
     if not len(ages) or not len(spent):
         raise BenchError("no frame of the cloth reached a client within the window")
-    superseded, dropped, malformed, overflow, heads = np.sum([log["counts"] for log in logs], axis=0).tolist()
+    counts, heads = sum_counts(logs)
     sent = sizes.sum() + np.count_nonzero(sizes) * heads / len(ages)
     return {
         "encode_ms_p50": compute_percentile(spent[:, 0], 50),
@@ -165,10 +166,7 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
         "bytes_per_frame": round(float(sizes[sizes > 0].mean()), 1),
         "frames_encoded": len(spent),
         "frames_refused": source.refused,
-        "frames_superseded": superseded,
-        "frames_dropped": dropped,
-        "frames_malformed": malformed,
-        "frames_not_logged": overflow,
+        **counts,
         **got.summarize("late_tick_share", "late_causes", "scheduling", "drops"),
     }
 

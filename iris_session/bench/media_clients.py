@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import zlib
 from abc import abstractmethod
+from collections.abc import Iterable, Mapping
 from enum import IntEnum, auto
 from pathlib import Path
 from typing import Any, Final
@@ -34,6 +35,13 @@ class MediaColumn(IntEnum):
     SIZE = auto()
     POINTS = auto()
     LEVEL = auto()
+
+
+def sum_counts(logs: Iterable[Mapping[str, NDArray[Any]]]) -> tuple[dict[str, int], int]:
+    """Return the frames that were not delivered or not logged, by key of a report, and the bytes of heads."""
+    *counts, heads = np.sum([log["counts"] for log in logs], axis=0).tolist()
+    keys = ("superseded", "dropped", "malformed", "not_logged")
+    return {f"frames_{key}": count for key, count in zip(keys, counts, strict=True)}, heads
 
 
 class MediaClient(BenchClient):

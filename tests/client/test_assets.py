@@ -293,6 +293,3 @@ def test_decode_function_may_use_the_client_until_it_is_closed(threaded: Threade
     assert not closing.is_alive()
     assert fetch.failed[ASSET].reason == "closed"
     assert seen == [(5, {})]
-
-
-# --- results ----------------------------------------------------------------------------------------------------------
