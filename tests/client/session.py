@@ -372,8 +372,7 @@ class ClientSession:
         self.simulation.call_at(self.simulation.now_ns + STEP_NS, self._step)
         if self.paused:
             return
-        if not self.front.alive:
-            self.front.restart()
+        self.front.poll(self.now_ns)  # it is started again when it has ended
         pending, self._pending = self._pending, []
         entries = [*pending, *self.front.link.poll()]
         self.entries += entries
