@@ -129,7 +129,9 @@ def _check_fields(pairs: Mapping[str, Any], kind: type[msgspec.Struct], path: st
             known = ", ".join(f"{path}{one}" for one in sorted(fields))
             raise ValueError(f"--headset: unknown field '{path}{name}'; fields: {known}")
         inner = fields[name]
-        if isinstance(value, Mapping) and isinstance(inner, type) and issubclass(inner, msgspec.Struct):
+        if isinstance(value, Mapping):
+            if not (isinstance(inner, type) and issubclass(inner, msgspec.Struct)):
+                raise ValueError(f"--headset: {path + name!r} has no fields of its own")
             _check_fields(value, inner, f"{path}{name}.")
 
 
