@@ -129,9 +129,10 @@ def _check_fields(pairs: Mapping[str, Any], kind: type[msgspec.Struct], path: st
             known = ", ".join(f"{path}{one}" for one in sorted(fields))
             raise ValueError(f"--headset: unknown field '{path}{name}'; fields: {known}")
         inner = fields[name]
+        whole = not (isinstance(inner, type) and issubclass(inner, msgspec.Struct))
+        if whole and isinstance(value, Mapping):
+            raise ValueError(f"--headset: '{path}{name}' has no fields of its own")
         if isinstance(value, Mapping):
-            if not (isinstance(inner, type) and issubclass(inner, msgspec.Struct)):
-                raise ValueError(f"--headset: {path + name!r} has no fields of its own")
             _check_fields(value, inner, f"{path}{name}.")
 
 
