@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import inspect
 import sys
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
-from iris_session.cli.common import CommandError, add_command, add_json_option, parse_seconds, print_json
+from iris_session.cli.common import CommandError, add_command, add_json_option, parse_seconds, print_result
 
 if TYPE_CHECKING:
     from iris_session.bench.report import BenchReport
@@ -18,58 +20,41 @@ Limits = dict[str, tuple[int, int]]
 
 
 class _Benchmark(NamedTuple):
-    """One benchmark: `run_NAME` in a module of `iris_session.bench`.
+    """One benchmark: `run_NAME` in a module of `iris_session.bench`, whose parameters are the options that it takes.
 
     Attributes:
-        options: Options that it takes, in words; those that are not given have the default of the function.
         limits: Lowest and highest values that a scene or a session can have.
         refused: Options that it does not take, and why. Other options are ignored.
     """
 
-    options: str
     limits: Limits
     refused: str = ""
     why: str = ""
 
 
-_LINK: Final = "seconds seed curve profile"
 _CLIENTS: Final[Limits] = {"clients": (1, 64)}
 _BODIES: Final[Limits] = {"bodies": (1, 2000)}
 _VERTICES: Final[Limits] = {"vertices": (16, 10_000)}
 _BOTH: Final = "curve profile"
 _BENCHMARKS: Final = {
-    "state": _Benchmark(f"clients bodies {_LINK}", _CLIENTS | _BODIES),
-    "input": _Benchmark(f"operators robots observers {_LINK}", {"robots": (1, 12), "observers": (0, 64)}),
-    "slow-client": _Benchmark(f"clients bodies {_LINK}", {"clients": (3, 64), **_BODIES}),
-    "alignment": _Benchmark("pairs seed", {"pairs": (10, 100_000)}),
-    "deformable": _Benchmark(f"vertices clients {_LINK}", _CLIENTS | _VERTICES),
-    "cloud": _Benchmark(
-        "points cameras seconds seed beside",
-        {"points": (10_000, 20_000_000), "cameras": (1, 4)},
-        _BOTH,
-        "it has no other clients",
-    ),
+    "state": _Benchmark(_CLIENTS | _BODIES),
+    "input": _Benchmark({"robots": (1, 12), "observers": (0, 64)}),
+    "slow-client": _Benchmark({"clients": (3, 64), **_BODIES}),
+    "alignment": _Benchmark({"pairs": (10, 100_000)}),
+    "deformable": _Benchmark(_CLIENTS | _VERTICES),
+    "cloud": _Benchmark({"points": (10_000, 20_000_000), "cameras": (1, 4)}, _BOTH, "it has no other clients"),
     "cloud-stream": _Benchmark(
-        "points hz clients seconds mbit seed curve",
         {"clients": (1, 16), "points": (1000, 1_000_000), "hz": (1, 120), "mbit": (0, 10_000)},
         "profile",
         "--mbit limits its links",
     ),
     "join": _Benchmark(
-        "objects assets_mb clients seconds seed",
-        {**_CLIENTS, "objects": (1, 2000), "assets_mb": (1, 2000)},
-        _BOTH,
-        "its bars are for plain loopback",
+        {**_CLIENTS, "objects": (1, 2000), "assets_mb": (1, 2000)}, _BOTH, "its bars are for plain loopback"
     ),
-    "stop": _Benchmark("seconds", {}, _BOTH, "it uses no network"),
-    "record": _Benchmark("seconds kills seed", {"kills": (1, 1000)}, _BOTH, "its bars are for loopback"),
+    "stop": _Benchmark({}, _BOTH, "it uses no network"),
+    "record": _Benchmark({"kills": (1, 1000)}, _BOTH, "its bars are for loopback"),
     # A tab, one that is disturbed and one that is not; a gateway has three quarters of all connections.
-    "web": _Benchmark(
-        "clients vertices seconds seed curve tab",
-        {"clients": (3, 48), **_VERTICES},
-        "profile",
-        "its bars are for loopback",
-    ),
+    "web": _Benchmark({"clients": (3, 48), **_VERTICES}, "profile", "its bars are for loopback"),
 }
 #: What limits a number.
 _NOTES: Final = {("input", "operators"): ", one robot each", ("slow-client", "clients"): ", two of which are slow"}
@@ -168,28 +153,31 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.bench.report import BenchError, measure_parallel_speed, read_stolen_time
     from iris_session.netsim.profiles import load_profile
 
-    options = _select_options(arguments)
+    name = arguments.bench.replace("-", "_")
+    function = getattr(importlib.import_module(f"iris_session.bench.{name}"), f"run_{name}")
+    options = _select_options(arguments, inspect.signature(function).parameters)
     if arguments.profile:
         load_profile(arguments.profile)  # fails before anything is started
+
+    def progress(text: str) -> None:
+        print(f"bench {arguments.bench}: {text}", file=sys.stderr, flush=True)
+
     speed = measure_parallel_speed()
     stolen_s, all_s = read_stolen_time()
     try:
-        report = _run_benchmark(arguments.bench, options)
+        report: BenchReport = function(**options, progress=progress)
     except BenchError as error:
         raise CommandError(str(error), 1) from error
     stolen_after_s, all_after_s = read_stolen_time()
     share = (stolen_after_s - stolen_s) / max(all_after_s - all_s, 1e-9)
     speed = min(speed, measure_parallel_speed())
     report = msgspec.structs.replace(report, stolen_share=share, parallel_speed=speed)
-    if arguments.json:
-        print_json(report.as_dict())
-    else:
-        print(report.format())
+    print_result(arguments, report.as_dict(), report.format().split("\n"))
     return 0 if report.ok or not arguments.check else 1
 
 
-def _select_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of the benchmark that are given or have a default.
+def _select_options(arguments: argparse.Namespace, names: Iterable[str]) -> dict[str, Any]:
+    """Return the options of the benchmark, of these names, that are given or have a default.
 
     Raises:
         CommandError: The benchmark does not take one of the others, or a scene or session cannot have a number.
@@ -198,7 +186,7 @@ def _select_options(arguments: argparse.Namespace) -> dict[str, Any]:
     if any(getattr(arguments, name) for name in one.refused.split()):
         refused = " or ".join(f"--{name}" for name in one.refused.split())
         raise CommandError(f"bench {arguments.bench} cannot be combined with {refused}: {one.why}")
-    options = {name: value for name in one.options.split() if (value := getattr(arguments, name)) is not None}
+    options = {name: value for name in names if (value := getattr(arguments, name, None)) is not None}
     limits = dict(one.limits)
     if "operators" in options:
         limits["operators"] = (1, arguments.robots)
@@ -209,14 +197,3 @@ def _select_options(arguments: argparse.Namespace) -> dict[str, Any]:
                 f"--{name.replace('_', '-')} {options[name]}: bench {arguments.bench} takes {low} to {high}{note}"
             )
     return options
-
-
-def _run_benchmark(name: str, options: dict[str, Any]) -> BenchReport:
-    name = name.replace("-", "_")
-
-    def progress(text: str) -> None:
-        print(f"bench {name.replace('_', '-')}: {text}", file=sys.stderr, flush=True)
-
-    module = importlib.import_module(f"iris_session.bench.{name}")
-    report: BenchReport = getattr(module, f"run_{name}")(**options, progress=progress)
-    return report

@@ -7,14 +7,13 @@ file, which it may fit to each other by ICP, or check. The mathematics is in `an
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from anchors.camera_calibration import (
     CalibrationPicture,
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from anchors.camera import CameraModel
-    from anchors.depth_calibration import PlacedCamera, PoseCheck
+    from anchors.depth_calibration import PlacedCamera
     from anchors.pose import PoseTuple
     from anchors.sheet import Sheet
     from iris_session.cloud.camera_file import CameraSettings, CloudSettings
@@ -49,8 +48,9 @@ if TYPE_CHECKING:
 
     Floats = npt.NDArray[np.float64]
 
+T = TypeVar("T")
 PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
-COLUMNS: Final = ("image", "x", "y", "z", "qw", "qx", "qy", "qz")
+COLUMNS: Final = "image,x,y,z,qw,qx,qy,qz"
 #: Time for a camera to give its frames [s].
 FRAMES_S: Final = 20.0
 #: Time for the session to name its anchors [s].
@@ -68,34 +68,27 @@ def _add_sheet_options(parser: argparse.ArgumentParser, *, is_required: bool, at
     """Add `--sheet` and `--at`. `at`: help of the latter."""
     parser.add_argument(
         "--sheet",
-        type=parse_named_length,
+        type=_make_named_type(parse_length),
         action="append",
         required=is_required,
         default=[],
         metavar="ID=LENGTH",
         help="id of a sheet and the printed edge of its code: table=160mm; repeatable",
     )
-    parser.add_argument(
-        "--at", type=parse_named_pose, action="append", default=[], metavar="ID=X,Y,Z,QW,QX,QY,QZ", help=at
-    )
+    pose = _make_named_type(parse_pose)
+    parser.add_argument("--at", type=pose, action="append", default=[], metavar="ID=X,Y,Z,QW,QX,QY,QZ", help=at)
 
 
-def parse_named_length(text: str) -> tuple[str, float]:
-    """Parse `ID=LENGTH`, such as `table=160mm`."""
-    name, _, rest = text.rpartition("=")
-    return _check_sheet_id(name, text), parse_length(rest)
+def _make_named_type(parse: Callable[[str], T]) -> Callable[[str], tuple[str, T]]:
+    """Return a type of options: the id of a sheet, `=`, and what `parse` takes."""
 
+    def parse_named(text: str) -> tuple[str, T]:
+        name, _, rest = text.rpartition("=")
+        if not name:
+            raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=160mm")
+        return name, parse(rest)
 
-def parse_named_pose(text: str) -> tuple[str, PoseTuple]:
-    """Parse `ID=X,Y,Z,QW,QX,QY,QZ`."""
-    name, _, rest = text.rpartition("=")
-    return _check_sheet_id(name, text), parse_pose(rest)
-
-
-def _check_sheet_id(name: str, text: str) -> str:
-    if not name:
-        raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=160mm")
-    return name
+    return parse_named
 
 
 def make_sheets(sizes: Iterable[tuple[str, float]]) -> list[Sheet]:
@@ -255,20 +248,20 @@ def _check_options(arguments: argparse.Namespace, sheets: list[Sheet]) -> None:
 def read_poses(path: Path) -> dict[str, PoseTuple]:
     """Read `T_base_ee` by name of the picture."""
     try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines(), skipinitialspace=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
         raise CommandError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if not rows or tuple(word.strip() for word in rows[0]) != COLUMNS:
-        raise CommandError(f"{path}: the first line must be {','.join(COLUMNS)}")
+    if not lines or lines[0].replace(" ", "") != COLUMNS:
+        raise CommandError(f"{path}: the first line must be {COLUMNS}")
     poses: dict[str, PoseTuple] = {}
-    for number, row in enumerate(rows[1:], 2):
-        if not any(word.strip() for word in row):
+    for number, line in enumerate(lines[1:], 2):
+        if not line.strip():
             continue
-        name = row[0].strip()
+        name, _, pose = line.partition(",")
         if name in poses:
             raise CommandError(f"{path}, line {number}: a second pose for {name}")
         try:
-            poses[name] = parse_pose(",".join(row[1:]))
+            poses[name] = parse_pose(pose)
         except argparse.ArgumentTypeError as error:
             raise CommandError(f"{path}, line {number}: must be the name of a picture and its pose: {error}") from None
     return poses
@@ -429,27 +422,24 @@ def _print_check(arguments: argparse.Namespace, settings: CloudSettings, placed:
     """Print whether the poses of the camera file fit those that were measured. Return 1 if one does not."""
     from anchors.depth_calibration import check_pose
 
-    checks: dict[str, PoseCheck] = {}
+    cameras: dict[str, dict[str, Any]] = {}
     for camera in settings.cameras:
         assert camera.pose is not None  # the camera file was checked
         error_mm = _UNKNOWN_ERROR_MM if camera.error_mm is None else camera.error_mm
-        checks[camera.name] = check_pose(camera.pose.to_matrix(), 1e-3 * error_mm, placed[camera.name])
-    is_well = all(one.fits for one in checks.values())
-    cameras = {
-        name: {
+        one = check_pose(camera.pose.to_matrix(), 1e-3 * error_mm, placed[camera.name])
+        cameras[camera.name] = {
             "fits": one.fits,
             "shift_mm": 1e3 * one.shift_m,
             "turn_deg": math.degrees(one.turn_rad),
             "off_mm": 1e3 * one.off_m,
             "limit_mm": 1e3 * one.limit_m,
         }
-        for name, one in checks.items()
-    }
+    is_well = all(found["fits"] for found in cameras.values())
     lines = (
-        f"{name} {'fits' if one['fits'] else 'was moved: put it back, or calibrate it again'}. Off by "
-        f"{one['shift_mm']:.1f} mm, {one['turn_deg']:.2f} deg, its points by {one['off_mm']:.1f} mm; stated errors "
-        f"explain {one['limit_mm']:.1f} mm"
-        for name, one in cameras.items()
+        f"{name} {'fits' if found['fits'] else 'was moved: put it back, or calibrate it again'}. Off by "
+        f"{found['shift_mm']:.1f} mm, {found['turn_deg']:.2f} deg, its points by {found['off_mm']:.1f} mm; stated "
+        f"errors explain {found['limit_mm']:.1f} mm"
+        for name, found in cameras.items()
     )
     print_result(arguments, {"ok": is_well, "cameras": cameras}, lines)
     return 0 if is_well else 1

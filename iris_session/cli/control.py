@@ -11,8 +11,8 @@ import getpass
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.cli.common import (
     CommandError,
@@ -43,13 +43,8 @@ ALL_ROLES: Final = (Role.OBSERVER, *DRIVERS)
 _ADDRESS: Final = re.compile(r"iris://.*|\d+\.\d+\.\d+\.\d+(:\d+)?|[\w.-]+:\d+|\[[0-9a-fA-F:]+\](:\d+)?")
 
 
-class Outcome(NamedTuple):
-    """Result of a command: one line for people, and fields for `--json`."""
-
-    text: str
-    fields: dict[str, Any]
-
-
+#: Result of a command: one line for people, and fields for `--json`.
+Outcome = tuple[str, dict[str, Any]]
 Action = Callable[["Client", argparse.Namespace], Outcome]
 
 
@@ -145,7 +140,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         with _join_session(arguments) as client:
             result["session"] = client.address
-            outcome = arguments.act(client, arguments)
+            text, fields = arguments.act(client, arguments)
     except (DeniedError, RefusedError, NotConnectedError, RequestTimeoutError, CommandError) as error:
         text = str(error)
         if isinstance(error, RefusedError) and error.code == DenialReason.ROLE and Role.DIRECTOR in arguments.roles:
@@ -158,7 +153,7 @@ def run(arguments: argparse.Namespace) -> int:
             reason = denied or (error.code if isinstance(error, RefusedError) else "no_answer")
             print_json({**result, "ok": False, "reason": reason, "error": text})
         return error.status if isinstance(error, CommandError) else 1
-    print_result(arguments, {**result, **outcome.fields}, [outcome.text])
+    print_result(arguments, result | fields, [text])
     return 0
 
 
@@ -170,21 +165,16 @@ def _join_session(arguments: argparse.Namespace) -> Iterator[Client]:
     if stops and _ADDRESS.fullmatch(" ".join(arguments.reason)):
         raise CommandError(f"{arguments.reason[0]} is an address, not a reason: give it with --address")
     for role in arguments.roles:
-        client = make_client(arguments, role, f"{_get_user_name()} (terminal)")
-        try:
-            if stops:
-                _begin_stop(client, " ".join(arguments.reason))
-            client.connect()
-        except RefusedError as error:
-            client.close()
-            if error.code != DenialReason.ROLE or role == arguments.roles[-1]:
-                raise
-        except BaseException:
-            client.close()
-            raise
-        else:
-            with client:
-                yield client
+        with closing(make_client(arguments, role, f"{_get_user_name()} (terminal)")) as client:
+            try:
+                if stops:
+                    _begin_stop(client, " ".join(arguments.reason))
+                client.connect()
+            except RefusedError as error:
+                if error.code != DenialReason.ROLE or role == arguments.roles[-1]:
+                    raise
+                continue
+            yield client
             return
 
 
@@ -222,13 +212,13 @@ def stop_session(client: Client, arguments: argparse.Namespace) -> Outcome:
     given = (("--address", arguments.address), ("--session", arguments.session))
     where = "".join(f" {option} {value}" for option, value in given if value)
     text = f"E-STOP at {client.address}: every robot holds; continue with `iris-session clear-estop{where}`"
-    return Outcome(text, {"estop": True})
+    return text, {"estop": True}
 
 
 def clear_session(client: Client, _: argparse.Namespace) -> Outcome:
     """End the e-stop, and say who had stopped. A stop that came after the list was read stays."""
     if not client.mirror.estop:
-        return Outcome("there is no e-stop", {"estop": False, "cleared": []})
+        return "there is no e-stop", {"estop": False, "cleared": []}
     stops = client.status().stops
     until_s = time.monotonic() + TIMEOUT_S
     while not stops and time.monotonic() < until_s:  # the status is a moment older than the event
@@ -240,7 +230,7 @@ def clear_session(client: Client, _: argparse.Namespace) -> Outcome:
     who = "; ".join(f"{one.name or 'a connection without a name'}: {one.reason or 'no reason given'}" for one in stops)
     cleared = [{"stop_seq": one.stop_seq, "name": one.name, "reason": one.reason} for one in stops]
     text = f"e-stop cleared ({who}): robots move when they are clutched again"
-    return Outcome(text, {"estop": False, "cleared": cleared})
+    return text, {"estop": False, "cleared": cleared}
 
 
 def control_physics(client: Client, arguments: argparse.Namespace) -> Outcome:
@@ -249,7 +239,7 @@ def control_physics(client: Client, arguments: argparse.Namespace) -> Outcome:
     text = {"pause": "paused", "resume": "running", "reset": "reset to the initial state"}[arguments.action]
     if client.mirror.estop:
         text += "; the e-stop is still active: clear-estop"
-    return Outcome(text, {"action": arguments.action})
+    return text, {"action": arguments.action}
 
 
 def assign_robots(client: Client, arguments: argparse.Namespace) -> Outcome:
@@ -257,10 +247,8 @@ def assign_robots(client: Client, arguments: argparse.Namespace) -> Outcome:
     person = find_participant(client, arguments.person).id
     robots = _split_names([arguments.robots])
     leases = client.assign(robots, person)
-    return Outcome(
-        f"{', '.join(robots)} -> {client.mirror.participants[person].name} ({person})",
-        {"participant": person, "robots": [lease.target for lease in leases] or robots},
-    )
+    text = f"{', '.join(robots)} -> {client.mirror.participants[person].name} ({person})"
+    return text, {"participant": person, "robots": [lease.target for lease in leases] or robots}
 
 
 def rename_participant(client: Client, arguments: argparse.Namespace) -> Outcome:
@@ -270,7 +258,7 @@ def rename_participant(client: Client, arguments: argparse.Namespace) -> Outcome
     client.request(Rename(0, person, arguments.name))
     client.wait_for(lambda one: _find_name(one, person) != before, NEWS_S)
     name = _find_name(client, person)
-    return Outcome(f"{person}: {before} is now {name}", {"participant": person, "name": name})
+    return f"{person}: {before} is now {name}", {"participant": person, "name": name}
 
 
 def _find_name(client: Client, person: str) -> str:
@@ -283,14 +271,14 @@ def set_role(client: Client, arguments: argparse.Namespace) -> Outcome:
     person = find_participant(client, arguments.person).id
     client.request(SetRole(0, person, arguments.role))
     name = _find_name(client, person)
-    return Outcome(f"{name} ({person}) is now {arguments.role}", {"participant": person, "role": arguments.role})
+    return f"{name} ({person}) is now {arguments.role}", {"participant": person, "role": arguments.role}
 
 
 def release_robots(client: Client, arguments: argparse.Namespace) -> Outcome:
     """Free robots."""
     robots = _split_names(arguments.robots)
     client.assign(robots)
-    return Outcome(f"{', '.join(robots)}: free", {"robots": robots})
+    return f"{', '.join(robots)}: free", {"robots": robots}
 
 
 def _split_names(words: Sequence[str]) -> list[str]:
@@ -303,7 +291,7 @@ def set_modes(client: Client, arguments: argparse.Namespace) -> Outcome:
     robots = _split_names(arguments.robots) or sorted(client.mirror.robots)
     for robot in robots:
         client.set_mode(robot, arguments.mode)
-    return Outcome(f"{', '.join(robots)}: mode {arguments.mode}", {"robots": robots, "mode": arguments.mode})
+    return f"{', '.join(robots)}: mode {arguments.mode}", {"robots": robots, "mode": arguments.mode}
 
 
 def control_episode(client: Client, arguments: argparse.Namespace) -> Outcome:
@@ -311,7 +299,7 @@ def control_episode(client: Client, arguments: argparse.Namespace) -> Outcome:
     before = client.mirror.episode
     client.episode(arguments.action, arguments.label)
     if arguments.action == EpisodeAction.RESET:
-        return Outcome("scene reset, no episode runs", {"action": arguments.action})
+        return "scene reset, no episode runs", {"action": arguments.action}
 
     def is_over(one: Client) -> bool:  # the reply may come before the event; `rerecord` makes two events
         now = one.mirror.episode
@@ -322,14 +310,12 @@ def control_episode(client: Client, arguments: argparse.Namespace) -> Outcome:
     episode = client.mirror.episode
     if episode is None:
         raise CommandError(f"the session accepted {arguments.action}, but announced no episode", 1)
-    return Outcome(
-        f"episode {episode.number}: {episode.state}",
-        {"action": arguments.action, "number": episode.number, "state": episode.state},
-    )
+    fields = {"action": arguments.action, "number": episode.number, "state": episode.state}
+    return f"episode {episode.number}: {episode.state}", fields
 
 
 def place_marker(client: Client, arguments: argparse.Namespace) -> Outcome:
     """Put a note into the recording."""
     text = " ".join(arguments.text)
     client.marker(text)
-    return Outcome(f"noted: {text}", {"text": text})
+    return f"noted: {text}", {"text": text}

@@ -76,9 +76,14 @@ def run(arguments: argparse.Namespace) -> int:
             "--drift, --bump-at and --glance-every cannot be combined with --headset; use its fields, for example "
             "--headset name=ann,model.drift_m_per_min=0.03,bump_at_s=20,glance_every_s=5"
         )
+    common = f",glance_every_s={arguments.glance_every}"  # fields of all headsets of `--count`
+    if arguments.bump_at:
+        common += ",bump_at_s=" + "/".join(map(str, arguments.bump_at))
+    if arguments.drift is not None:
+        common += f",model.drift_m_per_min={arguments.drift / 1000.0}"
     headsets = arguments.headset or [
         f"name={arguments.behaviour}{i + 1}-{os.getpid()},behaviour={arguments.behaviour},robot={arguments.robot},"
-        f"seed={arguments.seed + i}{_headset_options(arguments)}"
+        f"seed={arguments.seed + i}{common}"
         for i in range(arguments.count)
     ]
     options = ["--address", arguments.address, "--session", arguments.session, "--code", arguments.code]
@@ -96,13 +101,3 @@ def run(arguments: argparse.Namespace) -> int:
         except CommandError as error:
             print_error(str(error))
     return status
-
-
-def _headset_options(arguments: argparse.Namespace) -> str:
-    """Return the common options of all headsets of `--count`, as fields of `--headset`."""
-    text = f",glance_every_s={arguments.glance_every}"
-    if arguments.bump_at:
-        text += ",bump_at_s=" + "/".join(map(str, arguments.bump_at))
-    if arguments.drift is not None:
-        text += f",model.drift_m_per_min={arguments.drift / 1000.0}"
-    return text

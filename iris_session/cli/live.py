@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from iris_session.cli.common import to_printable
@@ -142,18 +142,16 @@ def _render_table(title: str, status: dict[str, Any], events: list[str], footer:
     )
 
 
-def _parse_refreshes(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
-    for line in lines:
-        try:
+def _read_refreshes() -> Iterator[dict[str, Any]]:
+    for line in sys.stdin:
+        with suppress(ValueError):  # a refresh that was cut because the pipe was full
             yield json.loads(line)
-        except ValueError:  # a refresh that was cut because the pipe was full
-            continue
 
 
 def main(title: str, footer: str = "") -> int:
     """Draw refreshes until standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session's process decides when this ends
-    refreshes = _parse_refreshes(iter(sys.stdin))
+    refreshes = _read_refreshes()
     if sys.stdout.isatty():
         try:
             from rich.live import Live

@@ -22,12 +22,9 @@ from iris_session.cli import (
     keys,
     pair,
     recording,
-    robots,
     scene,
     serve,
-    sessions,
     status,
-    verify,
     view,
     web,
 )
@@ -63,8 +60,7 @@ _EPILOG = """examples:
 
 #: In the order of `--help`.
 _MODULES = (
-    demo, serve, pair, web, keys, sessions, status, control, doctor, view, verify, recording, emulate, robots, scene,
-    anchors, cloud, bench,
+    demo, serve, pair, web, keys, status, control, doctor, view, recording, emulate, scene, anchors, cloud, bench,
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""`iris-session scene inspect` and `scene export`: show what clients receive of a scene, write it as GLB.
+"""`iris-session robots`, `scene inspect`, `scene export`: the robots of a model, what clients receive of a scene, GLB.
 
 Also the scene arguments that `serve` shares: MuJoCo reads MJCF, MJB and named scenes; every other file is composed
 without it (`SceneBuilder`).
@@ -18,6 +18,7 @@ from iris_session.cli.common import (
     CommandError,
     add_command,
     add_json_option,
+    explain_no_robots,
     make_number_type,
     open_scene,
     print_result,
@@ -40,7 +41,8 @@ class _ParsedScene(NamedTuple):
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `scene`."""
+    """Add the commands `robots` and `scene`."""
+    _register_robots(commands)
     parser = add_command(
         commands,
         "scene",
@@ -79,6 +81,37 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     _add_scene_arguments(export)
     export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")
     add_json_option(export)
+
+
+def _register_robots(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = add_command(
+        commands,
+        "robots",
+        run_robots,
+        help="show the robots found in a model, as TOML to edit",
+        description="Print the robots found in a model. Edit the output and pass it as `serve --robots FILE`.",
+        examples="""
+            iris-session robots scene.xml > robots.toml
+            iris-session robots handover
+        """,
+    )
+    parser.add_argument("scene", help="MJCF or MJB file, or the name of a scene (see `iris-session serve --help`)")
+    add_json_option(parser)
+
+
+def run_robots(arguments: argparse.Namespace) -> int:
+    """Print the result of `find_robots`. An ambiguous model is an error that carries the same TOML."""
+    from iris_session.physics import dump_robots_toml, find_objects, find_robots
+
+    model = open_scene(arguments.scene).model
+    robots = find_robots(model)
+    objects = find_objects(model)
+    if not robots:
+        print(explain_no_robots(model), file=sys.stderr)
+    first = f"# {len(robots)} robots, {len(objects)} free objects: {', '.join(o.name for o in objects) or 'none'}"
+    lines = [first, *dump_robots_toml(robots).split("\n")]
+    print_result(arguments, {"robots": robots, "objects": objects}, lines)
+    return 0
 
 
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:

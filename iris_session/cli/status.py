@@ -1,4 +1,4 @@
-"""`iris-session status`: the status of a session on one screen, as JSON, or as metrics for Prometheus."""
+"""`iris-session sessions`: those on this network; `status`: one of them on one screen, or as metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from iris_session.cli.common import (
     add_json_option,
     make_client,
     parse_seconds,
+    pick_attributes,
     print_result,
     to_printable,
 )
@@ -32,7 +33,8 @@ FIRST_REPORT_S: Final = 1.2
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `status`."""
+    """Add the commands `sessions` and `status`."""
+    _register_sessions(commands)
     parser = add_command(
         commands,
         "status",
@@ -52,6 +54,45 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     form.add_argument("--prometheus", action="store_true", help="print metrics in the text format of Prometheus, once")
     form.add_argument("--metrics-port", type=int, metavar="PORT", help="serve the metrics on 127.0.0.1 over HTTP")
     add_json_option(parser)
+
+
+def _register_sessions(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = add_command(
+        commands,
+        "sessions",
+        run_sessions,
+        help="list the sessions on this network",
+        description="List the sessions that announce themselves on the networks of this machine. If an access point "
+        "blocks broadcasts, none is heard: type the address of the session, or scan the code of `iris-session pair`.",
+        examples="""
+            iris-session sessions
+            iris-session sessions --seconds 3 --json
+        """,
+    )
+    parser.add_argument("--seconds", type=parse_seconds, default=1.0, help="listen this long (default: %(default)g)")
+    add_json_option(parser)
+
+
+def run_sessions(arguments: argparse.Namespace) -> int:
+    """Listen for beacons and print the sessions. Exit status 1 if none was heard."""
+    from iris_session.client import find_sessions
+    from iris_session.client.server_trust import known_fingerprints
+
+    known = known_fingerprints()
+    found = find_sessions(arguments.seconds)
+    names = ("name", "address", "addresses", "session_id", "kind", "key_fingerprint")
+    marks = [{"encrypted": bool(one.key_fingerprint), "known": one.key_fingerprint in known} for one in found]
+    rows = [pick_attributes(one, *names) | mark for one, mark in zip(found, marks, strict=True)]
+    lines = [f"{row['name']:<24} {row['address']:<24} {row['kind']:<8} {_format_key(row)}" for row in rows]
+    none = "no session was heard: type the address of a session, or scan its code (docs/network.md)"
+    print_result(arguments, {"ok": bool(rows), "sessions": rows}, lines or [none])
+    return 0 if rows else 1
+
+
+def _format_key(row: dict[str, object]) -> str:
+    if not row["encrypted"]:
+        return "not encrypted: this machine only"
+    return f"key {row['key_fingerprint']}{'' if row['known'] else ' (new: join with --code)'}"
 
 
 def add_watch_options(group: argparse._ActionsContainer, parser: argparse.ArgumentParser) -> None:

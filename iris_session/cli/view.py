@@ -202,9 +202,8 @@ def format_page_address(port: int) -> str:
 def _wait_until_open(port: int, process: subprocess.Popen[bytes]) -> None:
     deadline = time.monotonic() + START_S
     while not _is_open(port):
-        if process.poll() is not None:
-            _wait(process)
-            raise CommandError("Rerun's viewer ended at once: its messages are above", 1)
+        if (status := process.poll()) is not None:
+            raise CommandError(f"Rerun's viewer ended with exit status {status}: its messages are above", 1)
         if time.monotonic() > deadline:
             raise CommandError(f"Rerun's viewer did not listen on port {port} within {START_S:g} s", 1)
         time.sleep(POLL_S)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 from iris_session.cli.common import (
     CommandError,
@@ -14,11 +13,6 @@ from iris_session.cli.common import (
     print_error,
 )
 from iris_session.system.extras import require_package
-
-if TYPE_CHECKING:
-    from iris_session.client.endpoint_resolver import Endpoint
-    from iris_session.web.certificate import Certificate
-    from iris_session.web.config import GatewayConfig
 
 CONNECT_S = 15.0
 
@@ -55,9 +49,12 @@ def run(arguments: argparse.Namespace) -> int:
     for package in ("aiohttp", "cryptography"):
         require_package(package, "the page for browsers")
     from iris_session.client.endpoint_resolver import parse_connect_request, resolve_blocking
-    from iris_session.web.config import GatewayStart
+    from iris_session.link.interfaces import interfaces, reachable
+    from iris_session.security import KeyHome
+    from iris_session.web.certificate import load_certificate, load_or_make_certificate
+    from iris_session.web.config import WEB_PORT, GatewayConfig, GatewayStart, format_page_address
     from iris_session.web.gateway import serve
-
+    
     if bool(arguments.web_cert) != bool(arguments.web_key):
         raise CommandError("--web-cert and --web-key belong together: give both, or none")
     if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
@@ -65,12 +62,33 @@ def run(arguments: argparse.Namespace) -> int:
     check_session_reachable(arguments)
     request = parse_connect_request(arguments.address, arguments.session, None, arguments.code)
     endpoint = resolve_blocking(request, CONNECT_S)
-    host = _choose_host(arguments.host, encrypted=endpoint.curve is not None)
-    hosts = _list_own_addresses(host)
-    secure = endpoint.curve is not None or bool(arguments.web_cert)
-    certificate = _find_certificate(arguments, hosts) if secure else None
-    config = _make_config(arguments, endpoint, certificate, host, hosts)
-    _print_addresses(hosts, config.port, certificate)
+    curve = endpoint.curve
+    host = _choose_host(arguments.host, encrypted=curve is not None)
+    found = [one.address for one in reachable((host,), interfaces()) if not one.loopback]
+    hosts = tuple(dict.fromkeys(found)) or (host,)  # by which browsers reach the page, best first
+    certificate = None
+    if arguments.web_cert:
+        certificate = load_certificate(arguments.web_cert, arguments.web_key)
+    elif curve is not None:
+        certificate = load_or_make_certificate(KeyHome(), hosts)
+    config = GatewayConfig(
+        host=endpoint.address.host,
+        control_port=endpoint.address.port,
+        server_key="" if curve is None else curve.server_public.decode(),
+        public_key="" if curve is None else curve.public.decode(),
+        secret_key="" if curve is None else curve.secret.decode(),
+        hosts=(host,),
+        port=WEB_PORT if arguments.web_port is None else arguments.web_port,
+        certificate_path="" if certificate is None else str(certificate.certificate_path),
+        key_path="" if certificate is None else str(certificate.key_path),
+        certificate_hash=b"" if certificate is None else certificate.spki_hash,
+        names=(*hosts, *(() if certificate is None else certificate.names)),
+        session_name=endpoint.session,
+    )
+    pages = [format_page_address(one, config.port, secure=certificate is not None) for one in hosts]
+    print(f"in a browser: {'  or  '.join(pages)}", flush=True)
+    if certificate is not None:
+        print(f"certificate {certificate.fingerprint}", flush=True)
     endpoint.store_key()
     fault = asyncio.run(serve(GatewayStart(config)))
     if fault:
@@ -90,55 +108,3 @@ def _choose_host(host: str | None, *, encrypted: bool) -> str:
             "start it with `iris-session serve --curve`, or leave --host out"
         )
     return host
-
-
-def _make_config(
-    arguments: argparse.Namespace,
-    endpoint: Endpoint,
-    certificate: Certificate | None,
-    host: str,
-    hosts: tuple[str, ...],
-) -> GatewayConfig:
-    from iris_session.web.config import WEB_PORT, GatewayConfig
-
-    curve = endpoint.curve
-    return GatewayConfig(
-        host=endpoint.address.host,
-        control_port=endpoint.address.port,
-        server_key="" if curve is None else curve.server_public.decode(),
-        public_key="" if curve is None else curve.public.decode(),
-        secret_key="" if curve is None else curve.secret.decode(),
-        hosts=(host,),
-        port=WEB_PORT if arguments.web_port is None else arguments.web_port,
-        certificate_path="" if certificate is None else str(certificate.certificate_path),
-        key_path="" if certificate is None else str(certificate.key_path),
-        certificate_hash=b"" if certificate is None else certificate.spki_hash,
-        names=(*hosts, *(() if certificate is None else certificate.names)),
-        session_name=endpoint.session,
-    )
-
-
-def _list_own_addresses(host: str) -> tuple[str, ...]:
-    """Return the addresses by which browsers reach a page that listens on `host`, best first."""
-    from iris_session.link.interfaces import interfaces, reachable
-
-    found = [one.address for one in reachable((host,), interfaces()) if not one.loopback]
-    return tuple(dict.fromkeys(found)) or (host,)
-
-
-def _find_certificate(arguments: argparse.Namespace, hosts: tuple[str, ...]) -> Certificate:
-    from iris_session.security import KeyHome
-    from iris_session.web.certificate import load_certificate, load_or_make_certificate
-
-    if arguments.web_cert:
-        return load_certificate(arguments.web_cert, arguments.web_key)
-    return load_or_make_certificate(KeyHome(), hosts)
-
-
-def _print_addresses(hosts: tuple[str, ...], port: int, certificate: Certificate | None) -> None:
-    from iris_session.web.config import format_page_address
-
-    pages = [format_page_address(host, port, secure=certificate is not None) for host in hosts]
-    print(f"in a browser: {'  or  '.join(pages)}", flush=True)
-    if certificate is not None:
-        print(f"certificate {certificate.fingerprint}", flush=True)

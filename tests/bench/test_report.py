@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from functools import wraps
 from typing import Any
 
 import msgspec
 import pytest
 
+from iris_session.bench import state
 from iris_session.bench.report import NO_BARS, BenchReport, make_bar, make_link_report, measure_parallel_speed
 from iris_session.cli.main import main
 
@@ -24,6 +26,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """Replace the benchmark `state` by one that misses a bar when it is asked for 9 bodies."""
     found: list[dict[str, Any]] = []
 
+    @wraps(state.run_state)
     def run_state(**options: Any) -> BenchReport:
         found.append(options)
         return _report(9.0 if options["bodies"] == 9 else 1.0)

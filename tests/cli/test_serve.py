@@ -44,7 +44,7 @@ def test_scene_argument_is_a_file_a_model_or_a_name(
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("missing.glb", ": a.glb, Part no. 1.off, b.urdf, c.xml"),
+        ("missing.glb", ": Part no. 1.off, a.glb, b.urdf, c.xml"),
         ("lost/missing.glb", "no folder"),
         (".", ": Part no. 1.off, a.glb, b.urdf, c.xml"),
         ("folder.glb", "is a folder"),
@@ -114,7 +114,7 @@ def test_package_dir_is_used(tmp_path: Path, capfd: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"), [("part.off", "damaged"), ("part.docx", "cannot be read"), ("arm.urdf", "arm")]
+    ("name", "expected"), [("part.off", "export it again"), ("part.docx", "cannot be read"), ("arm.urdf", "arm")]
 )
 def test_unreadable_file_is_a_one_line_error(
     name: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
