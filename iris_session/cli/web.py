@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.web.certificate import load_certificate, load_or_make_certificate
     from iris_session.web.config import WEB_PORT, GatewayConfig, GatewayStart, format_page_address
     from iris_session.web.gateway import serve
-    
+
     if bool(arguments.web_cert) != bool(arguments.web_key):
         raise CommandError("--web-cert and --web-key belong together: give both, or none")
     if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
