@@ -12,8 +12,8 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from types import MappingProxyType, NoneType
-from typing import Any, Final, TypeVar
+from types import MappingProxyType, UnionType
+from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import mujoco
@@ -194,23 +194,6 @@ _OBJECTS: Final = (
     'a list of ObjectSpec is expected, as [ObjectSpec(name="hammer", body="hammer")] of iris_session.protocol.specs; '
     "without objects= they are found in the model"
 )
-#: Types by annotation of `SessionConfig`. A bool is no number.
-_KINDS: Final[dict[str, tuple[type, ...]]] = {
-    "str": (str,),
-    "int": (int,),
-    "int | None": (int, NoneType),
-    "float": (float, int),
-    "bool": (bool,),
-    "bool | str | Path": (bool, str, Path),
-    "str | Path | None": (str, Path, NoneType),
-    "tuple[str, ...]": (tuple,),
-    "tuple[str | Path, ...]": (tuple,),
-    "Mapping[str, PoseTuple]": (Mapping,),
-    "Mapping[str, float]": (Mapping,),
-    "Mapping[str, Mapping[str, Vec3]]": (Mapping,),
-    "AuthorityConfig": (msgspec.Struct,),
-    "ControlConfig": (msgspec.Struct,),
-}
 #: Quaternions in hand-written files have few digits.
 UNIT_TOLERANCE: Final = 1e-3
 #: Millimetres in a field of metres are a mistake, not a sheet.
@@ -223,17 +206,23 @@ LONGEST_TICK_S: Final = 0.1
 
 def check_types(config: Any) -> None:
     """Check the fields of a `SessionConfig` against their annotations. Raises `ConfigError`."""
+    hints = get_type_hints(type(config))
     for item in fields(config):
-        value, annotation = getattr(config, item.name), str(item.type)
-        kinds = _KINDS.get(annotation, (object,))
-        right = isinstance(value, kinds) and (bool in kinds or not isinstance(value, bool))
-        if kinds == (msgspec.Struct,):
-            right = type(value).__name__ == annotation
-        if kinds == (tuple,):
-            parts = (str, Path) if "Path" in annotation else str
-            right = right and all(isinstance(part, parts) for part in value)
-        if not right:
-            raise ConfigError(f"{item.name} must be {annotation}, not {type(value).__name__} {value!r:.60}")
+        value = getattr(config, item.name)
+        if not _is_of_type(value, hints[item.name]):
+            raise ConfigError(f"{item.name} must be {item.type}, not {type(value).__name__} {value!r:.60}")
+
+
+def _is_of_type(value: object, hint: Any) -> bool:
+    """Return whether a value fits an annotation. A bool is no number, and a whole number is a float."""
+    if get_origin(hint) is UnionType:
+        return any(_is_of_type(value, one) for one in get_args(hint))
+    if get_origin(hint) is tuple:
+        return isinstance(value, tuple) and all(_is_of_type(one, get_args(hint)[0]) for one in value)
+    kind = get_origin(hint) or hint
+    if isinstance(value, bool):
+        return kind is bool
+    return isinstance(value, (float, int) if kind is float else kind)
 
 
 def check_anchors(anchors: Mapping[str, Any], sizes: Mapping[str, Any], marks: Mapping[str, Any]) -> None:

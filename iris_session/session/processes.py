@@ -434,14 +434,5 @@ class SessionProcesses:
 
 def make_settings(config: SessionConfig) -> Settings:
     """Return the settings that a resumed session takes over, for the header of the recording."""
-    return Settings(
-        config.state_hz,
-        config.keyframe_s,
-        config.realtime,
-        config.adapt_media,
-        anchor_sizes=config.sheet_sizes(),
-        anchor_marks=config.mark_positions(),
-        record_clouds_hz=config.record_clouds_hz,
-        record_assets=config.record_assets,
-        record_budget_bytes=config.record_budget_bytes,
-    )
+    values = {name: getattr(config, name) for name in Settings.__struct_fields__}
+    return Settings(**values | {"anchor_sizes": config.sheet_sizes(), "anchor_marks": config.mark_positions()})

@@ -9,20 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.session.resume import NOTE_FILE, Listening, ResumeNote, ResumeNoteWriter, read_note
-
-
-def test_last_note_is_written_when_closed_during_a_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    keeper, disk = ResumeNoteWriter(tmp_path / NOTE_FILE), HangingDisk(monkeypatch)
-    keeper.offer(ResumeNote("s1", Listening("first")))
-    assert disk.reached.wait(30.0)
-    keeper.offer(ResumeNote("s1", Listening("last")))
-    threading.Timer(0.05, disk.works.set).start()
-    keeper.close(30.0)
-    note, _ = read_note(tmp_path / "session.rrd", "s1")
-    assert note is not None
-    assert note.listening.host == "last"
-    assert disk.synced_folders, "the new name is on the disk too"
+from iris_session.session.resume import NOTE_FILE, Listening, ResumeNote, ResumeNoteWriter
 
 
 def test_late_note_does_not_overwrite_that_of_the_next_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

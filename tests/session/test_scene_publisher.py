@@ -85,6 +85,12 @@ def test_owner_posts_and_patches(session: ScenePublisher) -> None:
     assert session.scene.visuals[0].rgba == (0.0, 0.0, 1.0, 1.0)
 
 
+def test_stream_names_of_deformables_are_reserved(session: ScenePublisher) -> None:
+    with pytest.raises(ValueError, match="'deformable-0'"):
+        session.publish_media("deformable-0", b"points")
+    session.publish_media("deformable-1", b"points")  # of nothing here
+
+
 def test_invalid_times_raise_and_change_nothing(session: ScenePublisher) -> None:
     session.run(seconds=0.1)
     session.publish(13.0)

@@ -103,12 +103,3 @@ def test_shares_cover_the_last_ten_marks() -> None:
         loop.mark()
     assert loop.times.compute_late_share() == 0.0
     assert loop.times.count_late_causes() == {}
-
-
-def test_pause_has_no_cause(loop: Loop) -> None:
-    loop.now_ns += 5_000 * MS
-    loop.times.restart_chain()
-    loop.due_ns = loop.now_ns + PERIOD
-    loop.tick()
-    loop.mark()
-    assert loop.times.count_late_causes() == {}

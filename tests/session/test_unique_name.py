@@ -8,7 +8,7 @@ import pytest
 
 from iris_session.link.discovery import DiscoveryError, FoundSession
 from iris_session.session import unique_name
-from iris_session.session.unique_name import LISTEN_S, NameFinder
+from iris_session.session.unique_name import NameFinder
 
 
 class Network:
@@ -64,14 +64,6 @@ def test_name_in_use_gets_the_next_free_number(network: Network, heard: tuple[st
     assert finder.find_free_name(name) == free
     assert [("192.0.2.0:7721" in note, repr(free) in note) for note in finder.notes] == [(True, True)] * (free != name)
     finder.close()
-
-
-def test_finder_waits_only_for_the_rest_of_its_time(network: Network) -> None:
-    finder = NameFinder(7720)
-    network.now_s += 0.2
-    finder.find_free_name("lab")
-    finder.find_free_name("lab")
-    assert network.waits == [pytest.approx(LISTEN_S - 0.2)]
 
 
 def test_finder_without_beacons_or_a_port_keeps_the_name(network: Network) -> None:

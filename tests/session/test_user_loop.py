@@ -43,19 +43,6 @@ def test_a_reset_is_read_with_the_state_after_it(rig: Rig) -> None:
     assert np.array_equal(rig.data.ctrl, rig.model.key_ctrl[0]), "nobody drives the robot: its ctrl is the owner's"
 
 
-def test_time_that_goes_back_is_one_reset(rig: Rig) -> None:
-    rig.rounds(5)
-    mujoco.mj_resetDataKeyframe(rig.model, rig.data, 0)
-    rig.rounds(5)
-    rig.loop.begin_tick()
-    mujoco.mj_resetDataKeyframe(rig.model, rig.data, 0)
-    rig.loop.end_tick()
-    rig.idle()
-    rig.rounds(2)
-    assert len(rig.resets()) == 2
-    assert len(rig.front.states) > 5
-
-
 def test_a_tick_is_published_when_it_ends_with_its_own_step(rig: Rig) -> None:
     recorded: list[tuple[int, int]] = []
     state = rig.recorder.add_state
