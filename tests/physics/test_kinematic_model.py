@@ -35,10 +35,10 @@ def test_bodies_have_the_ids_and_first_poses_of_the_scene() -> None:
 
 
 def test_state_has_the_poses_and_time_that_were_set() -> None:
-    carrier = KinematicModel(NAMES, FIRST)
-    world = World(carrier.model, (), ())
+    kinematic = KinematicModel(NAMES, FIRST)
+    world = World(kinematic.model, (), ())
     for seed, time_s in ((1, 12.3456), (2, 0.0)):
-        world.restore_state(carrier.encode_state(time_s, random_poses(seed)))
+        world.restore_state(kinematic.encode_state(time_s, random_poses(seed)))
         assert np.allclose(read_poses(world), random_poses(seed), atol=1e-15)
         assert (world.view().tick, world.view().sim_time) == (round(time_s / TICK_S), time_s)
 

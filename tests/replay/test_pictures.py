@@ -260,9 +260,9 @@ def project(camera: Any, model: Any, positions: NDArray[np.float64], aspect: flo
 
 
 def test_published_worlds_are_refused(tmp_path: Path) -> None:
-    carrier = KinematicModel(["box"], [Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))])
-    core = SessionCore(carrier.model, CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ()))
-    plant = carrier.encode_state(0.0, np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]))
+    kinematic = KinematicModel(["box"], [Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))])
+    core = SessionCore(kinematic.model, CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ()))
+    plant = kinematic.encode_state(0.0, np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]))
     path = play(
         tmp_path / "session.rrd", 3, core=core, make_plant=lambda step: plant, make_entries=lambda step: []
     ).write()

@@ -237,14 +237,14 @@ def test_robots_and_objects_have_the_rows_of_their_scenes(changed: tuple[Played,
 
 def test_bodies_of_a_published_world_have_poses(tmp_path: Path) -> None:
     """A kinematic model, moved by frames of a publisher; the rows between them have no plant."""
-    carrier = KinematicModel(("crate", "drum"), (Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),) * 2)
-    core = SessionCore(carrier.model, CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ()))
+    kinematic = KinematicModel(("crate", "drum"), (Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),) * 2)
+    core = SessionCore(kinematic.model, CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ()))
     frames = {3: 0.25, 6: 0.5}
 
     def make_plant(step: int) -> bytes:
         if step not in frames:
             return b""
-        return carrier.encode_state(frames[step], np.array([(frames[step], 0, 1, 1, 0, 0, 0), (0, 0, 1, 1, 0, 0, 0)]))
+        return kinematic.encode_state(frames[step], np.array([(frames[step], 0, 1, 1, 0, 0, 0), (0, 0, 1, 1, 0, 0, 0)]))
 
     played = play(tmp_path / "session.rrd", 9, core=core, make_entries=lambda _: [], make_plant=make_plant)
     with Recording.open(played.write()) as recording:

@@ -19,54 +19,54 @@ TURNED = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # a quarter turn around z
 
 
 @pytest.fixture
-def draft() -> PendingState:
+def pending() -> PendingState:
     return PendingState(composed())
 
 
-def pose(draft: PendingState, name: str) -> list[float]:
-    return draft.make_frame(0, 0.0, anew=False).poses[MOVING.index(name)].tolist()
+def pose(pending: PendingState, name: str) -> list[float]:
+    return pending.make_frame(0, 0.0, anew=False).poses[MOVING.index(name)].tolist()
 
 
-def everything(draft: PendingState) -> bytes:
-    frame = draft.make_frame(0, 0.0, anew=False)
+def everything(pending: PendingState) -> bytes:
+    frame = pending.make_frame(0, 0.0, anew=False)
     return frame.poses.tobytes() + b"".join(v.tobytes() for v in frame.vertices.values())
 
 
-def test_frame_has_new_values_and_keeps_others(draft: PendingState) -> None:
-    draft.set_pose("blue", (1.0, 2.0, 3.0), TURNED)
-    frame = draft.make_frame(7, 0.5, anew=True)
+def test_frame_has_new_values_and_keeps_others(pending: PendingState) -> None:
+    pending.set_pose("blue", (1.0, 2.0, 3.0), TURNED)
+    frame = pending.make_frame(7, 0.5, anew=True)
     assert (frame.capture_ns, frame.time_s, frame.anew) == (7, 0.5, True)
     assert frame.poses[1].tolist() == pytest.approx([1.0, 2.0, 3.0, *TURNED])
     assert frame.poses[0].tolist() == [0.0, 0.0, 0.5, *UNIT]
-    draft.set_pose("blue", (0.0, 0.0, 0.0), UNIT)
-    draft.set_vertices("cloth", CLOTH + 1.0)
+    pending.set_pose("blue", (0.0, 0.0, 0.0), UNIT)
+    pending.set_vertices("cloth", CLOTH + 1.0)
     assert frame.poses[1, 0] == 1.0, "a frame that was taken does not change any more"
     assert (frame.vertices["cloth"] == CLOTH).all()
-    assert (draft.make_frame(8, 1.0, anew=False).vertices["cloth"] == CLOTH + 1.0).all()
+    assert (pending.make_frame(8, 1.0, anew=False).vertices["cloth"] == CLOTH + 1.0).all()
 
 
-def test_joints_and_the_root_place_the_bodies_of_an_articulation(draft: PendingState) -> None:
-    draft.set_joints("arm", {"turn": math.pi / 2})
-    assert pose(draft, "arm/fore") == pytest.approx([0.0, 1.0, 0.8, *TURNED])
-    draft.set_joints("arm", {"slide": 0.25})
-    assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.25, 0.8]), "the other joint stays"
-    draft.set_pose("arm", (10.0, 0.0, 0.0), TURNED)
-    assert pose(draft, "arm/base") == pytest.approx([10.0, 0.0, 0.0, *TURNED])
-    assert pose(draft, "arm/fore")[:3] == pytest.approx([8.75, 0.0, 0.0])
+def test_joints_and_the_root_place_the_bodies_of_an_articulation(pending: PendingState) -> None:
+    pending.set_joints("arm", {"turn": math.pi / 2})
+    assert pose(pending, "arm/fore") == pytest.approx([0.0, 1.0, 0.8, *TURNED])
+    pending.set_joints("arm", {"slide": 0.25})
+    assert pose(pending, "arm/fore")[:3] == pytest.approx([0.0, 1.25, 0.8]), "the other joint stays"
+    pending.set_pose("arm", (10.0, 0.0, 0.0), TURNED)
+    assert pose(pending, "arm/base") == pytest.approx([10.0, 0.0, 0.0, *TURNED])
+    assert pose(pending, "arm/fore")[:3] == pytest.approx([8.75, 0.0, 0.0])
 
 
-def test_joints_beyond_their_limits_are_shown_and_warned_about(draft: PendingState) -> None:
+def test_joints_beyond_their_limits_are_shown_and_warned_about(pending: PendingState) -> None:
     """Encoders exceed the limits of the description slightly; degrees exceed them far."""
-    draft.set_joints("arm", {"turn": math.pi + 0.05, "slide": -0.01})
-    assert draft.warnings() == ()
-    assert pose(draft, "arm/upper")[3:] == pytest.approx([math.cos((math.pi + 0.05) / 2), 0, 0, 0.9997], abs=1e-4)
-    draft.set_joints("arm", {"turn": 90.0, "slide": 0.6})
-    assert draft.warnings() == (
+    pending.set_joints("arm", {"turn": math.pi + 0.05, "slide": -0.01})
+    assert pending.warnings() == ()
+    assert pose(pending, "arm/upper")[3:] == pytest.approx([math.cos((math.pi + 0.05) / 2), 0, 0, 0.9997], abs=1e-4)
+    pending.set_joints("arm", {"turn": 90.0, "slide": 0.6})
+    assert pending.warnings() == (
         "joint 'turn' of 'arm' is set to 90 rad, far beyond its limits, -3.142 to 3.142 rad",
         "joint 'slide' of 'arm' is set to 0.6 m, far beyond its limits, 0 to 0.5 m",
     )
-    draft.set_joints("arm", {"slide": 0.5})
-    assert len(draft.warnings()) == 1, "of those that are there now"
+    pending.set_joints("arm", {"slide": 0.5})
+    assert len(pending.warnings()) == 1, "of those that are there now"
 
 
 def on_a_floating_base() -> PendingState:
@@ -81,45 +81,45 @@ def on_a_floating_base() -> PendingState:
 
 @pytest.mark.parametrize("many", [False, True])
 def test_body_on_a_floating_joint_keeps_its_pose(many: bool) -> None:
-    draft = on_a_floating_base()
-    draft.set_joints("arm", {"slide": 0.25})
-    assert pose(draft, "arm/fore")[:3] == pytest.approx([1.25, 0.0, 1.0]), "at first it goes with the rest"
+    pending = on_a_floating_base()
+    pending.set_joints("arm", {"slide": 0.25})
+    assert pose(pending, "arm/fore")[:3] == pytest.approx([1.25, 0.0, 1.0]), "at first it goes with the rest"
     if many:
-        draft.set_poses(["red", "arm/upper"], [(1.0, 2.0, 3.0), (0.0, 0.0, 5.0)], [UNIT, TURNED])
+        pending.set_poses(["red", "arm/upper"], [(1.0, 2.0, 3.0), (0.0, 0.0, 5.0)], [UNIT, TURNED])
     else:
-        draft.set_pose("arm/upper", (0.0, 0.0, 5.0), TURNED)
-    assert pose(draft, "arm/upper") == pytest.approx([0.0, 0.0, 5.0, *TURNED])
-    assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.25, 5.0]), "what is on it goes with it"
-    draft.set_joints("arm", {"slide": 0.5})
-    draft.set_pose("arm", (7.0, 0.0, 0.0), UNIT)
-    assert pose(draft, "arm/base")[:3] == [7.0, 0.0, 0.0]
-    assert pose(draft, "arm/upper") == pytest.approx([0.0, 0.0, 5.0, *TURNED])
-    assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.5, 5.0])
+        pending.set_pose("arm/upper", (0.0, 0.0, 5.0), TURNED)
+    assert pose(pending, "arm/upper") == pytest.approx([0.0, 0.0, 5.0, *TURNED])
+    assert pose(pending, "arm/fore")[:3] == pytest.approx([0.0, 1.25, 5.0]), "what is on it goes with it"
+    pending.set_joints("arm", {"slide": 0.5})
+    pending.set_pose("arm", (7.0, 0.0, 0.0), UNIT)
+    assert pose(pending, "arm/base")[:3] == [7.0, 0.0, 0.0]
+    assert pose(pending, "arm/upper") == pytest.approx([0.0, 0.0, 5.0, *TURNED])
+    assert pose(pending, "arm/fore")[:3] == pytest.approx([0.0, 1.5, 5.0])
 
 
 def test_floating_link_too_far_away_changes_nothing() -> None:
-    draft = on_a_floating_base()
-    before = everything(draft)
+    pending = on_a_floating_base()
+    before = everything(pending)
     for put in (
-        lambda: draft.set_pose("arm/upper", (1e6, 0.0, 0.0), UNIT),
-        lambda: draft.set_poses(["red", "arm/upper"], [(0.0, 0.0, 0.0), (1e6, 0.0, 0.0)], [UNIT, UNIT]),
+        lambda: pending.set_pose("arm/upper", (1e6, 0.0, 0.0), UNIT),
+        lambda: pending.set_poses(["red", "arm/upper"], [(0.0, 0.0, 0.0), (1e6, 0.0, 0.0)], [UNIT, UNIT]),
     ):
         with pytest.raises(PublishError, match="1,000 km"):
             put()
-        assert everything(draft) == before
-    draft.set_joints("arm", {})
-    assert pose(draft, "arm/upper")[0] == 0.0
+        assert everything(pending) == before
+    pending.set_joints("arm", {})
+    assert pose(pending, "arm/upper")[0] == 0.0
 
 
-def test_setting_many_bodies_equals_setting_each(draft: PendingState) -> None:
+def test_setting_many_bodies_equals_setting_each(pending: PendingState) -> None:
     other = PendingState(composed())
     names = ["blue", "red"]
     positions = np.array([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)])
-    draft.set_poses(names, positions, [TURNED, np.array(UNIT) * 1.0005])
+    pending.set_poses(names, positions, [TURNED, np.array(UNIT) * 1.0005])
     for name, position, q in zip(names, positions, (TURNED, UNIT), strict=True):
         other.set_pose(name, position, q)
     assert np.allclose(
-        draft.make_frame(0, 0.0, anew=False).poses, other.make_frame(0, 0.0, anew=False).poses, atol=1e-15
+        pending.make_frame(0, 0.0, anew=False).poses, other.make_frame(0, 0.0, anew=False).poses, atol=1e-15
     )
 
 
@@ -179,11 +179,11 @@ NAN = float("nan")
     ],
 )  # fmt: skip
 def test_invalid_values_raise_and_change_nothing(
-    draft: PendingState, wrong: Callable[[PendingState], None], value: str
+    pending: PendingState, wrong: Callable[[PendingState], None], value: str
 ) -> None:
-    before = everything(draft)
+    before = everything(pending)
     with pytest.raises(PublishError, match=value):
-        wrong(draft)
-    assert everything(draft) == before
-    draft.set_pose("arm", (0.0, 0.0, 0.8), UNIT)  # nor does it come back later
-    assert pose(draft, "arm/fore") == pytest.approx([1.0, 0.0, 0.8, *UNIT])
+        wrong(pending)
+    assert everything(pending) == before
+    pending.set_pose("arm", (0.0, 0.0, 0.8), UNIT)  # nor does it come back later
+    assert pose(pending, "arm/fore") == pytest.approx([1.0, 0.0, 0.8, *UNIT])
