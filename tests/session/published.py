@@ -41,9 +41,11 @@ def composed() -> ComposedScene:
     return ComposedScene(
         SceneSpec(bodies=(ground, *bodies)),
         "0" * 64,
+        (),
+        0,
+        0,
         MOVING,
         poses,
         {"arm": arm()},
         {"cloth": DeformableSource("cloth", "cloth", topology, CLOTH)},
-        (),
     )
