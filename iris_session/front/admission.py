@@ -82,14 +82,16 @@ class Admission:
             raise _RefusedError(
                 RefusalCode.RATE, "this client was disconnected for flooding", "send less; try again soon"
             )
-        roles = self._find_roles(key_id, gateway, web=web)
+        roles, address = self._find_roles(key_id, gateway, web=web), peer_of(peer.descriptor)
         if roles is None:
-            self._audit_unpaired(key_id, peer, hello, now_ns, web=web)
+            if web:  # an unknown CURVE key does not get that far
+                self._context.audit.record(
+                    AuditKind.KEY_REFUSED, now_ns, subject=key_id, name=hello.name, address=address[0], detail="web"
+                )
             raise _RefusedError(
                 RefusalCode.UNPAIRED, "this key is not on the session's list (any more)", "pair anew with a join code"
             )
         budget = self._take_budget(key_id, hello, gateway, now_ns)
-        address = peer_of(peer.descriptor)
         resume_of = self._find_resumed(hello, key_id, address[0], now_ns)
         # A resuming client replaces a connection that may still be counted: twice the limit, so that it is bounded.
         limit = self._context.config.limits.connections
@@ -241,14 +243,6 @@ class Admission:
             text = "no role of this key may be taken behind this gateway"
             raise _RefusedError(DenialReason.ROLE, text, "ask the person who runs the session for another role")
         return roles
-
-    def _audit_unpaired(self, key_id: str, peer: Peer, hello: Hello, now_ns: int, *, web: bool) -> None:
-        """Record that an unknown web identity said hello. An unknown CURVE key does not get that far."""
-        if web:
-            address = peer_of(peer.descriptor)[0]
-            self._context.audit.record(
-                AuditKind.KEY_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail="web"
-            )
 
     def _find_resumed(self, hello: Hello, key_id: str, address: str, now_ns: int) -> str:
         """Return the participant that a resume token names, empty without a token. Raises `_RefusedError`."""

@@ -8,6 +8,7 @@ is decided in `asset_service`; which request is next in `assets.chunk_scheduler`
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -151,7 +152,7 @@ class AssetServer:
         ones."""
         for descriptor in self._scheduler.clear():
             self._guard.evict(descriptor, "")
-        self._count_reasons(["assets_fault"])
+        self.drops.count("assets_fault")
         if repr(error) != self._reported_fault:
             self._reported_fault = repr(error)
             log.error("fault in the thread of assets, which continues: %s", self._reported_fault, exc_info=error)
@@ -195,7 +196,7 @@ class AssetServer:
         mark = compute_fingerprint(request[6]) if is_curve_request(request) else ""
         if mark in self._applied.allowed_keys:
             return mark
-        self._count_reasons(["assets_unknown_key"])
+        self.drops.count("assets_unknown_key")
         return ""
 
     def _read_connection_events(self) -> None:
@@ -223,7 +224,7 @@ class AssetServer:
                 more = extra.more
             descriptor, user = read_peer(frame, encrypted=self._encrypted)
             if descriptor < 0:
-                self._count_reasons(["assets_unversioned_peer"])
+                self.drops.count("assets_unversioned_peer")
                 continue
             self._read_connection_events()
             refused = self._handle_request(route, descriptor, user, frame, single=len(lengths) == 1)
@@ -250,18 +251,13 @@ class AssetServer:
 
     def _queue_refusal(self, route: bytes, request_id: int, address: str, reason: str) -> None:
         """Refuse a request, at once or after the reader's pending chunks."""
-        self._count_reasons([f"assets_{reason}"])
-        if self._scheduler.has_pending(route) or not self._send_refusal(route, _refusal(request_id, address, reason)):
-            kept = self._scheduler.queue_refusal(route, request_id, address, reason)
-            self._count_reasons([] if kept else ["assets_refusal_unsent"])
-
-    def _send_refusal(self, route: bytes, refusal: bytes) -> bool:
-        """Send a refusal. Return whether there was room for it."""
-        try:
-            self._socket.send_multipart((route, refusal), _DONTWAIT)
-        except zmq.ZMQError:
-            return False
-        return True
+        self.drops.count(f"assets_{reason}")
+        if not self._scheduler.has_pending(route):
+            with contextlib.suppress(zmq.ZMQError):  # no room
+                self._socket.send_multipart((route, _refusal(request_id, address, reason)), _DONTWAIT)
+                return
+        if not self._scheduler.queue_refusal(route, request_id, address, reason):
+            self.drops.count("assets_refusal_unsent")
 
     # --- chunks ------------------------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ messages have a queue of their own that is sent first; a jump of the tracking fr
 from __future__ import annotations
 
 from collections.abc import Hashable
+from operator import itemgetter
 
 from iris_session.link.config import FrontLimits
 from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, RemoveParticipant, Sample, TrackingEpoch
@@ -193,7 +194,7 @@ class Coalescer:
         """Return the next batch of at most `batch_entries`: urgent entries first, then one connection after the other,
         each in order of arrival. The connection that does not fit comes first in the next batch."""
         urgent = [item for queue in self._queues.values() for item in queue.urgent]
-        urgent.sort(key=_arrival)
+        urgent.sort(key=itemgetter(0))
         for queue in self._queues.values():
             queue.urgent.clear()
         self.urgent = False
@@ -208,17 +209,13 @@ class Coalescer:
             if rest and len(batch) + len(rest) >= self._limits.batch_entries:
                 self._next_connection = number
                 break
-            rest += self._list_pending(self._queues.pop(number))
-        rest.sort(key=_arrival)
+            queue = self._queues.pop(number)
+            rest += queue.messages
+            for pending in queue.samples.values():
+                rest += pending
+            rest += queue.newest.values()
+        rest.sort(key=itemgetter(0))
         return batch + [entry for _, entry in rest]
-
-    @staticmethod
-    def _list_pending(queue: _ConnectionQueue) -> list[tuple[int, Entry]]:
-        items = queue.messages
-        for pending in queue.samples.values():
-            items += pending
-        items += queue.newest.values()
-        return items
 
     def remove_connection(self, connection: int) -> None:
         """Remove pending entries of a connection that the authority has ended, or never knew, except an e-stop."""
@@ -227,7 +224,3 @@ class Coalescer:
         if stops:
             kept = self._queues[connection] = _ConnectionQueue()
             kept.urgent = stops
-
-
-def _arrival(item: tuple[int, Entry]) -> int:
-    return item[0]

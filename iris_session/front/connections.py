@@ -137,6 +137,10 @@ class ConnectionTable:
         """Return the connections that a gateway speaks for."""
         return [c for c in self.by_number.values() if c.gateway == gateway.number]
 
+    def list_of_key(self, key_id: str) -> list[FrontConnection]:
+        """Return the connections of a key."""
+        return [c for c in self.by_number.values() if c.key_id == key_id]
+
     # Connections that were disconnected while their TCP connections stay open. Their clients may not know yet, and an
     # e-stop of theirs still counts.
 
@@ -223,8 +227,3 @@ class ControlSender:
                 return False
             raise
         return True
-
-
-def encode_message(message: ServerMessage) -> bytes:
-    """Encode a message for `ControlSender.send_encoded`."""
-    return _encoder.encode(message)

@@ -10,7 +10,6 @@ import zmq
 from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.asset_service import AssetService
-from iris_session.front.connections import encode_message
 from iris_session.front.context import FrontContext
 from iris_session.front.disconnects import DisconnectHandler
 from iris_session.front.media.service import MediaService
@@ -194,7 +193,7 @@ class Downlink:
 
     def broadcast(self, message: Event | ProtocolFault) -> None:
         """Send a message to every admitted connection, encoded once."""
-        encoded = encode_message(message)
+        encoded = link.encoder.encode(message)
         for connection in self._context.connections.by_number.values():
             if connection.admitted:
                 self._context.outbox.send_encoded(connection, encoded)

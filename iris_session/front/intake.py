@@ -88,23 +88,18 @@ class Intake:
                 raise MalformedError(f"a client message is one frame, got {1 + extra_frames}")
             envelope = decode_client(data)
         except ProtocolError as error:
-            self._reject_unreadable(self._find_route(routing_id, peer, data), peer, error, now_ns)
+            # Behind a gateway it counts against the client that it names.
+            name = peek_on_behalf_of(data)
+            if name and self._admission.find_gateway(routing_id, peer) is not None:
+                route = Route(routing_id, name)
+            self._reject_unreadable(route, peer, error, now_ns)
             return
         if envelope.on_behalf_of:
+            gateway = self._context.connections.find(route, peer)
+            if gateway is not None:
+                gateway.last_heard_ns = now_ns
             route = Route(routing_id, envelope.on_behalf_of)
-            self._touch_gateway(Route(routing_id), peer, now_ns)
         self._dispatch(route, peer, envelope, len(data), now_ns)
-
-    def _find_route(self, routing_id: bytes, peer: Peer, data: memoryview) -> Route:
-        """Return the route of a message that cannot be decoded: behind a gateway that of the client that it names."""
-        name = peek_on_behalf_of(data)
-        is_behind = bool(name) and self._admission.find_gateway(routing_id, peer) is not None
-        return Route(routing_id, name) if is_behind else Route(routing_id)
-
-    def _touch_gateway(self, route: Route, peer: Peer, now_ns: int) -> None:
-        gateway = self._context.connections.find(route, peer)
-        if gateway is not None:
-            gateway.last_heard_ns = now_ns
 
     def _dispatch(self, route: Route, peer: Peer, envelope: ClientEnvelope, size: int, now_ns: int) -> None:
         message = envelope.message
@@ -120,7 +115,9 @@ class Intake:
             self._end_connection(connection, "replaced")
             connection = None
         if connection is None and isinstance(message, EStop):
-            self._forward_late_estop(route, peer, envelope, now_ns)
+            kept = self._context.connections.find_kept(route, peer)
+            if kept is not None:  # a client that was disconnected, and does not know it yet
+                self._offer_estop(kept, envelope, now_ns)
         if isinstance(message, Hello):
             entry = self._admission.handle_hello(route, peer, message, now_ns)
             if entry is not None:
@@ -163,12 +160,6 @@ class Intake:
             self._send_fault(route, connection, FaultCode.HELLO, text, now_ns)
         elif connection is not None:
             self._end_connection(connection, _LOST_REASONS.get(message.reason, LOST))
-
-    def _forward_late_estop(self, route: Route, peer: Peer, envelope: ClientEnvelope, now_ns: int) -> None:
-        """Forward the e-stop of a client that was disconnected and does not know it yet."""
-        kept = self._context.connections.find_kept(route, peer)
-        if kept is not None:
-            self._offer_estop(kept, envelope, now_ns)
 
     def _offer_estop(self, connection: FrontConnection, envelope: ClientEnvelope, now_ns: int) -> bool:
         """Offer an e-stop within the budget of its key. One above it is merged into the next one, half a second later

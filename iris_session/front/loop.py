@@ -262,7 +262,9 @@ def _make_alignment_service(context: FrontContext) -> AlignmentService:
 
 
 def _make_media_proxy(context: FrontContext, sockets: FrontSockets) -> MediaProxy:
-    limits = context.config.limits
+    config, limits, recorder = context.config, context.config.limits, None
+    if config.recorder_media_endpoint and config.record_clouds_hz:
+        recorder = MediaRecorder(sockets.context, config.recorder_media_endpoint, config.record_clouds_hz)
     sources = _make_bounds(context, limits.sources, limits.source_bytes)
     sources = sources._replace(owner_bytes=limits.source_bytes, total_bytes=limits.ingest_bytes)
     return MediaProxy(
@@ -273,15 +275,8 @@ def _make_media_proxy(context: FrontContext, sockets: FrontSockets) -> MediaProx
         sockets.ingest.socket,
         context.now_ns,
         encrypted=context.keyring.key is not None,
-        recorder=_make_media_recorder(context, sockets),
+        recorder=recorder,
     )
-
-
-def _make_media_recorder(context: FrontContext, sockets: FrontSockets) -> MediaRecorder | None:
-    config = context.config
-    if not config.recorder_media_endpoint or not config.record_clouds_hz:
-        return None
-    return MediaRecorder(sockets.context, config.recorder_media_endpoint, config.record_clouds_hz)
 
 
 def _make_asset_server(context: FrontContext, sockets: FrontSockets) -> AssetServer:

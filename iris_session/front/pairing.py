@@ -138,7 +138,8 @@ class PairingService:
             source = _Source(find_network(address), address)
         else:
             source = _Source(f"gateway {gateway.key_id}", address, GATEWAY_FACTOR)
-        allowed = self._allow_source(source, now_ns)
+        rates = self._address_rates if gateway is None else self._gateway_rates
+        allowed = rates.take(source.name, now_ns)
         if self._has_exhausted_attempts(source, now_ns):  # before the limits that clients share
             self._context.audit.record(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
             self._context.drops.count("pair_shut_out")
@@ -293,11 +294,6 @@ class PairingService:
     def _refuse(self, route: Route, message: str, advice: str) -> None:
         self._context.drops.count("pair_refused")
         self._context.outbox.send_to_route(route, Refused(RefusalCode.CODE, message, advice))
-
-    def _allow_source(self, source: _Source, now_ns: int) -> bool:
-        """Return whether an address or gateway is within its rate limit, and use a token."""
-        rates = self._address_rates if source.factor == 1 else self._gateway_rates
-        return rates.take(source.name, now_ns)
 
     def _has_exhausted_attempts(self, source: _Source, now_ns: int) -> bool:
         wrong, since_ns = self._wrong.get(source.name, (0, now_ns))

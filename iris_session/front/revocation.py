@@ -104,7 +104,7 @@ class RevocationService:
             close_tcp(gone.peer.descriptor, gone.address)
 
     def _disconnect_key(self, key_id: str, now_ns: int, text: str) -> None:
-        for connection in self._list_connections(key_id):
+        for connection in self._context.connections.list_of_key(key_id):
             for one in self._context.connections.list_behind(connection):
                 self.disconnect(one, GATEWAY_REVOKED, now_ns)
             self.disconnect(connection, text, now_ns)
@@ -119,7 +119,7 @@ class RevocationService:
     def _apply_roles(self, key_id: str, roles: tuple[str, ...], now_ns: int) -> None:
         """Apply the present roles of a key: connections in a role that it lost, its own or behind it, are removed, and
         refused when they join again."""
-        for connection in self._list_connections(key_id):
+        for connection in self._context.connections.list_of_key(key_id):
             behind = self._context.connections.list_behind(connection)
             if roles and connection.role not in roles:
                 lost = [*behind, connection]
@@ -150,9 +150,6 @@ class RevocationService:
         if participant:
             self._context.tokens.remove_participant(participant)
             self._remove_participant(participant, ROLE_TAKEN, now_ns)
-
-    def _list_connections(self, key_id: str) -> list[FrontConnection]:
-        return [c for c in self._context.connections.by_number.values() if c.key_id == key_id]
 
     def _remove_participant(self, participant: str, reason: str, now_ns: int) -> None:
         self._context.coalescer.offer(Entry(HOST, HOST, now_ns, RemoveParticipant(0, participant, reason=reason)))

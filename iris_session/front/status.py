@@ -7,7 +7,8 @@ need the status. Memory is bounded: fixed rings per connection, which end with i
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import defaultdict, deque
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import msgspec
@@ -39,15 +40,13 @@ REUSE_NS: Final = 200_000_000
 _decode_report = msgspec.msgpack.Decoder(StatusReport).decode
 
 
+@dataclass(slots=True)
 class _ConnectionStats:
     """Measurements of one connection."""
 
-    __slots__ = ("delays_ns", "samples", "samples_per_s")
-
-    def __init__(self) -> None:
-        self.delays_ns: deque[int] = deque(maxlen=DELAYS)
-        self.samples = 0
-        self.samples_per_s = 0.0
+    delays_ns: deque[int] = field(default_factory=lambda: deque(maxlen=DELAYS))
+    samples: int = 0
+    samples_per_s: float = 0.0
 
 
 class StatusService:
@@ -60,7 +59,7 @@ class StatusService:
         self._media = media
         self._assets = assets
         self._alignment = alignment
-        self._stats: dict[int, _ConnectionStats] = {}
+        self._stats: defaultdict[int, _ConnectionStats] = defaultdict(_ConnectionStats)
         self._disconnected: dict[str, str] = {}  # participant id -> reason
         self._rolled_ns = 0
         self._entries = 0
@@ -70,7 +69,7 @@ class StatusService:
 
     def record_sample(self, connection: int, sample: Sample, now_ns: int) -> None:
         """Record a sample that was received."""
-        stats = self._find_stats(connection)
+        stats = self._stats[connection]
         stats.samples += 1
         stats.delays_ns.append(now_ns - sample.capture_ns)
 
@@ -114,12 +113,6 @@ class StatusService:
             stats.samples = 0
             if not stats.samples_per_s:
                 stats.delays_ns.clear()  # measured too long ago
-
-    def _find_stats(self, connection: int) -> _ConnectionStats:
-        stats = self._stats.get(connection)
-        if stats is None:
-            stats = self._stats[connection] = _ConnectionStats()
-        return stats
 
     def _make_report(self, now_ns: int) -> StatusReport:
         authority, config = self._context.authority, self._context.config

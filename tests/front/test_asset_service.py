@@ -8,7 +8,6 @@ from iris_session.front.asset_server import AssetAccess
 from iris_session.front.asset_service import (
     LATE_NS,
     LATE_TICK_NS,
-    MAX_REPLACED,
     PERIOD_NS,
     REPLACED_NS,
     AssetService,
@@ -94,14 +93,6 @@ def test_specifications_replaced_long_ago_are_not_served() -> None:
     assert "look0" not in rig.server.served
     rig.service.tick(2 * REPLACED_NS + PERIOD_NS)
     assert rig.server.served == {"look2", "mesh2", "look3", "mesh3"}
-
-
-def test_replaced_specifications_are_bounded() -> None:
-    rig = AssetServiceRig()
-    n = MAX_REPLACED + 10
-    for number in range(n):
-        served = rig.show(look(number))
-    assert {name for name in served if name.startswith("look")} == {f"look{i}" for i in range(n - MAX_REPLACED - 2, n)}
 
 
 def test_access_is_by_own_key_or_gateway_key_and_never_by_revoked_keys() -> None:

@@ -70,15 +70,6 @@ def test_beacons_carry_the_address_of_each_network() -> None:
     assert {msg.session_id for _, msg in wire.sent} == {"s1"}
 
 
-def test_beacons_only_on_the_chosen_interface() -> None:
-    beacon, wire, _ = sender(["192.168.0.9"], LO, ETH, WLAN)
-    beacon.tick(1)
-    assert wire.hosts() == {"127.255.255.255": "192.168.0.9", "192.168.0.255": "192.168.0.9"}
-    beacon, wire, _ = sender(["127.0.0.1"], LO, ETH, WLAN)
-    beacon.tick(1)
-    assert wire.hosts() == {"127.255.255.255": "127.0.0.1"}
-
-
 def test_beacons_five_times_a_second_also_on_new_networks() -> None:
     have = [LO, ETH]
     beacon = BeaconSender(BEACON, ["0.0.0.0"], 7720, Drops(), "", lambda: list(have))

@@ -17,9 +17,7 @@ from iris_session.protocol.client_messages import (
     Hello,
     Marker,
     Sample,
-    wrap_message,
 )
-from iris_session.protocol.codec import encode_client
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Join, Lost
 from iris_session.protocol.server_messages import (
@@ -74,15 +72,6 @@ def test_unsupported_version_is_refused_with_advice(session: FrontSession) -> No
 def test_states_of_another_scene_are_dropped_and_counted(session: FrontSession) -> None:
     session.send_state(np.zeros((N_BODIES + 1, 7)))
     assert session.wait_drops("state_of_other_scene") == 1
-
-
-def test_the_same_secret_has_the_same_key_id_on_every_connection(session: FrontSession) -> None:
-    first, second, other = session.client(), session.client(), session.client()
-    second.secret = first.secret
-    for client in (first, second, other):
-        client.join()
-    keys = [e.message.key_id for e in session.wait_entries(Join, 3) if isinstance(e.message, Join)]
-    assert keys[0] == keys[1] != keys[2]
 
 
 def test_resume_token_is_single_use_and_bound_to_the_key(session: FrontSession) -> None:
@@ -212,14 +201,6 @@ def test_gateway_sends_for_participants_and_they_leave_with_it(session: FrontSes
     assert acquire.connection == acquire.connection_epoch == 3
     gateway.close()
     assert [e.connection for e in session.wait_entries(Lost, 2)] == [2, 3]
-
-
-def test_wrong_connection_epoch_is_left_to_the_authority(session: FrontSession) -> None:
-    client = session.client()
-    client.join()
-    client.socket.send(encode_client(wrap_message(Acquire(1), 77)))
-    (acquire,) = session.wait_entries(Acquire)
-    assert (acquire.connection, acquire.connection_epoch) == (1, 77)
 
 
 def test_silent_gateway_disconnects_its_participants(open_session: OpenSession) -> None:

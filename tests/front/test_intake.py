@@ -88,14 +88,6 @@ def test_hellos_of_one_peer_are_bounded_until_it_disconnects(rig: IntakeRig) -> 
     assert rig.last() == rig.sent[0][1]
 
 
-def test_one_secret_behind_a_gateway_is_one_key_that_no_client_has(rig: IntakeRig) -> None:
-    rig.join(role="gateway")
-    for tab in ("tab1", "tab2"):
-        rig.take(Hello("operator", tab, secret=b"s" * 16), behalf=tab)
-    first, second = (e.message.key_id for e in rig.entries() if isinstance(e.message, Join))
-    assert first == second != rig.clients.by_number[1].key_id
-
-
 def test_gateway_is_bound_to_its_tcp_connection(rig: IntakeRig) -> None:
     rig.join(role="gateway")
     rig.take(Hello("operator", "Tab", secret=b"s" * 16), EVE, behalf="tab1")
@@ -196,15 +188,6 @@ def test_strangers_behind_a_gateway_use_up_no_hellos_of_others(rig: IntakeRig) -
     assert refused.code == "rate"
     rig.take(HELLO, Peer(5, "key-of-gateway"), behalf="ann")
     assert [e.message.name for e in rig.entries() if isinstance(e.message, Join)] == ["Ann"]
-
-
-def test_names_that_are_no_gateways_have_no_hellos_of_their_own(rig: IntakeRig) -> None:
-    for i in range(200):
-        rig.take(Hello("operator", "Eve", secret=b"%016d" % i), Peer(6, "key-of-eve"), behalf=f"tab{i}")
-    codes = [message.code for _, message, _ in rig.sent if isinstance(message, Refused)]
-    limits = rig.limits
-    assert codes.count("gateway_only") == limits.hello_source_burst + limits.hello_burst
-    assert codes[-1] == "rate"
 
 
 def test_excess_for_seconds_is_reported_as_a_flood(rig: IntakeRig) -> None:

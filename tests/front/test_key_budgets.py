@@ -21,7 +21,6 @@ from iris_session.protocol.client_messages import (
     EStop,
     GetSnapshot,
     Hello,
-    Marker,
     Release,
     Sample,
 )
@@ -99,16 +98,6 @@ def test_requests_for_many_targets_are_weighed_by_the_events_that_they_cause(rig
     assert {denial.reason for denial in denied} == {DenialReason.QUOTA}
     assert "events a second" in denied[0].message
     assert rig.drops.by_reason["key_events"] == 100 - kept[Acquire]
-
-
-def test_a_release_passes_when_the_events_of_its_key_are_used_up(rig: IntakeRig) -> None:
-    hog, kept = KeyRig(rig, 8), Counter[type]()
-    for i in range(96):
-        hog.send(i % 8, Marker(i + 1, "x"))
-    hog.send(0, Release(200))
-    collect(rig, kept)
-    assert kept[Marker] == 80
-    assert kept[Release] == 1
 
 
 def test_a_clutch_that_opens_always_passes(rig: IntakeRig) -> None:
@@ -209,19 +198,6 @@ def test_each_of_many_behind_a_gateway_is_limited_and_all_together(rig: IntakeRi
     budget = (80 + 10 * 20) // 2 + 1  # each time is two events
     assert max(put_on.values()) <= budget
     assert sum(put_on.values()) <= 8 * budget
-
-
-def test_a_gateway_is_not_limited_as_one_key_for_those_behind_it(rig: IntakeRig) -> None:
-    rig.join(role="gateway")
-    for i in range(8):
-        rig.now_ns += SECOND
-        rig.take(Hello("observer", f"p{i}", secret=b"%d" % i * 16), behalf=f"p{i}")
-        (entry,) = rig.entries()
-        rig.clients.by_number[entry.connection].admitted = True
-        for _ in range(30):
-            rig.take(Marker(1, "x"), epoch=entry.connection, behalf=f"p{i}")
-        assert len(rig.entries()) == 30
-    assert rig.drops.by_reason == {}
 
 
 @pytest.mark.parametrize("kind", ["messages", "bytes"])

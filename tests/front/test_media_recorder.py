@@ -153,14 +153,6 @@ def test_stream_ends_in_the_encoding_that_it_changes_from(rig: Rig, other: str) 
     assert rig.drops() == {}
 
 
-def test_only_clouds_and_pictures_go(rig: Rig) -> None:
-    for encoding in ("bytes", "deformable", "cloud", "jpeg", "of tomorrow"):
-        rig.push(encoding.replace(" ", "-"), encoding=encoding)
-    for _ in range(3):
-        rig.tick()
-    assert sorted(header.encoding for header, _ in rig.got) == ["cloud", "jpeg"]
-
-
 def test_bytes_are_bounded_and_every_stream_has_its_turn(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     """A large stream does not starve for small ones, nor they for it; what is missing is counted, and logged once."""
     seconds, sizes = 60, {"large": MAX_MEDIA_FRAME_BYTES, "small": 1000, "middle": 1_000_000}

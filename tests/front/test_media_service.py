@@ -9,13 +9,11 @@ import msgspec
 
 from iris_session.front.connections import FrontConnection, Peer, Route
 from iris_session.front.key_budgets import HandshakeLimiter
-from iris_session.front.media.scheduler import MAX_DETAIL, MAX_TITLE, MediaScheduler
+from iris_session.front.media.scheduler import MediaScheduler
 from iris_session.front.media.service import DESCRIPTION_BURST, PERIOD_NS, MediaService
 from iris_session.link import FrontConfig
 from iris_session.protocol.client_messages import Hello
-from iris_session.protocol.codec import decode_server, encode_server
-from iris_session.protocol.media import MAX_STREAMS, MediaPush, StreamBudget, StreamCamera, StreamInfo
-from iris_session.protocol.server_messages import ServerEnvelope
+from iris_session.protocol.media import MediaPush, StreamBudget, StreamCamera, StreamInfo
 from iris_session.protocol.status import DeliveryBudget
 from tests.front.fakes import make_context
 
@@ -157,17 +155,6 @@ def test_who_sends_in_vain_gets_to_know_who_has_the_stream() -> None:
     assert room.others[9].streams[0].taken_by == "", "it sends no more"
 
 
-def test_a_stream_of_the_session_itself_is_named_to_who_sends_in_vain() -> None:
-    room = Room()
-    room.join(9, Hello("source", "hall"))
-    room.tick()
-    for _ in range(5):
-        room.push()
-        assert not room.push_from(9)
-        room.tick()
-    assert room.others[9].streams[0].taken_by == "the session itself"
-
-
 def test_streams_end_with_the_participant_and_not_with_its_connection() -> None:
     room = Room()
     camera, other = room.join(8, Hello("camera", "room")), room.join(9, Hello("camera", "hall"))
@@ -197,17 +184,3 @@ def test_changes_with_every_frame_are_sent_at_a_bounded_rate_and_the_last_one_is
     assert DESCRIPTION_BURST < sent <= DESCRIPTION_BURST + 21
     room.tick(4)
     assert (room.find().detail, room.find().encoding) == ("79", "e79")
-
-
-def test_longest_descriptions_of_all_streams_fit_a_message() -> None:
-    room = Room()
-    text = "\N{ROBOT FACE}"
-    camera = msgspec.structs.replace(CAMERA, body=text * 64, distortion=(0.1,) * 8)
-    info = StreamInfo(text * 512, text * 64, camera, 30.0, text * 64, text * 512)
-    for n in range(MAX_STREAMS):
-        room.push(f"{n:x}".ljust(48, "x"), info, text * 64)
-    room.tick()
-    envelope = decode_server(encode_server(ServerEnvelope(1, 7, room.budgets[-1])))
-    assert isinstance(envelope.message, DeliveryBudget)
-    assert {len(one.title) for one in envelope.message.streams} == {MAX_TITLE}
-    assert {len(one.detail) for one in envelope.message.streams} == {MAX_DETAIL}

@@ -105,15 +105,6 @@ def test_the_largest_connection_of_the_owner_with_most_is_closed() -> None:
     assert select_largest([], 0) is None
 
 
-def test_many_who_hold_a_little_each_lose_the_largest(rig: ControlSocketRig) -> None:
-    held = [rig.open() for _ in range(40)]
-    for number, (peer, _) in enumerate(held):
-        rig.hello(peer, number)
-        rig.traffic.count_sent(peer.descriptor, [b"x" * (MIN_EVICT_BYTES + number)])
-    assert evict(rig, max_bytes=8 * MIB) == "Ann from 127.0.0.1"
-    assert is_closed(held[-1][1])
-
-
 class FakeMemory:
     """A memory guard with memory that the test sets."""
 

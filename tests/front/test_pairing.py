@@ -154,18 +154,6 @@ def test_revocation_during_pairing_takes_effect(rig: PairingRig, monkeypatch: py
     assert rig.tokens.is_revoked(own.fingerprint)
 
 
-def test_key_removed_by_a_command_during_pairing_stays_removed(rig: PairingRig) -> None:
-    own = KeyPair.generate()
-    code, _ = rig.home.join_codes.create(rig.server)
-    rig.asks(own, rig.proof(code, own))
-    rig.turn()
-    turns(lambda _: None, lambda: bool(rig.home.clients.read()))  # written, and not told yet
-    assert rig.home.clients.revoke_key("ann") is not None
-    rig.keyring.reload_if_changed()
-    assert "revoked" in rig.answer(own).message
-    assert rig.keyring.find_key(own.fingerprint) is None
-
-
 def test_unreadable_allow_list_is_read_again(
     rig: PairingRig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -253,16 +241,6 @@ def test_exhausted_pairing_attempts_do_not_limit_others(rig: PairingRig) -> None
     assert len(rig.answers(eve)) < 30, "and few are answered"
     rig.asks(ann, rig.proof(code, ann), descriptor=2)
     assert isinstance(rig.answer(ann), Paired)
-
-
-def test_one_address_cannot_exhaust_the_attempts_of_all(rig: PairingRig) -> None:
-    """Also while no code exists."""
-    eve, ann = KeyPair.generate(), KeyPair.generate()
-    for _ in range(200):
-        rig.asks(eve)
-    rig.asks(ann, descriptor=2)
-    assert rig.answer(ann).message == "no join code can be used now"
-    assert rig.drops.by_reason["pair_rate"] >= 180
 
 
 def test_pending_attempts_are_bounded_and_time_out(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:

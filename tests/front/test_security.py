@@ -156,14 +156,6 @@ def test_director_revokes_although_the_list_is_read_only(open_session: Open, tmp
     assert late.wait_for(Refused).code == RefusalCode.UNPAIRED
 
 
-def test_removed_participant_is_notified_and_may_rejoin(lab: Lab) -> None:
-    pair, client = lab.allowed("ann")
-    lab.session.once(Decision((), dropped=(Dropped(1, "removed"),)))
-    fault = client.wait_for(ProtocolFault)
-    assert (fault.code, fault.message) == (FaultCode.REVOKED, "a director removed this participant")
-    lab.client(pair).join(name="ann")
-
-
 def test_revoked_secret_stays_refused_on_unencrypted_loopback(session: FrontSession) -> None:
     client = session.client()
     client.join()

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import msgspec
 import numpy as np
 
-from iris_session.front.status import MIN_DELAYS, REUSE_NS
-from iris_session.protocol.client_messages import Hello, Observation, Sample, Samples
+from iris_session.front.status import MIN_DELAYS
+from iris_session.protocol.client_messages import Hello, Observation, Sample
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Join
 from iris_session.protocol.names import FaultCode
@@ -121,39 +120,6 @@ def test_alignment_report_has_both_halves(open_session: Callable[..., FrontSessi
     assert (ours.version, ours.alarm, ours.alarm_ns) == (7, "changed", 5)
     assert [(s.anchor_id, s.observations) for s in ours.seen] == [("table", 8)]
     assert other == theirs
-
-
-def test_delays_of_samples_are_measured(session: FrontSession) -> None:
-    client = session.client()
-    welcome = client.join(devices=("head",))
-    session.process.link.send_report(half(row(welcome.participant_id)))
-    seq = 0
-
-    def measured(report: StatusReport) -> bool:
-        nonlocal seq
-        for _ in range(40):
-            seq += 1
-            client.send(sample(seq, session.process.link.now_ns - 30 * MS))
-        client.send(Samples((sample(seq + 1, session.process.link.now_ns - 30 * MS),)))
-        seq += 1
-        (ann,) = report.participants or (None,)
-        return ann is not None and ann.samples_per_s > 0.0 and ann.capture_to_receive is not None
-
-    ann = ask(session, client, measured).participants[0]
-    assert ann.capture_to_receive is not None
-    assert 30.0 <= ann.capture_to_receive.p50 < 60.0
-
-
-def test_concurrent_requests_get_the_same_report(session: FrontSession) -> None:
-    client = session.client()
-    client.join()
-    client.send(GetStatus(1))
-    client.send(GetStatus(2))
-    client.wait_for(StatusReport, 2)
-    one, two = client.got(StatusReport)
-    assert (one.request_id, two.request_id) == (1, 2)
-    if two.session_time - one.session_time < REUSE_NS:
-        assert msgspec.structs.replace(two, request_id=1, session_time=one.session_time) == one
 
 
 def test_client_can_request_status_before_admission(session: FrontSession) -> None:

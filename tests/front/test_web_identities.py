@@ -145,22 +145,6 @@ class TestIdentity:
         client = lab.client(own)
         assert lab.refused(client, Hello("operator", "bob", secret=client.secret)).code == RefusalCode.UNPAIRED
 
-    def test_secret_of_another_person_gives_their_identity_only(self, lab: Lab) -> None:
-        """A forged identity needs the secret: the identity itself, or its fingerprint, is none."""
-        gateway, ada, eve = open_gateway(lab), Person(), Person("eve")
-        allow(lab, ada)
-        gateway.enter(ada)
-        eve.secret = ada.identity
-        assert gateway.refused(eve).code == RefusalCode.UNPAIRED
-
-    def test_resume_token_of_another_person_is_refused(self, lab: Lab) -> None:
-        gateway, ada, eve = open_gateway(lab), Person(), Person("eve")
-        allow(lab, ada)
-        allow(lab, eve)
-        welcome, _ = gateway.enter(ada)
-        assert gateway.refused(eve, eve.hello(resume_token=welcome.resume_token)).code == RefusalCode.RESUME_TOKEN
-        lab.audits(AuditKind.TOKEN_REFUSED)
-
     def test_one_person_has_as_many_connections_as_a_key(self, lab: Lab) -> None:
         gateway, ada = open_gateway(lab), Person()
         allow(lab, ada)
@@ -252,21 +236,6 @@ class TestPairing:
         client.wait_for(Paired)
         assert gateway.refused(ada, ada.pair(code)).code == RefusalCode.CODE
 
-    def test_wrong_code_uses_an_attempt(self, lab: Lab) -> None:
-        gateway, ada = open_gateway(lab), Person()
-        _, made = lab.home.join_codes.create(lab.server, web_key=CERTIFICATE)
-        assert gateway.refused(ada, ada.pair("0000-0000-0000")).code == RefusalCode.CODE
-        after = lab.home.join_codes.find_code(made.id)
-        assert after is not None
-        assert after.attempts_left == made.attempts_left - 1
-
-    def test_proof_for_another_identity(self, lab: Lab) -> None:
-        """A proof that was overheard is of no use to another identity."""
-        gateway, ada, eve = open_gateway(lab), Person(), Person("eve")
-        code, _ = lab.home.join_codes.create(lab.server, web_key=CERTIFICATE)
-        stolen = Pair("eve", ada.pair(code).proof, identity=eve.identity)
-        assert gateway.refused(eve, stolen).code == RefusalCode.CODE
-
     def test_code_made_for_another_certificate(self, lab: Lab) -> None:
         gateway, ada = open_gateway(lab), Person()
         code, made = lab.home.join_codes.create(lab.server, web_key=bytes(32))
@@ -318,16 +287,6 @@ class TestRevocation:
         gateway.client.send(Marker(1, "still here"), on_behalf_of="bob", epoch=theirs.connection_epoch)
         lab.session.wait_entries(Marker, connection=theirs.connection_epoch)
 
-    def test_revoked_gateway_ends_the_people_behind_it_not_their_identities(self, lab: Lab) -> None:
-        first, second = open_gateway(lab), open_gateway(lab)
-        ada = Person()
-        allow(lab, ada)
-        first.enter(ada)
-        first_mark = next(e.message.key_id for e in lab.session.entries if isinstance(e.message, Join))
-        lab.home.clients.revoke_key(first_mark)
-        lab.session.wait_entries(Lost, 2)
-        second.enter(ada)
-
 
 class TestOwnGateway:
     """The session's own gateway has a key made at its start, which is on no list."""
@@ -367,15 +326,6 @@ class TestDisconnected:
         assert join.resume_of == again.participant_id == welcome.participant_id
         assert len(lab.session.wait_entries(Lost)) == 1
 
-    def test_reasons_are_few(self, lab: Lab) -> None:
-        gateway, ada = open_gateway(lab), Person()
-        allow(lab, ada)
-        for sent, known in (("slow", "slow"), ("revoked", "closed")):
-            gateway.enter(ada)
-            before = len(lab.session.wait_entries(Lost, 0))
-            gateway.client.send(Disconnected(sent), on_behalf_of="ada", epoch=0)
-            assert lab.session.wait_entries(Lost, before + 1)[-1].message == Lost(known)
-
     def test_only_of_a_gateway(self, lab: Lab) -> None:
         _, bob = lab.allowed("bob", "operator")
         bob.send(Disconnected())
@@ -386,13 +336,6 @@ class TestDisconnected:
         bob.send(Disconnected(), on_behalf_of="ada", epoch=0)
         bob.wait_for(ProtocolFault, 2)
         assert not [e for e in lab.session.entries if isinstance(e.message, Lost)]
-
-    def test_of_one_that_has_not_joined(self, lab: Lab) -> None:
-        gateway = open_gateway(lab)
-        gateway.client.send(Disconnected(), on_behalf_of="ada", epoch=0)
-        gateway.client.send(Marker(1, "still here"))
-        lab.session.wait_entries(Marker)
-        assert not gateway.received("ada", ProtocolFault)
 
 
 def test_no_secret_reaches_the_journal(lab: Lab) -> None:

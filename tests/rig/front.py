@@ -71,7 +71,6 @@ class NoMedia:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.scheduler = MediaScheduler()
-        self.alive = True
 
     def start(self) -> None: ...
 

@@ -87,10 +87,6 @@ class MediaProxy:
         self.scheduler = MediaScheduler()
         self.is_source: Callable[[str], bool] = lambda _key: True
 
-    @property
-    def alive(self) -> bool:
-        return self._thread.is_alive()
-
     def start(self) -> None:
         self._thread.start()
 
