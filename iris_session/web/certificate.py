@@ -23,7 +23,6 @@ from iris_session.system.extras import require_package
 
 if TYPE_CHECKING:
     from cryptography import x509
-    from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
 
 CERTIFICATE_FILE: Final = "web.crt"
 KEY_FILE: Final = "web.key_pem"
@@ -97,13 +96,16 @@ def load_certificate(
     """
     require_package("cryptography", _PURPOSE)
     from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
 
     path, key = Path(certificate_path), Path(certificate_path if key_path is None else key_path)
     data = _read(path)
     try:
         found = x509.load_pem_x509_certificate(data)
         names = _read_names(found)
-        public = _encode_public(found.public_key())
+        spki = serialization.PublicFormat.SubjectPublicKeyInfo
+        public = found.public_key().public_bytes(serialization.Encoding.DER, spki)
+        fingerprint = found.fingerprint(hashes.SHA256()).hex(":").upper()
     except Exception as error:  # of the parser, for any bytes: ValueError, UnsupportedAlgorithm, its own panics
         raise KeysError(f"{path} is not a certificate in PEM form: {_shorten(error)}") from None
     try:
@@ -112,7 +114,7 @@ def load_certificate(
             make_tls_context(path, key)
     except (ssl.SSLError, OSError, ValueError) as error:
         raise KeysError(f"{key} is not the key of {path}, or is encrypted: {_shorten(error)}") from None
-    return Certificate(path, key, hashlib.sha256(public).digest(), _format_fingerprint(found), names)
+    return Certificate(path, key, hashlib.sha256(public).digest(), fingerprint, names)
 
 
 def make_tls_context(certificate_path: Path, key_path: Path) -> ssl.SSLContext:
@@ -216,18 +218,6 @@ def _read_names(certificate: x509.Certificate) -> tuple[str, ...]:
         return ()
     addresses = [str(one) for one in names.get_values_for_type(x509.IPAddress)]
     return tuple(dict.fromkeys((*addresses, *names.get_values_for_type(x509.DNSName))))
-
-
-def _encode_public(key: CertificatePublicKeyTypes) -> bytes:
-    from cryptography.hazmat.primitives import serialization
-
-    return key.public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
-
-
-def _format_fingerprint(certificate: x509.Certificate) -> str:
-    from cryptography.hazmat.primitives import hashes
-
-    return certificate.fingerprint(hashes.SHA256()).hex(":").upper()
 
 
 def _expires_soon(certificate: Certificate) -> bool:

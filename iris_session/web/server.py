@@ -82,12 +82,18 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class SocketWriter:
-    """Writes one WebSocket: knows whether there is room, and whether its client reads at all."""
+    """Writes one WebSocket: knows whether there is room, and whether its client reads at all.
+
+    Attributes:
+        socket: The WebSocket.
+        frame: Frame of media to write next.
+    """
 
     def __init__(self, socket: web.WebSocketResponse, request: web.Request) -> None:
         transport = request.transport
         assert transport is not None
         self.socket = socket
+        self.frame: bytes | None = None
         self._transport = transport
         sock = transport.get_extra_info("socket")
         self._descriptor = -1 if sock is None else sock.fileno()
@@ -101,6 +107,11 @@ class SocketWriter:
     def wake(self) -> None:
         """Let `wait` return."""
         self._wake.set()
+
+    def offer(self, frames: list[bytes]) -> None:
+        """Set the frame of media to write next."""
+        self.frame = encode_frames(MEDIA, frames)
+        self.wake()
 
     async def wait(self) -> None:
         """Wait for `wake`, or a moment."""
@@ -472,9 +483,8 @@ class WebServer:
         before, self._media[browser.name] = self._media.get(browser.name), writer
         if before is not None:
             await before.close(Closing(CLOSE_LIMIT, "another media socket of this participant was opened"))
-        stream = MediaWriter(writer)
-        feed = self._session.open_media(browser, stream.offer)
-        writing = asyncio.create_task(self._write_media(browser, stream, feed))
+        feed = self._session.open_media(browser, writer.offer)
+        writing = asyncio.create_task(self._write_media(browser, writer, feed))
         try:
             await self._read_media(browser, socket, feed, writer)
         finally:
@@ -527,13 +537,12 @@ class WebServer:
                 await writer.close(Closing(CLOSE_NOT_ALLOWED, str(error)))
                 return
 
-    async def _write_media(self, browser: Browser, stream: MediaWriter, feed: MediaFeedSocket) -> None:
+    async def _write_media(self, browser: Browser, writer: SocketWriter, feed: MediaFeedSocket) -> None:
         """Write frames one at a time; the next one is read from the session when there is room for it."""
-        writer = stream.writer
         while browser.is_admitted:
             await writer.wait()
-            if stream.frame is not None:
-                message, stream.frame = stream.frame, None
+            if writer.frame is not None:
+                message, writer.frame = writer.frame, None
                 if not await writer.send_pieces(message):
                     break
                 while not writer.has_room(MEDIA_WINDOW) and not writer.is_slow():
@@ -546,19 +555,6 @@ class WebServer:
             await writer.close(Closing(CLOSE_TOO_SLOW, "this client reads nothing"))
         else:
             await writer.close(Closing(CLOSE_NOT_ALLOWED, "the session has no connection for this participant now"))
-
-
-class MediaWriter:
-    """The frame that waits for one media socket."""
-
-    def __init__(self, writer: SocketWriter) -> None:
-        self.writer = writer
-        self.frame: bytes | None = None
-
-    def offer(self, frames: list[bytes]) -> None:
-        """Set the frame to write next."""
-        self.frame = encode_frames(MEDIA, frames)
-        self.writer.wake()
 
 
 def _pick_allow(error: web.HTTPException) -> dict[str, str]:

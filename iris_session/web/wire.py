@@ -103,15 +103,11 @@ class _ServerEnvelope(msgspec.Struct, array_like=True):
     message: _Type
 
 
-class _ClientType(msgspec.Struct):
-    type: str = ""
-
-
 class _ClientEnvelope(msgspec.Struct, array_like=True):
     version: int
     connection_epoch: int
     on_behalf_of: str
-    message: _ClientType
+    message: _Type
 
 
 _server: Final = msgspec.msgpack.Decoder(_ServerEnvelope)

@@ -104,16 +104,6 @@ def test_ipv6(open_process: OpenSession) -> None:
         session.pump(lambda: bool(client.poll(0)), "welcome over IPv6")
 
 
-def test_a_signal_ends_the_front_cleanly(process_session: ProcessSession) -> None:
-    session = process_session
-    client = session.client()
-    client.join()
-    assert os.getsid(session.process.pid) == session.process.pid != os.getsid(0), "Ctrl-C reaches only the parent"
-    os.kill(session.process.pid, signal.SIGTERM)
-    wait(lambda: not session.process.pid, "end of the front")
-    assert wait_until_told(client)[-1] == "session_ended"
-
-
 def test_crashed_front_is_replaced_and_its_successor_knows_what_it_knew(process_session: ProcessSession) -> None:
     """The same ports, resume tokens, counters and the number of the newest state; and a scene that came meanwhile."""
     session = process_session
@@ -142,25 +132,6 @@ def test_crashed_front_is_replaced_and_its_successor_knows_what_it_knew(process_
     snapshot = client.wait_for(Snapshot)
     assert len(snapshot.bodies) == 5
     assert snapshot.state_seq > 1
-
-
-def test_front_that_cannot_listen_again_says_why(process_session: ProcessSession) -> None:
-    session = process_session
-    address = session.host, session.ports.control
-    os.kill(session.process.pid, signal.SIGKILL)
-    wait(lambda: not session.process.pid, "crash")
-    with socket.socket() as other:
-        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        other.bind(address)
-        other.listen()
-        said: list[str] = []
-
-        def is_over() -> bool:
-            session.process.link.receive()
-            said.extend(session.process.poll(time.monotonic_ns()))
-            return f"port {address[1]}" in "".join(said)
-
-        wait(is_over, "failure")
 
 
 def test_hanging_front_is_replaced(process_session: ProcessSession) -> None:

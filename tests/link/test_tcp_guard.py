@@ -133,6 +133,14 @@ def test_connections_with_a_request_under_way_stay() -> None:
     assert rig.left == [0, 1], "the other was idle"
 
 
+def test_an_owner_has_its_share() -> None:
+    rig = Rig(established=100, find_share=lambda owner: 1 if owner == "hog" else 3)
+    for key in ("hog", "ann", "hog", "ann", "hog"):
+        rig.open(key=key)
+    rig.guard.tick(SECOND)
+    assert rig.left == [0, 1, 3]
+
+
 def test_silent_connections_are_closed_and_established_ones_may_be_silent() -> None:
     rig = Rig(silence_ns=10 * SECOND)
     rig.open()

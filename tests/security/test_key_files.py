@@ -193,16 +193,3 @@ def test_new_permissions_are_a_change(home: KeyHome) -> None:
         home.clients.read()
     path.chmod(0o600)
     assert home.clients.signature != before
-
-
-@pytest.mark.parametrize("saved", ["", "[", "[{}, nonsense", "[1" + 5000 * "0" + "]"])
-def test_file_saved_during_reading_is_damaged(
-    home: KeyHome, listed: Path, monkeypatch: pytest.MonkeyPatch, saved: str
-) -> None:
-    """The line is searched in a newer file than the damaged one."""
-    entries = json.loads(listed.read_text())
-    listed.write_text(json.dumps([*entries, entries[0]]))
-    whole, reads = home.folder.read, iter([listed.read_bytes(), saved.encode()])
-    monkeypatch.setattr(home.folder, "read", lambda name: next(reads, None) or whole(name))
-    with pytest.raises(KeysError, match="damaged"):
-        home.clients.read()

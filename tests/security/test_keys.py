@@ -278,6 +278,22 @@ def test_replaced_file_is_durable_after_a_power_cut(home: KeyHome, monkeypatch: 
     assert synced == [False, True]
 
 
+def test_cancelled_code_is_void(home: KeyHome) -> None:
+    server, ann = home.load_server_key(), KeyPair.generate()
+    code, made = home.join_codes.create(server)
+    home.join_codes.cancel(made.id)
+    late = home.join_codes.redeem(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
+    assert (late.entry, home.join_codes.find_code(made.id)) == (None, None)
+
+
+def test_codes_are_bounded(home: KeyHome) -> None:
+    server = home.load_server_key()
+    for _ in range(32):
+        home.join_codes.create(server)
+    with pytest.raises(KeysError, match="32 join codes"):
+        home.join_codes.create(server)
+
+
 def test_changed_server_key_is_an_error(home: KeyHome) -> None:
     old, new = KeyPair.generate(), KeyPair.generate()
     home.known_servers.pin("lab:7721", "lab", old.public)

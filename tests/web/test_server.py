@@ -11,6 +11,7 @@ import pytest
 from aiohttp import ClientSession, WSMsgType, web
 
 from iris_session.web import server, wire
+from iris_session.web.assets import ByteRate
 from iris_session.web.hub import Hub
 from iris_session.web.origin import HostCheck
 from iris_session.web.page import PageFiles
@@ -55,6 +56,12 @@ def test_late_ticket_is_no_wrong_one(monkeypatch: pytest.MonkeyPatch, first: byt
 
     assert asyncio.run(open_media()) == code
     assert hub.drops.by_reason == {"web_ticket": 1}
+
+
+def test_senders_of_assets_share_a_rate_and_do_not_pay_for_silence() -> None:
+    rate = ByteRate(1024.0)
+    assert [rate.reserve(128, 5.0) for _ in range(3)] == [0.0, 0.125, 0.25]
+    assert rate.reserve(128, 60.0) == 0.0
 
 
 async def send_beside_another(message: bytes) -> tuple[bytes, int]:
