@@ -49,11 +49,6 @@ class PageFiles:
         self._signature: tuple[int, int] | None = None
         self._files: dict[str, PageFile] = {}
 
-    @property
-    def is_built(self) -> bool:
-        """True when there is a page."""
-        return (self._folder / INDEX).is_file()
-
     def find(self, path: str) -> PageFile | None:
         """Return the file for the path of a request (`/` is the index), `None` without one."""
         if path in ("/", f"/{INDEX}"):

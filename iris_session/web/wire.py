@@ -170,11 +170,6 @@ def decode_gateway_message(frame: Bytes) -> GatewayMessage:
         raise MalformedError(f"no message of a gateway: {error}") from None
 
 
-def encode_subscriptions(streams: Sequence[str]) -> bytes:
-    """Return the WebSocket message that names all media streams that are wanted."""
-    return encode_frames(MEDIA_WISHES, (_encoder.encode(list(streams)),))
-
-
 def decode_subscriptions(frame: Bytes) -> frozenset[str]:
     """Decode the frame of channel 4. Raises `MalformedError`."""
     try:

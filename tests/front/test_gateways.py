@@ -101,14 +101,6 @@ def test_participants_of_a_gateway_lose_the_roles_of_its_key(lab: Lab) -> None:
     assert len(gateway.lost(1)) == 1
 
 
-def test_key_without_gateway_role_disconnects_its_participants(lab: Lab) -> None:
-    gateway = Gateway(lab)  # any role
-    gateway.enter("tab1", "director")
-    lab.home.clients.allow_key("web", gateway.pair.public, ("director",))
-    assert gateway.removed(2) == gateway.ids("web", "tab1")
-    assert set(gateway.lost(2).values()) == {"role"}
-
-
 @pytest.mark.parametrize("who", ["behind a gateway", "without state", "with state"])
 def test_subscribers_reconnect_only_when_a_subscribed_key_is_revoked(lab: Lab, who: str) -> None:
     bob, _ = lab.allowed("bob")

@@ -208,16 +208,6 @@ def test_client_may_lower_and_restore_its_level() -> None:
     assert link.play(20).levels == {"cloud": 0}
 
 
-def test_new_stream_starts_low_on_a_full_link() -> None:
-    link = Link(8)
-    link.play(5)
-    link.play(0.25, BOTH)
-    assert link.grants[-1][1].levels["cloth"] == NONE_LEVEL
-    controller = link.controller
-    controller.remove(7)
-    assert controller.update(7, LinkMeasure(None), BOTH, link.now_ns).levels == {"cloud": 0, "cloth": 0}
-
-
 MAPS = {**CLOUD, "map": (0.0, 0.0, 0.0), "plan": (0.0, 0.0, 0.0)}
 MAP_BYTES = {"map": 400_000, "plan": 400_000}
 

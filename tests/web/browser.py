@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import TypeVar
 
 import aiohttp
+import msgspec
 
 from iris_session.protocol.client_messages import ClientMessage, GetSnapshot, Heartbeat, Hello, wrap_message
 from iris_session.protocol.codec import decode_media_header, decode_server, decode_state_header, encode_client
@@ -140,7 +141,7 @@ class WebBrowser:
         self._media_socket = socket
         message = wire.Ticket(self.ticket if ticket is None else ticket)
         await socket.send_bytes(wire.encode_gateway_message(message))
-        await socket.send_bytes(wire.encode_subscriptions(streams))
+        await socket.send_bytes(wire.encode_frames(wire.MEDIA_WISHES, (msgspec.msgpack.encode(streams),)))
         self._tasks.append(asyncio.create_task(self._read_media(socket)))
         return socket
 

@@ -52,7 +52,6 @@ def test_gateway_messages(row: dict[str, Any]) -> None:
     data, value = bytes.fromhex(row["hex"]), row["value"]
     if isinstance(value, list):
         assert wire.decode_subscriptions(data) == frozenset(value)
-        assert wire.decode_frames(wire.encode_subscriptions(value))[1][0] == data
         return
     message = wire.decode_gateway_message(data)
     assert {**msgspec.to_builtins(message), **value} == msgspec.to_builtins(message)
