@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -62,21 +63,13 @@ class SoftRig(Rig):
         data.qpos[model.jnt_qposadr[joints + 1]] += moved[:, 1] - at[:, 1]
         self.moved_by_hand()
 
-    def verdict(self) -> str:
-        """Return an empty text when every operator is done and every goal is reached, else the fault."""
-        wrong = [
-            f"{robot} ({b.phase}): {b.failed or 'not done'}"
-            for robot, b in self.behaviours.items()
-            if b.failed or not b.done
-        ]
-        wrong += [f"{w.goal.deformable} is not {w.goal.name}" for w in self.watches if w.at_s is None]
-        return "; ".join(wrong)
+    def _list_missed_goals(self) -> Iterator[str]:
+        yield from (f"{w.goal.deformable} is not {w.goal.name}" for w in self.watches if w.at_s is None)
 
     def over(self) -> bool:
         """Return whether every operator is done and every goal is reached, or an operator has stopped trying."""
-        behaviours = self.behaviours.values()
         reached = all(watch.at_s is not None for watch in self.watches)
-        return any(b.failed for b in behaviours) or (reached and all(b.done for b in behaviours))
+        return any(b.failed for b in self.behaviours.values()) or (reached and super().over())
 
 
 def soft_demo(play: Demo, seed: int, *, shift: bool = True) -> SoftRig:

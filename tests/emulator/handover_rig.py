@@ -13,10 +13,11 @@ import math
 import random
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import mujoco
 
 from anchors.pose import (
@@ -227,10 +228,27 @@ class Rig:
             for referee in self.referees.values():
                 referee.tick(self.world)
 
-    @property
-    def referee(self) -> Referee:
-        """Return the referee of the first object."""
-        return self.referees[self.object]
+    def verdict(self) -> str:
+        """Return an empty text when every operator is done and every goal is reached, else the fault."""
+        wrong = [
+            f"{robot} ({b.phase}): {b.failed or 'not done'}"
+            for robot, b in self.behaviours.items()
+            if b.failed or not b.done
+        ]
+        return "; ".join([*wrong, *self._list_missed_goals()])
+
+    def over(self) -> bool:
+        """Return whether every operator is done, or one has stopped trying."""
+        behaviours = self.behaviours.values()
+        return all(b.done for b in behaviours) or any(b.failed for b in behaviours)
+
+    def _list_missed_goals(self) -> Iterator[str]:
+        for giver in (b for b in self.behaviours.values() if isinstance(b, Giver)):
+            referee = self.referees[giver.object]
+            if not referee.handed_over(giver.robot, giver.partner):
+                yield f"no clean handover of {giver.object}: {referee.flights}"
+            elif not referee.resting:
+                yield f"{giver.object} does not rest on the table alone"
 
     def end_engagement(self, robot: str) -> None:
         """Emulate the session after a gap in the samples: the robot holds until the clutch was opened once."""
@@ -291,15 +309,8 @@ class Rig:
             self._engagements[hand.robot] += not engaged
             self._seq += 1
             now_ns = round(self.now_s * 1e9)
-            source = CommandSource(
-                hand.robot,
-                hand.device,
-                self._engagements[hand.robot],
-                self._seq,
-                now_ns,
-                now_ns,
-                pose_world=Pose(*hand.pose_world),
-            )
+            engagement, pose = self._engagements[hand.robot], Pose(*hand.pose_world)
+            source = CommandSource(hand.robot, hand.device, engagement, self._seq, now_ns, now_ns, pose_world=pose)
             self._commands[hand.robot] = Command(hand.robot, CommandKind.POSE, "", (source,), hand.gripper)
 
     def _shift_object(self, name: str) -> None:
@@ -315,11 +326,7 @@ def _seen(command: Command) -> Command:
     """Return the command for a later step: its sample is not new any more."""
     if command.kind != CommandKind.POSE or not command.sources[0].new:
         return command
-    s = command.sources[0]
-    source = CommandSource(
-        s.participant, s.device, s.engagement, s.seq, s.capture_ns, s.receive_ns, new=False, pose_world=s.pose_world
-    )
-    return Command(command.robot, command.kind, "", (source,), command.gripper)
+    return msgspec.structs.replace(command, sources=(msgspec.structs.replace(command.sources[0], new=False),))
 
 
 def handover(seed: int, object: str = "hammer", giver: str = "left", receiver: str = "right", **options: Any) -> Rig:
@@ -337,46 +344,14 @@ def demo(play: Demo, seed: int, **options: Any) -> Rig:
     return Rig(behaviours, seed, play.objects[0], play.objects[1:], model=play.model, **options)
 
 
-def verdict(rig: Rig, giver: str, receiver: str) -> str:
-    """Return an empty text when the handover succeeded, else the fault."""
-    for robot, behaviour in rig.behaviours.items():
-        if behaviour.failed or not behaviour.done:
-            return f"{robot} ({behaviour.phase}): {behaviour.failed or 'not done'}"
-    if not rig.referee.handed_over(giver, receiver):
-        return f"no clean handover: {rig.referee.flights}"
-    return "" if rig.referee.resting else "the object does not rest on the table alone"
-
-
-def demo_verdict(rig: Rig) -> str:
-    """Return an empty text when every object changed hands cleanly and rests, else the fault."""
-    wrong = [
-        f"{robot} ({b.phase}): {b.failed or 'not done'}"
-        for robot, b in rig.behaviours.items()
-        if b.failed or not b.done
-    ]
-    for giver in (b for b in rig.behaviours.values() if isinstance(b, Giver)):
-        referee = rig.referees[giver.object]
-        if not referee.handed_over(giver.robot, giver.partner):
-            wrong.append(f"no clean handover of {giver.object}: {referee.flights}")
-        elif not referee.resting:
-            wrong.append(f"{giver.object} does not rest on the table alone")
-    return "; ".join(wrong)
-
-
-def over(rig: Rig) -> bool:
-    """Return whether every operator is done, or one has stopped trying."""
-    behaviours = rig.behaviours.values()
-    return all(b.done for b in behaviours) or any(b.failed for b in behaviours)
-
-
 def main(runs: int, name: str = "handover", operators: int = 2, first: int = 0) -> None:
     """Count successes over `runs` seeds."""
     good, times = 0, []
     play = None if name == "board" else make_demo(name, operators)
     for seed in range(first, first + runs):
         rig = handover(seed, "board", "right", "left") if play is None else demo(play, seed)
-        rig.run(90.0, until=over)
-        wrong = demo_verdict(rig)
+        rig.run(90.0, until=Rig.over)
+        wrong = rig.verdict()
         good += not wrong
         times.append(rig.now_s)
         tries = [b.attempts for b in rig.behaviours.values()]

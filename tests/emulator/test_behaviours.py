@@ -8,7 +8,7 @@ import pytest
 
 from anchors.pose import distance
 from iris_session.emulator.behaviours import Giver, Idle, Receiver, Wander, make_behaviour
-from tests.emulator.handover_rig import DEVICE, Rig, handover, verdict
+from tests.emulator.handover_rig import DEVICE, Rig, handover
 
 pytestmark = pytest.mark.usefixtures("untraced")
 
@@ -22,7 +22,7 @@ def test_board_is_handed_over_in_mid_air() -> None:
     """Friction alone holds the object; between the two grips it touches nothing else; it ends on the table."""
     rig = handover(3, "board", "right", "left")
     rig.run(25.0)
-    assert verdict(rig, "right", "left") == ""
+    assert rig.verdict() == ""
     assert rig.now_s < 25.0
     assert rig.fastest_hand < 0.5
     assert rig.world.view().object_pose("board").p[0] < -0.1, "on the receiver's side of the table"
@@ -43,7 +43,7 @@ def test_handover_finishes_after_an_emergency_stop() -> None:
     for view in rig.views.values():
         view.estop = False
     rig.run(30.0)
-    assert verdict(rig, "left", "right") == ""
+    assert rig.verdict() == ""
 
 
 @pytest.mark.long
@@ -53,7 +53,7 @@ def test_receiver_clutches_again_after_a_lost_engagement() -> None:
     rig.run(0.1, until=lambda r: False)
     rig.end_engagement("right")
     rig.run(40.0)
-    assert verdict(rig, "left", "right") == ""
+    assert rig.verdict() == ""
 
 
 @pytest.mark.long
@@ -68,7 +68,7 @@ def test_giver_picks_up_a_dropped_object() -> None:
     rig.run(5.0, until=lambda r: r.world.view().object_pose("hammer").p[2] < 0.06)
     model.geom_friction[pads] = rubber
     rig.run(60.0)
-    assert verdict(rig, "left", "right") == ""
+    assert rig.verdict() == ""
     assert rig.behaviours["left"].attempts >= 2  # type: ignore[attr-defined]
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from iris_session.demo.demos import make_demo
 from iris_session.emulator.behaviours import CombinedBehaviour, HandInput, OperatorView
-from tests.emulator.handover_rig import LateView, demo, demo_verdict, over
+from tests.emulator.handover_rig import LateView, Rig, demo
 
 
 @pytest.mark.long
@@ -16,8 +16,8 @@ from tests.emulator.handover_rig import LateView, demo, demo_verdict, over
 def test_every_object_is_handed_over() -> None:
     """By friction, in mid-air, onto a table. Two panda, and ALOHA: `tests/e2e/test_demo_scenes.py`."""
     rig = demo(make_demo("panda", 4), seed=0)
-    rig.run(60.0, until=over)
-    assert demo_verdict(rig) == ""
+    rig.run(60.0, until=Rig.over)
+    assert rig.verdict() == ""
     assert rig.fastest_hand < 0.5
 
 

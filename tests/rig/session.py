@@ -12,7 +12,7 @@ from typing import Any, Final, Self, TypeVar
 import mujoco
 import pytest
 
-from anchors.pose import PoseTuple
+from anchors.pose import PoseTuple, distance
 from iris_session.cli import control as _control  # noqa: F401  (commands import their modules late: simulated too)
 from iris_session.cli import status as _status  # noqa: F401
 from iris_session.cli.main import main
@@ -74,9 +74,7 @@ class Hand:
     @property
     def tip(self) -> PoseTuple:
         """`T_world_tip` of the robot as this client sees it now."""
-        tip = self.client.scene.tip_pose(self.robot)
-        assert tip is not None
-        return tip
+        return see_tip(self.client, self.robot)
 
     @property
     def is_following(self) -> bool:
@@ -358,6 +356,12 @@ class Rig:
         hand.clutch = True
         self.run_until(lambda: hand.is_following, f"{hand.robot} follows {hand.client.name}", 1.0)
 
+    def check_rest(self, client: Client, robot: str, seconds: float = 0.3) -> None:
+        """Check that a robot does not move for a time [s], as a client sees it."""
+        before = see_tip(client, robot)
+        self.run(seconds)
+        assert distance(before[0], see_tip(client, robot)[0]) < 1e-4
+
     def list_events(self, name: str, kind: type[T]) -> list[tuple[int, T]]:
         """Return session time [ns] and body of the events of a type that a client has received."""
         return [(event.session_time, body) for event in self.events[name] if isinstance(body := event.body, kind)]
@@ -416,6 +420,13 @@ def _refuse_introduction(*_: object) -> Any:
     """Answer as a port without an introduction does: clients of loopback then connect without encryption."""
     raise ConnectionRefusedError
     yield
+
+
+def see_tip(client: Client, robot: str) -> PoseTuple:
+    """Return `T_world_tip` of a robot as a client sees it now."""
+    tip = client.scene.tip_pose(robot)
+    assert tip is not None
+    return tip
 
 
 def is_driven(client: Client, robot: str, participant: str | None = None) -> bool:

@@ -9,7 +9,7 @@ from anchors.pose import distance
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.protocol.names import HoldReason
 from iris_session.protocol.server_messages import EngagementChanged, ParticipantLeft, SamplesRejected
-from tests.rig.session import Rig
+from tests.rig.session import Rig, see_tip
 
 MS = 1_000_000
 TICK = 0.01  # [s]
@@ -34,7 +34,7 @@ def test_blackout_of_five_seconds() -> None:
         assert (ended.engaged, ended.reason) == (False, HoldReason.STALE)
         assert 140 * MS < held_ns - blackout_ns < 180 * MS, "150 ms after the last sample, which was on its way"
         rig.run(0.5)
-        resting = watcher.scene.tip_pose("left")
+        resting = see_tip(watcher, "left")
         rig.run_until(lambda: not watcher.mirror.participants[me].connected, "ann is silent", 2.0)
         (left_ns, left), *_ = rig.list_events("watcher", ParticipantLeft)
         assert left.reason == "silent"
@@ -50,10 +50,7 @@ def test_blackout_of_five_seconds() -> None:
         assert (resumed.holder, resumed.expires_ns) == (me, 0)
         assert resumed.lease_version > lease.lease_version
         rig.run(0.5)
-        now = watcher.scene.tip_pose("left")
-        assert resting is not None
-        assert now is not None
-        assert distance(resting[0], now[0]) < 1e-4, "the clutch is still closed"
+        assert distance(resting[0], see_tip(watcher, "left")[0]) < 1e-4, "the clutch is still closed"
         hand.velocity = (0.0, 0.0, 0.0)
         rig.engage(hand)
 
@@ -90,9 +87,7 @@ def test_change_of_network_keeps_identity_and_lease() -> None:
         rig.run(0.1)
         assert watcher.mirror.leases["left"].holder == me
         assert watcher.mirror.leases["left"].lease_version > lease.lease_version
-        resting = hand.tip
-        rig.run(0.3)
-        assert distance(resting[0], hand.tip[0]) < 1e-4, "the clutch is still closed"
+        rig.check_rest(watcher, "left")  # the clutch is still closed
         hand.velocity = (0.0, 0.0, 0.0)
         rig.engage(hand)
         rig.run(2.5)  # the heartbeat timeout of the old connection

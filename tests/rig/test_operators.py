@@ -36,10 +36,8 @@ def test_second_operator_is_denied_with_the_holder_and_moves_nothing() -> None:
         assert bob.lease_version("right") is None, "all or none"
         hand = rig.add_hand(bob, "left")
         rig.run(0.5)
-        before = hand.tip
         hand.clutch, hand.velocity = True, (0.2, 0.0, 0.0)
-        rig.run(0.7)
-        assert distance(before[0], hand.tip[0]) < 1e-5
+        rig.check_rest(bob, "left", 0.7)
 
 
 def test_robot_follows_its_hand_and_holds_150_ms_after_the_last_sample() -> None:
@@ -58,9 +56,7 @@ def test_robot_follows_its_hand_and_holds_150_ms_after_the_last_sample() -> None
         held_ns, ended = rig.list_events("ann", EngagementChanged)[-1]
         assert 150 * MS <= held_ns - get_applied_ns(rig, hand) <= 154 * MS
         assert ended.reason == HoldReason.STALE
-        resting = hand.tip
-        rig.run(1.0)
-        assert distance(resting[0], hand.tip[0]) < 1e-4
+        rig.check_rest(hand.client, "left", 1.0)
 
 
 def test_late_client_has_the_same_state() -> None:
@@ -125,9 +121,7 @@ def test_takeover_ends_the_engagement_of_the_first_holder() -> None:
         assert anns.client.lease_version("left") is None
         assert [body.cause for _, body in rig.list_events("ann", LeaseChanged)][-1] == "takeover"
         rig.run(0.5)
-        resting = anns.tip
-        rig.run(0.5)  # the first holder goes on sending with the clutch closed
-        assert distance(resting[0], anns.tip[0]) < 1e-4
+        rig.check_rest(bob, "left", 0.5)  # the first holder goes on sending with the clutch closed
         rig.engage(rig.add_hand(bob, "left"))
 
 
@@ -139,15 +133,12 @@ def test_estop_holds_until_a_director_clears_it_and_the_clutch_was_open() -> Non
         hand.client.estop("test")
         rig.run(0.4)
         assert director.mirror.estop
-        resting = hand.tip
-        assert distance(begun[0], resting[0]) < 0.02, "at 0.1 m/s it stops within 2 cm"
-        rig.run(0.4)
-        assert distance(resting[0], hand.tip[0]) < 1e-4
+        assert distance(begun[0], hand.tip[0]) < 0.02, "at 0.1 m/s it stops within 2 cm"
+        rig.check_rest(director, "left", 0.4)
         with pytest.raises(DeniedError):
             hand.client.clear_estop()
         director.clear_estop()
-        rig.run(0.5)
-        assert distance(resting[0], hand.tip[0]) < 1e-4, "the clutch is still closed"
+        rig.check_rest(director, "left", 0.5)  # the clutch is still closed
         rig.engage(hand)
 
 

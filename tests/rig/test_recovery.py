@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from anchors.pose import distance
 from iris_session.authority.config import AuthorityConfig
 from iris_session.client import Client, DeniedError
 from iris_session.client.core.status import ConnectionPhase
@@ -32,17 +31,12 @@ def drive_left(rig: Rig) -> tuple[Client, Hand]:
 
 
 def check_resumed(rig: Rig, watcher: Client, me: str, lease_version: int) -> None:
-    """Check that a participant is back with the left robot, which holds with a new fencing token."""
+    """Check that a participant is back with the left robot, which holds until its clutch was opened."""
     lease = watcher.mirror.leases["left"]
     assert watcher.mirror.participants[me].connected
     assert (lease.holder, lease.expires_ns) == (me, 0)
     assert lease.lease_version > lease_version
-    resting = watcher.scene.tip_pose("left")
-    rig.run(0.3)
-    now = watcher.scene.tip_pose("left")
-    assert resting is not None
-    assert now is not None
-    assert distance(resting[0], now[0]) < 1e-4, "its clutch was not opened since"
+    rig.check_rest(watcher, "left")
 
 
 # --- clients ----------------------------------------------------------------------------------------------------------
@@ -154,9 +148,7 @@ def test_app_that_hangs_but_sends_heartbeats(mode: str) -> None:
         assert [(b.engaged, b.reason) for _, b in rig.list_events("ann", EngagementChanged)][1:] == [
             (False, HoldReason.STALE)
         ]
-        resting = hand.tip
-        rig.run(3.5)  # longer than the heartbeat timeout
-        assert distance(resting[0], hand.tip[0]) < 1e-4
+        rig.check_rest(ann, "left", 3.5)  # longer than the heartbeat timeout
         assert ann.connection.counters.reconnects == 0
         assert bob.mirror.leases["left"].holder == ann.participant_id
         if mode == "exclusive":
@@ -227,9 +219,7 @@ def test_session_that_stands_still_holds_until_clutched_again() -> None:
         assert gap.kind == "stalled"
         assert hand.client.connection.counters.reconnects == 0
         assert rig.list_events("watcher", EngagementChanged)[-1][1].reason == HoldReason.GAP
-        resting = hand.tip
-        rig.run(0.3)
-        assert distance(resting[0], hand.tip[0]) < 1e-4
+        rig.check_rest(hand.client, "left")
         rig.engage(hand)
 
 

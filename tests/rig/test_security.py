@@ -112,12 +112,8 @@ def test_removed_participant_is_out_at_once_and_others_are_not() -> None:
         rig.run(0.1)
         assert not director.mirror.leases["left"].holder
         assert [(b.reason, b.grace) for _, b in rig.list_events("director", ParticipantLeft)] == [("removed", False)]
-        tip = bob.client.scene.tip_pose("left")
-        rig.run(0.5)
-        now = bob.client.scene.tip_pose("left")
-        assert tip is not None
-        assert now is not None
-        assert distance(tip[0], now[0]) < 1e-3
+        rig.run(0.2)
+        rig.check_rest(director, "left", 0.5)
         assert bob.is_following
         del rig.failures["ann"]
         with pytest.raises(RefusedError):

@@ -10,7 +10,7 @@ from anchors.pose import distance
 from iris_session.client import DeniedError
 from iris_session.protocol.names import CommandKind, DenialReason, HoldReason
 from iris_session.protocol.server_messages import Gap, SceneChanged
-from tests.rig.session import Hand, Rig
+from tests.rig.session import Hand, Rig, see_tip
 
 
 def rest(rig: Rig, hand: Hand) -> None:
@@ -54,8 +54,7 @@ def test_policy_drives_until_a_participant_engages_and_after_the_release() -> No
         rig.policy = policy
         watcher = rig.join("watcher", "director")
         rig.run(2.0)
-        alone = watcher.scene.tip_pose("left")
-        assert alone is not None
+        alone = see_tip(watcher, "left")
         hand = rig.drive("ann", "left", (0.0, 0.1, 0.0))
         rig.run(0.5)
         assert distance(alone[0], hand.tip[0]) > 0.02
@@ -106,8 +105,7 @@ def test_reset_by_the_program_begins_a_scene_epoch() -> None:
     with Rig(user_loop=True, timestep=0.02) as rig:
         watcher = rig.join("watcher", "observer")
         rig.run(0.5)
-        start = watcher.scene.tip_pose("left")
-        assert start is not None
+        start = see_tip(watcher, "left")
         hand = rig.drive("ann", "left", (0.0, 0.1, 0.0))
         rig.run(0.5)
         reset(rig)
