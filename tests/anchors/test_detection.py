@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from anchors.camera import CameraModel, pose_from_rvec_tvec
+from anchors.camera import CameraModel
 from anchors.detection import DetectionError, SheetDetection, SheetDetector, detect_codes
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_to_rotvec
 from anchors.sheet import Sheet
@@ -125,28 +125,6 @@ def test_sheet_in_a_real_room_is_detected(pages: dict[str, Page], rgbd: Path) ->
     picture = photograph([(pages["table"], true)], CAMERA, CONDITIONS, np.random.default_rng(4), background=room)
     (seen,) = SheetDetector([TABLE], CAMERA).detect(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
     assert _errors(seen, true)[0] < 1.0
-
-
-def test_poses_from_corners_agree_with_opencv() -> None:
-    """Golden case: exact corners through `solvePnP`; OpenCV returns both poses of the plane."""
-    from anchors.detection import _plane_poses
-
-    true = _facing((0.05, -0.1, 1.5), 30.0)
-    points = TABLE.marker_corners.reshape(-1, 3)
-    pixels = CAMERA.project(points, true)
-    poses = _plane_poses(points, pixels, CAMERA, 4)
-    assert poses is not None
-    ok, rvec, tvec = cv2.solvePnP(points, pixels, CAMERA.matrix, CAMERA.coefficients, flags=cv2.SOLVEPNP_ITERATIVE)
-    assert ok
-    pose, rms = poses.best
-    assert rms < 1e-6
-    assert distance(pose[0], true[0]) < 1e-8
-    assert distance(pose_from_rvec_tvec(rvec, tvec)[0], pose[0]) < 1e-5
-    assert poses.mirrored is not None
-    mirrored, worse = poses.mirrored
-    assert worse > 0.1
-    assert math.degrees(quat_angle(mirrored[1], pose[1])) > 20.0
-    assert distance(mirrored[0], pose[0]) < 0.04
 
 
 def test_wrong_marker_is_excluded() -> None:

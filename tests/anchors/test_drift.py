@@ -159,18 +159,6 @@ def test_heads_of_an_old_frame_and_invalid_heads_are_no_jump() -> None:
     assert jumped.kind == "jump"
 
 
-def test_backward_clock_step_does_not_suppress_the_next_alarm() -> None:
-    rng = np.random.default_rng(1)
-    T = tracking_frame(rng)
-    view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.7))
-    monitor = DriftMonitor(ANCHORS)
-    late = 36_000
-    assert _monitor(monitor, view, T, range(late, late + 40)) == []
-    assert _monitor(monitor, view, shifted(T, (0.03, 0.0, 0.0)), range(late + 40, late + 60))
-    assert _monitor(monitor, view, shifted(T, (0.03, 0.0, 0.0)), range(40)) == []
-    assert _monitor(monitor, view, T, range(40, 60))
-
-
 def _monitor_two_sheets(
     monitor: DriftMonitor, rng: np.random.Generator, frame: PoseTuple, bump: Vec3 = (0.0, 0.0, 0.0), moved: float = 0.0
 ) -> list[tuple[int, Alarm]]:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -45,13 +43,6 @@ def test_log_is_the_inverse_of_exp(axis: Array, angle: float) -> None:
         assert _is_same_rotation(lie.quat_exp(back), q)
 
 
-@given(axes, angles)
-def test_exp_agrees_with_scipy_and_opencv(axis: Array, angle: float) -> None:
-    R = lie.quat_to_matrix(lie.quat_exp(axis * angle))
-    assert np.allclose(R, Rotation.from_rotvec(axis * angle).as_matrix(), atol=1e-9)
-    assert np.allclose(R, cv2.Rodrigues(axis * angle)[0], atol=1e-9)
-
-
 @given(vectors, vectors, vectors)
 def test_product_applies_the_right_factor_first(a: Array, b: Array, v: Array) -> None:
     qa, qb = lie.quat_exp(a), lie.quat_exp(b)
@@ -75,12 +66,6 @@ def test_batches_agree_with_single_values_and_tuples(r: Array) -> None:
 @given(vectors)
 def test_matrix_round_trip(r: Array) -> None:
     q = lie.quat_exp(r)
-    assert _is_same_rotation(lie.quat_from_matrix(lie.quat_to_matrix(q)), q)
-
-
-@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
-def test_matrix_to_quaternion_at_half_a_turn(axis: tuple[float, float, float]) -> None:
-    q = np.array([0.0, *axis])
     assert _is_same_rotation(lie.quat_from_matrix(lie.quat_to_matrix(q)), q)
 
 

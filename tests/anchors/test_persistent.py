@@ -46,13 +46,6 @@ def _touch(name: str, rng: np.random.Generator | None = None, T: PoseTuple = T_W
     return Touch(name, to_vec3(p if rng is None else p + rng.normal(0.0, SIGMA_M, 3)), SIGMA_M)
 
 
-def test_exact_place_gives_the_exact_alignment() -> None:
-    got = align_persistent(T_WORLD_ANCHOR, T_TRACKING_ANCHOR, EARLIER, 4)
-    assert got is not None
-    assert (got.tracking_epoch, got.refused) == (4, False)
-    assert distance(apply(got.T_world_tracking, (0.3, 0.2, 1.0)), apply(T_WORLD_TRACKING, (0.3, 0.2, 1.0))) < 1e-9
-
-
 @pytest.mark.parametrize("marks", ["", "1", "14"])
 def test_stated_error_is_honest(marks: str) -> None:
     """Monte Carlo: 95 % of the errors are within the stated error, at the anchor and at a robot, before and after."""

@@ -52,11 +52,6 @@ def test_normalize_rejects_zero_and_non_finite() -> None:
             ps.quat_normalize(bad)
 
 
-def test_yaw() -> None:
-    assert np.allclose(ps.quat_rotate(ps.quat_from_yaw(math.pi / 2), (1.0, 0.0, 0.0)), (0.0, 1.0, 0.0))
-    assert ps.distance((0.0, 0.0, 0.0), (3.0, 4.0, 0.0)) == 5.0
-
-
 def test_pivot_moves_on_a_straight_line() -> None:
     old: ps.PoseTuple = ((0.0, 0.0, 0.0), ps.quat_from_yaw(0.3))
     new: ps.PoseTuple = ((0.02, -0.01, 0.0), ps.quat_from_rotvec((0.01, 0.0, 0.33)))

@@ -44,19 +44,6 @@ def test_giver_both_receiver_is_a_handover_with_the_time_both_touched() -> None:
     assert len(handovers(t)) == 1
 
 
-def test_handing_back_is_a_second_one() -> None:
-    t = Table()
-    contact(t, 200, "left")
-    contact(t, 50, "left", "left right")
-    contact(t, 50, "left right")
-    contact(t, 50, "right", "left right")
-    contact(t, 200, "right")
-    contact(t, 50, "left right")
-    contact(t, 200, "left")
-    assert [(h.giver, h.receiver) for h in handovers(t)] == [("left", "right"), ("right", "left")]
-    assert handovers(t)[0].duration_ns == 140 * MS
-
-
 def test_single_ticks_without_contact_are_flicker() -> None:
     t = Table()
     contact(t, 200, "left")

@@ -640,15 +640,6 @@ def test_a_holder_sets_the_scale_of_its_robot_and_everybody_sees_it() -> None:
     assert t.command("right").scale == 1.0
 
 
-def test_without_names_every_robot_of_the_sender_is_meant() -> None:
-    t = Table(robots=(robot("left"), robot("right"), robot("third")))
-    anna, bert = t.operator("left", "right"), t.operator("third")
-    assert [lease.target for lease in anna.asks(SetScale(1, scale=0.5)).leases] == ["left", "right"]
-    assert (lease_scale(t, "left"), lease_scale(t, "third")) == (0.5, 1.0)
-    bert.does(Release())
-    assert bert.denied(SetScale(1, scale=0.5)) == "not_holder"
-
-
 @pytest.mark.parametrize("scale", [math.nan, math.inf, -math.inf, 0.0, -1.0, 0.049, 5.001, 1e308])
 def test_a_scale_out_of_range_is_denied_with_the_range(scale: float) -> None:
     t = Table()

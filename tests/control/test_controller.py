@@ -51,14 +51,6 @@ def twist(made: Rig, v: tuple[float, ...], **more: object) -> Command:
     return Command("panda", "twist", sources=(made.source((0.0,) * 3, pose_world=None, twist_world=v, **more),))
 
 
-def test_targets_after_reset_are_where_the_robots_stand() -> None:
-    rig = Rig(aloha_model(), aloha_robots())
-    for i in range(2):
-        assert apart(rig.target(i), rig.tip(i))[0] < 1e-12
-    rig.controller.tick(rig.data)
-    assert rig.data.ctrl == pytest.approx(rig.model.key_ctrl[0])
-
-
 def test_control_must_be_told_where_the_robots_stand() -> None:
     model = panda_model()
     with pytest.raises(ControlError, match=r"call reset\(data\) or restore\(bytes\) first"):
@@ -167,16 +159,6 @@ def test_an_absolute_target_is_reached_at_bounded_speed_from_one_sample() -> Non
     assert 0.02 < rig.target()[0][1] - start[0][1] < 0.3 * 0.25 + 0.02
     drive(rig, old(rig.source(*goal, absolute=True, device="target")), steps=1000)
     assert apart(rig.controller._ik.compute_tip(0, rig.controller._states[0]), goal)[0] < 3e-5
-
-
-def test_shared_twists_are_weighted() -> None:
-    rig = panda()
-    start = rig.target()
-    one = rig.source((0.0,) * 3, participant="a", pose_world=None, twist_world=(0.1, 0, 0, 0, 0, 0), weight=0.5)
-    two = rig.source((0.0,) * 3, participant="b", pose_world=None, twist_world=(0, -0.1, 0, 0, 0, 0), weight=0.5)
-    for _ in range(501):
-        rig.step(decision([Command("panda", "twist", sources=(one, two))]))
-    assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.05, -0.05, 0.0), abs=2e-3)
 
 
 def test_changing_the_scale_while_engaged_does_not_jump() -> None:

@@ -61,18 +61,6 @@ def test_limits_hold_for_any_goals(
     assert (joints.v == 0.0).all()
 
 
-def test_regular_goals_give_even_motion() -> None:
-    joints, speeds = make(acceleration=60.0), []
-    for sample in range(1, 80):
-        joints.set_goal(ALL, np.full(3, 0.8 * sample * 7 * DT), 7 * DT)
-        for _ in range(7):
-            joints.advance()
-            speeds.append(joints.v[0])
-    settled = np.array(speeds[200:])
-    assert abs(settled.mean() - 0.8) < 0.01
-    assert settled.std() < 0.04
-
-
 def test_a_stop_while_standing_or_moving_away_stays_near() -> None:
     joints = make()
     joints.set_goal(ALL, np.array([0.5, 0.5, 0.0]), 0.014)
