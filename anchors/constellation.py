@@ -391,6 +391,8 @@ def initial_guess(graph: ObservationGraph) -> tuple[Array, Array]:
                 p, q = poses[key]
                 poses[e.anchor_id] = (p + quat_to_matrix(q) @ e.p, quat_multiply(q, e.q))
                 break
+        else:
+            raise ConstellationError("some sheets are not connected with a known one")
     return np.array([poses[name][0] for name in wanted]), np.array([poses[name][1] for name in wanted])
 
 
