@@ -189,6 +189,9 @@ def test_a_tracking_jump_voids_alignment_and_engagement() -> None:
     anna.tracking_epoch, anna.alignment_version = 1, 2
     anna.engage("left", p=(5.0, 0.0, 0.0))
     assert t.command().kind == "pose"
+    anna.sends("left", clutch=True, p=(5.0, 0.0, 0.0), tracking_epoch=0)
+    assert (t.hold(), t.since(SamplesRejected)[0].reason) == ("rejected", "tracking_epoch")
+    anna.engage("left", p=(5.0, 0.0, 0.0))
     t.step(anna.says(proposal(tracking_epoch=2)))
     assert (t.hold(), t.last(AlignmentChanged).alignment.tracking_epoch) == ("rearm", 2)
 
