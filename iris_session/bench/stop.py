@@ -169,6 +169,8 @@ class StopScenario:
         return restore
 
     def _make_sample(self) -> Sample:
+        pressed_s = (self.step_number - self.begin_step) * TICK_NS * 1e-9 if "clutch" in self.changes else 0.0
+        moved = 0.6 * min(1.0, pressed_s)
         fields: dict[str, Any] = {
             "device": "controller/right",
             "kind": "pose",
@@ -179,12 +181,8 @@ class StopScenario:
             "alignment_version": 1,
             "targets": (Target("arm", 1),),
             "gripper": 0.5,
+            "pose": Pose((0.0, moved, 1.0), (1.0, 0.0, 0.0, 0.0)),
         }
-        if "clutch" in self.changes:
-            moved = 0.6 * min(1.0, (self.step_number - self.begin_step) * TICK_NS * 1e-9)
-            fields["pose"] = Pose((0.0, moved, 1.0), (1.0, 0.0, 0.0, 0.0))
-        else:
-            fields["pose"] = Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
         return Sample(**{**fields, **self.changes})
 
     def _is_pressing(self) -> bool:
