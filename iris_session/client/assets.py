@@ -130,13 +130,13 @@ class AssetFetch:
 
     # --- for the client ----------------------------------------------------------------------------------------------
 
-    def on_bytes(self, address: str, size: int, total: int, received: int = 0) -> None:
+    def _on_bytes(self, address: str, size: int, total: int, received: int = 0) -> None:
         """Note that `size` of `total` bytes of an asset are here."""
         if address in self.pending:
             self._done[address], self._sizes[address] = size, total
             self.bytes_received += received
 
-    def on_found(self, address: str, size: int, decoded: Sequence[tuple[Decode, Any]], *, fetched: bool) -> None:
+    def _on_found(self, address: str, size: int, decoded: Sequence[tuple[Decode, Any]], *, fetched: bool) -> None:
         """Note that an asset is here, with the results of decode functions. It stays pending without that of ours."""
         if address not in self.pending:
             return
@@ -147,7 +147,7 @@ class AssetFetch:
                 return
             value = results[0]
         if isinstance(value, AssetError):
-            self.fail(address, value)
+            self._fail(address, value)
             return
         self._done[address] = self._sizes[address] = size
         self.cached += not fetched
@@ -155,7 +155,7 @@ class AssetFetch:
             self.decoded[address] = value
         del self.pending[address]
 
-    def fail(self, address: str, error: AssetError) -> None:
+    def _fail(self, address: str, error: AssetError) -> None:
         """Note that an asset will not come."""
         if address in self.pending:
             del self.pending[address]
@@ -243,7 +243,7 @@ class ClientAssets:
         """
         with self._lock:
             for address in list(fetch.pending):
-                fetch.fail(address, AssetError(address, "cancelled", f"the fetch of asset {address} was cancelled"))
+                fetch._fail(address, AssetError(address, "cancelled", f"the fetch of asset {address} was cancelled"))
                 if not any(address in other.pending for other in self._fetches):
                     self._loader.remove(address)
                     if self._workers is not None:
@@ -305,7 +305,7 @@ class ClientAssets:
         error = AssetError("", "closed", "the client was closed")
         for fetch in self._fetches:
             for address in list(fetch.pending):
-                fetch.fail(address, error)
+                fetch._fail(address, error)
         self._fetches.clear()
         return workers
 
@@ -316,7 +316,7 @@ class ClientAssets:
         if not welcome.endpoints.assets:
             error = AssetError("", "no_channel", "this session has no channel for assets")
             for address in {address for fetch in self._fetches for address in fetch.pending}:
-                self.on_failed(address, error)
+                self._on_failed(address, error)
             return True
         now_ns = time.monotonic_ns()
         if self._loader.is_paused(now_ns) and not self._sockets.has_assets:
@@ -350,7 +350,7 @@ class ClientAssets:
             for fetch in self._fetches:
                 fetch.refusal = loader.refusal
             if isinstance(outcome, FailedAsset):
-                self.on_failed(outcome.address, AssetError(*outcome))
+                self._on_failed(outcome.address, AssetError(*outcome))
             elif outcome:
                 workers.restart(outcome)
             return
@@ -358,7 +358,7 @@ class ClientAssets:
         chunk = decode_asset_chunk(head, len(data))
         accepted = loader.process_chunk(chunk, len(data), now_ns)
         if isinstance(accepted, FailedAsset):
-            self.on_failed(accepted.address, AssetError(*accepted))
+            self._on_failed(accepted.address, AssetError(*accepted))
             return
         if not accepted:
             self.malformed += accepted is False
@@ -366,44 +366,44 @@ class ClientAssets:
         workers.write(chunk.address, data)
         for fetch in self._fetches:
             fetch.refusal = ""
-            fetch.on_bytes(chunk.address, chunk.offset + len(data), chunk.total, len(data))
+            fetch._on_bytes(chunk.address, chunk.offset + len(data), chunk.total, len(data))
         self._note_progress(chunk.address)
         if loader.is_complete(chunk.address):
             workers.finish(chunk.address, self._pending_decodes(chunk.address))
 
     # --- results of the workers ---------------------------------------------------------------------------------------
 
-    def on_stored(self, size: int) -> None:
+    def _on_stored(self, size: int) -> None:
         """Note that received bytes are written, or dropped."""
         self._loader.on_stored(size)
 
-    def on_missing(self, address: str, offset: int) -> None:
+    def _on_missing(self, address: str, offset: int) -> None:
         """Note that an asset is not complete in the cache; its first `offset` bytes are there."""
         self._loader.on_missing(address, offset)
 
-    def on_found(self, address: str, size: int, decoded: Sequence[tuple[Decode, Any]], *, fetched: bool) -> None:
+    def _on_found(self, address: str, size: int, decoded: Sequence[tuple[Decode, Any]], *, fetched: bool) -> None:
         """Note that an asset is in the cache, with the results of decode functions. `fetched`: stored just now."""
         self._loader.remove(address)
         self._note_progress(address)
         for fetch in self._fetches:
-            fetch.on_found(address, size, decoded, fetched=fetched)
+            fetch._on_found(address, size, decoded, fetched=fetched)
         if any(address in fetch.pending for fetch in self._fetches):
             self._loader.add(address, size)  # a new fetch decodes it by another function
 
-    def on_mismatch(self, address: str) -> None:
+    def _on_mismatch(self, address: str) -> None:
         """Note that the received bytes do not have the hash of the address; they were removed."""
         if not self._loader.restart_asset(address):
             text = f"the session sent other bytes than those of asset {address}, twice"
-            self.on_failed(address, AssetError(address, "hash", text))
+            self._on_failed(address, AssetError(address, "hash", text))
 
-    def on_failed(self, address: str, error: AssetError) -> None:
+    def _on_failed(self, address: str, error: AssetError) -> None:
         """Note that an asset will not come."""
         self._loader.remove(address)
         if self._workers is not None:
             self._workers.release(address)
         self._note_progress(address)
         for fetch in self._fetches:
-            fetch.fail(address, error)
+            fetch._fail(address, error)
 
     def _note_progress(self, address: str) -> None:
         new = [fetch for fetch in self._fetches if address in fetch.pending and fetch not in self._progressed]
@@ -468,9 +468,9 @@ class AssetWorkers:
         def work() -> Result:
             view = self.cache.find(address)
             if view is not None:
-                return partial(self._owner.on_found, address, *_decode(address, view, decodes), fetched=False)
+                return partial(self._owner._on_found, address, *_decode(address, view, decodes), fetched=False)
             part = self._parts[address] = self.cache.open_part(address)
-            return partial(self._owner.on_missing, address, part.offset)
+            return partial(self._owner._on_missing, address, part.offset)
 
         self._submit(address, work)
 
@@ -481,7 +481,7 @@ class AssetWorkers:
             part = self._parts.get(address)
             if part is not None:
                 part.append(data)
-            return partial(self._owner.on_stored, len(data))
+            return partial(self._owner._on_stored, len(data))
 
         self._submit(address, work, len(data))
 
@@ -490,10 +490,10 @@ class AssetWorkers:
 
         def work() -> Result:
             if not self._parts[address].finish():
-                return partial(self._owner.on_mismatch, address)
+                return partial(self._owner._on_mismatch, address)
             del self._parts[address]
             view = self.cache.view(address)
-            return partial(self._owner.on_found, address, *_decode(address, view, decodes), fetched=True)
+            return partial(self._owner._on_found, address, *_decode(address, view, decodes), fetched=True)
 
         self._submit(address, work)
 
@@ -502,7 +502,7 @@ class AssetWorkers:
 
         def work() -> Result:
             self._parts[address].restart()
-            return partial(self._owner.on_missing, address, 0)
+            return partial(self._owner._on_missing, address, 0)
 
         self._submit(address, work)
 
@@ -511,7 +511,7 @@ class AssetWorkers:
 
         def work() -> Result:
             self._close(address)
-            return partial(self._owner.on_stored, 0)
+            return partial(self._owner._on_stored, 0)
 
         self._submit(address, work)
 
@@ -552,8 +552,8 @@ class AssetWorkers:
             failure.__cause__ = error
         self._close(address)
         if size:
-            self._results.put(partial(self._owner.on_stored, size))
-        return partial(self._owner.on_failed, address, failure)
+            self._results.put(partial(self._owner._on_stored, size))
+        return partial(self._owner._on_failed, address, failure)
 
     def _close(self, address: str) -> None:
         part = self._parts.pop(address, None)
