@@ -131,8 +131,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     """Print the report of a scene."""
     import msgspec
 
-    from iris_session.scene.extent import compute_extent
-    from iris_session.scene.report import build_report
+    from iris_session.scene.report import build_report, compute_extent
 
     parsed, store = _parse_scene(arguments)
     extent = compute_extent(parsed.spec, store)
@@ -143,8 +142,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 
 def _format_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -> Iterator[str]:
-    from iris_session.scene.extent import format_coordinates, format_size
-    from iris_session.scene.report import format_tree
+    from iris_session.scene.report import format_coordinates, format_size, format_tree
 
     yield from format_tree(spec)
     totals = found.totals
@@ -358,7 +356,7 @@ def check_model_units(spec: SceneSpec) -> tuple[str, ...]:
 
     Only the largest mesh is considered: poses are in metres, and a hall may be large.
     """
-    from iris_session.scene.extent import format_unit_hint, largest_mesh_side
+    from iris_session.scene.report import format_unit_hint, largest_mesh_side
 
     hint = format_unit_hint(largest_mesh_side(spec), _MESH_SCALE_ADVICE)
     return (f"its largest mesh is {hint}",) if hint else ()

@@ -253,8 +253,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _describe_shown_file(session: Session | ScenePublisher, path: Path) -> str:
     """Return what is shown, its extent, and the meshes that should be simplified."""
     from iris_session.scene import AssetStore, SceneBuildError
-    from iris_session.scene.extent import compute_extent, format_size
-    from iris_session.scene.report import list_large_meshes
+    from iris_session.scene.report import compute_extent, format_size, list_large_meshes
 
     spec, what = session.scene, f"showing {path.name}, without robots"
     if spec is None:

@@ -24,8 +24,7 @@ from iris_session.protocol.common import Vec3
 from iris_session.protocol.names import AssetEncoding, TextureKind
 from iris_session.protocol.scene import MeshLevel, TextureLevel
 from iris_session.scene.images import Pixels, encode_image, halve
-from iris_session.scene.mesh_processing import simplify_mesh
-from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
+from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised, simplify_mesh
 
 #: Increased whenever the encoding of the same content changes.
 ENCODER_VERSION: Final = 5

@@ -42,10 +42,8 @@ from iris_session.protocol.scene import (
 from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions, MeshNote, Work
 from iris_session.scene.budget import add_totals
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.extent import compute_box_extent, format_unit_hint, largest_mesh_side
 from iris_session.scene.importers.urdf import Robot
-from iris_session.scene.mesh_processing import scale_mesh
-from iris_session.scene.meshes import MeshArrays, encode_deformable
+from iris_session.scene.meshes import MeshArrays, encode_deformable, scale_mesh
 from iris_session.scene.nodes import (
     MAX_TRIANGLES,
     Appearance,
@@ -60,6 +58,7 @@ from iris_session.scene.nodes import (
     to_pose,
     to_vec3,
 )
+from iris_session.scene.report import compute_box_extent, format_unit_hint, largest_mesh_side
 from iris_session.scene.result import Articulation, ComposedScene, DeformableSource
 from iris_session.streams.deformable_topology import DeformableTopology
 

@@ -18,8 +18,7 @@ from iris_session.protocol.names import AssetEncoding, GeometryKind, TextureKind
 from iris_session.protocol.scene import Geometry, SceneSpec, Texture
 from iris_session.scene.errors import AssetDecodeError
 from iris_session.scene.images import Pixels, decode_image, halve
-from iris_session.scene.mesh_processing import normalise
-from iris_session.scene.meshes import MeshArrays, index_corners
+from iris_session.scene.meshes import MeshArrays, index_corners, normalise
 
 #: Maximum side of a face in an exported file [pixels]: headsets can load six of them in one image.
 CUBE_SIDE: Final = 2_048

@@ -26,12 +26,10 @@ from iris_session.protocol.common import IDENTITY, Pose, Quat, Vec3
 from iris_session.protocol.names import ArrayKind, AssetEncoding, Follow, LightKind, TextureKind, TextureRole
 from iris_session.protocol.scene import Camera, Deformable, Light, SceneSpec, Visual
 from iris_session.scene.arrays import decode_arrays
-from iris_session.scene.colors import to_linear
 from iris_session.scene.cube_maps import CUBE_SIDE, CubeMap, CubeMapReader, bake_cube_map, direction_scale
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.images import decode_image, encode_image
-from iris_session.scene.mesh_processing import normalise
-from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
+from iris_session.scene.images import decode_image, encode_image, to_linear
+from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners, normalise
 from iris_session.scene.nodes import to_vec3
 from iris_session.scene.shapes import (
     add_texture_coordinates,
@@ -49,7 +47,7 @@ _LINES: Final = 1
 _MAX_BYTES: Final = (1 << 32) - 64
 #: Rotation from z up to y up: -90 degrees around x, `[x, y, z, w]` as in glTF.
 _Y_UP: Final = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
-_LIGHTS: Final = {LightKind.DIRECTIONAL: "directional", LightKind.SPOT: "spot", LightKind.POINT: "point"}
+_LIGHTS: Final = (LightKind.DIRECTIONAL, LightKind.SPOT, LightKind.POINT)
 #: Tracking modes that follow a target body by its origin: a specification has no centres of mass.
 _WATCHING: Final = (Follow.TARGET_BODY, Follow.TARGET_BODY_COM)
 _EXTENSION: Final = "KHR_lights_punctual"
@@ -366,7 +364,7 @@ def _build_camera(camera: Camera) -> dict[str, Any]:
 def _build_light(light: Light) -> dict[str, Any]:
     """Return a light as bright as it is drawn: intensity 1 by default, and its sRGB colour converted to linear."""
     lamp: dict[str, Any] = {
-        "type": _LIGHTS[light.kind],
+        "type": light.kind,
         "color": to_linear(light.diffuse).tolist(),
         "intensity": light.intensity or 1.0,
     }

@@ -7,7 +7,7 @@ import struct
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from iris_session.protocol.assets import MAX_ARRAY_BYTES
 from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
@@ -213,3 +213,19 @@ def check_pixels(pixels: Any, what: str) -> Pixels:
     if array.shape[0] * array.shape[1] > MAX_PIXELS:
         raise SceneBuildError(f"{what} has {array.shape[1]} x {array.shape[0]} pixels, at most {MAX_PIXELS:,}")
     return np.array(array)
+
+
+# --- colours: linear as in glTF, sRGB as in specifications; values beyond 0 to 1 are clipped -------------------------
+
+
+def to_srgb(linear: ArrayLike) -> NDArray[np.float64]:
+    """Convert linear values to sRGB."""
+    v = np.clip(np.asarray(linear, np.float64), 0.0, 1.0)
+    curved = np.where(v < 1.0, 1.055 * v ** (1 / 2.4) - 0.055, 1.0)  # which is off by one bit at 1
+    return np.where(v <= 0.0031308, v * 12.92, curved)
+
+
+def to_linear(srgb: ArrayLike) -> NDArray[np.float64]:
+    """Convert sRGB values to linear ones."""
+    v = np.clip(np.asarray(srgb, np.float64), 0.0, 1.0)
+    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)

@@ -72,14 +72,8 @@ class Appearance:
     @property
     def is_plain_color(self) -> bool:
         """True if all values but the colour are defaults."""
-        defaults = (0.0, 0.5, 0.5, -1.0, -1.0)
-        return not self.images and defaults == (
-            self.emission,
-            self.specular,
-            self.shininess,
-            self.metallic,
-            self.roughness,
-        )
+        surface = (self.emission, self.specular, self.shininess, self.metallic, self.roughness)
+        return not self.images and surface == (0.0, 0.5, 0.5, -1.0, -1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import Geometry, HeightField, Material
-from iris_session.scene.mesh_processing import normalise
-from iris_session.scene.meshes import MeshArrays, index_corners
+from iris_session.scene.meshes import MeshArrays, index_corners, normalise
 
 SLICES: Final = 28
 STACKS: Final = 16

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iris_session.physics import World
 from iris_session.protocol.names import MediaEncoding
-from iris_session.scene.mujoco_assets import read_flex_mesh, stream_name
+from iris_session.scene.mujoco_scene import read_flex_mesh, stream_name
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
 

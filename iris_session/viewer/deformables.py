@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from iris_session.protocol.scene import Deformable
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.arrays import require_array
-from iris_session.scene.mesh_processing import normalise
+from iris_session.scene.meshes import normalise
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError

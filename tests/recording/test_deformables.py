@@ -16,8 +16,7 @@ from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import SessionHeader, pack_model
 from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
-from iris_session.scene.mujoco_assets import read_flex_mesh
-from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene.mujoco_scene import parse_mujoco, read_flex_mesh
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.viewer.deformables import DrawnDeformable
 from tests.recording.support import column, read

@@ -12,9 +12,9 @@ import trimesh
 
 from iris_session.scene import AssetStore
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.extent import compute_box_extent, compute_extent, format_unit_hint
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.nodes import to_matrix
+from iris_session.scene.report import compute_box_extent, compute_extent, format_unit_hint
 from iris_session.scene.shapes import build_primitive
 
 TURN = (0.8, 0.1, -0.3, 0.5)

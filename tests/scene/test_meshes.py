@@ -18,8 +18,7 @@ from iris_session.scene import (
     encode_mesh_quantised,
 )
 from iris_session.scene.arrays import StoredArray
-from iris_session.scene.mesh_processing import build_smooth_mesh, simplify_mesh
-from iris_session.scene.meshes import index_corners
+from iris_session.scene.meshes import build_smooth_mesh, index_corners, simplify_mesh
 
 
 def soup(seed: int, faces: int, *, uv: bool) -> MeshArrays:

@@ -23,8 +23,13 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, to_pixels
 from iris_session.scene.importers.references import References, read_bounded
 from iris_session.scene.importers.xml_files import check_dae
-from iris_session.scene.mesh_processing import compute_creased_normals, merge_vertex_color, normalise
-from iris_session.scene.meshes import find_unique_rows, index_corners
+from iris_session.scene.meshes import (
+    compute_creased_normals,
+    find_unique_rows,
+    index_corners,
+    merge_vertex_color,
+    normalise,
+)
 from iris_session.scene.nodes import (
     GREY,
     MAX_NODES,

@@ -126,7 +126,7 @@ def test_limits_apply_to_the_whole_file(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "b.gltf").write_text(json.dumps(text))
     size = (tmp_path / "b.gltf").stat().st_size
     for most, fits in ((size + 3 * 3_600, True), (size + 3 * 3_600 - 2, False)):
-        monkeypatch.setattr("iris_session.scene.importers.gltf_file.MAX_FILE_BYTES", most // 2 + most % 2)
+        monkeypatch.setattr("iris_session.scene.importers.gltf.MAX_FILE_BYTES", most // 2 + most % 2)
         if fits:
             load_file(tmp_path / "b.gltf")
         else:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from iris_session.protocol.common import Pose
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.builder import SceneBuilder
-from iris_session.scene.extent import compute_extent
 from iris_session.scene.nodes import to_matrix
+from iris_session.scene.report import compute_extent
 from iris_session.scene.result import ComposedScene
 from tests.scene.arm import FREE, JOINTS, write_arm
 
