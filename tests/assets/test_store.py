@@ -433,17 +433,6 @@ def test_served_bytes_and_sizes(tmp_path: Path) -> None:
     assert files.size("../../secret") is None
 
 
-def test_several_stores_and_end_of_serving(tmp_path: Path) -> None:
-    files = ServedAssets()
-    a, b = put(tmp_path / "1", b"a"), put(tmp_path / "2", b"b")
-    files.serve([(str(tmp_path / "1"), (a,)), (str(tmp_path / "2"), (b,))])
-    held = files.chunk(a, 0, 1)
-    assert (files.size(a), files.size(b)) == (1, 1)
-    files.serve([(str(tmp_path / "2"), (b,))])
-    assert (files.size(a), files.size(b)) == (None, 1)
-    assert bytes(held or b"") == b"a"  # being sent
-
-
 def test_removed_file_and_directory(tmp_path: Path) -> None:
     files = ServedAssets()
     a, link = put(tmp_path, b"a"), "ab" + "0" * 62

@@ -70,17 +70,6 @@ def test_levels_of_a_texture(tmp_path: Path, encoding: str) -> None:
     assert (error > 0) == (encoding == "jpeg")
 
 
-def test_cube_faces_are_halved_separately(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path)
-    builder = AssetBuilder(store)
-    faces = np.repeat(np.arange(6, dtype=np.uint8) * 40, 512)[:, None, None] * np.ones((1, 512, 3), np.uint8)
-    (note,) = builder.run([builder.texture_work(faces, "cube")])
-    half = decode_image(store.get(note.levels[1].address), "arrays")
-    assert half.shape == (6 * 256, 256, 3)
-    assert np.array_equal(half[::256, 0, 0], np.arange(6) * 40)
-    assert np.array_equal(half[255::256, 0, 0], np.arange(6) * 40)
-
-
 #: A mesh and a flex, and one difference at a time.
 ALIKE = """<mujoco><asset><mesh name="m" file="m.obj" inertia="shell"/></asset>
     <worldbody><geom type="mesh" mesh="m"/></worldbody>
@@ -108,12 +97,3 @@ def test_cached_parts_of_a_model_are_not_used_for_another(tmp_path: Path) -> Non
         assert parsed.spec == parse_mujoco(model, AssetStore(tmp_path / str(number))).spec
         hashes.add(parsed.scene_hash)
     assert len(hashes) == len(DIFFERENT)
-
-
-def test_transparent_textures_are_not_jpeg(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path)
-    builder = AssetBuilder(store, EncodeOptions(texture_encoding="jpeg"))
-    pixels = np.random.default_rng(1).integers(0, 255, (16, 16, 4), np.uint8)
-    (note,) = builder.run([builder.texture_work(pixels, "2d")])
-    assert note.levels[0].encoding == "png"
-    np.testing.assert_array_equal(decode_image(store.get(note.levels[0].address), "png"), pixels)

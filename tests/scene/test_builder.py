@@ -8,7 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -96,31 +95,6 @@ def build_scenes(folder: Path, threads: int) -> list[str]:
         composed.scene_hash,
         *(parse_mujoco(model, store, threads=threads, sites=True).scene_hash for model in models),
     ]
-
-
-def test_shapes_agree_with_mujoco(store: AssetStore) -> None:
-    """The same shapes by MJCF and by hand."""
-    scene = SceneBuilder()
-    turned = (HALF, HALF, 0.0, 0.0)
-    scene.add_plane(half_size=(3, 4))
-    scene.add_sphere(radius=0.1, position=(1, 0, 0), rgba=(1, 0, 0, 1))
-    scene.add_capsule(radius=0.1, half_length=0.3, quaternion=turned)
-    scene.add_ellipsoid(half_size=(0.1, 0.2, 0.3))
-    scene.add_cylinder(radius=0.2, half_length=0.4)
-    scene.add_box(half_size=(0.1, 0.2, 0.3), rgba=(0, 0.25, 1, 0.5))
-    ours = scene.build(store).spec
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody>
-        <geom type="plane" size="3 4 1"/><geom type="sphere" size=".1" pos="1 0 0" rgba="1 0 0 1"/>
-        <geom type="capsule" size=".1 .3" quat="1 1 0 0"/><geom type="ellipsoid" size=".1 .2 .3"/>
-        <geom type="cylinder" size=".2 .4"/><geom type="box" size=".1 .2 .3" rgba="0 .25 1 .5"/>
-        </worldbody></mujoco>"""
-    )
-    theirs = parse_mujoco(model, store).spec
-    for a, b in zip(ours.visuals, theirs.visuals, strict=True):
-        assert a.geometry == b.geometry
-        np.testing.assert_allclose(a.T_body_visual.q, b.T_body_visual.q, atol=1e-12)
-        np.testing.assert_allclose(a.rgba, b.rgba, atol=1e-6)
 
 
 def test_looks(store: AssetStore) -> None:

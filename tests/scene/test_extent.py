@@ -82,10 +82,8 @@ def test_extent_of_a_model(tmp_path: Path) -> None:
     ("side", "expected"),
     [
         (0.0, ""),
-        (0.0021, ""),
         (9.9, ""),
         (62.0, "62 m large: in millimetres where metres are meant? --scale 0.001 makes it 62 mm"),
-        (1.5e6, "1,500,000 m large: in millimetres where metres are meant? --scale 0.001 makes it 1500 m"),
         (0.0005, "0.5 mm large: divided by 1,000 once too often? --scale 1000 makes it 0.5 m"),
     ],
 )

@@ -75,18 +75,6 @@ def test_position_accessors_have_bounds_also_when_shared_with_normals(tmp_path: 
     assert len(found["accessors"]) == 4, "the normals of both are one, and so are the triangles"
 
 
-def test_cloth_is_double_sided(tmp_path: Path, store: AssetStore) -> None:
-    scene = SceneBuilder()
-    scene.add_deformable("cloth", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    scene.add_box("box", half_size=(0.5, 0.5, 0.5))
-    found = exported(scene.build(store).spec, store, tmp_path)
-    worn = {node["name"]: found["meshes"][node["mesh"]]["primitives"][0] for node in found["nodes"] if "mesh" in node}
-    assert {name: found["materials"][one["material"]]["doubleSided"] for name, one in worn.items()} == {
-        "cloth": True,
-        "box": False,
-    }
-
-
 def test_dark_lights_are_left_out_and_orthographic_height_is_kept(tmp_path: Path, store: AssetStore) -> None:
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><light name="on" active="true"/><light name="off" active="false"/>'
@@ -98,18 +86,6 @@ def test_dark_lights_are_left_out_and_orthographic_height_is_kept(tmp_path: Path
     assert lamp["intensity"] == 1.0, "where the scene does not say"
     (camera,) = found["cameras"]
     assert (camera["orthographic"]["ymag"], camera["orthographic"]["xmag"]) == (4.5, 9.0), "half of 9 m, twice as wide"
-
-
-def test_emission_round_trips(tmp_path: Path, store: AssetStore) -> None:
-    """Without getting brighter: colours are linear in the file and sRGB in the specification."""
-    scene = SceneBuilder()
-    scene.add_sphere(radius=0.1, rgba=(0.9, 0.5, 0.1), emission=0.4)
-    write_glb(scene.build(store).spec, store, tmp_path / "a.glb")
-    again = SceneBuilder()
-    again.add_file(tmp_path / "a.glb")
-    (material,) = again.build(store).spec.materials
-    assert material.emission == pytest.approx(0.4, abs=1e-3)
-    assert material.rgba == pytest.approx((0.9, 0.5, 0.1, 1.0), abs=1e-3)
 
 
 WATCHERS = """<mujoco><worldbody>

@@ -8,14 +8,13 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from iris_session.physics import World
 from iris_session.protocol.scene import SceneSpec, decode_scene, encode_scene, list_assets
-from iris_session.scene import AssetStore, decode_arrays
+from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
 from iris_session.scene.mujoco_scene import ParsedScene, parse_mujoco
 from iris_session.scene.nodes import to_matrix
+from tests.models import MENAGERIE
 from tests.scene.models import every_shape, flexes
 
 
@@ -50,63 +49,10 @@ def check_tree(model: mujoco.MjModel, spec: SceneSpec) -> None:
         assert rotation == pytest.approx(data.geom_xmat[visual.id], abs=off)
 
 
-numbers = st.floats(-2, 2, allow_nan=False).map(lambda v: round(v, 4))
-names = st.sampled_from(["", "a", "b", "ü", "x y", "n" * 70])
-SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
-
-
-@st.composite
-def geoms(draw: st.DrawFn, used: set[str]) -> str:
-    kind = draw(st.sampled_from(sorted(SIZES)))
-    size = " ".join(str(draw(st.floats(0.01, 1))) for _ in range(SIZES[kind]))
-    look = draw(
-        st.sampled_from(["", 'material="m"', 'material="m" rgba="1 0 0 .5"', 'rgba=".5 .5 .5 1"', 'rgba="0 0 0 0"'])
-    )
-    place = " ".join(str(draw(numbers)) for _ in range(3))
-    turn = " ".join(str(draw(numbers)) for _ in range(3))
-    group = draw(st.integers(0, 5))
-    shape = f'type="{kind}" size="{size}" pos="{place}" euler="{turn}"'
-    return f'<geom {_name(draw, used, "g")} {shape} group="{group}" {look}/>'
-
-
-def _name(draw: st.DrawFn, used: set[str], kind: str) -> str:
-    """Draw a name that MuJoCo accepts: none, or one unique for this kind."""
-    name = draw(names)
-    if not name or kind + name in used:
-        return ""
-    used.add(kind + name)
-    return f'name="{name}"'
-
-
-@st.composite
-def trees(draw: st.DrawFn, used: set[str], depth: int = 0) -> str:
-    joint = draw(st.sampled_from(["", "<joint/>", "<joint type='slide'/>"] + (["<freejoint/>"] if depth == 0 else [])))
-    mocap = ' mocap="true"' if depth == 0 and not joint and draw(st.booleans()) else ""
-    inside = [draw(geoms(used)) for _ in range(draw(st.integers(1, 2)))]
-    if depth < 3:
-        inside += [draw(trees(used, depth + 1)) for _ in range(draw(st.integers(0, 2)))]
-    place = " ".join(str(draw(numbers)) for _ in range(3))
-    return f'<body {_name(draw, used, "b")} pos="{place}" euler="{place}"{mocap}>{joint}{"".join(inside)}</body>'
-
-
-@st.composite
-def models(draw: st.DrawFn) -> str:
-    used: set[str] = set()
-    bodies = "".join(draw(trees(used)) for _ in range(draw(st.integers(0, 3))))
-    lights = "".join(
-        f'<light type="{draw(st.sampled_from(["spot", "directional", "point"]))}" pos="0 0 {k}"/>'
-        for k in range(draw(st.integers(0, 2)))
-    )
-    return (
-        f'<mujoco><asset><material name="m" rgba=".2 .4 .6 1"/></asset><worldbody>{lights}{bodies}</worldbody></mujoco>'
-    )
-
-
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
-@given(models())
-def test_generated_models(tmp_path: Path, xml: str) -> None:
-    model = mujoco.MjModel.from_xml_string(xml)
-    spec = parse_mujoco(model, AssetStore(tmp_path)).spec
+@pytest.mark.parametrize("name", ["shapes", "unitree_go1"])
+def test_poses_colours_and_sizes_agree_with_mujoco(tmp_path: Path, name: str) -> None:
+    model = every_shape() if name == "shapes" else mujoco.MjModel.from_xml_path(str(MENAGERIE / name / "scene.xml"))
+    spec = parse_mujoco(model, AssetStore(tmp_path), options=EncodeOptions(levels=False)).spec
     assert decode_scene(encode_scene(spec)) == spec
     check_tree(model, spec)
     scene = mujoco.MjvScene(model, 500)
@@ -118,7 +64,7 @@ def test_generated_models(tmp_path: Path, xml: str) -> None:
     drawn = {geom.objid: geom for geom in scene.geoms[: scene.ngeom] if geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)}
     assert {visual.id for visual in spec.visuals if visual.rgba[3] > 0} == set(drawn)
     for visual in spec.visuals:
-        if visual.id in drawn:
+        if visual.id in drawn and visual.geometry.kind not in ("mesh", "sdf", "hfield", "plane"):
             assert visual.rgba == pytest.approx(drawn[visual.id].rgba)
             assert visual.geometry.size == pytest.approx(drawn[visual.id].size)
 

@@ -81,18 +81,6 @@ def test_shapes_are_closed_and_face_outwards(kind: str) -> None:
     assert np.einsum("fkc,fc->fk", mesh.normal[mesh.index], across).min() > 0
 
 
-def test_glb_has_every_mesh_and_picture_once(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path)
-    spec = parse_mujoco(every_shape(), store).spec
-    write_glb(spec, store, tmp_path / "a.glb")
-    found = document(tmp_path / "a.glb")
-    assert len(found["images"]) == 2  # one 2d, one of six faces
-    shown = [v for v in spec.visuals if v.rgba[3] > 0 and v.group in spec.groups_shown]
-    assert sum("mesh" in node for node in found["nodes"]) == len(shown)
-    assert len(found["meshes"]) == len({(v.geometry, v.material, v.rgba) for v in shown})
-    assert any(material.get("alphaMode") == "BLEND" for material in found["materials"])
-
-
 def test_scene_is_exported_in_its_initial_state(tmp_path: Path) -> None:
     """In the keyframe `home`, where joints are not at zero."""
     model = tmp_path / "arm.xml"

@@ -109,7 +109,7 @@ def test_scale_and_up_axis(tmp_path: Path) -> None:
             build(tmp_path / "a.stl", tmp_path, scale=scale)
 
 
-def test_colours_at_vertices_and_faces(tmp_path: Path) -> None:
+def test_colours_at_vertices(tmp_path: Path) -> None:
     box = trimesh.creation.box()
     colors = np.random.default_rng(1).integers(0, 255, (8, 4), dtype=np.uint8)
     box.visual.vertex_colors = colors
@@ -121,33 +121,10 @@ def test_colours_at_vertices_and_faces(tmp_path: Path) -> None:
         vertex = int(np.flatnonzero((box.vertices == position).all(axis=1))[0])
         assert color.tolist() == colors[vertex].tolist()
     assert scene.spec.visuals[0].rgba == (1.0, 1.0, 1.0, 1.0)
-    box = trimesh.creation.box()
-    box.visual.face_colors = [[255, 0, 0, 255]] * 6 + [[0, 0, 255, 255]] * 6
-    box.export(tmp_path / "b.ply")
-    scene, store = build(tmp_path / "b.ply", tmp_path)
-    mesh = decode_mesh(store.get(scene.spec.meshes[0].levels[0].address))
-    assert mesh.color is not None
-    assert sorted({tuple(c) for c in mesh.color[mesh.index].reshape(-1, 4).tolist()}) == [
-        (0, 0, 255, 255),
-        (255, 0, 0, 255),
-    ]
     # a given colour replaces them
-    scene, store = build(tmp_path / "b.ply", tmp_path, rgba=(0, 1, 0, 1))
+    scene, store = build(tmp_path / "a.ply", tmp_path, rgba=(0, 1, 0, 1))
     assert decode_mesh(store.get(scene.spec.meshes[0].levels[0].address)).color is None
     assert scene.spec.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
-
-
-def test_missing_material_values_are_not_invented(tmp_path: Path) -> None:
-    """A texture is not darkened, and a URDF colours a mesh that has coordinates but no material."""
-    path = write_obj(tmp_path)
-    (tmp_path / "parts.mtl").write_text("newmtl painted\nmap_Kd picture.png\n")
-    appearances = {node.name: node.surfaces[0].appearance for node in load_file(path).nodes}
-    painted = next(appearance for appearance in appearances.values() if appearance is not None and appearance.images)
-    assert painted.rgba == (1.0, 1.0, 1.0, 1.0)
-    (tmp_path / "bare.obj").write_text(OBJ.replace("mtllib parts.mtl\n", "").replace("f 1 2 3\n", ""))
-    (node,) = load_file(tmp_path / "bare.obj").nodes
-    assert node.surfaces[0].appearance is None
-    assert node.surfaces[0].mesh.uv is not None
 
 
 def test_missing_references_are_reported(tmp_path: Path) -> None:

@@ -207,16 +207,6 @@ def test_textures_of_the_material_are_read(tmp_path: Path, store: AssetStore) ->
     assert [t.channels for t in again.textures] == [t.channels for t in spec.textures], "alpha comes back"
 
 
-def test_picture_used_for_colours_and_normals_becomes_two_textures(tmp_path: Path, store: AssetStore) -> None:
-    document = Document()
-    use = {"index": document.image(PIXELS)}
-    document.json["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": use}, "normalTexture": use}]
-    document.square(0, TEXCOORD_0=document.accessor(SQUARE_UV))
-    spec = build(document.write(tmp_path / "a.glb"), store)
-    spaces = {use.role: spec.textures[use.texture].colorspace for use in spec.materials[0].textures}
-    assert spaces == {"rgb": "auto", "normal": "linear"}
-
-
 def test_open_meshes_are_drawn_from_both_sides(tmp_path: Path, store: AssetStore) -> None:
     document = Document()
     document.json["materials"] = [{"doubleSided": True}, {}]
@@ -297,17 +287,13 @@ def test_parts_that_are_not_drawn_are_reported(tmp_path: Path, store: AssetStore
         ({"nodes": [{"mesh": 7}]}, "meshes 7"),
         ({"nodes": [{"mesh": 0, "children": [0]}]}, "nothing that can be drawn|node 0"),
         ({"nodes": [{"children": [1]}, {"children": [0]}], "scenes": [{"nodes": [0]}]}, "node 0"),
-        ({"nodes": [{"mesh": 0, "translation": [1, "x", 1]}]}, "float: 'x'"),
         ({"meshes": [{"primitives": [{}]}]}, "mesh_0"),
-        ({"meshes": {}, "nodes": [{"mesh": 0}]}, "meshes 0"),
         ({"meshes": [{"primitives": 5}], "nodes": [{"mesh": 0}]}, "damaged"),
         (
             {"accessors": [{"bufferView": 0, "componentType": 5126, "count": 10**9, "type": "VEC3"}]},
             "1000000000 entries",
         ),
-        ({"bufferViews": [{"buffer": 0, "byteLength": 10**9}]}, "bufferViews 0"),
         ({"images": [{"uri": "../../../etc/passwd"}], "textures": [{"source": 0}]}, "etc/passwd, outside"),
-        ({"images": [{"uri": "data:image/png;base64,!!"}], "textures": [{"source": 0}]}, "damaged"),
         ({"images": [{"uri": "data:image/png;base64,AAAA"}], "textures": [{"source": 0}]}, "image 0 of a.glb"),
     ],
 )

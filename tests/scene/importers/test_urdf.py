@@ -92,24 +92,6 @@ def test_joints_bodies_and_followers(tmp_path: Path) -> None:
     assert scene.skipped == ()
 
 
-def test_joint_may_follow_a_follower(tmp_path: Path) -> None:
-    links = "".join(f'<link name="l{k}"/>' for k in range(4))
-    joints = "".join(
-        f'<joint name="j{k}" type="prismatic"><parent link="l0"/><child link="l{k}"/><axis xyz="0 0 1"/>'
-        f'<limit lower="-9" upper="9"/>{mimic}</joint>'
-        for k, mimic in (
-            (1, '<mimic joint="j2" multiplier="3" offset="0.01"/>'),
-            (2, '<mimic joint="j3" multiplier="2" offset="0.1"/>'),
-            (3, ""),
-        )
-    )
-    (tmp_path / "a.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
-    arm = composed(tmp_path / "a.urdf", tmp_path).articulations["arm"]
-    assert arm.mimics == {"j1": "j3", "j2": "j3"}
-    at = {body: pose.p[2] for body, pose in arm.compute_poses({"j3": 1.0}).items()}
-    assert at == {"arm/l0": 0.0, "arm/l1": pytest.approx(6.31), "arm/l2": pytest.approx(2.1), "arm/l3": 1.0}
-
-
 def test_meshes_in_millimetres_are_scaled(tmp_path: Path) -> None:
     trimesh.creation.box((1000, 2000, 3000)).export(tmp_path / "box.dae")
     text = (tmp_path / "box.dae").read_text()
