@@ -53,9 +53,9 @@ from iris_session.scene.nodes import (
     TextureImage,
     compose_poses,
     is_solid,
+    orient,
     split_rigid,
     to_matrix,
-    to_pose,
     to_vec3,
 )
 from iris_session.scene.report import compute_box_extent, format_unit_hint, largest_mesh_side
@@ -427,12 +427,7 @@ class SceneContent:
                     DrawnItem(places[k], surface.name, matrix, look or surface.appearance or Appearance(), mesh)
                 )
             self.lights += [(places[k], _place_light(matrix, light)) for light in node.lights]
-            if node.cameras:
-                T = _compute_camera_pose(matrix)
-                self.cameras += [
-                    (places[k], msgspec.structs.replace(camera, T_body_camera=compose_poses(T, camera.T_body_camera)))
-                    for camera in node.cameras
-                ]
+            self.cameras += [(places[k], _place_camera(matrix, camera)) for camera in node.cameras]
 
 
 def _find_nodes_with_content(loaded: LoadedFile) -> set[int]:
@@ -448,15 +443,11 @@ def _find_nodes_with_content(loaded: LoadedFile) -> set[int]:
 
 def _place_light(matrix: Matrix, light: Light) -> Light:
     """Return a light in the frame of its body, given the matrix of its node; also for a mirrored one."""
-    p = matrix @ [*light.p_body, 1.0]
-    along = matrix[:3, :3] @ light.direction_body
-    along /= np.linalg.norm(along)
-    return msgspec.structs.replace(light, p_body=to_vec3(p), direction_body=to_vec3(along))
+    along = -matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
+    return msgspec.structs.replace(light, p_body=to_vec3(matrix[:3, 3]), direction_body=to_vec3(along))
 
 
-def _compute_camera_pose(matrix: Matrix) -> Pose:
-    """Return T_body_camera for the matrix of its node: the camera looks along -z with y up, also for a mirrored one."""
-    back, up = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]), matrix[:3, 1]
-    up = up - (up @ back) * back
-    up /= np.linalg.norm(up)
-    return to_pose(np.stack([np.cross(up, back), up, back], axis=1), matrix[:3, 3])
+def _place_camera(matrix: Matrix, camera: Camera) -> Camera:
+    """Return a camera in the frame of its body: it looks along -z of its node with y up, also of a mirrored one."""
+    q = orient(matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]), matrix[:3, 1], IDENTITY.q)
+    return msgspec.structs.replace(camera, T_body_camera=Pose(to_vec3(matrix[:3, 3]), q))

@@ -45,14 +45,12 @@ class Atlas(NamedTuple):
     """Six faces in one image.
 
     `pixels`: two rows of three faces, each with a border that repeats the adjacent faces, so that filtering does not
-    mix in neighbouring faces of the image. `side`, `border`: of a face [pixels]. `plain`: every face has a single
-    colour.
+    mix in neighbouring faces of the image. `side`, `border`: of a face [pixels].
     """
 
     pixels: Pixels
     side: int
     border: int
-    single_colors: bool
 
     def to_uv(self, face: NDArray[np.int64], on_face: Floats) -> Floats:
         """Convert coordinates on faces to coordinates in the image, 0..1 (..., 2)."""
@@ -103,9 +101,7 @@ class CubeMapReader:
         if level.address not in self._read:
             pixels = decode_image(self._store.get(level.address), level.encoding)
             encoding = AssetEncoding.JPEG if level.encoding == AssetEncoding.JPEG else AssetEncoding.PNG
-            self._read[level.address] = _with_atlas(
-                CubeMap(level.address, encoding), split_faces(pixels), self._max_side
-            )
+            self._read[level.address] = _with_atlas(CubeMap(level.address, encoding), pixels, self._max_side)
         return self._read[level.address]
 
 
@@ -115,30 +111,21 @@ def find_cube_texture(spec: SceneSpec, material: int) -> int:
     return -1 if index < 0 or spec.textures[index].kind == TextureKind.IMAGE else index
 
 
-def split_faces(pixels: Pixels) -> Pixels:
-    """Split an image of six faces below one another to (6, side, side, channels). Raises `AssetDecodeError` for
-    others.
-    """
+def _with_atlas(cube: CubeMap, pixels: Pixels, max_side: int) -> CubeMap:
+    """Return a cube map with the atlas, or with the one colour, of six faces below one another."""
     if not len(pixels) == _FACES * pixels.shape[1] > 0:
         raise AssetDecodeError(
             f"a cube texture of {pixels.shape[1]} x {len(pixels)} pixels: expected six squares below one another"
         )
-    return pixels.reshape(_FACES, len(pixels) // _FACES, *pixels.shape[1:])
-
-
-def _with_atlas(cube: CubeMap, faces: Pixels, max_side: int) -> CubeMap:
-    plain = bool((faces == faces[:, :1, :1]).all())
-    if plain and bool((faces == faces[:1]).all()) and (faces.shape[3] < 4 or faces[0, 0, 0, 3] == 255):
+    faces = pixels.reshape(_FACES, len(pixels) // _FACES, *pixels.shape[1:])
+    if bool((faces == faces[:1, :1, :1]).all()) and (faces.shape[3] < 4 or faces[0, 0, 0, 3] == 255):
         red, green, blue = np.resize(faces[0, 0, 0, : 3 if faces.shape[3] >= 3 else 1] / 255.0, 3).tolist()
         return cube._replace(tint=(red, green, blue))
-    if plain and 0.5 / faces.shape[2] <= TOLERANCE:  # otherwise mixed colours at edges would be visible
-        cells = np.broadcast_to(faces[:, :1, :1], (_FACES, 5, 5, faces.shape[3]))
-        return cube._replace(atlas=Atlas(_join_cells(cells), side=1, border=2, single_colors=True))
     while faces.shape[2] > max_side:
         faces = np.stack([halve(face) for face in faces])
     side = faces.shape[2]
     border = max(2, side // 16)
-    return cube._replace(atlas=Atlas(_join_cells(_add_borders(faces, border)), side, border, single_colors=False))
+    return cube._replace(atlas=Atlas(_join_cells(_add_borders(faces, border)), side, border))
 
 
 def _join_cells(cells: Pixels) -> Pixels:
@@ -186,7 +173,7 @@ def bake_cube_map(mesh: MeshArrays, geometry: Geometry, scale: tuple[float, floa
     if geometry.kind == GeometryKind.CAPSULE:
         direction = _capsule_directions(rest[:, :, :3], direction, geometry.size)
     corners, face = _cut_at_faces(np.concatenate([direction, rest], axis=2))
-    corners, face, on_face = _split_triangles(corners, face, np.inf if atlas.single_colors else TOLERANCE)
+    corners, face, on_face = _split_triangles(corners, face)
     position, normal, color = corners[:, :, 3:6], normalise(corners[:, :, 6:9]), None
     if mesh.color is not None:
         color = np.rint(corners[:, :, 9:13]).astype(np.uint8)
@@ -266,10 +253,8 @@ def _face_coordinates(direction: Floats, face: NDArray[np.int64]) -> tuple[Float
     return (np.stack([u, v], axis=2) + 1) / 2, there
 
 
-def _split_triangles(
-    corners: Floats, face: NDArray[np.int64], tolerance: float
-) -> tuple[Floats, NDArray[np.int64], Floats]:
-    """Split triangles until the coordinates in the middles of their edges are within `tolerance` of exact ones.
+def _split_triangles(corners: Floats, face: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64], Floats]:
+    """Split triangles until the coordinates in the middles of their edges are within `TOLERANCE` of exact ones.
 
     Returns them with their faces, and the coordinates of their corners. Each edge is judged alone, as for its other
     triangle.
@@ -284,7 +269,7 @@ def _split_triangles(
         # A corner at the centre takes the mean of the others, which must then be close to each other.
         fan = np.where(there.all(axis=1, keepdims=True), 0.0, np.abs(following - on_face).max(axis=2) / 2)
         error = np.where(known, np.maximum(error, fan), 0.0)
-        cut = error > (tolerance if depth < _DEPTH else np.inf)
+        cut = error > (TOLERANCE if depth < _DEPTH else np.inf)
         stay = cut.sum(axis=1) == 0
         others = (on_face * there[:, :, None]).sum(axis=1) / np.maximum(there.sum(axis=1), 1)[:, None]
         uv = np.where(there[:, :, None], on_face, others[:, None])

@@ -19,10 +19,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import quat_from_matrix
 from anchors.pose import apply, compose, inverse, quat_conj, quat_rotate
 from iris_session.assets.store import AssetStore
-from iris_session.protocol.common import IDENTITY, Pose, Quat, Vec3
+from iris_session.protocol.common import IDENTITY, Pose, Vec3
 from iris_session.protocol.names import ArrayKind, AssetEncoding, Follow, LightKind, TextureKind, TextureRole
 from iris_session.protocol.scene import Camera, Deformable, Light, SceneSpec, Visual
 from iris_session.scene.arrays import decode_arrays
@@ -30,7 +29,7 @@ from iris_session.scene.cube_maps import CUBE_SIDE, CubeMap, CubeMapReader, bake
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import decode_image, encode_image, to_linear
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners, normalise
-from iris_session.scene.nodes import to_vec3
+from iris_session.scene.nodes import orient, to_vec3
 from iris_session.scene.shapes import (
     add_texture_coordinates,
     build_height_field,
@@ -116,7 +115,7 @@ class _GlbWriter:
             pose, ahead = camera.T_body_camera, self._find_direction_to_target(camera, camera.T_body_camera.p)
             if ahead is not None:  # upright
                 q_world_body = self._bodies[camera.body].T_world_body.q
-                pose = Pose(pose.p, _orient(-ahead, quat_rotate(quat_conj(q_world_body), (0.0, 0.0, 1.0)), pose.q))
+                pose = Pose(pose.p, orient(-ahead, quat_rotate(quat_conj(q_world_body), (0.0, 0.0, 1.0)), pose.q))
             lens = self._add("cameras", _build_camera(camera))
             self._add_node(nodes[camera.body], camera.name or f"camera_{k}", pose, camera=lens)
         lights = [light for light in self._spec.lights if light.active and light.kind in _LIGHTS]
@@ -128,7 +127,7 @@ class _GlbWriter:
             back = -np.array(light.direction_body if ahead is None else ahead, np.float64)
             back /= np.linalg.norm(back) or 1.0
             up = (0.0, 1.0, 0.0) if abs(back[1]) < 0.9 else (1.0, 0.0, 0.0)
-            pose = Pose(light.p_body, _orient(back, up, IDENTITY.q))
+            pose = Pose(light.p_body, orient(back, up, IDENTITY.q))
             name = light.name or f"light_{k}"
             self._add_node(nodes[light.body], name, pose, extensions={_EXTENSION: {"light": k}})
 
@@ -373,16 +372,3 @@ def _build_light(light: Light) -> dict[str, Any]:
     if light.kind == LightKind.SPOT:
         lamp["spot"] = {"outerConeAngle": min(max(math.radians(light.cutoff), 1e-3), _WIDEST)}
     return lamp
-
-
-def _orient(back: NDArray[np.float64], up: Vec3, default: Quat) -> Quat:
-    """Return the rotation of a frame whose z axis is `back`, with its y axis close to `up`.
-
-    `default`: rotation where these are parallel.
-    """
-    side = np.cross(up, back)
-    if np.linalg.norm(side) <= 1e-9:
-        return default
-    side /= np.linalg.norm(side)
-    w, x, y, z = quat_from_matrix(np.stack([side, np.cross(back, side), back], axis=1)).tolist()
-    return w, x, y, z

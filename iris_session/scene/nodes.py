@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from anchors.lie import quat_from_matrix, quat_to_matrix
 from anchors.pose import compose
-from iris_session.protocol.common import MAX_TEXT, Pose, Vec3
+from iris_session.protocol.common import MAX_TEXT, Pose, Quat, Vec3
 from iris_session.protocol.names import ColorSpace, GeometryKind, TextureKind, TextureRole
 from iris_session.protocol.scene import Camera, Light, Rgba, Vec2
 from iris_session.scene.errors import SceneBuildError
@@ -89,7 +89,7 @@ class Surface:
 class Node:
     """Node of a file. `matrix` (4, 4): T_file_node. `parent`: index of an earlier node, -1 for none.
 
-    The `lights` and `cameras` are in the node's frame; their bodies are not yet known.
+    The `lights` and `cameras` are at its origin and look along -z; their bodies are not yet known.
     """
 
     name: str = ""
@@ -161,6 +161,19 @@ def to_pose(R: NDArray[np.float64], p: Any) -> Pose:
     """Return the pose of a rotation matrix (3, 3) and a position."""
     w, i, j, k = quat_from_matrix(np.asarray(R, np.float64)).tolist()
     return Pose(to_vec3(p), (w, i, j, k))
+
+
+def orient(back: NDArray[np.float64], up: ArrayLike, default: Quat) -> Quat:
+    """Return the rotation of a frame whose z axis is `back`, with its y axis close to `up`.
+
+    `default`: rotation where these are parallel.
+    """
+    side = np.cross(up, back)
+    if np.linalg.norm(side) <= 1e-9:
+        return default
+    side /= np.linalg.norm(side)
+    w, x, y, z = quat_from_matrix(np.stack([side, np.cross(back, side), back], axis=1)).tolist()
+    return w, x, y, z
 
 
 def to_vec3(p: Any) -> Vec3:

@@ -33,7 +33,7 @@ from iris_session.scene.importers.references import (
     read_bounded,
     xacro_advice,
 )
-from iris_session.scene.importers.xml_files import line_of, parse_xml
+from iris_session.scene.importers.xml_files import parse_xml
 from iris_session.scene.nodes import (
     Appearance,
     DrawnItem,
@@ -256,7 +256,8 @@ class _Reader:
     def _place(self, element: Element) -> str:
         """Return the position of an element, for messages."""
         name = element.get("name") or ""
-        return f"{self._file}, line {line_of(element)}: <{element.tag}>{f' {name}' if name else ''}"
+        line = getattr(element, "line", 0)  # of `parse_xml`
+        return f"{self._file}, line {line}: <{element.tag}>{f' {name}' if name else ''}"
 
     def _skip(self, text: str) -> None:
         self._skipped[f"{self._file}: {text}"] = None

@@ -22,12 +22,9 @@ _HOLDERS: Final = ("node", "geometry", "controller", "library_nodes")
 
 
 class _Element(Element):
+    """An element with the `line` of the file in which it begins."""
+
     line = 0
-
-
-def line_of(element: Element) -> int:
-    """Return the line of the file in which an element of `parse_xml` begins."""
-    return element.line if isinstance(element, _Element) else 0
 
 
 class _TreeHandler(ContentHandler):
