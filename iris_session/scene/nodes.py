@@ -168,7 +168,7 @@ def orient(back: NDArray[np.float64], up: ArrayLike, default: Quat) -> Quat:
 
     `default`: rotation where these are parallel.
     """
-    side = np.cross(up, back)
+    side = np.cross(np.asarray(up, np.float64), back)
     if np.linalg.norm(side) <= 1e-9:
         return default
     side /= np.linalg.norm(side)
