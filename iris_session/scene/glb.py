@@ -222,7 +222,11 @@ class _GlbWriter:
         look = self._add_material(deformable.material, deformable.rgba, mapped=mapped, both_sides=deformable.dim == 2)
         if deformable.dim == 1:
             attributes = {"POSITION": self._add_accessor(arrays["position"], "VEC3", bounds=True)}
-            primitive = {"attributes": attributes, "indices": self._add_indices(arrays["elements"]), "mode": _LINES}
+            primitive = {
+                "attributes": attributes,
+                "indices": self._add_accessor(arrays["elements"], "SCALAR"),
+                "mode": _LINES,
+            }
         else:
             corners = arrays["position"][arrays["elements"]]
             normal = normalise(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
@@ -241,25 +245,20 @@ class _GlbWriter:
         if mesh.color is not None:
             linear = np.concatenate([to_linear(mesh.color[:, :3] / 255), mesh.color[:, 3:] / 255], axis=1)
             attributes["COLOR_0"] = self._add_accessor(linear.astype(np.float32), "VEC4")
-        return {"attributes": attributes, "indices": self._add_indices(mesh.index)}
+        return {"attributes": attributes, "indices": self._add_accessor(mesh.index, "SCALAR")}
 
-    def _add_indices(self, index: NDArray[Any]) -> int:
-        data = np.ascontiguousarray(index, "<u4")
-        return self._add_accessor_once(
-            data.tobytes(), _INDICES, {"componentType": _UINT, "count": data.size, "type": "SCALAR"}
-        )
-
-    def _add_accessor(self, values: NDArray[np.float32], kind: str, *, bounds: bool = False) -> int:
-        accessor: dict[str, Any] = {"componentType": _FLOAT, "count": len(values), "type": kind}
-        if bounds:
-            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        return self._add_accessor_once(values.astype("<f4").tobytes(), _VERTICES, accessor)
-
-    def _add_accessor_once(self, data: bytes, target: int, accessor: dict[str, Any]) -> int:
-        """Add an accessor for `data`, once for equal data: two accessors may not share a view."""
-        key = (hashlib.sha256(data).digest(), target, accessor["type"], "min" in accessor)
+    def _add_accessor(self, values: NDArray[Any], kind: str, *, bounds: bool = False) -> int:
+        """Add an accessor, once for equal data: two may not share a view. Whole numbers are indices."""
+        index = values.dtype.kind in "iu"
+        data = np.ascontiguousarray(values.reshape(-1) if index else values, "<u4" if index else "<f4")
+        key = (hashlib.sha256(data).digest(), kind, index, bounds)
         if key not in self._accessors:
-            self._accessors[key] = self._add("accessors", {"bufferView": self._add_view(data, target), **accessor})
+            view = self._add_view(data.tobytes(), _INDICES if index else _VERTICES)
+            accessor: dict[str, Any] = {"bufferView": view, "componentType": _UINT if index else _FLOAT}
+            accessor |= {"count": len(data), "type": kind}
+            if bounds:
+                accessor |= {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()}
+            self._accessors[key] = self._add("accessors", accessor)
         return self._accessors[key]
 
     def _add_view(self, data: bytes, target: int = 0) -> int:
