@@ -6,6 +6,7 @@ extensions of simulators, are not read.
 
 from __future__ import annotations
 
+import graphlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,6 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from anchors.lie import quat_to_matrix
 from anchors.pose import quat_from_rotvec, quat_mul
 from iris_session.protocol.common import Pose, Vec3
 from iris_session.protocol.names import GeometryKind
@@ -41,6 +41,7 @@ from iris_session.scene.nodes import (
     Matrix,
     TextureImage,
     color_images,
+    to_matrix,
     to_pose,
     truncate_name,
 )
@@ -248,10 +249,8 @@ class _Reader:
         roll, pitch, yaw = self._numbers(origin, "rpy", (0.0, 0.0, 0.0))
         about_z, about_y, about_x = ((0.0, 0.0, yaw), (0.0, pitch, 0.0), (roll, 0.0, 0.0))
         q = quat_mul(quat_mul(quat_from_rotvec(about_z), quat_from_rotvec(about_y)), quat_from_rotvec(about_x))
-        matrix = np.eye(4)
-        matrix[:3, :3] = quat_to_matrix(np.array(q))
-        matrix[:3, 3] = self._scale * np.array(self._numbers(origin, "xyz", (0.0, 0.0, 0.0)))
-        return matrix
+        x, y, z = (self._scale * v for v in self._numbers(origin, "xyz", (0.0, 0.0, 0.0)))
+        return to_matrix(Pose((x, y, z), q))
 
     def _place(self, element: Element) -> str:
         """Return the position of an element, for messages."""
@@ -317,16 +316,11 @@ class _Reader:
                     f"{joint.name}: {_TREE}"
                 )
             above[joint.child] = joint
-        rooted: set[str] = set()
-        for start in self._links:
-            link, way = start, dict[str, str]()  # links above one another, each with its joint
-            while link in above and link not in rooted:
-                if link in way:
-                    loop = [*way.values()][[*way].index(link) :][::-1]
-                    raise SceneBuildError(f"{self._file}: the joints {', '.join(loop[:8])} make a loop: {_TREE}")
-                way[link] = above[link].name
-                link = above[link].parent
-            rooted.update(way)
+        try:
+            graphlib.TopologicalSorter({joint.child: [joint.parent] for joint in joints}).prepare()
+        except graphlib.CycleError as error:
+            loop = ", ".join(above[link].name for link in error.args[1][1:9])  # from parent to child
+            raise SceneBuildError(f"{self._file}: the joints {loop} make a loop: {_TREE}") from None
         roots = [link for link in self._links if link not in above]
         if len(roots) > 1:
             raise SceneBuildError(
