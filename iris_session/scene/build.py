@@ -51,7 +51,6 @@ from iris_session.scene.nodes import (
     LoadedFile,
     Matrix,
     TextureImage,
-    compose_poses,
     is_solid,
     orient,
     split_rigid,
@@ -383,8 +382,8 @@ class SceneContent:
         """Add an articulation with its bodies, joints at rest."""
         articulation = robot.articulation
         first = len(self.bodies)
-        for name, pose in articulation.compute_poses({}).items():
-            self.bodies.append(ComposedBody(name, -1, compose_poses(articulation.T_world_root, pose), moving=True))
+        for name, pose in articulation.compute_world_poses(articulation.T_world_root, {}).items():
+            self.bodies.append(ComposedBody(name, -1, pose, moving=True))
         self.items += [replace(item, body=first + item.body) for item in robot.items]
         self.articulations[articulation.name] = articulation
         self.names.update((articulation.name, *articulation.bodies))

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from anchors.lie import quat_from_matrix, quat_to_matrix
-from anchors.pose import compose
 from iris_session.protocol.common import MAX_TEXT, Pose, Quat, Vec3
 from iris_session.protocol.names import ColorSpace, GeometryKind, TextureKind, TextureRole
 from iris_session.protocol.scene import Camera, Light, Rgba, Vec2
@@ -193,8 +192,3 @@ def to_matrix(pose: Pose) -> Matrix:
 def truncate_name(name: object) -> str:
     """Return a name that the wire can hold: not too long, without lone surrogates (JSON may have them)."""
     return str(name)[:MAX_TEXT].encode("utf-8", "replace").decode() if name is not None else ""
-
-
-def compose_poses(a: Pose, b: Pose) -> Pose:
-    """Return T_a_c of T_a_b and T_b_c."""
-    return Pose(*compose((a.p, a.q), (b.p, b.q)))
