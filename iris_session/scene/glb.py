@@ -251,9 +251,10 @@ class _GlbWriter:
         """Add an accessor, once for equal data: two may not share a view. Whole numbers are indices."""
         index = values.dtype.kind in "iu"
         data = np.ascontiguousarray(values.reshape(-1) if index else values, "<u4" if index else "<f4")
-        key = (hashlib.sha256(data).digest(), kind, index, bounds)
+        raw = data.tobytes()
+        key = (hashlib.sha256(raw).digest(), kind, index, bounds)
         if key not in self._accessors:
-            view = self._add_view(data.tobytes(), _INDICES if index else _VERTICES)
+            view = self._add_view(raw, _INDICES if index else _VERTICES)
             accessor: dict[str, Any] = {"bufferView": view, "componentType": _UINT if index else _FLOAT}
             accessor |= {"count": len(data), "type": kind}
             if bounds:
