@@ -10,7 +10,6 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -41,6 +40,7 @@ from iris_session.protocol.server_messages import (
 from iris_session.recording.reader import Recording
 from iris_session.rrd.assets import AssetCollector, AssetFault, AssetPiece, AssetsSummary, RecordedScene
 from iris_session.rrd.batches import FrameTime, RecordedStream, RowTimes
+from iris_session.rrd.file import get_size
 
 #: Maximum number of lines about missing steps, and about missing events: a file may have any number of gaps.
 MOST_GAPS: Final = 100
@@ -220,7 +220,7 @@ def summarise(recording: Recording, progress: Callable[[int, int], None] | None 
         path=recording.files[0],
         ok=not damage,
         files=tuple(os.path.basename(file) for file in recording.files),
-        bytes=sum(_read_size(file) for file in recording.files),
+        bytes=sum(max(0, get_size(file)) for file in recording.files),
         session_name=header.session_name,
         session_id=header.session_id,
         created_utc=header.created_utc,
@@ -264,12 +264,6 @@ def build_summary(
     changed = recording.changed_spans()
     lost = builder.assets.list_problems(finished=recording.all_closed)
     return builder, (*recording.missing, *recording.damage, *builder.list_gaps(end), *changed, *lost)
-
-
-def _read_size(file: str) -> int:
-    with suppress(OSError):
-        return os.path.getsize(file)
-    return 0
 
 
 def _describe_ending(recording: Recording, end_ns: int) -> str:

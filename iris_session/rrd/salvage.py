@@ -1,7 +1,7 @@
 """Damaged Rerun files: make a copy of the readable messages of a file that was cut short or changed.
 
 Rerun's reader stops or aborts at the first body that it cannot decode. `rerun rrd filter` goes on after most of them;
-where it aborts, some messages are left out and the rest is read without them.
+where it aborts, the message at fault is left out and the rest is read without it.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from iris_session.rrd.file import (
 )
 from iris_session.rrd.rerun_tool import filter_readable
 
-#: Attempts to read on after Rerun has aborted, each without one more message; what follows is given up. Rerun may have
-#: decoded some 30 messages when it aborts, and not written them: one of those after them is at fault.
-MOST_ABORTS: Final = 48
+#: Messages that Rerun may have decoded when it aborts, and not written: among those after them is the one at fault.
+AHEAD: Final = 32
+#: Number of messages that may make Rerun abort; what follows the last of them is given up.
+MOST_ABORTS: Final = 16
 
 
 def salvage(path: str | Path, copy: str | Path) -> list[str]:
@@ -62,8 +63,16 @@ def _find_readable(path: str | Path, messages: Sequence[RrdMessage]) -> tuple[li
         kept += [m for m in messages[begin:] if m in readable]
         if is_whole:
             return kept, len(messages)
-        begin = max(begin, messages.index(kept[-1]) + 1 if kept else 0) + 1
-    return kept, min(begin, len(messages))
+        if kept:
+            begin = max(begin, messages.index(kept[-1]) + 1)
+        for message in messages[begin : begin + AHEAD]:
+            infos = [m for m in kept if m.kind == KIND_STORE_INFO]
+            one, is_decoded = _try_messages(path, [*infos, message])
+            begin += 1
+            kept += [message] if message in one else []
+            if not is_decoded:
+                break
+    return kept, begin
 
 
 def _try_messages(path: str | Path, messages: Sequence[RrdMessage]) -> tuple[set[RrdMessage], bool]:

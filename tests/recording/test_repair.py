@@ -20,6 +20,7 @@ from iris_session.rrd import paths
 from iris_session.rrd.file import KIND_END, KIND_STORE_INFO, RrdMessage, read_message, scan_file
 from iris_session.rrd.paths import part_path
 from iris_session.rrd.rerun_tool import INDEX, rewrite
+from iris_session.rrd.salvage import salvage
 from tests.recording.support import SmallCore, has_index, journal, write
 
 HEAD_BYTES = 16  # of a message
@@ -114,6 +115,12 @@ def test_flipped_bits_cost_one_message(original: Original, tmp_path: Path) -> No
         damaged[at] ^= 1 << rng.randrange(8)
         found.append(check_repair(original, bytes(damaged), at, tmp_path))
     assert found.count("damaged") > 2
+
+
+def test_message_that_claims_a_terabyte_is_left_out(tmp_path: Path) -> None:
+    """Rerun's decoder aborts at it."""
+    path = Path(__file__).with_name("claims_a_terabyte.rrd")
+    assert salvage(path, tmp_path / "copy.rrd") == ["message of 1283 bytes at byte 93 is damaged and left out"]
 
 
 def test_cut_file_keeps_its_checksums(original: Original, tmp_path: Path) -> None:
