@@ -20,14 +20,13 @@ import pytest
 import zmq
 import zmq.auth
 
-from iris_session.link import FrontConfig, FrontError, FrontProcess
+from iris_session.link import FrontConfig, FrontProcess
 from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import FrontRestarted, Join
 from iris_session.protocol.server_messages import ProtocolFault, Snapshot
 from iris_session.security import KeyHome
-from tests.front.process_harness import ProcessClient, ProcessSession, scene
-from tests.loopback import make_loopback_address
+from tests.front.process_harness import ProcessSession, scene
 
 pytestmark = pytest.mark.e2e
 OpenSession = Callable[..., ProcessSession]
@@ -46,26 +45,6 @@ def wait(condition: Callable[[], bool], what: str) -> None:
     while not condition():
         assert time.monotonic() < deadline, f"no {what}"
         time.sleep(0.005)
-
-
-def wait_until_told(client: ProcessClient) -> list[str]:
-    """Wait for the word of the end, which may come after the end of the front. Return the codes of all faults."""
-
-    def codes() -> list[str]:
-        client.receive()
-        return [fault.code for fault in client.got(ProtocolFault)]
-
-    wait(lambda: "session_ended" in codes(), "word of the end")
-    return codes()
-
-
-def test_port_in_use_error_names_the_port() -> None:
-    host = make_loopback_address()  # the port before it, for the introduction, is free there
-    with socket.create_server((host, 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(FrontError) as error:
-            FrontProcess(FrontConfig(host=host, control_port=port, state_port=0), scene()).start()
-    assert f"port {port} (control)" in str(error.value)
 
 
 def test_networks_are_encrypted_with_a_key_made_on_first_use(tmp_path: Path) -> None:
