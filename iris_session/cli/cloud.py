@@ -43,11 +43,6 @@ FIRST_FRAME_S: Final = 10.0
 STREAMS_S: Final = 5.0
 #: Without a terminal, a line of `run` that is like the one before is printed this often [s].
 QUIET_S: Final = 10.0
-#: Meaning of what is left out as a rule, which `doctor` does not speak of.
-_DROPS: Final = {
-    "camera_superseded": "frames for which newer ones came in time",
-    "camera_budget": "points above the budget",
-}
 log = logging.getLogger(__name__)
 
 
@@ -348,8 +343,7 @@ def _format_drops(report: CameraReport) -> Iterator[str]:
     if report.drops:
         from iris_session.doctor.drop_explanations import EXPLANATIONS
 
-        meanings = {**EXPLANATIONS, **_DROPS}
-        parts = (f"{reason} {n} ({meanings[f'camera_{reason}']})" for reason, n in sorted(report.drops.items()))
+        parts = (f"{reason} {n} ({EXPLANATIONS[f'camera_{reason}']})" for reason, n in sorted(report.drops.items()))
         yield f"  left out: {', '.join(parts)}"
 
 

@@ -266,14 +266,10 @@ def _wait_until_used(home: KeyHome, made: JoinCode, arguments: argparse.Namespac
         result = {"paired": entry.name, "fingerprint": entry.fingerprint, "roles": entry.roles}
         print_result(arguments, result, [f"paired: {entry.name} ({entry.fingerprint})"])
         return 0
-    reason = _find_failure_reason(now)
+    reason = "expired"
+    if now is not None and now.attempts_left == 0:
+        reason = "void"
+    elif now is not None and (entry is not None or (not now.secret and time.time() < now.expires)):
+        reason = "not_listed"
     print_result(arguments, {"paired": None, "reason": reason}, [FAILURE_TEXTS[reason]])
     return 1
-
-
-def _find_failure_reason(code: JoinCode | None) -> str:
-    """Return why no device has paired."""
-    if code is not None and code.attempts_left == 0:
-        return "void"
-    used = code is not None and (code.paired is not None or (not code.secret and time.time() < code.expires))
-    return "not_listed" if used else "expired"

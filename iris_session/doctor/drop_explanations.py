@@ -115,6 +115,8 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "allow_list_missing": "the list of keys was missing; its keys counted for two more seconds",
     "journal_rows": _DISK,
     "recorded_items": _DISK,
+    "camera_superseded": "frames of cameras for which newer ones came in time",
+    "camera_budget": "points of cameras above the budget",
     "camera_send": "frames of cameras that the session did not take in time",
     "camera_join": "frames of a camera that were captured more than 50 ms before those of another one",
     "camera_pose": "frames of a camera without a pose of the body that carries it",

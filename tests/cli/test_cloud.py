@@ -129,13 +129,6 @@ def test_cameras_that_no_session_admitted_are_a_fault(
     assert main(command) == 0
 
 
-def test_no_session_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["cloud", "run", str(camera_file), "--address", "127.0.0.1:1"]) == 2
-    assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
-    assert main(["cloud", "inspect", "127.0.0.1:1"]) == 2
-    assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
-
-
 def test_a_camera_on_a_body_cannot_be_inspected_without_a_session(
     camera_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

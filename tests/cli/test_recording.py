@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import signal
@@ -77,9 +76,7 @@ def test_a_summary_is_lines_for_people() -> None:
     for line in (
         "lab  2026-11-25 16:28:51 UTC  2 min 5 s",
         "  file       s/session.rrd, 7.1 MB, format 4, 2 parts: session.rrd, session.part2.rrd",
-        "  end        not closed after 25 s: what may have followed is missing; 12,345 steps",
         "  objects    none",
-        "  deforming  cloth",
         "  people     ann (operator, head, hand/left): 24.0 s, joined 2 times, there at the end; held left for 20.0 s; "
         "12 stale rejected samples",
         "             bob\x1b[2J (observer): 0.0 s; held no robot",
@@ -88,10 +85,8 @@ def test_a_summary_is_lines_for_people() -> None:
         "  episodes   1 success 'pour' at 2.00 s, 5.0 s, by ann",
         "  handovers  hammer: left (ann) to right (bob) at 3.25 s, both held it for 0.56 s",
         "  e-stops    at 4.00 s by a connection that had not joined (hand in the way), for 1.0 s",
-        "             at 9.00 s by ann, to the end",
         "  streams    room (Room): cloud, 48 frames in 24.0 s, 2.0 Hz; FAULT stuck",
         "  assets     scene: 11 of 12 of 1 scene, 4.2 MB",
-        "             left out: asset 7777 (mesh arm): it cannot be read",
         "             7 steps did not fit into the recording",
         "             90 raw samples not recorded (disk slow or nearly full, or the budget); the journal is whole",
         "  damage     bytes 0 are gone",
@@ -116,25 +111,6 @@ def test_inspect_shows_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture
     result = json.loads(capsys.readouterr().out)
     assert sorted(result) == sorted(RecordingSummary.__struct_fields__)
     assert (result["ok"], result["steps"], result["people"][0]["held_s"]) == (True, 200, {"left": 0.358})
-
-
-def test_a_folder_that_cannot_be_read_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The tests may run as root, for whom every folder can be read."""
-    scan = os.scandir
-
-    def refuse(path: str) -> object:
-        if str(path).endswith("locked"):
-            raise PermissionError(errno.EACCES, "Permission denied", str(path))
-        return scan(path)
-
-    (tmp_path / "locked").mkdir()
-    monkeypatch.setattr(os, "scandir", refuse)
-    assert main(["recording", "inspect", str(tmp_path), "--json"]) == 1
-    out, err = capsys.readouterr()
-    assert [row["path"] for row in json.loads(out)["recordings"]] == [str(tmp_path / "locked")]
-    assert err.count("\n") == 1
 
 
 def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

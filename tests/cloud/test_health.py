@@ -155,23 +155,3 @@ def test_a_source_that_stops() -> None:
     assert watch.fault() == StreamFault.SOURCE
     watch.run(50)
     assert watch.fault() != StreamFault.SOURCE
-
-
-def test_a_source_that_was_opened_anew_begins_anew() -> None:
-    watch = Watch()
-    watch.run(2000, without_depth)
-    watch.health.restart(watch.now_ms * MS)
-    assert watch.fault() == ""
-    assert watch.run(100) == ""
-
-
-def test_one_picture_of_a_slow_camera_is_not_frozen() -> None:
-    health = CameraHealth(0.5)
-    health.restart(0)
-    health.check_frame(make_frame(1), CAMERA, 0)
-    assert health.find_fault(1900 * MS) is None
-    health.check_frame(frozen(make_frame(2000)), CAMERA, 2000 * MS)
-    health.check_frame(frozen(make_frame(4000)), CAMERA, 4000 * MS)
-    found = health.find_fault(4000 * MS)
-    assert found is not None
-    assert found.fault == StreamFault.FROZEN

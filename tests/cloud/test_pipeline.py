@@ -148,23 +148,6 @@ def test_cameras_that_are_never_close_in_time_are_shown_in_turn(hz: int, phase_m
     assert not sight.left_out
 
 
-def test_frames_that_arrive_late_and_unevenly_are_joined() -> None:
-    random = np.random.default_rng(1)
-    jitter = random.uniform(0.0, 12.0, (3, 200, 2))
-
-    def capture(camera: int, late_ms: float) -> Callable[[int], tuple[float, float]]:
-        def at(number: int) -> tuple[float, float]:
-            captured = number * 1000.0 / 30.0 + jitter[camera, number, 0]
-            return captured, captured + late_ms + jitter[camera, number, 1]
-
-        return at
-
-    sight = run_cameras(capture(0, 5.0), capture(1, 110.0), capture(2, 40.0))
-    assert sight.count("0", "1", "2") >= 0.9 * len(sight.clouds)
-    assert len(sight.clouds) >= 0.6 * 60
-    assert not sight.left_out
-
-
 def test_a_slow_camera_does_not_slow_down_the_cloud() -> None:
     sight = run_cameras(capture_evenly(30), capture_evenly(1, 10))
     assert len(sight.clouds) >= 50

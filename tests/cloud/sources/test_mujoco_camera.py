@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
 import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple
-from iris_session.cloud.camera_file import CameraSettings, CloudSettings
+from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceError
-from iris_session.cloud.sources import mujoco_camera
 from iris_session.cloud.sources.mujoco_camera import MujocoCamera
-from iris_session.cloud.voxels import VoxelFilter, make_rays
+from iris_session.cloud.voxels import make_rays
 
 MODEL = """
 <mujoco>
@@ -196,13 +193,3 @@ def test_a_missing_driver_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(SourceError) as caught:
         MujocoCamera(make_settings(tmp_path), lambda: 0)
     assert "gladLoadGL" in str(caught.value)
-
-
-def test_the_check_of_cameras_prepares_the_filter(monkeypatch: pytest.MonkeyPatch) -> None:
-    prepared: list[float] = []
-    monkeypatch.setattr(VoxelFilter, "warm_up", lambda voxels: prepared.append(voxels.voxel_m))
-    no_model = CameraSettings(name="a", source="folder", path="pictures")
-    settings = CloudSettings(stream="room", cameras=(no_model,), voxel_m=0.02)
-    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(msgspec.msgpack.encode(settings))))
-    assert mujoco_camera.main() == 0
-    assert prepared == [0.02]
