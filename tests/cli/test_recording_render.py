@@ -171,13 +171,3 @@ def test_ctrl_c_leaves_the_old_file_and_nothing_else(
     assert len(inside[0]) == 2, "it is written beside the old one"
     assert os.listdir(tmp_path) == [out.name]
     assert out.read_text() == "old"
-
-
-def test_pictures_that_did_not_reach_the_disk_are_noticed(
-    played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(RecordingPictures, "draw", lambda self, times: iter([np.zeros((120, 160, 3), np.uint8)]))
-    out = tmp_path / "x.mp4"
-    assert render(played.path, out, "--fps", "100") == 2
-    assert "cannot be written: 1 of 12 pictures are in it: is the disk full?" in capsys.readouterr().err
-    assert not os.listdir(tmp_path)

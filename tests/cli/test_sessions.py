@@ -80,16 +80,6 @@ def test_host_and_interface_are_exclusive() -> None:
         make_session_config(options("--interface", "eth0", "--host", "0.0.0.0"), "x")
 
 
-def test_emulate_reports_invalid_addresses(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, text in (
-        (["10.0.0.5", "--session", "lab"], "not both"),
-        (["10.0.0.5", "--code", "12"], "not a join code"),
-        (["iris://x/?k=1"], "iris://HOST:PORT"),
-    ):
-        assert main(["emulate", *words]) == 2
-        assert text in capsys.readouterr().err
-
-
 def test_rate_of_recorded_clouds() -> None:
     for text, hz in (("2Hz", 2.0), ("0.5", 0.5), ("10 hz", 10.0), ("off", 0.0), ("0", 0.0)):
         assert make_session_config(options("--record-clouds", text), "x").record_clouds_hz == hz

@@ -103,17 +103,6 @@ def test_means_are_those_of_a_slow_reference(use_numba: bool, distortion: tuple[
 
 
 @backends
-def test_the_order_of_cameras_does_not_matter(use_numba: bool) -> None:
-    rays, limits = make_rays(CAMERA), DepthLimits()
-    pictures = [(*make_picture(seed), make_pose(seed)) for seed in range(3)]
-    first, second = (run_filter(one, limits, rays, use_numba=use_numba) for one in (pictures, pictures[::-1]))
-    assert len(first.positions) == len(second.positions)
-    distance, at = cKDTree(first.positions).query(second.positions)
-    assert distance.max() < 2e-6
-    assert (first.counts[at] == second.counts).all()
-
-
-@backends
 def test_cells_beyond_the_bound_are_dropped_and_counted(use_numba: bool) -> None:
     depth, color = make_picture(1)
     small = VoxelFilter(VOXEL_M, max_cells=50, threads=1, use_numba=use_numba)
