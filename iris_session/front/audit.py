@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import msgspec
@@ -18,15 +19,13 @@ MANY_ADDRESSES: Final = "many addresses"
 _NAME: Final = 64
 
 
+@dataclass(slots=True)
 class _PendingAudit:
     """The newest unsent event of one kind and address, and how many there were."""
 
-    __slots__ = ("count", "due_ns", "newest")
-
-    def __init__(self, due_ns: int) -> None:
-        self.newest: Audit | None = None
-        self.count = 0
-        self.due_ns = due_ns
+    due_ns: int
+    newest: Audit | None = None
+    count: int = 0
 
 
 class AuditTrail:
@@ -40,15 +39,12 @@ class AuditTrail:
         self, kind: str, now_ns: int, *, subject: str = "", name: str = "", address: str = "", detail: str = ""
     ) -> None:
         """Send the first event of a kind and address at once, those that follow within a second as one with a count."""
+        if (kind, address) not in self._pending and len(self._pending) >= MAX_PENDING:
+            address = MANY_ADDRESSES
         audit = Audit(kind, subject[:_NAME], name[:_NAME], address[:_NAME], detail[:MAX_TEXT])
         line = self._pending.get((kind, address))
-        if line is None and len(self._pending) >= MAX_PENDING:
-            audit = msgspec.structs.replace(audit, address=MANY_ADDRESSES)
-            line = self._pending.get((kind, MANY_ADDRESSES))
         if line is None:
-            self._pending[(kind, audit.address if audit.address == MANY_ADDRESSES else address)] = _PendingAudit(
-                now_ns + PERIOD_NS
-            )
+            self._pending[kind, address] = _PendingAudit(now_ns + PERIOD_NS)
             self._send(audit, now_ns)
             return
         line.newest = audit

@@ -160,6 +160,7 @@ class FrontSockets:
         self.context.destroy()
 
 
+@dataclass(slots=True)
 class LinkState:
     """State of the link to the authority, written by `Downlink` (the first six), `Front` (stalls) and `Uplink`.
 
@@ -175,16 +176,15 @@ class LinkState:
         entries: Entries sent to it since the start.
     """
 
-    def __init__(self) -> None:
-        self.heard_ns = 0
-        self.step = -1
-        self.acknowledged = 0
-        self.report = b""
-        self.is_recorded = True
-        self.ended = False
-        self.stalled = False
-        self.stalls = 0
-        self.entries = 0
+    heard_ns: int = 0
+    step: int = -1
+    acknowledged: int = 0
+    report: bytes = b""
+    is_recorded: bool = True
+    ended: bool = False
+    stalled: bool = False
+    stalls: int = 0
+    entries: int = 0
 
 
 @dataclass(kw_only=True, slots=True)

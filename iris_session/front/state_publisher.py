@@ -104,16 +104,8 @@ class StatePublisher:
         if head.session_time != self._last_session_time:
             self._delays.append((published_ns, published_ns - head.session_time))
         self._last_session_time = head.session_time
-        stamped = StateHeader(
-            head.scene_epoch,
-            head.scene_revision,
-            head.tick,
-            head.sim_time,
-            head.session_time,
-            published_ns,
-            frame.state_seq,
-            frame.base_seq,
-            head.applied,
+        stamped = msgspec.structs.replace(
+            head, published_ns=published_ns, state_seq=frame.state_seq, base_seq=frame.base_seq
         )
         if self._state is not None:
             self._state.send_multipart((TOPIC_RIGID, _encoder.encode(stamped), frame.payload))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 
 from iris_session.protocol.client_messages import Hello, Marker, wrap_message
 from iris_session.protocol.codec import encode_client
 from iris_session.protocol.entries import Lost
-from iris_session.protocol.names import AuditKind
+from iris_session.protocol.names import AuditKind, RefusalCode
 from iris_session.protocol.server_messages import Refused, Welcome
 from iris_session.security import KeyPair
 from iris_session.security.zap import ZAP_INGEST
@@ -74,7 +73,7 @@ def test_a_flood_of_one_behind_a_gateway_ends_only_its_participant(open_session:
     gateway = session.client()
     gateway.join("gateway", "Gate")
     for name in ("Ann", "Mallory"):
-        gateway.send(Hello("observer", name, secret=os.urandom(16)), name)
+        gateway.send(Hello("observer", name, secret=name.ljust(16).encode()), name)
         gateway.wait_for(Welcome, 2 if name == "Ann" else 3)
     ann, mallory = (w.connection_epoch for w in gateway.got(Welcome)[1:])
     data = encode_client(wrap_message(Marker(1, "x"), mallory, "Mallory"))
@@ -87,6 +86,8 @@ def test_a_flood_of_one_behind_a_gateway_ends_only_its_participant(open_session:
     assert session.wait_drops("flood_cut") == 1
     gateway.send(Marker(7, "still here"), "Ann", ann)
     session.wait_entries(Marker, connection=ann)
+    gateway.send(Hello("observer", "Mallory", secret=b"Mallory".ljust(16)), "Mallory", 0)
+    assert gateway.wait_for(Refused).code == RefusalCode.RATE, "it may come back in a moment"
 
 
 # --- e-stops ---

@@ -39,6 +39,14 @@ class Rig:
             self.drops.count(reason)
 
 
+def test_one_address_evicts_its_own_oldest() -> None:
+    rig = Rig()
+    other, known = rig.connect("10.0.0.2"), rig.connect("10.0.0.1", "web-1")
+    flood = [rig.connect("10.0.0.1") for _ in range(BOUNDS.unauthenticated_per_owner + 3)]
+    assert list(rig.guard.table) == [other, known, *flood[3:]]
+    assert rig.drops.by_reason == {"web_connections_per_address": 3}
+
+
 def test_many_addresses_evict_those_with_the_most() -> None:
     rig = Rig()
     lone = rig.connect("10.0.0.9")
