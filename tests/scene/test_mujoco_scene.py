@@ -49,7 +49,7 @@ def check_tree(model: mujoco.MjModel, spec: SceneSpec) -> None:
         assert rotation == pytest.approx(data.geom_xmat[visual.id], abs=off)
 
 
-@pytest.mark.parametrize("name", ["shapes", "unitree_go1"])
+@pytest.mark.parametrize("name", ["shapes", "google_barkour_vb"])
 def test_poses_colours_and_sizes_agree_with_mujoco(tmp_path: Path, name: str) -> None:
     model = every_shape() if name == "shapes" else mujoco.MjModel.from_xml_path(str(MENAGERIE / name / "scene.xml"))
     spec = parse_mujoco(model, AssetStore(tmp_path), options=EncodeOptions(levels=False)).spec
