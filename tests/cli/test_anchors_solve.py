@@ -112,23 +112,6 @@ def test_relative_sheet_poses_and_moved_sheet(recording: Path, tmp_path: Path, c
     assert found.sizes == dict.fromkeys(TRUE, 0.16)
 
 
-def test_solve_prints_text(recording: Path, tmp_path: Path, capsys: Capture) -> None:
-    out = tmp_path / "anchors.toml"
-    assert main(["anchors", "solve", str(recording), "--out", str(out)]) == 0
-    shown = capsys.readouterr().out
-    lines = shown.splitlines()
-    assert all(line.isprintable() for line in lines)
-    assert any("120 observations from 6 places" in line and "table 60" in line for line in lines)
-    (beyond,) = [line for line in lines if "EXCEEDS THE STATED ERROR" in line]
-    assert beyond.lstrip().startswith("version 2 (measured), 10.0 s to the end: 2")
-    assert "stated 3.0 mm" in beyond
-    assert any(line.startswith("carl (p3): no ") for line in lines)
-    assert sum("outlier: 'shelf'" in line for line in lines) == 2
-    assert any(line.startswith("MOVED: sheet 'shelf' lies ") for line in lines)
-    assert "desk" not in shown
-    assert lines[-1].endswith(f"iris-session serve SCENE --anchors {out}")
-
-
 def test_moved_anchor_is_used_at_its_pose_of_the_time(tmp_path: Path) -> None:
     """Equal observations before and after: the alignment follows the anchor."""
     played, T = Played({"table": TRUE["table"]}), frames()[0]

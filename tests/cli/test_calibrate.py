@@ -283,18 +283,6 @@ def test_a_check_tells_which_camera_is_not_where_it_was_calibrated(room: Room, c
     assert "calibration" in refuse(capsys, 2, "cloud", "calibrate", room.write("front"), *SHEET, "--check")
 
 
-def test_one_camera_is_calibrated_and_the_next_step_is_named(room: Room, tmp_path: Path, capsys: Capture) -> None:
-    out = tmp_path / "calibration.toml"
-    assert main(["cloud", "calibrate", str(room.write("left")), *SHEET, "--frames", "1", "--out", str(out)]) == 0
-    text = capsys.readouterr().out
-    assert "left/frame 1  table" in text
-    assert "stated error" in text
-    assert f'calibration = "{out}"' in text  # in another folder than the camera file
-    saved = tomllib.loads(out.read_text())
-    assert measure_errors(saved["T_base_camera"], pose_from_matrix(POSES["left"]))[0] < 10.0
-    assert saved["error_mm_p95"] > 0.5
-
-
 def test_frames_of_a_camera_at_rest_count_as_one(room: Room, capsys: Capture) -> None:
     """Ten pictures from one place have the errors of that place ten times."""
     one, three = (run(capsys, "cloud", "calibrate", room.write("left"), *SHEET, "--frames", n) for n in (1, 3))

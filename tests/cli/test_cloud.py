@@ -139,24 +139,6 @@ def test_a_camera_on_a_body_cannot_be_inspected_without_a_session(
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("action", [["inspect"], ["run", "--address", "127.0.0.1:1"]])
-def test_an_unexpected_error_is_one_line(
-    action: list[str], camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*given: Any) -> None:
-        if len(given) > 2:
-            given[1].close()  # the client of `run_cameras`
-        raise RuntimeError("bus 3\nis away")
-
-    monkeypatch.setattr("iris_session.cloud.worker.CloudWorker.poll", fail)
-    monkeypatch.setattr("iris_session.cloud.process.run_cameras", fail)
-    monkeypatch.setattr("iris_session.cli.common.check_session_reachable", lambda _: None)
-    assert main(["cloud", action[0], str(camera_file), *action[1:]]) == 1
-    text = capsys.readouterr().err
-    assert "the cameras of 'room' ended: RuntimeError: bus 3 is away; " in text
-    assert text.count("\n") == 1
-
-
 def test_a_report_is_one_line() -> None:
     assert format_report(CameraReport("room")) == "room: no session yet"
     well = CameraReport("room", True, 29.84, 34814, 0.0119, 0.01, 1.25e6, 47.2, cameras={"front": SourceReport(30.0)})

@@ -11,7 +11,6 @@ from typing import Any
 import msgspec
 import pytest
 
-from iris_session.cli import progress
 from iris_session.cli.main import INTERRUPTED, main
 from iris_session.cli.recording import MOST_LINES, format_line, format_summary
 from iris_session.recording import parts
@@ -200,19 +199,3 @@ def test_a_folder_without_recordings_is_one_line(tmp_path: Path, capsys: pytest.
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"iris-session: there is no recording below the folder {tmp_path}: give a .rrd file")
     assert main(["recording", "inspect", "x" * 5000]) == 2
-
-
-def test_a_long_file_shows_how_far_it_was_read(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(progress, "PROGRESS_AFTER_S", 0.0)
-    monkeypatch.setattr(progress, "PROGRESS_PERIOD_S", 0.0)
-    for terminal in (True, False):
-        monkeypatch.setattr("sys.stderr.isatty", lambda terminal=terminal: terminal)
-        with progress.ReadingProgress(Path("a.rrd")) as shown_progress:
-            shown_progress.show_steps(3, 9)
-            shown_progress.show_steps(4, 0)
-            shown_progress.show_bytes(5_000_000, 9_000_000)
-        shown = capsys.readouterr().err
-        lines = "".join(f"\r\x1b[Ka.rrd: {text}" for text in ("step 3 of 9", "step 4", "read 5 of 9 MB")) + "\n"
-        assert shown.endswith(lines) if terminal else shown == ""

@@ -11,7 +11,6 @@ from iris_session.cli import serve
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.scene import find_scene_file
 from iris_session.protocol.errors import IrisError
-from iris_session.session.config import SessionConfig
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 ARM = '<robot name="arm"><link name="base"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
@@ -113,20 +112,6 @@ def test_package_dir_is_used(tmp_path: Path, capfd: pytest.CaptureFixture[str]) 
     assert capfd.readouterr().err == f"iris-session: --package-dir {tmp_path / 'nodir'}: no such folder\n"
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"), [("part.off", "export it again"), ("part.docx", "cannot be read"), ("arm.urdf", "arm")]
-)
-def test_unreadable_file_is_a_one_line_error(
-    name: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / name
-    path.write_text("nothing of the kind")
-    assert main(["serve", str(path), *QUIET]) == 2
-    error = capsys.readouterr().err
-    assert expected in error
-    assert error.count("\n") == 1
-
-
 DOOR = (
     'format = 1\nreference = "door"\n[anchors.door]\nposition_m = [1.0, 2.0, 0.5]\n'
     "quaternion_wxyz = [0.0, 0.0, 0.0, 1.0]\nsize_m = 0.12\n"
@@ -172,15 +157,3 @@ def test_invalid_file_is_a_one_line_error_that_names_the_example(
     assert error.count("\n") == 1
     assert error.startswith("iris-session: ")
     assert "`iris-session anchors example`" in error
-
-
-def test_resumed_session_gets_new_anchors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Effect in the session: tests/session/test_resume.py."""
-    path = tmp_path / "anchors.toml"
-    path.write_text(DOOR)
-    opened: list[SessionConfig] = []
-    monkeypatch.setattr("iris_session.session.session.Session", lambda model, config: opened.append(config))
-    for given in (["--anchors", str(path)], []):
-        serve.resume_session(build_parser().parse_args(["serve", "--resume", str(tmp_path), *given]))
-    assert [set(config.anchors) for config in opened] == [{"door"}, {"table"}]
-    assert opened[0].resume == tmp_path

@@ -138,13 +138,3 @@ def test_repair_says_what_is_lost(path: Path, tmp_path: Path, capsys: pytest.Cap
     result = json.loads(capsys.readouterr().out)
     assert sorted(result) == sorted(RepairReport.__struct_fields__)
     assert (result["ok"], result["lost_bytes"]) == (False, victim.length + 19)
-
-
-def test_repair_of_nothing_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "session.rrd").write_bytes(b"x" * 99)
-    for name, why in (("no.rrd", "does not exist"), ("session.rrd", "not a Rerun file"), (".", "not a Rerun file")):
-        assert main(["recording", "repair", str(tmp_path / name), "-o", str(tmp_path / "out.rrd")]) == 2
-        err = capsys.readouterr().err
-        assert err.count("\n") == 1
-        assert why in err
-    assert not (tmp_path / "out.rrd").exists()

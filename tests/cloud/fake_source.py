@@ -21,10 +21,10 @@ class FakeSource:
         closed: It was closed.
     """
 
-    def __init__(self, recorded_hz: float = 0.0) -> None:
+    def __init__(self) -> None:
         self.camera = CAMERA
         self.depth_scale_m = 0.001
-        self.recorded_hz = recorded_hz
+        self.recorded_hz = 0.0
         self.closed = False
         self._items: deque[DepthFrame | Exception] = deque()
 

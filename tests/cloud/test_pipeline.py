@@ -167,24 +167,6 @@ def test_a_camera_that_stops_does_not_stop_the_cloud() -> None:
     assert len([at for at, _ in sight.clouds if at > 2100]) >= 26, "it is not waited for any more"
 
 
-@pytest.mark.parametrize(("late_ms", "least"), [(100.0, 18), (400.0, 5)])
-def test_frames_that_take_long_are_joined(late_ms: float, least: int) -> None:
-    """As drawn ones do on a slow machine."""
-    sight = run_cameras(capture_evenly(30), capture_evenly(30, late_ms=late_ms))
-    assert sight.count("0", "1") >= least
-    assert sight.count("0", "1") >= len(sight.clouds) - 1
-    assert not sight.left_out
-
-
-@pytest.mark.parametrize("late_ms", [600.0])
-def test_a_camera_whose_captures_are_dated_too_early_is_named(late_ms: float) -> None:
-    """Its driver dates frames by another clock."""
-    sight = run_cameras(capture_evenly(30), capture_evenly(30, -late_ms, late_ms + 5.0))
-    assert sight.left_out == {"1"}
-    assert len(sight.clouds) >= 50
-    assert sight.pipeline.drops["join"] >= 50
-
-
 def test_the_voxel_meets_the_budget_and_no_frame_is_above_it() -> None:
     pipeline = make_pipeline("front", points=1000)
     edges = []
@@ -202,21 +184,6 @@ def test_the_voxel_meets_the_budget_and_no_frame_is_above_it() -> None:
     pipeline.offer("front", make_frame(9), 9 * MS)
     pipeline.make_cloud(pipeline.take_frames(9 * MS))
     assert pipeline.drops["budget"] == settled
-
-
-def test_cells_grow_until_they_are_enough() -> None:
-    """Fewer cells than the budget has points: else what comes last in a picture would never be seen."""
-    voxels = VoxelFilter(VOXEL_M, max_cells=300, use_numba=False)
-    pipeline = make_pipeline("front", points=50_000, voxels=voxels)
-    overflows, edges = [], []
-    for at in range(12):
-        pipeline.offer("front", make_frame(at), at * MS)
-        edges.append(pipeline.make_cloud(pipeline.take_frames(at * MS)).voxel_m)
-        overflows.append(voxels.overflow)
-    assert overflows[0] > 0
-    assert overflows[-6:] == [0] * 6
-    assert len(set(edges[-6:])) == 1, "it has settled"
-    assert voxels.n_cells > 100, "cells are no larger than needed"
 
 
 def test_a_camera_on_a_body_is_placed_by_the_pose_at_its_capture() -> None:
@@ -297,21 +264,3 @@ def test_a_camera_without_a_pose_does_not_stop_the_other() -> None:
     assert made[0] == set()
     assert made[-1] == {"front"}
     assert pipeline.lacks_pose("hand")
-
-
-@pytest.mark.parametrize("hz", [15, 60])
-def test_states_that_come_late_cost_no_cloud(hz: int) -> None:
-    """As over a slow link: the pose at a capture is known 150 ms after it."""
-    now = [0]
-    pose: PoseTuple = ((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    pipeline = make_pipeline(
-        "hand", body="gripper", body_pose=lambda body, at: pose if at + 150 * MS <= now[0] else None
-    )
-    made = 0
-    for number in range(hz):  # a second
-        now[0] = round(number * 1000 / hz) * MS
-        pipeline.offer("hand", make_frame(now[0] / MS), now[0])
-        made += bool(pipeline.take_frames(now[0]))
-    assert made >= 8
-    assert not pipeline.lacks_pose("hand")
-    assert pipeline.drops["pose"] == 0

@@ -190,38 +190,6 @@ def test_without_shapes_all_points_stay_until_they_are_there(
     assert robots.warning == ""
 
 
-def test_shapes_that_are_missing_are_a_warning_and_fetched_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    built: list[object] = []
-    failed = {"a": "lost", "b": "lost"}
-    monkeypatch.setattr(process, "RobotPoints", lambda *_: built.append(1) or FakeRobotPoints())
-    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed=dict(failed)))
-    lab = Lab()
-    robots = SessionRobots(lab.client, lab.history)
-    for number, (warning, n_built) in enumerate((("2 shapes", 1), ("2 shapes", 1), ("1 shapes", 2), ("", 3))):
-        robots.is_ready(number * FETCH_AGAIN_NS)
-        wait_for_fetch(robots)
-        assert (len(built), warning in robots.warning) == (n_built, True), "again while something new comes"
-        if number:
-            failed.popitem() if failed else None
-    assert len(robots.remove(make_points(), 0).positions) == 1, "those that are there are used"
-    thread = robots._thread
-    robots.is_ready(4 * FETCH_AGAIN_NS)
-    assert robots._thread is thread, "all are there"
-
-
-def test_bodies_without_poses_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process, "RobotPoints", FakeRobotPoints)
-    monkeypatch.setattr(process, "fetch_scene", lambda *_: SimpleNamespace(spec=None, meshes={}, failed={}))
-    lab = Lab()
-    robots = SessionRobots(lab.client, lab.history)
-    robots.is_ready(0)
-    wait_for_fetch(robots)
-    assert robots.warning == ""
-    points: Any = robots._points
-    points.n_unknown = 3
-    assert robots.warning == "points on robots stay in the cloud: the session sends no poses of 3 bodies of robots"
-
-
 @pytest.mark.parametrize("error", [NotConnectedError("away"), InvalidMessageError("too large")])
 def test_a_frame_that_cannot_be_sent_is_dropped(error: Exception) -> None:
     def publish(*_: object, **__: object) -> bool:

@@ -111,16 +111,6 @@ def test_another_clock_forgets_the_frames_and_opens_the_source_anew() -> None:
     assert (len(lab.sources), lab.reader.failures) == (2, 0)
 
 
-def test_a_recording_is_expected_to_come_at_its_own_rate() -> None:
-    lab = Lab(30.0, lambda: FakeSource(recorded_hz=5.0))
-    for _ in range(25):
-        lab.read(0)
-        lab.now_ns += 200 * MS
-    lab.now_ns -= 200 * MS
-    assert lab.fault() == ("", "")
-    assert lab.reader.measure_hz(lab.now_ns) == 5.0
-
-
 def test_a_thread_reads_until_it_is_stopped() -> None:
     def make_source() -> FakeSource:
         source = FakeSource()

@@ -108,12 +108,3 @@ def test_bodies_without_a_pose_are_counted_and_keep_their_points(tmp_path_factor
     at_rest = RobotPoints(holding.spec, holding.meshes, holding.robots, ())
     assert at_rest.find(holding.points, lambda name, at_ns: None, 8).any()
     assert at_rest.n_unknown == 0
-
-
-def test_clouds_without_points_and_scenes_without_robots_have_none(tmp_path_factory: pytest.TempPathFactory) -> None:
-    holding = hold_object("handover", tmp_path_factory.getbasetemp() / "handover")
-    found = RobotPoints(holding.spec, holding.meshes, holding.robots, holding.streamed)
-    assert found.find(np.empty((0, 3), np.float32), holding.body_pose, 7).shape == (0,)
-    without = RobotPoints(holding.spec, holding.meshes, (), holding.streamed)
-    assert without.n_bodies == 0
-    assert not without.find(holding.points, holding.body_pose, 7).any()

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from anchors.camera import CameraModel
 from iris_session.cloud import voxels
-from iris_session.cloud.voxels import DepthLimits, PointSet, Rays, VoxelFilter, choose_voxel_m, make_rays
+from iris_session.cloud.voxels import DepthLimits, PointSet, Rays, VoxelFilter, make_rays
 from iris_session.system.extras import MissingExtraError
 
 VOXEL_M = 0.02
@@ -137,35 +137,6 @@ def test_pictures_that_do_not_fit_are_refused(change: dict[str, Any], named: str
 def test_filters_that_cannot_be_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         VoxelFilter(**{"voxel_m": 0.01, **options})
-
-
-def test_the_edge_of_cells_meets_the_budget_and_then_stays() -> None:
-    random = np.random.default_rng(4)
-    for area_m2 in (0.01, 3.0, 40.0):
-        edges = [0.01]
-        for _ in range(40):
-            points = int(area_m2 / edges[-1] ** 2 * random.uniform(0.95, 1.05))
-            edges.append(choose_voxel_m(edges[-1], points, 10_000, 0.005))
-        assert len(set(edges[3:])) <= 2  # a budget at the border of two steps is met by the larger one
-        assert area_m2 / edges[-1] ** 2 <= 1.06 * 10_000
-        assert edges[-1] == 0.005 or area_m2 / edges[-1] ** 2 >= 0.5 * 10_000
-    assert choose_voxel_m(0.5, 0, 10_000, 0.01) == pytest.approx(0.01), "an empty room"
-
-
-@backends
-def test_the_edge_of_cells_can_change_from_picture_to_picture(use_numba: bool) -> None:
-    depth, color = make_picture(1)
-    found = VoxelFilter(VOXEL_M, use_numba=use_numba)
-    found.add_depth(depth, color, make_rays(CAMERA), np.eye(4))
-    fine = found.collect()
-    found.clear(4.0 * VOXEL_M)
-    assert len(found.collect().positions) == 0
-    found.add_depth(depth, color, make_rays(CAMERA), np.eye(4))
-    coarse = found.collect()
-    assert coarse.counts.sum() == fine.counts.sum()
-    assert len(coarse.positions) < 0.3 * len(fine.positions)
-    with pytest.raises(ValueError, match="voxel_m"):
-        found.clear(0.0)
 
 
 def test_without_numba_numpy_filters_and_says_so(

@@ -15,9 +15,7 @@ import pytest
 from iris_session.cloud import worker
 from iris_session.cloud.camera_file import CameraSettings
 from iris_session.cloud.frames import SourceError
-from iris_session.cloud.health import Fault
 from iris_session.cloud.worker import CloudWorker
-from iris_session.protocol.media import find_info_problem
 from iris_session.protocol.names import MediaEncoding, StreamFault
 from iris_session.streams.cloud import decode_cloud
 from tests.cloud.camera_settings import make_settings
@@ -132,16 +130,6 @@ def test_a_fault_is_published_without_a_frame_while_none_comes() -> None:
     assert lab.fault() == ("", "")
 
 
-def test_a_fault_whose_text_changes_is_told_once_a_second() -> None:
-    """As the number of seconds without a frame does, or the rate of frames that come too slowly."""
-    lab = Lab("front", hz=100.0)
-    texts = iter(range(10**6))
-    lab.worker.find_fault = lambda now_ns: Fault(StreamFault.SLOW, str(next(texts)))  # type: ignore[method-assign]
-    for _ in range(250):
-        lab.step(10)
-    assert len(lab.sink.published) == 3
-
-
 def test_frames_that_cannot_be_made_end_nothing(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -197,20 +185,6 @@ def test_frames_that_no_one_takes_are_counted_once_there_is_a_connection() -> No
     assert lab.worker.count_drops() == {"send": 1}
 
 
-def test_another_session_gets_nothing_of_the_one_before() -> None:
-    lab = Lab("front")
-    lab.step(40, "front")
-    before = lab.sources["front"]
-    lab.worker.restart_clock()
-    lab.sink.published.clear()
-    lab.worker.poll(0.0)
-    assert lab.sink.published == []
-    lab.open_sources()
-    assert lab.sources["front"] is not before
-    lab.step(40, "front")
-    assert lab.count("room") == 1
-
-
 def test_what_has_no_pose_is_named() -> None:
     lab = Lab("front", "hand")
     assert not lab.settings.cameras[0].body
@@ -260,14 +234,3 @@ def test_the_report() -> None:
     assert report.age_ms >= report.stages_ms["read"]
     assert report.cameras["front"].hz > 0.0
     assert report.cameras["front"].fault == ""
-
-
-def test_a_camera_that_the_protocol_does_not_describe_is_published() -> None:
-    lab = Lab("front", title="x" * 600, picture_hz=10.0)
-    far = np.eye(4)
-    far[0, 3] = 1e7
-    lab.step(40, "front", T_world_camera=far)
-    info = lab.sink.newest_info("room-front")
-    assert info is not None
-    assert find_info_problem(info) == ""
-    assert len(info.title) <= 512

@@ -48,16 +48,6 @@ def introduction(protocol: int = PROTOCOL_VERSION) -> bytes:
     return encode_introduction(Introduction(beacon, pairing=True, participants=3))
 
 
-@pytest.mark.parametrize(("theirs", "older"), [(PROTOCOL_VERSION + 1, "this machine"), (0, "the session")])
-def test_other_protocol_version_is_reported(answers: Answers, theirs: int, older: str) -> None:
-    answers.by_port[7721] = introduction(theirs)
-    _, version, message = network_checks.check_introduction(ADDRESS)
-    assert version.failed
-    assert f"version {theirs}" in version.text
-    assert version.advice.startswith(f"update {older}")
-    assert message is None
-
-
 def test_port_base_is_distinguished_from_control_port(answers: Answers, monkeypatch: pytest.MonkeyPatch) -> None:
     """`serve --port-base N` is joined at N + 1; the introduction is at N."""
     base = Address("127.0.0.1", 7720)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import msgspec
 import pytest
 
 from iris_session.doctor.session_checks import check_session_report
 from iris_session.doctor.stream_checks import FAULTS, MEDIA_DROPS, check_streams
 from iris_session.protocol.media import StreamBudget
-from iris_session.protocol.names import StreamFault
 from iris_session.protocol.status import MediaStreamReport, StatusReport
 from tests.doctor.test_session_checks import ANN, DOCTOR, WELL, assert_only, change
 
@@ -36,16 +34,6 @@ def test_every_fault_is_reported_with_cause_and_advice(fault: str) -> None:
 def test_stale_stream_is_reported() -> None:
     report = with_stream(stale=True, age_ms=2_500.0, title="", source="")
     assert_only(report, "streams", "warning", "room: no frame for 2.5 s", "hangs", "the program that publishes it")
-
-
-def test_several_streams_are_named_with_advice_once() -> None:
-    other = msgspec.structs.replace(ROOM, stream="hand", fault="frozen", detail="for 3 s")
-    found = check_streams((msgspec.structs.replace(ROOM, fault="frozen"), other))
-    assert "room (Room)" in found.text
-    assert "hand (Room) from cam-1: frozen (for 3 s)" in found.text
-    assert found.advice == FAULTS[StreamFault.FROZEN][1]
-    assert "room: the camera" in found.why
-    assert "hand: the camera" in found.why
 
 
 def test_reduced_or_dropped_media_are_reported() -> None:

@@ -31,7 +31,6 @@ from iris_session.recording import (
     OPEN,
     Keyframe,
     RecorderFeed,
-    RecorderProcess,
     SessionHeader,
     header_root,
     make_row,
@@ -94,7 +93,7 @@ class SmallCore:
         self.memory = keyframe.authority
 
 
-def make_header(recording_class: str = CLOSED, versions: dict[str, str] | None = None) -> SessionHeader:
+def make_header(recording_class: str = CLOSED) -> SessionHeader:
     """Return the header of the small session, with its real model."""
     model = mujoco.MjModel.from_xml_string(XML)
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
@@ -108,7 +107,6 @@ def make_header(recording_class: str = CLOSED, versions: dict[str, str] | None =
         config=b"config",
         model=pack_model(buffer.tobytes()),
         bodies=tuple(BodyInfo(i + 1, name, name != "post") for i, name in enumerate(names)),
-        versions=versions or {},
     )
 
 
@@ -134,11 +132,9 @@ class SmallSession:
         feed.send_header(self.header)
         feed.add_keyframe(self.core.keyframe(-1), self.chain)
 
-    def take(self, steps: int, pause_s: float = 0.0) -> None:
+    def take(self, steps: int) -> None:
         for _ in range(steps):
             self._one()
-            if pause_s:
-                time.sleep(pause_s)
 
     def _one(self) -> None:
         step, feed, core = self.step_count, self.feed, self.core
@@ -162,21 +158,6 @@ class SmallSession:
         if step % self._keyframe_steps == self._keyframe_steps - 1 or feed.wants_keyframe:
             feed.add_keyframe(core.keyframe(step), self.chain)
         self.step_count += 1
-
-
-@contextmanager
-def recorder(path: Path) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
-    """Yield a started recorder process with a feed, and end it."""
-    process = RecorderProcess(path, time.monotonic_ns())
-    feed: RecorderFeed | None = None
-    try:
-        process.start()
-        feed = RecorderFeed(process.feed_endpoint)
-        yield process, feed
-    finally:
-        if feed is not None:
-            feed.close(0.0)
-        process.close()
 
 
 class LoopRecorder:
@@ -241,16 +222,6 @@ def loop_recorder(**options: Any) -> Iterator[LoopRecorder]:
         finally:
             one.feed.close(0.0)
             one.kill()
-
-
-def record(path: Path, steps: int, **header: object) -> SmallSession:
-    """Record `steps` steps."""
-    with recorder(path) as (process, feed):
-        session = SmallSession(feed, **header)
-        session.take(steps)
-        assert feed.close(20.0)
-        assert process.close()
-    return session
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:

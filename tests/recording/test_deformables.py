@@ -112,24 +112,6 @@ def test_non_finite_vertices_are_finite_in_the_file(world: World) -> None:
         assert np.isfinite(np.array(told(drawn, f"Mesh3D:vertex_{name}")[8])).all()
 
 
-def test_normals_of_a_crumpled_mesh_are_weighted_by_area(world: World) -> None:
-    rng = np.random.default_rng(2)
-    vertices = world.vertices(0) + rng.uniform(-0.03, 0.03, (20, 3))
-    world.state(0)
-    world.publish(8, 0, vertices)
-    world.state(8)
-    drawn = world.read()[CLOTH]
-    seen, normals = (np.array(told(drawn, f"Mesh3D:vertex_{name}")[8]) for name in ("positions", "normals"))
-    around = np.zeros_like(seen, np.float64)
-    for triangle in told(drawn, "Mesh3D:triangle_indices")[0]:
-        a, b, c = seen[np.array(triangle)].astype(np.float64)
-        around[np.array(triangle)] += np.cross(b - a, c - a)
-    # vertices that are there twice, for their texture coordinates, share what is around them
-    places = np.unique(seen, axis=0, return_inverse=True)[1].reshape(-1)
-    shared = np.stack([np.bincount(places, around[:, k]) for k in range(3)], axis=1)[places]
-    assert normals == pytest.approx(shared / np.linalg.norm(shared, axis=1)[:, None], abs=1e-4)
-
-
 def test_ropes_are_lines_and_soft_bodies_surfaces(world: World) -> None:
     rope, soft = world.vertices(1) + 0.5, world.vertices(2) + 0.5
     world.state(0)

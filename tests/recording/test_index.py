@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.recording import NotARecordingError, Recording, parts, verify
+from iris_session.recording import NotARecordingError, Recording, verify
 from iris_session.rrd.file import END_MESSAGE, FILE_TAIL, scan_file
 from iris_session.rrd.index import add_index
 from iris_session.rrd.rerun_tool import find_rerun
@@ -132,17 +132,6 @@ def test_kill_during_the_write_leaves_a_finished_file(indexed: Path, tmp_path: P
         report = verify(path, SmallCore)
         assert report.ok, report.line()
         assert (report.finished, report.steps) == (True, STEPS)
-
-
-def test_file_may_get_its_index_while_it_is_opened(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def answer(name: str) -> bool:
-        monkeypatch.undo()
-        return not add_index(name)
-
-    monkeypatch.setattr(parts, "is_readable", answer)
-    with Recording.open(path) as recording:
-        assert has_index(path)
-        assert (recording.damage, len(list(recording.rows()))) == ([], STEPS)
 
 
 def test_index_keeps_to_the_bytes_that_the_file_may_have(indexed: Path, path: Path) -> None:

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import signal
-import socket
-import subprocess
-import warnings
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from iris_session.recording import NotARecordingError
-from iris_session.recording.live_feed import LiveFeed, MessageTail
+from iris_session.recording.live_feed import MessageTail
 from iris_session.rrd.file import KIND_END, read_message, scan_file
-from iris_session.rrd.rerun_tool import find_rerun, make_environment
-from tests.loopback import make_loopback_address
-from tests.recording.support import column, journal, read, wait_until, write
+from tests.recording.support import journal, write
 
 STEPS = 60
 
@@ -62,56 +55,3 @@ def test_other_files_are_not_followed(tmp_path: Path) -> None:
     path.write_bytes(b"x" * 99)
     with closing(MessageTail(str(path))) as tail, pytest.raises(NotARecordingError):
         tail.read(1 << 20)
-
-
-@contextmanager
-def receiver(path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """Start Rerun's server, which writes what it gets to `path`; yield it and its address."""
-    host = make_loopback_address()  # no other test takes the port meanwhile
-    with socket.socket() as listener:
-        listener.bind((host, 0))
-        port = listener.getsockname()[1]
-    command = [find_rerun(), "--bind", host, "--port", str(port), "--save", path]
-    server = subprocess.Popen(command, env=make_environment(), stderr=subprocess.DEVNULL)
-    try:
-        yield server, f"rerun+http://{host}:{port}/proxy"
-    finally:
-        server.send_signal(signal.SIGCONT)
-        server.kill()
-        server.wait()
-
-
-def steps_received(path: Path) -> list[int]:
-    try:
-        return sorted(set(column(read(path)["/journal/rows"], "step")))
-    except (OSError, LookupError, ValueError, RuntimeError):  # not there yet, or cut
-        return []
-
-
-def play_states(path: Path) -> list[tuple[bytes, list[int]]]:
-    """Return row ids and play states of the blueprint in a file that is being written."""
-    from rerun.chunk import RrdReader
-
-    with warnings.catch_warnings(), suppress(OSError, ValueError, RuntimeError):
-        warnings.simplefilter("ignore")  # there is no index
-        reader = RrdReader(str(path))
-        (blueprint,) = reader.blueprints()
-        assert len(reader.recordings()) == 1
-        batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
-        found = [batch for batch in batches if "TimePanelBlueprint:play_state" in batch.schema.names]
-        ids = column(found, "rerun.controls.RowId")
-        return [*zip(ids, column(found, "TimePanelBlueprint:play_state"), strict=True)]
-    return []
-
-
-@pytest.mark.e2e
-@pytest.mark.long
-def test_viewer_gets_everything_and_follows(closed: Path, tmp_path: Path) -> None:
-    got = tmp_path / "got.rrd"
-    with receiver(got) as (_, url):
-        feed = LiveFeed(str(closed), url)
-        while feed.poll():
-            pass
-        feed.close()
-        wait_until(lambda: steps_received(got) == list(range(STEPS)) and len(play_states(got)) == 2)
-    assert max(play_states(got))[1] == [3], "following, in place of paused"

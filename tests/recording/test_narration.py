@@ -8,8 +8,7 @@ from typing import get_args
 
 import msgspec
 
-from iris_session.journal.messages import DenialRecord
-from iris_session.protocol.common import Alignment, Denial, Lease, Pose
+from iris_session.protocol.common import Alignment, Lease, Pose
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentChanged,
@@ -45,11 +44,8 @@ from iris_session.viewer.narration import (
     PALETTE,
     EventNarration,
     LogLine,
-    describe_denial,
-    describe_session,
     find_colour,
 )
-from tests.recording.support import make_header
 
 POSE = Pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
 
@@ -68,52 +64,6 @@ def ann_and_bob() -> EventNarration:
 
 def narrate(narration: EventNarration, *bodies: EventKind) -> list[LogLine]:
     return [narration.add(Event(i, i, i, body)).line for i, body in enumerate(bodies)]
-
-
-def test_events_are_sentences_with_names() -> None:
-    measured = Alignment(2, "measured", POSE, covariance=(0.5,) * 36, error_at_robot_m=0.0017)
-    lines = narrate(
-        EventNarration(),
-        ParticipantJoined(ParticipantInfo("p1", "ann", "operator", True)),
-        ParticipantJoined(ParticipantInfo("p2", "bob", "observer", True)),
-        AlignmentChanged("p1", measured),
-        lease("left", "p1"),
-        lease("left", "p2", "p1", "takeover"),
-        Handover("hammer", "left", "right", "p1", "p2", 560_000_000),
-        Handover("hammer", "left", "right", "p2", "p2", 560_000_000),
-        ParticipantChanged(ParticipantInfo("p2", "eve", "observer", True)),
-        lease("left", "", "p2", "released"),
-        EpisodeChanged(3, "success", "folded", "p1"),
-        EStopChanged(True, "", "", 1),
-        Notice("info", "look", "p7"),
-        Notice("info", "eve: look", "p2"),
-        Audited("flood", "p1", count=3),
-    )
-    expected = (
-        *("INFO ann operator", "INFO bob observer", "INFO ann 1.7 mm measured", "INFO ann left"),
-        *("INFO bob left ann takeover", "INFO hammer ann bob 0.56", "INFO hammer left right 0.56", "INFO bob eve"),
-        *("INFO eve left", "INFO 3 success folded ann", "CRITICAL", "INFO p7 look", "INFO eve look", "INFO flood 3"),
-    )
-    for (level, text), (expected_level, *words) in zip(lines, map(str.split, expected), strict=True):
-        assert level == expected_level
-        assert [word for word in words if word not in text] == [], text
-    assert lines[-2].text.count("eve") == 1
-
-
-def test_frequent_events_are_for_debugging() -> None:
-    lines = narrate(
-        ann_and_bob(),
-        SamplesRejected("p1", "controller/left", "lease_version", 3),
-        EngagementChanged("left", "p1", True),
-        EngagementChanged("left", "p1", False, "clutch_open"),
-    )
-    assert {line.level for line in lines} == {"DEBUG"}
-    assert all(word in lines[0].text for word in ("ann", "left controller", "3", "lease version"))
-    several = LeasesChanged((lease("left", "p1").lease, lease("right", "p1").lease), "acquired", ("", ""))
-    (line,) = narrate(ann_and_bob(), several)
-    assert (line.level, line.text.count("ann"), "left" in line.text, "right" in line.text) == ("INFO", 2, True, True)
-    faults = narrate(ann_and_bob(), Gap("recording", 7, 12), EngagementChanged("left", "p1", False, "stale"))
-    assert [line.level for line in faults] == ["ERROR", "INFO"]
 
 
 def test_checks_of_two_headsets_are_told_when_they_change() -> None:
@@ -230,18 +180,3 @@ def test_colours_are_those_of_the_page() -> None:
     text = (Path(__file__).parents[2] / "web_client/src/view/avatars.ts").read_text()
     (listed,) = re.findall(r"PARTICIPANT_COLORS = \[(.*?)\]", text)
     assert [bytes.fromhex(one) for one in re.findall(r"#(\w{6})", listed)] == [bytes(colour) for colour in PALETTE]
-
-
-def test_denial_text_has_holder_and_advice() -> None:
-    line = describe_denial(DenialRecord(1, 2, 3, Denial("role", "observers cannot drive", "join as operator")))
-    assert line.level == "WARN"
-    assert all(part in line.text for part in ("3", "role", "observers cannot drive", "join as operator"))
-
-
-def test_session_page_names_class_and_versions() -> None:
-    page = describe_session(make_header("open", {"mujoco": "4.0.0"}))
-    assert "**open**" in page
-    assert "| mujoco | 4.0.0 |" in page
-    narration = ann_and_bob()
-    page = describe_session(make_header(), narration, 25.04)
-    assert all(part in page for part in ("**ann** (operator)", "**bob** (operator)", "25.0 s"))

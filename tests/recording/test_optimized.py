@@ -16,7 +16,7 @@ from iris_session.protocol.server_messages import Event, MarkerAdded
 from iris_session.recording import CLOSED, OPEN, Recording, verify
 from iris_session.recording import parts as recording_parts
 from iris_session.recording.writer import RrdWriter
-from iris_session.rrd.paths import ROWS, part_path
+from iris_session.rrd.paths import part_path
 from tests.recording.support import SmallCore, journal, write
 
 STEPS = 120
@@ -89,27 +89,6 @@ def test_optimized_copy_reads_and_verifies_like_the_original(
     report = verify(copy, SmallCore)
     assert report.ok, report.line()
     assert (report.steps, report.keyframes, report.finished) == (STEPS, 3, True)
-
-
-def test_missing_plant_is_found(tmp_path: Path) -> None:
-    """Plant states are in chunks of their own, of fifty rows; one of these is left out of another copy."""
-    from rerun.chunk import Chunk, LazyChunkStream, RrdReader
-
-    path = record(tmp_path / "session.rrd", OPEN)
-    split = optimize(tmp_path / "indexed.rrd", "--split-size-ratio", "1.5", "--max-rows", "50", path)
-    chunks = []
-    for chunk in RrdReader(split).stream().to_chunks():
-        batch = chunk.to_record_batch()
-        if chunk.entity_path != ROWS:
-            chunks.append(chunk)
-        elif "plant" not in batch.schema.names or 100 not in batch.column("step").to_pylist():
-            chunks += Chunk.from_record_batch(batch)
-    copy = tmp_path / "c.rrd"
-    LazyChunkStream.from_iter(chunks).write_rrd(copy, application_id="iris-session", recording_id="id")
-    report = verify(copy, SmallCore)
-    first = report.problems[0]
-    assert (report.ok, first.kind, first.field) == (False, "changed", "plant")
-    assert 50 < first.step <= 100
 
 
 @pytest.fixture

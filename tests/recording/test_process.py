@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
-import signal
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +16,7 @@ import pytest
 import zmq
 
 from iris_session.journal.errors import WriteError
-from iris_session.journal.feed import BATCH_NS, RecorderFeed
+from iris_session.journal.feed import BATCH_NS
 from iris_session.journal.messages import RecorderConfig
 from iris_session.protocol.scene import list_assets
 from iris_session.protocol.status import ClientReport
@@ -40,12 +37,8 @@ from tests.recording.support import (
     SmallCore,
     SmallSession,
     loop_recorder,
-    recorder,
-    wait_until,
 )
 from tests.recording.test_recorded_assets import Shared
-
-REPOSITORY = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -263,36 +256,3 @@ def test_killed_recorder_loses_at_most_a_quarter_second() -> None:
 
 
 # --- processes --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.e2e
-def test_killed_process_has_written_acknowledged_rows_and_the_next_part_the_rest(tmp_path: Path) -> None:
-    path = tmp_path / "session.rrd"
-    with recorder(path) as (process, feed):
-        session = SmallSession(feed)
-        while (written := _status(feed).written) < 20:
-            session.take(1, pause_s=0.002)
-        os.kill(process.pid, signal.SIGKILL)
-        wait_until(lambda: not process.alive)
-        assert "SIGKILL" in process.failure
-        shutil.copy(path, tmp_path / "killed.rrd")
-        with Recording.open(tmp_path / "killed.rrd") as recording:
-            assert not recording.finished
-            steps = [row.step for row in recording.rows()]
-        assert steps == list(range(len(steps)))
-        assert len(steps) >= written - 1, "a row or more in every batch but that of the first keyframe"
-        session.take(50)
-        wait_until(lambda: process.poll(time.monotonic_ns()))
-        session.take(50)
-        assert feed.close(20.0)
-        assert process.close()
-        assert (feed.stats.recorders, feed.stats.dropped_rows) == (2, 0)
-    report = verify(path, SmallCore)
-    assert (report.ok, report.parts, report.steps) == (True, 2, session.step_count), report.line()
-
-
-def _status(feed: RecorderFeed) -> Any:
-    """Wait for the recorder's newest status."""
-    feed.flush()
-    wait_until(lambda: feed.flush() is None and feed.stats.recorder is not None)
-    return feed.stats.recorder

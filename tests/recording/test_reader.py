@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 from pathlib import Path
 
@@ -103,19 +102,6 @@ def test_damaged_message_is_skipped(path: Path) -> None:
     assert any(p.kind == "unreadable" for p in report.problems)
 
 
-def test_parts_are_one_recording_and_repeated_rows_count_once(tmp_path: Path) -> None:
-    header, batch = journal(200)
-    first = tmp_path / "session.rrd"
-    rows, keyframes = batch.rows, batch.keyframes
-    batch.rows, batch.keyframes = rows[:110], keyframes[:3]
-    write(first, header, batch)
-    batch.rows, batch.keyframes = rows[95:], keyframes[2:]
-    write(Path(part_path(str(first), 2)), header, batch)
-    report = verify(first, SmallCore)
-    assert report.ok, report.line()
-    assert (report.parts, report.steps) == (2, 200)
-
-
 def test_empty_part_is_reported_and_skipped(tmp_path: Path, path: Path) -> None:
     """A recorder that could not begin its file (full disk) has lost nothing by it."""
     Path(part_path(str(path), 2)).write_bytes(b"")
@@ -138,17 +124,6 @@ def test_part_of_another_session_is_reported_and_skipped(path: Path) -> None:
         assert recording.finished
 
 
-def test_a_folder_stands_for_the_recording_in_it(path: Path, tmp_path: Path) -> None:
-    with Recording.open(path.parent) as recording:
-        assert recording.files == [str(path)]
-    renamed = path.rename(path.with_name("handover.rrd"))
-    with Recording.open(path.parent) as recording:
-        assert recording.files == [str(renamed)]
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(NotARecordingError, match="no recording below the folder"):
-        Recording.open(tmp_path / "empty")
-
-
 def test_missing_part_is_found(tmp_path: Path) -> None:
     header, batch = journal(200)
     rows, keyframes = batch.rows, batch.keyframes
@@ -168,15 +143,6 @@ def test_missing_part_is_found(tmp_path: Path) -> None:
     report = verify(files[0], SmallCore)
     assert report.gaps == [(70, 139)]
     assert (report.ok, report.missing) == (False, ["session.part2.rrd is missing"])
-
-
-def test_file_truncated_between_writes_is_not_finished(path: Path) -> None:
-    message = rrd_file.scan_file(path).messages[-16]
-    os.truncate(path, message.offset)
-    report = verify(path, SmallCore)
-    assert (report.ok, report.finished, report.cuts) == (True, False, [])
-    assert "NOT FINISHED" in report.line()
-    assert str(report.last_step) in report.as_dict()["ending"]
 
 
 def test_bytes_after_the_end_are_reported(path: Path) -> None:
@@ -208,15 +174,6 @@ def test_undecodable_content_is_one_line_with_its_place(tmp_path: Path) -> None:
         start = f"session.rrd: {entity} "
         (line,) = [problem.text for problem in report.problems if problem.text.startswith(start)]
         assert "\n" not in line
-
-
-@pytest.mark.parametrize(("data", "reason"), [(None, "x.rrd"), (b"", "x.rrd"), (b"x" * 99, "Rerun")])
-def test_other_files_are_rejected_in_one_line(tmp_path: Path, data: bytes | None, reason: str) -> None:
-    path = tmp_path / "x.rrd"
-    if data is not None:
-        path.write_bytes(data)
-    with pytest.raises(NotARecordingError, match=reason):
-        Recording.open(path)
 
 
 def test_recording_of_another_format_is_rejected_in_one_line(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from iris_session.recording import Recording, summarise, verify
 from iris_session.recording.reader import check_assets
 from iris_session.recording.repair import repair
 from iris_session.recording.writer import RrdWriter
-from iris_session.rrd import file as rrd_file
 from iris_session.rrd.assets import (
     ALL,
     NONE,
@@ -32,7 +31,6 @@ from iris_session.rrd.assets import (
     list_recorded_assets,
 )
 from iris_session.rrd.index import add_index
-from iris_session.rrd.paths import part_path
 from iris_session.scene import AssetStore, decode_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.recording.support import SmallCore, journal
@@ -154,32 +152,6 @@ def test_changed_byte_of_an_asset_is_found_and_named(whole: Path, shared: Shared
         with pytest.raises(LookupError):
             recording.asset(address)
     assert problem.text in repair(path, tmp_path / "repaired.rrd").damage
-
-
-def _asset_messages(path: Path) -> Iterator[int]:
-    data = path.read_bytes()
-    for message in rrd_file.scan_file(path).messages:
-        if b"/assets/data" in data[message.offset : message.offset + 4096]:
-            yield message.offset
-
-
-def test_assets_of_an_earlier_scene_that_a_kill_has_taken_are_no_damage(shared: Shared, tmp_path: Path) -> None:
-    """The next recorder gets the newest scene only."""
-    path = record(tmp_path / "session.rrd", shared)
-    offsets = list(_asset_messages(path))
-    path.write_bytes(path.read_bytes()[: offsets[len(offsets) // 2]])
-    header, batch = journal(STEPS)
-    writer = RrdWriter(part_path(str(path), 2), "id", AssetQueue(SCENE))
-    writer.write_header(header)
-    writer.add(batch)
-    writer.close()
-    report = verify(path, SmallCore)
-    assert report.ok, report.line()
-    assert report.finished
-    assert repair(path, tmp_path / "repaired.rrd").ok
-    assert verify(tmp_path / "repaired.rrd", SmallCore).ok
-    with Recording.open(path) as recording:
-        assert summarise(recording).assets.present < summarise(recording).assets.expected
 
 
 def test_copies_of_rerun_and_repaired_files_keep_them(whole: Path, tmp_path: Path) -> None:

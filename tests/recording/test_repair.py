@@ -12,8 +12,7 @@ import msgspec
 import pytest
 
 from iris_session.journal.errors import RecorderError
-from iris_session.journal.rows import seal_blob
-from iris_session.recording import NotARecordingError, Recording, header_root, summarise, verify
+from iris_session.recording import NotARecordingError, Recording, summarise, verify
 from iris_session.recording.lock import RecordingLock
 from iris_session.recording.repair import RepairReport, repair
 from iris_session.rrd import paths
@@ -156,22 +155,6 @@ def test_header_is_read_from_its_copy(original: Original, tmp_path: Path) -> Non
     report = verify(tmp_path / "repaired.rrd", None)
     assert report.steps == STEPS
     assert [problem.field for problem in report.problems] == ["file"]
-
-
-def test_model_of_a_changed_header_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    header, batch = journal(STEPS)
-
-    def seal(blob: bytes) -> bytes:
-        return seal_blob(blob).replace(b"small", b"smalm") if header.model in blob else seal_blob(blob)
-
-    monkeypatch.setattr("iris_session.recording.writer.seal_blob", seal)
-    path = write(tmp_path / "session.rrd", header, batch)
-    with Recording.open(path, warn=False) as recording:
-        assert recording.header == header
-        assert recording.root == header_root(header)
-        assert recording.damage == ["header: damaged, and read from its copy"]
-    found = verify(path, SmallCore)
-    assert (found.steps, found.unverified_steps, found.ok) == (STEPS, 0, False)
 
 
 def destroy_rows(original: Path, path: Path, first: int) -> None:

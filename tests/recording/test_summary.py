@@ -11,7 +11,6 @@ import numpy as np
 
 from iris_session.journal.messages import DenialRecord
 from iris_session.protocol.common import IDENTITY, Alignment, Denial, Lease
-from iris_session.protocol.media import StreamInfo
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentChanged,
@@ -35,7 +34,7 @@ from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import Recording, RecordingSummary, summarise
 from iris_session.recording.summary import SummaryBuilder
 from iris_session.recording.writer import RrdWriter
-from iris_session.rrd.batches import FrameTime, RecordedStream, RowTimes
+from iris_session.rrd.batches import RowTimes
 from iris_session.rrd.paths import part_path
 from tests.recording.support import TICK_NS, journal
 from tests.recording.test_media import message
@@ -184,23 +183,6 @@ def test_a_resumed_session_misses_nothing_before_it() -> None:
     assert builder.list_gaps() == []
     assert [(one.name, one.role, one.joins) for one in builder.list_people()] == [("p1", "", 0)]
     assert builder.make_drops().down_s == 30.0
-
-
-def test_streams_have_rate_and_description() -> None:
-    builder = SummaryBuilder()
-    for i in range(5):
-        builder.add(FrameTime("room", "cloud", i, 3 * S + i * S // 2))
-    builder.add(RecordedStream("room", 0, "cloud", StreamInfo(title="Room", fault="stuck")))
-    builder.add(RecordedStream("room", 9, "cloud", None))
-    (room,) = builder.list_streams()
-    assert (room.encoding, room.title, room.frames, room.duration_s, room.hz, room.fault) == (
-        "cloud",
-        "Room",
-        5,
-        2.0,
-        2.0,
-        "stuck",
-    )
 
 
 # --- files ---

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from anchors.pose import apply
 from iris_session.journal.messages import (
     Batch,
     DenialRecord,
@@ -56,10 +55,6 @@ from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.paths import part_path
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco
-from iris_session.viewer import scene_geometry as scene
-from iris_session.viewer.blueprint import place_eye
-from iris_session.viewer.scene_geometry import VisualShape
-from iris_session.viewer.scene_layer import build_components
 from tests.recording.support import XML, column, journal, make_header, read
 from tests.scene.models import every_shape
 
@@ -130,31 +125,6 @@ def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Pa
     assert times(moving) == [7, 32_000_007]
     assert column(found["/state"], "sim_time_s") == [[0.002 * 8 * i] for i in range(5)]
     assert not any("fixed" in entity for entity in found)
-
-
-def test_picture_begins_with_the_first_row(tmp_path: Path) -> None:
-    header, batch = journal(1)
-    state = frame(1, np.zeros((len(header.bodies), 7)))  # later than its row, by the duration of the step
-    batch.metrics = [MetricRecord(1, state.session_time, "late_ms", 1.0)]
-    writer = begin(tmp_path, header)
-    batch.states = [state, frame(9, np.ones((len(header.bodies), 7)))]
-    writer.add(batch)
-    found = finish(writer)
-    (row,) = times(found["/journal/rows"])
-    assert row < state.session_time
-    assert set(times(found["/scene/1/bodies/ball/g\\/ball"])) == {row}
-    for body in ("ball", "arm\\/link\\ 1", "tip"):
-        assert times(found[f"/scene/1/bodies/{body}"]) == [row, batch.states[1].session_time]
-    assert min(min(times(chunks)) for chunks in found.values() if "session_time" in chunks[0].schema.names) == row
-    assert times(found["/state"])[0] == state.session_time, "data have their own times"
-
-
-def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
-    q = (0.8, 0.2, -0.4, 0.4)
-    poses = build_components(VisualShape(scene.CAPSULE, (0.1, 0.1, 0.25)), (1, 2, 3, 4), ((1.0, 2.0, 3.0), q))[0]
-    start = tuple(poses.translations.as_arrow_array().to_pylist()[0])
-    end = apply((start, q), (0.0, 0.0, 0.5))
-    assert [(a + b) / 2 for a, b in zip(start, end, strict=True)] == pytest.approx((1.0, 2.0, 3.0))
 
 
 def joined(participant: str, name: str, role: str = "operator") -> Event:
@@ -281,28 +251,6 @@ def test_model_that_mujoco_refuses_does_not_stop_the_recording(tmp_path: Path) -
     writer = begin(tmp_path, msgspec.structs.replace(make_header(), model=b"no zlib"))
     writer.close()
     assert "scene" in column(read(path)["/events/recorder"], "TextLog:text")[0][0]
-
-
-def test_eye_is_placed_by_the_moving_bodies_of_the_first_state(tmp_path: Path) -> None:
-    from rerun.chunk import RrdReader
-
-    path = tmp_path / "w.rrd"
-    bodies = (BodyInfo(1, "a", True), BodyInfo(2, "far", False), BodyInfo(3, "b", True))
-    writer = begin(tmp_path, SessionHeader("s", "n", "closed", 2_000_000, bodies=bodies))
-    poses = np.zeros((3, 7))
-    poses[:, 0] = (1.0, 900.0, 3.0)
-    writer.add(Batch(states=[frame(0, poses), frame(8, poses + 5.0)]))
-    writer.close()
-    with pytest.warns(match="footer"):
-        reader = RrdReader(str(path))
-    (store,) = reader.blueprints()
-    chunks = [chunk.to_record_batch() for chunk in reader.stream(store=store)]
-    (eye,) = [chunk for chunk in chunks if "EyeControls3D:position" in chunk.schema.names]
-    ((target,),) = column([eye], "EyeControls3D:look_target")
-    assert target == pytest.approx([2.0, 0.0, -0.15 * 0.98]), "not what stands 900 m away"
-    ((position,),) = column([eye], "EyeControls3D:position")
-    assert position[1] == pytest.approx(-1.75 * 1.27 * 0.98), "98 % of half the distance between the bodies"
-    assert place_eye(np.full((2, 3), np.nan)) is None
 
 
 OTHER = """

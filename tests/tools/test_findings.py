@@ -6,16 +6,13 @@ from pathlib import Path
 
 import msgspec
 import pytest
-import zmq
 
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.discovery import Address
 from iris_session.client.errors import ClientError
 from iris_session.client.identity import Identity
-from iris_session.front.state_publisher import StatePublisher
 from iris_session.journal import rows as journal
 from iris_session.journal.messages import decode_header
-from iris_session.link import SceneInfo
 from iris_session.link.messages import decode_decided
 from iris_session.protocol.client_messages import Heartbeat, Hello
 from iris_session.protocol.codec import decode_client, encode_server
@@ -149,23 +146,3 @@ def test_frames_of_unknown_bodies_change_nothing() -> None:
         with pytest.raises(ValueError):
             decoder.apply(1, 0, payload)
     assert decoder.state_seq == 0
-
-
-def test_idle_state_socket_processes_events() -> None:
-    """libzmq handles connection events only inside its calls: also while no state is sent."""
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    state = context.socket(zmq.XPUB)
-    publisher = StatePublisher(state, SceneInfo("hash"), lambda: 0)
-    asked: list[int] = []
-    publisher.replace_socket(None)
-    publisher.poll()
-
-    class CountingSocket:
-        def get(self, option: int) -> int:
-            asked.append(option)
-            return 0
-
-    publisher._state = CountingSocket()  # type: ignore[assignment]
-    publisher.poll()
-    assert asked == [int(zmq.EVENTS)]
-    context.destroy(linger=0)

@@ -171,20 +171,6 @@ def test_a_wrong_model_or_camera_is_named(tmp_path: Path, text: str, camera: str
     assert "\n" not in str(caught.value)
 
 
-def test_a_model_may_be_in_the_binary_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "model.MJB"
-    mujoco.mj_saveModel(mujoco.MjModel.from_xml_string(MODEL), str(file), None)
-    settings = CameraSettings(name="a", source="mujoco", model=str(file), camera="front", width=64, height=48)
-    source = MujocoCamera(settings, lambda: 7)
-    assert read(source).depth.shape == (48, 64)
-    source.close()
-    monkeypatch.chdir(tmp_path)
-    file.write_bytes(file.read_bytes()[:5000])
-    with pytest.raises(SourceError, match="Truncated"):
-        MujocoCamera(settings, lambda: 7)
-    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
-
-
 def test_a_missing_driver_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise mujoco.FatalError("gladLoadGL error")

@@ -17,14 +17,11 @@ from iris_session.cloud.sources import open_source
 from iris_session.cloud.sources.playback import (
     RecordedPicture,
     RecordingSource,
-    choose_channel,
-    choose_device,
     decode_picture,
     fit_color,
     pair_pictures,
     resample,
     to_depth,
-    to_rgb,
 )
 
 MS = 1_000_000
@@ -71,15 +68,6 @@ def test_frames_come_at_their_times_and_again_after_the_end() -> None:
     assert clock.t_ns == 5_120 * MS
 
 
-def test_no_frame_within_the_timeout() -> None:
-    clock = Clock()
-    recording = Recording(clock, [0, 30])
-    recording.play()
-    assert recording.read(0.01) is None
-    assert clock.t_ns == 5_010 * MS
-    assert recording.play() == [(1, 5_030 * MS)]
-
-
 def test_a_late_reader_is_waited_for() -> None:
     clock = Clock()
     recording = Recording(clock, [0, 30, 60, 90, 120])
@@ -88,14 +76,6 @@ def test_a_late_reader_is_waited_for() -> None:
     assert recording.play(2) == [(1, 5_030 * MS), (2, 5_060 * MS)]
     clock.sleep(5.0)
     assert recording.play(2) == [(3, 10_060 * MS), (4, 10_090 * MS)]
-
-
-def test_the_rate_is_that_of_the_times() -> None:
-    recording = Recording(Clock(), [0, 200, 400, 9000, 9200, 9400])
-    assert recording.recorded_hz == 0.0
-    for _ in range(5):
-        recording.play()
-        assert recording.recorded_hz == 5.0
 
 
 def test_empty_and_closed_recordings_have_no_frames() -> None:
@@ -125,24 +105,6 @@ def test_depth_is_paired_with_colour_of_its_time() -> None:
     assert [t for t, _ in resample(iter(pairs), 10.0)] == [0, 100 * MS, 200 * MS]
 
 
-def test_a_channel_is_the_only_one_or_the_wanted_one() -> None:
-    assert choose_channel("depth", "", ["/a"], "file") == "/a"
-    assert choose_channel("depth", "/b", ["/a", "/b"], "file") == "/b"
-    for wanted, there in (("", ["/a", "/b"]), ("/c", ["/a"]), ("", [])):
-        with pytest.raises(SourceError) as caught:
-            choose_channel("depth", wanted, there, "file")
-        assert all(one in str(caught.value) for one in there)
-
-
-def test_a_device_is_the_only_one_or_the_wanted_one() -> None:
-    assert choose_device("Test", "", {"1": "D435"}) == "1"
-    assert choose_device("Test", "2", {"1": "D435", "2": "D455"}) == "2"
-    for wanted, there in (("", {"1": "D435", "2": "D455"}), ("3", {"1": "D435"}), ("", {})):
-        with pytest.raises(SourceError) as caught:
-            choose_device("Test", wanted, there)
-        assert all(serial in str(caught.value) and name in str(caught.value) for serial, name in there.items())
-
-
 def test_depth_in_metres_becomes_units() -> None:
     metres = np.array([[1.0, 0.2501, np.nan], [np.inf, -1.0, 70.0]], np.float32)
     assert to_depth(metres, 0.001, "x").tolist() == [[1000, 250, 0], [0, 0, 0]]
@@ -151,15 +113,6 @@ def test_depth_in_metres_becomes_units() -> None:
     for wrong in (np.zeros((2, 2), np.uint8), np.zeros((2, 2, 3), np.uint16)):
         with pytest.raises(SourceError):
             to_depth(wrong, 0.001, "x")
-
-
-def test_colour_becomes_red_green_blue() -> None:
-    bgr = np.array([[[1, 2, 3]]], np.uint8)
-    assert to_rgb(bgr, "x").tolist() == [[[3, 2, 1]]]
-    assert to_rgb(np.array([[[1, 2, 3, 4]]], np.uint8), "x").tolist() == [[[3, 2, 1]]]
-    assert to_rgb(np.array([[7]], np.uint8), "x").tolist() == [[[7, 7, 7]]]
-    with pytest.raises(SourceError):
-        to_rgb(np.zeros((2, 2, 3), np.uint16), "x")
 
 
 @pytest.mark.parametrize("scale", [3, 0.5])
