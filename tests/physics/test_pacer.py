@@ -118,20 +118,6 @@ def test_accounting_matches_a_simple_model_across_period_changes(
     assert (stats.ticks, stats.late) == (ticks, late)
 
 
-def test_period_change_starts_a_new_grid_at_the_end_of_its_tick() -> None:
-    pacer = Pacer(PERIOD, 0)
-    now = run(pacer, 0, [MS // 2] * 10)
-    began = pacer.next_deadline_ns
-    end = began + 40 * MS  # loading the scene took long
-    pacer.change_period(MS, began, end)
-    assert (pacer.period_ns, pacer.next_deadline_ns) == (MS, end + MS)
-    now = run(pacer, end, [MS // 4] * 20)
-    stats = pacer.get_stats(now)
-    assert (stats.ticks, stats.late, stats.missing, stats.max_ns) == (31, 0, 0, MS // 2)
-    pacer.finish_tick(pacer.next_deadline_ns + MS + 1)
-    assert pacer.get_stats(pacer.next_deadline_ns).late == 1, "late by the new period"
-
-
 def test_invalid_arguments_are_rejected() -> None:
     with pytest.raises(ValueError, match="must be positive"):
         Pacer(0, 0)

@@ -220,24 +220,6 @@ def test_divergence_raises_until_reset() -> None:
     assert world.dropped_counts == {}
 
 
-def pile(memory: str) -> mujoco.MjModel:
-    """Twenty boxes inside each other: hundreds of contacts."""
-    boxes = "".join(
-        f'<body pos="0 0 {0.09 + 0.02 * i}"><freejoint/><geom type="box" size=".1 .1 .1"/></body>' for i in range(20)
-    )
-    plane = '<geom type="plane" size="1 1 1"/>'
-    return model(f'<mujoco><size memory="{memory}"/><worldbody>{plane}{boxes}</worldbody></mujoco>')
-
-
-def test_exhausted_memory_is_counted() -> None:
-    world = World(pile("300K"), (), ())
-    world.tick()
-    assert sum(world.dropped_counts.values()) > 0
-    world.restore(world.snapshot())
-    world.reset()
-    assert world.diverged == ""
-
-
 def test_foreign_snapshots_are_rejected(handover: mujoco.MjModel) -> None:
     world = World(clutter(), (), ())
     with pytest.raises(SnapshotError, match="no world snapshot"):

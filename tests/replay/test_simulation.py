@@ -13,7 +13,7 @@ from iris_session.journal.rows import CRASHED
 from iris_session.recording import OPEN, Continues, Recording, make_row
 from iris_session.replay.simulation import Replay, ReplayError, StepSelector
 from iris_session.session.core import SessionCore
-from tests.replay.support import KEYFRAME_STEPS, Played, damaged, play
+from tests.replay.support import Played, damaged, play
 from tests.session.play import TICK_NS
 
 
@@ -59,36 +59,25 @@ def test_open_sessions_need_no_control(tmp_path: Path, monkeypatch: pytest.Monke
         replay(path)
 
 
-def test_after_a_gap_it_goes_on_at_the_next_keyframe(tmp_path: Path) -> None:
+@pytest.mark.parametrize("fault", ["two rows are missing", "digest", "step", "a keyframe is damaged too"])
+def test_after_a_gap_it_goes_on_at_the_next_intact_keyframe(tmp_path: Path, fault: str) -> None:
     played = play(tmp_path / "session.rrd", 70)
-    del played.batch.rows[25:27]
+    rows, keyframes = played.batch.rows, played.batch.keyframes
+    resumes = 60 if "keyframe" in fault else 40
+    if fault == "digest":
+        rows[25] = damaged(rows[25])
+    elif fault == "step":
+        rows[25] = msgspec.structs.replace(rows[25], step=9025)
+    else:
+        del rows[25:27]
+    if "keyframe" in fault:
+        at = next(i for i, one in enumerate(keyframes) if one.step == 39)
+        keyframes[at] = msgspec.structs.replace(keyframes[at], plant=b"other")
     steps, positions, taken = replay(played.write())
-    assert steps == [*range(25), *range(2 * KEYFRAME_STEPS, 70)]
+    assert steps == [*range(25), *range(resumes, 70)]
     assert_equals(played, steps, positions)
-    assert taken.left_out == [(25, 39)]
-    assert "15 steps are missing" in taken.describe_left_out()
-
-
-@pytest.mark.parametrize("field", ["digest", "step"])
-def test_a_damaged_row_is_a_gap(tmp_path: Path, field: str) -> None:
-    played = play(tmp_path / "session.rrd", 70)
-    row = played.batch.rows[25]
-    played.batch.rows[25] = damaged(row) if field == "digest" else msgspec.structs.replace(row, step=9025)
-    steps, positions, taken = replay(played.write())
-    assert steps == [*range(25), *range(40, 70)]
-    assert_equals(played, steps, positions)
-    assert taken.left_out == [(25, 39)]
-
-
-def test_a_damaged_keyframe_is_not_used(tmp_path: Path) -> None:
-    played = play(tmp_path / "session.rrd", 70)
-    del played.batch.rows[25]
-    at = next(i for i, one in enumerate(played.batch.keyframes) if one.step == 39)
-    played.batch.keyframes[at] = msgspec.structs.replace(played.batch.keyframes[at], plant=b"other")
-    steps, positions, taken = replay(played.write())
-    assert steps == [*range(25), *range(60, 70)]
-    assert_equals(played, steps, positions)
-    assert taken.left_out == [(25, 59)]
+    assert taken.left_out == [(25, resumes - 1)]
+    assert f"{resumes - 25} steps are missing" in taken.describe_left_out()
 
 
 def test_another_result_is_an_error_with_its_step(tmp_path: Path) -> None:

@@ -40,7 +40,8 @@ def test_a_participant_drives_and_a_director_cannot_pause_the_program() -> None:
 
 
 def test_policy_drives_until_a_participant_engages_and_after_the_release() -> None:
-    with Rig(user_loop=True, timestep=0.02) as rig:
+    """The journal continues from every keyframe, also from those of a robot that is driven or given back."""
+    with Rig(user_loop=True, timestep=0.02, keyframe_s=0.5) as rig:
         home = rig.session.model.key_ctrl[0].copy()
 
         def policy(data: mujoco.MjData) -> None:
@@ -67,6 +68,9 @@ def test_policy_drives_until_a_participant_engages_and_after_the_release() -> No
         rig.run(0.5)
         assert requests == [("watcher", "reset")]
         assert watcher.mirror.scene_epoch == epoch + 1
+    assert len(rig.journal.keyframes) > 10
+    for i in range(len(rig.journal.keyframes)):
+        rig.journal.verify(i)
 
 
 def test_a_loop_that_blocks_keeps_leases_and_the_estop() -> None:

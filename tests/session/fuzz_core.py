@@ -1,14 +1,12 @@
 """Random schema-valid entries for a whole session core: numbers, names and lengths that no honest client would send.
 
-`python -m tests.session.fuzz_core --entries 100000 --seed 1` runs it for long. Whatever comes, a step never raises,
-commands stay typed, memory stays bounded and joints keep their limits.
+`tools/fuzz_state_machines.py` runs it for long. Whatever comes, a step never raises, commands stay typed, memory stays
+bounded and joints keep their limits.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 from random import Random
 from typing import Any, Final, get_args
 
@@ -242,17 +240,3 @@ def run(seed: int, entries: int, per_step: int = 20) -> Fuzz:
         fuzz.step(n)
         entries -= n
     return fuzz
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--entries", type=int, default=100_000)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    fuzz = run(arguments.seed, arguments.entries)
-    print(f"{fuzz.moved} commands moved, snapshot <= {fuzz.largest} B, rejected: {', '.join(sorted(fuzz.rejected))}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -277,6 +277,3 @@ def test_steps_that_are_not_seen_are_a_warning(attached: Attached) -> None:
     for _ in range(600):
         ORIGINALS["mj_step"](attached.model, attached.data)
     assert any("outside of the session's ticks" in text for text in attached.rig.loop.list_warnings())
-
-
-# --- driving through the wrapped step ---------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ import pytest
 
 from iris_session.cloud.config import CameraReport
 from iris_session.link import Ports
-from iris_session.session import cameras as session_cameras
 from iris_session.session.cameras import SILENT_NS, SLOW_START_NS, SessionCameras, load_camera_files
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import StartError
@@ -62,25 +61,6 @@ def test_each_process_of_an_encrypted_session_has_a_key(tmp_path: Path) -> None:
     first, second = SessionCameras(SessionConfig(cameras=paths, curve=True)).public_keys
     assert first != second
     assert SessionCameras(SessionConfig(curve=True)).public_keys == ()
-
-
-def test_warnings_name_what_the_processes_cannot_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise OSError("no memory")
-
-    monkeypatch.setattr(session_cameras, "ChildProcess", fail)
-    cameras = SessionCameras(SessionConfig(cameras=(write_file(tmp_path, "room"),)))
-    assert cameras.start(Ports("127.0.0.1", 1, 2)) == ["cameras: room"]
-    assert cameras.list_warnings() == []
-    cameras.poll(SECOND)
-    process = cameras._processes["room"]
-    assert process._thread is not None
-    process._thread.join()
-    assert cameras.poll(SECOND) == ["the camera process of 'room' does not start: no memory"]
-    assert cameras.list_warnings() == ["the camera process of 'room' does not start: no memory"]
-    assert cameras.restarts == 1
-    cameras.close()
-    assert cameras.list_warnings() == []
 
 
 def test_a_process_that_is_silent_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

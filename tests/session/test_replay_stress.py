@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import msgspec
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from iris_session.protocol.client_messages import PlaceAlignment
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, decode_entries, encode_entries
-from iris_session.protocol.server_messages import StateHeader
-from iris_session.protocol.steps import Decision
 from iris_session.session.core import CoreConfig, SessionCore
 from iris_session.session.stepper import Stepper
 from tests.session.fuzz_core import run
 from tests.session.play import make_core
 from tests.session.replay_stress import play, replay, replay_elsewhere
+from tests.session.test_stepper import Front
 
 ENCODE = msgspec.msgpack.Encoder().encode
 
@@ -48,23 +45,12 @@ def test_integers_in_a_configuration_are_stored_as_floats() -> None:
 
 def test_posted_messages_are_used_as_journaled() -> None:
     core = make_core()
-    stepper = Stepper(core, Quiet(), None, iter(range(1, 100)).__next__, 10**9, 10**9)
+    stepper = Stepper(core, Front(), None, iter(range(1, 100)).__next__, 10**9, 10**9)
     stepper.post(PlaceAlignment(1, "p1", Pose((1, 0, 0), (1, 0, 0, 0))))
     seen: list[Entry] = []
     stepper.on_entries = seen.extend
     stepper.step(0)
     assert ENCODE(seen) == ENCODE(decode_entries(encode_entries(seen)))
-
-
-class Quiet:
-    """A front without messages."""
-
-    def poll(self) -> list[Entry]:
-        return []
-
-    def send_decision(self, step: int, decision: Decision) -> None: ...
-
-    def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None: ...
 
 
 @pytest.mark.parametrize("seed", [12, 13])

@@ -12,9 +12,7 @@ from types import MappingProxyType
 
 import msgspec
 import mujoco
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from anchors.pose import IDENTITY_QUAT, PoseTuple
 from iris_session.authority import AuthorityConfig
@@ -27,8 +25,7 @@ from iris_session.protocol.client_messages import Marker, MoveAnchor
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, SessionResumed, decode_entries
 from iris_session.protocol.names import CommandKind
-from iris_session.protocol.server_messages import Gap, StateHeader
-from iris_session.protocol.steps import Decision
+from iris_session.protocol.server_messages import Gap
 from iris_session.recording import (
     CLOSED,
     OPEN,
@@ -36,11 +33,9 @@ from iris_session.recording import (
     Keyframe,
     Recording,
     RecordingLock,
-    SessionHeader,
     Settings,
     header_root,
     make_row,
-    pack_model,
 )
 from iris_session.security.resume_tokens import ResumeTokens, encode_handback
 from iris_session.session.config import SessionConfig
@@ -60,17 +55,13 @@ from iris_session.session.resume import (
 from iris_session.session.stepper import ResumedFrom, Stepper
 from iris_session.session.verification import verify_recording
 from tests.recording.support import write
+from tests.replay.support import keyframe_of, make_header
 from tests.session.play import ANN, TICK_NS, entries, host, make_core, play
-from tests.session.test_stepper import Recorder
+from tests.session.test_stepper import Front, Recorder
 
 STEPS = 100
 KEYFRAMES = (39, 79)
 LAST_NS = STEPS * TICK_NS
-
-
-def keyframe_of(core: SessionCore, step: int) -> Keyframe:
-    state = core.snapshot()
-    return Keyframe(step, state.plant, state.authority, state.controller, state.status)
 
 
 def recorded(
@@ -83,23 +74,15 @@ def recorded(
 ) -> Path:
     """The scripted session of `play`, as `Session.run` records it."""
     core = core or make_core()
-    head = SessionHeader(
-        "s1",
-        "lab",
-        CLOSED,
-        TICK_NS,
-        msgspec.msgpack.encode(core.config),
-        pack_model(core.world.encode_model()),
-        core.world.scene_hash,
-        core.config.robots,
-        core.config.objects,
-        core.world.bodies,
-        origin_ns=time.monotonic_ns() - LAST_NS,
-        boot_id=read_boot_id(),
-    )
-    head = msgspec.structs.replace(head, **header)
+    usual = {
+        "session_name": "lab",
+        "scene_hash": core.world.scene_hash,
+        "origin_ns": time.monotonic_ns() - LAST_NS,
+        "boot_id": read_boot_id(),
+    }
+    head = msgspec.structs.replace(make_header(core, CLOSED), **{**usual, **header})
     chain = header_root(head)
-    batch = Batch(keyframes=[seal_keyframe(keyframe_of(core, -1), chain)])
+    batch = Batch(keyframes=[keyframe_of(core, -1, chain)])
     for step in range(STEPS):
         now_ns = (step + 1) * TICK_NS
         came = [*entries(step), *said.get(step, ())]
@@ -107,7 +90,7 @@ def recorded(
         batch.rows.append(change(row))
         chain = batch.rows[-1].chain
         if step in KEYFRAMES:
-            batch.keyframes.append(keyframes(seal_keyframe(keyframe_of(core, step), chain)))
+            batch.keyframes.append(keyframes(keyframe_of(core, step, chain)))
     return write(path, head, batch)
 
 
@@ -136,17 +119,6 @@ def test_resumed_state_is_that_after_the_last_row(session: Path) -> None:
     assert past.header.session_id == "s1"
     assert len(past.notes) == 1
     assert "resume.tokens" in past.notes[0]
-    past.close()
-
-
-def test_end_of_a_budget_is_said(session: Path, tmp_path: Path) -> None:
-    """The session went on without a recording: its robots are set back to where they were."""
-    with Recording.open(session) as recording:
-        content = recording.header, Batch(rows=[*recording.rows()], keyframes=[*recording.keyframes()])
-    past = PastSession(write(tmp_path / "other.rrd", *content, reason="recording ended: budget is used up"))
-    assert past.step == STEPS - 1
-    end = f"what came after {LAST_NS * 1e-9:.1f} s is not in it"
-    assert f"other.rrd: recording ended: budget is used up: {end}" in past.notes
     past.close()
 
 
@@ -292,7 +264,7 @@ def test_anchors_are_those_of_the_recording_by_default(tmp_path: Path, given: di
     now = {name: Pose(*T) for name, T in given.items()}
     assert (config.anchor_poses(), past.anchors) == (now or {"table": moved}, now)
     stepper = Stepper(
-        past.core, Front(), None, lambda: LAST_NS + 10**9, 10**9, 10**10, b"",
+        past.core, Front(STEPS), None, lambda: LAST_NS + 10**9, 10**9, 10**10, b"",
         ResumedFrom(past.step, past.now_ns, past.anchors),
     )  # fmt: skip
     stepper.step(1)
@@ -350,11 +322,6 @@ def test_untrusted_note_is_ignored(session: Path, fault: str) -> None:
     assert path.name in why
 
 
-def test_each_recording_has_its_own_note() -> None:
-    names = [find_note_path(Path(name)).name for name in ("session.rrd", "session.resume3.part2.rrd", "b.resume2.rrd")]
-    assert names == ["resume.tokens", "resume.tokens", "b.resume.tokens"]
-
-
 # --- time -------------------------------------------------------------------------------------------------------------
 
 
@@ -371,22 +338,6 @@ def test_session_time_after_a_reboot_continues_above_recorded_times(tmp_path: Pa
 
 
 # --- the first steps --------------------------------------------------------------------------------------------------
-
-
-class Front:
-    """Keeps decisions."""
-
-    def __init__(self) -> None:
-        self.decisions: list[tuple[int, Decision]] = []
-
-    def poll(self) -> list[Entry]:
-        return []
-
-    def send_decision(self, step: int, decision: Decision) -> None:
-        self.decisions.append((step, decision))
-
-    def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None:
-        pass
 
 
 class Journal(Recorder):
@@ -407,7 +358,7 @@ def gone_on(session: Path) -> tuple[Stepper, Front, Path]:
         return now_ns[0]
 
     header = msgspec.structs.replace(past.header, continues=past.continues)
-    front, journal = Front(), Journal()
+    front, journal = Front(STEPS), Journal()
     stepper = Stepper(
         past.core, front, journal, clock, 10**9, 10**10, header_root(header), ResumedFrom(past.step, past.now_ns)
     )  # fmt: skip
@@ -420,8 +371,7 @@ def gone_on(session: Path) -> tuple[Stepper, Front, Path]:
 
 def test_first_entry_is_session_resumed(gone_on: tuple[Stepper, Front, Path]) -> None:
     stepper, front, path = gone_on
-    step, decision = front.decisions[0]
-    assert step == STEPS
+    decision = front.decisions[0]
     (gap,) = [event.body for event in decision.events if isinstance(event.body, Gap)]
     assert gap.kind == "resumed"
     assert gap.duration_ns == pytest.approx(5e9, abs=1e8)
@@ -444,7 +394,7 @@ def test_participants_keep_leases_and_robots_hold(gone_on: tuple[Stepper, Front,
     assert lease.expires_ns > LAST_NS + 5_000_000_000, "the grace period begins anew"
     (ann,) = stepper.view.make_participant_reports(0)
     assert (ann.name, ann.connected, ann.holds) == ("ann", False, ("left",))
-    assert all(command.kind == CommandKind.HOLD for _, decision in front.decisions for command in decision.commands)
+    assert all(command.kind == CommandKind.HOLD for decision in front.decisions for command in decision.commands)
     assert stepper.core.world.view().tick == STEPS + 39, "the first step has no tick: it may be paused"
 
 

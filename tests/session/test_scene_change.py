@@ -9,7 +9,7 @@ import pytest
 
 from iris_session import Session, SessionConfig
 from iris_session.demo.scenes import n_arms_scene, scene_path
-from iris_session.physics import Pacer, PhysicsError, find_objects, find_robots
+from iris_session.physics import Pacer, find_objects, find_robots
 from iris_session.physics.load import compute_scene_hash, decode_model, encode_model
 from iris_session.protocol.entries import SceneLoaded, decode_entries
 from iris_session.protocol.server_messages import SceneChanged
@@ -115,15 +115,6 @@ def test_stepper_sends_the_scene_before_the_step() -> None:
     assert rig.stepper.view.mirror.synced
     assert set(rig.stepper.view.mirror.leases) == {"left", "right", "object1", "object2", "object3"}
     assert rig.front.n_bodies == len(scene.plant.world.bodies)
-
-
-def test_unsuitable_scenes_are_refused_with_a_reason() -> None:
-    core = make_core()
-    for timestep in (1e-6, 0.25):
-        with pytest.raises(ConfigError, match=f"timestep of {timestep:g} s"):
-            prepare_scene(core, SharedScenes(False, "test"), bench_scene(timestep), b"", None, None)
-    with pytest.raises(PhysicsError):
-        prepare_scene(core, SharedScenes(False, "test"), bench_scene(), b"too short", None, None)
 
 
 @pytest.mark.usefixtures("simulation")

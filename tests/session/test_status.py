@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,9 +10,9 @@ import pytest
 from iris_session.journal.feed import FeedStats
 from iris_session.journal.messages import RecorderStatus
 from iris_session.physics import Pacer
-from iris_session.protocol.client_messages import Acquire, MoveAnchor, PlaceAlignment, TrackingEpoch
+from iris_session.protocol.client_messages import MoveAnchor, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose
-from iris_session.protocol.entries import Bye, Entry, Join
+from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.names import Role
 from iris_session.protocol.status import ParticipantReport, RecorderReport
 from iris_session.session.config import SessionConfig
@@ -79,20 +78,6 @@ def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
     assert session.people()["bob"].alignment_void_ns == -1
 
 
-def test_joins_denials_holds_and_leaves_are_logged(session: Session, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO, "iris_session.session"):
-        session.step(bob(TICK_NS))
-        session.step(Entry(BOB, BOB, session.now_ns, Acquire(1, ("nothing",))))
-        session.step(Entry(BOB, BOB, session.now_ns, Bye()))
-    assert [word for text in caplog.messages for word in ("joined", "holds", "denied", "left:") if word in text] == [
-        "joined",
-        "holds",
-        "holds",
-        "denied",
-        "left:",
-    ]
-
-
 def test_report_lists_robots_and_holders(session: Session) -> None:
     session.step()
     before = {row.name: row for row in make_robot_reports(session.stepper)}
@@ -123,16 +108,6 @@ def test_report_waits_for_idle_time_up_to_a_limit() -> None:
 def test_warnings_of_other_sources_are_reported(session: Session) -> None:
     assert collect_warnings(session.stepper, RecorderReport(), "") == []
     assert collect_warnings(session.stepper, RecorderReport(), "", ["x" * 5000]) == ["x" * MAX_TEXT]
-
-
-def test_alignments_are_in_the_report(session: Session) -> None:
-    session.step(bob(TICK_NS))
-    row = session.people()["bob"]
-    session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
-    reports = session.stepper.core.authority.build_alignment_reports()
-    (told,) = [r for r in session.stepper.view.make_participant_reports(session.now_ns, reports) if r.id == row.id]
-    assert told.alignment_report is not None
-    assert (told.alignment_report.version, told.alignment_report.running) == (1, True)
 
 
 def test_new_front_gets_the_current_anchors() -> None:
