@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,44 +28,31 @@ def judge(*warnings: str, restarts: int = 0, **values: Any) -> tuple[str, str]:
     return "; ".join(problems), "; ".join(notes)
 
 
-def test_streams_that_came_to_the_end_are_no_problem() -> None:
-    assert judge() == ("", "")
-
-
 @pytest.mark.parametrize(
-    ("values", "text"),
+    ("values", "problem", "note"),
     [
-        ({"stream": "other"}, "eve: no frame of the stream 'room' came$"),
-        ({"frames": 0, "fault": "source", "detail": "no OpenGL here"}, "'room' came, source: no OpenGL here$"),
-        ({"stale": True, "silent_s": 6.0}, "eve: the stream 'room' is stale, newest frame 6.0 s ago$"),
-        ({"silent_s": 6.0}, "eve: the stream 'room' is stale, newest frame 6.0 s ago$"),
-        ({"fault": "no_depth", "detail": "camera front: no pixel"}, "'room' is no_depth: camera front: no pixel, "),
-        ({"fault": "source", "detail": "no frame for 7 s", "silent_s": 7.0}, "'room' is source: no frame for 7 s, "),
-        ({"restarts": 2}, "started again, 2 times$"),
+        ({}, "", ""),
+        ({"stream": "other"}, "eve: no frame of the stream 'room' came", ""),
+        ({"frames": 0, "fault": "source", "detail": "no OpenGL here"}, "source: no OpenGL here", ""),
+        ({"stale": True, "silent_s": 6.0}, "'room' is stale", ""),
+        ({"fault": "no_depth", "detail": "camera front: no pixel"}, "'room' is no_depth: camera front: no pixel", ""),
+        ({"restarts": 2}, "started again, 2 times", ""),
+        ({"silent_s": 1.5, "fault": "slow", "detail": "3 of 10"}, "", "'room' is slow: 3 of 10"),
+        ({"silent_s": 1.5, "fault": "source", "detail": "no frame", "stale": True}, "", "'room' is source: no frame"),
+        ({"silent_s": 1.5, "stale": True}, "", "'room' is stale"),
     ],
 )
-def test_streams_that_are_missing_stale_or_faulty_are_problems(values: dict[str, Any], text: str) -> None:
+def test_streams_that_are_missing_or_faulty_are_problems_and_late_ones_notes(
+    values: dict[str, Any], problem: str, note: str
+) -> None:
     problems, notes = judge(**values)
-    assert re.search(text, problems), problems
-    assert notes == ""
+    assert (bool(problems), bool(notes)) == (bool(problem), bool(note))
+    assert problem in problems
+    assert note in notes
 
 
 def test_warnings_of_camera_processes_are_problems() -> None:
     assert judge("the camera process of 'room' hangs") == ("the camera process of 'room' hangs", "")
-
-
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        ({"fault": "slow", "detail": "3 of 10"}, "'room' is slow: 3 of 10, newest frame 1.5 s ago$"),
-        ({"fault": "source", "detail": "no frame for 1 s", "stale": True}, "'room' is source: no frame for 1 s, "),
-        ({"stale": True}, "'room' is stale, newest frame 1.5 s ago$"),
-    ],
-)
-def test_cameras_whose_frames_come_late_are_noted(values: dict[str, Any], text: str) -> None:
-    problems, notes = judge(silent_s=1.5, **values)
-    assert problems == ""
-    assert re.search(text, notes), notes
 
 
 def test_cameras_that_cannot_be_drawn_end_a_demo_before_it_starts(

@@ -81,9 +81,6 @@ def test_jaw_at_the_end_of_the_chain_belongs_to_the_gripper() -> None:
     assert len(robot.joints) == 5
     assert (robot.gripper_actuator, robot.gripper_open, robot.gripper_closed) == ("so/jaw", 1.0, 0.0)
     assert robot.finger_bodies == ("so/moving",)
-    # The same without a descriptive name: the site on the previous link decides.
-    (robot,) = find_robots(scene(body.replace("so/jaw", "so/j9"), actuators + jaw_actuator.replace("so/jaw", "so/j9")))
-    assert (len(robot.joints), robot.gripper_actuator) == (5, "so/j9")
 
 
 def test_torso_with_two_arms_and_two_separate_arms() -> None:

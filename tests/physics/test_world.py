@@ -256,9 +256,6 @@ def test_scene_hash_does_not_depend_on_the_folder(panda: mujoco.MjModel) -> None
     assert World(clutter(), (), ()).scene_hash != first.scene_hash
 
 
-# --- user loop --------------------------------------------------------------------------------------------------------
-
-
 def test_actuators_and_bodies_belong_to_one_robot(handover: mujoco.MjModel) -> None:
     left, right = find_robots(handover)
     (hammer, *_) = find_objects(handover)

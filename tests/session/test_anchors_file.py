@@ -42,7 +42,6 @@ def test_marks_are_part_of_their_sheet(tmp_path: Path) -> None:
     [
         ({"shelf": {}}, "'shelf': there is no such anchor"),
         ({"table": {"1": (0.1, 0.2)}}, "mark '1'"),
-        ({"table": {"1": (0.1, 0.2, "z")}}, "mark '1'"),
         ({"table": {"1": (0.1, 0.2, float("nan"))}}, "mark '1'"),
         ({"table": {"1": (92.4, 131.6, 0.0)}}, "in metres"),
         ({"table": {"": (0.1, 0.2, 0.0)}}, "mark ''"),
@@ -68,7 +67,6 @@ def test_marks_that_cannot_be_used_are_named(marks: dict[str, Any], value: str) 
         (GOOD + "marks_m = 4\n", "anchors.a.marks_m must be a table"),
         (GOOD + "marks_m = {1 = [0, 0]}\n", "anchors.a.marks_m.1"),
         (GOOD.replace('"a"', f'"{"x" * 65}"').replace(".a]", f".{'x' * 65}]"), "1 to 64 characters"),
-        (GOOD.replace('"a"', '""').replace(".a]", '.""]'), "1 to 64 characters"),
     ],
 )
 def test_invalid_anchors_file_names_the_entry(text: str, value: str, tmp_path: Path) -> None:
@@ -86,5 +84,3 @@ def test_unreadable_anchors_file_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="UTF-8"):
         load_anchors(tmp_path / "binary")
-    with pytest.raises(ConfigError, match=str(tmp_path)):
-        load_anchors(tmp_path)

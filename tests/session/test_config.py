@@ -20,21 +20,15 @@ from iris_session.protocol.specs import RobotSpec
     ("settings", "expected"),
     [
         ({"name": "a/b"}, "letters, digits"),
-        ({"name": ""}, "letters, digits"),
         ({"name": "x" * 49}, "1 to 48"),
         ({"control_port": -1}, "control_port -1"),
-        ({"state_port": 65536}, "state_port 65536"),
-        ({"beacon_port": 70000}, "beacon_port 70000"),
         ({"advertise": "lab:pc/7"}, "advertise"),
         ({"state_hz": 0.5}, "1 to 240"),
         ({"state_hz": float("nan")}, "1 to 240"),
         ({"keyframe_s": 0.0}, "0.5 to 60"),
         ({"record_clouds_hz": 61.0}, "record_clouds_hz 61.0 is out of range: 0.01 to 60, or 0"),
-        ({"record_clouds_hz": -1.0}, "record_clouds_hz -1.0"),
-        ({"record_clouds_hz": float("nan")}, "record_clouds_hz nan"),
         ({"record_assets": "some"}, "record_assets 'some' is none of none, scene, all"),
         ({"record_budget_bytes": 15_999_999}, "record_budget_bytes 15999999 is too small: give 16000000 or more, or 0"),
-        ({"record_budget_bytes": -1}, "record_budget_bytes -1 is too small"),
     ],
 )
 def test_values_out_of_range(settings: dict[str, Any], expected: str) -> None:
@@ -65,10 +59,8 @@ def test_defaults_listen_on_loopback_only() -> None:
         ({"name": 5}, "name"),
         ({"control_port": "7721"}, "control_port"),
         ({"state_hz": True}, "state_hz"),
-        ({"record": 3}, "record"),
         ({"interfaces": "eth0"}, "interfaces"),
         ({"authority": ControlConfig()}, "authority"),
-        ({"anchors": {"a": (0.0, 0.0, 0.0)}}, "anchor 'a'"),
         ({"anchors": {"a": ((0.0, 0.0), (1.0, 0.0, 0.0, 0.0))}}, "anchor 'a'"),
         ({"anchors": {"a": ((0.0, 0.0, math.nan), (1.0, 0.0, 0.0, 0.0))}}, "not finite"),
         ({"anchors": {"a": ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0))}}, "1.41"),
@@ -109,16 +101,12 @@ def test_invalid_scene_is_named() -> None:
     ("given", "text"),
     [
         ({"objects": ["hammer"]}, r"^objects\[0\] is 'hammer'.*ObjectSpec"),
-        ({"objects": "hammer"}, "^objects is 'hammer'.*ObjectSpec"),
         (
             {"objects": [RobotSpec("left", (), (), "tcp", "base")]},
             r"^objects\[0\] is RobotSpec.*ObjectSpec",
         ),
         ({"robots": ["left"]}, r"^robots\[0\] is 'left'.*RobotSpec"),
         ({"robots": "robots.toml"}, "^robots is 'robots.toml': .*load_robots_toml"),
-        ({"robots": Path("robots.toml")}, "^robots is .*load_robots_toml"),
-        ({"robots": {"name": "left"}}, "^robots is .*RobotSpec"),
-        ({"robots": 5}, "^robots is 5.*RobotSpec"),
         ({"robots": [RobotSpec("left", "joint1", (), "tcp", "base")]}, r"^robots\[0\] is a RobotSpec .*joints"),  # type: ignore[arg-type]
     ],
 )

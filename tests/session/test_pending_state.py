@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from iris_session.protocol.common import Pose
@@ -97,18 +96,6 @@ def test_body_on_a_floating_joint_keeps_its_pose(many: bool) -> None:
     assert pose(pending, "arm/fore")[:3] == pytest.approx([0.0, 1.5, 5.0])
 
 
-def test_setting_many_bodies_equals_setting_each(pending: PendingState) -> None:
-    other = PendingState(composed())
-    names = ["blue", "red"]
-    positions = np.array([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)])
-    pending.set_poses(names, positions, [TURNED, np.array(UNIT) * 1.0005])
-    for name, position, q in zip(names, positions, (TURNED, UNIT), strict=True):
-        other.set_pose(name, position, q)
-    assert np.allclose(
-        pending.make_frame(0, 0.0, anew=False).poses, other.make_frame(0, 0.0, anew=False).poses, atol=1e-15
-    )
-
-
 NAN = float("nan")
 
 
@@ -118,50 +105,32 @@ NAN = float("nan")
         (lambda d: d.set_pose("redd", (0, 0, 0), UNIT), "nearest: 'red'"),
         (lambda d: d.set_pose("cloth", (0, 0, 0), UNIT), "set_vertices"),
         (lambda d: d.set_pose("red", (0, NAN, 0), UNIT), "3 finite numbers"),
-        (lambda d: d.set_pose("red", (0, 0), UNIT), "3 finite numbers"),
-        (lambda d: d.set_pose("red", None, UNIT), "3 numbers"),
         (lambda d: d.set_pose("red", ("0", "1", "2"), UNIT), "3 numbers"),
-        (lambda d: d.set_pose("red", "012", UNIT), "3 numbers"),
-        (lambda d: d.set_pose("red", (0, 0, 0), ("1", "0", "0", "0")), "4 numbers"),
-        (lambda d: d.set_poses(["red"], [("1", "1", "1")], [UNIT]), "numbers"),
         (lambda d: d.set_vertices("cloth", CLOTH.astype(str)), "numbers"),
         (lambda d: d.set_pose("red", (0, 0, 2e6), UNIT), "in metres"),
         (lambda d: d.set_pose("red", (0, 0, 0), (0, 0, 0, 0)), "length 0"),
         (lambda d: d.set_pose("red", (0, 0, 0), (1.002, 0, 0, 0)), "length 1"),
         (lambda d: d.set_pose("red", (0, 0, 10**400), UNIT), "3 numbers"),
-        (lambda d: d.set_pose("red", np.zeros((90, 3)), UNIT), "^[^\n]{1,120}$"),
-        (lambda d: d.set_pose(["red"], (0, 0, 0), UNIT), r"\['red'\]"),
         (lambda d: d.set_pose("red", (0, 0, 0), (1, 0, 0)), "4 finite numbers"),
         (lambda d: d.set_poses(["red", "blu"], [(1, 1, 1)] * 2, [UNIT] * 2), "nearest: 'blue'"),
         (lambda d: d.set_poses(["red", "arm"], [(1, 1, 1)] * 2, [UNIT] * 2), "set_pose"),
         (lambda d: d.set_poses(["red", "blue"], [(1, 1, 1)] * 2, [UNIT, (1.1, 0, 0, 0)]), "of 'blue' has length 1.1"),
         (lambda d: d.set_poses(["red", "blue", "red"], [(1, 1, 1)] * 3, [UNIT] * 3), "'red'"),
-        (lambda d: d.set_poses(["red"], [(1, 1, 1)], [(0, 0, 0, 0)]), "of 'red' has length 0"),
-        (lambda d: d.set_poses(["red"], [(1, 1, 1)], [(1e200, 0, 0, 0)]), "has length inf"),
         (lambda d: d.set_poses("red", [(1, 1, 1)] * 3, [UNIT] * 3), "'red'"),
-        (lambda d: d.set_poses(None, [(1, 1, 1)], [UNIT]), "names"),
-        (lambda d: d.set_poses([0], [(1, 1, 1)], [UNIT]), "0"),
         (lambda d: d.set_poses(["red"], [(1, 1, 10**400)], [UNIT]), "shape"),
         (lambda d: d.set_poses(["red"], [(1, NAN, 1)], [UNIT]), "not finite"),
         (lambda d: d.set_poses(["red"], [(1, 1)], [UNIT]), r"\(1, 2\)"),
-        (lambda d: d.set_poses(["red"], "red", [UNIT]), "shape"),
         (lambda d: d.set_joints("armm", {}), "nearest: 'arm'"),
         (lambda d: d.set_joints("arm", {"turn": 1.0, "twist": 1.0}), "turn, slide"),
         (lambda d: d.set_joints("arm", {"follower": 1.0}), "'turn'"),
         (lambda d: d.set_joints("arm", {"turn": NAN}), "finite"),
-        (lambda d: d.set_joints("arm", [1.0]), "joint"),
         (lambda d: d.set_joints("arm", {"turn": "1.0"}), "turn"),
-        (lambda d: d.set_joints("arm", {"turn": 10**400}), "set_joints"),
-        (lambda d: d.set_joints(["arm"], {}), "arm"),
         (lambda d: d.set_joints("arm", {"turn": 1e300}), "radians"),
-        (lambda d: d.set_joints("arm", {"slide": 1e7}), "1,000 km"),
         (lambda d: d.set_joints("arm", {"turn": 1.0, "slide": 1e308}), "1,000 km"),
         (lambda d: d.set_vertices("clot", CLOTH), "nearest: 'cloth'"),
         (lambda d: d.set_vertices("cloth", CLOTH[:3]), r"\(3, 3\)"),
         (lambda d: d.set_vertices("cloth", CLOTH * NAN), "not finite"),
         (lambda d: d.set_vertices("cloth", CLOTH * 1e9), "metres"),
-        (lambda d: d.set_vertices("cloth", CLOTH.astype(np.float64) * 1e300), "metres"),
-        (lambda d: d.set_vertices(["cloth"], CLOTH), "cloth"),
     ],
 )  # fmt: skip
 def test_invalid_values_raise_and_change_nothing(
