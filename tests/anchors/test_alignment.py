@@ -164,15 +164,6 @@ def test_old_observations_are_dropped() -> None:
     assert distance(got.T_world_tracking[0], _pose_at(0.2)[0]) < 0.01
 
 
-def test_observations_after_a_backward_clock_step_are_used() -> None:
-    estimator = AlignmentEstimator({"sheet": SHEET})
-    _observe(estimator, _pose_at(1.0), 0, capture_ns=2**62)
-    _observe(estimator, _pose_at(0.0), 0, capture_ns=5)
-    got = estimator.estimate()
-    assert (got.refused, got.n_observations) == (False, 20)
-    assert distance(got.T_world_tracking[0], _pose_at(0.0)[0]) < 0.01
-
-
 def test_sheet_of_another_size_than_configured_fails_with_advice() -> None:
     estimator = AlignmentEstimator({"sheet": SHEET}, sizes={"sheet": 0.2})
     _observe(estimator, _pose_at(0.0), 0, size_m=0.19)

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from anchors.controller import TipCalibration, calibrate_tip, controller_covariance, holder_anchor
+from anchors.controller import TipCalibration, calibrate_tip
 from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix
-from anchors.pose import PoseTuple, apply, compose, inverse, quat_from_rotvec
+from anchors.pose import PoseTuple, apply
 
 TIP = np.array([0.01, -0.02, -0.12])
 PIVOT = np.array([0.4, 1.1, -0.3])
@@ -65,14 +65,6 @@ def test_insufficient_motion_fails_with_advice(poses: list[PoseTuple], word: str
     got = calibrate_tip(poses)
     assert got.refused
     assert word in got.advice
-
-
-def test_holder_becomes_an_anchor() -> None:
-    T_world_holder: PoseTuple = ((1.0, 2.0, 0.8), quat_from_rotvec((0.0, 0.0, 0.5)))
-    T_holder_controller: PoseTuple = ((0.0, 0.0, 0.05), quat_from_rotvec((0.4, 0.0, 0.0)))
-    T = holder_anchor(T_world_holder, T_holder_controller)
-    assert np.allclose(compose(inverse(T_world_holder), T)[0], T_holder_controller[0])
-    assert len(controller_covariance()) == 36
 
 
 def test_invalid_poses_are_excluded() -> None:

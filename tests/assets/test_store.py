@@ -8,13 +8,12 @@ import os
 import random
 import resource
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from iris_session.assets.errors import AssetMissingError, AssetStoreError
-from iris_session.assets.store import GRACE_S, MAX_MAPPED_FILES, AssetStore, ServedAssets, default_root
+from iris_session.assets.store import GRACE_S, MAX_MAPPED_FILES, AssetStore, ServedAssets
 from tests.front.fakes import put
 
 #: Ends with another byte than the wrong copies below.
@@ -112,18 +111,6 @@ def test_least_recently_used_assets_are_evicted(tmp_path: Path) -> None:
     assert store.evicted == 1
 
 
-def test_reading_counts_as_use(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path, max_bytes=2_000)
-    keys = [f"{k:064x}" for k in range(2)]
-    for k, key in enumerate(keys):
-        store.write_index(key, b"n" * 1_000)
-        at = time.time() - GRACE_S - 300 + 100 * k
-        os.utime(tmp_path / "index" / key[:2] / key, (at, at))
-    assert store.read_index(keys[0]) is not None
-    store.put(b"x" * 1_000)
-    assert [store.read_index(key) is not None for key in keys] == [True, False]
-
-
 def test_held_and_recent_assets_are_kept(tmp_path: Path) -> None:
     store = AssetStore(tmp_path, max_bytes=2_000)
     held, old, young = (store.put(bytes([k]) * 1_000) for k in range(3))
@@ -207,31 +194,6 @@ def test_read_only_disk_serves_what_it_has(tmp_path: Path, monkeypatch: pytest.M
     assert not list((tmp_path / "holds").glob("*"))
 
 
-def test_asset_used_by_another_process_during_eviction_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The other process marks an asset as used and then holds it; both may follow the scan."""
-    store = AssetStore(tmp_path, max_bytes=1_500)
-    taken, other = store.put(b"t" * 1_000), store.put(b"o" * 400)
-    for address in (taken, other):
-        set_age(store, address, GRACE_S + 100)
-    files = store._iterate_files
-
-    def use_afterwards() -> Iterator[tuple[os.DirEntry[str], os.stat_result]]:
-        yield from files()
-        AssetStore(tmp_path).mark_used(taken, 1_000)
-
-    monkeypatch.setattr(store, "_iterate_files", use_afterwards)
-    store.put(b"n" * 1_000)
-    assert (taken in store, other in store, store.evicted) == (True, False, 1)
-
-
-def test_default_roots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_root() == AssetStore().root == tmp_path / "iris-session" / "assets"
-    assert default_root("client-assets") == tmp_path / "iris-session" / "client-assets"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert default_root() == Path.home() / ".cache" / "iris-session" / "assets"
-
-
 def test_files_of_killed_processes_are_removed_by_the_next_scan(tmp_path: Path) -> None:
     """Recent files may belong to a running process, and a part that can be resumed is kept for a week."""
     store = AssetStore(tmp_path)
@@ -283,18 +245,6 @@ def test_two_processes_can_download_the_same_asset(tmp_path: Path) -> None:
     assert late.offset == len(b"of another process")
     late.close()
     assert cache.find(ADDRESS) == DATA
-
-
-def test_abandoned_parts_are_evicted_first(tmp_path: Path) -> None:
-    cache = AssetStore(tmp_path)
-    address = store_part(cache, bytes(10_000))
-    old = cache.open_part("0" * 64)
-    old.append(b"x")
-    old.close()
-    os.utime(tmp_path / "00" / ("0" * 64 + ".part"), (1, 1))
-    assert AssetStore(tmp_path, max_bytes=10_000).trim() == 10_000
-    assert address in cache
-    assert not (tmp_path / "00" / ("0" * 64 + ".part")).exists()
 
 
 def store_part(cache: AssetStore, data: bytes) -> str:

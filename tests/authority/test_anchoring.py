@@ -20,9 +20,9 @@ from iris_session.protocol.server_messages import (
     Notice,
     ParticipantChanged,
 )
-from iris_session.protocol.status import AlignmentReport
 
-from .table import MS, SECOND, Person, Table, proposal
+from .table import MS, SECOND, Table, proposal
+from .test_alignment import report
 
 TABLE = Pose((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
 DOOR = Pose((2.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
@@ -31,10 +31,6 @@ CONFIG = AuthorityConfig(anchors={"table": TABLE, "door": DOOR})
 
 def shifted(x: float, **fields: Any) -> Any:
     return proposal(T_world_tracking=Pose((x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), **fields)
-
-
-def report(t: Table, person: Person) -> AlignmentReport:
-    return t.authority.build_alignment_reports()[person.id]
 
 
 def compared(other: int, **fields: Any) -> CrossChecked:

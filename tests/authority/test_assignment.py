@@ -5,10 +5,11 @@ from __future__ import annotations
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.protocol.client_messages import Acquire, Bye, Release
 from iris_session.protocol.common import Pose
-from iris_session.protocol.entries import Entry, Join, Lost
+from iris_session.protocol.entries import Lost
 from iris_session.protocol.server_messages import LeaseChanged
 
 from .table import Person, Table, robot
+from .test_roster import rejoin
 
 ANY = Acquire(1)
 
@@ -51,9 +52,7 @@ def test_a_second_key_under_an_assigned_name_gets_nothing_while_the_first_is_her
         t.step(anna.says(Lost()))
     assert mallory.acquire("right").ok
     t.step(mallory.says(Release()))
-    t.people += 1
-    again = t.persons[t.people] = Person(t, t.people, "anna")
-    t.step(Entry(t.people, t.people, t.now_ns, Join("key1", "operator", "anna", resume_of=anna.id)))
+    again = rejoin(t, anna)
     assert got(again) == ["left"]
     again.does(Bye())
     assert got(mallory) == ["left"], "who waits takes over the name when the first has left for good"
@@ -62,9 +61,7 @@ def test_a_second_key_under_an_assigned_name_gets_nothing_while_the_first_is_her
 def test_a_name_taken_on_by_a_resume_is_not_ones_own() -> None:
     t = Table(AuthorityConfig(policy="config", assignments={"anna": ("left",)}))
     mallory, anna = t.join(name="mallory"), t.join(name="anna")
-    t.people += 1
-    again = t.persons[t.people] = Person(t, t.people, "anna")
-    t.step(Entry(t.people, t.people, t.now_ns, Join("key1", "operator", "anna", resume_of=mallory.id)))
+    again = rejoin(t, mallory, name="anna")
     assert again.denied(ANY) == "policy"
     assert got(anna) == ["left"]
 

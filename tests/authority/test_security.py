@@ -13,21 +13,13 @@ from iris_session.protocol.client_messages import (
     SetMode,
 )
 from iris_session.protocol.common import MAX_TEXT
-from iris_session.protocol.entries import Audit, Entry, Join, Lost
+from iris_session.protocol.entries import Audit, Lost
 from iris_session.protocol.names import AuditKind, DenialReason
 from iris_session.protocol.server_messages import Audited, LeaseChanged, ParticipantLeft, Refused
 from iris_session.protocol.steps import Dropped
 
-from .table import Person, Table
-
-
-def rejoined(t: Table, old: Person) -> Person:
-    """`old` comes on a new connection with its resume token."""
-    t.people += 1
-    person = t.persons[t.people] = Person(t, t.people, old.name)
-    key = f"key{old.connection}"
-    t.step(Entry(t.people, t.people, t.now_ns, Join(key, "operator", old.name, resume_of=old.id)))
-    return person
+from .table import Table
+from .test_roster import rejoin
 
 
 @pytest.mark.parametrize("revoke", [False, True])
@@ -48,7 +40,7 @@ def test_a_director_removes_somebody_at_once_and_without_grace(revoke: bool) -> 
     t.step(ann.says(EStop("late words")))
     t.step(ann.says(Lost("closed")))  # the front closes what is gone already
     assert t.decision.dropped == ()
-    assert rejoined(t, ann).connection in {a.connection for a in t.decision.admitted}
+    assert rejoin(t, ann).connection in {a.connection for a in t.decision.admitted}
     assert not t.decision.admitted[0].resumed, "it comes back as somebody new"
 
 
@@ -59,7 +51,8 @@ def test_who_is_away_is_removed_with_the_lease_that_was_kept() -> None:
     assert director.asks(RemoveParticipant(1, ann.id, revoke=True)).ok
     assert t.decision.dropped == (Dropped(0, "revoked", "key2"),), "the front finds its key without a connection"
     assert t.since(ParticipantLeft) == [ParticipantLeft(ann.id, "removed")]
-    assert not rejoined(t, ann).id
+    rejoin(t, ann)
+    assert not t.decision.admitted[0].resumed
 
 
 def test_only_directors_and_the_host_remove_and_only_who_is_there() -> None:

@@ -21,7 +21,7 @@ from iris_session.client import client as client_module
 from iris_session.front import context as front_context
 from iris_session.link import FrontConfig, Ports, SceneInfo
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
-from iris_session.protocol.client_messages import Control, Sample
+from iris_session.protocol.client_messages import Control
 from iris_session.protocol.codec import (
     decode_asset_request,
     encode_asset_header,
@@ -314,13 +314,6 @@ class ClientSession:
         assert isinstance(sockets, MemorySockets)
         return sockets
 
-    def kill_client(self, client: Client) -> None:
-        """End the program of a client, as SIGKILL does: no bye."""
-        connection = self.sockets_of(client).connection
-        assert connection is not None
-        client.connection.phase = client.connection.phase.CLOSED
-        self.network.close(connection, notify=False)
-
     def _make_sockets(self) -> MemorySockets:
         self._links += 1
         sockets = MemorySockets(self.network, self._links)
@@ -332,11 +325,6 @@ class ClientSession:
     def submit(self, message: Any) -> None:
         """Submit a message of the session's owner."""
         self._pending.append(Entry(HOST, HOST, self.now_ns, message))
-
-    def submit_from_front(self, message: Any) -> None:
-        """Submit an entry of the front about the first participant who sent a sample."""
-        joined = next(entry for entry in self.entries if isinstance(entry.message, Sample))
-        self._pending.append(Entry(joined.connection, joined.connection, self.now_ns, message))
 
     def change_scene(self, scene_hash: str, assets: Sequence[str] = (), cause: str = "patch") -> None:
         """Change the look of the scene, load another one (`new_scene`), or change the served assets (empty cause)."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import builtins
 import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -17,7 +15,7 @@ from anchors.camera import CameraModel
 from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_from_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
-from iris_session.client import Client, ClientError, InvalidMessageError
+from iris_session.client import Client, InvalidMessageError
 from iris_session.client.alignment import CAMERA_SIGMA, ViewpointCounter, to_tracking_covariance
 from iris_session.protocol.client_messages import Align, ClientMessage, MoveAnchor, Observation
 from iris_session.protocol.common import Pose
@@ -89,21 +87,6 @@ def test_picture_without_a_sheet_reports_nothing(ann: FakeClient, picture: Any) 
     assert ann.alignment.observe_image(np.zeros_like(picture), CAMERA, [TABLE], T_TRACKING_CAMERA) == []
     assert ann.alignment.observe_image(picture, CAMERA, [Sheet("shelf", 0.120)], T_TRACKING_CAMERA) == []
     assert ann.sent == []
-
-
-def test_missing_opencv_names_the_extra(ann: FakeClient, picture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    honest = builtins.__import__
-
-    def raise_missing(name: str, *rest: Any) -> Any:
-        if name == "cv2":
-            raise ImportError("no OpenCV here", name="cv2")
-        return honest(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", raise_missing)
-    monkeypatch.delitem(sys.modules, "cv2")
-    with pytest.raises(ClientError, match=r"cv2 .*'iris-session\[anchors\]'"):
-        ann.alignment.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA)
-    assert cv2 is not None
 
 
 def test_ambiguous_detections_are_left_out(ann: FakeClient, picture: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -161,21 +161,13 @@ def test_failed_assets_have_a_reason_and_the_rest_arrives(shared: Shared) -> Non
         client.assets.fetch([good])
 
 
-def test_unusable_cache_is_a_failure_and_another_may_replace_it(shared: Shared, tmp_path: Path) -> None:
+def test_unusable_cache_is_a_failure(shared: Shared, tmp_path: Path) -> None:
     client = shared.join()
     (tmp_path / "file").write_bytes(b"")
     client.assets.cache = AssetStore(tmp_path / "file")
     fetch = client.assets.fetch(shared.addresses[:2])
     finish(client, fetch)
     assert {error.reason for error in fetch.failed.values()} == {"cache"}
-    client.assets.cache = AssetStore(tmp_path / "folder")
-    fetch = client.assets.fetch(shared.addresses[:2])
-    client.assets.cache = AssetStore(tmp_path / "another")
-    with pytest.raises(AssetError) as raised:
-        client.assets.fetch(shared.addresses[:1])
-    assert raised.value.reason == "cache", "assets are on their way into the one before"
-    finish(client, fetch)
-    fetch.check()
 
 
 def test_cancelled_fetch_stops_and_resumes_later(shared: Shared) -> None:
@@ -197,26 +189,6 @@ def test_cancelled_fetch_stops_and_resumes_later(shared: Shared) -> None:
     client.assets.cancel(again)
     assert again.failed == {}
     assert client.assets.malformed == 0
-
-
-def test_each_fetch_gets_the_result_of_its_own_decode_function(shared: Shared) -> None:
-    client = shared.join()
-    address = shared.addresses[0]
-
-    def fail(_address: str, _data: memoryview) -> None:
-        raise ZeroDivisionError
-
-    late: list[AssetFetch] = []
-
-    def measure(_address: str, data: memoryview) -> int:
-        late.append(client.assets.fetch([address], decode=lambda *_: "late"))  # when the others are being decoded
-        return len(data)
-
-    fetches = [client.assets.fetch([address], decode=d) for d in (measure, lambda *_: "b", fail, None)]
-    finish(client, *fetches)
-    finish(client, *late)
-    assert [fetch.decoded.get(address) for fetch in (*fetches, *late)] == [1000, "b", None, None, "late"]
-    assert [[error.reason for error in fetch.failed.values()] for fetch in fetches] == [[], [], ["decode"], []]
 
 
 # --- hostile session -------------------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import mujoco
 import pytest
 
@@ -108,39 +107,6 @@ def test_refused_scene_is_retried_and_permanent_refusal_raises(
         fetch_scene(client)
     assert (raised.value.address, raised.value.reason) == ("0" * 64, AssetRefusal.UNKNOWN)
     assert session.simulation.now_ns - began_ns >= fetched_scene.REFUSED_S * 0.5e9
-
-
-@pytest.mark.parametrize("cause", ["patch", "new_scene"])
-def test_endlessly_patched_scene_arrives_and_endlessly_replaced_one_does_not(
-    store: AssetStore,
-    join: Callable[..., Client],
-    session: ClientSession,
-    monkeypatch: pytest.MonkeyPatch,
-    cause: str,
-) -> None:
-    parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
-    client = join(parsed.scene_hash, *parsed.addresses)
-    variants = [store.put(encode_scene(msgspec.structs.replace(parsed.spec, name=str(n)))) for n in range(20)]
-    shown = [parsed.scene_hash]
-    wait = fetched_scene._wait
-
-    def replace_meanwhile(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
-        result = wait(client, fetch, until)
-        if fetch.addresses == (shown[-1],) and len(shown) < len(variants):
-            shown.append(variants[len(shown)])
-            session.change_scene(shown[-1], (shown[-1], *parsed.addresses), cause)
-            assert client.wait_for(lambda c: c.mirror.synced and c.mirror.scene_hash == shown[-1])
-        return result
-
-    monkeypatch.setattr(fetched_scene, "_wait", replace_meanwhile)
-    monkeypatch.setattr(fetched_scene, "CATCH_UP_S", 0.0)
-    scene = fetch_scene(client)
-    assert scene.meshes.keys() == {0}
-    if cause == "patch":
-        assert len(shown) == 3, "what is here is returned"
-        assert scene.scene_hash == shown[1]
-    else:
-        assert scene.scene_hash == shown[-1] == variants[-1], "of another scene nothing is of use"
 
 
 def test_late_assets_are_not_fetched_after_the_timeout(session: ClientSession, join: Callable[..., Client]) -> None:

@@ -7,8 +7,6 @@ from collections.abc import Callable
 import pytest
 
 from iris_session.client import Client, DeniedError, RequestTimeoutError
-from iris_session.client import client as client_module
-from iris_session.client.requests import CONSENT_TIMEOUT_S
 from iris_session.protocol.client_messages import Acquire, Observation, Withdraw
 from iris_session.protocol.names import DenialReason, Device, EpisodeAction, LeaseMode
 from iris_session.protocol.server_messages import (
@@ -108,26 +106,6 @@ def test_who_gives_up_waiting_is_never_granted_the_robot(join: Join) -> None:
     carl.release()
     assert bob.wait_for(lambda c: not c.mirror.leases["left"].holder)
     assert bob.lease_version("left") is None
-
-
-def test_acquire_waits_as_long_as_a_holder_may_take_to_consent(
-    join: Join, session: ClientSession, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(client_module, "DEFAULT_TIMEOUT_S", 0.3)
-    boss, ann, bob = join("boss", role="director"), join(), join("bob")
-    boss.set_mode("left", LeaseMode.REQUEST)
-    ann.acquire(["left"])
-    assert bob.wait_for(lambda c: c.mirror.leases["left"].mode == LeaseMode.REQUEST and c.mirror.leases["left"].holder)
-    assert bob.mirror.consent_timeout_ns == session.authority._ctx.config.consent_timeout_ns
-    bob.mirror.consent_timeout_ns = 1_000_000_000
-    began_ns = session.now_ns
-    with pytest.raises(RequestTimeoutError):
-        bob.acquire(["left"])
-    assert 1.3e9 <= session.now_ns - began_ns < CONSENT_TIMEOUT_S * 1e9, (
-        "not as long as another session may let one take"
-    )
-    with pytest.raises(RequestTimeoutError):
-        bob.acquire(["right", "left"], timeout_s=0.1)
 
 
 def test_hand_grasps_an_object(session: ClientSession, join: Join) -> None:

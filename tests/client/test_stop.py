@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from iris_session.client.core.status import ConnectionPhase
-from iris_session.client.errors import NotConnectedError
 from iris_session.protocol.client_messages import Acquire, ClearEStop, ClockPing, EStop, Hello, Release
 from iris_session.protocol.server_messages import ClockPong, EStopChanged, Event
 from tests.client.core.test_connection import MS, SAMPLE, SECOND, Wire
@@ -74,16 +73,6 @@ def test_stop_is_acknowledged_by_the_answer_to_a_later_ping(wire: Wire) -> None:
     (ping,) = (message for message in wire.sent() if isinstance(message, ClockPing))
     wire.receive(ClockPong(ping.t0_ns, SECOND, SECOND), SECOND + MS)
     assert wire.connection.pending_estop.message is None
-
-
-def test_unopened_or_closed_client_raises() -> None:
-    wire = Wire()
-    with pytest.raises(NotConnectedError):
-        wire.connection.send(STOP)
-    wire.join()
-    wire.connection.close()
-    with pytest.raises(NotConnectedError):
-        wire.connection.send(STOP)
 
 
 def test_release_overtakes_samples_but_not_the_acquire_before_it(wire: Wire) -> None:

@@ -178,7 +178,6 @@ class Rig:
     vertices: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # of deformables that operators watch
     shift: bool = True  # start the objects up to 30 mm and 20 deg from their places
     noise: tuple[float, float] = NOISE
-    watch: Callable[[Rig, str], None] | None = None  # called at every phase change of an operator
     views: dict[str, LateView] = field(default_factory=dict)
     fastest_hand: float = 0.0  # m/s
     model: Any = None
@@ -202,7 +201,6 @@ class Rig:
         self._engagements = dict.fromkeys(self.behaviours, 0)
         self._next_sample_s = {robot: self.rng.uniform(0, SAMPLE_S) for robot in self.behaviours}
         self._next_state_s = 0.0
-        self._must_open: set[str] = set()
         self._seq = 0
 
     @property
@@ -250,11 +248,6 @@ class Rig:
             elif not referee.resting:
                 yield f"{giver.object} does not rest on the table alone"
 
-    def end_engagement(self, robot: str) -> None:
-        """Emulate the session after a gap in the samples: the robot holds until the clutch was opened once."""
-        self._commands[robot] = Command(robot, CommandKind.HOLD, HoldReason.STALE)
-        self._must_open.add(robot)
-
     def moved_by_hand(self) -> None:
         """Update poses and contacts after a write to `qpos`."""
         self.world.restore_state(self.world.save_state())
@@ -282,7 +275,7 @@ class Rig:
         view, behaviour = self.views[robot], self.behaviours[robot]
         if view.stalled(self.now_s):
             return
-        before, phase = view.session_time_ns, behaviour.phase
+        before = view.session_time_ns
         view.receive_frame(self.now_s)
         for hand in behaviour.update(view):
             if hand.clutch and view.session_time_ns > before:
@@ -293,18 +286,13 @@ class Rig:
                 hand.device, hand.robot, add_noise(hand.pose_world, self.rng, self.noise), hand.clutch, hand.gripper
             )
             self._on_the_way.append((self.now_s + self.rng.uniform(0.008, 0.025), noisy))
-        if self.watch is not None and behaviour.phase != phase:
-            self.watch(self, robot)
 
     def _receive(self) -> None:
         while self._on_the_way and self._on_the_way[0][0] <= self.now_s:
             hand = self._on_the_way.popleft()[1]
             engaged = self._commands[hand.robot].kind == CommandKind.POSE
             if not hand.clutch:
-                self._must_open.discard(hand.robot)
                 self._commands[hand.robot] = Command(hand.robot, CommandKind.HOLD, HoldReason.CLUTCH_OPEN)
-                continue
-            if hand.robot in self._must_open:
                 continue
             self._engagements[hand.robot] += not engaged
             self._seq += 1

@@ -1,4 +1,4 @@
-"""Whole handovers with real physics and control, and recovery of operators from disturbances."""
+"""Recovery of operators from disturbances, with real physics and control."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 
 import pytest
 
-from anchors.pose import distance
 from iris_session.emulator.behaviours import Giver, Idle, Receiver, Wander, make_behaviour
 from tests.emulator.handover_rig import DEVICE, Rig, handover
 
@@ -15,45 +14,6 @@ pytestmark = pytest.mark.usefixtures("untraced")
 
 def _in_phase(robot: str, phase: str):  # type: ignore[no-untyped-def]
     return lambda rig: rig.behaviours[robot].phase == phase
-
-
-@pytest.mark.long  # without: `tests/rig/test_demos.py`
-def test_board_is_handed_over_in_mid_air() -> None:
-    """Friction alone holds the object; between the two grips it touches nothing else; it ends on the table."""
-    rig = handover(3, "board", "right", "left")
-    rig.run(25.0)
-    assert rig.verdict() == ""
-    assert rig.now_s < 25.0
-    assert rig.fastest_hand < 0.5
-    assert rig.world.view().object_pose("board").p[0] < -0.1, "on the receiver's side of the table"
-
-
-@pytest.mark.long
-def test_handover_finishes_after_an_emergency_stop() -> None:
-    """While stopped the clutch is open; afterwards the operators engage again and finish."""
-    rig = handover(4)
-    rig.run(30.0, until=_in_phase("left", "present"))
-    rig.run(0.4, until=lambda r: False)
-    for view in rig.views.values():
-        view.estop = True
-    rig.run(0.3, until=lambda r: False)
-    tip = rig.world.view().tip_pose("left").p
-    rig.run(1.0, until=lambda r: False)
-    assert distance(tip, rig.world.view().tip_pose("left").p) < 2e-3
-    for view in rig.views.values():
-        view.estop = False
-    rig.run(30.0)
-    assert rig.verdict() == ""
-
-
-@pytest.mark.long
-def test_receiver_clutches_again_after_a_lost_engagement() -> None:
-    rig = handover(7)
-    rig.run(30.0, until=_in_phase("right", "put"))
-    rig.run(0.1, until=lambda r: False)
-    rig.end_engagement("right")
-    rig.run(40.0)
-    assert rig.verdict() == ""
 
 
 @pytest.mark.long

@@ -1,10 +1,9 @@
-"""Parts of the operators: reaches, the clutched hand, perception, and their knowledge of objects."""
+"""Parts of the operators: reaches, the clutched hand, and perception."""
 
 from __future__ import annotations
 
 import math
 
-import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,30 +13,15 @@ from anchors.pose import (
     IDENTITY_POSE,
     IDENTITY_QUAT,
     PoseTuple,
-    compose,
     distance,
-    inverse,
     quat_angle,
     quat_conj,
     quat_from_rotvec,
     quat_from_yaw,
     quat_mul,
 )
-from iris_session.demo.scenes import n_arms_scene, scene_path
-from iris_session.emulator.behaviours.hand import (
-    LONGEST_STEP_S,
-    REARM_S,
-    ClutchedHand,
-    HandMovement,
-)
-from iris_session.emulator.behaviours.objects import (
-    HandoverObject,
-    compute_grasps,
-    compute_tilt,
-    find_object,
-    get_face_up,
-    make_level_pose,
-)
+from iris_session.emulator.behaviours.hand import LONGEST_STEP_S, REARM_S, ClutchedHand, HandMovement
+from iris_session.emulator.behaviours.objects import find_object
 from iris_session.emulator.behaviours.perception import Perception, TrackedPose
 
 STEP_NS = 13_888_889  # 72 Hz
@@ -226,65 +210,3 @@ def test_holder_of_an_object_is_perceived(x: float, y: float, half_gap: float, h
     assert eyes.is_complete
     assert eyes.compute_gap("left") == pytest.approx(2 * half_gap)
     assert eyes.is_holding("left", "hammer", find_object("hammer").half_width) is holds
-
-
-def test_perception_names_missing_bodies() -> None:
-    eyes = Perception(("hammer",), ("left",), perhaps=("board",))
-    poses = _gripper_at(0.0, 0.0, 0.04)
-    base = poses.pop("left/base")
-    eyes.observe(FixedView(poses))
-    assert eyes.missing == ("left/base",)
-    assert eyes.list_obstacles() == []
-    eyes.observe(FixedView(poses | {"left/base": base, "board": ((1.0, 2.0, 3.0), IDENTITY_QUAT)}))
-    assert eyes.is_complete
-    assert eyes.list_obstacles() == [(1.0, 2.0, 3.0)]
-
-
-def _outline(model: mujoco.MjModel, body: str) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner of all geoms of `body`, body frame [m]."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for g in range(model.ngeom):
-        if int(model.geom_bodyid[g]) == model.body(body).id:
-            turn = np.empty(9)
-            mujoco.mju_quat2Mat(turn, model.geom_quat[g])
-            centre, half = model.geom_aabb[g][:3], model.geom_aabb[g][3:]
-            middle = model.geom_pos[g] + turn.reshape(3, 3) @ centre
-            extent = np.abs(turn.reshape(3, 3)) @ half
-            low, high = np.minimum(low, middle - extent), np.maximum(high, middle + extent)
-    return low, high
-
-
-@pytest.mark.parametrize("body", ["hammer", "board", "object1", "object2"])
-def test_object_descriptions_match_the_scenes(body: str) -> None:
-    """The operators' outlines and grasp places fit the geoms of the scenes."""
-    if body.startswith("object"):
-        model = n_arms_scene(4).compile()
-    else:
-        model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
-    thing: HandoverObject = find_object(body)
-    low, high = _outline(model, body)
-    corners = np.array(thing.corners)
-    np.testing.assert_allclose(corners.max(axis=0)[[0, 2]], high[[0, 2]], atol=1.5e-3)
-    np.testing.assert_allclose(corners.min(axis=0)[[0, 2]], low[[0, 2]], atol=1.5e-3)
-    assert thing.half_thickness == pytest.approx(high[2], abs=1e-3)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    T_world_thing = (tuple(data.body(body).xpos.tolist()), tuple(data.body(body).xquat.tolist()))
-    assert abs(thing.compute_lowest(T_world_thing)) < 2e-3  # it lies on the table
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.floats(-3.1, 3.1), st.booleans(), st.floats(-3.1, 3.1))
-def test_grasps_come_from_above_with_either_face_up(yaw: float, flipped: bool, gripper_yaw: float) -> None:
-    thing = make_level_pose((0.1, 0.2, 0.016), yaw, -1.0 if flipped else 1.0)
-    assert get_face_up(thing) == (-1.0 if flipped else 1.0)
-    assert compute_tilt(thing) < 1e-6
-    like = quat_mul(quat_from_yaw(gripper_yaw), (0.0, 1.0, 0.0, 0.0))
-    pose = min(compute_grasps(thing, 0.08), key=lambda way: quat_angle(way[1], like))
-    approach = compose((((0.0, 0.0, 0.0)), pose[1]), ((0.0, 0.0, 1.0), IDENTITY_QUAT))[0]
-    closing = compose((((0.0, 0.0, 0.0)), compose(inverse(thing), pose)[1]), ((0.0, 1.0, 0.0), IDENTITY_QUAT))[0]
-    assert approach[2] == pytest.approx(-1.0)
-    assert abs(closing[1]) == pytest.approx(1.0)  # across the handle
-    assert quat_angle(pose[1], like) <= math.pi / 2 + 1e-9
-    assert pose[0][2] == pytest.approx(0.019)

@@ -1,4 +1,4 @@
-"""Casts of the demos with real physics and control, delayed and noisy; and people with two hands."""
+"""A cast of the demos with real physics and control; people with two hands; deformables that are not there."""
 
 from __future__ import annotations
 
@@ -7,18 +7,10 @@ import random
 import pytest
 
 from iris_session.demo.demos import make_demo
-from iris_session.emulator.behaviours import CombinedBehaviour, HandInput, OperatorView
-from tests.emulator.handover_rig import LateView, Rig, demo
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("untraced")
-def test_every_object_is_handed_over() -> None:
-    """By friction, in mid-air, onto a table. Two panda, and ALOHA: `tests/e2e/test_demo_scenes.py`."""
-    rig = demo(make_demo("panda", 4), seed=0)
-    rig.run(60.0, until=Rig.over)
-    assert rig.verdict() == ""
-    assert rig.fastest_hand < 0.5
+from iris_session.emulator.behaviours import CombinedBehaviour, Folder, HandInput, OperatorView, Stower, make_behaviour
+from iris_session.emulator.behaviours.phases import SEARCH_S
+from tests.emulator.deformable_rig import SoftRig, soft_demo
+from tests.emulator.handover_rig import LateView
 
 
 class ScriptedHand:
@@ -54,3 +46,30 @@ def test_failure_of_one_hand_is_a_failure_of_the_person() -> None:
     hands.update(view())
     assert hands.failed == "dropped it"
     assert not hands.done
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("untraced")
+def test_two_people_fold_a_cloth() -> None:
+    rig = soft_demo(make_demo("cloth"), seed=1)
+    rig.run(30.0, until=SoftRig.over)
+    assert rig.verdict() == ""
+    assert rig.world.dropped_counts == {}
+
+
+@pytest.mark.parametrize("name", ["folder", "stower"])
+def test_deformable_that_is_not_visible_is_named(name: str) -> None:
+    thing = {"folder": "cloth", "stower": "rose"}[name]
+    behaviour = make_behaviour(name, "left", thing)
+    seen = view()
+    for k in range(int(SEARCH_S * 72) + 10):
+        seen.receive_frame(k / 72.0)
+        behaviour.update(seen)
+    assert behaviour.done
+    assert thing in behaviour.failed
+
+
+@pytest.mark.parametrize("behaviour", [Folder, Stower])
+def test_unknown_deformable_is_rejected(behaviour: type) -> None:
+    with pytest.raises(ValueError, match=r"'jelly'.*: cloth, rose, mint"):
+        behaviour("left", "jelly", *(["right"] if behaviour is Folder else []))

@@ -15,15 +15,13 @@ import pytest
 from iris_session import SceneBuilder, ScenePublisher, SessionConfig
 from iris_session.client import Client
 from iris_session.emulator import runner
-from iris_session.emulator.__main__ import _LinePrinter, main
+from iris_session.emulator.__main__ import main
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR
-from iris_session.emulator.operator import EmulatedOperator
 from iris_session.emulator.runner import run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import AlignmentAlarm, Entry, decode_entries
 from iris_session.protocol.names import Device
-from iris_session.protocol.server_messages import Event, Notice
 from tests.rig.owned import simulate_sessions
 from tests.rig.session import ADDRESS, Rig
 from tests.rig.simulation import Simulation
@@ -147,29 +145,6 @@ def test_lost_session_is_shown_and_fails(session: Rig) -> None:
     assert max(one[2] for one in reports) > 2.0
     assert report.phase == "failed"
     assert ADDRESS in report.failed
-
-
-def test_notice_for_another_participant_is_not_the_own_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Client, "participant_id", "p-1")
-    operator = EmulatedOperator("127.0.0.1:1", HeadsetSpec(name="ann", behaviour="wander"), 0)
-    for number, participant in enumerate(("p-2", "", "p-1", "p-2")):
-        operator.client.on_event(Event(number, 0, 0, Notice("warning", f"for {participant}", participant)))  # type: ignore[misc]
-        assert operator._refused_because == ("for p-1" if number >= 2 else "")
-    operator.client.close()
-
-
-def test_lines_name_the_session_once(capsys: pytest.CaptureFixture[str]) -> None:
-    show = _LinePrinter()
-    report = HeadsetReport(name="ann")
-    show(report)
-    report.session, report.address, report.phases = "lab\x1b1", "10.0.0.5:7721", {"watch": 1.0}
-    show(report)
-    report.lost_s = 3.0
-    show(report, final=True)
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.count("10.0.0.5:7721") for line in lines] == [0, 1, 0, 0]
-    assert [line.count("session lost") for line in lines] == [0, 0, 0, 1]
-    assert all(line.isprintable() for line in lines)
 
 
 def test_person_without_a_robot_reports_the_reason(session: Rig) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 import pytest
 import trimesh
 
@@ -75,43 +74,3 @@ def test_dark_lights_are_left_out_and_orthographic_height_is_kept(tmp_path: Path
     assert lamp["intensity"] == 1.0, "where the scene does not say"
     (camera,) = found["cameras"]
     assert (camera["orthographic"]["ymag"], camera["orthographic"]["xmag"]) == (4.5, 9.0), "half of 9 m, twice as wide"
-
-
-WATCHERS = """<mujoco><worldbody>
-    <body name="seen" pos="1 2 3"><freejoint/><geom size=".1"/></body>
-    <body pos="0 0 1" euler="20 30 40"><joint/><geom size=".1"/>
-      <camera name="eye" mode="targetbody" target="seen" pos="1 0 0"/>
-      <camera name="rigid" pos="0 0 1" euler="0 50 0"/>
-      <camera name="lens" pos="0 0 1" resolution="240 180" sensorsize=".004 .003" focalpixel="200 310"/>
-      <light name="lamp" mode="targetbodycom" target="seen" pos="0 1 0"/>
-      <light name="fixed" dir="1 2 3"/></body>
-  </worldbody></mujoco>"""
-
-
-def test_cameras_and_lights_have_their_initial_orientation(tmp_path: Path, store: AssetStore) -> None:
-    """Also those that track a body."""
-    model = mujoco.MjModel.from_xml_string(WATCHERS)
-    data = mujoco.MjData(model)
-    data.qpos[:3], data.qpos[7] = (-2, 1, 0.5), 0.7
-    mujoco.mj_forward(model, data)
-    found = exported(parse_mujoco(model, store, data=data).spec, store, tmp_path)
-    T_world = {0: np.diag([1.0, 1, 1, 1])}
-    waiting = [0]
-    while waiting:
-        at = waiting.pop()
-        for child in found["nodes"][at].get("children", []):
-            node = found["nodes"][child]
-            x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-            T = trimesh.transformations.quaternion_matrix([w, x, y, z])
-            T[:3, 3] = node.get("translation", (0, 0, 0))
-            T_world[child] = T_world[at] @ T
-            waiting.append(child)
-    named = {node.get("name"): T_world[k] for k, node in enumerate(found["nodes"]) if k in T_world}
-    for k, name in enumerate(("eye", "rigid")):
-        np.testing.assert_allclose(named[name][:3, :3], data.cam_xmat[k].reshape(3, 3), atol=1e-6)
-        np.testing.assert_allclose(named[name][:3, 3], data.cam_xpos[k], atol=1e-6)
-    for k, name in enumerate(("lamp", "fixed")):
-        np.testing.assert_allclose(-named[name][:3, 2], data.light_xdir[k], atol=1e-6)
-    lens = found["cameras"][2]["perspective"]
-    assert lens["aspectRatio"] == pytest.approx(240 / 180 * 310 / 200)
-    assert 180 / 2 / np.tan(lens["yfov"] / 2) == pytest.approx(310)

@@ -134,21 +134,6 @@ def test_sites_and_tendons_are_optional(tmp_path: Path) -> None:
     assert (tendons.tendons[0].width, len(tendons.tendons[0].sites)) == (0.02, 2)
 
 
-def test_texture_in_its_own_encoding_is_passed_on(tmp_path: Path) -> None:
-    """Not as a picture of its bytes."""
-    store, data = AssetStore(tmp_path), b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(500)
-    xml = """<mujoco><asset><texture name="t" type="2d" file="a.ktx"/><material name="m" texture="t"/></asset>
-    <worldbody><geom size=".1" material="m"/></worldbody></mujoco>"""
-    try:
-        model = mujoco.MjModel.from_xml_string(xml, {"a.ktx": data})
-    except ValueError as error:  # MuJoCo 3.3
-        pytest.skip(str(error))
-    parsed = parse_mujoco(model, store)
-    (level,) = parsed.spec.textures[0].levels
-    assert (level.encoding, store.get(level.address)) == ("opaque", data)
-    assert "KTX" in parsed.skipped[0]
-
-
 WATCHED_CLOTH = """<mujoco><worldbody>
     <body name="hand" mocap="true"><geom size=".1"/><body name="ring" pos="0 0 .2"><geom size=".05"/></body></body>
     <body name="table"><geom size=".1"/></body>

@@ -100,20 +100,6 @@ def test_new_epoch_is_delivered_once_the_session_has_announced_it(server: Server
     assert np.abs(state.poses - server.poses).max() < 1e-4
 
 
-def test_first_frame_after_a_stall_is_fresh(server: Server) -> None:
-    stream = StateStream()
-    server.frame(0)
-    server.join(stream)
-    assert drain(stream, [server.frame(MS)], MS) is not None
-    waiting = [server.frame(17 * MS * i) for i in range(1, 4)]
-    now = 3000 * MS
-    assert drain(stream, waiting, now) is None
-    assert stream.counters.queued_old == 1
-    state = drain(stream, [server.frame(now + 10 * MS)], now + 11 * MS)
-    assert state is not None
-    assert state.age_ns == 2 * MS
-
-
 def test_slow_link_delivers_the_newest_available_frame(server: Server) -> None:
     stream = StateStream()
     server.frame(0)

@@ -71,14 +71,6 @@ def test_valid_meshes_are_read(tmp_path: Path, name: str, content: str | bytes, 
     assert node.surfaces[0].mesh.triangles == triangles
 
 
-def test_comments_in_off_files_are_ignored(tmp_path: Path) -> None:
-    """At any position: trimesh made a vertex at (3, 1, 0) of these counts."""
-    text = OFF.format(1).replace("1 0\n", "1 0 # corners, faces, edges\n", 1) + "3 0 1 2 # OFF\n"
-    (node,) = load_file(written(tmp_path, "a.off", text)).nodes
-    mesh = node.surfaces[0].mesh
-    assert mesh.position[mesh.index].tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
-
-
 # --- DAE files that would fill memory or expose other files -----------------------------------------------------------
 
 

@@ -194,18 +194,6 @@ def test_scaled_robot(tmp_path: Path) -> None:
             composed(urdf, tmp_path, scale=wrong)
 
 
-def test_xacro_must_be_expanded(tmp_path: Path) -> None:
-    path = tmp_path / "arm.urdf.xacro"
-    path.write_text("<robot/>")
-    with pytest.raises(SceneBuildError, match=r"xacro arm\.urdf\.xacro > arm\.urdf"):
-        SceneBuilder().add_urdf(path)
-    with pytest.raises(SceneBuildError, match="is a folder"):
-        SceneBuilder().add_urdf(tmp_path)
-    (tmp_path / "part.glb").write_bytes(b"glTF")
-    with pytest.raises(SceneBuildError, match=r"part\.glb .* add_file"):
-        SceneBuilder().add_urdf(tmp_path / "part.glb")
-
-
 def test_invalid_arguments_are_rejected(tmp_path: Path) -> None:
     arm = composed(write_arm(tmp_path), tmp_path).articulations["arm"]
     with pytest.raises(SceneBuildError, match="follows 'finger_left'"):
@@ -216,25 +204,3 @@ def test_invalid_arguments_are_rejected(tmp_path: Path) -> None:
         arm.compute_poses({"lift": float("nan")})
     with pytest.raises(SceneBuildError, match="number"):
         arm.compute_poses({"lift": "high"})  # type: ignore[dict-item]
-
-
-def test_missing_package_file_lists_the_existing_ones(tmp_path: Path) -> None:
-    """A typo; a reference that only xacro can expand."""
-    package = tmp_path / "mybot"
-    for folder in ("meshes", "urdf"):
-        (package / folder).mkdir(parents=True)
-    (package / "package.xml").write_text("<package><name>mybot</name></package>")
-    (package / "meshes" / "base.stl").write_bytes(b"x")
-    for reference, reason in (
-        (
-            "package://mybot/meshes/bsae.stl",
-            "package mybot is there, and has no file .*bsae.stl; in .*meshes: base.stl$",
-        ),
-        ("../meshes/bsae.stl", "there is no file .*bsae.stl; in .*meshes: base.stl$"),
-        ("$(find mybot)/meshes/base.stl", "xacro must be expanded first"),
-        ("package://mybt/meshes/base.stl", "name the package's folder in package_dirs: looked in "),
-    ):
-        text = f'<robot name="r"><link name="a"><visual><geometry><mesh filename="{reference}"/></geometry></visual>'
-        (package / "urdf" / "r.urdf").write_text(f"{text}</link></robot>")
-        with pytest.raises(SceneBuildError, match=reason):
-            SceneBuilder().add_urdf(package / "urdf" / "r.urdf")
