@@ -11,6 +11,7 @@ from iris_session.cli import serve
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.scene import find_scene_file
 from iris_session.protocol.errors import IrisError
+from iris_session.session.config import SessionConfig
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 ARM = '<robot name="arm"><link name="base"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
@@ -157,3 +158,15 @@ def test_invalid_file_is_a_one_line_error_that_names_the_example(
     assert error.count("\n") == 1
     assert error.startswith("iris-session: ")
     assert "`iris-session anchors example`" in error
+
+
+def test_resumed_session_gets_new_anchors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Effect in the session: tests/session/test_resume.py."""
+    path = tmp_path / "anchors.toml"
+    path.write_text(DOOR)
+    opened: list[SessionConfig] = []
+    monkeypatch.setattr("iris_session.session.session.Session", lambda model, config: opened.append(config))
+    for given in (["--anchors", str(path)], []):
+        serve.resume_session(build_parser().parse_args(["serve", "--resume", str(tmp_path), *given]))
+    assert [set(config.anchors) for config in opened] == [{"door"}, {"table"}]
+    assert opened[0].resume == tmp_path

@@ -66,6 +66,11 @@ def narrate(narration: EventNarration, *bodies: EventKind) -> list[LogLine]:
     return [narration.add(Event(i, i, i, body)).line for i, body in enumerate(bodies)]
 
 
+def test_lost_rows_are_an_error_and_rejected_samples_are_for_debugging() -> None:
+    lines = narrate(ann_and_bob(), Gap("recording", 7, 12), SamplesRejected("p1", "controller/left", "stale", 3))
+    assert [line.level for line in lines] == ["ERROR", "DEBUG"]
+
+
 def test_checks_of_two_headsets_are_told_when_they_change() -> None:
     narration = ann_and_bob()
 

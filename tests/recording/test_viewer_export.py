@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from iris_session.recording.viewer_export import open_view_file
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.file import scan_file
 from iris_session.rrd.index import add_index
+from iris_session.system.files import Replacement
 from tests.recording.support import column, has_index, journal, read, write
 
 STEPS = 60
@@ -102,6 +104,24 @@ def test_copy_is_no_recording(path: Path) -> None:
         Recording.open(view.path)
     with pytest.raises(NotARecordingError, match="is no recording"), open_view_file(view.path):
         pass
+
+
+def test_folder_that_cannot_be_written_gets_no_copy(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests may run as root, who can write everywhere."""
+
+    class Refusing(Replacement):
+        def __init__(self, target: Path, **options: object) -> None:
+            if target.parent == path.parent:
+                raise PermissionError(errno.EACCES, "Permission denied")
+            super().__init__(target, permissions=None)
+
+    monkeypatch.setattr(viewer_export, "Replacement", Refusing)
+    with open_view_file(path) as view:
+        assert (view.made, view.kept) == (True, False)
+        assert "Permission denied" in view.notes[0]
+        assert has_index(view.path)
+    assert not view.path.parent.exists()
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_small_file_with_an_index_needs_no_copy(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
