@@ -15,9 +15,7 @@ from PIL import Image
 
 from iris_session import Client, StreamCamera, StreamInfo, encode_cloud
 from tests.e2e.browser import Page
-from tests.e2e.emulated_quest import HEADSET, INSTALL, IWER, aim_at
 from tests.e2e.session_process import SessionProcess, wait_until
-from tools.codegen.conversions import from_three, to_three
 
 pytestmark = [pytest.mark.e2e, pytest.mark.long]
 
@@ -181,80 +179,6 @@ def test_a_camera_is_seen_in_the_page_and_said_to_be_faulty_and_stale(
         wait_until(lambda: count_subscribers() == 0, "a closed panel is not subscribed to")
         camera.stop()
         page.wait("irisSession.state.budget.streams.length === 0 && irisSession.view.clouds.drawn.size === 0")
-        assert page.errors == []
-
-
-def test_a_camera_is_a_panel_in_the_headset_while_it_is_chosen(
-    serve: Callable[..., SessionProcess], open_page: Callable[..., Page], tmp_path: Path
-) -> None:
-    """In VR: chosen in the menu, seen, hostile pictures refused, closed. In AR: only when chosen there; stale."""
-    server = serve("handover")
-    pictures = f"{HEADSET}.pictures"
-    panel = f"{pictures}.panels.get('front')"
-    with run_camera(server) as camera, Client(server.address, role="observer", name="host") as host:
-        page = open_page(server, "quest", width=480, height=320, before=[IWER.read_text(), INSTALL])
-        page.wait("irisSession.state.budget?.streams.length === 2")
-
-        def enter(button: str) -> None:
-            # The emulator has laid its canvas over the button.
-            buttons = "[...document.querySelectorAll('.headset button')]"
-            page.evaluate(f"{buttons}.find((one) => one.innerText === '{button}').click()")
-            page.wait(f"irisSession.state.isReady && {pictures}?.stand && {HEADSET}.reading.inputs.length === 2")
-
-        def press(item: str, result: str) -> None:
-            """Point at an item of the menu, and press the trigger until an expression is true."""
-            row = f"{pictures}.rows[{pictures}.items.indexOf('{item}')]"
-            page.wait(f"{row}.sprite.visible")
-            x, y, z, *_ = from_three([*page.evaluate(f"{row}.sprite.position.toArray()"), 0.0, 0.0, 0.0, 1.0])
-            eyes = page.evaluate(f"{pictures}.stand.eyes")
-            p, q = aim_at((x + 0.1 * (y - eyes[1]), y - 0.1 * (x - eyes[0]), z), 0.5)  # to the right of its left end
-            page.evaluate(f"place(quest.controllers.right, {list(to_three((*p, *q)))})")
-
-            def is_done() -> bool:
-                let_go = f"{HEADSET}.reading.inputs.every((one) => one.trigger === 0)"
-                page.wait(f"{HEADSET}.aimed.right === '{item}' && {let_go}")
-                page.evaluate("tap()")
-                return bool(page.evaluate(result))  # not if the frame before was too long ago for a press
-
-            wait_until(is_done, f"a press at {item}: {result}")
-
-        def count_subscribers() -> int:
-            return next(one.subscribers for one in host.status().media if one.stream == "front")
-
-        def sees_picture() -> bool:
-            return measure_share(page, GREEN, tmp_path / "picture.png") > 0.01
-
-        enter("Enter VR")
-        assert count_subscribers() == 0
-        press("menu", f"{pictures}.items.length === 2")
-        press("picture front", f"{panel} !== undefined")
-        wait_until(sees_picture, "the picture is seen")
-        wait_until(lambda: count_subscribers() == 1, "the page subscribed")
-        page.wait(f"/Front camera.* old/.test({panel}.label.shown)")
-        aspect = page.evaluate(f"{panel}.plane.scale.x / {panel}.plane.scale.y")
-        assert aspect == pytest.approx(320 / 240)
-
-        publish_bad(camera, page)
-        wait_until(sees_picture, "the picture is still seen")
-        press("picture front", f"{panel} === undefined")
-        wait_until(lambda: not sees_picture(), "the picture is gone")
-        wait_until(lambda: count_subscribers() == 0, "a closed panel is not subscribed to")
-
-        press("picture front", f"{panel} !== undefined")
-        page.evaluate(f"{HEADSET}.session.end().then(() => null)")
-        page.wait("document.querySelector('.picture[data-stream=front]') !== null")
-        wait_until(lambda: count_subscribers() == 1, "the panel is open on the screen")
-        enter("Enter AR")
-        press("menu", f"{pictures}.items.length === 2")
-        assert page.evaluate(f"{panel} === undefined")  # it is for remote people
-        wait_until(lambda: count_subscribers() == 0, "nothing is subscribed to unless it is chosen")
-        press("picture front", f"{panel} !== undefined")
-        wait_until(sees_picture, "it is seen when it is chosen")
-        camera.silent = True
-        page.wait(f"{panel}.label.shown.includes('stale')")
-        wait_until(lambda: not sees_picture(), "a stale picture is dimmed")
-        press("picture front", f"{panel} === undefined")
-        wait_until(lambda: count_subscribers() == 0, "nothing is subscribed to")
         assert page.errors == []
 
 

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import json
 import os
 import re
 import subprocess
-import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -20,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from iris_session.bench.web_tab import BUILT_PAGE, WEB_CLIENT
+from iris_session.bench.web_tab import WEB_CLIENT
 from iris_session.demo.named_scenes import scene_by_name
 from iris_session.protocol.server_messages import (
     Event,
@@ -124,26 +120,6 @@ def test_the_page_draws_what_mujoco_draws(
     assert page.errors == []
 
 
-@pytest.mark.long
-def test_a_cloth_that_is_folded_moves_in_the_page(
-    serve: Callable[..., SessionProcess], open_page: Callable[..., Page], emulate: Callable[..., object]
-) -> None:
-    """By itself it lies still on its table, also after a reset; two operators lift its edge."""
-    server = serve("cloth")
-    page = open_page(server, "viewer", width=480, height=360)  # drawn by the processor that the operators need, too
-    page.wait("irisSession.view.shown.vertices.size > 0")
-    highest = (
-        "Math.max(...irisSession.view.scene.deformables[0].object.geometry.attributes.position.array"
-        ".filter((_, i) => i % 3 === 2))"
-    )
-    assert page.evaluate(highest) < 0.02
-    folders = [f"name={side},behaviour=folder,object=cloth,robot={side}" for side in ("left", "right")]
-    emulate(server.address, *folders, seconds=4 * DEADLINE_S)
-    drawn = "Math.max(...[...irisSession.view.shown.vertices.values()][0].filter((_, i) => i % 3 === 2))"
-    page.wait(f"{highest} > 0.05 && {drawn} > 0.03", 4 * DEADLINE_S)
-    assert page.errors == []
-
-
 # --- people and leases ------------------------------------------------------------------------------------------------
 
 
@@ -167,15 +143,6 @@ def test_two_browsers_share_robots(scenario: Scenario, open_page: Callable[..., 
     second.wait("document.querySelector('[data-robot=left] .holder').textContent === 'free'")
     assert first.errors == []
     assert second.errors == []
-
-
-@pytest.mark.long
-def test_markup_in_names_is_text(scenario: Scenario, open_page: Callable[..., Page]) -> None:
-    page = open_page(scenario.server, "reader")
-    scenario.join("<img src=x onerror=alert(1)>")
-    page.wait("document.querySelector('#panel-participants').textContent.includes('<img src=x')")
-    assert page.evaluate("document.querySelectorAll('img').length") == 0
-    assert page.errors == []
 
 
 def measure_drift(scenario: Scenario, hand: Hand, seconds: float) -> float:
@@ -204,37 +171,8 @@ def test_estop_holds_all_robots(scenario: Scenario, open_page: Callable[..., Pag
     page.wait("!document.querySelector('.stopped').hidden && document.title.startsWith('STOPPED')")
     page.click("button", "Clear")
     scenario.run_until(lambda: not hand.client.mirror.estop, "the e-stop is cleared")
-
-
-@pytest.mark.long
-def test_the_estop_button_stops_robots(scenario: Scenario, open_page: Callable[..., Page]) -> None:
-    """From the click to the event and to the pose at another client: measured and printed, with a generous bound."""
-    page = open_page(scenario.server, "stopper")
-    hand = scenario.drive("cat", "left", (0.0, 0.05, 0.0))
-    begin = hand.tip
-    scenario.run_until(lambda: np.linalg.norm(np.subtract(hand.tip[0], begin[0])) > 0.01, "the robot moves")
-    page.evaluate(
-        "void document.querySelector('#estop').addEventListener('click',"
-        " () => { window.clicked = performance.timeOrigin + performance.now(); }, { capture: true })"
-    )
-    stopped_at: list[float] = []
-
-    def note_stop() -> bool:
-        if hand.client.mirror.estop and not stopped_at:
-            stopped_at.append(time.time())
-        return bool(stopped_at)
-
-    with ThreadPoolExecutor(1) as thread:  # the client is polled while the browser clicks
-        click = thread.submit(page.click, "button", "E-STOP Space")
-        scenario.run_until(lambda: note_stop() and click.done(), "the e-stop is in force")
-        click.result()
-    drift = measure_drift(scenario, hand, 0.5)
-    delay_ms = 1e3 * stopped_at[0] - page.evaluate("window.clicked")
-    print(f"e-stop by the button: at another client after {delay_ms:.0f} ms, then {1e3 * drift:.1f} mm of motion")
-    assert 0.0 < delay_ms < 5_000.0
-    assert drift < 0.01
-    page.wait("!document.querySelector('.stopped').hidden")
-    assert page.errors == []
+    page.click("button", "E-STOP Space")
+    scenario.run_until(lambda: hand.client.mirror.estop, "the button stops, too")
 
 
 # --- everyone ---------------------------------------------------------------------------------------------------------
@@ -338,37 +276,6 @@ def test_a_browser_pairs_by_the_printed_link(
 # --- connections ------------------------------------------------------------------------------------------------------
 
 
-class NewerGateway(http.server.SimpleHTTPRequestHandler):
-    """This page, served by a gateway of a later version of the protocol."""
-
-    def do_GET(self) -> None:
-        if self.path != "/v1/info":
-            super().do_GET()
-            return
-        body = json.dumps({"versions": [2, 3], "session_name": "later", "session_id": "s", "key": "", "pairing": False})
-        self.send_response(200)
-        self.send_header("Content-Type", "application/json")
-        self.end_headers()
-        self.wfile.write(body.encode())
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing."""
-
-
-@pytest.mark.long
-def test_a_page_of_an_older_version_says_to_reload(browser: Browser) -> None:
-    handler = functools.partial(NewerGateway, directory=str(BUILT_PAGE.parent))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        try:
-            page = browser.open("older", f"http://127.0.0.1:{server.server_port}/")
-            page.wait("!document.querySelector('.message').hidden && irisSession.state.phase.refusal === 'version'")
-            page.wait("/different versions.*reload/.test(document.querySelector('.message').innerText)")
-            page.close()
-        finally:
-            server.shutdown()
-
-
 def test_a_reload_resumes_with_the_lease(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     page = open_page(scenario.server, "reload")
     join_as(page, "dan", "operator")
@@ -412,9 +319,3 @@ def test_a_tab_in_the_background_keeps_its_robot(scenario: Scenario, open_page: 
     page.wait(f"irisSession.view.drawn > {drawn} && irisSession.state.phase.phase === 'ready'")
     assert page.evaluate("irisSession.state.self.id") == dan
     assert page.errors == []
-
-
-READY_WITH_ARM: Final = (
-    "irisSession.state.phase.phase === 'ready' && irisSession.state.session?.synced"
-    " && document.querySelector('[data-robot=arm8] .holder').textContent === 'you'"
-)

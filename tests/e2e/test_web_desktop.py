@@ -17,7 +17,7 @@ from PIL import Image
 
 from iris_session.demo.scenes import scene_path
 from iris_session.protocol.names import HoldReason
-from iris_session.protocol.server_messages import EngagementChanged, LeaseChanged
+from iris_session.protocol.server_messages import EngagementChanged
 from tests.e2e.browser import Page, decode_picture, join_as
 from tests.e2e.scenario import Scenario, assert_only_late
 from tests.e2e.session_process import SessionProcess
@@ -41,19 +41,6 @@ NOTE_KEYS = """void (window.at = {}, ["keydown", "keyup", "blur"].forEach((type)
   const note = (event) => { window.at[`${type} ${event.code ?? ""}`.trim()] = irisSession.view.sessionTime(); };
   window.addEventListener(type, (event) => { if (!event.repeat) note(event); }, { capture: true });
 }))"""
-#: A gamepad whose left stick is pushed away; `window.shoulder`: its right shoulder button is held.
-PAD = """void (window.shoulder = false, navigator.getGamepads = () => [{
-  connected: true, id: "pad", index: 0, mapping: "standard", axes: [0, -1, 0, 0],
-  buttons: Array.from({ length: 17 }, (_, i) => ({ pressed: i === 5 && window.shoulder })),
-}])"""
-#: Largest distance of a body of the scene from its pose of the newest state [m].
-FARTHEST_BODY = """(() => {
-  const { scene, shown } = irisSession.view;
-  const offsets = shown.bodies.map((id, row) => scene.bodies.get(id).position.distanceTo(
-    { x: shown.poses[7 * row], y: shown.poses[7 * row + 1], z: shown.poses[7 * row + 2] }));
-  return Math.max(...offsets);
-})()"""
-UNPLUG = 'void (navigator.getGamepads = () => [], window.dispatchEvent(new Event("gamepaddisconnected")))'
 
 
 class Tip:
@@ -218,65 +205,6 @@ def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
 
 
 @pytest.mark.long
-def test_a_window_without_focus_stops_the_robot(scenario: Scenario, driver: Page) -> None:
-    """It stops although the keys are still pressed, and goes on when the dead-man is pressed anew."""
-    tip = Tip(scenario)
-    drive_forward(driver, tip, 0.03)
-    driver.evaluate("void window.dispatchEvent(new Event('blur'))")
-    stopped_s = tip.measure_stop(driver.evaluate("window.at.blur"))
-    print(f"at rest {1e3 * stopped_s:.0f} ms after the focus was lost")
-    assert stopped_s < STOP_S
-    assert words(driver).startswith("Held: the window lost the focus.")
-    driver.let_go("w")
-    driver.let_go("Shift")
-    wait_for_samples(tip, driver)
-    drive_forward(driver, tip, 0.01)
-    driver.let_go("Shift")
-
-
-def list_freed_ms(scenario: Scenario) -> list[float]:
-    """Return when the left robot became free after it was held, in session time [ms]."""
-    changes = [(e.body, e.session_time) for e in scenario.events["watcher"]]
-    return [1e-6 * at for b, at in changes if isinstance(b, LeaseChanged) and b.previous_holder and not b.lease.holder]
-
-
-@pytest.mark.long
-def test_a_lost_lease_ends_driving(scenario: Scenario, driver: Page) -> None:
-    tip = Tip(scenario)
-    drive_forward(driver, tip, 0.03)
-    tip.client.assign(["left"])
-    tip.watch(lambda: list_freed_ms(scenario), "the lease is lost")
-    stopped_s = tip.measure_stop(list_freed_ms(scenario)[0])
-    print(f"at rest {1e3 * stopped_s:.0f} ms after the lease was lost")
-    assert stopped_s < STOP_S
-    driver.wait("document.querySelector('.drive').hidden")
-    driver.let_go("w")
-    driver.let_go("Shift")
-
-
-@pytest.mark.long
-def test_the_estop_key_is_the_same_while_driving(scenario: Scenario, driver: Page) -> None:
-    tip = Tip(scenario)
-    drive_forward(driver, tip, 0.02)
-    driver.press("Space")
-    driver.wait("irisSession.state.session.estop")
-    tip.watch_for(0.5)
-    stopped = tip.place
-    tip.watch_for(0.5)
-    assert np.linalg.norm(tip.place - stopped) < REST_M
-    assert words(driver).startswith("Held: e-stop.")
-    tip.client.clear_estop()
-    driver.wait("!irisSession.state.session.estop")
-    tip.watch_for(0.5)
-    assert np.linalg.norm(tip.place - stopped) < REST_M  # the keys are still pressed
-    driver.let_go("w")
-    driver.let_go("Shift")
-    wait_for_samples(tip, driver)  # as a finger: a sample must have seen the key let go
-    drive_forward(driver, tip, 0.01)
-    driver.let_go("Shift")
-
-
-@pytest.mark.long
 def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> None:
     """Half a millimetre for a pixel: to the right along +X, and no farther when the button is let go.
 
@@ -305,42 +233,6 @@ def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> N
         assert is_late or driver.evaluate("irisSession.view.drawn") - drawn < 10 * DRAG_S, held
     assert tip.place[0] - first[0] > 0.02
     assert words(driver).startswith("Held. Hold left Shift")
-
-
-@pytest.mark.long
-def test_a_gamepad_drives_until_it_is_unplugged_and_again_once_let_go(scenario: Scenario, driver: Page) -> None:
-    """The pad is one that the test makes: the page was never tried with a real one."""
-    tip = Tip(scenario)
-    begin = tip.place
-    driver.evaluate(PAD)
-    wait_for_samples(tip, driver)
-    assert np.linalg.norm(tip.place - begin) < REST_M  # the shoulder button is not held
-    shoulder = "void (window.shoulder = {})"
-
-    def drive(distance: float) -> None:
-        drive_until(
-            driver,
-            tip,
-            lambda: bool(tip.place[1] - begin[1] > distance),
-            lambda: driver.evaluate(shoulder.format("true")),
-            lambda: driver.evaluate(shoulder.format("false")),
-        )
-
-    drive(0.03)
-    unplugged_ms = driver.evaluate("irisSession.view.sessionTime()")
-    driver.evaluate(UNPLUG)
-    stopped_s = tip.measure_stop(unplugged_ms)
-    print(f"at rest {1e3 * stopped_s:.0f} ms after the gamepad was unplugged")
-    assert stopped_s < STOP_S
-    assert words(driver).startswith("Held: the gamepad was disconnected.")
-    driver.evaluate(PAD)
-    driver.evaluate('void (window.shoulder = true, window.dispatchEvent(new Event("gamepadconnected")))')
-    begin = tip.place
-    tip.watch_for(1.0)
-    assert np.linalg.norm(tip.place - begin) < REST_M  # the shoulder button was held when the gamepad came
-    driver.evaluate(shoulder.format("false"))
-    wait_for_samples(tip, driver)
-    drive(0.02)
 
 
 # --- recording cameras ------------------------------------------------------------------------------------------------

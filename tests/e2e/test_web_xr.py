@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, Final
+from typing import Final
 
 import pytest
 
-from anchors.pose import PoseTuple, apply, compose
-from iris_session.protocol.client_messages import Acquire
-from iris_session.protocol.names import AlignmentKind, DenialReason
-from iris_session.protocol.server_messages import ConsentRequested, Reply
+from anchors.pose import PoseTuple, compose
+from iris_session.protocol.names import AlignmentKind
 from tests.e2e.browser import Page, join_as
 from tests.e2e.emulated_quest import HEAD, HEADSET, INSTALL, IWER, T_WORLD_TRACKING, EmulatedQuest, aim_at, holder
 from tests.e2e.scenario import Scenario, is_driven
@@ -130,57 +128,6 @@ def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     assert quest.page.errors == []
 
 
-@pytest.mark.long
-def test_a_request_for_the_robot_is_answered_in_the_headset(quest: EmulatedQuest) -> None:
-    """Ben asks and is refused, asks again and gets it; then the headset asks, and waits for Ben's consent."""
-    host, ben, person = quest.host, quest.scenario.join("ben"), quest.person.id
-    host.set_mode("left", "request")
-    host.assign(["left"], person)
-    quest.enter("Enter AR")
-    host.alignment.place(person, T_WORLD_TRACKING)
-    quest.place("quest", compose(T_WORLD_TRACKING, HEAD))
-    quest.wait(f"{HEADSET}.showsScene")
-
-    def ask(answer: str) -> Reply:
-        """Let Ben ask, and answer from the headset: point and press the trigger."""
-        request = ben.submit(Acquire(0, ("left",)))
-        quest.wait(f"{HEADSET}.consent.question.shown.includes('ben asks you for left')")
-        quest.wait(f"{HEADSET}.consent.answers !== null")
-        found: Any = quest.evaluate(f"{HEADSET}.consent.answers.{answer}")
-        quest.place("quest.controllers.right", aim_at(apply(T_WORLD_TRACKING, tuple(found)), 0.4))
-        quest.wait(f"{HEADSET}.aimed.right === '{answer}'")
-        replies: list[Reply] = []
-
-        def has_reply() -> bool:
-            replies.extend(filter(None, [ben.answer(request)]))
-            return bool(replies)
-
-        quest.press_until("trigger", has_reply, f"Ben's request is answered: {answer}")
-        quest.press("trigger", 0.0)
-        quest.wait(f"{HEADSET}.consent.answers === null")
-        return replies[0]
-
-    refused = ask("refuse")
-    assert refused.denial is not None
-    assert refused.denial.reason == DenialReason.CONSENT_REFUSED
-    assert holder(host, "left") == person
-    assert ask("grant").denial is None
-    quest.run_until(lambda: holder(host, "left") == ben.participant_id, "Ben has the robot")
-
-    tip = host.scene.tip_pose("left")
-    assert tip
-    quest.place("quest.controllers.right", aim_at(tip[0], 0.6))
-    quest.wait(f"{HEADSET}.pointed.right === 'left'")
-    asks = f'{HEADSET}.consent.question.shown.includes("waiting for ben\'s consent to left")'
-    quest.press_until("trigger", lambda: quest.evaluate(asks), "the headset asks Ben")
-    quest.press("trigger", 0.0)
-    asked = [e.body for e in quest.scenario.events["ben"] if isinstance(e.body, ConsentRequested)][-1]
-    ben.consent(asked.consent_id, grant=True)
-    quest.run_until(lambda: holder(host, "left") == person, "Ben has given it")
-    quest.wait(f"{HEADSET}.consent.question.shown === '[[],\"#e0a33a\"]'")
-    assert quest.page.errors == []
-
-
 #: Moves the right hand so that its index finger is in the ball at the left wrist, or next to it.
 TOUCH: Final = """(({ reading, wristStop }, away) => {
   const tip = reading.inputs.find(({ side }) => side === "right").tip;
@@ -205,10 +152,3 @@ def test_bare_hands_stop_at_the_wrist(quest: EmulatedQuest) -> None:
     quest.run_until(lambda: host.mirror.estop, "a fingertip at the wrist stops")
     quest.wait(f"{HEADSET}.props.urgent.shown.includes('STOPPED')")
     assert quest.page.errors == []
-
-
-@pytest.mark.long
-def test_without_a_headset_the_page_says_so(scenario: Scenario, open_page: Callable[..., Page]) -> None:
-    page = open_page(scenario.server, "screen")
-    page.wait("document.querySelector('.headset').innerText.includes('No headset')")
-    assert page.evaluate("[...document.querySelectorAll('.headset button')].every((one) => one.hidden)")

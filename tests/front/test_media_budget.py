@@ -158,15 +158,6 @@ def test_measured_rate_of_a_full_link_bounds_what_is_sent_and_tried() -> None:
     assert controller.update(1, LinkMeasure(None, 15, 15), rates, 200 * STEP_NS).levels["cloud"] == 0, "but later"
 
 
-def find_lowered(delivered: list[int]) -> int | None:
-    """Return the measure after which the level is lowered. `delivered`: of 15 due frames, each quarter of a second."""
-    controller = BudgetController()
-    for i, n in enumerate([15] * 8 + delivered):
-        if controller.update(1, LinkMeasure(None, n, 15), CLOUD, i * STEP_NS).levels["cloud"]:
-            return i - 8
-    return None
-
-
 def test_level_rises_when_the_link_recovers() -> None:
     link = Link(6)
     link.play(20)

@@ -5,19 +5,16 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from typing import TypeVar
 
 import aiohttp
-import msgspec
 
 from iris_session.protocol.client_messages import ClientMessage, GetSnapshot, Heartbeat, Hello, wrap_message
-from iris_session.protocol.codec import decode_media_header, decode_server, decode_state_header, encode_client
+from iris_session.protocol.codec import decode_server, decode_state_header, encode_client
 from iris_session.protocol.common import Message
-from iris_session.protocol.media import MediaHeader
-from iris_session.protocol.server_messages import ClockPong, Snapshot, StateHeader, Welcome
+from iris_session.protocol.server_messages import Snapshot, StateHeader, Welcome
 from iris_session.web import wire
 
 T = TypeVar("T", bound=Message)
@@ -36,14 +33,9 @@ class WebBrowser:
         self.inbox: list[Message] = []
         self.bulk: list[bytes] = []
         self.states: list[tuple[StateHeader, int]] = []
-        self.presences = 0
-        self.pongs: list[tuple[int, int, int]] = []
-        self.media: list[MediaHeader] = []
         self.ticket = ""
         self.welcome: Welcome | None = None
-        self.heartbeats = True
         self._socket: aiohttp.ClientWebSocketResponse | None = None
-        self._media_socket: aiohttp.ClientWebSocketResponse | None = None
         self._tasks: list[asyncio.Task[None]] = []
 
     @property
@@ -99,13 +91,6 @@ class WebBrowser:
         data = encode_client(wrap_message(message, self.epoch if epoch is None else epoch))
         await self.socket.send_bytes(wire.encode_frames(wire.CONTROL, [data]))
 
-    def stop_reading(self) -> Callable[[], None]:
-        """Leave what comes in the system. Return a function that reads on."""
-        connection = self.socket._conn  # type: ignore[attr-defined]
-        transport = connection.transport
-        transport.pause_reading()
-        return transport.resume_reading  # type: ignore[no-any-return]
-
     async def snapshot(self) -> Snapshot:
         before = len(self.got(Snapshot))
         await self.send(GetSnapshot())
@@ -135,16 +120,6 @@ class WebBrowser:
         async with self.http.get(f"{self.page}v1/asset/{address}", headers=sent) as answer:
             return answer.status, await answer.read(), dict(answer.headers)
 
-    async def open_media(self, *streams: str, ticket: str | None = None) -> aiohttp.ClientWebSocketResponse:
-        """Open the media socket, and read it, wishing for these streams."""
-        socket = await self.http.ws_connect(f"{self.page}v1/media", protocols=[wire.SUBPROTOCOL], max_msg_size=0)
-        self._media_socket = socket
-        message = wire.Ticket(self.ticket if ticket is None else ticket)
-        await socket.send_bytes(wire.encode_gateway_message(message))
-        await socket.send_bytes(wire.encode_frames(wire.MEDIA_WISHES, (msgspec.msgpack.encode(streams),)))
-        self._tasks.append(asyncio.create_task(self._read_media(socket)))
-        return socket
-
     async def _read(self) -> None:
         socket = self.socket
         async for message in socket:
@@ -157,28 +132,18 @@ class WebBrowser:
                 self.bulk += [bytes(frame) for frame in frames[1:]]
                 if isinstance(answer, Welcome):
                     self.welcome = answer
-                elif isinstance(answer, ClockPong):
-                    self.pongs.append((answer.t0_ns, answer.t1_ns, now_ns))
             elif channel == wire.STATE and bytes(frames[0]) == b"rigid":
                 self.states.append((decode_state_header(frames[1]), now_ns))
-            elif channel == wire.STATE:
-                self.presences += 1
-            else:
+            elif channel == wire.GATEWAY:
                 told = wire.decode_gateway_message(frames[0])
                 if isinstance(told, wire.Ticket):
                     self.ticket = told.ticket
-
-    async def _read_media(self, socket: aiohttp.ClientWebSocketResponse) -> None:
-        async for message in socket:
-            channel, frames = wire.decode_frames(message.data)
-            assert channel == wire.MEDIA
-            self.media.append(decode_media_header(frames[1]))
 
     async def _beat(self) -> None:
         socket = self.socket
         with contextlib.suppress(ConnectionError):
             while not socket.closed:
-                if self.epoch and self.heartbeats:
+                if self.epoch:
                     await self.send(Heartbeat())
                 await asyncio.sleep(HEARTBEAT_S)
 
@@ -187,25 +152,14 @@ class WebBrowser:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self._tasks.clear()
-        for one in (self._socket, self._media_socket):
-            if one is not None and not one.closed:
-                await one.close()
+        if self._socket is not None and not self._socket.closed:
+            await self._socket.close()
 
 
 @contextlib.asynccontextmanager
-async def open_http(receive_bytes: int = 0) -> AsyncIterator[aiohttp.ClientSession]:
-    """A client that takes the gateway's certificate as it is, with any number of connections.
-
-    `receive_bytes`: what the system receives of each connection without being read, 0 for its default.
-    """
-
-    def make_socket(info: aiohttp.AddrInfoType) -> socket.socket:
-        made = socket.socket(*info[:3])
-        if receive_bytes:
-            made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_bytes)
-        return made
-
-    connector = aiohttp.TCPConnector(ssl=False, limit=0, socket_factory=make_socket)
+async def open_http() -> AsyncIterator[aiohttp.ClientSession]:
+    """A client that takes the gateway's certificate as it is, with any number of connections."""
+    connector = aiohttp.TCPConnector(ssl=False, limit=0)
     async with aiohttp.ClientSession(connector=connector, auto_decompress=False) as http:
         yield http
         await asyncio.sleep(0.05)  # TLS connections close
