@@ -90,10 +90,6 @@ class Page:
         step_ms = 1e3 * seconds / steps
         self._browser.call("drag", self.name, selector=selector, x=x, y=y, steps=steps, step_ms=step_ms)
 
-    def type(self, text: str) -> None:
-        """Type a text where the focus is."""
-        self._browser.call("type", self.name, text=text)
-
     def screenshot(self, path: Path, *, full: bool = False) -> None:
         """Write a PNG of the page."""
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,7 @@ from tests.e2e.session_process import (
 #: Files that begin first: one of them at the end would keep one worker busy while the others have nothing left.
 #: Those that compute most lie between those that wait most.
 LONGEST: Final = (
-    "test_resume.py", "test_joining.py", "test_process_failures.py", "test_soak.py", "test_process.py",
+    "test_resume.py", "test_joining.py", "test_process_failures.py", "test_soak.py",
     "test_shutdown.py", "test_security.py", "test_hostile_clients.py",
 )  # fmt: skip
 

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import psutil
 
-from tests.e2e.session_process import COMMAND, DEADLINE_S, assert_all_end, list_descendants, skip_unless_ci, wait_until
+from tests.e2e.session_process import COMMAND, DEADLINE_S, list_descendants, skip_unless_ci, wait_until
 from tests.network_namespaces import Namespace, connect
 
 #: Frames of state after which an observer counts as having joined.
@@ -106,23 +106,10 @@ class ServedSession:
         return re.search(r"on (\S+:\d+),", self.output) is not None
 
     @property
-    def name(self) -> str:
-        found = re.search(r"session '(\S+)' on", self.output)
-        assert found
-        return found[1]
-
-    @property
     def address(self) -> str:
         found = re.search(r"on (\S+:\d+),", self.output)
         assert found
         return found[1]
-
-    def stop(self) -> None:
-        """Press Ctrl-C; no process may stay."""
-        children = list_descendants(self.process.pid)
-        self.process.send_signal(signal.SIGINT)
-        assert self.process.wait(DEADLINE_S) == 0, self.output
-        assert_all_end(children)
 
 
 class Network:

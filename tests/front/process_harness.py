@@ -9,19 +9,17 @@ import zmq
 
 from iris_session.link import FrontProcess
 from iris_session.protocol.steps import Decision
-from tests.front.harness import N_BODIES, ClientBase, Curve, SessionBase, scene
+from tests.front.harness import ClientBase, Curve, SessionBase, scene
 from tests.loopback import make_loopback_address
 
 
 class ProcessClient(ClientBase):
     """A DEALER on the control port."""
 
-    def __init__(self, session: ProcessSession, routing_id: bytes = b"", curve: Curve | None = None) -> None:
+    def __init__(self, session: ProcessSession, curve: Curve | None = None) -> None:
         super().__init__(session)
         self.socket = session.context.socket(zmq.DEALER)
         self.socket.linger = 0
-        if routing_id:
-            self.socket.setsockopt(zmq.ROUTING_ID, routing_id)
         if curve:
             self.socket.curve_serverkey, self.socket.curve_publickey, self.socket.curve_secretkey = curve
         self.socket.connect(f"tcp://{session.host}:{session.ports.control}")
@@ -40,28 +38,25 @@ class ProcessClient(ClientBase):
 class ProcessSession(SessionBase):
     """A front process, and its authority."""
 
-    def __init__(self, *, start: bool = True, bodies: int = N_BODIES, **config: object) -> None:
+    def __init__(self, **config: object) -> None:
         free = {"host": make_loopback_address(), "control_port": 0, "state_port": 0, "origin_ns": time.monotonic_ns()}
         super().__init__(**{**free, **config})
         #: Address of the session's sockets for clients of this machine.
         self.host = "127.0.0.1" if {"host", "listen"} & config.keys() else self.config.host
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self.process = FrontProcess(self.config, scene(bodies))
+        self.process = FrontProcess(self.config, scene())
         self.link = self.process.link
         self.clients: list[ProcessClient] = []
         self.subscribers: list[zmq.Socket[bytes]] = []
-        if start:
-            self.ports = self.process.start()
+        self.ports = self.process.start()
 
-    def client(self, routing_id: bytes = b"", curve: Curve | None = None) -> ProcessClient:
-        self.clients.append(ProcessClient(self, routing_id, curve))
+    def client(self, curve: Curve | None = None) -> ProcessClient:
+        self.clients.append(ProcessClient(self, curve))
         return self.clients[-1]
 
-    def subscriber(self, curve: Curve | None = None, rcvhwm: int = 1000, rcvbuf: int = -1) -> zmq.Socket[bytes]:
+    def subscriber(self, curve: Curve | None = None) -> zmq.Socket[bytes]:
         sub = self.context.socket(zmq.SUB)
         sub.linger = 0
-        sub.rcvhwm = rcvhwm
-        sub.setsockopt(zmq.RCVBUF, rcvbuf)
         if curve:
             sub.curve_serverkey, sub.curve_publickey, sub.curve_secretkey = curve
         sub.connect(f"tcp://{self.host}:{self.ports.state}")

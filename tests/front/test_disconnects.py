@@ -12,7 +12,7 @@ from iris_session.front.disconnects import LAST_MESSAGES_NS, DisconnectHandler
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.codec import decode_server
 from iris_session.protocol.entries import Lost
-from iris_session.protocol.server_messages import Message, ProtocolFault
+from iris_session.protocol.server_messages import Message
 from tests.front.fakes import make_alignment, make_context, make_status
 from tests.rig.network import Monitor
 
@@ -78,18 +78,6 @@ def test_report_before_the_descriptor_is_closed_is_processed_later(rig: Disconne
     assert rig.leave() == []
     del rig.addresses[7]
     assert rig.leave() == [(1, Lost("closed"))]
-
-
-def test_participants_of_a_closed_gateway_are_disconnected_and_notified(rig: DisconnectRig) -> None:
-    gateway = rig.join(1, 7)
-    rig.join(2, 7, behind=gateway)
-    rig.join(3, 8)
-    rig.disconnects.remove(gateway, "heartbeat")
-    assert [(e.connection, e.message) for e in rig.coalescer.take_batch()] == [(2, Lost("gateway"))]
-    assert list(rig.clients.by_number) == [3]
-    (fault,) = rig.sent
-    assert isinstance(fault, ProtocolFault)
-    assert (fault.code, fault.reason) == ("dropped", "gateway")
 
 
 @pytest.mark.parametrize(("reason", "stops"), [("heartbeat", True), ("removed", False), ("bye", False)])

@@ -12,7 +12,7 @@ import pytest
 import zmq
 
 from iris_session.front.downlink import Downlink
-from iris_session.front.state_publisher import RECENT_NS, StatePublisher
+from iris_session.front.state_publisher import StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.config import SceneInfo
 from iris_session.protocol.server_messages import (
@@ -158,14 +158,3 @@ def test_decision_beyond_the_limits_does_not_end_the_front(rig: LinkRig) -> None
     rig.downlink.drain()
     assert rig.drops.by_reason == {"decision_invalid": 1}
     assert [h.tick for h in rig.headers()] == [1]
-
-
-def test_delays_cover_the_last_seconds(rig: LinkRig) -> None:
-    now = [10]
-    publisher = StatePublisher(rig, scene(1), lambda: now[0])  # type: ignore[arg-type]
-    assert (publisher.read_recent_delays_ns(), publisher.newest_delay_ns) == ([], 0)
-    for at_ns, session_time in ((10, 1), (RECENT_NS, RECENT_NS - 20), (RECENT_NS + 20, RECENT_NS + 13)):
-        now[0] = at_ns
-        header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
-        assert publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
-    assert (publisher.read_recent_delays_ns(), publisher.newest_delay_ns) == ([20, 7], 7)

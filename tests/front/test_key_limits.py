@@ -88,6 +88,3 @@ def test_a_flood_of_one_behind_a_gateway_ends_only_its_participant(open_session:
     session.wait_entries(Marker, connection=ann)
     gateway.send(Hello("observer", "Mallory", secret=b"Mallory".ljust(16)), "Mallory", 0)
     assert gateway.wait_for(Refused).code == RefusalCode.RATE, "it may come back in a moment"
-
-
-# --- e-stops ---

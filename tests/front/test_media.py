@@ -176,15 +176,6 @@ def test_invalid_media_are_an_error_of_the_publisher(tmp_path: Path, stream: str
     source.close()
 
 
-def test_publishing_media_after_the_end_raises(tmp_path: Path) -> None:
-    source = MediaSource(f"ipc://{tmp_path}/front")
-    assert source.publish("a", b"x", 0, 0, "bytes")
-    source.close()
-    source.close()
-    assert not source.publish("a", b"x", 0, 0, "bytes")
-    assert source.dropped == 1
-
-
 def test_pending_media_are_bounded_in_bytes(tmp_path: Path) -> None:
     """No front reads. Large frames are not copied, and count until they were sent."""
     endpoint = f"ipc://{tmp_path}/media"

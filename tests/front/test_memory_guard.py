@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable, Iterator
 
-import psutil
 import pytest
 
 from iris_session.front.connection_guard import SILENT_BYTES
@@ -14,8 +12,6 @@ from iris_session.front.memory_guard import (
     MEMORY_PERIOD_NS,
     MIN_EVICT_BYTES,
     MemoryGuard,
-    _make_resident_reader,
-    select_largest,
 )
 from iris_session.link.tcp_guard import PendingConnection
 from iris_session.protocol.limits import Drops
@@ -47,10 +43,6 @@ def evict(rig: ControlSocketRig, release_media: Callable[[], str] = lambda: "", 
     )
     guard.tick(MEMORY_PERIOD_NS)
     return evicted[0] if evicted else ""
-
-
-def pending(owner: str, n_bytes: int) -> PendingConnection:
-    return PendingConnection(owner, n_bytes, f"{owner} {n_bytes}", lambda: 1)
 
 
 def test_room_is_made_by_the_newest_strangers_when_no_client_stands_out(rig: ControlSocketRig) -> None:
@@ -94,15 +86,6 @@ def test_room_is_made_by_media_where_no_connection_holds_much(rig: ControlSocket
     assert evict(rig, lambda: "") == ""
     rig.traffic.count_sent(crowd[0][0].descriptor, [b"x" * 2 * MIN_EVICT_BYTES])
     assert evict(rig, lambda: "media") == "Ann from 127.0.0.1"
-
-
-def test_the_largest_connection_of_the_owner_with_most_is_closed() -> None:
-    hog = [pending("hog", 6 * MIB) for _ in range(5)]
-    slow = pending("slow", 8 * MIB)
-    largest = select_largest([slow, *hog], MIN_EVICT_BYTES)
-    assert largest is hog[-1]
-    assert select_largest([slow], 9 * MIB) is None
-    assert select_largest([], 0) is None
 
 
 class FakeMemory:
@@ -160,16 +143,3 @@ def test_memory_that_is_free_but_kept_costs_nobody() -> None:
     memory.look()
     assert memory.shed == []
     assert memory.free == 0
-
-
-def test_memory_that_cannot_be_read_now_is_that_of_the_last_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The system has no descriptor left for the file that tells it."""
-    read_resident = _make_resident_reader()
-    before = read_resident()
-
-    def fail(_process: psutil.Process) -> None:
-        raise OSError(errno.EMFILE, "Too many open files")
-
-    monkeypatch.setattr(psutil.Process, "memory_info", fail)
-    assert read_resident() == before > 0
-    assert _make_resident_reader()() == -1, "not known yet"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -83,10 +82,6 @@ class PairingRig:
         return message
 
 
-def _no_descriptor(*_args: object, **_more: object) -> None:
-    raise OSError(errno.EMFILE, "Too many open files")
-
-
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PairingRig]:
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
@@ -152,24 +147,6 @@ def test_revocation_during_pairing_takes_effect(rig: PairingRig, monkeypatch: py
     assert own.fingerprint not in rig.home.clients.read()
     assert rig.keyring.find_key(own.fingerprint) is None
     assert rig.tokens.is_revoked(own.fingerprint)
-
-
-def test_unreadable_allow_list_is_read_again(
-    rig: PairingRig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """A revocation takes effect once a descriptor is free to read the list."""
-    own = KeyPair.generate()
-    rig.home.clients.allow_key("ann", own.public)
-    rig.keyring.reload_if_changed()
-    rig.home.clients.revoke_key("ann")
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "open", _no_descriptor)
-        for _ in range(3):
-            rig.keyring.reload_if_changed()
-    assert rig.keyring.find_key(own.fingerprint) is not None
-    assert caplog.text.count("Too many open files") == 1, "reported once"
-    rig.keyring.reload_if_changed()
-    assert rig.keyring.find_key(own.fingerprint) is None
 
 
 def test_lost_pairing_answer_is_sent_again(rig: PairingRig) -> None:

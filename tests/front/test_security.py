@@ -170,20 +170,6 @@ def test_revoked_secret_stays_refused_on_unencrypted_loopback(session: FrontSess
     session.client().join()
 
 
-def test_stolen_resume_token_is_refused_and_audited(lab: Lab) -> None:
-    _, ann = lab.allowed("ann")
-    assert ann.welcome is not None
-    eve = KeyPair.generate()
-    lab.home.clients.allow_key("eve", eve.public)
-    thief = lab.client(eve)
-    answer = lab.refused(thief, Hello("operator", "ann", resume_token=ann.welcome.resume_token))
-    assert answer.code == RefusalCode.RESUME_TOKEN
-    (audit,) = lab.audits(AuditKind.TOKEN_REFUSED)
-    assert (audit.subject, audit.name) == (eve.fingerprint, "ann")
-    ann.send(Marker(1, "still ann"))
-    lab.session.wait_entries(Marker)
-
-
 def test_list_may_be_edited_during_the_session(lab: Lab) -> None:
     _, ann = lab.allowed("ann")
     _, bob = lab.allowed("bob")

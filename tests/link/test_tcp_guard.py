@@ -14,13 +14,10 @@ from iris_session.link.sockets import close_tcp, peer_of, tcp_counts
 from iris_session.link.tcp_guard import (
     CLOSE_FAILED,
     TcpBounds,
-    TcpConnection,
     TcpFlood,
     TcpGuard,
     TrafficCounter,
     make_reasons,
-    select_evictions,
-    select_share_evictions,
 )
 
 FIRST = 100_000  # no descriptor of this process
@@ -67,29 +64,6 @@ class Rig:
     @property
     def left(self) -> list[int]:
         return [descriptor - FIRST for descriptor in self.guard.table]
-
-
-def make_owned(owners: str) -> list[tuple[int, TcpConnection]]:
-    connections = []
-    for number, owner in enumerate(owners):
-        one = TcpConnection(("", 0), 0)
-        one.owner = owner
-        connections.append((number, one))
-    return connections
-
-
-def test_evictions_follow_the_given_order() -> None:
-    connections = make_owned("baaabcab")
-    assert select_evictions(connections, 8) == select_evictions(connections, 100) == []
-    assert select_evictions(connections, 7) == [1]
-    assert select_evictions(connections, 3) == [1, 0, 2, 3, 4]
-    assert sorted(select_evictions(connections, 0)) == list(range(8))
-
-
-def test_the_first_connections_above_a_share_are_closed() -> None:
-    newest_first = make_owned("aabaca")
-    assert select_share_evictions(newest_first, lambda owner: 2) == [0, 1]
-    assert select_share_evictions(newest_first, lambda owner: {"a": 4, "b": 0, "c": 1}[owner]) == [2]
 
 
 def test_silent_connections_of_the_address_with_most_are_evicted_and_established_ones_stay() -> None:

@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 
 import pytest
-from zmq.auth import create_certificates
 
 from iris_session.security import (
     AllowedKey,
@@ -58,27 +57,6 @@ def test_unusable_certificate_is_named_with_its_fault(tmp_path: Path, lines: dic
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
     assert PAIR.secret[:20] not in str(error.value)
-
-
-def test_secret_key_readable_by_others_is_refused_with_the_command(tmp_path: Path) -> None:
-    public, secret = create_certificates(tmp_path, "ann")
-    Path(secret).chmod(0o640)
-    with pytest.raises(KeysError, match=f"chmod 600 {secret}$"):
-        load_secret(secret)
-    Path(public).chmod(0o644)
-    assert load_public(public), "a public key is no secret"
-    Path(secret).chmod(0o400)
-    assert load_secret(secret).public == load_public(public)
-
-
-def test_key_file_without_permission_names_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def closed(path: Path, *_mode: object) -> None:
-        raise PermissionError(13, "Permission denied", str(path))  # root may read everything, so a file cannot show it
-
-    path = certificate(tmp_path, public=PAIR.public)
-    monkeypatch.setattr(Path, "open", closed)
-    with pytest.raises(KeysError, match=r"chmod u\+r"):
-        load_public(path)
 
 
 def test_checked_file_is_the_one_that_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,15 +159,3 @@ def test_session_note_does_not_undo_an_edit(home: KeyHome, listed: Path, monkeyp
         with pytest.raises(KeysBusyError):
             home.clients.record_last_seen({marks[0]: "2026-01-01T00:00:00+00:00"})
     assert read() == {}
-
-
-def test_new_permissions_are_a_change(home: KeyHome) -> None:
-    """The list is read again after its permissions were corrected."""
-    home.clients.allow_key("ann", PAIR.public)
-    path = home.path / "clients.json"
-    path.chmod(0o644)
-    before = home.clients.signature
-    with pytest.raises(KeysError, match="chmod 600"):
-        home.clients.read()
-    path.chmod(0o600)
-    assert home.clients.signature != before

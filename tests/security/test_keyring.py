@@ -73,19 +73,17 @@ def test_list_that_is_replaced_while_it_is_read_is_read_again_at_once(listed: Li
     keyring.close()
 
 
-def test_list_that_stays_missing_revokes_all(listed: List) -> None:
-    listed.file.unlink()
-    listed.pass_time(2 * ABSENCE_NS)
+@pytest.mark.parametrize("how", ["stays missing", "is empty"])
+def test_list_that_stays_missing_or_is_empty_revokes_all(listed: List, how: str) -> None:
+    if how == "is empty":
+        listed.file.write_text("[]")
+        listed.keyring.reload_if_changed()
+    else:
+        listed.file.unlink()
+        listed.pass_time(2 * ABSENCE_NS)
     assert list(listed.keyring.fingerprints) == []
     assert list(listed.keyring.removed) == listed.marks
     assert not listed.keyring.is_missing
-
-
-def test_empty_list_revokes_all_at_once(listed: List) -> None:
-    listed.file.write_text("[]")
-    listed.keyring.reload_if_changed()
-    assert list(listed.keyring.fingerprints) == []
-    assert list(listed.keyring.removed) == listed.marks
 
 
 def test_own_processes_join_without_the_list_in_their_roles_only(tmp_path: Path) -> None:

@@ -47,16 +47,6 @@ def test_one_address_evicts_its_own_oldest() -> None:
     assert rig.drops.by_reason == {"web_connections_per_address": 3}
 
 
-def test_many_addresses_evict_those_with_the_most() -> None:
-    rig = Rig()
-    lone = rig.connect("10.0.0.9")
-    for n in range(6):
-        for _ in range(60):
-            rig.connect(f"10.0.0.{n}")
-    assert len(rig.guard) == BOUNDS.unauthenticated
-    assert lone in rig.guard.table
-
-
 def test_connections_without_a_request_are_closed() -> None:
     rig = Rig()
     slow, busy, known = rig.connect("a"), rig.connect("a"), rig.connect("a", "web-1")
