@@ -1,7 +1,10 @@
-"""Order of the end-to-end tests, and fixtures that start and end sessions on free ports."""
+"""Order of the end-to-end tests, and fixtures that start and end sessions and emulated headsets on free ports."""
 
 from __future__ import annotations
 
+import contextlib
+import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,17 +17,21 @@ from iris_session.client import client as client_module
 from tests.e2e.browser import Browser, Page, printed_address, require_browser
 from tests.e2e.scenario import Hand, Scenario
 from tests.e2e.session_process import (
+    COMMAND,
     DEADLINE_S,
+    END_WITH_PARENT,
     SessionProcess,
     kill_all,
     make_serve_command,
     run_in_process,
 )
 
+#: Emulated headsets leave the session within it; then they are killed [s].
+SHUTDOWN_S: Final = 10.0
 #: Files that begin first: one of them at the end would keep one worker busy while the others have nothing left.
 #: Those that compute most lie between those that wait most.
 LONGEST: Final = (
-    "test_resume.py", "test_joining.py", "test_process_failures.py", "test_soak.py",
+    "test_resume.py", "test_joining.py", "test_process_failures.py", "test_soak.py", "test_process.py",
     "test_shutdown.py", "test_security.py", "test_hostile_clients.py",
 )  # fmt: skip
 
@@ -130,3 +137,31 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
     yield open_one
     for page in pages:
         page.close()
+
+
+@pytest.fixture
+def emulate(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Start emulated headsets in a process of their own; its output is shown when a condition fails."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(address: str, *headsets: str, seconds: float = 100.0) -> subprocess.Popen[bytes]:
+        options = [x for headset in headsets for x in ("--headset", headset)]
+        with (tmp_path / f"emulator{len(started)}.out").open("wb") as out:
+            process = subprocess.Popen(
+                [*END_WITH_PARENT, *COMMAND, "emulate", address, *options, "--seconds", str(seconds)],
+                stdout=out,
+                stderr=out,
+            )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:  # first by a signal: the session keeps the robots of a killed headset for a while
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+    for process in started:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(SHUTDOWN_S)
+        if process.poll() is None:
+            process.kill()
+        process.wait()

@@ -11,7 +11,7 @@ import pytest
 from anchors.pose import PoseTuple
 from iris_session.client import Client
 from iris_session.protocol.names import HoldReason, RejectReason
-from iris_session.protocol.server_messages import Event
+from iris_session.protocol.server_messages import Event, ParticipantJoined
 from tests.e2e.session_process import DEADLINE_S, SessionProcess, read_output_tails
 
 
@@ -154,6 +154,21 @@ class Scenario:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.poll()
+
+    def get_height(self, name: str, body: str) -> float:
+        """Return the height at which client `name` sees a body [m]; 0 before its first state."""
+        client = next(client for client in self.clients if client.name == name)
+        state = client.scene.state
+        return 0.0 if state is None else float(state.poses[client.mirror.body_index[body]][2])
+
+    def list_event_kinds(self, name: str) -> list[str]:
+        """Return the names of the events that client `name` has received."""
+        return [type(event.body).__name__ for event in self.events[name]]
+
+    def has_seen_joining(self, name: str, joined: str) -> bool:
+        """Return whether client `name` has received the event that participant `joined` joined."""
+        bodies = [event.body for event in self.events[name]]
+        return any(isinstance(b, ParticipantJoined) and b.participant.name == joined for b in bodies)
 
     def close(self) -> None:
         for client in self.clients:

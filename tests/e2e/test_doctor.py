@@ -1,11 +1,13 @@
-"""`iris-session doctor` beside real sessions: keys, ports and processes."""
+"""`iris-session doctor` beside real sessions: keys, ports and processes, late ticks, a full disk."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,9 @@ from iris_session.security import KeyHome, KeyPair
 from tests.e2e.session_process import (
     COMMAND,
     SessionProcess,
+    kill_all,
     make_serve_command,
+    skip_unless_ci,
 )
 
 pytestmark = pytest.mark.e2e
@@ -102,3 +106,33 @@ def test_refused_keys_and_codes_at_an_encrypted_session(tmp_path: Path) -> None:
         found.assert_names("server_key", "iris-session keys forget")
     finally:
         server.stop()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 20 MB: the recorder begins with at least 16 free."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=20m", "tmpfs", str(folder)], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode:
+        skip_unless_ci(f"needs the right to mount a small file system: {mounted.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)  # processes that are about to end may still use it
+
+
+@pytest.mark.long
+def test_full_disk(small_disk: Path, tmp_path: Path) -> None:
+    recording = small_disk / "session.rrd"
+    server = SessionProcess(tmp_path, recording, make_serve_command("arm", recording))
+    filler = small_disk / "other-data"
+    try:
+        with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
+            while True:
+                file.write(bytes(1 << 16))
+        found = run_doctor(server.address)
+        found.assert_names("disk", "GB")
+        assert found.status == 1
+    finally:
+        kill_all([server])  # finishing the recording would wait for free space

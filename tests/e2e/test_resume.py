@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Callable, Iterator
 
 import psutil
@@ -11,7 +12,7 @@ import pytest
 from anchors.pose import distance
 from iris_session.client import Client
 from iris_session.protocol.entries import SessionResumed, decode_entries
-from iris_session.protocol.server_messages import Gap, ParticipantJoined
+from iris_session.protocol.server_messages import Gap, Handover, ParticipantJoined
 from iris_session.recording import Recording
 from tests.e2e.scenario import Hand, Scenario
 from tests.e2e.session_process import (
@@ -60,6 +61,42 @@ def wait_reconnected(scenario: Scenario, server: SessionProcess, *clients: Clien
         return client.ready and fresh and f"participant_joined   {client.name}" in server.output
 
     scenario.run_until(lambda: all(map(is_back, clients)), "all clients have reconnected")
+
+
+@pytest.mark.long
+def test_operators_finish_the_handover_although_the_authority_was_killed(
+    scenario: Scenario, emulate: Callable[..., subprocess.Popen[bytes]], resume: Resume
+) -> None:
+    """It is killed while the hammer is in the air; the same two emulated headsets, never restarted, hand it over."""
+    watcher = scenario.join("watcher", "observer")
+    headsets = emulate(
+        scenario.server.address,
+        "name=ann,behaviour=giver,robot=left",
+        "name=bob,behaviour=receiver,robot=right",
+        seconds=300.0,  # longer than all that is waited for
+    )
+
+    def get_hammer_height() -> float:
+        return scenario.get_height("watcher", "hammer")
+
+    scenario.run_until(lambda: get_hammer_height() > 0.0, "a first state")
+    table = get_hammer_height()
+    scenario.run_until(lambda: get_hammer_height() > table + 0.06, "ann lifts the hammer", 60.0)
+    before = dict(watcher.mirror.leases)
+    wait_until_recorded(scenario, scenario.server.recording, watcher.session_now_ns())
+    kill_authority(scenario.server)
+    lifted = get_hammer_height()
+    again = resume(scenario.server)
+    assert again.address == scenario.server.address
+    scenario.run_until(lambda: watcher.ready, "the watcher has reconnected")
+    assert get_hammer_height() > table + 0.03, f"the hammer is still in the gripper: {lifted}"
+    scenario.run_until(lambda: "Handover" in scenario.list_event_kinds("watcher"), "the hammer changes hands", 60.0)
+    (event,) = [e.body for e in scenario.events["watcher"] if isinstance(e.body, Handover)]
+    assert {event.giver_participant, event.receiver_participant} == {before["left"].holder, before["right"].holder}
+    assert headsets.poll() is None
+    assert scenario.server.verify()["finished"]
+    report = again.finish()
+    assert report["continues"].startswith("session.rrd ")
 
 
 def test_resume_after_ctrl_c_keeps_participants_leases_estop_and_pause(

@@ -59,6 +59,21 @@ def interrupt(server: SessionProcess) -> None:
 
 
 @pytest.mark.long
+def test_ctrl_c_while_one_client_joins_and_another_drives(
+    scenario: Scenario, driving: Hand, emulate: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    headset = emulate(scenario.server.address, "name=eve,behaviour=idle")
+    scenario.run_until(lambda: scenario.has_seen_joining("ann", "eve"), "eve has sent hello")
+    headset.send_signal(signal.SIGSTOP)
+    try:
+        interrupt(scenario.server)
+    finally:
+        headset.send_signal(signal.SIGCONT)
+    assert scenario.server.process.returncode == 0
+    assert scenario.server.verify()["finished"]
+
+
+@pytest.mark.long
 def test_ctrl_c_while_the_recorder_hangs(scenario: Scenario, driving: Hand) -> None:
     """Rows that the recorder did not receive are lost, which is reported; the rest verifies."""
     scenario.run_until(scenario.server.count_recorded_rows, "rows are in the file")
