@@ -7,23 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from anchors.alignment import AlignmentEstimate, AlignmentEstimator
+from anchors.alignment import AlignmentEstimator
 from anchors.cross_check import CrossCheck, CrossCheckConfig
 from anchors.pose import PoseTuple, compose, inverse, quat_from_yaw
-from tests.anchors.worlds import Viewpoint, tracking_frame, viewpoint_around
+from tests.anchors.worlds import Viewpoint, align_to_sheet, tracking_frame, viewpoint_around
 
 SHEET: PoseTuple = ((0.2, -0.4, 0.75), quat_from_yaw(0.5))
 PERIOD = 100_000_000
-
-
-def _aligned(rng: np.random.Generator, T_world_tracking: PoseTuple) -> AlignmentEstimate:
-    estimator = AlignmentEstimator({"sheet": SHEET})
-    for viewpoint in range(3):
-        view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], rng.uniform(0.4, 1.0)))
-        for _ in range(20):
-            pose, head = view.observe(T_world_tracking), view.head_pose(T_world_tracking)
-            estimator.add("sheet", pose, 0, 0, viewpoint, p_tracking_head=head)
-    return estimator.estimate()
 
 
 def _observe(
@@ -40,7 +30,7 @@ def test_aligned_headsets_differ_within_expectation() -> None:
         check, alignments = CrossCheck(), {}
         for name in "ab":
             T = tracking_frame(rng)
-            alignments[name] = _aligned(rng, T)
+            alignments[name] = align_to_sheet(rng, SHEET, T)
             _observe(check, name, Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.6)), T)
         (got,) = check.compare(alignments, 30 * PERIOD)
         assert (got.a, got.b, got.target, got.n) == ("a", "b", "sheet", 20)
@@ -55,7 +45,7 @@ def test_aligned_headsets_differ_within_expectation() -> None:
 def test_moving_controller_is_compared_at_equal_times() -> None:
     rng = np.random.default_rng(2)
     frames = {name: tracking_frame(rng) for name in "ab"}
-    exact = {name: replace(_aligned(rng, T), T_world_tracking=T) for name, T in frames.items()}
+    exact = {name: replace(align_to_sheet(rng, SHEET, T), T_world_tracking=T) for name, T in frames.items()}
     check = CrossCheck(config=CrossCheckConfig(max_gap_ns=30_000_000))
     for i in range(200):
         name = "ab"[i % 2]  # 72 Hz each, never at the same time; 1 m/s
@@ -70,7 +60,7 @@ def test_moving_controller_is_compared_at_equal_times() -> None:
 def test_recentred_failed_or_stale_headset_is_not_compared() -> None:
     rng = np.random.default_rng(3)
     T = tracking_frame(rng)
-    good = _aligned(rng, T)
+    good = align_to_sheet(rng, SHEET, T)
     check = CrossCheck()
     view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.6))
     _observe(check, "a", view, T)

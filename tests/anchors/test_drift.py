@@ -7,25 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from anchors.alignment import AlignmentEstimate, AlignmentEstimator
+from anchors.alignment import AlignmentEstimate
 from anchors.drift import Alarm, DriftConfig, DriftMonitor
 from anchors.pose import PoseTuple, Vec3, quat_from_rotvec, quat_from_yaw
-from tests.anchors.worlds import Viewpoint, shifted, tracking_frame, viewpoint_around
+from tests.anchors.worlds import Viewpoint, align_to_sheet, shifted, tracking_frame, viewpoint_around
 
 SHEET: PoseTuple = ((0.2, -0.4, 0.75), quat_from_yaw(0.5))
 OTHER: PoseTuple = ((1.2, 0.4, 0.75), quat_from_yaw(-2.0))
 ANCHORS = {"sheet": SHEET, "other": OTHER}
 PERIOD = 100_000_000
-
-
-def _estimate(rng: np.random.Generator, T_world_tracking: PoseTuple) -> AlignmentEstimate:
-    estimator = AlignmentEstimator({"sheet": SHEET})
-    for viewpoint in range(3):
-        view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], rng.uniform(0.4, 1.0)))
-        for _ in range(20):
-            head = view.head_pose(T_world_tracking)
-            estimator.add("sheet", view.observe(T_world_tracking), 0, 0, viewpoint, p_tracking_head=head)
-    return estimator.estimate()
 
 
 def _monitor(
@@ -72,7 +62,7 @@ def test_slow_drift_and_head_motion_raise_no_alarm(seed: int) -> None:
     """One minute, 3 mm/min, a new viewpoint every 4 s, wrong detections."""
     rng = np.random.default_rng(100 + seed)
     T_world_tracking = tracking_frame(rng)
-    alignment = _estimate(rng, T_world_tracking)
+    alignment = align_to_sheet(rng, SHEET, T_world_tracking)
     monitor, alarms = DriftMonitor(ANCHORS), []
     for viewpoint in range(15):
         view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], rng.uniform(0.4, 1.2)))
@@ -85,7 +75,7 @@ def test_slow_drift_and_head_motion_raise_no_alarm(seed: int) -> None:
 def test_change_while_the_sheet_was_out_of_sight_raises_an_alarm() -> None:
     rng = np.random.default_rng(3)
     T_world_tracking = tracking_frame(rng)
-    alignment = _estimate(rng, T_world_tracking)
+    alignment = align_to_sheet(rng, SHEET, T_world_tracking)
     monitor = DriftMonitor(ANCHORS)
     view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.5))
     alarms = _monitor(monitor, view, shifted(T_world_tracking, (0.03, 0.0, 0.0)), range(20), alignment)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix, to_vec3
 from anchors.pose import PoseTuple, Vec3, apply, compose, inverse
 from anchors.uncertainty import NoiseModel
@@ -49,6 +50,17 @@ def viewpoint_around(rng: np.random.Generator, p: Vec3, d: float) -> Vec3:
     return to_vec3(
         np.array(p) + d * np.array([math.cos(up) * math.cos(way), math.cos(up) * math.sin(way), math.sin(up)])
     )
+
+
+def align_to_sheet(rng: np.random.Generator, sheet: PoseTuple, T_world_tracking: PoseTuple) -> AlignmentEstimate:
+    """Return the estimate from 20 detections of one sheet at each of three viewpoints."""
+    estimator = AlignmentEstimator({"sheet": sheet})
+    for viewpoint in range(3):
+        view = Viewpoint(rng, sheet, viewpoint_around(rng, sheet[0], rng.uniform(0.4, 1.0)))
+        for _ in range(20):
+            pose, head = view.observe(T_world_tracking), view.head_pose(T_world_tracking)
+            estimator.add("sheet", pose, 0, 0, viewpoint, p_tracking_head=head)
+    return estimator.estimate()
 
 
 def tracking_frame(rng: np.random.Generator, tilt_deg: float = 0.2) -> PoseTuple:

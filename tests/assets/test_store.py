@@ -7,7 +7,6 @@ import hashlib
 import os
 import random
 import resource
-import time
 from pathlib import Path
 
 import pytest
@@ -192,26 +191,6 @@ def test_read_only_disk_serves_what_it_has(tmp_path: Path, monkeypatch: pytest.M
         store.hold([address])
     assert not list(tmp_path.rglob("*.part"))
     assert not list((tmp_path / "holds").glob("*"))
-
-
-def test_files_of_killed_processes_are_removed_by_the_next_scan(tmp_path: Path) -> None:
-    """Recent files may belong to a running process, and a part that can be resumed is kept for a week."""
-    store = AssetStore(tmp_path)
-    address = store.put(b"hello")
-    holds, folder = tmp_path / "holds", store.path(address).parent
-    left = [folder / f"{address}.c3.part", tmp_path / f"index/ab/ab{0:062x}.d4.part", holds / "tmpe5.new.hold"]
-    kept = [folder / f"{address}.part", folder / "mine.part"]
-    young = folder / f"{address}.g7.part"
-    for path in (*left, *kept, young):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"half")
-    then = time.time() - 2 * GRACE_S
-    for path in (*left, *kept, store.path(address)):
-        os.utime(path, (then, then))
-    AssetStore(tmp_path).trim()
-    assert not [path for path in left if path.exists()]
-    assert all(path.exists() for path in (*kept, young))
-    assert store.get(address) == b"hello"
 
 
 # --- downloads ---

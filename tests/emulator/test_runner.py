@@ -12,11 +12,10 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from iris_session import SceneBuilder, ScenePublisher, SessionConfig
 from iris_session.client import Client
 from iris_session.emulator import runner
 from iris_session.emulator.__main__ import main
-from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR
+from iris_session.emulator.headset import DEFAULT_ANCHOR_ID
 from iris_session.emulator.runner import run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from iris_session.protocol.client_messages import Sample
@@ -152,17 +151,6 @@ def test_person_without_a_robot_reports_the_reason(session: Rig) -> None:
     (report,) = run_headsets(ADDRESS, specs, seconds=30.0)
     assert "nothing" in report.failed
     assert report.phase == "failed"
-
-
-def test_session_without_robots_is_joined_without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = SceneBuilder()
-    scene.add_box(half_size=(0.1, 0.1, 0.1))
-    anchors = {DEFAULT_ANCHOR_ID: DEFAULT_T_WORLD_ANCHOR}
-    config = SessionConfig(beacon_port=0, record=False, web=False, anchors=anchors)
-    with simulate_sessions() as simulation, ScenePublisher(scene, config):
-        monkeypatch.setattr(runner, "wait_any", wait_in(simulation))
-        (report,) = run_headsets(ADDRESS, [HeadsetSpec(name="ann", behaviour="wander", **QUICK)], seconds=60.0)
-    assert "no robots" in report.failed
 
 
 def test_person_without_a_requested_robot_drives_the_assigned_one(session: Rig) -> None:

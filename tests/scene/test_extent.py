@@ -1,4 +1,4 @@
-"""Extent of a scene: exact for rotated parts, and suspected unit mistakes."""
+"""Extent of a scene: exact for rotated parts."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import pytest
 import trimesh
 
 from iris_session.scene import AssetStore
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.nodes import to_matrix
-from iris_session.scene.report import compute_box_extent, compute_extent, format_unit_hint
+from iris_session.scene.report import compute_box_extent, compute_extent
 from iris_session.scene.shapes import build_primitive
 
 TURN = (0.8, 0.1, -0.3, 0.5)
@@ -76,16 +75,3 @@ def test_extent_of_a_model(tmp_path: Path) -> None:
     assert found is not None
     np.testing.assert_allclose(found.low, (-1, -2, -3.25))
     np.testing.assert_allclose(found.high, (1, 3.5, 0.5))
-
-
-@pytest.mark.parametrize(
-    ("side", "expected"),
-    [
-        (0.0, ""),
-        (9.9, ""),
-        (62.0, "62 m large: in millimetres where metres are meant? --scale 0.001 makes it 62 mm"),
-        (0.0005, "0.5 mm large: divided by 1,000 once too often? --scale 1000 makes it 0.5 m"),
-    ],
-)
-def test_unit_mistakes_are_suspected(side: float, expected: str) -> None:
-    assert format_unit_hint(side, "--scale {factor}") == expected
