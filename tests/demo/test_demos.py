@@ -113,11 +113,8 @@ def test_every_observer_of_the_cloud_watches_all_its_streams(observers: int, nam
     ("demo", "operators", "observers", "why"),
     [
         ("handover", 1, 0, "2 to 8 operators, not 1"),
-        ("panda", 9, 0, "2 to 8 operators, not 9"),
         ("aloha", 4, 0, "2 operators, not 4"),
         ("handover", 2, 17, "--observers 17 .*0 to 16"),
-        ("cloth", 3, 0, "2 operators, not 3"),
-        ("soft", 8, 0, "2 operators, not 8"),
         ("cloud", 3, 0, "2 operators, not 3.*--observers"),
         ("juggle", 2, 0, "'juggle': handover, panda, aloha, cloth, soft, cloud"),
     ],

@@ -49,33 +49,6 @@ def test_home_is_at_rest() -> None:
     assert abs(data.site("left/tcp").xmat.reshape(3, 3)[1, 1]) == pytest.approx(1.0, abs=1e-4)
 
 
-def test_hammer_held_at_its_end_does_not_creep() -> None:
-    """Held 19 cm from its centre of mass for 3 s: settles within 0.5 deg and then does not slip."""
-    model = _handover()
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    at = model.joint("hammer").qposadr[0]
-    data.qpos[at : at + 3] = data.site("right/tcp").xpos - (0.085, 0.0, 0.0)
-    for side in ("left", "right"):
-        data.qpos[model.joint(f"right/finger_joint_{side}").qposadr[0]] = 0.0126
-    data.actuator("right/gripper").ctrl[0] = 0.0
-    gravity = model.opt.gravity.copy()
-    model.opt.gravity[:] = 0.0
-    mujoco.mj_step(model, data, 200)
-    model.opt.gravity[:] = gravity
-
-    def pitch_deg() -> float:
-        return math.degrees(math.asin(data.body("hammer").xmat[6]))
-
-    mujoco.mj_step(model, data, 500)
-    early = pitch_deg()
-    mujoco.mj_step(model, data, 1000)
-    assert abs(early) < 0.5
-    assert abs(pitch_deg() - early) < 0.02
-    assert data.body("hammer").xpos[2] > 0.27
-
-
 @pytest.mark.parametrize("n", [1, 8])
 def test_arms_around_a_table(n: int) -> None:
     model = n_arms_scene(n).compile()
@@ -97,7 +70,7 @@ def test_free_bodies_keep_their_speed_and_stay_inside() -> None:
     model = free_bodies_scene(60, seed=1).compile()
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    for _ in range(30):
+    for _ in range(10):
         mujoco.mj_step(model, data, 500)
         mujoco.mj_forward(model, data)
         before = data.xpos[1:].copy()

@@ -26,9 +26,10 @@ from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from tests.models import MENAGERIE
 from tests.physics.models import clutter, model
 
+NAMES = {"EULER": "Euler", "RK4": "RK4"}
 INTEGRATORS = [n.removeprefix("mjINT_") for n in dir(mujoco.mjtIntegrator) if n.startswith("mjINT_")]
 CASES = [
-    *((name, "", "") for name in INTEGRATORS),
+    *((NAMES.get(name, name.lower()), "", "") for name in INTEGRATORS),
     ("implicitfast", 'cone="elliptic" impratio="10" noslip_iterations="3"', ""),
     ("Euler", 'solver="PGS"', ""),
     ("Euler", 'solver="CG" jacobian="sparse"', '<flag warmstart="disable" energy="enable"/>'),
@@ -52,8 +53,7 @@ def drive(data: mujoco.MjData, k: int) -> None:
 
 @pytest.mark.parametrize(("integrator", "option", "flag"), CASES)
 def test_ticks_equal_mj_steps_bit_for_bit(integrator: str, option: str, flag: str) -> None:
-    names = {"EULER": "Euler", "RK4": "RK4"}
-    m = clutter(names.get(integrator, integrator if integrator == "Euler" else integrator.lower()), option, flag)
+    m = clutter(integrator, option, flag)
     plain, world = mujoco.MjData(m), World(m, (), ())
     contacts = 0
     for k in range(200):
@@ -94,8 +94,7 @@ def test_real_models_tick_like_mj_step_and_restore(name: str, request: pytest.Fi
 @pytest.mark.parametrize(("integrator", "option", "flag"), CASES)
 def test_restore_has_no_effect_on_later_ticks(integrator: str, option: str, flag: str) -> None:
     """A world saved and restored every 37 ticks, and one restored elsewhere, stay equal to an untouched one."""
-    names = {"EULER": "Euler", "RK4": "RK4"}
-    m = clutter(names.get(integrator, integrator if integrator == "Euler" else integrator.lower()), option, flag)
+    m = clutter(integrator, option, flag)
     objects = find_objects(m)
     world, saved_often, other = (World(m, (), objects) for _ in range(3))
     shared = b""

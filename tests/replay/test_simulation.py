@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 
 from iris_session.journal.rows import CRASHED
 from iris_session.recording import OPEN, Continues, Recording, make_row
-from iris_session.replay.simulation import Replay, ReplayError, StepSelector
+from iris_session.replay.simulation import Replay, ReplayError
 from iris_session.session.core import SessionCore
 from tests.replay.support import Played, damaged, play
 from tests.session.play import TICK_NS
@@ -115,28 +113,3 @@ def test_a_header_that_is_none_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(ReplayError, match="the session cannot be built from the header: ") as found:
         replay(played.write())
     assert "\n" not in str(found.value)
-
-
-# --- selection --------------------------------------------------------------------------------------------------------
-
-
-def jittered(steps: int, seed: int = 3) -> Iterator[int]:
-    """Yield times of steps of 2 ms, each up to 0.9 ms late."""
-    rng = np.random.default_rng(seed)
-    return (step * TICK_NS + int(late) for step, late in enumerate(rng.integers(0, 900_000, steps)))
-
-
-def select(hz: float | None, times: Iterator[int]) -> list[int]:
-    selector = StepSelector(hz, TICK_NS)
-    return [i for i, now_ns in enumerate(times) if selector.selects(now_ns)]
-
-
-@pytest.mark.parametrize("hz", [None, 500, 499.9, 501.0, 1e6])
-def test_the_rate_of_the_session_is_every_step(hz: float | None) -> None:
-    assert select(hz, jittered(1000)) == list(range(1000))
-
-
-@pytest.mark.parametrize(("hz", "every"), [(250.0, 2), (100.0, 5), (50, 10), (1.0, 500)])
-def test_a_fraction_of_the_rate_is_every_nth_step(hz: float, every: int) -> None:
-    assert select(hz, iter(range(0, 4000 * TICK_NS, TICK_NS))) == list(range(0, 4000, every))
-    assert select(hz, jittered(4000)) == list(range(0, 4000, every)), "within half a tick"

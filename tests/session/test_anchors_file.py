@@ -18,23 +18,15 @@ PLACES: dict[str, PoseTuple] = {
 GOOD = 'format = 1\nreference = "a"\n[anchors.a]\nposition_m = [0, 0, 0]\nquaternion_wxyz = [1, 0, 0, 0]\n'
 
 
-def test_anchors_file_roundtrip(tmp_path: Path) -> None:
-    path = tmp_path / "anchors.toml"
-    path.write_text(dump_anchors(PLACES, {"table": 0.16}))
-    found = load_anchors(path)
-    assert (found.anchors, found.sizes, found.reference) == (PLACES, {"table": 0.16}, "table")
-    assert found.marks == {}
-    config = SessionConfig(anchors=found.anchors, anchor_sizes=found.sizes)
-    assert config.sheet_sizes() == {"table": 0.16}
-
-
-def test_marks_are_part_of_their_sheet(tmp_path: Path) -> None:
-    marks = {'door "2"': {"1": (0.1, 0.2, 0.0), "left up": (-0.1, 0.2, 0.0)}}
+@pytest.mark.parametrize("marks", [{}, {'door "2"': {"1": (0.1, 0.2, 0.0), "left up": (-0.1, 0.2, 0.0)}}])
+def test_anchors_file_roundtrip(tmp_path: Path, marks: dict[str, Any]) -> None:
     path = tmp_path / "anchors.toml"
     path.write_text(dump_anchors(PLACES, {"table": 0.16}, marks))
     found = load_anchors(path)
-    assert (found.anchors, found.sizes, found.marks) == (PLACES, {"table": 0.16}, marks)
-    assert SessionConfig(anchors=found.anchors, anchor_marks=found.marks).mark_positions() == marks
+    assert (found.anchors, found.sizes, found.reference) == (PLACES, {"table": 0.16}, "table")
+    assert found.marks == marks
+    config = SessionConfig(anchors=found.anchors, anchor_sizes=found.sizes, anchor_marks=found.marks)
+    assert (config.sheet_sizes(), config.mark_positions()) == ({"table": 0.16}, marks)
 
 
 @pytest.mark.parametrize(

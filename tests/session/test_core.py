@@ -19,20 +19,13 @@ from tests.session.play import TICK_NS, host, make_core, play
 from tools.codegen.examples import make_full
 
 
-def test_same_journal_gives_the_same_digests() -> None:
-    one, two = make_core(), make_core()
-    digests = play(one, 0, 200)
-    assert digests == play(two, 0, 200)
-    assert len(set(digests[:120])) == 120, "every tick shows in its digest"
-    assert one.snapshot() == two.snapshot()
-
-
 @pytest.mark.parametrize("at", [0, 49, 120, 150])
 def test_restoring_a_snapshot_changes_nothing(at: int) -> None:
     """In the same core, and in another one that continues from it."""
     straight, restored, other = make_core(), make_core(), make_core()
     before = play(straight, 0, at)
     expected = play(straight, at, 200)
+    assert len(set((before + expected)[:120])) == 120, "every tick shows in its digest"
     assert play(restored, 0, at) == before
     state = restored.snapshot()
     restored.restore(state)

@@ -272,17 +272,9 @@ def test_anchors_are_those_of_the_recording_by_default(tmp_path: Path, given: di
 
 
 def test_note_of_a_resumed_session_has_its_settings() -> None:
-    config = SessionConfig(
-        state_hz=30.0,
-        keyframe_s=2.0,
-        realtime=False,
-        adapt_media=False,
-        anchors={"wall": ((1.0, 0.0, 1.0), IDENTITY_QUAT)},
-        anchor_sizes={"wall": 0.2},
-        record_clouds_hz=5.0,
-        record_assets="all",
-        record_budget_bytes=20_000_000,
-    )
+    wall = {"anchors": {"wall": ((1.0, 0.0, 1.0), IDENTITY_QUAT)}, "anchor_sizes": {"wall": 0.2}}
+    recording = {"record_clouds_hz": 5.0, "record_assets": "all", "record_budget_bytes": 20_000_000}
+    config = SessionConfig(state_hz=30.0, keyframe_s=2.0, realtime=False, adapt_media=False, **wall, **recording)  # type: ignore[arg-type]
     noted = make_settings(config)
     assert {name: getattr(config, name) for name in noted.__struct_fields__} == msgspec.structs.asdict(noted)
 

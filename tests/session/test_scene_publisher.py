@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from iris_session import (
     ConfigError,
@@ -165,18 +163,6 @@ def test_invalid_scene_or_configuration_raises(tmp_path: Path) -> None:
             ScenePublisher(builder, config)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="scene"):
         ScenePublisher(broken, CONFIG).start()
-
-
-def test_probable_mistakes_are_notes_and_unknown_names_raise(tmp_path: Path) -> None:
-    """A part in millimetres, and a name that is nearly right."""
-    builder = scene()
-    trimesh.creation.icosphere(radius=50).export(tmp_path / "ball_mm.stl")
-    builder.add_file(tmp_path / "ball_mm.stl", movable=True)
-    with ScenePublisher(builder, replace(CONFIG, assets=tmp_path)) as session:
-        assert [note for note in session.notes if "100 m" in note]
-        session.set_pose("ball_mm", (0, 0, 0))
-        with pytest.raises(PublishError, match="nearest: 'box'"):
-            session.set_pose("boxx", (0, 0, 0))
 
 
 def test_error_that_stopped_the_session_is_raised_by_later_calls(monkeypatch: pytest.MonkeyPatch) -> None:

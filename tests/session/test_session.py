@@ -52,13 +52,6 @@ def _make_report(session: Session) -> StatusReport:
     return session._processes.make_report(session.stepper)
 
 
-def test_messages_posted_before_the_first_step_are_in_it(session: Session) -> None:
-    session.marker("first")
-    session.run(until=session.recent_events)
-    assert isinstance(_bodies(session)[0], MarkerAdded)
-    assert session.status().tick >= 1
-
-
 def test_invalid_messages_raise_and_an_estop_never_does(session: Session) -> None:
     session.marker("before")
     with pytest.raises(ValueError, match="Marker"):

@@ -45,23 +45,6 @@ def test_replaced_specifications_are_released(world: World, tmp_path: Path, monk
     scenes.close()
 
 
-def test_full_disk_does_not_undo_a_scene_change(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scenes = SharedScenes(tmp_path, "test")
-    shown = scenes.make(world)
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(AssetStore, "hold", full)
-    assert scenes.show(shown) is shown.info
-    assert scenes.newest is shown
-    assert "No space left on device" in scenes.notes[-1]
-    said = len(scenes.notes)
-    for i in range(3):
-        scenes.show(scenes.patch([SetVisual(0, rgba=(i / 20, 0.0, 0.0, 1.0))]))
-    assert len(scenes.notes) == said, "once, however often it is patched"
-
-
 def test_scene_without_specification_does_not_affect_the_next(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

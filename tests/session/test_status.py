@@ -122,21 +122,13 @@ def test_new_front_gets_the_current_anchors() -> None:
     assert front.anchors == {"table": moved}
 
 
-def processes(
-    alive: bool = True,
-    hangs: bool = False,
-    failure: str = "",
-    fault: str = "",
-    budget: str = "",
-    ended: bool = False,
-    journal_only: bool = False,
-) -> Any:
+def processes(fault: str = "", **state: Any) -> Any:
     """Return feed and recorder."""
     said = RecorderStatus(1, 0, 0, bytes=1000, fault=fault, disk_free=5000)
-    state = {"alive": alive, "hangs": hangs, "failure": failure, "is_used_up": ended, "budget_text": budget}
+    well = {"alive": True, "hangs": False, "failure": "", "is_used_up": False, "budget_text": "", "journal_only": False}
     return (
         SimpleNamespace(stats=FeedStats(dropped_rows=2, waiting_bytes=30, recorder=said)),
-        SimpleNamespace(path="/data/session.rrd", journal_only=journal_only, **state),
+        SimpleNamespace(path="/data/session.rrd", **{**well, **state}),
     )
 
 
@@ -148,7 +140,11 @@ def processes(
         ({"alive": False}, "dead", ""),
         ({"alive": False, "failure": "no space left"}, "failed", "no space left"),
         ({"fault": "cannot be written"}, "failed", "cannot be written"),
-        ({"alive": False, "budget": "recording ended: budget", "ended": True}, "ended", "recording ended: budget"),
+        (
+            {"alive": False, "budget_text": "recording ended: budget", "is_used_up": True},
+            "ended",
+            "recording ended: budget",
+        ),
         ({"journal_only": True}, "running", NO_PICTURE),
         ({"hangs": True, "failure": "no space left"}, "failed", "no space left"),  # dies again and again
     ],

@@ -16,14 +16,12 @@ class Network:
 
     Attributes:
         names: Of the sessions that are heard.
-        waits: What the finder has waited [s].
         error: Of opening the port.
     """
 
     def __init__(self) -> None:
         self.names: tuple[str, ...] = ()
         self.now_s = 100.0
-        self.waits: list[float] = []
         self.error: DiscoveryError | None = None
 
     def open_listener(self, port: int) -> Network:
@@ -32,7 +30,6 @@ class Network:
         return self
 
     def wait(self, timeout_s: float) -> None:
-        self.waits.append(timeout_s)
         self.now_s += timeout_s
 
     def poll_sessions(self) -> list[FoundSession]:

@@ -44,10 +44,3 @@ def test_error_keeps_the_old_content_and_leaves_no_temporary_file(tmp_path: Path
         fail()
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["file"]
-
-
-def test_irreplaceable_target_leaves_no_temporary_file(tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(OSError, match="folder"):
-        write_atomic(tmp_path / "folder", b"new")
-    assert os.listdir(tmp_path) == ["folder"]
