@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
@@ -186,6 +187,31 @@ class EmulatedQuest:
         found: Any = self.evaluate(FEEDBACK.format(robot))
         return {**found}
 
+    def pull_robot(self, robot: str, begin: PoseTuple, motion: Vec3) -> None:
+        """Squeeze and move the right controller until the end effector has gone half of `motion` [m].
+
+        A person begins anew where the robot held on the way: a machine that draws for the headset and runs the session
+        may stand still for longer than samples may be old, or hands without a frame.
+        """
+        tip = self.host.scene.tip_pose(robot)
+        assert tip
+        first = tip[0]
+
+        def has_followed() -> bool:
+            now = self.host.scene.tip_pose(robot)
+            return now is not None and dot(motion, sub(now[0], first)) > 0.5 * dot(motion, motion)
+
+        deadline = time.monotonic() + DEADLINE_S
+        while not has_followed():
+            assert time.monotonic() < deadline, f"{robot} does not follow\n{self.page.describe()}"
+            self.press("squeeze", 0.0)
+            self.wait(f"{HEADSET}.reading.inputs.every((one) => one.squeeze === 0)")
+            self.place("quest.controllers.right", begin)
+            self.press("squeeze", 1.0)
+            if self.scenario.wait_for(lambda: is_driven(self.host, robot, self.person.id), ANSWER_S):
+                self.glide(add(begin[0], motion), 2.0)
+                self.scenario.wait_for(has_followed, 1.0)
+
     def move_robot(self, robot: str, begin: PoseTuple, motion: Vec3) -> float:
         """Squeeze, move the right controller, and return how far the end effector is from where that takes it [m].
 
@@ -232,6 +258,14 @@ class EmulatedQuest:
 
 def add(a: Vec3, b: Vec3) -> Vec3:
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def sub(a: Vec3, b: Vec3) -> Vec3:
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+def dot(a: Vec3, b: Vec3) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def holder(client: Client, robot: str) -> str:

@@ -38,6 +38,24 @@ DEMO_S: Final = 900.0
 #: recorded takes as long again.
 DEMO_OPTIONS: Final = ("--json", "--timeout", "360")
 COMMAND: Final = [sys.executable, "-m", "iris_session.cli.main"]
+#: The command with limits of time that a machine which stands still for seconds does not reach: no robot holds and
+#: nobody leaves because others compute. What happens at these limits is tested in simulated time (tests/rig).
+PATIENT_COMMAND: Final = [
+    sys.executable,
+    "-c",
+    """
+import functools, sys
+import iris_session.session.session  # has the class itself
+from iris_session import authority
+from iris_session.cli.main import main
+
+long_ns = 60 * 1_000_000_000
+authority.AuthorityConfig = functools.partial(
+    authority.AuthorityConfig, freshness_ns=long_ns, gap_ns=long_ns, heartbeat_timeout_ns=long_ns
+)
+sys.exit(main())
+""",
+]
 #: Options of `serve` that bind free ports.
 FREE_PORTS: Final = ("--control-port", "0", "--state-port", "0")
 #: Prefix of a command that gets SIGTERM when the tests die: servers of a killed run slowed down the next one.
@@ -109,7 +127,7 @@ def read_output_tails(folder: Path) -> str:
 def make_serve_command(scene: str, recording: Path, *arguments: str) -> list[str]:
     """Return a command that serves a scene on free ports of a loopback address of its own."""
     host = make_loopback_address()
-    return [*COMMAND, "serve", scene, "--host", host, *FREE_PORTS, "--record", str(recording), *arguments]
+    return [*PATIENT_COMMAND, "serve", scene, "--host", host, *FREE_PORTS, "--record", str(recording), *arguments]
 
 
 class SessionProcess:
