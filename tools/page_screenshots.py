@@ -106,7 +106,6 @@ def shoot_ar(browser: Browser, scratch: Path, picture: Path) -> None:
         quest.evaluate(HIDE_PAGE)
         ben.velocity = (0.0, 0.02, 0.0)
         scenario.run_for(SETTLE_S)
-        scenario.keep_engaged(ben)
         quest.in_page(lambda: page.screenshot(picture), "the picture is made")
         quest.close()
         page.close()

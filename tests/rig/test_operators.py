@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 
 import numpy as np
@@ -38,6 +39,24 @@ def test_second_operator_is_denied_with_the_holder_and_moves_nothing() -> None:
         rig.run(0.5)
         hand.clutch, hand.velocity = True, (0.2, 0.0, 0.0)
         rig.check_rest(bob, "left", 0.7)
+
+
+def test_log_has_joins_denials_holds_and_leaves_once_each(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, "iris_session.session"), Rig(timestep=TICK) as rig:
+        hand, bob = rig.drive("ann", "left"), rig.join("bob")
+        caplog.clear()
+        with pytest.raises(DeniedError) as denied:
+            bob.acquire(["left"])
+        hand.sending = False
+        rig.run(0.5)
+        bob.close()
+        rig.run(0.2)
+        rig.join("carl")
+        told = caplog.messages
+    assert [HoldReason.STALE in text and "left" in text for text in told].count(True) == 1
+    assert [bob.participant_id in text for text in told].count(True) == 1
+    assert ["carl" in text for text in told].count(True) == 1
+    assert [denied.value.denial.message in text for text in told].count(True) == 1
 
 
 def test_robot_follows_its_hand_and_holds_150_ms_after_the_last_sample() -> None:
