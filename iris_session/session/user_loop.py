@@ -305,10 +305,8 @@ class UserLoop:
         self._forces.write(self._data.xfrc_applied, held, core.world.data.xfrc_applied)
 
     def _count_ticks(self) -> int:
-        """Return the ticks that this round stands for: those of the one before, at most those of the one before that.
-
-        So a single long round makes no leap.
-        """
+        """Return for how many ticks of the model this round counts: as many as the last round took, at most as many as
+        the round before it, so that a single long round makes no leap."""
         began, self._began_time = self._began_time, float(self._data.time)
         if began is None:
             self._ticks_before = 0
