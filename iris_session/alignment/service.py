@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, wait
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, Protocol
@@ -54,6 +54,8 @@ _MAX_WAITING: Final = 64
 TIP_PERIOD_NS: Final = 500_000_000
 #: Devices of one connection whose tips wait for their calibration.
 MAX_WAITING_TIPS: Final = 4
+#: Time for a job that runs when the service is closed [s].
+CLOSE_S: Final = 1.0
 
 
 class Worker:
@@ -84,9 +86,10 @@ class Worker:
             finished.result()()
 
     def close(self) -> None:
-        """End the thread after the job that runs, whose result is discarded."""
+        """End the thread, whose job has a second to end; its result is discarded."""
         if self._executor is not None:
-            self._executor.shutdown()
+            wait([self._running] if self._running is not None else [], CLOSE_S)
+            self._executor.shutdown(wait=False, cancel_futures=True)
 
 
 class HeadsetConnection(Protocol):

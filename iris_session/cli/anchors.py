@@ -25,6 +25,7 @@ from iris_session.cli.common import (
     open_scene,
     parse_length,
     pick_attributes,
+    print_json,
     print_result,
     write_file,
 )
@@ -259,7 +260,10 @@ def run_example(arguments: argparse.Namespace) -> int:
         anchors, sizes = scene.anchors, scene.anchor_sizes
     marks = {name: compute_marks(MARKED_SHEET_M) for name in anchors if arguments.marks}
     text = dump_anchors(anchors, sizes | dict.fromkeys(marks, MARKED_SHEET_M), marks)
-    print_result(arguments, {"toml": text}, text.splitlines())
+    if arguments.json:
+        print_json({"toml": text})
+    else:
+        print(text, end="", flush=True)  # a file: names as they are
     return 0
 
 

@@ -21,6 +21,7 @@ from iris_session.cli.common import (
     explain_no_robots,
     make_number_type,
     open_scene,
+    print_json,
     print_result,
 )
 
@@ -109,8 +110,10 @@ def run_robots(arguments: argparse.Namespace) -> int:
     if not robots:
         print(explain_no_robots(model), file=sys.stderr)
     first = f"# {len(robots)} robots, {len(objects)} free objects: {', '.join(o.name for o in objects) or 'none'}"
-    lines = [first, *dump_robots_toml(robots).split("\n")]
-    print_result(arguments, {"robots": robots, "objects": objects}, lines)
+    if arguments.json:
+        print_json({"robots": robots, "objects": objects})
+    else:
+        print(f"{first}\n{dump_robots_toml(robots)}", flush=True)  # a file: names as they are
     return 0
 
 

@@ -30,8 +30,10 @@ from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import MAX_FACES, MAX_VERTICES, DeformableTopology
 from iris_session.streams.errors import StreamError
 
-#: Pause before the assets of a scene are requested again after a failure [s].
-RETRY_S: Final = 0.1
+#: First and longest pause before the assets of a scene are requested again after a failure [s]; each pause is twice the
+#: one before.
+FIRST_PAUSE_S: Final = 0.02
+LONGEST_PAUSE_S: Final = 2.5
 #: Largest asset of a deformable in memory [bytes], about twice that of the largest mesh. It is decoded in the thread
 #: that polls the client.
 MAX_ASSET_BYTES: Final = 128 << 20
@@ -161,7 +163,7 @@ class Deformables:
         self._parts: tuple[Deformable, ...] | None = None  # deformables of that scene
         self._fetch: AssetFetch | None = None
         self._fault = ""
-        self._retry_s = 0.0
+        self._pause_s = self._retry_s = 0.0
 
     @property
     def meshes(self) -> Mapping[str, DeformableMesh]:
@@ -205,7 +207,7 @@ class Deformables:
         if self._fetch is not None:  # it has most of what a later look has: patches may come faster than assets
             return
         if scene_hash != self._asked:
-            self._asked = scene_hash
+            self._asked, self._pause_s = scene_hash, FIRST_PAUSE_S / 2.0
         elif time.monotonic() < self._retry_s:
             return
         self._begin()
@@ -277,7 +279,8 @@ class Deformables:
         if self._parked:
             self._show_meshes([], "")
         self._fault = str(error)
-        self._retry_s = time.monotonic() + RETRY_S
+        self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+        self._retry_s = time.monotonic() + self._pause_s
 
     def _show(self, mesh: _Mesh) -> bool:
         frame = mesh.feed.newest

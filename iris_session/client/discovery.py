@@ -126,7 +126,10 @@ LISTEN_S: Final = 1.0
 #: Error numbers by which different systems report a connection that is not established yet.
 _NOT_YET: Final = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.EINPROGRESS, errno.ENOTCONN})
 #: Names that the system is being asked for: it may take many seconds, and all who ask meanwhile share the answer.
-_lookups: dict[str, Future[str]] = {}
+_lookups: dict[str, tuple[Future[str], float]] = {}  # with the time at which the system was asked
+_lookups_lock = threading.Lock()
+#: An answer that came too late for its question serves the next attempt within so long of the question [s].
+KEPT_S: Final = 30.0
 
 
 def open_listener(port: int = DISCOVERY_PORT) -> BeaconListener:
@@ -218,15 +221,19 @@ def resolve_host(host: str, until_s: float) -> Generator[None, None, str]:
     """
     with contextlib.suppress(ValueError):
         return str(ipaddress.ip_address(host))
-    if host not in _lookups:
-        _lookups[host] = Future()
-        threading.Thread(target=_look_up, args=(host, _lookups[host]), name=f"iris-resolve-{host}", daemon=True).start()
-    lookup = _lookups[host]
+    with _lookups_lock:
+        lookup, began_s = _lookups.get(host, (None, 0.0))
+        if lookup is None or (lookup.done() and time.monotonic() - began_s > KEPT_S):
+            lookup = Future()
+            _lookups[host] = lookup, time.monotonic()
+            threading.Thread(target=_look_up, args=(host, lookup), name=f"iris-resolve-{host}", daemon=True).start()
     while not lookup.done():
         if time.monotonic() > until_s:
             raise TimeoutError(errno.ETIMEDOUT, f"the name {host} is still looked up")
         yield
-    _lookups.pop(host, None)
+    with _lookups_lock:
+        if _lookups.get(host, (None,))[0] is lookup:
+            del _lookups[host]
     return lookup.result()
 
 

@@ -199,7 +199,7 @@ class _Reader:
     def read(self) -> CloudSettings:
         try:
             document = tomllib.loads(self._text)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:  # also a nesting that Python does not take
             line = re.search(r"line (\d+)", str(error))
             raise CameraFileError(f"{self._path}: {error}", line=int(line[1]) if line else 0) from error
         tables = document.get("cameras")
@@ -350,7 +350,7 @@ def read_calibration(path: Path, camera: str, *, on_body: bool) -> tuple[CameraP
     text = _read_text(path, "calibration")
     try:
         document = tomllib.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CameraFileError(f"{path}: {error}", "calibration") from error
     cameras = document.get("cameras")
     part = cameras.get(camera) if isinstance(cameras, dict) else document

@@ -171,8 +171,8 @@ def check_leases(people: tuple[ParticipantReport, ...], all_robots: tuple[RobotR
     without = [p for p in people if p.connected and p.role in DRIVERS and not p.holds]
     if not without or not all_robots:
         return ok("leases", held)
-    waits = {p.name: f", waits for {', '.join(p.waits_for)}" if p.waits_for else "" for p in without}
-    text = "; ".join(f"{name} has no robot{waiting}" for name, waiting in waits.items())
+    waits = [f", waits for {', '.join(p.waits_for)}" if p.waits_for else "" for p in without]
+    text = "; ".join(f"{p.name} has no robot{waiting}" for p, waiting in zip(without, waits, strict=True))
     free = [r.name for r in all_robots if not r.holder]
     disconnected = {p.id: p.name for p in people if not p.connected}
     kept = [

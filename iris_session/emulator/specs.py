@@ -19,7 +19,7 @@ class HandTask(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """The task of one hand: `behaviour` (a name of `emulator.behaviours`) with `device` on `robot`.
 
     `object`, `partner`: the object that is handed over, and the other robot. `arm`: kind of both robots
-    (`behaviours.arms`).
+    (`behaviours.objects`).
     `place`: position at which a receiver lays the object, x and y [m, world].
     """
 

@@ -35,11 +35,11 @@ from iris_session.rrd.file import (
     FILE_HEAD,
     KIND_ARROW,
     KIND_END,
+    KIND_LAST,
     KIND_STORE_INFO,
     MAGIC,
     RECORDING,
     find_store_id,
-    message_at,
     read_chunks,
     read_message,
     read_message_head,
@@ -55,6 +55,7 @@ SEND_S: Final = 0.5
 #: After this long without a writer and without new bytes the session has ended.
 ENDED_S: Final = 2.0
 _KIND_ACTIVATION: Final = 3
+_HEAD_BYTES: Final = len(END_MESSAGE)
 
 
 class MessageTail:
@@ -70,7 +71,7 @@ class MessageTail:
         """Return the next messages of one file, about `n_bytes` at most; none if none is complete.
 
         Raises:
-            NotARecordingError: It is not a Rerun file.
+            NotARecordingError: The file is not one that a recorder writes.
         """
         if self._file is None and not self._open():
             return []
@@ -107,8 +108,17 @@ class MessageTail:
     def _read_message(self) -> bytes:
         """Return the next message, empty if it is not complete or the file was closed."""
         assert self._file is not None
-        message = message_at(self._file, self._at, os.fstat(self._file.fileno()).st_size)
-        return b"" if message is None or message.kind == KIND_END else read_message(self._file, message)
+        self._file.seek(self._at)
+        head = self._file.read(_HEAD_BYTES)
+        if len(head) < _HEAD_BYTES:
+            return b""
+        kind, length = read_message_head(head)
+        if kind > KIND_LAST:
+            raise NotARecordingError(f"{self._file.name} cannot be followed: byte {self._at} begins no message")
+        if kind == KIND_END:
+            return b""
+        body = self._file.read(length)
+        return head + body if len(body) == length else b""
 
 
 class LiveFeed:

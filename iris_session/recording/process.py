@@ -62,15 +62,20 @@ DRAIN_MEDIA: Final = 2
 #: After SIGTERM or the end of the parent: without a message for this long, everything was received.
 QUIET_S: Final = 0.1
 FINISH_S: Final = 10.0
+#: An orphaned recorder whose file does not grow for this long exits: a write to a hung disk never returns.
+ORPHAN_S: Final = 20.0
 #: Exit statuses. An error that nothing catches is 1 (`supervise.CRASHED`).
 NOT_BEGUN: Final = 2
 NOT_WRITTEN: Final = 3
+ORPHANED: Final = 4
 MIN_FREE_BYTES: Final = 16 << 20
-#: Free bytes that are left to the journal: hours of it. Below, raw samples and media are left out.
+#: Free bytes that are left to the journal: hours of it. Below, raw samples, vertices and media are left out.
 JOURNAL_RESERVE_BYTES: Final = 256 << 20
 #: A write that takes longer shows a disk that cannot keep up: raw samples are left out until one is shorter. Drawing a
 #: scene or a busy processor makes a flush long, but not this.
 SLOW_WRITE_S: Final = 0.3
+#: Bytes written to test a new file. A file begins with about 22 KB, mostly the blueprint.
+TRIAL_BYTES: Final = 128 << 10
 #: Bytes of assets in a write: at most, at least, and what the disk takes in `ASSETS_S`.
 MAX_ASSETS_BYTES: Final = 1 << 20
 MIN_ASSETS_BYTES: Final = 64 << 10
@@ -119,6 +124,7 @@ class RecorderLoop:
 
     def run(self) -> int:
         """Record until stopped. Return the exit status of the process."""
+        threading.Thread(target=self._give_up_as_orphan, name="orphan", daemon=True).start()
         try:
             self._send_status(-1)
             self._loop()
@@ -157,6 +163,20 @@ class RecorderLoop:
         is_abrupt = not self._stopping and os.getppid() != self._config.parent
         self._writer.close(reason=reason, samples_left_out=self._samples_left_out, is_abrupt=is_abrupt)
         self._ended = self._is_used_up
+
+    def _give_up_as_orphan(self) -> None:
+        """Exit the process when its parent has ended and the file cannot be written (runs in a thread)."""
+        size, since = -1, time.monotonic()
+        while True:
+            time.sleep(SYNC_S)
+            try:
+                now = os.stat(self._writer.path).st_size
+            except OSError:
+                now = size
+            if now != size or os.getppid() == self._config.parent:
+                size, since = now, time.monotonic()
+            elif time.monotonic() - since > ORPHAN_S:
+                os._exit(ORPHANED)
 
     def _remove(self) -> None:
         """Remove file and folder of a session that never began (its port was in use)."""
@@ -288,6 +308,9 @@ class RecorderLoop:
                 self._is_used_up = True
                 return
             batch = self._decode(frames[1])
+            if batch.vertices and self._is_short:
+                self._writer.drawing.vertices_refused += len(batch.vertices)
+                batch.vertices.clear()
             if batch.rows:
                 self._newest_ns = batch.rows[-1].now_ns
             self._writer.add(batch)
@@ -408,7 +431,7 @@ def claim_file(path: Path) -> bool:
     made_folder = not os.path.exists(path.parent)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))
+        _try_to_write(path)
         free = os.statvfs(path.parent)
     except OSError as error:
         raise RecorderError(f"cannot record to {path}: {error.strerror or error}") from error
@@ -416,6 +439,21 @@ def claim_file(path: Path) -> bool:
         path.unlink(missing_ok=True)
         raise RecorderError(f"cannot record to {path}: less than {MIN_FREE_BYTES >> 20} MiB of the disk are free")
     return made_folder
+
+
+def _try_to_write(path: Path) -> None:
+    """Create the empty file after a trial write of `TRIAL_BYTES`, so that errors appear before the session begins."""
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+    try:
+        left = bytes(TRIAL_BYTES)
+        while left:
+            left = left[os.write(fd, left) :]
+        os.ftruncate(fd, 0)
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(fd)
 
 
 def get_free_bytes(path: Path) -> int:

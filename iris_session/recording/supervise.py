@@ -236,7 +236,10 @@ class RecorderProcess:
 
     def _read_reason(self) -> str:
         """Return the recorder's last own line in its log, else the last line of the log."""
-        data = b"" if self._log is None else os.pread(self._log.fileno(), LOG_BYTES, 0)
+        data = b""
+        if self._log is not None:
+            log = self._log.fileno()
+            data = os.pread(log, LOG_BYTES, max(0, os.fstat(log).st_size - LOG_BYTES))
         lines = data.decode(errors="replace").strip().splitlines()
         own = [line.removeprefix(FAULT_PREFIX) for line in lines if line.startswith(FAULT_PREFIX)]
         return (own or lines or ["no message"])[-1][:300]

@@ -31,11 +31,15 @@ SCENE: Final = "scene"
 ALL: Final = "all"
 RECORD_ASSETS: Final = (NONE, SCENE, ALL)
 SPECIFICATION: Final = "specification of the scene"
+#: Upper bound of the number of assets whose faults and names are kept: a hostile file may name any number.
+MOST_ASSETS: Final = 1 << 20
 #: Largest piece [bytes].
 PIECE_BYTES: Final = 512 << 10
 #: Time between the specifications of two patches [ns]: of patches in between, the last is recorded. The picture has
 #: all of them, and the journal.
 PATCH_PERIOD_NS: Final = 1_000_000_000
+#: Upper bound of the scenes that wait.
+MOST_SCENES: Final = 256
 SCENES_FILE: Final = "scenes.json"
 #: Nothing is removed from a folder to make room.
 _NO_LIMIT: Final = 1 << 62
@@ -144,10 +148,12 @@ class AssetJoiner:
         data = b"".join(self._parts)
         self._address, self._parts = "", []
         if hashlib.sha256(data).hexdigest() != piece.address:
-            self.changed[piece.address] = None
+            if len(self.changed) < MOST_ASSETS:
+                self.changed[piece.address] = None
             return None
         self.changed.pop(piece.address, None)
-        self.whole[piece.address] = len(data)
+        if len(self.whole) < MOST_ASSETS:
+            self.whole[piece.address] = len(data)
         return data
 
 
@@ -172,9 +178,10 @@ class AssetCollector:
             if data is not None and item.is_scene:
                 self._read_scene(data)
         elif isinstance(item, RecordedScene):
-            self._changes.add(item)
-            self._scenes[item.hash] = item.recorded
-        else:
+            if len(self._changes) < MOST_ASSETS:
+                self._changes.add(item)
+                self._scenes[item.hash] = item.recorded
+        elif len(self._faults) < MOST_ASSETS:
             self._faults[item.address] = item.text
 
     def _read_scene(self, data: bytes) -> None:
@@ -279,6 +286,9 @@ class AssetQueue:
             return  # no assets are shared
         if is_patch and self._scenes and self._scenes[-1][1]:
             self._scenes.pop()
+        if len(self._scenes) >= MOST_SCENES:
+            self._scenes.popleft()
+            self.left_out += 1
         self._scenes.append((scene, is_patch))
 
     def read(self, now_ns: int, max_bytes: int) -> AssetRows:

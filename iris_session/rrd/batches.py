@@ -373,8 +373,9 @@ def _flatten(batch: Any, column: str) -> Any:
 # `rerun rrd optimize` puts large columns of an entity into chunks of their own, merges chunks, and fills in nulls where
 # a merged chunk had no such column; one chunk may hold a row twice then, with something in other columns each time.
 # What it keeps is the id of every row, which grows in the order of writing: the parts of one row have one id. As
-# measured with rerun-sdk 0.41, the chunks of an entity come in the order of their first rows; so chunks that overlap
-# are held here together. In another order parts stay separate, and readers miss the rest of their rows.
+# measured with rerun-sdk 0.41, the chunks of an entity come in the order of their first rows; so no more is
+# held here than the longest chunk and those beside it. In another order parts stay separate, and readers miss the rest
+# of their rows.
 
 ROW_ID: Final = "rerun.controls.RowId"
 _ENTITY: Final = b"rerun:entity_path"
@@ -395,13 +396,9 @@ def group_spans(batches: Iterable[Any]) -> Iterator[list[Any]]:
             pieces = waiting.setdefault(get_entity(batch), [])
             if pieces and ordered.equals(pieces[-1]):
                 continue
-            first = ordered.column(ROW_ID)[0].as_py()
-            if pieces and all(piece.column(ROW_ID)[-1].as_py() < first for piece in pieces):
-                waiting[get_entity(batch)] = [ordered]
-                yield pieces
-            else:
-                pieces.append(ordered)
-    yield from waiting.values()
+            yield from _release_before(pieces, ordered.column(ROW_ID)[0])
+            pieces.append(ordered)
+    yield from filter(None, waiting.values())
 
 
 def join_pieces(pieces: list[Any]) -> Any:
@@ -439,6 +436,22 @@ def _in_order(batch: Any) -> Any:
     import pyarrow.compute as pc
 
     return batch if _is_ascending(batch) else batch.take(pc.sort_indices(batch.column(ROW_ID)))
+
+
+def _release_before(pieces: list[Any], bound: Any) -> Iterator[list[Any]]:
+    """Remove the rows before the id `bound` from `pieces` and yield them as a span."""
+    import pyarrow.compute as pc
+
+    heads, tails = [], []
+    for piece in pieces:
+        n = pc.sum(pc.less(piece.column(ROW_ID), bound)).as_py()
+        if n:
+            heads.append(piece.slice(0, n))
+        if n < piece.num_rows:
+            tails.append(piece.slice(n))
+    pieces[:] = tails
+    if heads:
+        yield heads
 
 
 def _list_row_ids(pieces: list[Any]) -> Any:

@@ -128,7 +128,8 @@ class SessionProcesses:
         self.reporter = StatusReporter()
         self._next_supervise_ns = 0
         self._address = ""
-        self._overflows: dict[str, int] = {}  # contacts that MuJoCo had no room for, at most in one run of the world
+        self._overflows: dict[str, int] = {}  # contacts that MuJoCo had no room for
+        self._world_overflows: dict[str, int] = {}  # the same since the world was reset
         self._dropped: set[str] = set()  # reasons that were logged
 
     def start(self) -> None:
@@ -333,10 +334,14 @@ class SessionProcesses:
 
     def _report_overflows(self, stepper: Stepper) -> None:
         """Count the contacts that MuJoCo drops, which change what happens, and announce the first."""
-        for reason, count in stepper.core.world.dropped_counts.items():
+        counts = stepper.core.world.dropped_counts
+        for reason, count in counts.items():
+            before = self._world_overflows.get(reason, 0)
             if reason not in self._overflows:
                 self._announce(stepper, f"MuJoCo: {reason}; give the model <size memory='...'/>")
-            self._overflows[reason] = max(count, self._overflows.get(reason, 0))
+            added = count - before if count >= before else count  # less: the world was reset
+            self._overflows[reason] = self._overflows.get(reason, 0) + added
+        self._world_overflows = counts
 
     def make_report(self, stepper: Stepper) -> StatusReport:
         """Return the authority's half of a status report."""

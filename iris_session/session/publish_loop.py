@@ -192,7 +192,8 @@ class PublishLoop:
                 self._wake.wait(self._compute_pause_s())
                 self._wake.clear()
                 self.poll()
-        except BaseException as error:  # the stepper raises it at the next `publish`, which may not come
+        except BaseException as error:
+            self._stepper.end(error)  # raised at the next `publish`, which may not come
             _log.error("the session stands still after an error: %s: %s", type(error).__name__, error)
 
     def _compute_pause_s(self) -> float:

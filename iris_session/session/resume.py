@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import itertools
 import logging
 import os
 import socket
@@ -222,7 +223,9 @@ class PastSession:
             problems.append(why)
             self.core = restore_core(header, keyframe, recording.model)
             replay_rows(
-                self.core, keyframe, (row for row in recording.rows(after=keyframe.step) if row.step <= self.step)
+                self.core,
+                keyframe,
+                itertools.takewhile(lambda row: row.step <= self.step, recording.rows(after=keyframe.step)),
             )
         self.now_ns = self.core.authority.now_ns
         if recording.end is not None and recording.end.reason:
@@ -443,6 +446,7 @@ class ResumeNoteWriter:
         self._changed = threading.Event()
         self._closing = threading.Event()
         self._is_closed = self._has_warned = False
+        self._replacing = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="iris-session-note", daemon=True)
         self._thread.start()
 
@@ -457,7 +461,10 @@ class ResumeNoteWriter:
         self._closing.set()
         self._changed.set()
         self._thread.join(patience_s)
+        free = self._replacing.acquire(timeout=patience_s)  # a disk that hangs must not delay the end
         self._is_closed = True
+        if free:
+            self._replacing.release()
 
     def _run(self) -> None:
         written: ResumeNote | None = None
@@ -476,9 +483,12 @@ class ResumeNoteWriter:
         try:
             with Replacement(self._path, durable=True) as replacement:
                 replacement.file.write(msgspec.msgpack.encode(note))
-                replacement.finish()  # may wait for a disk
-                if self._is_closed:
-                    replacement.discard()
+                replacement.finish()  # before the lock is taken: it may wait for a disk
+                with self._replacing:
+                    if self._is_closed:
+                        replacement.discard()
+                    else:
+                        replacement.commit()
         except OSError as error:
             if not self._has_warned:
                 text = "%s cannot be written (%s): clients cannot resume after a restart of the session"

@@ -87,9 +87,9 @@ class SessionView:
             body = event.body
             if isinstance(body, ParticipantJoined):
                 again = " again" if body.resumed else ""
-                _log.info("%s joined as %s%s", body.participant.name, body.participant.role, again)
+                _log.info("%r joined as %s%s", body.participant.name, body.participant.role, again)
             elif isinstance(body, ParticipantLeft):
-                _log.info("participant %s left: %s", body.participant, body.reason)
+                _log.info("participant %s left: %r", body.participant, body.reason)
             elif isinstance(body, SamplesRejected):
                 self.rejected[body.participant, body.device, body.reason] = body.count
             elif isinstance(body, Handover):
@@ -103,7 +103,7 @@ class SessionView:
             if outgoing.connection == HOST and isinstance(message, Snapshot):
                 self._apply_snapshot(message)
             elif isinstance(message, Reply) and message.denial is not None:
-                _log.info("denied to connection %d: %s", outgoing.connection, message.denial.message)
+                _log.info("denied to connection %d: %r", outgoing.connection, message.denial.message)
         for command in decision.commands:
             if command.hold_reason != self._hold_reasons.get(command.robot, ""):
                 self._hold_reasons[command.robot] = command.hold_reason

@@ -282,5 +282,8 @@ def collect_warnings(
 
 
 def measure_memory_bytes() -> int:
-    """Return the resident memory of this process."""
-    return int(psutil.Process().memory_info().rss)
+    """Return the resident memory of this process, 0 where the system does not say: it may have no descriptor left."""
+    try:
+        return int(psutil.Process().memory_info().rss)
+    except (OSError, psutil.Error):
+        return 0

@@ -220,8 +220,13 @@ class Stepper:
         try:
             return self._step(n_ticks, plant, publish)
         except BaseException as error:
-            self._ended, self._ended_at = end_error(error), error.__traceback__
+            self.end(error)
             raise
+
+    def end(self, error: BaseException) -> None:
+        """End the session by an error: every later step raises it. From any thread."""
+        if self._ended is None:
+            self._ended, self._ended_at = end_error(error), error.__traceback__
 
     def raise_if_ended(self) -> None:
         """Raise what has ended the session in an earlier step."""

@@ -395,5 +395,6 @@ class UserLoop:
         try:
             while not self._closed.wait(IDLE_PERIOD_S):
                 self._step_if_idle()
-        except BaseException as error:  # the stepper raises it at the user's next tick, where it is seen
+        except BaseException as error:
+            self._stepper.end(error)  # raised at the user's next tick, where it is seen
             _log.error("the session stands still after an error: %s", error)

@@ -269,7 +269,8 @@ def _check_stl(name: str, data: bytes) -> bytes:
 
 def _check_ply(name: str, data: bytes) -> bytes:
     """Check that a text PLY has as many lines as its header states."""
-    head, _, body = data.partition(b"end_header\n")
+    head, *bodies = re.split(rb"end_header\r?\n", data, maxsplit=1)
+    body = b"".join(bodies)
     rows = sum(int(count) for count in re.findall(rb"^element[ \t]+\S+[ \t]+(\d{1,18})", head, re.MULTILINE))
     if b"format ascii" in head and (lines := len(body.splitlines())) < rows:
         raise SceneBuildError(f"{name} is cut: its head says {rows:,} lines, and it has {lines:,}; export it again")
