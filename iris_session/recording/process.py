@@ -124,7 +124,8 @@ class RecorderLoop:
 
     def run(self) -> int:
         """Record until stopped. Return the exit status of the process."""
-        threading.Thread(target=self._give_up_as_orphan, name="orphan", daemon=True).start()
+        has_ended = threading.Event()
+        threading.Thread(target=self._give_up_as_orphan, args=(has_ended,), name="orphan", daemon=True).start()
         try:
             self._send_status(-1)
             self._loop()
@@ -148,6 +149,7 @@ class RecorderLoop:
             self._context.destroy(linger=500)
             if os.getppid() != self._config.parent:  # the parent was killed: it cannot remove the folder
                 shutil.rmtree(Path(self._config.feed_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
+            has_ended.set()
         return 0
 
     def _close_file(self) -> None:
@@ -164,11 +166,10 @@ class RecorderLoop:
         self._writer.close(reason=reason, samples_left_out=self._samples_left_out, is_abrupt=is_abrupt)
         self._ended = self._is_used_up
 
-    def _give_up_as_orphan(self) -> None:
+    def _give_up_as_orphan(self, has_ended: threading.Event) -> None:
         """Exit the process when its parent has ended and the file cannot be written (runs in a thread)."""
         size, since = -1, time.monotonic()
-        while True:
-            time.sleep(SYNC_S)
+        while not has_ended.wait(SYNC_S):
             try:
                 now = os.stat(self._writer.path).st_size
             except OSError:
