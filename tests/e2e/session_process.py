@@ -48,8 +48,10 @@ import functools, sys
 import iris_session.session.session  # has the class itself
 from iris_session import authority
 from iris_session.cli.main import main
+from iris_session.link import front_process
 
 long_ns = 60 * 1_000_000_000
+front_process.HANGING_NS = front_process.STARVED_NS = long_ns
 authority.AuthorityConfig = functools.partial(
     authority.AuthorityConfig, freshness_ns=long_ns, gap_ns=long_ns, heartbeat_timeout_ns=long_ns
 )
