@@ -465,7 +465,6 @@ def solve_graph(
         x_scale="jac",
         method="trf",
         jac_sparsity=graph.find_jacobian_pattern() if len(p0) > _FEW_POSES else None,
-        max_nfev=60,
     )
     p, q = move(got.x)
     jacobian = got.jac if len(p0) <= _FEW_POSES else got.jac.toarray()

@@ -117,6 +117,8 @@ def _nest_fields(pairs: Mapping[str, Any]) -> dict[str, Any]:
             inner = inner.setdefault(part, {})
             if type(inner) is not dict:
                 raise ValueError(f"--headset: {part!r} and {key!r} cannot both be given")
+        if name in inner:  # a field of it was given before
+            raise ValueError(f"--headset: {key!r} and a field of it cannot both be given")
         inner[name] = value
     return nested
 

@@ -38,8 +38,8 @@ DEMO_S: Final = 900.0
 #: recorded takes as long again.
 DEMO_OPTIONS: Final = ("--json", "--timeout", "360")
 COMMAND: Final = [sys.executable, "-m", "iris_session.cli.main"]
-#: The command with limits of time that a machine which stands still for seconds does not reach: no robot holds and
-#: nobody leaves because others compute. What happens at these limits is tested in simulated time (tests/rig).
+#: The command with limits of time that a machine which stands still for seconds does not reach: no robot holds and no
+#: participant leaves because other programs compute. What happens at these limits is tested in simulated time.
 PATIENT_COMMAND: Final = [
     sys.executable,
     "-c",

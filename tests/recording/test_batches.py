@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -44,6 +45,22 @@ def test_columns_cut_at_any_place_are_joined(seed: int) -> None:
         batches += [table(a, b - a, group) for a, b in pairwise(cuts)]
     batches.sort(key=lambda batch: (batch.column("step")[0].as_py(), rng.random()))
     assert values([join_pieces(pieces) for pieces in group_spans(batches)]) == values([table(0, 100)])
+
+
+def test_pending_rows_are_bounded_by_interleaving() -> None:
+    taken = 0
+
+    def thick_and_thin() -> Iterator[Any]:
+        nonlocal taken
+        for first in range(0, 1000, 10):
+            if first % 200 == 0:
+                yield table(first, 200, ("b", "c"))
+            taken += 1
+            yield table(first, 10, ("a",))
+
+    for n, pieces in enumerate(group_spans(thick_and_thin())):
+        assert join_pieces(pieces).num_rows == 10
+        assert taken <= n + 2
 
 
 def test_rows_without_a_column_have_null_in_it() -> None:

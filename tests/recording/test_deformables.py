@@ -146,7 +146,7 @@ def test_invalid_frames_are_rejected_and_counted(world: World) -> None:
     world.state(0)
     for data in (b"", b"\1" * 200):
         world.add(VertexFrame("flex-0", 7, data))
-    world.add(VertexFrame("nobody", 7, b""))
+    world.add(VertexFrame("unknown", 7, b""))
     frames = world.encoders[1].encode(world.vertices(1))
     assert frames is not None
     world.add(VertexFrame("flex-0", 7, frames["full"]))  # of another mesh

@@ -81,7 +81,7 @@ def test_checks_of_two_headsets_are_told_when_they_change() -> None:
     assert [check(0.001), check(0.005), check(0.011, "p2", "p1")] == ["INFO", "DEBUG", "DEBUG"]
     assert [check(0.02), check(0.03), check(0.004)] == ["INFO", "DEBUG", "INFO"]
     narrate(narration, ParticipantLeft("p2", "bye"))
-    assert check(0.001) == "INFO", "somebody new has the name"
+    assert check(0.001) == "INFO", "another participant has the name"
 
 
 def test_every_kind_of_event_has_a_line_without_ids() -> None:

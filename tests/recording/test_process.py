@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ import zmq
 
 from iris_session.journal.errors import WriteError
 from iris_session.journal.feed import BATCH_NS
-from iris_session.journal.messages import RecorderConfig
+from iris_session.journal.messages import BATCH, FRAME, Batch, RecorderConfig, VertexFrame, encode_batch
 from iris_session.protocol.scene import list_assets
 from iris_session.protocol.status import ClientReport
 from iris_session.recording import (
@@ -100,6 +101,17 @@ def test_raw_samples_are_left_out_while_the_disk_is_nearly_full(
     loop._disk_free, loop._write_s = 0, 2 * process_module.SLOW_WRITE_S  # a slow disk, of unknown size
     loop._process_samples(batch)
     assert loop._samples_left_out == 6
+
+
+def test_vertices_are_left_out_while_the_disk_is_nearly_full(one: LoopRecorder) -> None:
+    SmallSession(one.feed).take(5)
+    one.pump()
+    loop = one.loop
+    loop._disk_free = process_module.JOURNAL_RESERVE_BYTES - 1
+    batch = Batch(vertices=[VertexFrame("cloth", 7, b"frame")] * 3)
+    before = loop._writer.drawing.vertices_refused
+    loop._process_message([FRAME.pack(BATCH, loop._expecting), encode_batch(batch)])
+    assert loop._writer.drawing.vertices_refused == before + 3
 
 
 def test_reports_of_clients_are_plotted_and_no_raw_samples(one: LoopRecorder) -> None:
@@ -192,8 +204,12 @@ def test_session_that_never_began_leaves_no_file(tmp_path: Path) -> None:
         loop = RecorderLoop(config)
         assert path.exists()
         loop.stop()
+        before = set(threading.enumerate())
         assert loop.run() == 0
     assert list(tmp_path.iterdir()) == []
+    for thread in set(threading.enumerate()) - before:  # that which ends an orphan whose disk hangs
+        thread.join(30.0)
+        assert not thread.is_alive(), thread.name
 
 
 def test_file_that_is_removed_or_cannot_be_written_is_an_error(one: LoopRecorder) -> None:
@@ -221,6 +237,20 @@ def test_path_that_cannot_be_recorded_to_is_refused(tmp_path: Path, name: str) -
         process_module.claim_file(tmp_path / name)
     assert "\n" not in str(failure.value)
     assert (tmp_path / "session.rrd").read_bytes() == b"something of yours"
+
+
+def test_disk_that_takes_nothing_is_found_before_the_session_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A quota, for example: the free bytes of the disk do not show it."""
+
+    def refuse(*_: object) -> int:
+        raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
+
+    monkeypatch.setattr(process_module.os, "write", refuse)
+    with pytest.raises(RecorderError, match="quota"):
+        process_module.claim_file(tmp_path / "session.rrd")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_assets_follow_the_journal_and_each_part_has_them(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def exchange_keyframe(batch: Batch) -> None:
 def test_a_change_is_named_and_verification_goes_on_after_it(
     path: Path, edit: Edit, problems: list[str], unverified: int
 ) -> None:
-    """What follows is simulated again from the next keyframe on, and not blamed."""
+    """What follows is simulated again from the next keyframe on, and counts as no difference."""
     header, batch = journal(200)
     edit(batch)
     rows = len(batch.rows)

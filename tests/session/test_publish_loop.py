@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -205,3 +206,14 @@ def test_close_publishes_the_pending_frame_and_no_later_one(rig: PublishLoopRig)
     assert rig.xs()[-1] == 2.0
     with pytest.raises(OwnershipError, match="closed"):
         rig.publish(3.0)
+
+
+def test_error_beside_a_step_of_the_helper_is_raised_by_the_next_offer(rig: PublishLoopRig) -> None:
+    def break_down(_: Any) -> None:
+        raise OSError("no descriptor left")
+
+    rig.loop._processes.supervise = break_down  # type: ignore[method-assign]
+    rig.now_ns += 100 * MS
+    rig.loop._run_helper()
+    with pytest.raises(OSError, match="no descriptor left"):
+        rig.publish(1.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
+import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -414,3 +415,21 @@ def test_continuation_of_a_different_recording_fails(gone_on: tuple[Stepper, Fro
     report = verify_recording(path)
     assert not report.ok
     assert "does not continue" in report.problems[0].text
+
+
+def test_late_note_does_not_overwrite_that_of_the_next_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk hangs while the session ends."""
+    reached, works = threading.Event(), threading.Event()
+
+    def hang(_: int) -> None:
+        reached.set()
+        assert works.wait(30.0)
+
+    monkeypatch.setattr(os, "fsync", hang)
+    keeper = ResumeNoteWriter(find_note_path(tmp_path / "session.rrd"))
+    keeper.offer(ResumeNote("s1", Listening("too late")))
+    assert reached.wait(30.0)
+    keeper.close(0.0)
+    works.set()
+    keeper._thread.join(30.0)
+    assert list(tmp_path.iterdir()) == []

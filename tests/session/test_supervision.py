@@ -108,7 +108,7 @@ def test_close_does_not_wait_for_a_hanging_disk(lab: Lab) -> None:
     lab.threads.are_stuck = True
     lab.recorder.stop_restarts()
     lab.threads.run_started()
-    assert not lab.recorder.alive, "nobody would look after the successor that is started now"
+    assert not lab.recorder.alive, "the successor that is started now would have no supervisor"
 
 
 def _left(n_bytes: int, *, ended: bool = False) -> RecorderStatus:

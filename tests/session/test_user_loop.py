@@ -179,3 +179,19 @@ def test_polling_requests_is_known_to_the_authority_from_then_on() -> None:
         data.qvel[0] = np.nan
         session.begin_tick()
         assert session.status().data_fault == DataFault(("qvel",), pytest.approx(session.clock() * 1e-9, abs=60.0))
+
+
+def test_error_beside_a_step_of_the_helper_is_raised_at_every_tick(rig: Rig) -> None:
+    def break_down(_: object) -> None:
+        raise OSError("no descriptor left")
+
+    rig.rounds(1)
+    rig.loop._processes.supervise = break_down  # type: ignore[method-assign]
+    rig.now_ns += 40 * MS
+    rig.loop._run_helper()
+    depths = set()
+    for _ in range(3):
+        with pytest.raises(OSError, match="no descriptor left") as caught:
+            rig.rounds(1)
+        depths.add(len(caught.traceback))
+    assert len(depths) == 1, "it does not grow"

@@ -69,6 +69,14 @@ def test_obj_with_materials_and_a_texture(tmp_path: Path) -> None:
     assert at == {(0, 0, 0): (0, 1), (1, 0, 0): (1, 1), (0, 0, 1): (0, 0.75)}  # v goes down here, up in the file
 
 
+def test_text_of_another_system_is_no_cut_file(tmp_path: Path) -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    text = trimesh.exchange.ply.export_ply(box, encoding="ascii")
+    (tmp_path / "box.ply").write_bytes(text.replace(b"\n", b"\r\n"))
+    scene, _ = build(tmp_path / "box.ply", tmp_path)
+    assert len(scene.spec.visuals) == 1
+
+
 @pytest.mark.parametrize("kind", ["stl", "ply", "off", "obj", "dae"])
 def test_geometry_of_every_format(tmp_path: Path, kind: str) -> None:
     mesh = trimesh.creation.annulus(0.2, 0.5, 0.3)
