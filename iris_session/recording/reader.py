@@ -10,7 +10,7 @@ import os
 import warnings
 from bisect import bisect_left
 from collections.abc import Callable, Hashable, Iterator
-from itertools import repeat
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.journal.errors import NotARecordingError
-from iris_session.journal.messages import DenialRecord, EndMark
+from iris_session.journal.messages import DenialRecord
 from iris_session.journal.rows import JournalRow, Keyframe, unpack_model
 from iris_session.protocol.server_messages import Event
 from iris_session.recording.folders import find_session_in
@@ -66,7 +66,6 @@ class Recording(RecordingParts):
         samples_left_out: Number of raw messages of clients that the recorder did not write, of parts that were closed:
             the disk was slow or nearly full, or the budget nearly used up. Those that the front left out before are
             only in the session's status. The journal has what the session used of them.
-        all_closed: Every part was closed by its recorder, so that nothing can be missing within.
         damage: One line per place that could not be read, at most `MOST_DAMAGE`. Reading on may add lines.
         missing: One line per missing part, or range of parts.
         notes: One line per empty part.
@@ -78,17 +77,24 @@ class Recording(RecordingParts):
     def __init__(self, files: list[str]) -> None:
         super().__init__(files)
         try:
-            marks = list(self._iterate((paths.HEADER, paths.END), _decode_end))
+            ends = dict(self._iterate(paths.END, batches.decode_ends))
         except BaseException:
             self.close()
             raise
-        ends = {part: end for part, end in marks if end is not None}
+        self._n_closed = len(ends)
         self.end = ends.get(len(self.files) - 1)
         self.samples_left_out = sum(end.samples_left_out for end in ends.values())
-        # A file that Rerun's tools have written may hold several parts, each with its header.
-        self.all_closed = len({mark for mark in marks if mark[1]}) == sum(end is None for _, end in marks)
         if self.end is not None and self.end.reason:
             self.notes.append(f"{self.end.reason[:200]}; the session may have gone on")
+
+    @cached_property
+    def all_closed(self) -> bool:
+        """True if every part was closed by its recorder, so that nothing can be missing within. Not known, so false, of
+        a copy by Rerun's tools, which may be of parts that were not."""
+        return self._n_closed == len(self.files) and all(
+            rrd_file.is_of_recorder(rrd_file.scan_file(self.files[part]), marks)
+            for part, marks in self._read_marks().items()
+        )
 
     @property
     def finished(self) -> bool:
@@ -348,15 +354,19 @@ class Recording(RecordingParts):
         Raises:
             NotARecordingError: A file can no longer be read.
         """
-        marks: dict[int, list[rrd_file.Mark]] = {}
-        for part, mark in self._iterate(paths.MARKS, batches.decode_marks):
-            marks.setdefault(part, []).append(mark)
         closed = {part for part, _ in self._iterate(paths.END, batches.decode_ends)}
         return [
             f"{os.path.basename(self.files[part])}: {line}"
-            for part, noted in marks.items()
+            for part, noted in self._read_marks().items()
             for line in rrd_file.changed_spans(self.files[part], noted, closed=part in closed)
         ]
+
+    def _read_marks(self) -> dict[int, list[rrd_file.Mark]]:
+        """Return the recorder's checksums by part."""
+        marks: dict[int, list[rrd_file.Mark]] = {}
+        for part, mark in self._iterate(paths.MARKS, batches.decode_marks):
+            marks.setdefault(part, []).append(mark)
+        return marks
 
     def __enter__(self) -> Self:
         return self
@@ -365,11 +375,6 @@ class Recording(RecordingParts):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _decode_end(batch: Any) -> Iterator[EndMark | None]:
-    """Yield the marks at the ends of parts, and `None` for each header."""
-    return batches.decode_ends(batch) if get_entity(batch) == paths.END else repeat(None, batch.num_rows)
 
 
 def check_assets(recording: Recording) -> AssetCollector:

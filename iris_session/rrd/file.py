@@ -152,11 +152,7 @@ def changed_spans(path: str | Path, marks: Sequence[Mark], *, closed: bool) -> l
     marks do not end between messages.
     """
     found = scan_file(path)
-    ends = {m.offset for m in found.messages} | {found.size}
-    placed = sum(mark.end in ends for mark in marks)
-    # Half is enough with an index: of the two marks of a short recording, one may be what was changed. Without one,
-    # no tool has written the file.
-    if not placed or (found.indexed and 2 * placed < len(marks)):
+    if not is_of_recorder(found, marks):
         return []
     out = []
     left = 2 * found.size  # a recorder's marks do not overlap: those of a hostile file are not all computed
@@ -168,6 +164,15 @@ def changed_spans(path: str | Path, marks: Sequence[Mark], *, closed: bool) -> l
         if closed:
             out += _changed_end(file, found, max(mark.end for mark in marks))
     return out
+
+
+def is_of_recorder(found: Scan, marks: Sequence[Mark]) -> bool:
+    """Return whether marks of a file are where a recorder has written them; else another tool has rewritten it."""
+    ends = {m.offset for m in found.messages} | {found.size}
+    placed = sum(mark.end in ends for mark in marks)
+    # Half is enough with an index: of the two marks of a short recording, one may be what was changed. Without one,
+    # no tool has written the file.
+    return placed > 0 and not (found.indexed and 2 * placed < len(marks))
 
 
 def _changed_end(file: BinaryIO, found: Scan, begin: int) -> list[str]:

@@ -56,6 +56,7 @@ def test_recording_roundtrip_is_exact(one: LoopRecorder) -> None:
     with Recording.open(one.path) as recording:
         assert recording.header == session.header
         assert recording.finished
+        assert recording.all_closed
         assert recording.damage == []
         assert [row.step for row in recording.rows()] == list(range(300))
         assert [k.step for k in recording.keyframes()] == [-1, 99, 199, 299]
