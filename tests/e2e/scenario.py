@@ -97,33 +97,16 @@ class Scenario:
         return hand
 
     def engage(self, hand: Hand) -> None:
-        """Open and close the clutch until the robot follows: an operator tries again, too, when it does not."""
-        closed_at = 0.0
+        """Open and close the clutch, so that the robot follows. Limits of time do not count here: `PATIENT_COMMAND`."""
+        hand.clutch = False
+        self.run_until(lambda: self.is_open(hand), f"the session knows that the clutch of {hand.client.name} is open")
+        hand.clutch = True
+        self.run_until(lambda: self.is_following(hand), f"{hand.robot} follows {hand.client.name}")
 
-        def has_engaged() -> bool:
-            nonlocal closed_at
-            if time.monotonic() > closed_at + 2.0:  # on a busy machine no sample may have counted while it was open
-                hand.clutch = False
-                self.run_for(0.1)
-                hand.clutch, closed_at = True, time.monotonic()
-            return self.is_following(hand)
-
-        self.run_until(has_engaged, f"{hand.robot} follows {hand.client.name}")
-
-    def move_until(
-        self, hand: Hand, velocity: tuple[float, float, float], condition: Callable[[], object], what: str
-    ) -> None:
-        """Move a hand at `velocity` [m/s] until a condition holds, then stop it."""
-
-        def is_done() -> bool:
-            if not self.is_following(hand):
-                hand.velocity = (0.0, 0.0, 0.0)
-                self.engage(hand)
-            hand.velocity = velocity
-            return bool(condition())
-
-        self.run_until(is_done, what)
-        hand.velocity = (0.0, 0.0, 0.0)
+    def is_open(self, hand: Hand) -> bool:
+        """Return whether the robot holds because the clutch of the hand is open."""
+        feedback = hand.client.feedback.get(hand.robot)
+        return feedback is not None and feedback.hold_reason == HoldReason.CLUTCH_OPEN
 
     def is_following(self, hand: Hand) -> bool:
         """Return whether samples of the hand's participant were applied to its robot within 100 ms."""

@@ -17,13 +17,14 @@ SCRIPT = """
 import time
 from pathlib import Path
 import mujoco
-from iris_session import Session, SessionConfig
+from iris_session import AuthorityConfig, Session, SessionConfig
 from iris_session.demo.scenes import scene_path
 
 model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
 data = mujoco.MjData(model)
 mujoco.mj_resetDataKeyframe(model, data, 0)
-config = SessionConfig(name="mine", control_port=0, state_port=0, record="session.rrd")
+patient = AuthorityConfig(freshness_ns=10**11, gap_ns=10**11, heartbeat_timeout_ns=10**11)  # others may compute
+config = SessionConfig(name="mine", control_port=0, state_port=0, record="session.rrd", authority=patient)
 session = Session.attach(model, data, config)
 print(f"session on {session.address}, recording to {session.recording}", flush=True)
 while not Path("end").exists():
@@ -46,7 +47,8 @@ def scenario(tmp_path: Path) -> Iterator[Scenario]:
 def test_attached_script_without_close_ends_in_order(scenario: Scenario, tmp_path: Path) -> None:
     hand = scenario.drive("ann", "left")
     before = hand.tip
-    scenario.move_until(hand, (0.0, 0.1, 0.0), lambda: hand.tip[0][1] - before[0][1] > 0.03, "the robot follows")
+    hand.velocity = (0.0, 0.1, 0.0)
+    scenario.run_until(lambda: hand.tip[0][1] - before[0][1] > 0.03, "the robot follows")
     children = list_descendants(scenario.server.process.pid)
     (tmp_path / "end").touch()
     scenario.run_until(lambda: scenario.server.process.poll() is not None, "the script ends")
