@@ -20,9 +20,19 @@ import numpy as np
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
 from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_to_matrix, to_quat, to_vec3
-from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, quat_from_yaw
+from anchors.pose import PoseTuple, Vec3
 from anchors.touch import Touch, register_touches
 from anchors.uncertainty import length_p95
+from iris_session.bench.alignment_sources import (
+    HEAD_SIGMA_M,
+    HOLDER_SIGMA_RAD,
+    MARKS,
+    ONE,
+    TILT_SIGMA_RAD,
+    TIP_SIGMA_M,
+    TRIANGLE,
+)
+from iris_session.bench.alignment_worlds import make_world_bars, run_worlds, select_worlds
 from iris_session.bench.report import Bar, BenchReport, make_bar
 from iris_session.emulator.sheet_noise import SheetNoise, mix_viewpoint_noise
 
@@ -34,13 +44,7 @@ WALK_S: Final = 3.0  # from one viewpoint to the next
 DISTANCE_M: Final = (0.4, 1.2)
 ELEVATION_DEG: Final = (40.0, 80.0)
 NOISE: Final = SheetNoise()
-TILT_SIGMA_RAD: Final = math.radians(0.2)
 DRIFT_M_PER_S: Final = 0.003 / 60.0
-HEAD_SIGMA_M: Final = 0.0005  # a headset's tracking of its own head from frame to frame; our assumption
-TIP_SIGMA_M: Final = 0.0015
-HOLDER_SIGMA_RAD: Final = math.radians(
-    0.3
-)  # our assumption: a tracked controller is turned as well as a sheet at 0.5 m
 
 
 @dataclass(frozen=True)
@@ -136,22 +140,6 @@ class SimulatedHeadset:
 
 # --- benchmark --------------------------------------------------------------------------------------------------------
 
-#: Three sheets, 1.5 m from each other, with different headings.
-TRIANGLE: Final[dict[str, PoseTuple]] = {
-    name: (
-        (1.5 / math.sqrt(3.0) * math.cos(turn), 1.5 / math.sqrt(3.0) * math.sin(turn), 0.0),
-        quat_from_yaw(0.4 + 1.1 * k),
-    )
-    for k, (name, turn) in enumerate(zip("abc", (0.0, 2.0 * math.pi / 3.0, -2.0 * math.pi / 3.0), strict=True))
-}
-ONE: Final[dict[str, PoseTuple]] = {"a": IDENTITY_POSE}
-#: Marks near the corners of a table top; no two sides are equal, so that swapped marks show.
-MARKS: Final[dict[str, Vec3]] = {
-    "a": (-0.30, -0.20, 0.0),
-    "b": (0.32, -0.17, 0.0),
-    "c": (0.25, 0.25, 0.0),
-    "d": (-0.27, 0.12, 0.0),
-}
 CASES: Final = ("one_sheet", "three_sheets", "three_sheets_quick", "holder", "touch")
 #: (case, key, bound): the issue's bars; the share of refused pairs and the coverage are added for every case.
 BOUNDS: Final = (
@@ -181,14 +169,26 @@ class CaseStatistics:
     refused: int = 0
 
 
-def run_alignment(pairs: int = 2000, seed: int = 0, progress: Callable[[str], None] = lambda _: None) -> BenchReport:
-    """Run every case with `pairs` pairs of headsets.
+def run_alignment(
+    pairs: int = 2000,
+    seed: int = 0,
+    worlds: str = "none",
+    headsets: int = 200,
+    progress: Callable[[str], None] = lambda _: None,
+) -> BenchReport:
+    """Run every case with `pairs` pairs of headsets, then worlds in which an alignment can go wrong.
 
     Args:
         pairs: Pairs of headsets per case.
         seed: Random seed.
+        worlds: Names of worlds (`alignment_worlds`) with commas between them; `all`, `rows`, `mixes`, `none`.
+        headsets: Headsets per world.
         progress: Called with a short text before each case.
+
+    Raises:
+        BenchError: A world is unknown.
     """
+    names = select_worlds(worlds)
     results: dict[str, Any] = {}
     bars: list[Bar] = []
     for k, case in enumerate(CASES):
@@ -203,7 +203,12 @@ def run_alignment(pairs: int = 2000, seed: int = 0, progress: Callable[[str], No
         bars.append(make_bar(results, f"{case}.coverage_share", ">=", 0.93))
         bars.append(make_bar(results, f"{case}.coverage_share", "<=", 0.97))
     bars += [make_bar(results, f"{load}update_us_p50", "<=", 200.0) for load in ("", "loaded_")]
-    return BenchReport("alignment", {"pairs": pairs, "seed": seed}, results, tuple(bars))
+    params: dict[str, Any] = {"pairs": pairs, "seed": seed}
+    if names:
+        results |= run_worlds(names, headsets, seed, progress)
+        bars += make_world_bars(names, results)
+        params |= {"worlds": worlds, "headsets": headsets}
+    return BenchReport("alignment", params, results, tuple(bars))
 
 
 def _run_case(case: str, rngs: Sequence[np.random.Generator]) -> dict[str, float]:

@@ -40,7 +40,7 @@ _BENCHMARKS: Final = {
     "state": _Benchmark(_CLIENTS | _BODIES),
     "input": _Benchmark({"robots": (1, 12), "observers": (0, 64)}),
     "slow-client": _Benchmark({"clients": (3, 64), **_BODIES}),
-    "alignment": _Benchmark({"pairs": (10, 100_000)}),
+    "alignment": _Benchmark({"pairs": (10, 100_000), "headsets": (2, 100_000)}),
     "deformable": _Benchmark(_CLIENTS | _VERTICES),
     "cloud": _Benchmark({"points": (10_000, 20_000_000), "cameras": (1, 4)}, _BOTH, "it has no other clients"),
     "cloud-stream": _Benchmark(
@@ -75,6 +75,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session bench slow-client --check
             iris-session bench state --profile busy-wifi
             iris-session bench alignment --pairs 2000 --seed 1 --check
+            iris-session bench alignment --worlds W1,mixes --headsets 100 --json
             iris-session bench deformable --check
             iris-session bench cloud --check
             iris-session bench cloud --beside --check
@@ -101,6 +102,14 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         ("robots", int, 8, "input: seven-joint arms (default: %(default)s)"),
         ("observers", int, 8, "input: observers (default: %(default)s)"),
         ("pairs", int, 2000, "alignment: pairs of headsets (default: %(default)s)"),
+        ("headsets", int, 200, "alignment: headsets in every world (default: %(default)s)"),
+        (
+            "worlds",
+            str,
+            "none",
+            "alignment: also these worlds, with commas between them: W1 to W12, lab_..., rows, mixes, all "
+            "(default: %(default)s)",
+        ),
         ("vertices", int, 10_000, "deformable, web: vertices of the cloth, a square number (default: %(default)s)"),
         (
             "points",
