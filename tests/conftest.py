@@ -64,12 +64,20 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 
 def _find_test_processes() -> list[psutil.Process]:
-    """Return the running processes that the tests of this process started."""
+    """Return the running processes that the tests of this process started.
+
+    Those that index a finished recording run on by design, only while the machine is idle; they are killed.
+    """
     found = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
             marked = process.pid != os.getpid() and process.environ().get(RUN_VARIABLE) == os.environ[RUN_VARIABLE]
-            if marked and process.status() != psutil.STATUS_ZOMBIE:
+            if not marked or process.status() == psutil.STATUS_ZOMBIE:
+                continue
+            if "iris_session.rrd.index" in process.cmdline():
+                for one in (*process.children(recursive=True), process):
+                    one.kill()
+            else:
                 found.append(process)
     return found
 
