@@ -40,7 +40,7 @@ def process_sample(ctx: Context, entry: Entry, s: Sample) -> None:
     reason = samples.check_sample(ctx, p, entry, s, drives)
     if reason:
         return samples.reject_sample(ctx, p, s, reason)
-    usable = s.tracked and s.worn
+    usable = s.tracked and s.worn and not s.emulated
     _store_payload(p, s, usable)
     if s.worn != p.worn:
         roster.set_worn(ctx, p, s.worn)

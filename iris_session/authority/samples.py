@@ -30,7 +30,11 @@ from iris_session.protocol.server_messages import SamplesRejected
 Drive = tuple[LeaseState, LeaseGrant]
 UNSEEN = DeviceState()
 #: Reasons of a hold that are said also to one whose clutch is open: nothing moves before they are mended.
-_HOLDS = {RejectReason.UNALIGNED: HoldReason.UNALIGNED, RejectReason.VIEW_ONLY: HoldReason.VIEW_ONLY}
+_HOLDS = {
+    RejectReason.UNALIGNED: HoldReason.UNALIGNED,
+    RejectReason.VIEW_ONLY: HoldReason.VIEW_ONLY,
+    RejectReason.EMULATED: HoldReason.EMULATED,
+}
 
 
 def check_sample(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: list[Drive]) -> str:
@@ -57,6 +61,8 @@ def check_sample(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: 
         reason = _check_alignment(ctx, p, s, drives)
     if not reason:
         reason = _check_numbers(ctx, s)
+    if not reason and s.emulated and drives and s.tracked and s.worn:
+        reason = RejectReason.EMULATED
     if not reason and s.tracked and s.worn:
         reason = _check_payload(ctx, s, seen) or (_check_engagement(ctx, p, s, drives) if s.clutch else "")
     return reason

@@ -53,6 +53,10 @@ HOLD_ADVICE: Final = {
     HoldReason.UNTRACKED: "the device is not tracked: bring it into view",
     HoldReason.UNALIGNED: "no alignment, or its error here is too large: bring the sheet into view",
     HoldReason.VIEW_ONLY: "aligned by a fingertip or a kept anchor: touch marks with a calibrated tip",
+    HoldReason.EMULATED: "the position of the device is an estimate: bring it into the view of the headset's cameras",
+    HoldReason.ZERO_POSE: "the device reports the origin of its tracking frame: wait until it is tracked",
+    HoldReason.FROZEN: "the device reports one pose again and again: move it, or wake it",
+    HoldReason.JUMP: "the tracking of the device jumped: open and close the clutch",
     HoldReason.REJECTED: "a sample was rejected: see `rejected`; open and close the clutch",
     HoldReason.DISCONNECTED: "its holder is disconnected; the lease is kept for a grace period",
 }

@@ -83,7 +83,8 @@ class Sample(Message, frozen=True, tag="sample"):
     `clutch`: true while the person wants the target to follow. `gripper`: 0 open to 1 closed.
     `buttons`: bit mask (section 6). `hand_joints`: up to 26 poses `T_tracking_joint` flattened (x, y, z, qw, qx, qy,
     qz): 25 in the order of WebXR (the wrist first), 26 in that of OpenXR (the palm first); not in every sample. `q`,
-    `qd`: a leader's joint positions [rad or m] and velocities.
+    `qd`: a leader's joint positions [rad or m] and velocities. `emulated`: the position of `pose` is an estimate, not
+    a measurement (WebXR `emulatedPosition`; OpenXR: valid, but not tracked): it drives nothing.
     """
 
     device: Name
@@ -104,6 +105,7 @@ class Sample(Message, frozen=True, tag="sample"):
     hand_joints: Annotated[tuple[float, ...], msgspec.Meta(max_length=182)] = ()
     q: Joints = ()
     qd: Joints = ()
+    emulated: bool = False
 
 
 class Samples(Message, frozen=True, tag="samples"):

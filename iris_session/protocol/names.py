@@ -186,6 +186,10 @@ class HoldReason:
     INTERVENTION: Final = "intervention"  # mode `priority`, sent to the agent: a human has the robot
     REARM: Final = "rearm"  # engagement ended (release, takeover, new tracking epoch); clutch again
     VIEW_ONLY: Final = "view_only"  # the alignment is good enough to look, not to drive
+    EMULATED: Final = "emulated"  # the position of the device is an estimate, not a measurement
+    ZERO_POSE: Final = "zero_pose"  # the device reports the origin of its tracking frame; clutch again
+    FROZEN: Final = "frozen"  # the device reports one pose again and again; clutch again
+    JUMP: Final = "jump"  # the pose of the device jumped; clutch again
 
 
 class RejectReason:
@@ -213,6 +217,10 @@ class RejectReason:
     LEADER_APART: Final = "leader_apart"
     KIND_MISMATCH: Final = "kind"  # others drive this shared robot by samples of another kind
     VIEW_ONLY: Final = "view_only"  # the alignment is good enough to look, not to drive
+    EMULATED: Final = "emulated"  # the position is an estimate, not a measurement
+    ZERO_POSE: Final = "zero_pose"  # the origin of the tracking frame, as some runtimes report before they have a pose
+    FROZEN: Final = "frozen"  # one pose again and again, to the last bit
+    JUMP: Final = "jump"  # farther from the pose before than its motion and time explain
 
 
 class DenialReason:

@@ -244,6 +244,23 @@ def test_untracked_and_unworn_samples_need_no_payload() -> None:
         assert t.command().kind == "hold"
 
 
+def test_a_pose_that_is_not_measured_drives_nothing_and_is_not_shown() -> None:
+    t, op = engaged()
+    op.sends("left", clutch=True, emulated=True)
+    assert t.since(SamplesRejected)[0].reason == "emulated"
+    assert t.hold() == "emulated"
+    op.sends("left", clutch=True)
+    assert t.hold() == "emulated", "open and close the clutch"
+    op.sends("left", emulated=True)
+    assert t.hold() == "emulated", "said also while the clutch is open"
+    op.engage("left")
+    assert t.command().kind == "pose"
+    op.sends(emulated=True)
+    assert t.decision.presence == ()
+    op.sends()
+    assert len(t.decision.presence) == 1
+
+
 def test_capture_times_that_go_back_and_forth_make_no_time_for_a_jump() -> None:
     t = Table()
     anna = t.operator("left")

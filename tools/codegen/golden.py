@@ -36,6 +36,7 @@ _pack = msgspec.msgpack.encode
 ADDED_FIELDS: Final[dict[type[msgspec.Struct], tuple[str, ...]]] = {
     Hello: ("certificate_hash",),
     Pair: ("identity",),
+    Sample: ("emulated",),
     Snapshot: ("anchors",),
     MediaHeader: ("sent_ns", "received_ns"),
     MediaPush: ("info", "sent_ns", "connection_epoch"),

@@ -192,6 +192,10 @@ namespace IrisSession.Protocol
         public const string Intervention = "intervention";
         public const string Rearm = "rearm";
         public const string ViewOnly = "view_only";
+        public const string Emulated = "emulated";
+        public const string ZeroPose = "zero_pose";
+        public const string Frozen = "frozen";
+        public const string Jump = "jump";
     }
 
     /// <summary>
@@ -221,6 +225,10 @@ namespace IrisSession.Protocol
         public const string LeaderApart = "leader_apart";
         public const string KindMismatch = "kind";
         public const string ViewOnly = "view_only";
+        public const string Emulated = "emulated";
+        public const string ZeroPose = "zero_pose";
+        public const string Frozen = "frozen";
+        public const string Jump = "jump";
     }
 
     /// <summary>
@@ -2849,7 +2857,8 @@ namespace IrisSession.Protocol
     /// clutch: true while the person wants the target to follow. gripper: 0 open to 1 closed.
     /// buttons: bit mask (section 6). hand_joints: up to 26 poses T_tracking_joint flattened (x, y, z, qw, qx, qy,
     /// qz): 25 in the order of WebXR (the wrist first), 26 in that of OpenXR (the palm first); not in every sample. q,
-    /// qd: a leader's joint positions [rad or m] and velocities.
+    /// qd: a leader's joint positions [rad or m] and velocities. emulated: the position of pose is an estimate, not
+    /// a measurement (WebXR emulatedPosition; OpenXR: valid, but not tracked): it drives nothing.
     /// </summary>
     public sealed class Sample : ClientMessage
     {
@@ -2873,6 +2882,7 @@ namespace IrisSession.Protocol
         public double[] HandJoints = new double[0];
         public double[] Q = new double[0];
         public double[] Qd = new double[0];
+        public bool Emulated = false;
 
         public static Sample Read(WireReader reader)
         {
@@ -2900,6 +2910,7 @@ namespace IrisSession.Protocol
                     case "hand_joints": value.HandJoints = reader.ReadDoubles(0, 182); break;
                     case "q": value.Q = reader.ReadDoubles(0, 64); break;
                     case "qd": value.Qd = reader.ReadDoubles(0, 64); break;
+                    case "emulated": value.Emulated = reader.ReadBool(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -2909,7 +2920,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(19);
+            writer.WriteMapHeader(20);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("device");
@@ -2948,6 +2959,8 @@ namespace IrisSession.Protocol
             writer.Write(Q);
             writer.Write("qd");
             writer.Write(Qd);
+            writer.Write("emulated");
+            writer.Write(Emulated);
         }
     }
 

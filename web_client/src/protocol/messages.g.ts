@@ -166,6 +166,10 @@ export const HoldReason = {
   INTERVENTION: "intervention",
   REARM: "rearm",
   VIEW_ONLY: "view_only",
+  EMULATED: "emulated",
+  ZERO_POSE: "zero_pose",
+  FROZEN: "frozen",
+  JUMP: "jump",
 } as const;
 export type HoldReason = (typeof HoldReason)[keyof typeof HoldReason] | (string & {});
 
@@ -193,6 +197,10 @@ export const RejectReason = {
   LEADER_APART: "leader_apart",
   KIND_MISMATCH: "kind",
   VIEW_ONLY: "view_only",
+  EMULATED: "emulated",
+  ZERO_POSE: "zero_pose",
+  FROZEN: "frozen",
+  JUMP: "jump",
 } as const;
 export type RejectReason = (typeof RejectReason)[keyof typeof RejectReason] | (string & {});
 
@@ -899,7 +907,8 @@ export interface GetSnapshot {
  * `clutch`: true while the person wants the target to follow. `gripper`: 0 open to 1 closed.
  * `buttons`: bit mask (section 6). `hand_joints`: up to 26 poses `T_tracking_joint` flattened (x, y, z, qw, qx, qy,
  * qz): 25 in the order of WebXR (the wrist first), 26 in that of OpenXR (the palm first); not in every sample. `q`,
- * `qd`: a leader's joint positions [rad or m] and velocities.
+ * `qd`: a leader's joint positions [rad or m] and velocities. `emulated`: the position of `pose` is an estimate, not
+ * a measurement (WebXR `emulatedPosition`; OpenXR: valid, but not tracked): it drives nothing.
  */
 export interface Sample {
   type: "sample";
@@ -921,6 +930,7 @@ export interface Sample {
   hand_joints?: number[];
   q?: number[];
   qd?: number[];
+  emulated?: boolean;
 }
 
 /**
@@ -2253,7 +2263,7 @@ export const DEFAULTS = {
   heartbeat: { worn: true },
   clock_ping: {},
   get_snapshot: { request_id: 0 },
-  sample: { targets: [], tracked: true, worn: true, clutch: false, gripper: null, buttons: 0, pose: null, twist: null, hand_joints: [], q: [], qd: [] },
+  sample: { targets: [], tracked: true, worn: true, clutch: false, gripper: null, buttons: 0, pose: null, twist: null, hand_joints: [], q: [], qd: [], emulated: false },
   samples: {},
   acquire: { robots: [], objects: [], wait: false, weight: 1.0 },
   release: { request_id: 0, targets: [] },

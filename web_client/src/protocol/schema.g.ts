@@ -451,6 +451,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["hand_joints", ["array", ["float"], 0, 182], [[]]],
       ["q", ["array", ["float"], 0, 64], [[]]],
       ["qd", ["array", ["float"], 0, 64], [[]]],
+      ["emulated", ["bool"], [false]],
     ],
   },
   Samples: {
