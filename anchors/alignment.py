@@ -43,8 +43,10 @@ from anchors.solver import (
     to_world_covariance,
 )
 from anchors.uncertainty import (
+    SOURCE_BIASES,
     Z99,
     NoiseModel,
+    SourceBias,
     chi2_quantile,
     covariance_at_point,
     isotropic_covariance,
@@ -68,7 +70,8 @@ class AlignmentConfig:
     """Bounds and noise model of the estimator.
 
     `noise` is used where it is known from where an anchor was seen, `position_sigma_m` and `rotation_sigma_rad` (per
-    axis) where nothing is. `dof`: 4, or 6 to measure the tilt without gravity. `tilt_sigma_rad`: how far a headset's
+    axis) where nothing is. `biases`: by source of observations, what all of them share.
+    `dof`: 4, or 6 to measure the tilt without gravity. `tilt_sigma_rad`: how far a headset's
     vertical may be off; `max_tilt_rad`: beyond it a single observation is wrong; `follow_tilt_rad`: so far a tilt that
     all anchors show is followed, from `tilt_warning_rad` on with a warning. `drift_m_per_s`, `walk_m_per_sqrt_s`:
     how the tracking frame drifts and wanders, per axis. `max_error_m`: the stated p95 at the anchors above which the
@@ -81,6 +84,7 @@ class AlignmentConfig:
     position_sigma_m: float = 0.005
     rotation_sigma_rad: float = math.radians(0.6)
     noise: NoiseModel = field(default_factory=NoiseModel)
+    biases: Mapping[str, SourceBias] = field(default_factory=lambda: SOURCE_BIASES)
     dof: int = 4
     tilt_sigma_rad: float = math.radians(0.2)
     tilt_warning_rad: float = math.radians(1.0)
@@ -189,6 +193,7 @@ class AlignmentEstimator:
         covariance: tuple[float, ...] = (),
         p_tracking_head: Vec3 | None = None,
         alternative: PoseTuple | None = None,
+        source: str = "",
     ) -> bool:
         """Add one observation.
 
@@ -205,6 +210,7 @@ class AlignmentEstimator:
             p_tracking_head: Position of the observer.
             alternative: The other pose that explains the same image; without it the pose mirrored along the line of
                 sight is tried, if `p_tracking_head` is known.
+            source: Kind of the source: its biases (`AlignmentConfig.biases`) are in the stated error; empty: none.
 
         Returns:
             False if it is not used: unknown anchor, older epoch, not a rigid transform, a sheet of the wrong size, or
@@ -233,7 +239,7 @@ class AlignmentEstimator:
         self._memory.add(
             (anchor_id, viewpoint_id),
             AnchorObservation(
-                capture_ns, pose[0], pose[1], p_tracking_head, validate_covariance(covariance), quality, size_m
+                capture_ns, pose[0], pose[1], p_tracking_head, validate_covariance(covariance), quality, size_m, source
             ),
         )
         return True
@@ -331,6 +337,7 @@ class AlignmentEstimator:
             merged,
             np.array([min(ns - newest, 0) * 1e-9 for ns in times]),
             prior,
+            self.config.biases,
         )
 
     def _is_majority(self, b: AlignmentProblem, s: AlignmentSolution, n_groups: int) -> bool:

@@ -10,8 +10,9 @@ what then lies outside its 99.9 % ellipsoid is left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -27,7 +28,7 @@ from anchors.lie import (
     skew,
     swing,
 )
-from anchors.uncertainty import Z999, chi2_quantile
+from anchors.uncertainty import Z999, SourceBias, chi2_quantile
 from anchors.viewpoints import MergedObservation, circular_median
 
 _CHI2_6_999: Final = 22.458
@@ -69,6 +70,7 @@ class AlignmentProblem:
     covariance: Array  # (G, 6, 6)
     information: Array  # (G, 6, 6), the inverse
     age_s: Array  # (G,)
+    bias: Array  # (G, 6, K): shifts of the observed poses by one standard deviation of each of K common biases
 
     @property
     def size(self) -> int:
@@ -105,8 +107,10 @@ def build_problem(
     merged: Sequence[MergedObservation],
     age_s: Array,
     prior: AlignmentPrior,
+    biases: Mapping[str, SourceBias] = MappingProxyType({}),
 ) -> AlignmentProblem:
-    """Return merged observations as arrays. Older ones are less certain: the tracking frame wanders."""
+    """Return merged observations as arrays. Older ones are less certain: the tracking frame wanders. `biases`: what all
+    observations of one source share."""
     # Joined, not stacked: of small arrays that takes a third of the time.
     p = np.concatenate([m.p for m in merged]).reshape(-1, 3)
     q = quat_multiply(np.concatenate([m.q for m in merged]).reshape(-1, 4), quat_conjugate(q_world))
@@ -114,7 +118,21 @@ def build_problem(
     if float(age_s.min()) < -_STEADY_S:
         walked = prior.walk_m_per_sqrt_s**2 * np.maximum(-age_s - _STEADY_S, 0.0)
         covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
-    return AlignmentProblem(tuple(anchor), p_world, p, q, covariance, np.linalg.inv(covariance), age_s)
+    information = np.linalg.inv(covariance)
+    return AlignmentProblem(
+        tuple(anchor), p_world, p, q, covariance, information, age_s, _compute_biases(merged, biases)
+    )
+
+
+def _compute_biases(merged: Sequence[MergedObservation], biases: Mapping[str, SourceBias]) -> Array:
+    """Return the shifts (G, 6, K) of all groups; sources have no bias in common."""
+    sources = sorted({m.source for m in merged} & biases.keys())
+    out = np.zeros((len(merged), 6, 9 * len(sources)))
+    for g, m in enumerate(merged):
+        if m.source in sources:
+            k = 9 * sources.index(m.source)
+            out[g, :, k : k + 9] = biases[m.source].compute_shifts(m.p_head, m.p, m.q)
+    return out
 
 
 def solve_alignment(
@@ -235,6 +253,10 @@ def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: A
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
     r = r - J @ step  # the last step was small: its linear effect is all there is
+    covariance = inverse[:6, :6]
+    if b.bias.size:  # considered, not estimated (Schmidt 1966): by how much each bias shifts the solution
+        shift = inverse[:6] @ (A.T @ b.bias.reshape(len(A), -1))
+        covariance = covariance + shift @ shift.T
     distance2 = np.add.reduce((b.information @ r[:, :, None])[:, :, 0] * r, axis=1)
     chi2 = float(weights @ distance2) + float(drift @ (diagonal[6:] * drift))
     freedom = 6.0 * float(weights.sum()) - 6.0
@@ -242,7 +264,7 @@ def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: A
         tilt = _tilt(q)
         chi2 += tilt_information * float(tilt @ tilt)
         freedom += 2.0
-    return AlignmentSolution(t, q, inverse[:6, :6], inside, chi2, freedom, drift, distance2, r[:, 3:])
+    return AlignmentSolution(t, q, covariance, inside, chi2, freedom, drift, distance2, r[:, 3:])
 
 
 def _tilt(q: Array) -> Array:

@@ -6,13 +6,14 @@ Covariances of alignments are 6x6, order (x, y, z [m], rx, ry, rz [rad]), world 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 
-from anchors.lie import Array
+from anchors.lie import Array, quat_to_matrix
 from anchors.pose import Vec3
 
 #: 95 % quantile of the standard normal distribution.
@@ -110,6 +111,55 @@ class NoiseModel:
         whole = noise + FLOOR
         common = self.viewpoint_share * whole
         return common, whole - common
+
+
+@dataclass(frozen=True)
+class SourceBias:
+    """Errors that all looks of one headset share, standard deviations: more looks do not reduce them.
+
+    `scale`: share of the distance, along the view (size of a print, focal length). `direction_rad`: of the line of
+    sight, along either axis of the picture. `position_m`, `turn_rad`: per axis of the anchor (how a maker defines the
+    pose of a controller, corners that a detector puts too far out).
+    """
+
+    scale: float = 0.0
+    direction_rad: float = 0.0
+    position_m: float = 0.0
+    turn_rad: float = 0.0
+
+    def compute_shifts(self, p_head: Array | None, p_anchor: Array, q_anchor: Array) -> Array:
+        """Return by how much one standard deviation of each bias shifts an observed pose, tracking axes: (6, 9).
+
+        Without the position of the head, scale and direction count as at `_UNKNOWN_DISTANCE_M`, along any axis.
+        """
+        out = np.zeros((6, 9))
+        position = self.position_m
+        if p_head is None:
+            position = math.hypot(position, max(self.scale, self.direction_rad) * _UNKNOWN_DISTANCE_M)
+        else:
+            ray = p_anchor - p_head
+            right = np.array([ray[1], -ray[0], 0.0])
+            level = math.sqrt(float(right @ right))
+            right = right / level if level > 1e-6 else np.array([1.0, 0.0, 0.0])
+            d = math.sqrt(float(ray @ ray))
+            out[:3, 0] = self.scale * ray
+            out[:3, 1] = self.direction_rad * d * right
+            out[:3, 2] = self.direction_rad * np.cross(right, ray)
+        axes = quat_to_matrix(q_anchor)
+        out[:3, 3:6] = position * axes
+        out[3:, 6:] = self.turn_rad * axes
+        return out
+
+
+_UNKNOWN_DISTANCE_M: Final = 0.7
+#: By source of observations; docs/anchors.md, "Biases", says where the figures come from.
+SOURCE_BIASES: Final[Mapping[str, SourceBias]] = MappingProxyType(
+    {
+        "qr_camera": SourceBias(scale=0.005, direction_rad=0.001, turn_rad=math.radians(0.4)),
+        "qr_system": SourceBias(scale=0.006, direction_rad=0.002, position_m=0.002, turn_rad=math.radians(0.4)),
+        "holder": SourceBias(position_m=0.002, turn_rad=math.radians(0.6)),
+    }
+)
 
 
 def isotropic_covariance(position_sigma_m: float, rotation_sigma_rad: float) -> Array:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -35,6 +35,7 @@ class AnchorObservation(NamedTuple):
     covariance: tuple[float, ...]
     quality: float
     size_m: float
+    source: str = ""
 
 
 @dataclass
@@ -53,7 +54,11 @@ class ViewpointGroup:
             p = np.array([s.p for s in self.observations])
             q = np.array([s.q for s in self.observations])
             common, each = self._noise(p, noise, fallback)
-            self.merged, self.dirty = merge_poses(p, q, common, each, min_agreeing), False
+            merged, self.dirty = merge_poses(p, q, common, each, min_agreeing), False
+            heads = [s.p_head for s in self.observations if s.p_head is not None]
+            p_head = fast_median(np.array(heads)) if heads else None
+            source = self.observations[-1].source
+            self.merged = None if merged is None else replace(merged, p_head=p_head, source=source)
             sizes = self.list_sizes()
             self.sizes = (min(sizes), max(sizes)) if sizes else None
         return self.merged
@@ -172,13 +177,16 @@ _MAX_SCATTER: Final = 100.0  # variance ratio beyond which it is no longer noise
 @dataclass(frozen=True)
 class MergedObservation:
     """Observations of one anchor from one viewpoint as one: mean `T_tracking_anchor` (`p`, `q`), its covariance (6, 6)
-    in tracking axes, how many agree (`n`) and how many there were (`of`)."""
+    in tracking axes, how many agree (`n`) and how many there were (`of`). `p_head`: median position of the observer,
+    if known; `source`: whose biases it has."""
 
     p: Array
     q: Array
     covariance: Array
     n: int
     n_total: int
+    p_head: Array | None = None
+    source: str = ""
 
 
 def merge_poses(p: Array, q: Array, common: Array, each: Array, min_agreeing: float) -> MergedObservation | None:

@@ -20,7 +20,7 @@ from iris_session.alignment.touches import MAX_TIPS, TouchEstimator
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import AlignmentProposal
-from iris_session.protocol.names import AlignmentKind, AnchorKind
+from iris_session.protocol.names import AlignmentKind, AnchorKind, ObservationSource
 from iris_session.protocol.status import AlignmentReport, AnchorSeen
 
 #: Errors that linear algebra raises for extreme input of a client.
@@ -146,6 +146,7 @@ class ConnectionEstimator:
             return self._touches.add_persistent(observation)
         if observation.kind == AnchorKind.CONTROLLER:  # tracked: neither distance nor mirrored poses matter
             covariance, p_tracking_head = covariance or _CONTROLLER, None
+        source = ObservationSource.HOLDER if observation.kind == AnchorKind.CONTROLLER else ObservationSource.QR_CAMERA
         misprints = self._estimator.wrong_size
         try:
             used = self._estimator.add(
@@ -158,6 +159,7 @@ class ConnectionEstimator:
                 size_m=observation.size_m,
                 covariance=covariance,
                 p_tracking_head=p_tracking_head,
+                source=observation.source or source,
             )
         except NUMERICAL_ERRORS:
             return False

@@ -43,6 +43,9 @@ MAX_POINTS: Final = 8
 MAX_TIPS: Final = 8
 #: Noise of a touch per axis: of a fingertip, and of everything that is no calibrated tip and states no covariance.
 FINGERTIP_SIGMA_M: Final = 0.010
+#: Per axis, of a tip that was not calibrated in this session, of which a client states the noise of its touches:
+#: assumed, for a tip that is known to 3 mm.
+UNCALIBRATED_TIP_SIGMA_M: Final = 0.003 / math.sqrt(3.0)
 #: Coarser touches do not make an alignment to drive with.
 MAX_DRIVING_SIGMA_M: Final = 0.004
 #: No client can state that its touches are better.
@@ -54,6 +57,8 @@ _MIN_POINTS: Final = 3
 _NOT_USED: Final = "the touched marks contradict the kept anchor: it is not used"
 #: Fingertips are less exact than tips at the sheet too.
 _FINGERTIP_CONFIG: Final = AlignmentConfig(max_error_m=0.05)
+
+_UNCALIBRATED_TIP: Final = tuple(UNCALIBRATED_TIP_SIGMA_M**2 if i % 4 == 0 else 0.0 for i in range(9))
 
 #: Covariance of the tip of each device (3x3 row-major, grip frame [m^2]).
 Tips = Mapping[str, tuple[float, ...]]
@@ -188,6 +193,11 @@ class TouchEstimator:
     def _list_precise(self) -> list[Touch]:
         return [t for kept in self._touches.values() for t in kept if t.sigma_m <= MAX_DRIVING_SIGMA_M]
 
+    def _list_tips(self, touches: list[Touch]) -> dict[str, tuple[float, ...]]:
+        """Return the covariance of each tip: as calibrated, else the default for precise touches."""
+        precise = {t.tip for t in touches if t.sigma_m <= MAX_DRIVING_SIGMA_M}
+        return dict.fromkeys(sorted(precise), _UNCALIBRATED_TIP) | self._tips
+
     @property
     def advice(self) -> str:
         """The marks still to be touched for an estimate, as text; empty if nothing is missing."""
@@ -243,7 +253,7 @@ class TouchEstimator:
             return self._register(points, everything, _FINGERTIP_CONFIG), AlignmentKind.FINGERTIP
         if not everything:
             return kept, AlignmentKind.PERSISTENT
-        confirmed = confirm_alignment(kept, points, precise or everything, self._tips)
+        confirmed = confirm_alignment(kept, points, precise or everything, self._list_tips(precise))
         self._suspects = frozenset()
         if not confirmed.refused:
             return (confirmed, AlignmentKind.MEASURED) if precise else (kept, AlignmentKind.PERSISTENT)
@@ -254,7 +264,8 @@ class TouchEstimator:
         return confirmed, AlignmentKind.PERSISTENT
 
     def _register(self, points: Mapping[str, Vec3], touches: list[Touch], config: AlignmentConfig) -> AlignmentEstimate:
-        registration = register_touches(points, touches, self._tracking_epoch, self._tips, config)
+        tips = self._list_tips(touches)
+        registration = register_touches(points, touches, self._tracking_epoch, tips, config)
         self._suspects = frozenset(registration.suspects)
         return replace(registration.estimate, advice=registration.estimate.advice or _describe_residuals(registration))
 

@@ -185,6 +185,8 @@ class Wearer:
             self.viewpoint += 1
         viewpoint = 0 if way == "zero" else self.viewpoint
         at_ns = self.room.now_ns
+        if kind == AnchorKind.QR:
+            fields["source"] = self.motion.source.reported_as
         observation = Observation(name, kind, Pose(*T_tracking_sheet), at_ns, 0, viewpoint, **fields)
         self.room.service.process_observation(self, observation, at_ns)
 

@@ -31,6 +31,7 @@ from anchors.lie import (
 )
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, compose, inverse, quat_from_yaw
 from iris_session.emulator.sheet_noise import SheetNoise, mix_viewpoint_noise
+from iris_session.protocol.names import ObservationSource
 
 SHEET_M: Final = 0.16
 ONE: Final[dict[str, PoseTuple]] = {"a": IDENTITY_POSE}
@@ -75,6 +76,7 @@ class SheetSource:
     `focal`: share by which its focal length is wrong. `corner_px`: constant error of each detected corner, per axis.
     `weight`: of a new pose in a smoothing filter. `remembers`: the first second repeats a pose of an earlier session.
     `viewpoints`: `head` (a new number at every place), `each` (a new one at every observation), `zero`.
+    `reported_as`: `ObservationSource`.
     """
 
     hz: float = 10.0
@@ -86,6 +88,7 @@ class SheetSource:
     weight: float = 1.0
     remembers: bool = False
     viewpoints: str = "head"
+    reported_as: str = ObservationSource.QR_CAMERA
     noise: SheetNoise = field(default_factory=SheetNoise)
 
 

@@ -45,7 +45,7 @@ from iris_session.bench.alignment_sources import (
 )
 from iris_session.bench.report import Bar, BenchError, make_bar
 from iris_session.emulator.sheet_noise import mix_viewpoint_noise
-from iris_session.protocol.names import AnchorKind, Device
+from iris_session.protocol.names import AnchorKind, Device, ObservationSource
 
 TOUCH_COVARIANCE: Final = tuple(TIP_SIGMA_M**2 if i % 7 == 0 else 0.0 for i in range(36))
 
@@ -328,16 +328,16 @@ class Variant:
         return room
 
 
-_SYSTEM: Final = SheetSource(hz=1.0, weight=0.2, size_sigma=0.0035)
+_QR_SYSTEM: Final = ObservationSource.QR_SYSTEM
+_MRUK: Final = SheetSource(hz=1.0, weight=0.2, size_sigma=0.0035, reported_as=_QR_SYSTEM)
+_HOLOLENS: Final = SheetSource(hz=3.0, weight=0.2, size_sigma=0.005, remembers=True, reported_as=_QR_SYSTEM)
 #: "Smoothed 20 %": a new pose counts for a fifth. The largest errors are taken as two sigma.
 MIXES: Final[dict[str, tuple[Variant, ...]]] = {
     "lab_own_detector": (
         Variant("", work_in_laboratory, SheetSource(late_s=(0.05, 0.05), corner_px=0.35), print_max=0.005),
     ),
-    "lab_system_qr": (Variant("", work_in_laboratory, _SYSTEM),),
-    "lab_hololens": (
-        Variant("", work_in_laboratory, SheetSource(hz=3.0, weight=0.2, size_sigma=0.005, remembers=True)),
-    ),
+    "lab_system_qr": (Variant("", work_in_laboratory, _MRUK),),
+    "lab_hololens": (Variant("", work_in_laboratory, _HOLOLENS),),
     "lab_three_sheets": (
         Variant(
             "",

@@ -194,6 +194,7 @@ class Observation(Message, frozen=True, tag="observation"):
     `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
     share their systematic error. `covariance`: 6x6 row-major (position, rotation), tracking axes, of kind `persistent`
     those of the anchor, or empty. `quality`: 0 to 1.
+    `source`: `ObservationSource`, empty for that of `kind`: `qr_camera`, `holder` or `touch`.
     `mark`: touched mark of the anchor (`AnchorInfo.marks`), empty for the origin of the anchor. `grip_poses`: of kind
     `tip`, `T_tracking_grip` of `device` (section 5).
     """
@@ -210,6 +211,7 @@ class Observation(Message, frozen=True, tag="observation"):
     covariance: Annotated[tuple[float, ...], msgspec.Meta(max_length=36)] = ()
     mark: Name = ""
     grip_poses: TipPoses = ()
+    source: Name = ""
 
 
 class PlaceAlignment(Message, frozen=True, tag="place_alignment"):

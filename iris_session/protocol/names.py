@@ -152,6 +152,20 @@ class AnchorKind:
     ALL: Final = frozenset({"qr", "board", "controller", "touch", "tip", "persistent"})
 
 
+class ObservationSource:
+    """Source of an observation, whose constant errors are known by size (docs/anchors.md, "Biases").
+
+    `qr_camera`: a detector of the application, on pictures of a camera. `qr_system`: codes that the system of the
+    headset tracks. `holder`: a tracked controller in its holder. `touch`: a tip on a mark.
+    """
+
+    QR_CAMERA: Final = "qr_camera"
+    QR_SYSTEM: Final = "qr_system"
+    HOLDER: Final = "holder"
+    TOUCH: Final = "touch"
+    ALL: Final = frozenset({"qr_camera", "qr_system", "holder", "touch"})
+
+
 class SessionKind:
     """Kind of a session."""
 

@@ -185,7 +185,9 @@ def test_controller_in_its_holder_is_an_anchor() -> None:
                 lab.poll()
         stated[kind] = ann.proposals()[-1].error_at_anchor_m
         assert error_at_anchor(ann, ann.proposals()[-1]) < 0.003
-    assert stated["controller"] < 0.4 * stated["qr"], "1.5 mm per axis, not the 5 mm of a sheet seen from nowhere"
+    assert stated["controller"] < 0.6 * stated["qr"], (
+        "1.5 mm per axis and a bias of 2 mm, not the 5 mm of a sheet seen from nowhere"
+    )
 
 
 MARKS: dict[str, PoseTuple] = {

@@ -177,6 +177,7 @@ _ENUMS: Final[dict[str, str]] = {
     "Align.action": "AlignAction",
     "Observation.kind": "AnchorKind",
     "Observation.device": "Device",
+    "Observation.source": "ObservationSource",
     "TipCalibrated.device": "Device",
     "Episode.action": "EpisodeAction",
     "Control.action": "ControlAction",

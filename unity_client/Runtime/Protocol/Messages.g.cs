@@ -153,6 +153,20 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// Source of an observation, whose constant errors are known by size (docs/anchors.md, "Biases").
+    ///
+    /// qr_camera: a detector of the application, on pictures of a camera. qr_system: codes that the system of the
+    /// headset tracks. holder: a tracked controller in its holder. touch: a tip on a mark.
+    /// </summary>
+    public static class ObservationSource
+    {
+        public const string QrCamera = "qr_camera";
+        public const string QrSystem = "qr_system";
+        public const string Holder = "holder";
+        public const string Touch = "touch";
+    }
+
+    /// <summary>
     /// Kind of a session.
     /// </summary>
     public static class SessionKind
@@ -3354,6 +3368,7 @@ namespace IrisSession.Protocol
     /// kind: AnchorKind. size_m: edge of the sheet as detected. viewpoint_id: observations with the same number
     /// share their systematic error. covariance: 6x6 row-major (position, rotation), tracking axes, of kind persistent
     /// those of the anchor, or empty. quality: 0 to 1.
+    /// source: ObservationSource, empty for that of kind: qr_camera, holder or touch.
     /// mark: touched mark of the anchor (AnchorInfo.marks), empty for the origin of the anchor. grip_poses: of kind
     /// tip, T_tracking_grip of device (section 5).
     /// </summary>
@@ -3373,6 +3388,7 @@ namespace IrisSession.Protocol
         public double[] Covariance = new double[0];
         public string Mark = "";
         public Pose[] GripPoses = new Pose[0];
+        public string Source = "";
 
         public static Observation Read(WireReader reader)
         {
@@ -3394,6 +3410,7 @@ namespace IrisSession.Protocol
                     case "covariance": value.Covariance = reader.ReadDoubles(0, 36); break;
                     case "mark": value.Mark = reader.ReadString(64); break;
                     case "grip_poses": value.GripPoses = reader.ReadArray(Protocol.Pose.Read, 100); break;
+                    case "source": value.Source = reader.ReadString(64); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3403,7 +3420,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(13);
+            writer.WriteMapHeader(14);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("anchor_id");
@@ -3430,6 +3447,8 @@ namespace IrisSession.Protocol
             writer.Write(Mark);
             writer.Write("grip_poses");
             writer.Write(GripPoses);
+            writer.Write("source");
+            writer.Write(Source);
         }
     }
 

@@ -133,6 +133,20 @@ export const AnchorKind = {
 } as const;
 export type AnchorKind = (typeof AnchorKind)[keyof typeof AnchorKind] | (string & {});
 
+/**
+ * Source of an observation, whose constant errors are known by size (docs/anchors.md, "Biases").
+ *
+ * `qr_camera`: a detector of the application, on pictures of a camera. `qr_system`: codes that the system of the
+ * headset tracks. `holder`: a tracked controller in its holder. `touch`: a tip on a mark.
+ */
+export const ObservationSource = {
+  QR_CAMERA: "qr_camera",
+  QR_SYSTEM: "qr_system",
+  HOLDER: "holder",
+  TOUCH: "touch",
+} as const;
+export type ObservationSource = (typeof ObservationSource)[keyof typeof ObservationSource] | (string & {});
+
 /** Kind of a session. */
 export const SessionKind = {
   LIVE: "live",
@@ -1022,6 +1036,7 @@ export interface Grasp {
  * `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
  * share their systematic error. `covariance`: 6x6 row-major (position, rotation), tracking axes, of kind `persistent`
  * those of the anchor, or empty. `quality`: 0 to 1.
+ * `source`: `ObservationSource`, empty for that of `kind`: `qr_camera`, `holder` or `touch`.
  * `mark`: touched mark of the anchor (`AnchorInfo.marks`), empty for the origin of the anchor. `grip_poses`: of kind
  * `tip`, `T_tracking_grip` of `device` (section 5).
  */
@@ -1039,6 +1054,7 @@ export interface Observation {
   covariance?: number[];
   mark?: string;
   grip_poses?: Pose[];
+  source?: ObservationSource;
 }
 
 /** Align a participant by hand, or add an offset to a measured alignment (`offset` true). Directors only. */
@@ -2273,7 +2289,7 @@ export const DEFAULTS = {
   set_mode: {},
   set_scale: { robots: [], scale: 1.0 },
   grasp: {},
-  observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [], mark: "", grip_poses: [] },
+  observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [], mark: "", grip_poses: [], source: "" },
   place_alignment: { offset: false },
   align: { participant: "" },
   move_anchor: { force: false },

@@ -549,6 +549,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["covariance", ["array", ["float"], 0, 36], [[]]],
       ["mark", ["str", 64, ""], [""]],
       ["grip_poses", ["array", ["struct", "Pose"], 0, 100], [[]]],
+      ["source", ["str", 64, ""], [""]],
     ],
   },
   PlaceAlignment: {
