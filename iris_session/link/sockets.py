@@ -16,7 +16,7 @@ from zmq.utils.monitor import parse_monitor_message
 
 from iris_session.link.config import FrontConfig, FrontError, FrontLimits, PortInUseError
 from iris_session.protocol.assets import MAX_ASSET_REQUESTS
-from iris_session.protocol.limits import MAX_CLIENT_BYTES, MAX_MEDIA_FRAME_BYTES
+from iris_session.protocol.limits import MAX_CONTROL_BYTES, MAX_MEDIA_FRAME_BYTES
 from iris_session.security import KeyPair
 from iris_session.security.zap import ZAP_ASSETS, ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_STATE
 
@@ -73,7 +73,7 @@ def open_control(
     """Open the ROUTER of the control channel."""
     control = context.socket(zmq.ROUTER)
     control.setsockopt(zmq.ROUTER_MANDATORY, 1)
-    control.setsockopt(zmq.MAXMSGSIZE, MAX_CLIENT_BYTES)
+    control.setsockopt(zmq.MAXMSGSIZE, MAX_CONTROL_BYTES)
     control.setsockopt(zmq.SNDHWM, config.limits.send_queue)
     control.setsockopt(zmq.RCVHWM, config.limits.receive_queue)
     control.setsockopt(zmq.SNDBUF, CONTROL_BUFFER_BYTES)

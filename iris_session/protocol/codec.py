@@ -28,6 +28,7 @@ from iris_session.protocol.limits import (
     MAX_MEDIA_FRAME_BYTES,
     MAX_MEDIA_HEADER_BYTES,
     MAX_MEDIA_PUSH_BYTES,
+    MAX_ON_BEHALF_BYTES,
     MAX_PRESENCE_BYTES,
     MAX_SERVER_BYTES,
     MAX_STATE_HEADER_BYTES,
@@ -163,7 +164,8 @@ def encode_client(envelope: ClientEnvelope) -> bytes:
 
 def decode_client(data: Bytes) -> ClientEnvelope:
     """Decode a message to the session. Raises `ProtocolVersionError`, `TooLargeError` or `MalformedError`."""
-    return _decode_envelope(_client, _client_tags, CLIENT_TYPES, LIMITS, data, MAX_CLIENT_BYTES)
+    max_bytes = MAX_CLIENT_BYTES + MAX_ON_BEHALF_BYTES
+    return _decode_envelope(_client, _client_tags, CLIENT_TYPES, LIMITS, data, max_bytes)
 
 
 def encode_server(envelope: ServerEnvelope) -> bytes:
@@ -374,7 +376,8 @@ def _decode_envelope(
         raise _explain_failure(error, data, tags, known) from None
     _require_version(envelope.version)
     kind = type(envelope.message)
-    _check_size(get_tag(kind), data, limits[kind].max_bytes)
+    behind = envelope.on_behalf_of if isinstance(envelope, ClientEnvelope) else ""
+    _check_length(get_tag(kind), len(data) - len(behind), limits[kind].max_bytes)  # a gateway has put that name in
     return envelope
 
 

@@ -113,8 +113,13 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         ClientReport: Limit(1_000, 4, 8),
     }
 )
-#: Largest message of any type from a client (`ZMQ_MAXMSGSIZE` of the control socket).
+#: Largest message of any type from a client, without the name that a gateway puts into it.
 MAX_CLIENT_BYTES: Final = max(limit.max_bytes for limit in LIMITS.values())
+#: Bytes of that name: `on_behalf_of` in MessagePack.
+MAX_ON_BEHALF_BYTES: Final = 64
+#: Largest message on the wire of the control channel (`ZMQ_MAXMSGSIZE`, beyond which libzmq closes the connection, of a
+#: gateway with all clients behind it): 33 bytes of CURVE, rounded up.
+MAX_CONTROL_BYTES: Final = MAX_CLIENT_BYTES + MAX_ON_BEHALF_BYTES + 64
 
 #: From the server, checked by clients. A snapshot names every body: 65,535 of them.
 SERVER_LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(

@@ -22,6 +22,29 @@ class _StandardErrorHandler(logging.Handler):
             self.handleError(record)
 
 
+class RepetitionFilter(logging.Filter):
+    """Filter that lets one message through at most `BURST` times in `PERIOD_S`, whatever its arguments are."""
+
+    BURST: Final = 5
+    PERIOD_S: Final = 10.0
+    _MAX_MESSAGES: Final = 64
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seen: dict[str, tuple[float, int]] = {}  # since when [s], how often
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a record is written."""
+        key = str(record.msg)
+        since, n = self._seen.pop(key, (record.created, 0))
+        if not 0.0 <= record.created - since < self.PERIOD_S:
+            since, n = record.created, 0
+        while len(self._seen) >= self._MAX_MESSAGES:
+            del self._seen[next(iter(self._seen))]
+        self._seen[key] = since, n + 1
+        return n < self.BURST
+
+
 def configure_logging() -> None:
     """Write the log of this package to standard error, one line `LEVEL name: text` a record.
 

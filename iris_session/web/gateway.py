@@ -25,7 +25,7 @@ from iris_session.assets.store import AssetStore, default_root
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.link.sockets import raise_descriptor_limit
 from iris_session.protocol.limits import Drops
-from iris_session.system.log import configure_logging
+from iris_session.system.log import RepetitionFilter, configure_logging
 from iris_session.system.process import die_with_parent, is_parent
 from iris_session.web.assets import GatewayAssets
 from iris_session.web.certificate import list_host_names, make_tls_context
@@ -162,6 +162,7 @@ async def serve(start: GatewayStart) -> str:
 def main() -> int:
     """Run the gateway of one session. Exit status 1 if it cannot start, or is not admitted."""
     configure_logging()
+    logging.getLogger("asyncio").addFilter(RepetitionFilter())  # a line for every write to a closed connection
     start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=GatewayStart)
     raise_descriptor_limit()
     sys.setswitchinterval(SWITCH_S)

@@ -20,7 +20,7 @@ from typing import Final
 from iris_session.link.config import SECOND
 from iris_session.link.sockets import open_listeners
 from iris_session.link.tcp_guard import TcpBounds, TcpConnection, TcpGuard, TcpReasons
-from iris_session.protocol.limits import Drops, KeyedBuckets, find_network
+from iris_session.protocol.limits import Drops, KeyedBuckets, TokenBucket, find_network
 from iris_session.web.sockets import limit_unsent
 
 #: Connections of one browser that are established. It has two WebSockets, and 16 assets at once.
@@ -29,6 +29,13 @@ MAX_PER_BROWSER: Final = 24
 HANDSHAKES_PER_S, HANDSHAKE_BURST = 20.0, 120
 REQUESTS_PER_S, REQUEST_BURST = 200.0, 1000
 MAX_ADDRESSES: Final = 1024
+#: Bytes from one connection: of an established one what its browser may send in messages (`HubLimits`) with their
+#: frames, of another a request, a hello and pairing. All that a peer can send counts, whatever aiohttp does with it:
+#: empty fragments of WebSockets for example never become a message.
+ESTABLISHED_BYTES_PER_S, ESTABLISHED_BYTES_BURST = 5e6, 10_000_000
+OTHER_BYTES_PER_S, OTHER_BYTES_BURST = 20e3, 200_000
+#: The same of all connections of a network that are not established.
+NETWORK_BYTES_PER_S, NETWORK_BYTES_BURST = 200e3, 2_000_000
 #: Time for the first byte, for the handshake of TLS, and for a request.
 FIRST_BYTE_S: Final = 5.0
 HANDSHAKE_S: Final = 8.0
@@ -54,22 +61,35 @@ _PATH: Final = re.compile(rb"[A-Z]{3,7} (/[A-Za-z0-9._~!$&'()*+,;=:@%/?-]{0,500}
 
 
 class WatchedProtocol(asyncio.Protocol):
-    """Protocol of one connection that passes everything on to that of aiohttp, and notes the end."""
+    """Protocol of one connection that passes everything on to that of aiohttp, and notes the end.
+
+    `take`: returns whether so many bytes more may come; a connection with too many is cut.
+    """
 
     def __init__(
-        self, inner: asyncio.Protocol, on_made: Callable[[asyncio.Transport], None], on_lost: Callable[[], None]
+        self,
+        inner: asyncio.Protocol,
+        on_made: Callable[[asyncio.Transport], None],
+        on_lost: Callable[[], None],
+        take: Callable[[int], bool],
     ) -> None:
         self._inner = inner
         self._on_made = on_made
         self._on_lost = on_lost
+        self._take = take
+        self._transport: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
         self._on_made(transport)
         self._inner.connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        self._inner.data_received(data)
+        if self._take(len(data)):
+            self._inner.data_received(data)
+        elif self._transport is not None:
+            self._transport.abort()
 
     def eof_received(self) -> bool | None:
         return self._inner.eof_received()
@@ -104,6 +124,7 @@ class Listener:
         self._closers: dict[TcpConnection, Callable[[], object]] = {}
         self._handshakes = KeyedBuckets(HANDSHAKES_PER_S, HANDSHAKE_BURST, MAX_ADDRESSES)
         self._requests = KeyedBuckets(REQUESTS_PER_S, REQUEST_BURST, MAX_ADDRESSES)
+        self._bytes = KeyedBuckets(NETWORK_BYTES_PER_S, NETWORK_BYTES_BURST, MAX_ADDRESSES)
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -205,7 +226,12 @@ class Listener:
                 self._closers[connection] = transport.abort
                 connection.quiet_ns = time.monotonic_ns()
 
-            protocol = WatchedProtocol(self._make_protocol(), on_made, lambda: self._remove(descriptor, connection))
+            protocol = WatchedProtocol(
+                self._make_protocol(),
+                on_made,
+                lambda: self._remove(descriptor, connection),
+                self._make_byte_limit(connection),
+            )
             is_passed_on = True
             try:
                 await self._loop.connect_accepted_socket(
@@ -221,6 +247,24 @@ class Listener:
                 self._remove(descriptor, connection)
                 with contextlib.suppress(OSError):
                     sock.close()
+
+    def _make_byte_limit(self, connection: TcpConnection) -> Callable[[int], bool]:
+        """Return the function that takes bytes of one connection from its limit."""
+        network, now_ns = find_network(connection.address[0]), time.monotonic_ns()
+        other = TokenBucket(OTHER_BYTES_PER_S, OTHER_BYTES_BURST, now_ns)
+        established = TokenBucket(ESTABLISHED_BYTES_PER_S, ESTABLISHED_BYTES_BURST, now_ns)
+
+        def take(n_bytes: int) -> bool:
+            now_ns = time.monotonic_ns()
+            if connection.is_established:
+                is_allowed = established.take(now_ns, n_bytes)
+            else:
+                is_allowed = other.take(now_ns, n_bytes) and self._bytes.take(network, now_ns, n_bytes)
+            if not is_allowed:
+                self._drops.count("web_flood")
+            return is_allowed
+
+        return take
 
     def _remove(self, descriptor: int, connection: TcpConnection) -> None:
         self._closers.pop(connection, None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from collections.abc import Collection
 from typing import Final
@@ -39,11 +40,17 @@ class HostCheck:
     """Check of `Host` and `Origin`, against pages of other sites that speak to a gateway in a private network.
 
     A page of another site has another origin. It can have its own name point to this machine (DNS rebinding); so a name
-    must be one of this machine, while an address needs no resolver and is always right.
+    must be one of this machine, while an address needs no resolver and is always right. What is not encrypted is for
+    programs on this machine only: `localhost` and loopback addresses.
+
+    Args:
+        names: Names of this machine.
+        secure: The gateway speaks HTTPS.
     """
 
     def __init__(self, names: Collection[str], *, secure: bool) -> None:
-        self._names = frozenset(filter(None, (*map(normalise_name, names), "localhost")))
+        known = map(normalise_name, names) if secure else ()
+        self._names = frozenset(filter(None, (*known, "localhost")))
         self._scheme = "https" if secure else "http"
 
     def find_host(self, host: str | None) -> str:
@@ -52,8 +59,11 @@ class HostCheck:
         if match is None or host is None:
             return ""
         name = normalise_name(match["name"])
-        is_address = bool(name) and (":" in name or name.replace(".", "").isdigit())
-        return host if is_address or name in self._names else ""
+        try:
+            address = ipaddress.ip_address(name)
+        except ValueError:
+            return host if name in self._names else ""
+        return host if address.is_loopback or self._scheme == "https" else ""
 
     def is_own_origin(self, origin: str | None, host: str) -> bool:
         """Return whether a request comes from our own page, or from no page at all (an app sends no `Origin`)."""

@@ -16,7 +16,7 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Final
 
-from aiohttp import WSCloseCode, WSMsgType, web
+from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.errors import ProtocolError
@@ -73,12 +73,78 @@ ASSET_PIECE: Final = 65_536
 ASSET_BYTES_PER_S: Final = 48e6
 #: Messages a second on a media socket: subscriptions and tickets, nothing else.
 _SUBSCRIPTIONS_PER_S, _SUBSCRIPTIONS_BURST = 5.0, 20
+#: Pings and pongs of one WebSocket: browsers answer one in 15 s, and never ask.
+_PINGS_PER_S, _PING_BURST = 5.0, 20
 _RANGE: Final = re.compile(r"bytes=(\d{0,15})-(\d{0,15})")
 _TICKET_HEADER: Final = "X-Iris-Ticket"
+TOO_MANY_PINGS: Final = "more pings than a client may send"
 _MAX_REASON: Final = 120
 _FAULT_LOG_S: Final = 10.0
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class Acknowledgements:
+    """Tells whether the peer of a transport acknowledges anything of what waits for it."""
+
+    def __init__(self, transport: asyncio.Transport) -> None:
+        self._transport = transport
+        sock = transport.get_extra_info("socket")
+        self._descriptor = -1 if sock is None else sock.fileno()
+        self._acknowledged = 0
+        self._progress_at = asyncio.get_running_loop().time()
+        self._checked_at = 0.0
+        self._slow = False
+
+    def count_waiting(self) -> int:
+        """Return the bytes that the peer has not acknowledged."""
+        return self._transport.get_write_buffer_size() + count_unacknowledged(self._descriptor)
+
+    def is_slow(self) -> bool:
+        """Return whether bytes wait, and the peer has acknowledged none for `SLOW_S`."""
+        now = asyncio.get_running_loop().time()
+        if now - self._checked_at < _CHECK_S / 2:
+            return self._slow
+        self._checked_at = now
+        acknowledged = count_acknowledged(self._descriptor)
+        if acknowledged != self._acknowledged or not self.count_waiting():
+            self._acknowledged, self._progress_at = acknowledged, now
+        self._slow = now - self._progress_at > SLOW_S
+        return self._slow
+
+    async def wait_for(self, writing: Awaitable[None]) -> bool:
+        """Return whether something is written before the peer is too slow. What writes is cancelled otherwise."""
+        task = asyncio.ensure_future(writing)
+        try:
+            while not task.done():
+                if self.is_slow():
+                    return False
+                await asyncio.wait((task,), timeout=_CHECK_S)
+            task.result()
+        finally:
+            task.cancel()
+        return True
+
+
+class SocketReader:
+    """Reads one WebSocket. Pings and pongs are limited, and those who send fast leave others their turn."""
+
+    def __init__(self, socket: web.WebSocketResponse) -> None:
+        self._socket = socket
+        self._pings = TokenBucket(_PINGS_PER_S, _PING_BURST, time.monotonic_ns())
+
+    async def receive(self) -> WSMessage | None:
+        """Return the next message that is no ping or pong, `None` when there were too many of these."""
+        while True:
+            message = await self._socket.receive()
+            await asyncio.sleep(0)  # `receive` does not wait for what has come already
+            if message.type not in (WSMsgType.PING, WSMsgType.PONG):
+                return message
+            if not self._pings.take(time.monotonic_ns()):
+                return None
+            if message.type == WSMsgType.PING:
+                with contextlib.suppress(ConnectionError, RuntimeError):  # closed meanwhile
+                    await self._socket.pong(message.data)
 
 
 class SocketWriter:
@@ -95,13 +161,9 @@ class SocketWriter:
         self.socket = socket
         self.frame: bytes | None = None
         self._transport = transport
-        sock = transport.get_extra_info("socket")
-        self._descriptor = -1 if sock is None else sock.fileno()
+        self._acknowledgements = Acknowledgements(transport)
+        self.is_slow = self._acknowledgements.is_slow
         self._wake = asyncio.Event()
-        self._acknowledged = 0
-        self._progress_at = asyncio.get_running_loop().time()
-        self._checked_at = 0.0
-        self._slow = False
         transport.set_write_buffer_limits(high=MEDIA_WINDOW)
 
     def wake(self) -> None:
@@ -122,7 +184,7 @@ class SocketWriter:
 
     def has_room(self, window: int) -> bool:
         """Return whether less than `window` bytes wait for the client."""
-        return not self._transport.get_write_buffer_size() and count_unacknowledged(self._descriptor) < window
+        return not self._transport.get_write_buffer_size() and self._acknowledgements.count_waiting() < window
 
     async def send(self, message: bytes) -> bool:
         """Send a message. False: the client has read nothing for `SLOW_S`, or has closed."""
@@ -130,18 +192,9 @@ class SocketWriter:
             if len(message) < _SMALL_MESSAGE and not self._transport.get_write_buffer_size():
                 await self.socket.send_bytes(message)  # does not wait: there is room
                 return True
-            sending = asyncio.ensure_future(self.socket.send_bytes(message))
-            try:
-                while not sending.done():
-                    if self.is_slow():
-                        return False
-                    await asyncio.wait((sending,), timeout=_CHECK_S)
-                sending.result()
-            finally:
-                sending.cancel()
+            return await self._acknowledgements.wait_for(self.socket.send_bytes(message))
         except (ConnectionError, RuntimeError):  # closed meanwhile
             return False
-        return True
 
     async def send_pieces(self, message: bytes) -> bool:
         """Send a large message, and let others send between its pieces. Return false if the WebSocket has closed.
@@ -154,19 +207,6 @@ class SocketWriter:
             self._transport.write(make_fragment(message, begin, min(begin + MEDIA_PIECE, len(message))))
             await asyncio.sleep(0)
         return True
-
-    def is_slow(self) -> bool:
-        """Return whether bytes wait, and the client has acknowledged none for `SLOW_S`."""
-        now = asyncio.get_running_loop().time()
-        if now - self._checked_at < _CHECK_S / 2:
-            return self._slow
-        self._checked_at = now
-        acknowledged = count_acknowledged(self._descriptor)
-        waits = self._transport.get_write_buffer_size() or count_unacknowledged(self._descriptor)
-        if acknowledged != self._acknowledged or not waits:
-            self._acknowledged, self._progress_at = acknowledged, now
-        self._slow = now - self._progress_at > SLOW_S
-        return self._slow
 
     async def close(self, closing: Closing) -> None:
         """Close the WebSocket with a code and a reason; a client that does not answer is cut off."""
@@ -263,7 +303,8 @@ class WebServer:
                 connection.quiet_ns = time.monotonic_ns()
 
     async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        host = self._hosts.find_host(request.headers.get("Host"))
+        hosts = request.headers.getall("Host", [])
+        host = self._hosts.find_host(hosts[0]) if len(hosts) == 1 else ""
         try:
             if not host:
                 self._drops.count("web_host")
@@ -283,10 +324,31 @@ class WebServer:
             response = web.Response(status=500, text="the gateway has a fault: see its log\n")
         if not response.prepared:
             response.headers.update(make_security_headers(host))
+        if isinstance(response, web.Response) and isinstance(response.body, bytes) and request.method == "GET":
+            return await self._write_body(request, response, response.body)
         return response
 
+    async def _write_body(self, request: web.Request, response: web.Response, body: bytes) -> web.StreamResponse:
+        """Write a body in pieces, while its request counts as under way. aiohttp would write it afterwards and at once:
+        a peer that reads nothing would have all of it in our memory.
+        """
+        if len(body) <= ASSET_PIECE or request.transport is None:
+            return response
+        streamed = web.StreamResponse(status=response.status, headers=response.headers)
+        streamed.content_length = len(body)
+        await streamed.prepare(request)
+        acknowledgements = Acknowledgements(request.transport)
+        for at in range(0, len(body), ASSET_PIECE):
+            if not await acknowledgements.wait_for(streamed.write(body[at : at + ASSET_PIECE])):
+                self._drops.count("web_too_slow")
+                request.transport.abort()
+                return streamed
+        await streamed.write_eof()
+        return streamed
+
     def _is_from_own_page(self, request: web.Request, host: str) -> bool:
-        if not self._hosts.is_own_origin(request.headers.get("Origin"), host):
+        origins = request.headers.getall("Origin", [])
+        if len(origins) > 1 or not self._hosts.is_own_origin(next(iter(origins), None), host):
             return False
         # A link to the page from elsewhere is a navigation, and fine; scripts of other sites are not.
         site = request.headers.get("Sec-Fetch-Site", "none")
@@ -358,22 +420,20 @@ class WebServer:
             response.headers["Content-Range"] = f"bytes {begin}-{end - 1}/{total}"
         response.headers.update(make_security_headers(self._hosts.find_host(request.headers.get("Host"))))
         await response.prepare(request)
+        transport = request.transport
+        if transport is None:
+            raise ConnectionResetError
+        acknowledgements = Acknowledgements(transport)
         loop = asyncio.get_running_loop()
         for at in range(begin, end, ASSET_PIECE):
             await asyncio.sleep(self._asset_rate.reserve(min(ASSET_PIECE, end - at), time.monotonic()))
             # Read by a thread: a file that is not in memory must not stop the loop.
             piece = await loop.run_in_executor(None, bytes, view[at : min(at + ASSET_PIECE, end)])
-            try:
-                async with asyncio.timeout(SLOW_S):
-                    await response.write(piece)
-            except TimeoutError:
+            is_read = await acknowledgements.wait_for(response.write(piece))
+            if not is_read:
                 self._drops.count("web_asset_slow")
-                if request.transport is not None:
-                    request.transport.abort()
-                return response
-            if browser.closing is not None and not browser.is_admitted:  # revoked, or its WebSocket is closed
-                if request.transport is not None:
-                    request.transport.abort()
+            if not is_read or not browser.is_admitted:  # revoked, or its WebSocket is closed
+                transport.abort()
                 return response
         await response.write_eof()
         return response
@@ -387,7 +447,12 @@ class WebServer:
             self._drops.count("web_subprotocol")
             raise web.HTTPBadRequest(reason=f"expected a WebSocket with subprotocol {SUBPROTOCOL}")
         socket = web.WebSocketResponse(
-            protocols=(SUBPROTOCOL,), max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=_CLOSE_S, heartbeat=30.0
+            protocols=(SUBPROTOCOL,),
+            max_msg_size=MAX_CLIENT_MESSAGE + 1,  # aiohttp takes less than that
+            compress=False,
+            timeout=_CLOSE_S,
+            heartbeat=30.0,
+            autoping=False,  # its own answers are not counted, and give way to no one
         )
         if not socket.can_prepare(request).ok:
             raise web.HTTPBadRequest(reason=f"expected a WebSocket with subprotocol {SUBPROTOCOL}")
@@ -414,9 +479,13 @@ class WebServer:
         return socket
 
     async def _read_session(self, browser: Browser, socket: web.WebSocketResponse) -> None:
+        reader = SocketReader(socket)
         while browser.closing is None:
-            message = await socket.receive()
-            if message.type == WSMsgType.BINARY:
+            message = await reader.receive()
+            if message is None:
+                self._drops.count("web_flood")
+                browser.close(CLOSE_LIMIT, TOO_MANY_PINGS)
+            elif message.type == WSMsgType.BINARY:
                 envelope = self._hub.receive(browser, message.data, time.monotonic_ns())
                 if envelope is not None and not self._session.send(envelope):
                     self._drops.count("web_session_full")
@@ -498,9 +567,9 @@ class WebServer:
     async def _receive_ticket(self, socket: web.WebSocketResponse) -> Browser | None:
         """Return the browser whose ticket comes first, `None` for one that is not valid. Raises `TimeoutError`."""
         async with asyncio.timeout(TICKET_S):
-            message = await socket.receive()
+            message = await SocketReader(socket).receive()
         try:
-            if message.type != WSMsgType.BINARY:
+            if message is None or message.type != WSMsgType.BINARY:
                 return None
             channel, frames = decode_frames(message.data)
             ticket = decode_gateway_message(frames[0])
@@ -516,12 +585,13 @@ class WebServer:
         self, browser: Browser, socket: web.WebSocketResponse, feed: MediaFeedSocket, writer: SocketWriter
     ) -> None:
         rate = TokenBucket(_SUBSCRIPTIONS_PER_S, _SUBSCRIPTIONS_BURST, time.monotonic_ns())
+        reader = SocketReader(socket)
         while browser.is_admitted:
-            message = await socket.receive()
-            if message.type != WSMsgType.BINARY:
+            message = await reader.receive()
+            if message is not None and message.type != WSMsgType.BINARY:
                 self._count_end(message.type, socket)
                 return
-            if not rate.take(time.monotonic_ns()):
+            if message is None or not rate.take(time.monotonic_ns()):
                 self._drops.count("web_flood")
                 await writer.close(Closing(CLOSE_LIMIT, "more messages than a client may send: send less"))
                 return

@@ -38,12 +38,15 @@ from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 from iris_session.web.config import GatewayConfig
 from iris_session.web.hub import Browser, Hub
 from iris_session.web.sockets import SocketReader
-from iris_session.web.wire import CLOSE_ENDED, CLOSE_RESTART
+from iris_session.web.wire import CLOSE_ENDED, CLOSE_RESTART, peek_client_type
 
 #: Time for the gateway to be admitted by the session, before a WebSocket is closed with "come again".
 READY_S: Final = 5.0
 #: Control messages that wait for the session while it does not read.
 MAX_WAITING: Final = 2048
+#: E-stops for which there is room besides.
+MAX_STOPS: Final = 256
+_ESTOP: Final = "estop"
 #: Time without browsers after which the state is not subscribed to any more.
 STATE_LINGER_S: Final = 5.0
 CONTROL_HWM: Final = 2048
@@ -172,12 +175,16 @@ class SessionLink:
         return self._ready.is_set()
 
     def send(self, envelope: bytes) -> bool:
-        """Send a message of a browser, in order. False: too much waits for the session."""
+        """Send a message of a browser, in order; an e-stop goes ahead. False: too much waits for the session."""
         if not self._ready.is_set():
             return True  # the browsers of this connection are being closed
-        if len(self._waiting) >= MAX_WAITING:
+        is_stop = bool(self._waiting) and peek_client_type(envelope) == _ESTOP
+        if len(self._waiting) >= MAX_WAITING + is_stop * MAX_STOPS:
             return False
-        self._waiting.append(envelope)
+        if is_stop:
+            self._waiting.appendleft(envelope)
+        else:
+            self._waiting.append(envelope)
         self._flush()
         return True
 

@@ -16,6 +16,7 @@ import msgspec
 
 from iris_session.protocol.codec import BAD_BYTES, Bytes
 from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, TooLargeError
+from iris_session.protocol.limits import MAX_CLIENT_BYTES
 from iris_session.protocol.media import is_stream_name
 from iris_session.protocol.names import PROTOCOL_VERSION, RefusalCode
 
@@ -26,8 +27,10 @@ STATE: Final = 2
 MEDIA: Final = 3
 MEDIA_WISHES: Final = 4
 GATEWAY: Final = 5
-#: WebSocket message of a client at most [bytes].
-MAX_CLIENT_MESSAGE: Final = 65_536
+_HEAD: Final = 2
+_LENGTH: Final = 4
+#: Largest WebSocket message of a client [bytes]: one frame of what the session takes.
+MAX_CLIENT_MESSAGE: Final = _HEAD + _LENGTH + MAX_CLIENT_BYTES
 #: Streams that a client may subscribe to, as many as a session has.
 MAX_SUBSCRIPTIONS: Final = 16
 #: Server messages that are larger are none of those that a gateway acts on.
@@ -42,8 +45,6 @@ CLOSE_LIMIT: Final = 4009
 CLOSE_RESTART: Final = 1012
 CLOSE_TRY_AGAIN: Final = 1013
 
-_HEAD: Final = 2
-_LENGTH: Final = 4
 _MAX_FRAMES: Final = 255
 _ENVELOPE_ELEMENTS: Final = 4
 #: Bytes of a name that MessagePack encodes with one byte of length.

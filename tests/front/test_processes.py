@@ -13,7 +13,7 @@ import zmq
 from iris_session.link import FrontLimits
 from iris_session.protocol.client_messages import EStop, Hello, Marker
 from iris_session.protocol.entries import Lost
-from iris_session.protocol.limits import MAX_CLIENT_BYTES
+from iris_session.protocol.limits import MAX_CONTROL_BYTES
 from iris_session.protocol.names import FaultCode, RefusalCode
 from iris_session.protocol.server_messages import ProtocolFault, Refused
 from iris_session.security import KeyPair
@@ -43,7 +43,7 @@ def test_floods_of_unauthenticated_connections_keep_no_known_key_out(open_proces
 
     session.pump(has_state, "state")
     huge = lab.client(KeyPair.generate())
-    huge.socket.send(b"x" * (MAX_CLIENT_BYTES + 1))
+    huge.socket.send(b"x" * (MAX_CONTROL_BYTES + 1))
     client.send(EStop())
     session.wait_entries(EStop, connection=client.epoch)
     assert session.wait_drops("strangers_too_many") > 0

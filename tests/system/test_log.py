@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from iris_session.system.log import ROOTS, configure_logging
+from iris_session.system.log import ROOTS, RepetitionFilter, configure_logging
 
 
 @pytest.fixture(autouse=True)
@@ -35,3 +35,16 @@ def test_level_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch, nam
     monkeypatch.setenv("IRIS_LOG", name)
     configure_logging()
     assert logging.getLogger("iris_session").level == level
+
+
+def test_a_repeated_message_does_not_fill_the_log() -> None:
+    limit = RepetitionFilter()
+
+    def write(text: str, at_s: float) -> bool:
+        record = logging.makeLogRecord({"msg": text, "args": (at_s,)})
+        record.created = at_s
+        return limit.filter(record)
+
+    assert sum(write("closed %g", 100.0 + n * 1e-3) for n in range(1000)) == RepetitionFilter.BURST
+    assert write("another %g", 101.0)
+    assert write("closed %g", 101.0 + RepetitionFilter.PERIOD_S)

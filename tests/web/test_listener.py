@@ -5,14 +5,22 @@ from __future__ import annotations
 import asyncio
 import socket
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from iris_session.link.config import SECOND
-from iris_session.link.tcp_guard import TcpGuard
+from iris_session.link.tcp_guard import TcpConnection, TcpGuard
 from iris_session.protocol.limits import Drops
 from iris_session.web import listener
-from iris_session.web.listener import BOUNDS, MAX_PER_BROWSER, REASONS, Listener, open_listening_sockets
+from iris_session.web.listener import (
+    BOUNDS,
+    MAX_PER_BROWSER,
+    REASONS,
+    Listener,
+    WatchedProtocol,
+    open_listening_sockets,
+)
 
 
 class Rig:
@@ -91,6 +99,36 @@ def test_one_browser_has_few_connections_and_networks_have_rates() -> None:
     for pair in pairs:
         for one in pair:
             one.close()
+
+
+def test_bytes_are_limited_before_anything_reads_them() -> None:
+    """Empty fragments of WebSockets, for example, never become a message."""
+
+    async def send() -> None:
+        serving = Listener(asyncio.Protocol, None, drops := Drops())
+        a, b = (TcpConnection((address, 1), SECOND) for address in ("10.0.0.1", "10.0.0.2"))
+        take = serving._make_byte_limit(a)
+        assert take(listener.OTHER_BYTES_BURST - 1)
+        assert not take(listener.OTHER_BYTES_BURST)
+        a.is_established = True
+        assert take(listener.OTHER_BYTES_BURST)
+        assert not take(listener.ESTABLISHED_BYTES_BURST)
+        many = [serving._make_byte_limit(TcpConnection(b.address, SECOND))(100_000) for _ in range(60)]
+        assert 10 < many.count(True) < 40  # of one network together
+        assert drops.by_reason == {"web_flood": 2 + many.count(False)}
+
+    asyncio.run(send())
+
+
+def test_a_connection_that_sends_too_much_is_cut() -> None:
+    transport, inner = Mock(spec=asyncio.Transport), Mock(spec=asyncio.Protocol)
+    protocol = WatchedProtocol(inner, lambda _: None, lambda: None, lambda n_bytes: n_bytes < 100)
+    protocol.connection_made(transport)
+    protocol.data_received(bytes(99))
+    assert not transport.abort.called
+    protocol.data_received(bytes(100))
+    assert transport.abort.called
+    inner.data_received.assert_called_once_with(bytes(99))
 
 
 def test_listening_sockets_share_one_free_port() -> None:

@@ -64,6 +64,9 @@ def test_the_page_is_read_when_it_was_built(tmp_path: Path) -> None:
 def test_names_of_others_are_refused(host: str | None, allowed: bool) -> None:
     check = HostCheck(["lab-pc.local"], secure=True)
     assert check.find_host(host) == (host if allowed else "")
+    plain = HostCheck(["lab-pc.local"], secure=False)
+    is_here = allowed and host is not None and host.startswith(("127.", "localhost"))
+    assert plain.find_host(host) == (host if is_here else "")
 
 
 @pytest.mark.parametrize(

@@ -1,21 +1,25 @@
-"""WebSockets of the gateway: large messages, whole for the browser and in pieces for the loop; late tickets."""
+"""WebSockets and HTTP of the gateway: messages in pieces, tickets, pings, slow readers, foreign pages."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import random
-from collections.abc import Awaitable, Callable
+import socket
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
-from aiohttp import ClientSession, WSMsgType, web
+from aiohttp import ClientError, ClientSession, WSMessage, WSMsgType, web
 
 from iris_session.web import server, wire
 from iris_session.web.assets import ByteRate
 from iris_session.web.hub import Hub
 from iris_session.web.origin import HostCheck
 from iris_session.web.page import PageFiles
-from iris_session.web.server import MEDIA_PIECE, SocketWriter, WebServer
+from iris_session.web.server import ASSET_PIECE, MEDIA_PIECE, SocketReader, SocketWriter, WebServer
 
 
 @pytest.mark.parametrize("length", [1, 125, 126, MEDIA_PIECE - 1, MEDIA_PIECE, MEDIA_PIECE + 1, 40 * MEDIA_PIECE + 200])
@@ -33,29 +37,150 @@ def test_others_send_between_the_pieces_of_a_message() -> None:
 @pytest.mark.parametrize(("first", "code"), [(None, 1013), (wire.encode_gateway_message(wire.Ticket("x")), 4003)])
 def test_late_ticket_is_no_wrong_one(monkeypatch: pytest.MonkeyPatch, first: bytes | None, code: int) -> None:
     monkeypatch.setattr(server, "TICKET_S", 0.05 if first is None else 60.0)
-    unused: Any = None
     hub = Hub()
 
     async def open_media() -> object:
-        serving = WebServer(hub, unused, unused, HostCheck((), secure=False), PageFiles())
-        listening = await asyncio.get_running_loop().create_server(await serving.start(), "127.0.0.1", 0)
-        page = f"http://127.0.0.1:{listening.sockets[0].getsockname()[1]}/"
-        try:
-            async with (
-                ClientSession() as session,
-                session.ws_connect(f"{page}v1/media", protocols=[wire.SUBPROTOCOL]) as media,
-            ):
-                if first is not None:
-                    await media.send_bytes(first)
-                message = await media.receive(30.0)
-                assert message.type == WSMsgType.CLOSE
-                return message.data
-        finally:
-            listening.close()
-            await serving.close()
+        async with serve(hub) as (page, _), ClientSession() as session, open_socket(session, page) as media:
+            if first is not None:
+                await media.send_bytes(first)
+            message = await media.receive()
+            assert message.type == WSMsgType.CLOSE
+            return message.data
 
     assert asyncio.run(open_media()) == code
     assert hub.drops.by_reason == {"web_ticket": 1}
+
+
+def test_pings_are_answered_and_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "TICKET_S", 600.0)
+
+    async def ping(n_pings: int) -> tuple[int, WSMsgType]:
+        n_pongs = 0
+        async with serve(Hub()) as (page, _), ClientSession() as session:
+            media = await session.ws_connect(f"{page}v1/media", protocols=[wire.SUBPROTOCOL], autoping=False)
+            for _ in range(n_pings):
+                await media.ping(b"x")
+            while (message := await media.receive()).type == WSMsgType.PONG:
+                n_pongs += 1
+                if n_pongs == n_pings:
+                    break
+            await media.close()
+        return n_pongs, message.type
+
+    assert asyncio.run(ping(10)) == (10, WSMsgType.PONG)
+    n_pongs, last = asyncio.run(ping(10_000))
+    assert n_pongs < 5_000
+    assert last in (WSMsgType.CLOSE, WSMsgType.CLOSED, WSMsgType.ERROR)
+
+
+def test_others_have_their_turn_between_messages_that_have_come() -> None:
+    class Ready:
+        async def receive(self) -> WSMessage:
+            return WSMessage(WSMsgType.BINARY, b"", None)
+
+    async def count_turns() -> int:
+        turns = 0
+
+        async def take_turns() -> None:
+            nonlocal turns
+            while True:
+                turns += 1
+                await asyncio.sleep(0)
+
+        other = asyncio.create_task(take_turns())
+        ready: Any = Ready()
+        reader = SocketReader(ready)
+        for _ in range(100):
+            await reader.receive()
+        other.cancel()
+        return turns
+
+    assert asyncio.run(count_turns()) >= 99
+
+
+def test_a_page_that_is_not_read_is_not_kept_in_memory(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_bytes(bytes(64 << 20))
+
+    async def read_nothing() -> int:
+        async with serve(Hub(), folder=tmp_path) as (page, serving):
+            host, port = page.removeprefix("http://").rstrip("/").split(":")
+            sock = socket.create_connection((host, int(port)))
+            sock.sendall(f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode())
+            handlers = serving._runner.server.connections if serving._runner.server is not None else []
+            while not (handlers := getattr(serving._runner.server, "connections", handlers)) or not (
+                waiting := handlers[0].transport.get_write_buffer_size()
+            ):
+                await asyncio.sleep(0)
+            sock.close()
+            return int(waiting)
+
+    assert asyncio.run(read_nothing()) <= 4 * ASSET_PIECE
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ("Origin: {page}\r\n", 200),
+        ("Origin: {page}\r\nOrigin: https://evil.example\r\n", 403),
+        ("Origin: https://evil.example\r\nOrigin: {page}\r\n", 403),
+    ],
+)
+def test_one_origin_is_named(headers: str, status: int) -> None:
+    async def request() -> bytes:
+        async with serve(Hub()) as (page, _):
+            host, port = page.removeprefix("http://").rstrip("/").split(":")
+            reader, writer = await asyncio.open_connection(host, int(port))
+            origins = headers.format(page=page.rstrip("/"))
+            writer.write(f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\n{origins}Connection: close\r\n\r\n".encode())
+            answer = await reader.readline()
+            writer.close()
+            return answer
+
+    assert asyncio.run(request()).split()[1] == str(status).encode()
+
+
+def test_a_download_ends_with_the_admission(monkeypatch: pytest.MonkeyPatch) -> None:
+    hub, address, total = Hub(), "ab" * 32, 256 << 20
+
+    class Assets:
+        async def find(self, _address: str) -> memoryview:
+            return memoryview(bytes(total))
+
+    async def download() -> int:
+        browser = hub.open_browser(bytes(range(6)), "127.0.0.1", time.monotonic_ns())
+        assert browser is not None
+        browser.epoch = 5
+        hub.issue_ticket(browser, bytes(32), time.monotonic_ns())
+        assets: Any = Assets()
+        async with serve(hub, assets) as (page, _), ClientSession() as session:
+            headers = {"X-Iris-Ticket": browser.ticket.decode()}
+            async with session.get(f"{page}v1/asset/{address}", headers=headers) as response:
+                n = len(await response.content.readany())
+                browser.epoch = 0  # revoked: the WebSocket may still be open
+                with contextlib.suppress(ClientError):
+                    while more := await response.content.readany():
+                        n += len(more)
+        return n
+
+    assert 0 < asyncio.run(download()) < total
+
+
+@contextlib.asynccontextmanager
+async def serve(hub: Hub, assets: Any = None, *, folder: Path | None = None) -> AsyncIterator[tuple[str, WebServer]]:
+    """Serve without a session. Yields the address of the page."""
+    unused: Any = None
+    page = PageFiles() if folder is None else PageFiles(folder)
+    serving = WebServer(hub, unused, assets, HostCheck((), secure=False), page)
+    listening = await asyncio.get_running_loop().create_server(await serving.start(), "127.0.0.1", 0)
+    try:
+        yield f"http://127.0.0.1:{listening.sockets[0].getsockname()[1]}/", serving
+    finally:
+        listening.close()
+        await serving.close()
+
+
+def open_socket(session: ClientSession, page: str) -> Any:
+    return session.ws_connect(f"{page}v1/media", protocols=[wire.SUBPROTOCOL])
 
 
 def test_senders_of_assets_share_a_rate_and_do_not_pay_for_silence() -> None:

@@ -14,10 +14,14 @@ from hypothesis import strategies as st
 from iris_session.protocol.client_messages import Bye, Heartbeat, wrap_message
 from iris_session.protocol.codec import decode_client, encode_client, encode_server
 from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, TooLargeError
+from iris_session.protocol.limits import MAX_CLIENT_BYTES, MAX_CONTROL_BYTES
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, ServerEnvelope
 from iris_session.web import wire
+from iris_session.web.hub import NAME_LENGTH
 from tools.codegen.web_golden import build_golden, render_golden
 
+#: Of a MESSAGE command of CurveZMQ around a frame (RFC 26): its name, nonce, authentication and flags.
+CURVE_BYTES = 8 + 8 + 16 + 1
 FILE = Path(__file__).parents[2] / "docs" / "protocol" / "web.json"
 GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
 
@@ -104,6 +108,20 @@ def test_what_follows_the_name_cannot_change_it(rest: bytes) -> None:
         assert decode_client(envelope).on_behalf_of == "web-00112233aabb"
     except ProtocolError:
         return
+
+
+def test_what_a_gateway_takes_the_session_takes_with_the_name_in_it() -> None:
+    def make(pad: int) -> bytes:
+        return msgspec.msgpack.encode([1, 7, "", {"type": "samples", "samples": [], "pad": bytes(pad)}])
+
+    largest = make(2 * MAX_CLIENT_BYTES - len(make(MAX_CLIENT_BYTES)))
+    assert len(largest) == MAX_CLIENT_BYTES
+    assert len(wire.encode_frames(wire.CONTROL, [largest])) == wire.MAX_CLIENT_MESSAGE
+    spliced = wire.splice_name(largest, "w" * NAME_LENGTH)
+    assert decode_client(spliced).on_behalf_of == "w" * NAME_LENGTH
+    assert len(spliced) + CURVE_BYTES <= MAX_CONTROL_BYTES
+    with pytest.raises(TooLargeError):
+        decode_client(wire.splice_name(make(MAX_CLIENT_BYTES), "w" * NAME_LENGTH))
 
 
 def test_names_have_one_byte_of_length() -> None:

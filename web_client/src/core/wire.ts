@@ -3,14 +3,15 @@
 
 import { MalformedError, TooLargeError } from "./errors.ts";
 import { type Value, decodeValue, encodeValue } from "./msgpack.ts";
+import { MAX_CLIENT_BYTES } from "../protocol/schema.g.ts";
 
 /** Channels of a message. */
 export const Channel = { CONTROL: 1, STATE: 2, MEDIA: 3, WISHES: 4, GATEWAY: 5 } as const;
 
 /** Subprotocol of both WebSockets. */
 export const SUBPROTOCOL = "iris-session.1";
-/** Most bytes of a message from a client. */
-export const MAX_CLIENT_MESSAGE_BYTES = 64 << 10;
+/** Most bytes of a message from a client: one frame of what the session takes. */
+export const MAX_CLIENT_MESSAGE_BYTES = 2 + 4 + MAX_CLIENT_BYTES;
 
 /** Reasons for which the gateway closes a WebSocket. */
 export const CloseCode = {
