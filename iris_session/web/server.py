@@ -126,7 +126,7 @@ class Acknowledgements:
         return True
 
 
-class SocketReader:
+class MessageReader:
     """Reads one WebSocket. Pings and pongs are limited, and those who send fast leave others their turn."""
 
     def __init__(self, socket: web.WebSocketResponse) -> None:
@@ -479,7 +479,7 @@ class WebServer:
         return socket
 
     async def _read_session(self, browser: Browser, socket: web.WebSocketResponse) -> None:
-        reader = SocketReader(socket)
+        reader = MessageReader(socket)
         while browser.closing is None:
             message = await reader.receive()
             if message is None:
@@ -567,7 +567,7 @@ class WebServer:
     async def _receive_ticket(self, socket: web.WebSocketResponse) -> Browser | None:
         """Return the browser whose ticket comes first, `None` for one that is not valid. Raises `TimeoutError`."""
         async with asyncio.timeout(TICKET_S):
-            message = await SocketReader(socket).receive()
+            message = await MessageReader(socket).receive()
         try:
             if message is None or message.type != WSMsgType.BINARY:
                 return None
@@ -585,7 +585,7 @@ class WebServer:
         self, browser: Browser, socket: web.WebSocketResponse, feed: MediaFeedSocket, writer: SocketWriter
     ) -> None:
         rate = TokenBucket(_SUBSCRIPTIONS_PER_S, _SUBSCRIPTIONS_BURST, time.monotonic_ns())
-        reader = SocketReader(socket)
+        reader = MessageReader(socket)
         while browser.is_admitted:
             message = await reader.receive()
             if message is not None and message.type != WSMsgType.BINARY:

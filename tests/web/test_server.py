@@ -19,7 +19,7 @@ from iris_session.web.assets import ByteRate
 from iris_session.web.hub import Hub
 from iris_session.web.origin import HostCheck
 from iris_session.web.page import PageFiles
-from iris_session.web.server import ASSET_PIECE, MEDIA_PIECE, SocketReader, SocketWriter, WebServer
+from iris_session.web.server import ASSET_PIECE, MEDIA_PIECE, MessageReader, SocketWriter, WebServer
 
 
 @pytest.mark.parametrize("length", [1, 125, 126, MEDIA_PIECE - 1, MEDIA_PIECE, MEDIA_PIECE + 1, 40 * MEDIA_PIECE + 200])
@@ -89,7 +89,7 @@ def test_others_have_their_turn_between_messages_that_have_come() -> None:
 
         other = asyncio.create_task(take_turns())
         ready: Any = Ready()
-        reader = SocketReader(ready)
+        reader = MessageReader(ready)
         for _ in range(100):
             await reader.receive()
         other.cancel()
