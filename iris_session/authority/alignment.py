@@ -42,7 +42,7 @@ from iris_session.authority.state import Correction, Participant, Placement, War
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
 from iris_session.protocol.entries import AlignmentProposal
-from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason
+from iris_session.protocol.names import AlignmentDoubt, AlignmentKind, DenialReason, HoldReason
 from iris_session.protocol.server_messages import AlignmentChanged, Notice
 
 #: For a participant that says `not_needed` and drives with a headset.
@@ -89,9 +89,11 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
     warn_wearer(ctx, p, "tilt", tilt if tilted else "", same="tilted")
     advice = f"alignment of {p.name}: {m.advice}" if m.advice and not tilted else ""
     warn_wearer(ctx, p, "advice", advice, same=m.advice)
-    if not p.placed and _is_news(ctx, p, m, error):
-        offer_measurement(ctx, p, m)
-    return None
+    if p.placed:
+        return None
+    if _is_news(ctx, p, m, error):
+        return offer_measurement(ctx, p, m)
+    return confirm_alignment(ctx, p, ctx.now_ns)
 
 
 def _is_valid_proposal(ctx: Context, m: AlignmentProposal) -> bool:
@@ -251,6 +253,7 @@ def apply_placement(ctx: Context, p: Participant, word: Placement) -> None:
     p.offset = p.T_world_tracking_measured = p.correction = None
     p.placed = True
     _set_alignment(ctx, p, AlignmentKind.PLACED, word.T_world_tracking)
+    confirm_alignment(ctx, p, ctx.now_ns)
     return _clear_answered_alarm(ctx, p)
 
 
@@ -259,7 +262,7 @@ def void_alignment(p: Participant) -> None:
     p.alignment = p.offset = p.T_world_tracking_measured = p.correction = p.placing = p.alarm = None
     p.placed = p.in_use = False
     p.aligned_ns = p.refused_ns = None
-    p.refusal = ""
+    p.refusal = p.doubt = ""
 
 
 def advance_corrections(ctx: Context) -> None:
@@ -378,6 +381,7 @@ def _complete_correction(ctx: Context, p: Participant, c: Correction, kind: str 
     """Apply all of a correction."""
     p.correction = None
     _apply_measured(ctx, p, c.T_world_tracking, c.pivot_world, c.covariance, c.error_at_anchor_m, kind)
+    confirm_alignment(ctx, p, ctx.now_ns)
     _clear_answered_alarm(ctx, p)
 
 
@@ -431,6 +435,38 @@ def _clear_answered_alarm(ctx: Context, p: Participant) -> None:
     if p.alarm is not None and not p.alarm.beside:
         p.alarm = None
         warn_wearer(ctx, p, "alarm", "", same="")
+
+
+# --- confirmed, or in doubt ---
+
+
+def doubt_alignment(ctx: Context, p: Participant, doubt: str, text: str) -> None:
+    """Make the alignment in force *unconfirmed*: it begins no engagement until a look confirms or replaces it.
+
+    An engagement under way goes on, in the alignment that was frozen for it.
+
+    Args:
+        ctx: Of this step.
+        p: Whose alignment it is; nothing happens without one, or where the configuration has no law of ageing.
+        doubt: The `AlignmentDoubt`; a contradiction stays one when it ages.
+        text: Warning to the wearer: why, and what to do. Empty: another one says it.
+    """
+    if ctx.config.ageing is None or p.alignment is None or p.doubt == AlignmentDoubt.CONTRADICTED:
+        return
+    p.doubt = doubt
+    warn_wearer(ctx, p, "doubt", text, same=doubt)
+
+
+def confirm_alignment(ctx: Context, p: Participant, looked_ns: int) -> None:
+    """Note that a look at `looked_ns` agrees with the alignment in force: doubts end, and its age starts again."""
+    p.confirmed_ns = looked_ns
+    if p.doubt:
+        p.doubt = ""
+        warn_wearer(ctx, p, "doubt", "", same="")
+        for lease in (*ctx.state.robots.values(), *ctx.held_objects):
+            for g in lease.grants:
+                if g.participant == p.id and g.hold == HoldReason.UNCONFIRMED:
+                    g.hold = HoldReason.REARM
 
 
 # --- stated errors ---

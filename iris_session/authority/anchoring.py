@@ -17,7 +17,7 @@ from iris_session.authority.state import HOST_ID, AlarmState, CrossCheckState, P
 from iris_session.protocol.client_messages import Align, MoveAnchor, TrackingEpoch
 from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.entries import AlignmentAlarm, CrossChecked, TipSolved
-from iris_session.protocol.names import AlarmKind, AlignAction, AlignmentKind, DenialReason, Role
+from iris_session.protocol.names import AlarmKind, AlignAction, AlignmentDoubt, AlignmentKind, DenialReason, Role
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentRun,
@@ -131,6 +131,9 @@ def raise_alarm(ctx: Context, p: Participant, m: AlignmentAlarm) -> None:
     if m.kind == AlarmKind.JUMP:
         ctx.publish_participant(p)
     alignment.warn_wearer(ctx, p, "alarm", _describe_alarm(p, m, size_m), same=f"{m.kind} {m.anchor_id}")
+    placed = m.kind == AlarmKind.DIFFERS and p.placed  # a director's word is to count more than what is measured
+    if m.kind != AlarmKind.JUMP and not m.beside and not placed:
+        alignment.doubt_alignment(ctx, p, AlignmentDoubt.CONTRADICTED, "")  # the warning of the alarm says it
 
 
 def _describe_alarm(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
@@ -141,7 +144,7 @@ def _describe_alarm(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
     advice = "look at an anchor sheet again" if p.aligning else "start its alignment run again"
     if m.kind == AlarmKind.JUMP:
         return f"the tracking of {p.name} jumped by {size}: it is not aligned, robots hold; {advice}"
-    return f"{p.name} sees anchor {m.anchor_id} {size} elsewhere than its alignment says: {advice}"
+    return f"{p.name} sees anchor {m.anchor_id} {size} elsewhere than its alignment says, robots hold next time: {advice}"
 
 
 def _clear_alarm(ctx: Context, p: Participant) -> None:
@@ -196,6 +199,8 @@ def build_alignment_report(ctx: Context, p: Participant) -> AlignmentReport:
         alarm="" if last is None else last.kind,
         alarm_size_m=0.0 if last is None else last.size_m,
         alarm_ns=-1 if last is None else ctx.now_ns - last.raised_ns,
+        doubt=p.doubt,
+        confirmed_ns=-1 if now is None else ctx.now_ns - p.confirmed_ns,
     )
 
 

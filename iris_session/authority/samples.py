@@ -34,6 +34,7 @@ _HOLDS = {
     RejectReason.UNALIGNED: HoldReason.UNALIGNED,
     RejectReason.VIEW_ONLY: HoldReason.VIEW_ONLY,
     RejectReason.EMULATED: HoldReason.EMULATED,
+    RejectReason.UNCONFIRMED: HoldReason.UNCONFIRMED,
 }
 
 
@@ -171,6 +172,9 @@ def _check_payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
 def _check_engagement(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> str:
     """Reject samples that cannot drive their target, beyond the checks above."""
     for lease, g in drives:
+        begins = not g.engagement and s.device in g.armed
+        if begins and p.doubt and s.kind != SampleKind.JOINTS:
+            return RejectReason.UNCONFIRMED
         if lease.kind == TargetKind.OBJECT:
             if s.kind != SampleKind.POSE:
                 return RejectReason.SHAPE
@@ -179,7 +183,7 @@ def _check_engagement(ctx: Context, p: Participant, s: Sample, drives: list[Driv
             return RejectReason.SHAPE
         if (g.engagement or s.device in g.armed) and _is_kind_mismatch(lease, g, s):
             return RejectReason.KIND_MISMATCH
-        if g.engagement or s.device not in g.armed:
+        if not begins:
             continue
         if p.role == Role.LEADER and s.kind == SampleKind.JOINTS and ctx.config.leader_apart == "refuse":
             apart = max(abs(a - b) for a, b in zip(s.q, ctx.view.joints(lease.target), strict=True))

@@ -21,7 +21,7 @@ HOST_ID: Final = "host"
 #: `Pending.request_id` of a place in the queue that outlived its connection: no reply is sent.
 NO_REPLY: Final = -1
 #: Fields of `Participant` that snapshots of the first recordings of this format do not have.
-ADDED_FIELDS: Final = frozenset({"roles", "hello_name", "hello_role"})
+ADDED_FIELDS: Final = frozenset({"roles", "hello_name", "hello_role", "doubt", "confirmed_ns"})
 #: `Participant.connection` while the connection is lost.
 NO_CONNECTION: Final = -1
 
@@ -107,7 +107,8 @@ class Participant(msgspec.Struct):
     were made at `proposals_from_ns` or before do not count. `told_ns`: when a correction was last announced to its
     wearer. `roles`: those that its key may join as; empty: any. `hello_name`, `hello_role`: what it said when it
     joined, empty unless a director changed it since. `refusal`: of a measurement, reported as progress since
-    `refusal_from_ns`; empty: none, or it was reported as a warning. `devices` empty: none
+    `refusal_from_ns`; empty: none, or it was reported as a warning. `doubt`: why the alignment begins no engagement
+    (`AlignmentDoubt`), empty for none. `confirmed_ns`: of the last look that agreed with it. `devices` empty: none
     declared, all known ones are accepted.
     """
 
@@ -143,6 +144,8 @@ class Participant(msgspec.Struct):
     refused_ns: int | None = None
     refusal: str = ""
     refusal_from_ns: int = 0
+    doubt: str = ""
+    confirmed_ns: int = 0
     warnings: dict[str, WarningState] = {}
     seen: dict[str, DeviceState] = {}
     rejected: dict[str, int] = {}

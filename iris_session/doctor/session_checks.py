@@ -57,6 +57,7 @@ HOLD_ADVICE: Final = {
     HoldReason.ZERO_POSE: "the device reports the origin of its tracking frame: wait until it is tracked",
     HoldReason.FROZEN: "the device reports one pose again and again: move it, or wake it",
     HoldReason.JUMP: "the tracking of the device jumped: open and close the clutch",
+    HoldReason.UNCONFIRMED: "its alignment is doubted: glance at a sheet, then open and close the clutch",
     HoldReason.REJECTED: "a sample was rejected: see `rejected`; open and close the clutch",
     HoldReason.DISCONNECTED: "its holder is disconnected; the lease is kept for a grace period",
 }

@@ -508,7 +508,8 @@ RECLUTCH_SAMPLES: Final = 3  # ... for this many samples
 CLUTCH_AGAIN: Final = frozenset(
     {HoldReason.REARM, HoldReason.REJECTED, HoldReason.STALE, HoldReason.GAP, HoldReason.SCENE_CHANGED,
      HoldReason.NO_SAMPLE, HoldReason.DISCONNECTED, HoldReason.ESTOP, HoldReason.UNTRACKED, HoldReason.NOT_WORN,
-     HoldReason.UNALIGNED, HoldReason.EMULATED, HoldReason.ZERO_POSE, HoldReason.FROZEN, HoldReason.JUMP}
+     HoldReason.UNALIGNED, HoldReason.EMULATED, HoldReason.ZERO_POSE, HoldReason.FROZEN, HoldReason.JUMP,
+     HoldReason.UNCONFIRMED}
 )  # fmt: skip
 
 

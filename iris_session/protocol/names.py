@@ -135,6 +135,16 @@ class AlarmKind:
     ALL: Final = frozenset({"changed", "differs", "jump"})
 
 
+class AlignmentDoubt:
+    """Reason why an alignment in force is *unconfirmed*: it begins no engagement until a look at an anchor confirms or
+    replaces it. Empty: none.
+    """
+
+    AGED: Final = "aged"  # no look for so long that drift alone may exceed the bound at the robot
+    CONTRADICTED: Final = "contradicted"  # later looks disagree with it
+    ALL: Final = frozenset({"aged", "contradicted"})
+
+
 class AnchorKind:
     """Kind of an observation: the form of the anchor, or the way in which it was found.
 
@@ -204,6 +214,7 @@ class HoldReason:
     ZERO_POSE: Final = "zero_pose"  # the device reports the origin of its tracking frame; clutch again
     FROZEN: Final = "frozen"  # the device reports one pose again and again; clutch again
     JUMP: Final = "jump"  # the pose of the device jumped; clutch again
+    UNCONFIRMED: Final = "unconfirmed"  # the alignment is doubted (`AlignmentDoubt`): glance at a sheet; clutch again
 
 
 class RejectReason:
@@ -235,6 +246,7 @@ class RejectReason:
     ZERO_POSE: Final = "zero_pose"  # the origin of the tracking frame, as some runtimes report before they have a pose
     FROZEN: Final = "frozen"  # one pose again and again, to the last bit
     JUMP: Final = "jump"  # farther from the pose before than its motion and time explain
+    UNCONFIRMED: Final = "unconfirmed"  # it would engage while the alignment is doubted (`AlignmentDoubt`)
 
 
 class DenialReason:

@@ -89,7 +89,9 @@ class AlignmentReport(msgspec.Struct, frozen=True):
 
     `error_at_anchor_m`, `error_at_robot_m`: stated p95. `pending_m`, `pending_rad`: size of a correction that waits, or
     slides in. `advice`: why the estimator refuses, or warns. `alarm`: the last `AlarmKind` that no new alignment has
-    resolved yet, `alarm_ns` ago. `unusable`: observations that could not be used, since the run began.
+    resolved yet, `alarm_ns` ago. `unusable`: observations that could not be used, since the run began. `doubt`: why it
+    is unconfirmed and begins no engagement (`AlignmentDoubt`), empty for not so. `confirmed_ns`: since the last look
+    that agreed with it, -1 without an alignment.
     """
 
     version: Count = 0
@@ -108,6 +110,8 @@ class AlignmentReport(msgspec.Struct, frozen=True):
     alarm_size_m: float = 0.0
     alarm_ns: Nanoseconds = -1
     seen: tuple[AnchorSeen, ...] = ()
+    doubt: Name = ""
+    confirmed_ns: Nanoseconds = -1
 
 
 class CrossCheckReport(msgspec.Struct, frozen=True):

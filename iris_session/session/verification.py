@@ -7,7 +7,8 @@ from pathlib import Path
 
 import msgspec
 
-from iris_session.authority import is_same_snapshot
+from anchors.ageing import AgeingLaw
+from iris_session.authority import AuthorityConfig, is_same_snapshot
 from iris_session.journal.environment import use_one_blas_thread
 from iris_session.journal.rows import SNAPSHOTS
 from iris_session.journal.verification import Models
@@ -17,12 +18,22 @@ from iris_session.recording import Keyframe, SessionHeader, VerifyReport, unpack
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
 
 
+class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
+    """Configuration in the header of a recording: laws that it does not name were not in force when it was made."""
+
+    ageing: AgeingLaw | None = None
+
+
+class _RecordedConfig(CoreConfig, frozen=True):
+    authority: _RecordedAuthorityConfig
+
+
 class ReplayCore:
     """A `SessionCore` as `recording.verify` drives it."""
 
     def __init__(self, header: SessionHeader, models: Models) -> None:
         use_one_blas_thread()
-        config = msgspec.msgpack.decode(header.config, type=CoreConfig)
+        config = msgspec.msgpack.decode(header.config, type=_RecordedConfig)
         model = decode_model(unpack_model(header.model))
         self.core = SessionCore(model, config, lambda model_hash: decode_model(models(model_hash)))
 

@@ -157,7 +157,7 @@ class TestEarlierSnapshots:
         now = t.authority.snapshot()
         earlier = msgspec.msgpack.decode(now)
         for fields in earlier["participants"].values():
-            for name in ("roles", "hello_name", "hello_role"):
+            for name in ("roles", "hello_name", "hello_role", "doubt", "confirmed_ns"):
                 del fields[name]
             if fields["alignment"]:
                 del fields["alignment"]["pivot_world"]

@@ -188,6 +188,7 @@ _ENUMS: Final[dict[str, str]] = {
     "Alignment.kind": "AlignmentKind",
     "AlignmentAlarmed.kind": "AlarmKind",
     "AlignmentReport.alarm": "AlarmKind",
+    "AlignmentReport.doubt": "AlignmentDoubt",
     "Applied.device": "Device",
     "ParticipantInfo.role": "Role",
     "ParticipantInfo.devices": "Device",

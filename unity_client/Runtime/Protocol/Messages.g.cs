@@ -137,6 +137,16 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// Reason why an alignment in force is *unconfirmed*: it begins no engagement until a look at an anchor confirms or
+    /// replaces it. Empty: none.
+    /// </summary>
+    public static class AlignmentDoubt
+    {
+        public const string Aged = "aged";
+        public const string Contradicted = "contradicted";
+    }
+
+    /// <summary>
     /// Kind of an observation: the form of the anchor, or the way in which it was found.
     ///
     /// touch: a tip or a fingertip on a mark. tip: a controller turned while its tip stayed in a hole. persistent: a
@@ -210,6 +220,7 @@ namespace IrisSession.Protocol
         public const string ZeroPose = "zero_pose";
         public const string Frozen = "frozen";
         public const string Jump = "jump";
+        public const string Unconfirmed = "unconfirmed";
     }
 
     /// <summary>
@@ -243,6 +254,7 @@ namespace IrisSession.Protocol
         public const string ZeroPose = "zero_pose";
         public const string Frozen = "frozen";
         public const string Jump = "jump";
+        public const string Unconfirmed = "unconfirmed";
     }
 
     /// <summary>
@@ -1993,7 +2005,9 @@ namespace IrisSession.Protocol
     ///
     /// error_at_anchor_m, error_at_robot_m: stated p95. pending_m, pending_rad: size of a correction that waits, or
     /// slides in. advice: why the estimator refuses, or warns. alarm: the last AlarmKind that no new alignment has
-    /// resolved yet, alarm_ns ago. unusable: observations that could not be used, since the run began.
+    /// resolved yet, alarm_ns ago. unusable: observations that could not be used, since the run began. doubt: why it
+    /// is unconfirmed and begins no engagement (AlignmentDoubt), empty for not so. confirmed_ns: since the last look
+    /// that agreed with it, -1 without an alignment.
     /// </summary>
     public sealed class AlignmentReport : WireValue
     {
@@ -2013,6 +2027,8 @@ namespace IrisSession.Protocol
         public double AlarmSizeM = 0.0;
         public long AlarmNs = -1;
         public AnchorSeen[] Seen = new AnchorSeen[0];
+        public string Doubt = "";
+        public long ConfirmedNs = -1;
 
         public static AlignmentReport Read(WireReader reader)
         {
@@ -2037,6 +2053,8 @@ namespace IrisSession.Protocol
                     case "alarm_size_m": value.AlarmSizeM = reader.ReadDouble(); break;
                     case "alarm_ns": value.AlarmNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
                     case "seen": value.Seen = reader.ReadArray(Protocol.AnchorSeen.Read, 0); break;
+                    case "doubt": value.Doubt = reader.ReadString(64); break;
+                    case "confirmed_ns": value.ConfirmedNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -2045,7 +2063,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(16);
+            writer.WriteMapHeader(18);
             writer.Write("version");
             writer.Write(Version);
             writer.Write("running");
@@ -2078,6 +2096,10 @@ namespace IrisSession.Protocol
             writer.Write(AlarmNs);
             writer.Write("seen");
             writer.Write(Seen);
+            writer.Write("doubt");
+            writer.Write(Doubt);
+            writer.Write("confirmed_ns");
+            writer.Write(ConfirmedNs);
         }
     }
 

@@ -118,6 +118,16 @@ export const AlarmKind = {
 export type AlarmKind = (typeof AlarmKind)[keyof typeof AlarmKind] | (string & {});
 
 /**
+ * Reason why an alignment in force is *unconfirmed*: it begins no engagement until a look at an anchor confirms or
+ * replaces it. Empty: none.
+ */
+export const AlignmentDoubt = {
+  AGED: "aged",
+  CONTRADICTED: "contradicted",
+} as const;
+export type AlignmentDoubt = (typeof AlignmentDoubt)[keyof typeof AlignmentDoubt] | (string & {});
+
+/**
  * Kind of an observation: the form of the anchor, or the way in which it was found.
  *
  * `touch`: a tip or a fingertip on a mark. `tip`: a controller turned while its tip stayed in a hole. `persistent`: a
@@ -184,6 +194,7 @@ export const HoldReason = {
   ZERO_POSE: "zero_pose",
   FROZEN: "frozen",
   JUMP: "jump",
+  UNCONFIRMED: "unconfirmed",
 } as const;
 export type HoldReason = (typeof HoldReason)[keyof typeof HoldReason] | (string & {});
 
@@ -215,6 +226,7 @@ export const RejectReason = {
   ZERO_POSE: "zero_pose",
   FROZEN: "frozen",
   JUMP: "jump",
+  UNCONFIRMED: "unconfirmed",
 } as const;
 export type RejectReason = (typeof RejectReason)[keyof typeof RejectReason] | (string & {});
 
@@ -703,7 +715,9 @@ export interface AnchorSeen {
  *
  * `error_at_anchor_m`, `error_at_robot_m`: stated p95. `pending_m`, `pending_rad`: size of a correction that waits, or
  * slides in. `advice`: why the estimator refuses, or warns. `alarm`: the last `AlarmKind` that no new alignment has
- * resolved yet, `alarm_ns` ago. `unusable`: observations that could not be used, since the run began.
+ * resolved yet, `alarm_ns` ago. `unusable`: observations that could not be used, since the run began. `doubt`: why it
+ * is unconfirmed and begins no engagement (`AlignmentDoubt`), empty for not so. `confirmed_ns`: since the last look
+ * that agreed with it, -1 without an alignment.
  */
 export interface AlignmentReport {
   version?: number;
@@ -722,6 +736,8 @@ export interface AlignmentReport {
   alarm_size_m?: number;
   alarm_ns?: number;
   seen?: AnchorSeen[];
+  doubt?: AlignmentDoubt;
+  confirmed_ns?: number;
 }
 
 /** The newest comparison of two headsets, `age_ns` ago; fields as in `HeadsetsCompared`. */
@@ -2433,6 +2449,8 @@ export const VALUE_DEFAULTS = {
     alarm_size_m: 0.0,
     alarm_ns: -1,
     seen: [],
+    doubt: "",
+    confirmed_ns: -1,
   },
   CrossCheckReport: {
     n: 0,

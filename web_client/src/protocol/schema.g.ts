@@ -250,6 +250,8 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["alarm_size_m", ["float"], [0.0]],
       ["alarm_ns", ["int", null, null], [-1]],
       ["seen", ["array", ["struct", "AnchorSeen"], 0, 0], [[]]],
+      ["doubt", ["str", 64, ""], [""]],
+      ["confirmed_ns", ["int", null, null], [-1]],
     ],
   },
   CrossCheckReport: {

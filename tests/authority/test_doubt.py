@@ -1,0 +1,109 @@
+"""Alignments in doubt: what begins no engagement, what goes on, and what ends the doubt."""
+
+from __future__ import annotations
+
+import pytest
+
+from iris_session.authority import AuthorityConfig
+from iris_session.protocol.client_messages import Align, Grasp, PlaceAlignment
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.entries import AlignmentAlarm
+from iris_session.protocol.names import AlarmKind, AlignmentDoubt, HoldReason, RejectReason
+from iris_session.protocol.server_messages import Notice, SamplesRejected
+from iris_session.protocol.status import AlignmentReport
+
+from .table import SECOND, Person, Table, proposal
+
+
+def report(t: Table, person: Person) -> AlignmentReport:
+    return t.authority.build_alignment_reports()[person.id]
+
+
+def doubted(t: Table) -> Person:
+    anna = t.operator("left")
+    t.step(anna.says(AlignmentAlarm(AlarmKind.CHANGED, 0, "table", 0.03)))
+    return anna
+
+
+@pytest.mark.parametrize("kind", [AlarmKind.CHANGED, AlarmKind.DIFFERS])
+def test_a_contradiction_lets_nothing_begin_until_a_look_agrees(kind: str) -> None:
+    t = Table()
+    anna = t.operator("left")
+    anna.engage("left")
+    t.step(anna.says(AlignmentAlarm(kind, 0, "table", 0.03)))
+    told = [(n.level, n.participant) for n in t.since(Notice)]
+    anna.sends("left", clutch=True)
+    assert t.command().kind == "pose", "what is engaged goes on"
+    assert report(t, anna).doubt == AlignmentDoubt.CONTRADICTED
+    assert told == [("warning", anna.id)]
+    anna.engage("left")
+    assert t.hold() == HoldReason.UNCONFIRMED
+    assert t.last(SamplesRejected).reason == RejectReason.UNCONFIRMED
+    t.authority.restore(t.authority.snapshot())
+    anna.engage("left")
+    assert t.hold() == HoldReason.UNCONFIRMED
+    t.step(anna.says(proposal()))
+    t.wait(SECOND)
+    assert (report(t, anna).doubt, report(t, anna).alarm) == ("", "")
+    anna.alignment_version = report(t, anna).version
+    anna.sends("left", clutch=True)
+    assert t.hold() == HoldReason.REARM, "the squeeze is still held"
+    anna.engage("left")
+    assert t.command().kind == "pose"
+
+
+def test_objects_and_twists_wait_too_and_joints_do_not() -> None:
+    t = Table()
+    anna = doubted(t)
+    assert anna.asks(Grasp(1, "hammer", "controller/right")).ok
+    anna.engage("hammer")
+    assert t.last(SamplesRejected).reason == RejectReason.UNCONFIRMED
+    anna.sends("left")
+    anna.sends("left", clutch=True, kind="twist", pose=None, twist=(0.1,) + (0.0,) * 5)
+    assert t.hold() == HoldReason.UNCONFIRMED
+    for clutch in (False, True):
+        anna.sends("left", clutch=clutch, device="joints", kind="joints", pose=None, q=(0.0,) * 7)
+    assert t.command().kind == "joints"
+
+
+def test_one_moved_sheet_is_no_doubt_about_the_headset() -> None:
+    t = Table()
+    anna = t.operator("left")
+    t.step(anna.says(AlignmentAlarm(AlarmKind.CHANGED, 0, "table", 0.03, 0, ("door",))))
+    assert report(t, anna).doubt == ""
+    anna.engage("left")
+    assert t.command().kind == "pose"
+
+
+def test_a_directors_word_ends_a_doubt_and_is_not_doubted_for_what_it_differs_from() -> None:
+    t = Table()
+    boss, anna = t.join("director", alignment="not_needed"), doubted(t)
+    assert boss.asks(PlaceAlignment(1, anna.id, IDENTITY)).ok
+    assert report(t, anna).doubt == ""
+    t.step(anna.says(AlignmentAlarm(AlarmKind.DIFFERS, 0, "table", 0.03)))
+    assert report(t, anna).doubt == ""
+
+
+def test_without_the_law_nothing_is_doubted() -> None:
+    """As recordings of before verify."""
+    t = Table(AuthorityConfig(ageing=None))
+    anna = doubted(t)
+    assert report(t, anna).doubt == ""
+    anna.engage("left")
+    assert t.command().kind == "pose"
+
+
+def test_the_age_of_an_alignment_begins_again_with_every_look_that_agrees() -> None:
+    t = Table()
+    anna = t.join()
+    assert report(t, anna).confirmed_ns == -1
+    t.step(anna.says(proposal()))
+    for away in (0.0, 0.0005):
+        t.wait(SECOND // 2)
+        assert report(t, anna).confirmed_ns >= SECOND // 2
+        t.step(anna.says(proposal(T_world_tracking=Pose((1.0 + away, 0.0, 0.0), IDENTITY.q))))
+        assert (report(t, anna).confirmed_ns, report(t, anna).version) == (0, 1)
+    anna.asks(Align(1, "stop"))
+    t.wait(SECOND // 2)
+    t.step(anna.says(proposal()))
+    assert report(t, anna).confirmed_ns >= SECOND // 2, "a stopped run hears nothing"
