@@ -144,7 +144,7 @@ def _describe_alarm(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
     advice = "look at an anchor sheet again" if p.aligning else "start its alignment run again"
     if m.kind == AlarmKind.JUMP:
         return f"the tracking of {p.name} jumped by {size}: it is not aligned, robots hold; {advice}"
-    return f"{p.name} sees anchor {m.anchor_id} {size} elsewhere than its alignment says, robots hold next time: {advice}"
+    return f"{p.name} sees anchor {m.anchor_id} {size} off from its alignment, robots hold next time: {advice}"
 
 
 def _clear_alarm(ctx: Context, p: Participant) -> None:
