@@ -194,6 +194,7 @@ class AlignmentEstimator:
         p_tracking_head: Vec3 | None = None,
         alternative: PoseTuple | None = None,
         source: str = "",
+        shift: tuple[float, ...] = (),
     ) -> bool:
         """Add one observation.
 
@@ -211,6 +212,7 @@ class AlignmentEstimator:
             alternative: The other pose that explains the same image; without it the pose mirrored along the line of
                 sight is tried, if `p_tracking_head` is known.
             source: Kind of the source: its biases (`AlignmentConfig.biases`) are in the stated error; empty: none.
+            shift: By how much the anchor is displaced [m/s] and turned [rad/s] per second that its picture is late.
 
         Returns:
             False if it is not used: unknown anchor, older epoch, not a rigid transform, a sheet of the wrong size, or
@@ -239,7 +241,15 @@ class AlignmentEstimator:
         self._memory.add(
             (anchor_id, viewpoint_id),
             AnchorObservation(
-                capture_ns, pose[0], pose[1], p_tracking_head, validate_covariance(covariance), quality, size_m, source
+                capture_ns,
+                pose[0],
+                pose[1],
+                p_tracking_head,
+                validate_covariance(covariance),
+                quality,
+                size_m,
+                source,
+                shift,
             ),
         )
         return True

@@ -2,9 +2,10 @@
 
 A change is found in two ways. (1) Against earlier observations of the same anchor: the last second against the ten
 before it; errors common to a viewpoint cancel, so small changes show. (2) Against the alignment in force, also after
-the anchor was out of sight; here all uncertainties count. A jump (the tracking frame moved at once) needs no
-statistics: a new `tracking_epoch`, a head faster than people are, or three detections in a row that agree with each
-other far away. Pure: times are passed in.
+the anchor was out of sight; here all uncertainties count, and yaw is watched too. A source that is too slow for these
+times has windows of a few looks instead. A jump (the tracking frame moved at once) needs no statistics: a new
+`tracking_epoch`, a head faster than people are, or three detections in a row that agree with each other far away. Pure:
+times are passed in; every observation must be a look (`anchors.looks`), as a repeated pose agrees with itself.
 """
 
 from __future__ import annotations
@@ -18,24 +19,29 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from anchors.alignment import AlignmentEstimate
-from anchors.lie import Array, quat_to_matrix, to_vec3
-from anchors.pose import PoseTuple, Vec3, apply, distance, is_rigid, is_valid_point, quat_angle
+from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_to_matrix, to_vec3
+from anchors.looks import Look
+from anchors.pose import PoseTuple, Quat, Vec3, apply, distance, is_rigid, is_valid_point, quat_angle
 from anchors.uncertainty import NoiseModel, isotropic_covariance
-from anchors.viewpoints import fast_median
+from anchors.viewpoints import MAX_LATE_S, fast_median
 
 AlarmKind = Literal["changed", "differs", "jump", "epoch"]
 
 _CHI2_3_ONE_IN_A_MILLION: Final = 30.66
+_CHI2_1_ONE_IN_A_MILLION: Final = 23.93
 _MIN_BESIDE: Final = 2  # detections of another anchor: one alone may be wrong
 _MEDIAN_VARIANCE: Final = math.pi / 2.0  # of a median over that of a mean, Gaussian noise
+_MIN_AGREEING: Final = 0.6  # share of a window near its median: fewer say nothing
+_AT_REST: Final = (0.0,) * 6
+_AGREEING_M: Final = 0.015  # or three sigma
 
 
 class Alarm(NamedTuple):
     """A detected change: `changed` and `differs` ask for a new observation, `jump` and `epoch` invalidate the
     alignment.
 
-    `size_m`: distance; `capture_ns`: time of detection, of a jump the time of its first observation; `beside`: other
-    anchors that did not change meanwhile (then this one was moved).
+    `size_m`: distance, of a turn that 1 m away; `capture_ns`: time of detection, of a jump the time of its first
+    observation; `beside`: other anchors that did not change meanwhile (then this one was moved).
     """
 
     kind: AlarmKind
@@ -54,18 +60,25 @@ class DriftConfig:
     """Thresholds of the monitor.
 
     `window_ns`: length of the present window; `reference_ns`: of the window before it, which is summarized every
-    `reference_every_ns`. `min_change_m`: smaller changes are left to corrections. `jump_m`: `jump_count` consecutive
-    detections that far away are a jump. `max_speed_m_per_s`, `max_turn_rad_per_s`: upper bounds of a head's motion.
-    `quiet_ns`: time after an alarm in which an anchor raises no other. `unknown_viewpoint_sigma_m`: noise per axis of
-    detections without a head pose.
+    `reference_every_ns`. Where fewer than `min_in_window` looks lie in them, each has its newest so many, not older
+    than `max_window_ns` and `max_reference_ns`. `min_change_m`, `min_difference_m`, `min_turn_rad`: smaller changes
+    are left to corrections. `same_place_m`: of two viewpoints this far apart half of the common errors does not cancel.
+    `drift_m_per_s`: of the tracking frame, per axis. `jump_m`: `jump_count` consecutive detections that far away are a
+    jump. `max_speed_m_per_s`, `max_turn_rad_per_s`: upper bounds of a head's motion. `quiet_ns`: time after an alarm in
+    which an anchor raises no other. `unknown_viewpoint_sigma_m`: noise per axis of detections without a head pose.
     """
 
     window_ns: int = 1_000_000_000
     reference_ns: int = 10_000_000_000
     reference_every_ns: int = 500_000_000
-    min_in_window: int = 8
+    max_window_ns: int = 20_000_000_000
+    max_reference_ns: int = 90_000_000_000
+    min_in_window: int = 5
     min_change_m: float = 0.005
     min_difference_m: float = 0.010
+    min_turn_rad: float = math.radians(1.0)
+    same_place_m: float = 0.06
+    drift_m_per_s: float = 0.003 / 60.0 / math.sqrt(3.0)
     jump_m: float = 0.03
     jump_count: int = 3
     max_speed_m_per_s: float = 6.0
@@ -78,17 +91,24 @@ class DriftConfig:
 class _Detection(NamedTuple):
     capture_ns: int
     p: Vec3
-    p_head: Vec3 | None
+    q: Quat
     viewpoint_id: int
+    p_head: Vec3 | None
+    shift: tuple[float, ...]
 
 
 class _Window(NamedTuple):
-    """Median position of some observations of one viewpoint, its own covariance, and that of what they share."""
+    """Median position of some observations of one viewpoint, its own covariance (6, 6), and that of what they share.
+    `away`: position of the head from the anchor. `shift` (6,): displacement and turn per second of lateness."""
 
     p: Array
     own: Array
     common: Array
     viewpoint_id: int
+    capture_ns: int
+    away: Array | None
+    shift: Array
+    has_majority: bool
 
 
 @dataclass
@@ -125,31 +145,30 @@ class DriftMonitor:
     def add_observation(
         self,
         anchor_id: str,
-        p_tracking_anchor: Vec3,
-        p_tracking_head: Vec3 | None,
+        T_tracking_anchor: PoseTuple,
+        look: Look,
         capture_ns: int,
         tracking_epoch: int,
-        viewpoint_id: int = 0,
         alignment: AlignmentEstimate | None = None,
     ) -> Alarm | None:
         """Add one detection and return at most one alarm. `alignment`: the alignment in force, if any."""
-        if not is_valid_point(p_tracking_anchor) or not is_valid_point(p_tracking_head):
+        if not is_rigid(T_tracking_anchor) or not is_valid_point(look.p_tracking_head):
             return None
         alarm = self._update_epoch(capture_ns, tracking_epoch)
         if alarm is not None or tracking_epoch < self.tracking_epoch or anchor_id not in self.anchors:
             return alarm
         seen = self._detections.setdefault(anchor_id, deque(maxlen=self.config.max_detections))
-        while seen and not 0 <= capture_ns - seen[0].capture_ns <= self.config.window_ns + self.config.reference_ns:
+        while seen and not 0 <= capture_ns - seen[0].capture_ns <= self.config.max_reference_ns:
             seen.popleft()
-        seen.append(_Detection(capture_ns, p_tracking_anchor, p_tracking_head, viewpoint_id))
+        seen.append(_Detection(capture_ns, *T_tracking_anchor, look.viewpoint_id, look.p_tracking_head, look.shift))
         if 0 < self._quiet_until_ns.get(anchor_id, 0) - capture_ns <= self.config.quiet_ns:
             return None  # more than that: the clock was set back
         return self._check_anchor(anchor_id, capture_ns, alignment)
 
     def _check_anchor(self, anchor_id: str, now_ns: int, alignment: AlignmentEstimate | None) -> Alarm | None:
         seen = self._detections[anchor_id]
-        new = self._select_summarize_viewpoint(seen, now_ns)
-        reference = self._get_reference(anchor_id, now_ns, new[-1].viewpoint_id)
+        new = self._select_window(seen)
+        reference = self._get_reference(anchor_id, now_ns, new)
         jumped = self._measure_jump(new, reference)
         if jumped:
             since_ns = new[-self.config.jump_count].capture_ns
@@ -161,23 +180,28 @@ class DriftMonitor:
         if len(new) < self.config.min_in_window:
             return None
         now = self._summarize(new)
+        if not now.has_majority:
+            return None
         changed = self._measure_change(now, reference)
         if changed:
             beside = self._find_unmoved_anchors(anchor_id, new[len(new) // 2].capture_ns, changed)
             return self._raise_alarm("changed", anchor_id, changed, now_ns, beside)
         differs = self._measure_difference(anchor_id, now, alignment)
+        differs = differs or self._measure_turn(anchor_id, new, now, alignment)
         if differs:
-            return self._raise_alarm(
-                "differs", anchor_id, differs, now_ns, self._find_steady_anchors(anchor_id, now_ns)
-            )
+            beside = self._find_steady_anchors(anchor_id, new[0].capture_ns)
+            return self._raise_alarm("differs", anchor_id, differs, now_ns, beside)
         self._steady_ns[anchor_id] = now_ns
         return None
 
-    def _select_summarize_viewpoint(self, seen: deque[_Detection], now_ns: int) -> list[_Detection]:
-        """Return the detections of the last window from the present viewpoint, oldest first."""
-        new = []
+    def _select_window(self, seen: deque[_Detection]) -> list[_Detection]:
+        """Return the newest detections from the present viewpoint, oldest first: those of the last window, or as many
+        as are enough."""
+        c = self.config
+        new: list[_Detection] = []
         for s in reversed(seen):
-            if now_ns - s.capture_ns >= self.config.window_ns:
+            age_ns = seen[-1].capture_ns - s.capture_ns
+            if age_ns >= c.max_window_ns or (age_ns >= c.window_ns and len(new) >= c.min_in_window):
                 break
             if s.viewpoint_id == seen[-1].viewpoint_id:
                 new.append(s)
@@ -205,19 +229,37 @@ class DriftMonitor:
                 stayed.append(other)
         return tuple(stayed)
 
-    def _find_steady_anchors(self, anchor_id: str, now_ns: int) -> tuple[str, ...]:
+    def _find_steady_anchors(self, anchor_id: str, since_ns: int) -> tuple[str, ...]:
         """Return other anchors observed where the alignment predicts them."""
-        window_ns = self.config.window_ns
-        return tuple(o for o, ns in sorted(self._steady_ns.items()) if o != anchor_id and abs(now_ns - ns) < window_ns)
+        return tuple(o for o, ns in sorted(self._steady_ns.items()) if o != anchor_id and ns >= since_ns)
 
-    def _get_reference(self, anchor_id: str, now_ns: int, viewpoint_id: int) -> _Window | None:
+    def _get_reference(self, anchor_id: str, now_ns: int, new: list[_Detection]) -> _Window | None:
+        viewpoint_id = new[-1].viewpoint_id
         kept = self._references.get(anchor_id)
         if kept is not None and 0 < kept[0] - now_ns <= self.config.reference_every_ns and kept[1] == viewpoint_id:
             return kept[2]
-        old = [s for s in self._detections[anchor_id] if now_ns - s.capture_ns >= self.config.window_ns]
+        old = self._select_older(self._detections[anchor_id], new[0].capture_ns)
         reference = self._summarize_viewpoint(old, viewpoint_id)
         self._references[anchor_id] = (now_ns + self.config.reference_every_ns, viewpoint_id, reference)
         return reference
+
+    def _select_older(self, seen: deque[_Detection], before_ns: int) -> list[_Detection]:
+        """Return the detections before the present window, oldest first: `reference_ns` of them, or enough of one
+        viewpoint, with no longer pause between."""
+        c = self.config
+        old: list[_Detection] = []
+        counts: dict[int, int] = {}
+        after_ns = before_ns
+        for s in reversed(seen):
+            if s.capture_ns >= before_ns:
+                continue
+            is_enough = before_ns - s.capture_ns > c.reference_ns and max(counts.values(), default=0) >= c.min_in_window
+            if is_enough or after_ns - s.capture_ns > c.reference_ns:
+                break
+            after_ns = s.capture_ns
+            counts[s.viewpoint_id] = counts.get(s.viewpoint_id, 0) + 1
+            old.append(s)
+        return old[::-1]
 
     def _summarize_viewpoint(self, seen: list[_Detection], viewpoint_id: int) -> _Window | None:
         """Summarize the detections of the given viewpoint, else of the one that has most; `None` if too few."""
@@ -229,25 +271,42 @@ class DriftMonitor:
         rows = [s for s in seen if s.viewpoint_id == viewpoint_id]
         if len(rows) < self.config.min_in_window:
             return None
-        return self._summarize(rows)
+        window = self._summarize(rows)
+        return window if window.has_majority else None
 
     def _summarize(self, rows: list[_Detection]) -> _Window:
-        p = fast_median(np.array([s.p for s in rows]))
-        p_head = rows[len(rows) // 2].p_head
-        if p_head is None:
+        every = np.array([s.p for s in rows])
+        p = fast_median(every)
+        middle = rows[len(rows) // 2]
+        if any(s.p_head is None for s in rows):
+            away = None
             common, each = self.noise.split_covariance(isotropic_covariance(self.config.unknown_viewpoint_sigma_m, 0.0))
         else:
-            common, each = self.noise.compute_covariances(np.array(p_head), p)
-        return _Window(p, each[:3, :3] * (_MEDIAN_VARIANCE / len(rows)), common[:3, :3], rows[-1].viewpoint_id)
+            away = fast_median(np.array([s.p_head for s in rows]) - every)
+            common, each = self.noise.compute_covariances(p + away, p)
+        near_m = max(_AGREEING_M, 3.0 * math.sqrt(float(np.trace(each[:3, :3]))))
+        n_near = int(np.count_nonzero(np.linalg.norm(every - p, axis=1) <= near_m))
+        own = each * (_MEDIAN_VARIANCE / len(rows))
+        has_majority = n_near >= _MIN_AGREEING * len(rows)
+        shift = np.mean([s.shift or _AT_REST for s in rows], axis=0)
+        return _Window(p, own, common, middle.viewpoint_id, middle.capture_ns, away, shift, has_majority)
 
     def _measure_change(self, now: _Window, before: _Window | None, least_m: float = 0.0) -> float:
         """Return the distance [m] from the reference, 0 if not significant."""
         if before is None:
             return 0.0
-        C = now.own + before.own
-        if now.viewpoint_id != before.viewpoint_id:
-            C = C + now.common + before.common
-        return _significant(now.p - before.p, C, least_m or self.config.min_change_m)
+        drift_m = self.config.drift_m_per_s * (now.capture_ns - before.capture_ns) * 1e-9
+        C = now.own + before.own + self._independent_share(now, before) * (now.common + before.common)
+        C = C + _late_covariance(now.shift - before.shift)
+        return _significant(now.p - before.p, C[:3, :3] + drift_m**2 * np.eye(3), least_m or self.config.min_change_m)
+
+    def _independent_share(self, a: _Window, b: _Window) -> float:
+        """Return the share of the common errors of two windows that does not cancel, by how far apart the head was. A
+        client's word for it does not count."""
+        if a.viewpoint_id != b.viewpoint_id or a.away is None or b.away is None:
+            return 1.0
+        apart = a.away - b.away
+        return 1.0 - math.exp2(-float(apart @ apart) / self.config.same_place_m**2)
 
     def _measure_difference(self, anchor_id: str, now: _Window, alignment: AlignmentEstimate | None) -> float:
         """Return the distance [m] from the pose that the alignment predicts, 0 if not significant."""
@@ -256,8 +315,32 @@ class DriftMonitor:
         p_world = self.anchors[anchor_id][0]
         placed = apply(alignment.T_world_tracking, to_vec3(now.p))
         R = quat_to_matrix(np.array(alignment.T_world_tracking[1]))
-        C = alignment.covariance_at(p_world) + R @ (now.own + now.common) @ R.T
+        C = alignment.covariance_at(p_world)
+        C = C + R @ (now.own + now.common + _late_covariance(now.shift))[:3, :3] @ R.T
         return _significant(np.array(placed) - p_world, C, self.config.min_difference_m)
+
+    def _measure_turn(
+        self, anchor_id: str, rows: list[_Detection], now: _Window, alignment: AlignmentEstimate | None
+    ) -> float:
+        """Return by how much the alignment is turned about the vertical [rad], 0 if not significant or unknown."""
+        if alignment is None or alignment.refused or alignment.tracking_epoch != self.tracking_epoch:
+            return 0.0
+        if now.away is None:
+            return 0.0
+        q_predicted = quat_multiply(
+            quat_conjugate(np.array(alignment.T_world_tracking[1])), np.array(self.anchors[anchor_id][1])
+        )
+        turns = quat_log(quat_multiply(np.array([s.q for s in rows]), quat_conjugate(q_predicted)))
+        R = quat_to_matrix(np.array(alignment.T_world_tracking[1]))
+        yaws = np.sort(turns @ R[2])  # about the world's vertical
+        yaw = float(0.5 * (yaws[(len(yaws) - 1) // 2] + yaws[len(yaws) // 2]))
+        C = (now.own + now.common + _late_covariance(now.shift))[3:, 3:]
+        variance = alignment.covariance[35] + float(R[2] @ C @ R[2])
+        near = 3.0 * math.sqrt(float(R[2] @ now.common[3:, 3:] @ R[2]))
+        if int(np.count_nonzero(np.abs(yaws - yaw) <= near)) < _MIN_AGREEING * len(yaws):
+            return 0.0
+        sure = yaw * yaw > _CHI2_1_ONE_IN_A_MILLION * variance
+        return abs(yaw) if sure and abs(yaw) >= self.config.min_turn_rad else 0.0
 
     def _measure_jump(self, new: list[_Detection], reference: _Window | None) -> float:
         """Return the distance [m] of the last few detections from the reference, 0 unless they agree with each other:
@@ -287,6 +370,11 @@ class DriftMonitor:
         self._quiet_until_ns.clear()
         self._steady_ns.clear()
         self._head = None
+
+
+def _late_covariance(shift: Array) -> Array:
+    """Return the covariance (6, 6) by lateness, with its largest value as sigma: one in a million is far out."""
+    return MAX_LATE_S**2 * shift[:, None] * shift
 
 
 def _significant(d: Array, C: Array, least_m: float) -> float:

@@ -21,12 +21,16 @@ from anchors.pose import Quat, Vec3
 from anchors.uncertainty import Z999, NoiseModel, chi2_quantile
 
 GroupKey = tuple[str, int]
+#: How late a picture may be for the head pose it is combined with (assumed), and that as a sigma about 0.
+MAX_LATE_S: Final = 0.060
+LATE_SIGMA_S: Final = MAX_LATE_S / math.sqrt(3.0)
 _MIN_MATURE: Final = 3  # fewer observations cannot outvote one wrong detection among them
 
 
 class AnchorObservation(NamedTuple):
     """One observation `T_tracking_anchor` (`p`, unit `q`). `p_head`: position of the observer, tracking frame.
-    `covariance`: as stated by the observer and validated (36 values), else empty."""
+    `covariance`: as stated by the observer and validated (36 values), else empty. `shift` (6,): displacement [m/s] and
+    turn [rad/s] per second that the picture is late, empty if unknown."""
 
     capture_ns: int
     p: Vec3
@@ -36,6 +40,7 @@ class AnchorObservation(NamedTuple):
     quality: float
     size_m: float
     source: str = ""
+    shift: tuple[float, ...] = ()
 
 
 @dataclass
@@ -54,6 +59,9 @@ class ViewpointGroup:
             p = np.array([s.p for s in self.observations])
             q = np.array([s.q for s in self.observations])
             common, each = self._noise(p, noise, fallback)
+            if any(s.shift for s in self.observations):
+                shared, new = compute_lateness([s.shift for s in self.observations if s.shift])
+                common, each = common + shared, each + new
             merged, self.dirty = merge_poses(p, q, common, each, min_agreeing), False
             heads = [s.p_head for s in self.observations if s.p_head is not None]
             p_head = fast_median(np.array(heads)) if heads else None
@@ -222,6 +230,15 @@ def merge_poses(p: Array, q: Array, common: Array, each: Array, min_agreeing: fl
         covariance = covariance * wider[:, None] * wider
     mean += about
     return MergedObservation(mean[0], quat_multiply(quat_exp(mean[1]), centre), covariance, n, count)
+
+
+def compute_lateness(shifts: list[tuple[float, ...]]) -> tuple[Array, Array]:
+    """Return covariances (6, 6) of observations whose pictures are late by an unknown, constant time: of what is common
+    to them, and of what is new in each. `shifts`: displacement and turn per second."""
+    rows = LATE_SIGMA_S * np.array(shifts)
+    mean = rows.mean(axis=0)
+    rows = rows - mean
+    return mean[:, None] * mean, rows.T @ rows / len(rows)
 
 
 def fast_median(x: Array) -> Array:

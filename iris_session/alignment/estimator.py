@@ -15,6 +15,7 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
+from anchors.looks import Look
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3
 from iris_session.alignment.touches import MAX_TIPS, TouchEstimator
 from iris_session.protocol.client_messages import Observation
@@ -30,6 +31,8 @@ AGAINST_GRAVITY: Final = (
 )
 #: The authority notifies a wearer of at most one refusal a second; one that follows another sooner may be lost.
 _CLOSE_NS: Final = 1_500_000_000
+#: So many poses in a row that are no looks are reported: a headset at 72 Hz repeats some that its source did not renew.
+_MANY_FAULTS: Final = 50
 #: How fast a tracking frame may drift (docs/anchors.md).
 _DRIFT_M_PER_S: Final = 0.003 / 60.0
 _CONTROLLER: Final = controller_covariance()
@@ -71,6 +74,8 @@ class ConnectionEstimator:
         self._touches = TouchEstimator(self._anchors, self._marks, self._tips)
         self._observed: dict[str, tuple[int, int]] = {}  # anchor -> number of observations, time of the last [ns]
         self._used = self._unusable = 0
+        self._faults: dict[str, int] = {}  # poses that were no looks, by reason
+        self._in_a_row = 0
         self._next_ns = 0
         self._wrong: tuple[int, str] | None = None  # tracking epoch, why an observation was refused; not yet reported
         self._is_wrong_touch = False  # it was a touch: its person waits for the answer
@@ -107,8 +112,8 @@ class ConnectionEstimator:
         self._refused = self._touched = self.newest = None
         self._pending = self._used > 0
 
-    def add_observation(self, observation: Observation, p_tracking_head: Vec3 | None = None, now_ns: int = 0) -> bool:
-        """Add one observation.
+    def add_observation(self, observation: Observation, look: Look | None = None, now_ns: int = 0) -> bool:
+        """Add one observation; `look`: what is known of it as a look.
 
         Returns:
             False if it is unusable: unknown anchor, old tracking epoch, not a rigid transform, or a sheet of another
@@ -122,10 +127,11 @@ class ConnectionEstimator:
             used = False
             self._note_wrong((observation.tracking_epoch, wrong), observation.kind == AnchorKind.TOUCH)
         else:
-            used = self._use_observation(observation, p_tracking_head)
+            used = self._use_observation(observation, look or Look(observation.viewpoint_id))
             if used and observation.kind == AnchorKind.TOUCH and self._is_wrong_touch:
                 self._wrong = None
         if used:
+            self._in_a_row = 0
             self._used += 1
             self._observed[anchor_id] = (self._observed.get(anchor_id, (0, 0))[0] + 1, now_ns)
         else:
@@ -138,8 +144,18 @@ class ConnectionEstimator:
             return
         self._wrong, self._is_wrong_touch = wrong, is_touch
 
-    def _use_observation(self, observation: Observation, p_tracking_head: Vec3 | None) -> bool:
-        pose, covariance = observation.T_tracking_anchor, observation.covariance
+    def count_fault(self, fault: str, tracking_epoch: int, is_known: bool) -> None:
+        """Count a pose that is no look (`anchors.looks`), and report it if many follow each other."""
+        if not self.running:
+            return
+        self._unusable += 1
+        self._faults[fault] = self._faults.get(fault, 0) + 1
+        self._in_a_row = self._in_a_row + 1 if is_known else 0
+        if self._in_a_row >= _MANY_FAULTS:
+            self._note_wrong((tracking_epoch, f"poses of the sheet are not used: {fault}"), False)
+
+    def _use_observation(self, observation: Observation, look: Look) -> bool:
+        pose, covariance, p_tracking_head = observation.T_tracking_anchor, observation.covariance, look.p_tracking_head
         if observation.kind == AnchorKind.TOUCH:
             return self._touches.add_touch(observation)
         if observation.kind == AnchorKind.PERSISTENT:
@@ -154,12 +170,13 @@ class ConnectionEstimator:
                 (pose.p, pose.q),
                 observation.capture_ns,
                 observation.tracking_epoch,
-                viewpoint_id=observation.viewpoint_id,
+                viewpoint_id=look.viewpoint_id,
                 quality=observation.quality,
                 size_m=observation.size_m,
                 covariance=covariance,
                 p_tracking_head=p_tracking_head,
                 source=observation.source or source,
+                shift=look.shift,
             )
         except NUMERICAL_ERRORS:
             return False
@@ -262,6 +279,7 @@ class ConnectionEstimator:
         e = self._estimator
         counted = {"of a void tracking frame": e.stale_epochs, "no poses": e.invalid, "of a wrong size": e.wrong_size}
         counted[AGAINST_GRAVITY] = e.against_gravity
+        counted |= self._faults
         unusable = ", ".join(f"{n} {why}" for why, n in counted.items() if n)
         parts = ["" if self._last is None else self._last.advice, self._touches.advice]
         return "; ".join(filter(None, [*parts, f"not used: {unusable}" if unusable else ""]))

@@ -16,6 +16,7 @@ from typing import Any, Final, Protocol
 
 from anchors.alignment import AlignmentEstimate
 from anchors.drift import Alarm
+from anchors.looks import Look
 from anchors.pose import PoseTuple, Vec3, is_rigid
 from iris_session.alignment.cross_check import CrossCheckScheduler, Job
 from iris_session.alignment.estimator import NUMERICAL_ERRORS, ConnectionEstimator
@@ -240,40 +241,36 @@ class AlignmentService:
         if state.is_before_jump(observation):
             self._drops.count("observation_before_jump", number)
             return
-        p_tracking_head = self._find_head_position(state, observation)
         known = observation.anchor_id in self.anchors
         seen, tracked = observation.kind not in AnchorKind.NOT_SEEN, observation.kind == AnchorKind.CONTROLLER
+        look = state.monitor.judge_look(observation)
+        if isinstance(look, str):
+            state.estimator.count_fault(look, observation.tracking_epoch, known)
+            self._drops.count("observation_unusable", number)
+            return
         if known and seen:
-            alarm = state.monitor.check_observation(observation, p_tracking_head)
+            alarm = state.monitor.check_observation(observation, look)
             if alarm is not None:
                 self._process_alarm(number, state, alarm, observation.tracking_epoch, now_ns)
         used = True
         if known or not tracked:
-            used = state.estimator.add_observation(observation, p_tracking_head, now_ns)
+            used = state.estimator.add_observation(observation, look, now_ns)
         if (known and seen and used) or (tracked and not known):
-            kept = self._add_to_cross_check(number, observation, p_tracking_head, now_ns)
+            kept = self._add_to_cross_check(number, observation, look, now_ns)
             used = kept if not known else used
         if not used:
             self._drops.count("observation_unusable", number)
 
-    def _find_head_position(self, state: _HeadsetState, observation: Observation) -> Vec3 | None:
-        if observation.device != _HEAD:
-            return None
-        T_tracking_head = state.monitor.heads.find_nearest(observation.capture_ns, observation.tracking_epoch)
-        return None if T_tracking_head is None else T_tracking_head[0]
-
-    def _add_to_cross_check(
-        self, number: int, observation: Observation, p_tracking_head: Vec3 | None, now_ns: int
-    ) -> bool:
+    def _add_to_cross_check(self, number: int, observation: Observation, look: Look, now_ns: int) -> bool:
         pose = observation.T_tracking_anchor
         return self._cross_check.add_observation(
             number,
             observation.anchor_id,
             (pose.p, pose.q),
-            p_tracking_head,
+            look.p_tracking_head,
             observation.capture_ns,
             observation.tracking_epoch,
-            observation.viewpoint_id,
+            look.viewpoint_id,
             now_ns,
         )
 

@@ -271,7 +271,7 @@ def test_status_says_which_mark_to_touch_next() -> None:
 
 def test_unknown_mark_is_refused_with_those_that_are_known() -> None:
     lab, ann = _lab()
-    ann.observe(Observation("sheet", "touch", IDENTITY, lab.now_ns, 1, device=RIGHT, mark="9"))
+    ann.observe(Observation("sheet", "touch", Pose((0.0, 0.0, 0.1), IDENTITY.q), lab.now_ns, 1, device=RIGHT, mark="9"))
     lab.poll()
     assert _advice(ann).startswith("anchor 'sheet' has no mark '9'; known: 1, 2, 3, 4")
     assert lab.drops.by_reason["observation_unusable"] == 1

@@ -9,12 +9,15 @@ import pytest
 
 from anchors.alignment import AlignmentEstimate
 from anchors.drift import Alarm, DriftConfig, DriftMonitor
-from anchors.pose import PoseTuple, Vec3, quat_from_rotvec, quat_from_yaw
+from anchors.looks import Look
+from anchors.pose import PoseTuple, Vec3, compose, inverse, quat_from_rotvec, quat_from_yaw
 from tests.anchors.worlds import Viewpoint, align_to_sheet, shifted, tracking_frame, viewpoint_around
 
 SHEET: PoseTuple = ((0.2, -0.4, 0.75), quat_from_yaw(0.5))
 OTHER: PoseTuple = ((1.2, 0.4, 0.75), quat_from_yaw(-2.0))
 ANCHORS = {"sheet": SHEET, "other": OTHER}
+ONE: PoseTuple = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+AT_ZERO = Look(0, (0.0, 0.0, 0.0))
 PERIOD = 100_000_000
 
 
@@ -30,11 +33,11 @@ def _monitor(
     """Return the alarms raised by detections at 10 Hz; with `wrong` one in twenty of them is wrong."""
     alarms = []
     for i in frames:
-        p = view.observe(T_world_tracking)[0]
+        p, q = view.observe(T_world_tracking)
         if wrong is not None and wrong.random() < 0.05:
             p = (p[0] + wrong.normal(0.0, 0.25), p[1] + wrong.normal(0.0, 0.25), p[2])
         alarm = monitor.add_observation(
-            "sheet", p, view.head_pose(T_world_tracking), i * PERIOD, 0, viewpoint, alignment
+            "sheet", (p, q), Look(viewpoint, view.head_pose(T_world_tracking)), i * PERIOD, 0, alignment
         )
         if alarm is not None:
             alarms.append(alarm)
@@ -84,6 +87,32 @@ def test_change_while_the_sheet_was_out_of_sight_raises_an_alarm() -> None:
     assert not alarms[0].invalidates
 
 
+@pytest.mark.parametrize("turn_deg", [0.0, 4.0])
+def test_turn_of_the_frame_about_the_sheet_differs(turn_deg: float) -> None:
+    """The sheet is where it was: only its heading shows that everything 2 m away is displayed elsewhere."""
+    rng = np.random.default_rng(5)
+    T_world_tracking = tracking_frame(rng)
+    alignment = align_to_sheet(rng, SHEET, T_world_tracking)
+    about: PoseTuple = (SHEET[0], quat_from_yaw(math.radians(turn_deg)))
+    turned = compose(compose(about, inverse((SHEET[0], (1.0, 0.0, 0.0, 0.0)))), T_world_tracking)
+    view = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.5))
+    alarms = _monitor(DriftMonitor(ANCHORS), view, turned, range(20), alignment)
+    assert [a.kind for a in alarms] == (["differs"] if turn_deg else [])
+    assert all(a.size_m == pytest.approx(math.radians(turn_deg), abs=0.02) for a in alarms)
+
+
+def test_few_detections_that_disagree_raise_no_alarm() -> None:
+    """A slow source: five detections, three of which are wrong, each elsewhere."""
+    rng = np.random.default_rng(6)
+    T_world_tracking = tracking_frame(rng)
+    alignment = align_to_sheet(rng, SHEET, T_world_tracking)
+    view, monitor = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.7)), DriftMonitor(ANCHORS)
+    for i, off in enumerate((0.0, 0.2, 0.0, 0.4, 0.3)):
+        (x, y, z), q = view.observe(T_world_tracking)
+        look = Look(0, view.head_pose(T_world_tracking))
+        assert monitor.add_observation("sheet", ((x + off, y, z), q), look, i * 10 * PERIOD, 0, alignment) is None
+
+
 def test_jump_alarm_needs_three_detections() -> None:
     rng = np.random.default_rng(4)
     T_world_tracking = tracking_frame(rng)
@@ -101,11 +130,11 @@ def test_jump_alarm_needs_three_detections() -> None:
 def test_new_tracking_epoch_is_a_jump_and_restarts_monitoring() -> None:
     monitor = DriftMonitor(ANCHORS)
     zero: Vec3 = (0.0, 0.0, 0.0)
-    alarm = monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 0, 1)
+    alarm = monitor.add_observation("sheet", ONE, AT_ZERO, 0, 1)
     assert alarm is not None
     assert (alarm.kind, alarm.invalidates) == ("epoch", True)
-    assert monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 1, 1) is None
-    assert monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 2, 0) is None, "what is older is of no use"
+    assert monitor.add_observation("sheet", ONE, AT_ZERO, 1, 1) is None
+    assert monitor.add_observation("sheet", ONE, AT_ZERO, 2, 0) is None, "what is older is of no use"
     assert monitor.add_head_pose((zero, (1.0, 0.0, 0.0, 0.0)), 3, 2) is not None
 
 
@@ -125,12 +154,11 @@ def test_implausible_head_speed_is_a_jump() -> None:
 
 def test_invalid_numbers_and_unknown_anchors_raise_no_alarm_and_memory_is_bounded() -> None:
     monitor = DriftMonitor(ANCHORS, config=DriftConfig(max_detections=50))
-    zero: Vec3 = (0.0, 0.0, 0.0)
-    assert monitor.add_observation("sheet", (math.nan, 0.0, 0.0), zero, 0, 0) is None
-    assert monitor.add_observation("nobody", zero, zero, 0, 0) is None
+    assert monitor.add_observation("sheet", ((math.nan, 0.0, 0.0), ONE[1]), AT_ZERO, 0, 0) is None
+    assert monitor.add_observation("nobody", ONE, AT_ZERO, 0, 0) is None
     for i in range(200):
-        monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 5, 0)
-        monitor.add_observation("sheet", (0.0, 0.0, 1.0), zero, 5 - i, 0)
+        monitor.add_observation("sheet", ONE, AT_ZERO, 5, 0)
+        monitor.add_observation("sheet", ONE, AT_ZERO, 5 - i, 0)
     assert len(monitor._detections["sheet"]) <= 50
 
 
@@ -158,8 +186,8 @@ def _monitor_two_sheets(
         now = shifted(frame, bump) if i >= 30 else frame
         for k, (name, view) in enumerate(views.items()):
             place = shifted(SHEET, (moved, 0.0, 0.0)) if name == "sheet" and i >= 30 else None
-            p = view.observe(now, place)[0]
-            alarm = monitor.add_observation(name, p, view.head_pose(now), i * PERIOD + k * PERIOD // 2, 0)
+            pose = view.observe(now, place)
+            alarm = monitor.add_observation(name, pose, Look(0, view.head_pose(now)), i * PERIOD + k * PERIOD // 2, 0)
             alarms += [(i, alarm)] if alarm is not None else []
     return alarms
 
