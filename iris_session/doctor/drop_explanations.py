@@ -43,6 +43,7 @@ WEB_EXPLANATIONS: Final[Mapping[str, str]] = {
     "web_silent": "web gateway: clients that sent no heartbeats",
     "web_subprotocol": "web gateway: WebSockets of another version, or of other programs",
     "web_ticket": "web gateway: requests without a valid ticket",
+    "web_too_large": "web gateway: messages that are larger than the session takes",
     "web_too_slow": "web gateway: clients closed because they read nothing for seconds",
     "web_unknown_name": "web gateway: messages for clients that had closed",
     "web_version": "web gateway: clients of another protocol version",

@@ -162,7 +162,8 @@ async def serve(start: GatewayStart) -> str:
 def main() -> int:
     """Run the gateway of one session. Exit status 1 if it cannot start, or is not admitted."""
     configure_logging()
-    logging.getLogger("asyncio").addFilter(RepetitionFilter())  # a line for every write to a closed connection
+    if logging.lastResort is not None:  # of asyncio: a line for every write to a closed connection
+        logging.lastResort.addFilter(RepetitionFilter())
     start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=GatewayStart)
     raise_descriptor_limit()
     sys.setswitchinterval(SWITCH_S)

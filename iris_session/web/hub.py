@@ -53,6 +53,11 @@ _PAIR: Final = "pair"
 MAX_NETWORKS: Final = 1024
 #: Answers to malformed messages of one browser.
 _FAULTS_PER_S, _FAULT_BURST = 2.0, 5
+#: Requests of one browser for assets that the session does not serve: it closes a connection of the gateway, which all
+#: share, after 1,024 of them.
+_UNKNOWN_PER_S, _UNKNOWN_BURST = 0.5, 32
+#: Media sockets that one browser opens: each is a handshake of the gateway's key, and the session allows 8 a second.
+_MEDIA_PER_S, _MEDIA_BURST = 0.5, 8
 _WELCOME, _FAULT, _REFUSED, _BUDGET = "welcome", "protocol_fault", "refused", "delivery_budget"
 
 
@@ -135,6 +140,8 @@ class Browser:
         self.messages = TokenBucket(limits.messages_per_s, limits.message_burst, now_ns)
         self.bytes = TokenBucket(limits.bytes_per_s, limits.byte_burst, now_ns)
         self.faults = TokenBucket(_FAULTS_PER_S, _FAULT_BURST, now_ns)
+        self.unknown_assets = TokenBucket(_UNKNOWN_PER_S, _UNKNOWN_BURST, now_ns)
+        self.media_opens = TokenBucket(_MEDIA_PER_S, _MEDIA_BURST, now_ns)
 
     @property
     def is_admitted(self) -> bool:
@@ -232,6 +239,18 @@ class Hub:
     def _reject(self, browser: Browser, code: int, drop: str, text: str) -> None:
         self.drops.count(drop)
         browser.close(code, text)
+
+    def note_unknown_asset(self, browser: Browser, now_ns: int) -> None:
+        """Note that a browser asked for an asset that the session does not serve; too many close its WebSocket."""
+        if not browser.unknown_assets.take(now_ns):
+            self._reject(browser, CLOSE_LIMIT, "web_flood", "too many requests for assets that are not served")
+
+    def allow_media(self, browser: Browser, now_ns: int) -> bool:
+        """Return whether a browser may open one more media socket now."""
+        if browser.media_opens.take(now_ns):
+            return True
+        self.drops.count("web_flood")
+        return False
 
     # --- from browsers to the session ---------------------------------------------------------------------------------
 

@@ -21,7 +21,9 @@ from iris_session.link.config import SECOND
 from iris_session.link.sockets import open_listeners
 from iris_session.link.tcp_guard import TcpBounds, TcpConnection, TcpGuard, TcpReasons
 from iris_session.protocol.limits import Drops, KeyedBuckets, TokenBucket, find_network
+from iris_session.web.frames import NETWORK_EXTRA_BURST, NETWORK_EXTRA_PER_S, FrameMeter
 from iris_session.web.sockets import limit_unsent
+from iris_session.web.wire import CLOSE_LIMIT, make_close_frame
 
 #: Connections of one browser that are established. It has two WebSockets, and 16 assets at once.
 MAX_PER_BROWSER: Final = 24
@@ -55,6 +57,9 @@ _BACKLOG: Final = 256
 #: Pause when the system gives no connection, for lack of descriptors for example.
 _ACCEPT_PAUSE_S: Final = 0.1
 _TLS_HANDSHAKE: Final = 0x16
+_FLOOD: Final = make_close_frame(CLOSE_LIMIT, "more frames than a client may send: send less")
+#: Time for a peer that is cut to read why.
+_FAREWELL_S: Final = 1.0
 _MAX_PLAIN_REQUEST: Final = 2048
 _HOST_LINE: Final = re.compile(rb"\r\nhost:[ \t]*([A-Za-z0-9._:\[\]-]{1,260})[ \t]*\r\n", re.IGNORECASE)
 _PATH: Final = re.compile(rb"[A-Z]{3,7} (/[A-Za-z0-9._~!$&'()*+,;=:@%/?-]{0,500}) HTTP/1\.")
@@ -63,7 +68,8 @@ _PATH: Final = re.compile(rb"[A-Z]{3,7} (/[A-Za-z0-9._~!$&'()*+,;=:@%/?-]{0,500}
 class WatchedProtocol(asyncio.Protocol):
     """Protocol of one connection that passes everything on to that of aiohttp, and notes the end.
 
-    `take`: returns whether so many bytes more may come; a connection with too many is cut.
+    `take`: returns whether so many bytes more may come; a connection with too many is cut, as is a WebSocket with too
+    many frames.
     """
 
     def __init__(
@@ -78,6 +84,12 @@ class WatchedProtocol(asyncio.Protocol):
         self._on_lost = on_lost
         self._take = take
         self._transport: asyncio.Transport | None = None
+        self._take_frames: Callable[[bytes], bool] | None = None
+        self._is_cut = False
+
+    def count_frames(self, take_frames: Callable[[bytes], bool]) -> None:
+        """Let `take_frames` tell of what comes from now on, a WebSocket, whether it is within the limits of frames."""
+        self._take_frames = take_frames
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
@@ -86,9 +98,25 @@ class WatchedProtocol(asyncio.Protocol):
         self._inner.connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        if self._take(len(data)):
+        if self._is_cut:
+            return
+        if not self._take(len(data)):
+            self._cut(b"")
+        elif self._take_frames is not None and not self._take_frames(data):
+            self._cut(_FLOOD)
+        else:
             self._inner.data_received(data)
-        elif self._transport is not None:
+
+    def _cut(self, farewell: bytes) -> None:
+        """Close the connection, and read nothing of it any more; `farewell` says why, to those who read."""
+        self._is_cut = True
+        if self._transport is None:
+            return
+        if farewell:
+            self._transport.write(farewell)
+            self._transport.close()
+            asyncio.get_running_loop().call_later(_FAREWELL_S, self._transport.abort)
+        else:
             self._transport.abort()
 
     def eof_received(self) -> bool | None:
@@ -125,6 +153,7 @@ class Listener:
         self._handshakes = KeyedBuckets(HANDSHAKES_PER_S, HANDSHAKE_BURST, MAX_ADDRESSES)
         self._requests = KeyedBuckets(REQUESTS_PER_S, REQUEST_BURST, MAX_ADDRESSES)
         self._bytes = KeyedBuckets(NETWORK_BYTES_PER_S, NETWORK_BYTES_BURST, MAX_ADDRESSES)
+        self._extra_frames = KeyedBuckets(NETWORK_EXTRA_PER_S, NETWORK_EXTRA_BURST, MAX_ADDRESSES)
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -150,6 +179,26 @@ class Listener:
             return
         if sum(one.owner == browser for one in self._guard.table.values()) < MAX_PER_BROWSER:
             connection.is_established, connection.owner = True, browser
+
+    def count_frames(self, transport: asyncio.BaseTransport | None) -> None:
+        """Count and limit the frames of a connection that becomes a WebSocket."""
+        connection, protocol = self.find(transport), transport.get_protocol() if transport is not None else None
+        if connection is None or not isinstance(protocol, WatchedProtocol):
+            return
+        network = find_network(connection.address[0])
+
+        def take_extra(now_ns: int) -> bool:
+            return connection.is_established or self._extra_frames.take(network, now_ns)
+
+        meter = FrameMeter(take_extra, time.monotonic_ns())
+
+        def take_frames(data: bytes) -> bool:
+            if meter.feed(data, time.monotonic_ns()):
+                return True
+            self._drops.count("web_flood")
+            return False
+
+        protocol.count_frames(take_frames)
 
     def allow_handshake(self, address: str) -> bool:
         """Return whether an address may make one more handshake of TLS now."""

@@ -21,7 +21,7 @@ from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.limits import Drops, TokenBucket
-from iris_session.web.assets import TOO_MANY, AssetUnavailableError, ByteRate, GatewayAssets
+from iris_session.web.assets import TOO_MANY, UNKNOWN, AssetUnavailableError, ByteRate, GatewayAssets
 from iris_session.web.hub import NAME_BYTES, Browser, Closing, Hub
 from iris_session.web.listener import Listener
 from iris_session.web.origin import HostCheck, make_security_headers
@@ -403,6 +403,8 @@ class WebServer:
         try:
             view = await self._assets.find(address)
         except AssetUnavailableError as error:
+            if error.status == UNKNOWN:
+                self._hub.note_unknown_asset(browser, time.monotonic_ns())
             headers = {"Retry-After": "1"} if error.status in (TOO_MANY, 503) else {}
             return web.Response(status=error.status, text=f"{error}\n", headers=headers)
         total = len(view)
@@ -456,6 +458,10 @@ class WebServer:
         )
         if not socket.can_prepare(request).ok:
             raise web.HTTPBadRequest(reason=f"expected a WebSocket with subprotocol {SUBPROTOCOL}")
+        if getattr(request.protocol, "_message_tail", b""):  # no frame was counted that came before the answer
+            raise web.HTTPBadRequest(reason="a client waits for the answer to its handshake")
+        if self._listener is not None:
+            self._listener.count_frames(request.transport)
         await socket.prepare(request)
         return socket
 
@@ -487,9 +493,8 @@ class WebServer:
                 browser.close(CLOSE_LIMIT, TOO_MANY_PINGS)
             elif message.type == WSMsgType.BINARY:
                 envelope = self._hub.receive(browser, message.data, time.monotonic_ns())
-                if envelope is not None and not self._session.send(envelope):
-                    self._drops.count("web_session_full")
-                    browser.close(CLOSE_LIMIT, "the session does not read: come again")
+                if envelope is not None:
+                    self._send_to_session(browser, envelope)
             elif message.type == WSMsgType.TEXT:
                 self._drops.count("web_malformed")
                 browser.close(CLOSE_NOT_ALLOWED, "messages are binary")
@@ -497,8 +502,16 @@ class WebServer:
                 self._count_end(message.type, socket)
                 return
 
+    def _send_to_session(self, browser: Browser, envelope: bytes) -> None:
+        excess = self._session.send(browser, envelope)
+        if excess is not None:
+            self._drops.count("web_session_full")
+            excess.close(CLOSE_LIMIT, "the session does not read: come again")
+
     def _count_end(self, kind: WSMsgType, socket: web.WebSocketResponse) -> None:
-        if kind == WSMsgType.ERROR or socket.close_code in (WSCloseCode.MESSAGE_TOO_BIG, WSCloseCode.PROTOCOL_ERROR):
+        if socket.close_code == WSCloseCode.MESSAGE_TOO_BIG:
+            self._drops.count("web_too_large")
+        elif kind == WSMsgType.ERROR or socket.close_code == WSCloseCode.PROTOCOL_ERROR:
             self._drops.count("web_malformed")
 
     async def _write_session(self, browser: Browser, writer: SocketWriter, request: web.Request) -> None:
@@ -525,7 +538,7 @@ class WebServer:
     async def _end_session(self, browser: Browser, writer: SocketWriter, writing: asyncio.Task[None]) -> None:
         notification = self._hub.close_browser(browser)
         if notification is not None:
-            self._session.send(notification)
+            self._send_to_session(browser, notification)
         media = self._media.pop(browser.name, None)
         writer.wake()
         with contextlib.suppress(asyncio.CancelledError, Exception):
@@ -547,6 +560,9 @@ class WebServer:
             return socket
         if browser is None:
             await writer.close(Closing(CLOSE_NOT_ALLOWED, "the first message must be a valid ticket"))
+            return socket
+        if not self._hub.allow_media(browser, time.monotonic_ns()):
+            await writer.close(Closing(CLOSE_LIMIT, "too many media sockets: come again later"))
             return socket
         self._establish(request, browser)
         before, self._media[browser.name] = self._media.get(browser.name), writer

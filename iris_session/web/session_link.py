@@ -11,7 +11,6 @@ import contextlib
 import importlib.metadata
 import time
 from base64 import urlsafe_b64encode
-from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -38,18 +37,17 @@ from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 from iris_session.web.config import GatewayConfig
 from iris_session.web.hub import Browser, Hub
 from iris_session.web.sockets import SocketReader
+from iris_session.web.uplink import Uplink
 from iris_session.web.wire import CLOSE_ENDED, CLOSE_RESTART, peek_client_type
 
 #: Time for the gateway to be admitted by the session, before a WebSocket is closed with "come again".
 READY_S: Final = 5.0
-#: Control messages that wait for the session while it does not read.
-MAX_WAITING: Final = 2048
-#: E-stops for which there is room besides.
-MAX_STOPS: Final = 256
-_ESTOP: Final = "estop"
 #: Time without browsers after which the state is not subscribed to any more.
 STATE_LINGER_S: Final = 5.0
 CONTROL_HWM: Final = 2048
+#: Messages, and bytes, to the session that libzmq and the system queue: few, because an e-stop cannot go ahead of them.
+CONTROL_SEND_HWM: Final = 64
+CONTROL_SEND_BYTES: Final = 65_536
 
 
 class SessionLink:
@@ -80,7 +78,7 @@ class SessionLink:
         self._monitor: zmq.Socket[bytes] | None = None
         self._state: SocketReader | None = None
         self._newest: dict[bytes, list[zmq.Frame]] = {}
-        self._waiting: deque[bytes] = deque()
+        self._uplink = Uplink()
         self._ready = asyncio.Event()
         self._stateless_since = time.monotonic()
 
@@ -132,7 +130,7 @@ class SessionLink:
         """Note that the session knows none of the browsers any more."""
         was_ready = self._ready.is_set()
         self._ready.clear()
-        self._waiting.clear()
+        self._uplink.clear()
         self._close_state()
         if was_ready:
             ended = self.connection.counters.faults.get(FaultCode.SESSION_ENDED, 0)
@@ -145,11 +143,12 @@ class SessionLink:
         config = self._config
         control = open_socket(self._context, zmq.DEALER, config.host, self._keys)
         control.setsockopt(zmq.IMMEDIATE, 1)
-        control.setsockopt(zmq.SNDHWM, CONTROL_HWM)
+        control.setsockopt(zmq.SNDHWM, CONTROL_SEND_HWM)
+        control.setsockopt(zmq.SNDBUF, CONTROL_SEND_BYTES)
         control.setsockopt(zmq.RCVHWM, CONTROL_HWM)
         self._monitor = control.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         control.connect(f"tcp://{host_port(config.host, config.control_port)}")
-        self._control = SocketReader(control, self._receive_control, self._update)
+        self._control = SocketReader(control, self._receive_control, self._update, on_room=self._flush)
 
     def _close_control(self) -> None:
         if self._control is not None:
@@ -174,23 +173,21 @@ class SessionLink:
                 await self._ready.wait()
         return self._ready.is_set()
 
-    def send(self, envelope: bytes) -> bool:
-        """Send a message of a browser, in order; an e-stop goes ahead. False: too much waits for the session."""
+    def send(self, browser: Browser, envelope: bytes) -> Browser | None:
+        """Send a message of a browser. Return the browser of which too much waits for the session, mostly none."""
         if not self._ready.is_set():
-            return True  # the browsers of this connection are being closed
-        is_stop = bool(self._waiting) and peek_client_type(envelope) == _ESTOP
-        if len(self._waiting) >= MAX_WAITING + is_stop * MAX_STOPS:
-            return False
-        if is_stop:
-            self._waiting.appendleft(envelope)
-        else:
-            self._waiting.append(envelope)
-        self._flush()
-        return True
+            return None  # the browsers of this connection are being closed
+        control = self._control
+        if not len(self._uplink) and control is not None and control.send([envelope]):
+            return None
+        kind = peek_client_type(envelope)
+        excess = self._uplink.push(browser.name, kind, envelope, admitted=browser.is_admitted)
+        return self._hub.find(excess) if excess else None
 
     def _flush(self) -> None:
-        while self._waiting and self._control is not None and self._control.send([self._waiting[0]]):
-            self._waiting.popleft()
+        uplink, control = self._uplink, self._control
+        while (message := uplink.peek()) is not None and control is not None and control.send([message]):
+            uplink.pop()
 
     def watch_state(self) -> None:
         """Subscribe to the state unless it is subscribed to."""

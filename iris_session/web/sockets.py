@@ -21,6 +21,7 @@ if sys.platform == "linux":
 #: Messages handled before other tasks of the loop run.
 ROUND: Final = 64
 _NOBLOCK: Final = int(zmq.NOBLOCK)
+_EVENTS, _POLLIN, _POLLOUT = int(zmq.EVENTS), int(zmq.POLLIN), int(zmq.POLLOUT)
 #: Unsent bytes that the system takes of one connection; more stays with us, where the newest value replaces the last.
 NOT_SENT_BYTES: Final = 16_384
 _TCP_NOTSENT_LOWAT: Final = 25  # linux/tcp.h
@@ -34,6 +35,7 @@ class SocketReader:
         on_message: Called with the frames of each message, in order.
         on_drained: Called after a round of messages.
         batch: Messages at a time; with 1, `pause` in `on_message` leaves the next one unread.
+        on_room: Called when there is room to send.
     """
 
     def __init__(
@@ -42,11 +44,13 @@ class SocketReader:
         on_message: Callable[[list[zmq.Frame]], None],
         on_drained: Callable[[], None] | None = None,
         batch: int = ROUND,
+        on_room: Callable[[], None] | None = None,
     ) -> None:
         self.socket = sock
         self._on_message = on_message
         self._on_drained = on_drained
         self._batch = batch
+        self._on_room = on_room
         self._paused = False
         self._scheduled = False
         self._loop = asyncio.get_running_loop()
@@ -98,6 +102,12 @@ class SocketReader:
             self._on_message(self.socket.recv_multipart(_NOBLOCK, copy=False))
         if n and self._on_drained is not None and not self.socket.closed:
             self._on_drained()
+        if self._on_room is not None and not self.socket.closed:
+            events = int(self.socket.get(_EVENTS))  # which uses up the signal that a message has come, too
+            if events & _POLLIN:
+                self._schedule()
+            if events & _POLLOUT:
+                self._on_room()
 
 
 def limit_unsent(sock: socket.socket) -> None:

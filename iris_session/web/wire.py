@@ -50,9 +50,11 @@ _ENVELOPE_ELEMENTS: Final = 4
 #: Bytes of a name that MessagePack encodes with one byte of length.
 _MAX_NAME: Final = 31
 
-# Of the frames of a WebSocket: opcode of a binary message (0: it goes on), marks of its end and of long lengths.
+# Of the frames of a WebSocket: opcodes of a binary message (0: it goes on) and of a close, marks of its end and of long
+# lengths.
 _BINARY: Final = 2
 _FINAL: Final = 0x80
+_CLOSE: Final = 8
 _LENGTH_16: Final = 126
 _LENGTH_64: Final = 127
 
@@ -137,6 +139,12 @@ def make_fragment(message: bytes, begin: int, end: int) -> bytes:
     else:
         head = struct.pack(">BBQ", first, _LENGTH_64, length)
     return head + memoryview(message)[begin:end]
+
+
+def make_close_frame(code: int, reason: str) -> bytes:
+    """Return the WebSocket frame that closes, of a server; `reason`: at most 123 bytes."""
+    body = struct.pack(">H", code) + reason.encode()
+    return bytes((_CLOSE | _FINAL, len(body))) + body
 
 
 def decode_frames(data: Bytes) -> tuple[int, list[memoryview]]:

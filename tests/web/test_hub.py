@@ -314,3 +314,22 @@ def test_a_full_hub_makes_room_only_by_those_that_have_not_joined() -> None:
         welcome(hub, browser)
     assert hub.open_browser(b"\0\0\0\0\0\x09", "", 0) is None
     assert hub.drops.by_reason == {"web_evicted": 3, "web_full": 1}
+
+
+def test_unknown_assets_and_media_sockets_are_limited_by_browser() -> None:
+    hub = Hub()
+    ann, bob = open_browser(hub, 1), open_browser(hub, 2)
+    for browser in (ann, bob):
+        welcome(hub, browser)
+        hub.issue_ticket(browser, bytes((browser is ann,)) * TICKET_BYTES, 0)
+    for n in range(10):
+        hub.note_unknown_asset(bob, n * SECOND)
+    for _ in range(100):
+        hub.note_unknown_asset(ann, 0)
+    assert ann.closing is not None
+    assert ann.closing.code == wire.CLOSE_LIMIT
+    assert hub.find_ticket(ann.ticket.decode(), 0) is None
+    assert bob.closing is None
+    n_media = sum(hub.allow_media(bob, 10 * SECOND) for _ in range(100))
+    assert 1 < n_media < 20
+    assert hub.allow_media(bob, 20 * SECOND)

@@ -13,6 +13,7 @@ from iris_session.link.config import SECOND
 from iris_session.link.tcp_guard import TcpConnection, TcpGuard
 from iris_session.protocol.limits import Drops
 from iris_session.web import listener
+from iris_session.web.hub import Hub
 from iris_session.web.listener import (
     BOUNDS,
     MAX_PER_BROWSER,
@@ -21,6 +22,10 @@ from iris_session.web.listener import (
     WatchedProtocol,
     open_listening_sockets,
 )
+from iris_session.web.origin import HostCheck
+from iris_session.web.page import PageFiles
+from iris_session.web.server import WebServer
+from iris_session.web.wire import CLOSE_LIMIT, SUBPROTOCOL
 
 
 class Rig:
@@ -129,6 +134,68 @@ def test_a_connection_that_sends_too_much_is_cut() -> None:
     protocol.data_received(bytes(100))
     assert transport.abort.called
     inner.data_received.assert_called_once_with(bytes(99))
+
+
+def test_a_websocket_with_too_many_frames_is_told_and_cut() -> None:
+    async def feed() -> None:
+        transport, inner = Mock(spec=asyncio.Transport), Mock(spec=asyncio.Protocol)
+        protocol = WatchedProtocol(inner, lambda _: None, lambda: None, lambda _: True)
+        protocol.connection_made(transport)
+        protocol.count_frames(lambda data: data != b"bad")
+        for data in (b"good", b"bad", b"good"):
+            protocol.data_received(data)
+        inner.data_received.assert_called_once_with(b"good")
+        (farewell,) = transport.write.call_args.args
+        assert farewell[0] == 0x88
+        assert int.from_bytes(farewell[2:4], "big") == CLOSE_LIMIT
+        assert transport.close.called
+
+    asyncio.run(feed())
+
+
+@pytest.mark.parametrize("path", ["/v1/session", "/v1/media"])
+@pytest.mark.parametrize("frame", [b"\x89\x80\0\0\0\0", b"\x8a\x80\0\0\0\0", b"\x02\x80\0\0\0\0"])
+def test_frames_that_are_no_message_end_their_websocket(path: str, frame: bytes) -> None:
+    """Through aiohttp: pings, pongs and empty fragments."""
+
+    async def send(data_at_once: bytes, data: bytes) -> tuple[bytes, dict[str, int]]:
+        class Session:
+            async def wait_ready(self) -> bool:
+                await asyncio.Event().wait()
+                return False
+
+        unused: Any = None
+        session: Any = Session()
+        hub = Hub()
+        serving = WebServer(hub, session, unused, HostCheck((), secure=False), PageFiles())
+        listening = Listener(await serving.start(), None, hub.drops)
+        serving.attach(listening)
+        sockets = open_listening_sockets(["127.0.0.1"], 0)
+        listening.listen(sockets)
+        port = sockets[0].getsockname()[1]
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(
+            f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
+            f"Sec-WebSocket-Protocol: {SUBPROTOCOL}\r\n\r\n".encode()
+            + data_at_once
+        )
+        answer = await reader.readuntil(b"\r\n\r\n")
+        writer.write(data)
+        answer += await reader.read()
+        writer.close()
+        for one in sockets:
+            one.close()
+        await listening.close()
+        await serving.close()
+        return answer, hub.drops.by_reason
+
+    answer, drops = asyncio.run(send(b"", frame * 1000))
+    assert answer.startswith(b"HTTP/1.1 101")
+    assert CLOSE_LIMIT.to_bytes(2, "big") in answer
+    assert drops == {"web_flood": 1}
+    answer, _ = asyncio.run(send(frame, b""))
+    assert answer.startswith(b"HTTP/1.1 400")
 
 
 def test_listening_sockets_share_one_free_port() -> None:
