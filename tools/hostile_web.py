@@ -1,0 +1,331 @@
+"""Attacks on the web gateway by peers without a key, while an honest browser drives an e-stop again and again.
+
+    python tools/hostile_web.py --json --quick
+    python tools/hostile_web.py --case pings --case large
+
+The session is `iris-session serve handover` on loopback, so that everything an attacker may send reaches the gateway
+without TLS. For each case, at 0.1 and at 5 MB/s, an e-stop of the honest browser must reach the session and come back
+as an event within 200 ms, or three times what it takes without the attack; its WebSocket must stay open. After all
+cases the gateway may keep 50 MiB and the log may have grown by 100 lines. Prints progress to standard error, and as its
+last line one JSON object with `--json`, else a table; exit status 0 if all is well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import secrets
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any, Final
+
+import aiohttp
+import psutil
+
+from iris_session.protocol.client_messages import ClientMessage, EStop, Heartbeat, Hello, wrap_message
+from iris_session.protocol.codec import decode_server, encode_client
+from iris_session.protocol.server_messages import EStopChanged, Event, Welcome
+from iris_session.web import wire
+
+MIB: Final = 1 << 20
+START_S: Final = 90.0
+#: Longest time for an e-stop to come back, and its share of that without the attack [ms].
+STOP_MS: Final = 200.0
+STOP_SHARE: Final = 3.0
+LOST_S: Final = 5.0
+STOP_PERIOD_S: Final = 0.3
+MEMORY_MIB: Final = 50.0
+LOG_LINES: Final = 100
+RATES: Final = (0.1e6, 5e6)
+#: Frames of WebSockets by case: first byte (mark of the end, opcode), and bytes of the payload (0, or 126 and more).
+FRAMES: Final = {
+    "large": (0x82, 47_000),
+    "too_large": (0x82, 60_000),
+    "pings": (0x89, 0),
+    "pongs": (0x8A, 0),
+    "fragments": (0x00, 0),
+}
+OTHERS: Final = ("half_open", "unread")
+CASES: Final = (*FRAMES, *OTHERS)
+
+
+# --- the honest browser -----------------------------------------------------------------------------------------------
+
+
+class NotWelcomedError(Exception):
+    """The session did not welcome the honest browser."""
+
+
+class HonestBrowser:
+    """A browser that joins, beats, and stops."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self._socket = socket
+        self.epoch = 0
+        self.stops = 0
+        self._changed = asyncio.Event()
+
+    @property
+    def is_closed(self) -> bool:
+        return self._socket.closed
+
+    async def send(self, message: ClientMessage) -> None:
+        """Send a message on the control channel."""
+        envelope = encode_client(wrap_message(message, self.epoch))
+        await self._socket.send_bytes(wire.encode_frames(wire.CONTROL, [envelope]))
+
+    async def read(self) -> None:
+        """Read until the WebSocket is closed."""
+        async for message in self._socket:
+            channel, frames = wire.decode_frames(message.data)
+            if channel != wire.CONTROL:
+                continue
+            answer = decode_server(frames[0]).message
+            if isinstance(answer, Welcome):
+                self.epoch = answer.connection_epoch
+            elif isinstance(answer, Event) and isinstance(answer.body, EStopChanged):
+                self.stops += 1
+            self._changed.set()
+
+    async def beat(self) -> None:
+        """Send heartbeats."""
+        while not self.is_closed:
+            await self.send(Heartbeat())
+            await asyncio.sleep(0.3)
+
+    async def wait(self, condition: Callable[[], bool], seconds: float) -> bool:
+        """Return whether a condition came true in time."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while not condition():
+                    self._changed.clear()
+                    await self._changed.wait()
+        return condition()
+
+    async def measure_stop(self) -> float:
+        """Return the time from an e-stop to its event [ms], infinity for one that is lost."""
+        before, began = self.stops, time.perf_counter()
+        try:
+            await self.send(EStop())
+        except ConnectionError:
+            return float("inf")
+        is_there = await self.wait(lambda: self.stops > before, LOST_S)
+        return (time.perf_counter() - began) * 1e3 if is_there else float("inf")
+
+
+@contextlib.asynccontextmanager
+async def open_honest(page: str) -> AsyncIterator[HonestBrowser]:
+    """An honest browser that has joined as an operator."""
+    async with (
+        aiohttp.ClientSession() as http,
+        http.ws_connect(f"{page}v1/session", protocols=[wire.SUBPROTOCOL], max_msg_size=0) as socket,
+    ):
+        browser = HonestBrowser(socket)
+        reading = asyncio.create_task(browser.read())
+        hello = Hello(
+            "operator", "honest", secret=secrets.token_bytes(32), alignment="not_needed", devices=("desktop",)
+        )
+        await browser.send(hello)
+        if not await browser.wait(lambda: browser.epoch > 0, 30.0):
+            raise NotWelcomedError
+        beating = asyncio.create_task(browser.beat())
+        try:
+            yield browser
+        finally:
+            for task in (reading, beating):
+                task.cancel()
+
+
+# --- attacks ----------------------------------------------------------------------------------------------------------
+
+
+def make_frame(first: int, length: int) -> bytes:
+    """Return a frame of a client (RFC 6455, section 5.2), masked with zeros."""
+    if not length:
+        return struct.pack(">BB", first, 0x80) + bytes(4)
+    head = struct.pack(">BBH", first, 0x80 | 126, length)
+    n_pad = length - 29  # what is around it: 6 bytes of the web channel, 23 of the envelope
+    envelope = b"\x94\x01\x00\xa0\x82\xa4type\xa5hello\xa3pad\xc5" + struct.pack(">H", n_pad) + bytes(n_pad)
+    return head + bytes(4) + wire.encode_frames(wire.CONTROL, [envelope])
+
+
+async def read_all(reader: asyncio.StreamReader) -> None:
+    """Read what comes until the end, so that the attacker's own connection holds nothing up."""
+    with contextlib.suppress(OSError):
+        while await reader.read(1 << 16):
+            pass
+
+
+async def attack_with_frames(host: str, port: int, kind: str, bytes_per_s: float) -> None:
+    """Send frames of one kind on one WebSocket after the other, each opened as soon as the last is cut."""
+    frame = make_frame(*FRAMES[kind])
+    begin = make_frame(0x02, 0) if kind == "fragments" else b""  # the message whose empty rest follows
+    piece = frame * max(1, round(min(bytes_per_s * 0.02, 256e3) / len(frame)))
+    key = "dGhlIHNhbXBsZSBub25jZQ=="
+    request = (
+        f"GET /v1/session HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {wire.SUBPROTOCOL}\r\n\r\n"
+    ).encode()
+    while True:
+        with contextlib.suppress(OSError, asyncio.IncompleteReadError):
+            reader, writer = await asyncio.open_connection(host, port)
+            try:
+                writer.write(request)
+                await reader.readuntil(b"\r\n\r\n")
+                print("connected", flush=True)
+                writer.write(begin)
+                reading = asyncio.create_task(read_all(reader))
+                while not reading.done():
+                    writer.write(piece)
+                    await writer.drain()
+                    await asyncio.sleep(len(piece) / bytes_per_s)
+            finally:
+                writer.close()
+        await asyncio.sleep(0.02)
+
+
+async def attack_with_sockets(host: str, port: int, kind: str, n: int = 200) -> None:
+    """Keep connections that say nothing (`half_open`), or that request the page and read nothing (`unread`)."""
+    request = b"" if kind == "half_open" else f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode()
+    writers: list[asyncio.StreamWriter] = []
+    while True:
+        with contextlib.suppress(OSError):
+            reader, writer = await asyncio.open_connection(host, port, limit=1)
+            reader._transport.pause_reading()  # type: ignore[attr-defined]
+            print("connected", flush=True)
+            writer.write(request * 8)
+            writers.append(writer)
+        if len(writers) > n:
+            writers.pop(0).close()
+        await asyncio.sleep(0.01)
+
+
+def attack(kind: str, host: str, port: int, bytes_per_s: float) -> None:
+    """Attack until the process is ended."""
+    if kind in FRAMES:
+        asyncio.run(attack_with_frames(host, port, kind, bytes_per_s))
+    else:
+        asyncio.run(attack_with_sockets(host, port, kind))
+
+
+# --- the lab ----------------------------------------------------------------------------------------------------------
+
+
+async def measure(page: str, browser: HonestBrowser, seconds: float) -> tuple[float, int]:
+    """Return the longest time of an e-stop [ms], and how many there were."""
+    until, slowest, n = time.monotonic() + seconds, 0.0, 0
+    while time.monotonic() < until and not browser.is_closed:
+        slowest, n = max(slowest, await browser.measure_stop()), n + 1
+        await asyncio.sleep(STOP_PERIOD_S)
+    return slowest, n
+
+
+async def run_case(kind: str, port: int, bytes_per_s: float, seconds: float) -> dict[str, Any]:
+    """Return what an honest browser has measured during an attack."""
+    page = f"http://127.0.0.1:{port}/"
+    async with open_honest(page) as browser:
+        usual, _ = await measure(page, browser, seconds)
+        command = [sys.executable, __file__, "--attack", kind, str(port), str(bytes_per_s)]
+        attacker = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE)
+        try:
+            assert attacker.stdout is not None
+            await attacker.stdout.readline()  # it is connected
+            slowest, n = await measure(page, browser, seconds)
+            is_open = not browser.is_closed
+        finally:
+            attacker.kill()
+            await attacker.wait()
+    ok = is_open and slowest <= max(STOP_MS, STOP_SHARE * usual)
+    row = {"case": kind, "mb_per_s": bytes_per_s / 1e6, "stops": n, "usual_ms": round(usual, 1)}
+    return {**row, "slowest_ms": round(slowest, 1), "is_open": is_open, "ok": ok}
+
+
+def find_gateway(server: subprocess.Popen[bytes]) -> psutil.Process:
+    """Return the gateway process of a session."""
+    for child in psutil.Process(server.pid).children():
+        if "iris_session.web.gateway" in child.cmdline():
+            return child
+    raise SystemExit("hostile_web: the session has no gateway")
+
+
+def wait_for_page(server: subprocess.Popen[bytes], port: int) -> None:
+    """Wait until the gateway answers. Raises `SystemExit`."""
+    until = time.monotonic() + START_S
+    while time.monotonic() < until and server.poll() is None:
+        with contextlib.suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/v1/info", timeout=5.0):
+            return
+        time.sleep(0.2)
+    raise SystemExit("hostile_web: the session did not start")
+
+
+def run(cases: list[str], seconds: float) -> dict[str, Any]:
+    """Run cases against one session. Return the figures."""
+    with tempfile.TemporaryDirectory() as folder, (Path(folder) / "log").open("wb") as log:
+        port = 20_000 + os.getpid() % 20_000
+        server = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "iris_session.cli.main", "serve", "handover", "--no-record", "--no-beacon"),
+                *("--control-port", "0", "--state-port", "0", "--web-port", str(port)),
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=log,
+            env={**os.environ, "IRIS_HOME": str(Path(folder) / "home")},
+        )
+        try:
+            wait_for_page(server, port)
+            gateway, rows = find_gateway(server), []
+            base_mib = gateway.memory_info().rss / MIB
+            for kind in cases:
+                for bytes_per_s in RATES if kind in FRAMES else RATES[:1]:
+                    try:
+                        rows.append(asyncio.run(run_case(kind, port, bytes_per_s, seconds)))
+                    except NotWelcomedError:
+                        rows.append({"case": kind, "mb_per_s": bytes_per_s / 1e6, "is_open": False, "ok": False})
+                    print(f"hostile_web: {rows[-1]}", file=sys.stderr, flush=True)
+            time.sleep(2.0)
+            kept_mib = gateway.memory_info().rss / MIB - base_mib
+            n_lines = (Path(folder) / "log").read_bytes().count(b"\n")
+        finally:
+            server.send_signal(signal.SIGINT)
+            server.wait(60.0)
+    ok = all(row["ok"] for row in rows) and kept_mib <= MEMORY_MIB and n_lines <= LOG_LINES
+    return {"cases": rows, "kept_mib": round(kept_mib, 1), "log_lines": n_lines, "ok": ok}
+
+
+def main() -> int:
+    """Run the tool. Return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.add_argument("--quick", action="store_true", help="3 s a measurement instead of 10")
+    parser.add_argument("--case", action="append", choices=CASES, help="run this case only; may be repeated")
+    parser.add_argument("--attack", nargs=3, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.attack:
+        kind, port, bytes_per_s = options.attack
+        attack(kind, "127.0.0.1", int(port), float(bytes_per_s))
+        return 0
+    figures = run(options.case or list(CASES), 3.0 if options.quick else 10.0)
+    if options.json:
+        print(json.dumps(figures))
+    else:
+        print(
+            "| case | MB/s | e-stops | slowest, usual [ms] | slowest [ms] | open | ok |\n|---|---|---|---|---|---|---|"
+        )
+        for row in figures["cases"]:
+            print("| " + " | ".join(str(value) for value in row.values()) + " |")
+        print(f"the gateway keeps {figures['kept_mib']} MiB, the log has {figures['log_lines']} lines")
+    return 0 if figures["ok"] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
