@@ -74,7 +74,7 @@ class DriftConfig:
     max_window_ns: int = 20_000_000_000
     max_reference_ns: int = 90_000_000_000
     min_in_window: int = 5
-    min_change_m: float = 0.005
+    min_change_m: float = 0.006
     min_difference_m: float = 0.010
     min_turn_rad: float = math.radians(1.0)
     same_place_m: float = 0.06

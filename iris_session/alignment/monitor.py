@@ -48,8 +48,11 @@ _MAX_BESIDE: Final = 32  # names in one message
 MAX_HEAD_POSES: Final = 128
 #: A head pose further away in time is of no use: at 0.5 m/s a head moves 25 mm meanwhile.
 MAX_HEAD_OFFSET_NS: Final = 50_000_000
-#: Velocity is measured over so long before and after an observation: with 0.5 mm of noise per pose, to 5 mm/s.
-_MOTION_SPAN_NS: Final = 220_000_000
+#: Velocity is measured over so long before and after an observation: with 0.5 mm of noise per pose, to 10 mm/s; of a
+#: client with few head samples over longer.
+_MOTION_SPAN_NS: Final = 100_000_000
+_SPARSE_SPAN_NS: Final = 220_000_000
+_MIN_STEPS: Final = 3
 _MIN_MOTION_S: Final = 0.01
 
 
@@ -99,14 +102,9 @@ class HeadHistory:
         T = self.find_nearest(capture_ns, tracking_epoch)
         if T is None:
             return None
-        around = [
-            head
-            for head in self._heads
-            if abs(head.capture_ns - capture_ns) <= _MOTION_SPAN_NS
-            and head.tracking_epoch == tracking_epoch
-            and is_rigid(head.T_tracking_head)
-        ]
-        steps = [_Step.between(a, b) for a, b in pairwise(around) if b.capture_ns > a.capture_ns]
+        steps = self._list_steps(capture_ns, tracking_epoch, _MOTION_SPAN_NS)
+        if len(steps) < _MIN_STEPS:
+            steps = self._list_steps(capture_ns, tracking_epoch, _SPARSE_SPAN_NS)
         if len(steps) > 1:
             steps.remove(max(steps, key=_Step.measure_size))
         seconds = sum(step.seconds for step in steps)
@@ -114,6 +112,16 @@ class HeadHistory:
             return None
         moved = np.sum([(*step.moved, *step.turned) for step in steps], axis=0) / seconds
         return HeadMotion(T, to_vec3(moved[:3]), to_vec3(moved[3:]))
+
+    def _list_steps(self, capture_ns: int, tracking_epoch: int, span_ns: int) -> list[_Step]:
+        around = [
+            head
+            for head in self._heads
+            if abs(head.capture_ns - capture_ns) <= span_ns
+            and head.tracking_epoch == tracking_epoch
+            and is_rigid(head.T_tracking_head)
+        ]
+        return [_Step.between(a, b) for a, b in pairwise(around) if b.capture_ns > a.capture_ns]
 
 
 class _Step(NamedTuple):
