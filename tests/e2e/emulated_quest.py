@@ -39,10 +39,19 @@ IWER: Final = WEB_CLIENT / "node_modules" / "iwer" / "build" / "iwer.min.js"
 INSTALL: Final = """
 // A headset with 30 frames a second: without a graphics card more leave nothing for the session on the same machine.
 const request = window.requestAnimationFrame.bind(window);
-window.requestAnimationFrame = (callback) => setTimeout(() => request(callback), 25);
+window.requestAnimationFrame = (callback) => setTimeout(() => request((time) => (tremble(), callback(time))), 25);
 window.quest = new IWER.XRDevice(IWER.metaQuest3);
 quest.installRuntime({ forceInstall: true });
-// The emulator says of every pose that it is a guess; headsets say so of devices that they have lost.
+// Measured poses are never the same twice, to the last bit: these move by less than 0.1 mm, unless they are frozen.
+window.isFrozen = false;
+let beat = 0;
+const tremble = () => {
+  if (isFrozen) return;
+  const shift = 5e-5 * (Math.cos(beat + 1) - Math.cos(beat++));
+  const inputs = [...Object.values(quest.controllers), ...Object.values(quest.hands)];
+  for (const { position } of [quest, ...inputs]) position.x += shift;
+};
+// The emulator says of every pose that it is an estimate; headsets say so of devices that their cameras do not see.
 window.isGuess = false;
 Object.defineProperty(XRPose.prototype, "emulatedPosition", { get: () => window.isGuess });
 window.place = (input, [x, y, z, qx, qy, qz, qw]) => {

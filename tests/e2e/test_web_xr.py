@@ -11,7 +11,17 @@ import pytest
 from anchors.pose import PoseTuple, compose
 from iris_session.protocol.names import AlignmentKind
 from tests.e2e.browser import Page, join_as
-from tests.e2e.emulated_quest import HEAD, HEADSET, INSTALL, IWER, T_WORLD_TRACKING, EmulatedQuest, aim_at, holder
+from tests.e2e.emulated_quest import (
+    FEEDBACK,
+    HEAD,
+    HEADSET,
+    INSTALL,
+    IWER,
+    T_WORLD_TRACKING,
+    EmulatedQuest,
+    aim_at,
+    holder,
+)
 from tests.e2e.scenario import Scenario, is_driven
 
 pytestmark = pytest.mark.e2e
@@ -19,6 +29,8 @@ pytestmark = pytest.mark.e2e
 #: Motion of the hand in the world, 10 cm long.
 MOTION_M: Final = (0.0, 0.06, 0.08)
 FOLLOWS_M: Final = 0.005
+#: How the page shows the right controller.
+SHOWN_HAND: Final = f"{HEADSET}.props.props.get('right')"
 
 
 @pytest.fixture
@@ -65,10 +77,18 @@ def lease_in_ar(quest: EmulatedQuest) -> PoseTuple:
 
 
 def test_a_robot_is_driven_in_ar(quest: EmulatedQuest) -> None:
-    """Enter, be aligned by a director, point, lease, squeeze, move, release, stop."""
+    """Enter, be aligned by a director, point, lease, squeeze, move, be out of sight, squeeze again, release, stop."""
     host = quest.host
     pose = lease_in_ar(quest)
     quest.pull_robot("left", pose, MOTION_M)
+
+    quest.evaluate("window.isGuess = true")
+    quest.wait(f"{FEEDBACK.format('left')}.hold_reason === 'emulated'")
+    quest.run_until(lambda: not is_driven(host, "left", quest.person.id), "it holds while the headset guesses")
+    quest.wait(f"{SHOWN_HAND}.object.visible && {SHOWN_HAND}.words.shown.includes('out of sight')")
+    quest.evaluate("window.isGuess = false")
+    quest.wait(f"{SHOWN_HAND}.words.shown.includes('squeeze again')")
+    quest.engage("left")
 
     quest.press("squeeze", 0.0)
     quest.run_until(lambda: not is_driven(host, "left", quest.person.id), "the robot holds")
@@ -114,9 +134,6 @@ def test_a_lease_goes_into_vr_and_back(quest: EmulatedQuest) -> None:
     quest.evaluate("quest.updateVisibilityState('visible')")
     quest.press("squeeze", 0.0)
     quest.wait("irisSession.state.feedback.get('left').hold_reason === 'clutch_open'")
-    quest.evaluate("window.isGuess = true")
-    quest.wait("irisSession.state.feedback.get('left').hold_reason === 'untracked'")
-    quest.evaluate("window.isGuess = false")
 
     alignment = quest.person.alignment
     assert alignment

@@ -54,6 +54,7 @@ export interface SampleInput {
   objects?: string[];
   kind?: wire.SampleKind;
   tracked?: boolean;
+  emulated?: boolean;
   clutch?: boolean;
   gripper?: number | null;
   buttons?: number;

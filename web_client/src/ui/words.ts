@@ -2,9 +2,9 @@
 
 import type { Filled } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { BudgetClass, StreamFault } from "../protocol/messages.g.ts";
+import { BudgetClass, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
 
-const HOLD_REASONS: Record<string, string> = {
+const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string> = {
   no_lease: "no participant has its lease",
   no_sample: "its holder sends nothing yet",
   clutch_open: "clutch open",
@@ -21,6 +21,10 @@ const HOLD_REASONS: Record<string, string> = {
   scene_changed: "the scene changed: open and close the clutch",
   intervention: "a person took over",
   rearm: "open and close the clutch",
+  emulated: "out of sight, its position is a guess: bring the hand into view, open and close the clutch",
+  zero_pose: "the device has no pose yet: wait until it is tracked, open and close the clutch",
+  frozen: "the pose of the device is frozen: move or wake it, open and close the clutch",
+  jump: "tracking jumped: open and close the clutch",
 };
 
 const LEASE_MODES: Record<string, string> = {

@@ -3,6 +3,9 @@
 // Time of capture is that at which the frame's callback begins. WebXR predicts poses for the time of display and tells
 // neither that time nor when the sensors were read; the callback lies between them, and the session wants the time of
 // capture, never that of display.
+//
+// `emulatedPosition` is true of a pose whose position is not actively tracked: an estimate, or the last known one (WebXR Device
+// API, "populate the pose"). A ray has a fixed place on its controller, so it is measured when the grip is.
 
 import { nowMs } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
@@ -10,6 +13,7 @@ import { type FrameReading, type InputReading, packButtons, readGesture, type Si
 
 /** Least time between two readings of all joints of the hands [ms]: 50 poses are 3 kB. */
 const JOINTS_PERIOD_MS = 33;
+const LOST = { tracked: false, emulated: false };
 
 /** Reads frames of one session. Keeps the last known poses: a lost device is reported where it was, as not tracked. */
 export class FrameReader {
@@ -33,7 +37,8 @@ export class FrameReader {
       inputs.push(this.readInput(frame, space, source, side, wantsJoints));
     }
     const stops = [...this.session.inputSources].filter(isStopPressed);
-    return { capture_ms, head: this.head, headTracked: isTracked(viewer), inputs, stops };
+    const { tracked: headTracked, emulated: headEmulated } = judgePoses(viewer);
+    return { capture_ms, head: this.head, headTracked, headEmulated, inputs, stops };
   }
 
   private readInput(frame: XRFrame, space: XRReferenceSpace, source: XRInputSource, side: Side, wantsJoints: boolean): InputReading {
@@ -55,7 +60,7 @@ export class FrameReader {
       kind,
       ray,
       pose: this.poses.get(key) ?? null,
-      tracked: isTracked(at) && isTracked(aim),
+      ...judgePoses(at, aim),
       trigger: buttons[0]?.value ?? 0,
       squeeze: buttons[1]?.value ?? 0,
       buttons: packButtons(buttons.map(({ pressed }) => pressed)),
@@ -65,7 +70,7 @@ export class FrameReader {
   }
 
   /** Read a hand: its pose is that of the wrist. */
-  private readHand(frame: XRFrame, space: XRReferenceSpace, hand: XRHand, key: string): Pick<InputReading, "pose" | "tracked" | "trigger" | "squeeze" | "tip"> {
+  private readHand(frame: XRFrame, space: XRReferenceSpace, hand: XRHand, key: string): Pick<InputReading, "pose" | "tracked" | "emulated" | "trigger" | "squeeze" | "tip"> {
     const find = (name: XRHandJoint): XRJointPose | undefined => {
       const joint = hand.get(name);
       return joint && frame.getJointPose?.(joint, space);
@@ -76,8 +81,8 @@ export class FrameReader {
     const [thumb, index, middle, knuckle, at] = tips.map((joint) => joint && toPose(joint.transform.position, joint.transform.orientation)[0]);
     const isWhole = thumb && index && middle && knuckle && at;
     const gesture = isWhole ? readGesture({ thumb, index, middle, knuckle, wrist: at }) : { trigger: 0, squeeze: 0 };
-    const tracked = Boolean(isWhole) && isTracked(wrist);
-    return { pose: this.poses.get(key) ?? null, tracked, tip: (tracked && index) || null, ...gesture };
+    const { tracked, emulated } = isWhole ? judgePoses(wrist) : LOST;
+    return { pose: this.poses.get(key) ?? null, tracked, emulated, tip: (tracked && index) || null, ...gesture };
   }
 }
 
@@ -86,9 +91,11 @@ function isStopPressed({ gamepad }: XRInputSource): boolean {
   return (packButtons((gamepad?.buttons ?? []).map(({ pressed }) => pressed)) & STOP_BUTTONS) !== 0;
 }
 
-/** Return whether a pose was measured: there is one, and its position is not a guess. */
-function isTracked(pose: XRPose | XRViewerPose | null | undefined): boolean {
-  return pose !== null && pose !== undefined && !pose.emulatedPosition;
+/** Return whether what has these poses is measured, or its position is an estimate. Neither: it is lost. */
+function judgePoses(...poses: readonly (XRPose | null | undefined)[]): typeof LOST {
+  if (poses.some((pose) => !pose)) return LOST;
+  const emulated = poses.some((pose) => pose?.emulatedPosition);
+  return { tracked: !emulated, emulated };
 }
 
 /** Return the poses of a hand's joints, as in `Sample.hand_joints`; none unless all are known. */

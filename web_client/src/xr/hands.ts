@@ -6,6 +6,7 @@
 // are touched, only answers are given. Buttons that are held when a hand appears count from their next press; only the e-stop counts always.
 
 import type { SampleInput } from "../core/api.ts";
+import type * as wire from "../protocol/messages.g.ts";
 import { Grips } from "./grips.ts";
 import type { MenuItem } from "./picture_places.ts";
 import type { Answer } from "./question.ts";
@@ -24,6 +25,8 @@ const GAP_MS = 500;
 const GRANTED_MS = 2000;
 /** The clutch of a hand that has got a robot stays open this long [ms]: a session engages after it has seen it open. */
 const OPEN_MS = 100;
+/** Samples of an estimated pose name the robot of the hand for this long [ms]: it holds and says why. More would be as many rejections. */
+const EMULATED_MS = 500;
 
 /** What a hand can point at, and press, that is no robot. */
 export type Target = Answer | MenuItem;
@@ -61,6 +64,8 @@ interface Hand {
   squeeze: boolean;
   /** The squeeze was held when the hand appeared, and has not been let go since. */
   mustLetGo: boolean;
+  /** The same of the trigger. */
+  mustLetGoTrigger: boolean;
   buttons: number;
   /** When the trigger was pressed at one's own robot [ms], null: it was not. */
   pressed_ms: number | null;
@@ -78,6 +83,8 @@ export class Hands {
   private readonly wanted = new Map<Side, { robot: string; until_ms: number }>();
   /** When each hand got its robot [ms]. */
   private readonly bound_ms = new Map<Side, number>();
+  /** Since when the position of a device is an estimate [ms]. */
+  private readonly emulated_ms = new Map<string, number>();
   private readonly grips = new Grips();
   /** What is asked of the gripper of each hand in this frame. */
   private readonly grasps = new Map<Side, number | null>();
@@ -127,6 +134,13 @@ export class Hands {
     return this.hands.get(side)?.squeeze ?? false;
   }
 
+  /** Return what a hand holds that does not count before it is let go, null: nothing. */
+  findIgnored(side: Side): "squeeze" | "trigger" | null {
+    const hand = this.hands.get(side);
+    if (hand?.mustLetGo) return "squeeze";
+    return hand?.mustLetGoTrigger && !hand.squeeze ? "trigger" : null;
+  }
+
   /** Return how far a hand is on the way to release its robot, from 0 to 1. */
   releaseShare(side: Side, now_ms: number): number {
     const since = this.hands.get(side)?.pressed_ms ?? null;
@@ -137,17 +151,22 @@ export class Hands {
   makeSamples(reading: FrameReading, isVisible: boolean): SampleInput[] {
     const { capture_ms } = reading;
     const samples: SampleInput[] = [];
-    if (reading.head) samples.push({ device: "head", pose: reading.head, capture_ms, tracked: isVisible && reading.headTracked });
+    const judge = (tracked: boolean, emulated: boolean) => ({ tracked: isVisible && (tracked || emulated), ...(isVisible && emulated && { emulated }) });
+    if (reading.head) samples.push({ device: "head", pose: reading.head, capture_ms, ...judge(reading.headTracked, reading.headEmulated) });
     for (const input of reading.inputs) {
       if (!input.pose) continue;
       const { side } = input;
-      const robot = this.driven.get(side);
+      const device: wire.Device = `${input.kind}/${side}`;
+      if (!input.emulated) this.emulated_ms.delete(device);
+      else if (!this.emulated_ms.has(device)) this.emulated_ms.set(device, capture_ms);
+      const isNamed = capture_ms - (this.emulated_ms.get(device) ?? capture_ms) < EMULATED_MS;
+      const robot = isNamed ? this.driven.get(side) : undefined;
       const clutch = this.isSqueezing(side) && capture_ms - (this.bound_ms.get(side) ?? 0) >= OPEN_MS;
       samples.push({
-        device: `${input.kind}/${side}`,
+        device,
         pose: input.pose,
         capture_ms,
-        tracked: isVisible && input.tracked,
+        ...judge(input.tracked, input.emulated),
         robots: robot === undefined ? [] : [robot],
         clutch,
         gripper: clutch ? (this.grasps.get(side) ?? null) : null,
@@ -164,11 +183,13 @@ export class Hands {
     const isNew = before?.kind !== kind;
     const isSqueezed = isPressed(input.squeeze, isNew || before.squeeze || before.mustLetGo);
     const mustLetGo = isSqueezed && (isNew || before.mustLetGo);
+    const trigger = isPressed(input.trigger, isNew || before.trigger);
     const hand: Hand = {
       kind,
-      trigger: isPressed(input.trigger, isNew || before.trigger),
+      trigger,
       squeeze: isSqueezed && !mustLetGo,
       mustLetGo,
+      mustLetGoTrigger: trigger && (isNew || before.mustLetGoTrigger),
       buttons,
       pressed_ms: isNew ? null : before.pressed_ms,
       pressedAt: isNew ? "" : before.pressedAt,

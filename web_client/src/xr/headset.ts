@@ -22,7 +22,7 @@ import { type Chain, findPointed, listChains } from "./pointing.ts";
 import { Props } from "./props.ts";
 import { type FrameReading, type Side, toWorldRay, type Vec3 } from "./reading.ts";
 import { WristStop } from "./stop.ts";
-import { awaitsConsent, describeAlignment, describeRobot, describeUrgent, drawBar, findPulse, isPlaced, wrap } from "./words.ts";
+import { awaitsConsent, describeAlignment, describeHand, describeRobot, describeUrgent, drawBar, findPulse, isPlaced, wrap } from "./words.ts";
 
 export type Mode = Exclude<PageMode, "screen">;
 
@@ -32,6 +32,7 @@ const PANEL_ABOVE_M = 0.18;
 /** Time that a denial is shown [ms], and between two updates of the panels. */
 const NOTICE_MS = 5000;
 const PANEL_PERIOD_MS = 100;
+const SIDES = ["left", "right"] as const;
 const URGENT_COLOR = "#e0a33a";
 const FREE_COLOR = "#8a93a3";
 
@@ -327,6 +328,10 @@ export class Headset {
     const driven = [...this.hands.driven].map(([side, robot]) => `${side} hand: ${robot}`);
     const color = participantColor(state.selfId);
     this.props.status.setText([state.self?.name ?? "", ...wrap(describeAlignment(alignment)), ...driven], color);
+    for (const side of SIDES) {
+      const input = reading.inputs.find((one) => one.side === side);
+      this.props.describeHand(side, input ? describeHand(input.emulated, this.marks.isActive ? null : this.hands.findIgnored(side)) : []);
+    }
     this.pictures.update();
     const robots = session?.robots ?? [];
     for (const name of this.labels.keys()) if (!robots.some((robot) => robot.name === name)) this.removePanel(name);
@@ -338,7 +343,7 @@ export class Headset {
     const lease = state.lease(name);
     const isOwn = lease !== undefined && (lease.holder === state.selfId || lease.sub_holders.includes(state.selfId));
     const holdReason = (isOwn ? state.feedback.get(name)?.hold_reason : undefined) ?? state.status?.robots.find((robot) => robot.name === name)?.hold_reason ?? "";
-    const sides = (["left", "right"] as const).filter((side) => this.pointed[side] === name);
+    const sides = SIDES.filter((side) => this.pointed[side] === name);
     const lines = describeRobot({
       name,
       lease,

@@ -9,6 +9,10 @@ import { type FrameReading, type InputReading, type Ray, type Side, toRow, type 
 import { STOP_RADIUS_M } from "./stop.ts";
 
 const COLOR = 0x8fa3bf;
+/** Of a device whose position is an estimate, and how much of it covers what is behind. */
+const EMULATED_COLOR = 0x8c8c8c;
+const EMULATED_OPACITY = 0.4;
+const WORDS_COLOR = "#e0a33a";
 const RAY_COLOR = 0xc9d2e0;
 const HIT_COLOR = 0x35d0ba;
 const STOP_COLOR = "#d9363e";
@@ -21,12 +25,16 @@ const URGENT_AT = new Vector3(0, -0.22, -0.9);
 /** The same while the eyes look at what the hands do. */
 const RAISED_AT = new Vector3(0, 0.27, -0.9);
 const ABOVE_HAND_M = 0.13;
+/** Place of the words about a hand, below it [m]. */
+const BELOW_HAND_M = 0.06;
 
 interface Prop {
   object: Group;
   controller: Mesh;
   hand: Mesh;
   ray: Line;
+  /** What the person has to know about this hand. */
+  words: Label;
 }
 
 /** The props of one headset. `rig` is the tracking frame. */
@@ -48,10 +56,7 @@ export class Props {
     this.rig.name = "headset";
     this.stopLabel.setText(["STOP"], STOP_COLOR);
     this.stop.add(this.stopLabel.sprite);
-    for (const { sprite } of [this.urgent, this.status, this.stopLabel]) {
-      sprite.material.depthTest = false;
-      sprite.renderOrder = 20;
-    }
+    for (const label of [this.urgent, this.status, this.stopLabel]) showThrough(label);
     this.rig.add(this.camera, this.urgent.sprite, this.status.sprite, this.stop);
   }
 
@@ -63,11 +68,16 @@ export class Props {
     this.rig.updateMatrixWorld();
   }
 
+  /** Say something about a hand, beside it. */
+  describeHand(side: Side, lines: readonly string[]): void {
+    this.props.get(side)?.words.setText(lines, WORDS_COLOR);
+  }
+
   /** Move everything to where a frame has it. `hits`: how far the ray of a hand goes until it meets something [m]. `stop`: centre of the ball. */
   move(reading: FrameReading, hits: Partial<Record<Side, number>>, stop: Vec3 | null): void {
     this.stop.visible = stop !== null;
     if (stop) moveTo(this.stop, stop);
-    for (const prop of this.props.values()) prop.object.visible = prop.ray.visible = false;
+    for (const { object, ray } of this.props.values()) object.visible = ray.visible = false;
     for (const input of reading.inputs) this.moveInput(input, hits[input.side]);
     if (reading.head) {
       const [x, y, z, qx, qy, qz, qw] = toRow(reading.head) as [number, number, number, number, number, number, number];
@@ -81,9 +91,7 @@ export class Props {
   }
 
   dispose(): void {
-    this.urgent.dispose();
-    this.status.dispose();
-    this.stopLabel.dispose();
+    for (const label of [this.urgent, this.status, this.stopLabel, ...[...this.props.values()].map(({ words }) => words)]) label.dispose();
     this.stop.geometry.dispose();
     this.stop.material.dispose();
     this.rig.removeFromParent();
@@ -95,14 +103,18 @@ export class Props {
     }
   }
 
-  private moveInput({ side, kind, pose, tracked, ray }: InputReading, hit: number | undefined): void {
+  private moveInput({ side, kind, pose, tracked, emulated, ray }: InputReading, hit: number | undefined): void {
     const prop = this.props.get(side) ?? this.addProp(side);
     if (pose) {
       const [x, y, z, qx, qy, qz, qw] = toRow(pose) as [number, number, number, number, number, number, number];
       prop.object.position.set(x, y, z);
       prop.object.quaternion.set(qx, qy, qz, qw);
     }
-    prop.object.visible = pose !== null && tracked;
+    prop.object.visible = pose !== null && (tracked || emulated);
+    const material = prop.controller.material as MeshBasicMaterial;
+    material.color.set(emulated ? EMULATED_COLOR : COLOR);
+    material.opacity = emulated ? EMULATED_OPACITY : 1;
+    prop.words.sprite.position.copy(prop.object.position).y -= BELOW_HAND_M;
     prop.controller.visible = kind === "controller";
     prop.hand.visible = kind === "hand";
     prop.ray.visible = ray !== null && tracked;
@@ -110,7 +122,7 @@ export class Props {
   }
 
   private addProp(side: Side): Prop {
-    const material = new MeshBasicMaterial({ color: COLOR });
+    const material = new MeshBasicMaterial({ transparent: true });
     const controller = new Mesh(new CapsuleGeometry(0.018, 0.09, 4, 12).rotateX(Math.PI / 2), material);
     const hand = new Mesh(new SphereGeometry(0.025, 16, 12), material);
     const geometry = new BufferGeometry();
@@ -119,11 +131,19 @@ export class Props {
     ray.frustumCulled = false;
     const object = new Group();
     object.add(controller, hand);
-    this.rig.add(object, ray);
-    const prop = { object, controller, hand, ray };
+    const words = new Label(0.012);
+    showThrough(words);
+    this.rig.add(object, ray, words.sprite);
+    const prop = { object, controller, hand, ray, words };
     this.props.set(side, prop);
     return prop;
   }
+}
+
+/** Draw a label over everything that is before it. */
+function showThrough({ sprite }: Label): void {
+  sprite.material.depthTest = false;
+  sprite.renderOrder = 20;
 }
 
 /** Place an object at a point of the wire's axes. */

@@ -17,9 +17,12 @@ export interface Ray {
 export interface InputReading {
   side: Side;
   kind: "controller" | "hand";
-  /** `T_tracking_device`, the last known one while `tracked` is false; null: never seen. */
+  /** `T_tracking_device`, the last known one of a device that is lost; null: never seen. */
   pose: wire.Pose | null;
+  /** The pose is measured. */
   tracked: boolean;
+  /** The position is the headset's estimate: cameras do not see the device. One that is lost is neither. */
+  emulated: boolean;
   /** Where it points, null while that is unknown. */
   ray: Ray | null;
   /** 0 open to 1 closed. */
@@ -40,6 +43,7 @@ export interface FrameReading {
   /** `T_tracking_head`, null: never seen. */
   head: wire.Pose | null;
   headTracked: boolean;
+  headEmulated: boolean;
   inputs: InputReading[];
   /** Devices whose button of the e-stop is pressed, tracked or not. */
   stops: readonly object[];

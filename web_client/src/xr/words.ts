@@ -48,6 +48,12 @@ export function describeConsent(requester: string, robot: string, left_ms: numbe
   return [...wrap(`${requester} asks you for ${robot}`), `point at an answer, press the trigger: ${Math.ceil(left_ms / 1000)} s`];
 }
 
+/** Return the lines beside a hand. `ignored`: what it holds that does not count before it is let go. */
+export function describeHand(emulated: boolean, ignored: "squeeze" | "trigger" | null): string[] {
+  if (emulated) return ["out of sight: its place is a guess", "bring it before the headset's cameras"];
+  return ignored === null ? [] : [`let go, then ${ignored === "squeeze" ? "squeeze" : "press"} again`];
+}
+
 type OwnAlignment = ParticipantInfo["alignment"] | undefined;
 
 /** Kinds of alignments that are good enough to look, not to drive. */

@@ -9,7 +9,7 @@ import { type FrameReading, BUTTON, type InputReading, STOP_BUTTONS } from "../.
 const POSE: InputReading["pose"] = [[0.1, 0.2, 1.0], [1, 0, 0, 0]];
 
 function input(fields: Partial<InputReading> = {}): InputReading {
-  return { side: "right", kind: "controller", pose: POSE, tracked: true, ray: null, trigger: 0, squeeze: 0, buttons: 0, tip: null, joints: [], ...fields };
+  return { side: "right", kind: "controller", pose: POSE, tracked: true, emulated: false, ray: null, trigger: 0, squeeze: 0, buttons: 0, tip: null, joints: [], ...fields };
 }
 
 const DEVICES = { left: {}, right: {} };
@@ -24,7 +24,7 @@ beforeEach(() => {
 function reading(...inputs: InputReading[]): FrameReading {
   now += 10;
   const stops = inputs.filter(({ buttons }) => buttons & STOP_BUTTONS).map(({ side }) => DEVICES[side]);
-  return { capture_ms: now, head: POSE, headTracked: true, inputs, stops };
+  return { capture_ms: now, head: POSE, headTracked: true, headEmulated: false, inputs, stops };
 }
 
 const NOTHING: Context = { held: [], tenures: new Map(), following: [], pointed: {}, aimed: {}, isEpisodeRunning: false, canPlace: false, isTouching: false };
@@ -369,6 +369,37 @@ describe("samples", () => {
     expect(find(reading(input({ kind: "hand", joints })), true)).toEqual(joints);
     expect(find(reading(input({ kind: "hand", joints })), false)).toBeUndefined();
     expect(find(reading(input({ kind: "hand" })), true)).toBeUndefined();
+  });
+
+  test("an estimated pose is sent as one, names its robot at first, and what is held through it counts from its next press", () => {
+    take("arm");
+    const context = { held: ["arm"] };
+    const guess = { tracked: false, emulated: true, squeeze: 1 };
+    sample(context, [input({ squeeze: 1 })]);
+    expect(sample(context, [input(guess)])).toMatchObject({ tracked: true, emulated: true, clutch: false, robots: ["arm"] });
+    for (let i = 0; i < 60; i++) sample(context, [input(guess)]);
+    expect(sample(context, [input(guess)])).toMatchObject({ emulated: true, robots: [] }); // the session knows
+    expect(hands.findIgnored("right")).toBe(null);
+    const back = sample(context, [input({ squeeze: 1 })]);
+    expect(back).toMatchObject({ tracked: true, clutch: false, robots: ["arm"] });
+    expect(back).not.toHaveProperty("emulated");
+    expect(hands.findIgnored("right")).toBe("squeeze");
+    expect([0, 1].map((squeeze) => sample(context, [input({ squeeze })])?.clutch)).toEqual([false, true]);
+    expect(hands.findIgnored("right")).toBe(null);
+    const covered = hands.makeSamples({ ...reading(input(guess)), headTracked: false, headEmulated: true }, false);
+    for (const one of covered) expect(one).not.toHaveProperty("emulated");
+  });
+
+  test("a press that begins while no frames come does not count, and is told until it is let go", () => {
+    const press = (trigger: number): Intent[] => step({ pointed: { right: "arm" } }, input({ trigger }));
+    press(0);
+    now += 600;
+    expect(press(1)).toEqual([]);
+    expect(hands.findIgnored("right")).toBe("trigger");
+    press(0);
+    expect(hands.findIgnored("right")).toBe(null);
+    expect(press(1)).toEqual([{ type: "acquire", robot: "arm" }]);
+    expect(hands.findIgnored("right")).toBe(null);
   });
 
   test("tracked is false while hidden, and for a pose that is not measured", () => {

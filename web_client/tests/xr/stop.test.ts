@@ -30,7 +30,7 @@ function jitter(at: Vec3): Vec3 {
 }
 
 function hand(side: InputReading["side"], fields: Partial<InputReading>): InputReading {
-  return { side, kind: "hand", pose: WRIST, tracked: true, ray: null, trigger: 0, squeeze: 0, buttons: 0, tip: null, joints: [], ...fields };
+  return { side, kind: "hand", pose: WRIST, tracked: true, emulated: false, ray: null, trigger: 0, squeeze: 0, buttons: 0, tip: null, joints: [], ...fields };
 }
 
 interface Frame {
@@ -45,7 +45,7 @@ function show(duration_ms: number, { tip, left = {}, finger_m = 0.17 }: Frame): 
   let stops = 0;
   for (const end = now + duration_ms; now < end; now += FRAME_MS) {
     const inputs = [hand("left", { pose: [[...jitter(WRIST[0])], WRIST[1]], ...left }), hand("right", { tip: tip && jitter(tip), pose: tip && [[tip[0] - finger_m, tip[1], tip[2]], [1, 0, 0, 0]] })];
-    const reading: FrameReading = { capture_ms: now, head: null, headTracked: true, inputs, stops: [] };
+    const reading: FrameReading = { capture_ms: now, head: null, headTracked: true, headEmulated: false, inputs, stops: [] };
     if (stop.update(reading)) stops += 1;
   }
   return stops;

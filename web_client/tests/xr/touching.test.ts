@@ -29,7 +29,7 @@ beforeEach(() => {
 });
 
 function controller(fields: Partial<InputReading> = {}): InputReading {
-  return { side: "right", kind: "controller", pose: IDENTITY, tracked: true, ray: null, trigger: 0, squeeze: 0, buttons: 0, tip: null, joints: [], ...fields };
+  return { side: "right", kind: "controller", pose: IDENTITY, tracked: true, emulated: false, ray: null, trigger: 0, squeeze: 0, buttons: 0, tip: null, joints: [], ...fields };
 }
 
 function hand(side: InputReading["side"], fingertip: Vec3, trigger = 0): InputReading {
@@ -38,7 +38,7 @@ function hand(side: InputReading["side"], fingertip: Vec3, trigger = 0): InputRe
 
 function reading(...inputs: InputReading[]): FrameReading {
   now += 20;
-  return { capture_ms: now, head: IDENTITY, headTracked: true, inputs, stops: [] };
+  return { capture_ms: now, head: IDENTITY, headTracked: true, headEmulated: false, inputs, stops: [] };
 }
 
 const step = (...inputs: InputReading[]): Outcome[] => touching.update(reading(...inputs), facts);

@@ -4,7 +4,7 @@ import { describe, expect, test } from "vitest";
 
 import type { Lease, ParticipantInfo } from "../../src/core/api.ts";
 import { describeMissing } from "../../src/xr/controls.ts";
-import { describeAlignment, describeConsent, describeRobot, describeUrgent, findPulse, isPlaced, wrap } from "../../src/xr/words.ts";
+import { describeAlignment, describeConsent, describeHand, describeRobot, describeUrgent, findPulse, isPlaced, wrap } from "../../src/xr/words.ts";
 
 const facts = { name: "left", lease: undefined, holdReason: "", selfId: "p1", isStopped: false, nameOf: () => "ben", isPointedAt: false, isOwn: false, isRequested: false };
 const lease = { target: "left", holder: "p2", queue: [] as string[] } as unknown as Lease;
@@ -48,6 +48,12 @@ describe("panels", () => {
     expect(describeUrgent({ ...well, isAligned: false, isTransparent: false }).join(" ")).toMatch(/a place of this headset's own/);
     expect(describeUrgent({ ...well, isAligned: false, isTransparent: false, canPlace: true }).join(" ")).toMatch(/To stay here: point at no robot/);
     expect(describeUrgent({ ...well, isStopped: true, connection: "lost", isAligned: false })).toEqual(["STOPPED: all robots hold", "lost"]);
+  });
+
+  test("at a hand: nothing while it works, else what the person does", () => {
+    expect(describeHand(false, null)).toEqual([]);
+    expect(describeHand(true, "squeeze").join(" ")).toMatch(/out of sight/);
+    expect([describeHand(false, "squeeze"), describeHand(false, "trigger")]).toEqual([["let go, then squeeze again"], ["let go, then press again"]]);
   });
 
   test("long texts are wrapped between words", () => {
