@@ -5,7 +5,7 @@ import type { Actions } from "./actions.ts";
 import { button, h, KeyedList, type Row, setText } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
-import { alignmentWords, capitalize, formatAge, formatMillimetres } from "./words.ts";
+import { alignmentWords, capitalize, doubtWords, formatAge, formatMillimetres } from "./words.ts";
 
 const HEADSET_DEVICES = /^(head|controller\/|hand\/)/;
 
@@ -61,9 +61,10 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
       setText(name, item.name);
       const alignment = item.alignment;
       const report = state.status?.participants.find((one) => one.id === id)?.alignment_report ?? null;
-      setText(kind, alignmentWords(alignment?.kind ?? "none"));
-      kind.classList.toggle("good", alignment?.kind === "measured");
-      kind.classList.toggle("bad", !alignment || alignment.kind === "none");
+      const doubt = doubtWords(report);
+      setText(kind, alignmentWords(alignment?.kind ?? "none") + (doubt && ", unconfirmed"));
+      kind.classList.toggle("good", alignment?.kind === "measured" && doubt === "");
+      kind.classList.toggle("bad", !alignment || alignment.kind === "none" || doubt !== "");
       const parts: string[] = [];
       if (alignment && alignment.error_at_robot_m > 0) parts.push(`± ${formatMillimetres(alignment.error_at_robot_m)} at the robot`);
       if (alignment && alignment.error_at_anchor_m > 0) parts.push(`± ${formatMillimetres(alignment.error_at_anchor_m)} at the sheet`);
@@ -72,7 +73,8 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
       if (report && report.observations > 0) parts.push(`${report.observations} observations from ${report.viewpoints} places`);
       setText(errors, parts.join(" · "));
       const alarm = report?.alarm ? `Found wrong by ${formatMillimetres(report.alarm_size_m)}. ` : "";
-      const words = alarm + (report?.advice ? capitalize(report.advice) : "");
+      const glance = doubt && `Glance at a sheet: ${doubt}. `;
+      const words = glance + alarm + (report?.advice ? capitalize(report.advice) : "");
       setText(advice, words);
       advice.hidden = words === "";
       const mayChange = state.isDirector || id === state.selfId;

@@ -2,7 +2,7 @@
 
 import type { Filled } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { BudgetClass, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
+import { AlignmentDoubt, BudgetClass, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
 
 const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string> = {
   no_lease: "no participant has its lease",
@@ -115,6 +115,13 @@ export function formatAge(ns: number): string {
   const s = Math.max(0, ns / 1e9);
   if (s < 90) return `${s.toFixed(0)} s`;
   return s < 5400 ? `${(s / 60).toFixed(0)} min` : `${(s / 3600).toFixed(1)} h`;
+}
+
+/** Return why an alignment is unconfirmed, so that robots hold at the next squeeze; empty: it is not. */
+export function doubtWords(report: { doubt: string; confirmed_ns: number } | null | undefined): string {
+  if (!report || report.doubt === "") return "";
+  if (report.doubt === AlignmentDoubt.AGED) return `the alignment is ${formatAge(report.confirmed_ns)} old`;
+  return report.doubt === AlignmentDoubt.CONTRADICTED ? "later looks contradict the alignment" : `the alignment is doubted: ${report.doubt.replaceAll("_", " ")}`;
 }
 
 /** Return how old the newest frame of a stream is, empty where that is not known. */

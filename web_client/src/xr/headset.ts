@@ -8,6 +8,7 @@ import type { WorkerClient } from "../core/page_client.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import type { Actions } from "../ui/actions.ts";
 import { DESKTOP, type Entry, type PageState } from "../ui/state.ts";
+import { doubtWords } from "../ui/words.ts";
 import type { Mode as PageMode, StreamChoices } from "../ui/stream_choices.ts";
 import { participantColor } from "../view/avatars.ts";
 import { Label } from "../view/labels.ts";
@@ -319,6 +320,7 @@ export class Headset {
       connection: state.isReady ? "" : phase.text || "joining the session again",
       isAligned: this.isAligned || steps.length > 0,
       hasMarks: this.marks.hasMarks,
+      doubt: steps.length > 0 ? "" : doubtWords(report),
       isTransparent: this.isTransparent,
       canPlace: this.canPlace,
       advice: report?.advice ?? "",

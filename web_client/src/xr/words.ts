@@ -2,7 +2,7 @@
 
 import type { Filled, Lease, ParticipantInfo } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { formatMillimetres, holdReasonWords } from "../ui/words.ts";
+import { capitalize, formatMillimetres, holdReasonWords } from "../ui/words.ts";
 
 /** Characters of a line. */
 const LINE = 44;
@@ -89,13 +89,15 @@ export interface Urgent {
   canPlace: boolean;
   /** The session has a sheet with marks to touch. */
   hasMarks: boolean;
+  /** Why the alignment is unconfirmed, empty: it is not. */
+  doubt: string;
   /** Advice of the session about the alignment. */
   advice: string;
   notice: string;
 }
 
 /** Return the lines before the eyes, none when all is well. */
-export function describeUrgent({ isStopped, connection, isAligned, isTransparent, canPlace, hasMarks, advice, notice }: Urgent): string[] {
+export function describeUrgent({ isStopped, connection, isAligned, isTransparent, canPlace, hasMarks, doubt, advice, notice }: Urgent): string[] {
   const lines: string[] = [];
   if (isStopped) lines.push("STOPPED: all robots hold");
   if (connection !== "") lines.push(...wrap(connection));
@@ -111,6 +113,9 @@ export function describeUrgent({ isStopped, connection, isAligned, isTransparent
     if (canPlace) lines.push(...wrap("To stay here: point at no robot, and press the trigger for a moment."));
     if (hasMarks) lines.push(...wrap("To touch the marks of a sheet, hold a trigger for two seconds, pointing at no robot."));
     if (advice !== "") lines.push(...wrap(advice));
+  } else if (doubt !== "") {
+    lines.push(...wrap(`${capitalize(doubt)}: robots hold at the next squeeze.`));
+    lines.push(...wrap(hasMarks ? "Touch marks: hold a trigger for two seconds, pointing at no robot." : "Ask a director to place this headset again."));
   }
   if (notice !== "") lines.push(...wrap(notice));
   return lines;

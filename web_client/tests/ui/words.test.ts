@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
 
-import { denialWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, isDoubtful, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
+import { denialWords, doubtWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, isDoubtful, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
 
 const nameOf = (id: string): string => ({ p1: "ann", p2: "ben" })[id] ?? "";
 type Body = Parameters<typeof eventWords>[0];
@@ -25,6 +25,13 @@ test("a denial names the holder once, and the advice", () => {
   const denial = { reason: "held", message: "left is held", advice: "wait for it", target: "left", holder: "p1" };
   expect(denialWords({ ...denial, holder_name: "ann" })).toBe("Left is held. Held by ann. Wait for it");
   expect(denialWords({ ...denial, message: "ann holds left.", holder_name: "ann" })).toBe("Ann holds left. Wait for it");
+});
+
+test("an unconfirmed alignment says why, also for a reason of another version", () => {
+  expect(doubtWords({ doubt: "", confirmed_ns: 400e9 })).toBe("");
+  expect(doubtWords({ doubt: "aged", confirmed_ns: 360e9 })).toBe("the alignment is 6 min old");
+  expect(doubtWords({ doubt: "contradicted", confirmed_ns: 0 })).toMatch(/contradict/);
+  expect(doubtWords({ doubt: "too_hot", confirmed_ns: 0 })).toMatch(/too hot/);
 });
 
 test("numbers have units that fit", () => {

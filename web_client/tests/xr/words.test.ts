@@ -41,8 +41,12 @@ describe("panels", () => {
   });
 
   test("before the eyes: nothing while all is well, else what matters most first", () => {
-    const well = { isStopped: false, connection: "", isAligned: true, isTransparent: true, canPlace: false, hasMarks: false, advice: "", notice: "" };
+    const well = { isStopped: false, connection: "", isAligned: true, isTransparent: true, canPlace: false, hasMarks: false, doubt: "", advice: "", notice: "" };
     expect(describeUrgent(well)).toEqual([]);
+    const old = { ...well, doubt: "the alignment is 6 min old" };
+    expect(describeUrgent(old).join(" ")).toMatch(/^The alignment is 6 min old: .*director/);
+    expect(describeUrgent({ ...old, hasMarks: true }).join(" ")).toMatch(/Touch marks/);
+    expect(describeUrgent({ ...old, isAligned: false })).toEqual(describeUrgent({ ...well, isAligned: false }));
     expect(describeUrgent({ ...well, isAligned: false }).join(" ")).toMatch(/not aligned The scene appears when/);
     expect(describeUrgent({ ...well, isAligned: false, hasMarks: true }).join(" ")).toMatch(/hold a trigger for two seconds/);
     expect(describeUrgent({ ...well, isAligned: false, isTransparent: false }).join(" ")).toMatch(/a place of this headset's own/);
