@@ -1,4 +1,4 @@
-"""How the uncertainty of an alignment grows since the last look that confirmed it: by time, and by the distance that
+"""Growth of the uncertainty of an alignment since the last look that confirmed it: by time, and by the distance that
 the head has walked.
 
 Pure arithmetic on tuples, as the authority needs it: no numpy. Covariances are 6x6 row-major, (x, y, z [m], rx, ry, rz

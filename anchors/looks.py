@@ -1,4 +1,4 @@
-"""What counts as a look at an anchor: a pose that was measured just now, from a head at rest, at a place of its own.
+"""Looks at an anchor: which poses count, those measured just now, from a head at rest, at a place of its own.
 
 Sources of poses repeat them, report the origin before they have any, and number viewpoints as they like. So a pose that
 is bit for bit one of the last ones is no look, nor is the origin with identity, nor one from a head in motion: the

@@ -92,7 +92,7 @@ class SheetSource:
     noise: SheetNoise = field(default_factory=SheetNoise)
 
 
-class Look(NamedTuple):
+class Glance(NamedTuple):
     """Reports of a headset in one look: times in seconds, `T_tracking_head` and `T_tracking_sheet`."""
 
     head_s: list[float]
@@ -182,7 +182,7 @@ class HeadsetMotion:
         azimuth: float | None = None,
         walk_m_per_s: float = 0.0,
         print_scale: float = 0.0,
-    ) -> Look:
+    ) -> Glance:
         """Return what the headset reports while its wearer looks at one sheet from a new place.
 
         Args:
@@ -215,7 +215,7 @@ class HeadsetMotion:
         heads = _to_poses(*self.to_tracking(head_s, at_p, at_q))
         poses = _to_poses(p, q)
         self.last[name] = poses[-1]
-        return Look(head_s.tolist(), heads, times.tolist(), poses)
+        return Glance(head_s.tolist(), heads, times.tolist(), poses)
 
     def _detect(self, p: Array, q: Array, print_scale: float) -> tuple[Array, Array]:
         """Return detections (n) of a sheet at `p`, `q` in the frame of the head (x ahead)."""

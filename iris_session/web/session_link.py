@@ -37,7 +37,7 @@ from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 from iris_session.web.config import GatewayConfig
 from iris_session.web.hub import Browser, Hub
 from iris_session.web.sockets import SocketReader
-from iris_session.web.uplink import Uplink
+from iris_session.web.uplink import BrowserUplink
 from iris_session.web.wire import CLOSE_ENDED, CLOSE_RESTART, peek_client_type
 
 #: Time for the gateway to be admitted by the session, before a WebSocket is closed with "come again".
@@ -78,7 +78,7 @@ class SessionLink:
         self._monitor: zmq.Socket[bytes] | None = None
         self._state: SocketReader | None = None
         self._newest: dict[bytes, list[zmq.Frame]] = {}
-        self._uplink = Uplink()
+        self._uplink = BrowserUplink()
         self._ready = asyncio.Event()
         self._stateless_since = time.monotonic()
 

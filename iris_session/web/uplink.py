@@ -56,8 +56,8 @@ class TurnQueue:
             self.waiting[name] = own
 
 
-class Uplink:
-    """What browsers have said and the session has not read."""
+class BrowserUplink:
+    """Messages of browsers that the session has not read."""
 
     def __init__(self) -> None:
         self._urgent = TurnQueue()

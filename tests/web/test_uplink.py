@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.web.uplink import MAX_PER_BROWSER, MAX_WAITING, Uplink
+from iris_session.web.uplink import MAX_PER_BROWSER, MAX_WAITING, BrowserUplink
 
 
-def drain(uplink: Uplink) -> list[bytes]:
+def drain(uplink: BrowserUplink) -> list[bytes]:
     taken = []
     while (message := uplink.peek()) is not None:
         taken.append(message)
@@ -16,12 +16,12 @@ def drain(uplink: Uplink) -> list[bytes]:
     return taken
 
 
-def push(uplink: Uplink, name: str, kind: str, *, admitted: bool = True) -> str:
+def push(uplink: BrowserUplink, name: str, kind: str, *, admitted: bool = True) -> str:
     return uplink.push(name, kind, f"{name}.{kind}".encode(), admitted=admitted)
 
 
 def test_browsers_take_turns() -> None:
-    uplink = Uplink()
+    uplink = BrowserUplink()
     for n in range(100):
         push(uplink, "loud", f"sample{n}")
     for n in range(3):
@@ -33,7 +33,7 @@ def test_browsers_take_turns() -> None:
 
 @pytest.mark.parametrize("kind", ["estop", "release", "heartbeat"])
 def test_what_stops_goes_ahead_of_all_others(kind: str) -> None:
-    uplink = Uplink()
+    uplink = BrowserUplink()
     for n in range(1500):
         push(uplink, f"loud{n % 20}", "sample")
     push(uplink, "stranger", kind, admitted=False)
@@ -44,7 +44,7 @@ def test_what_stops_goes_ahead_of_all_others(kind: str) -> None:
 
 
 def test_a_release_follows_what_its_browser_has_acquired() -> None:
-    uplink = Uplink()
+    uplink = BrowserUplink()
     push(uplink, "bob", "acquire")
     for kind in ("acquire", "sample", "release", "sample", "estop"):
         push(uplink, "ann", kind)
@@ -52,7 +52,7 @@ def test_a_release_follows_what_its_browser_has_acquired() -> None:
 
 
 def test_who_sends_too_much_is_named_and_others_stop_nevertheless() -> None:
-    uplink = Uplink()
+    uplink = BrowserUplink()
     excess = [push(uplink, "loud", "sample") for _ in range(MAX_PER_BROWSER + 1)]
     assert excess == [""] * MAX_PER_BROWSER + ["loud"]
     assert len(uplink) == 0
@@ -66,7 +66,7 @@ def test_who_sends_too_much_is_named_and_others_stop_nevertheless() -> None:
 
 
 def test_the_stop_of_one_who_sends_too_much_arrives() -> None:
-    uplink = Uplink()
+    uplink = BrowserUplink()
     push(uplink, "ann", "estop")
     assert [push(uplink, "ann", "heartbeat") for _ in range(MAX_PER_BROWSER)][-1] == "ann"
     assert drain(uplink)[0] == b"ann.estop"
