@@ -8,7 +8,7 @@ import numpy as np
 
 from iris_session.front.status import MIN_DELAYS
 from iris_session.protocol.client_messages import Hello, Observation, Sample
-from iris_session.protocol.common import IDENTITY
+from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Join
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
@@ -109,7 +109,8 @@ def test_alignment_report_has_both_halves(open_session: Callable[..., FrontSessi
     theirs = AlignmentReport(version=7, alarm="changed", alarm_ns=5)
     session.process.link.send_report(half(row(ids[0], alignment_report=theirs), row(ids[1], alignment_report=theirs)))
     for i in range(8):
-        ann.send(Observation("table", "qr", IDENTITY, session.process.link.now_ns, 1, i))
+        seen = Pose((0.5, 0.0, 0.001 * i), IDENTITY.q)
+        ann.send(Observation("table", "qr", seen, session.process.link.now_ns, 1, i))
     report = ask(
         session,
         bob,
