@@ -195,7 +195,7 @@ def test_hostile_messages_close_their_sender_only(page: str) -> None:
                     lambda n=n: sum(f.code == "malformed" for f in bad.got(ProtocolFault)) > n, "an answer of its own"
                 )
             with contextlib.suppress(ConnectionError):
-                for _ in range(6000):
+                for _ in range(1000):  # below the limit of frames, which cuts without a word
                     await bad.send(Bye(), 99)
             assert await bad.wait_closed() == wire.CLOSE_LIMIT
             await bad.close()
