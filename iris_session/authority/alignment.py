@@ -42,7 +42,7 @@ from iris_session.authority.state import Correction, Participant, Placement, War
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
 from iris_session.protocol.entries import AlignmentProposal
-from iris_session.protocol.names import AlignmentDoubt, AlignmentKind, DenialReason, HoldReason
+from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason
 from iris_session.protocol.server_messages import AlignmentChanged, Notice
 
 #: For a participant that says `not_needed` and drives with a headset.
@@ -93,7 +93,9 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
         return None
     if _is_news(ctx, p, m, error):
         return offer_measurement(ctx, p, m)
-    return confirm_alignment(ctx, p, ctx.now_ns)
+    if p.correction is None:  # else it agrees with that, not with what is in force
+        confirm_alignment(ctx, p, ctx.now_ns)
+    return None
 
 
 def _is_valid_proposal(ctx: Context, m: AlignmentProposal) -> bool:
@@ -447,18 +449,18 @@ def doubt_alignment(ctx: Context, p: Participant, doubt: str, text: str) -> None
 
     Args:
         ctx: Of this step.
-        p: Whose alignment it is; nothing happens without one, or where the configuration has no law of ageing.
-        doubt: The `AlignmentDoubt`; a contradiction stays one when it ages.
+        p: Whose alignment it is; nothing happens without one, or where the configuration lets nothing be doubted.
+        doubt: The `AlignmentDoubt`.
         text: Warning to the wearer: why, and what to do. Empty: another one says it.
     """
-    if ctx.config.ageing is None or p.alignment is None or p.doubt == AlignmentDoubt.CONTRADICTED:
+    if not ctx.config.doubts or p.alignment is None:
         return
     p.doubt = doubt
     warn_wearer(ctx, p, "doubt", text, same=doubt)
 
 
 def confirm_alignment(ctx: Context, p: Participant, looked_ns: int) -> None:
-    """Note that a look at `looked_ns` agrees with the alignment in force: doubts end, and its age starts again."""
+    """Note that a look at `looked_ns` agrees with the alignment in force: doubts end."""
     p.confirmed_ns = looked_ns
     if p.doubt:
         p.doubt = ""

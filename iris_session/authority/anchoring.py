@@ -130,10 +130,10 @@ def raise_alarm(ctx: Context, p: Participant, m: AlignmentAlarm) -> None:
     ctx.emit(AlignmentAlarmed(p.id, m.kind, m.anchor_id, size_m, m.beside))
     if m.kind == AlarmKind.JUMP:
         ctx.publish_participant(p)
-    alignment.warn_wearer(ctx, p, "alarm", _describe_alarm(p, m, size_m), same=f"{m.kind} {m.anchor_id}")
     placed = m.kind == AlarmKind.DIFFERS and p.placed  # a director's word is to count more than what is measured
     if m.kind != AlarmKind.JUMP and not m.beside and not placed:
         alignment.doubt_alignment(ctx, p, AlignmentDoubt.CONTRADICTED, "")  # the warning of the alarm says it
+    alignment.warn_wearer(ctx, p, "alarm", _describe_alarm(p, m, size_m), same=f"{m.kind} {m.anchor_id}")
 
 
 def _describe_alarm(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
@@ -144,7 +144,8 @@ def _describe_alarm(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
     advice = "look at an anchor sheet again" if p.aligning else "start its alignment run again"
     if m.kind == AlarmKind.JUMP:
         return f"the tracking of {p.name} jumped by {size}: it is not aligned, robots hold; {advice}"
-    return f"{p.name} sees anchor {m.anchor_id} {size} off from its alignment, robots hold next time: {advice}"
+    holds = ", robots hold at the next engagement" if p.doubt else ""
+    return f"{p.name} sees anchor {m.anchor_id} {size} off from its alignment{holds}: {advice}"
 
 
 def _clear_alarm(ctx: Context, p: Participant) -> None:

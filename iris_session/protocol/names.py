@@ -140,9 +140,8 @@ class AlignmentDoubt:
     replaces it. Empty: none.
     """
 
-    AGED: Final = "aged"  # no look for so long that drift alone may exceed the bound at the robot
     CONTRADICTED: Final = "contradicted"  # later looks disagree with it
-    ALL: Final = frozenset({"aged", "contradicted"})
+    ALL: Final = frozenset({"contradicted"})
 
 
 class AnchorKind:
@@ -193,7 +192,9 @@ class CommandKind:
 
 
 class HoldReason:
-    """Reason why a robot holds. Exactly one is given with every hold command."""
+    """Reason why a robot holds. Exactly one is given with every hold command. `zero_pose`, `frozen` and `jump` are
+    reserved: no session gives them yet.
+    """
 
     NO_LEASE: Final = "no_lease"
     NO_SAMPLE: Final = "no_sample"  # a lease, but nothing counted yet
@@ -218,7 +219,9 @@ class HoldReason:
 
 
 class RejectReason:
-    """Reason why a sample was rejected. Counted per participant, device and reason."""
+    """Reason why a sample was rejected. Counted per participant, device and reason. `zero_pose`, `frozen` and `jump`
+    are reserved: no session gives them yet.
+    """
 
     CONNECTION_EPOCH: Final = "connection_epoch"
     SCENE_EPOCH: Final = "scene_epoch"

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import msgspec
 
-from anchors.ageing import AgeingLaw
 from iris_session.authority import AuthorityConfig, is_same_snapshot
 from iris_session.journal.environment import use_one_blas_thread
 from iris_session.journal.rows import SNAPSHOTS
@@ -21,7 +20,7 @@ from iris_session.session.core import CoreConfig, CoreState, SessionCore
 class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
     """Configuration in the header of a recording: laws that it does not name were not in force when it was made."""
 
-    ageing: AgeingLaw | None = None
+    doubts: bool = False
 
 
 class _RecordedConfig(CoreConfig, frozen=True):

@@ -73,11 +73,8 @@ ASSET_PIECE: Final = 65_536
 ASSET_BYTES_PER_S: Final = 48e6
 #: Messages a second on a media socket: subscriptions and tickets, nothing else.
 _SUBSCRIPTIONS_PER_S, _SUBSCRIPTIONS_BURST = 5.0, 20
-#: Pings and pongs of one WebSocket: browsers answer one in 15 s, and never ask.
-_PINGS_PER_S, _PING_BURST = 5.0, 20
 _RANGE: Final = re.compile(r"bytes=(\d{0,15})-(\d{0,15})")
 _TICKET_HEADER: Final = "X-Iris-Ticket"
-TOO_MANY_PINGS: Final = "more pings than a client may send"
 _MAX_REASON: Final = 120
 _FAULT_LOG_S: Final = 10.0
 
@@ -126,25 +123,19 @@ class Acknowledgements:
         return True
 
 
-class MessageReader:
-    """Reads one WebSocket. Pings and pongs are limited, and those who send fast leave others their turn."""
+async def receive_message(socket: web.WebSocketResponse) -> WSMessage:
+    """Return the next message of a WebSocket that is no ping or pong, after others had their turn.
 
-    def __init__(self, socket: web.WebSocketResponse) -> None:
-        self._socket = socket
-        self._pings = TokenBucket(_PINGS_PER_S, _PING_BURST, time.monotonic_ns())
-
-    async def receive(self) -> WSMessage | None:
-        """Return the next message that is no ping or pong, `None` when there were too many of these."""
-        while True:
-            message = await self._socket.receive()
-            await asyncio.sleep(0)  # `receive` does not wait for what has come already
-            if message.type not in (WSMsgType.PING, WSMsgType.PONG):
-                return message
-            if not self._pings.take(time.monotonic_ns()):
-                return None
-            if message.type == WSMsgType.PING:
-                with contextlib.suppress(ConnectionError, RuntimeError):  # closed meanwhile
-                    await self._socket.pong(message.data)
+    `web.frames` limits how many of those come.
+    """
+    while True:
+        message = await socket.receive()
+        await asyncio.sleep(0)  # `receive` does not wait for what has come already
+        if message.type == WSMsgType.PING:
+            with contextlib.suppress(ConnectionError, RuntimeError):  # closed meanwhile
+                await socket.pong(message.data)
+        elif message.type != WSMsgType.PONG:
+            return message
 
 
 class SocketWriter:
@@ -454,7 +445,7 @@ class WebServer:
             compress=False,
             timeout=_CLOSE_S,
             heartbeat=30.0,
-            autoping=False,  # its own answers are not counted, and give way to no one
+            autoping=False,  # it would answer what has come without a pause
         )
         if not socket.can_prepare(request).ok:
             raise web.HTTPBadRequest(reason=f"expected a WebSocket with subprotocol {SUBPROTOCOL}")
@@ -485,13 +476,9 @@ class WebServer:
         return socket
 
     async def _read_session(self, browser: Browser, socket: web.WebSocketResponse) -> None:
-        reader = MessageReader(socket)
         while browser.closing is None:
-            message = await reader.receive()
-            if message is None:
-                self._drops.count("web_flood")
-                browser.close(CLOSE_LIMIT, TOO_MANY_PINGS)
-            elif message.type == WSMsgType.BINARY:
+            message = await receive_message(socket)
+            if message.type == WSMsgType.BINARY:
                 envelope = self._hub.receive(browser, message.data, time.monotonic_ns())
                 if envelope is not None:
                     self._send_to_session(browser, envelope)
@@ -583,9 +570,9 @@ class WebServer:
     async def _receive_ticket(self, socket: web.WebSocketResponse) -> Browser | None:
         """Return the browser whose ticket comes first, `None` for one that is not valid. Raises `TimeoutError`."""
         async with asyncio.timeout(TICKET_S):
-            message = await MessageReader(socket).receive()
+            message = await receive_message(socket)
         try:
-            if message is None or message.type != WSMsgType.BINARY:
+            if message.type != WSMsgType.BINARY:
                 return None
             channel, frames = decode_frames(message.data)
             ticket = decode_gateway_message(frames[0])
@@ -601,13 +588,12 @@ class WebServer:
         self, browser: Browser, socket: web.WebSocketResponse, feed: MediaFeedSocket, writer: SocketWriter
     ) -> None:
         rate = TokenBucket(_SUBSCRIPTIONS_PER_S, _SUBSCRIPTIONS_BURST, time.monotonic_ns())
-        reader = MessageReader(socket)
         while browser.is_admitted:
-            message = await reader.receive()
-            if message is not None and message.type != WSMsgType.BINARY:
+            message = await receive_message(socket)
+            if message.type != WSMsgType.BINARY:
                 self._count_end(message.type, socket)
                 return
-            if message is None or not rate.take(time.monotonic_ns()):
+            if not rate.take(time.monotonic_ns()):
                 self._drops.count("web_flood")
                 await writer.close(Closing(CLOSE_LIMIT, "more messages than a client may send: send less"))
                 return

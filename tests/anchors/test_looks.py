@@ -1,4 +1,4 @@
-"""What counts as a look: new poses of resting heads, at places of their own."""
+"""Looks: new poses of resting heads, at places of their own."""
 
 from __future__ import annotations
 

@@ -84,9 +84,23 @@ def test_a_directors_word_ends_a_doubt_and_is_not_doubted_for_what_it_differs_fr
     assert report(t, anna).doubt == ""
 
 
-def test_without_the_law_nothing_is_doubted() -> None:
-    """As recordings of before verify."""
-    t = Table(AuthorityConfig(ageing=None))
+def test_a_look_that_agrees_with_a_pending_correction_confirms_nothing() -> None:
+    t = Table()
+    anna = t.operator("left")
+    anna.engage("left")
+    away = proposal(T_world_tracking=Pose((1.05, 0.0, 0.0), IDENTITY.q))
+    t.step(anna.says(away))
+    for _ in range(5):
+        anna.sends("left", clutch=True)
+    before = report(t, anna).confirmed_ns
+    t.step(anna.says(away))
+    assert report(t, anna).pending_m > 0.04
+    assert report(t, anna).confirmed_ns > before
+
+
+def test_where_nothing_is_doubted_an_engagement_begins() -> None:
+    """As in recordings of earlier versions."""
+    t = Table(AuthorityConfig(doubts=False))
     anna = doubted(t)
     assert report(t, anna).doubt == ""
     anna.engage("left")

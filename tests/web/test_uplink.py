@@ -1,4 +1,4 @@
-"""What waits for the session: turns of browsers, and who goes ahead."""
+"""Messages that wait for the session: turns of browsers, and which go ahead."""
 
 from __future__ import annotations
 

@@ -142,7 +142,6 @@ namespace IrisSession.Protocol
     /// </summary>
     public static class AlignmentDoubt
     {
-        public const string Aged = "aged";
         public const string Contradicted = "contradicted";
     }
 
@@ -197,7 +196,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Reason why a robot holds. Exactly one is given with every hold command.
+    /// Reason why a robot holds. Exactly one is given with every hold command. zero_pose, frozen and jump are
+    /// reserved: no session gives them yet.
     /// </summary>
     public static class HoldReason
     {
@@ -224,7 +224,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Reason why a sample was rejected. Counted per participant, device and reason.
+    /// Reason why a sample was rejected. Counted per participant, device and reason. zero_pose, frozen and jump
+    /// are reserved: no session gives them yet.
     /// </summary>
     public static class RejectReason
     {

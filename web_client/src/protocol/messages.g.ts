@@ -122,7 +122,6 @@ export type AlarmKind = (typeof AlarmKind)[keyof typeof AlarmKind] | (string & {
  * replaces it. Empty: none.
  */
 export const AlignmentDoubt = {
-  AGED: "aged",
   CONTRADICTED: "contradicted",
 } as const;
 export type AlignmentDoubt = (typeof AlignmentDoubt)[keyof typeof AlignmentDoubt] | (string & {});
@@ -173,7 +172,10 @@ export const CommandKind = {
 } as const;
 export type CommandKind = (typeof CommandKind)[keyof typeof CommandKind] | (string & {});
 
-/** Reason why a robot holds. Exactly one is given with every hold command. */
+/**
+ * Reason why a robot holds. Exactly one is given with every hold command. `zero_pose`, `frozen` and `jump` are
+ * reserved: no session gives them yet.
+ */
 export const HoldReason = {
   NO_LEASE: "no_lease",
   NO_SAMPLE: "no_sample",
@@ -198,7 +200,10 @@ export const HoldReason = {
 } as const;
 export type HoldReason = (typeof HoldReason)[keyof typeof HoldReason] | (string & {});
 
-/** Reason why a sample was rejected. Counted per participant, device and reason. */
+/**
+ * Reason why a sample was rejected. Counted per participant, device and reason. `zero_pose`, `frozen` and `jump`
+ * are reserved: no session gives them yet.
+ */
 export const RejectReason = {
   CONNECTION_EPOCH: "connection_epoch",
   SCENE_EPOCH: "scene_epoch",
