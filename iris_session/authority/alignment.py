@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from anchors.ageing import grow_covariance
 from anchors.pose import (
     apply,
     compose,
@@ -42,8 +43,8 @@ from iris_session.authority.state import Correction, Participant, Placement, War
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
 from iris_session.protocol.entries import AlignmentProposal
-from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason
-from iris_session.protocol.server_messages import AlignmentChanged, Notice
+from iris_session.protocol.names import AlignmentDoubt, AlignmentKind, DenialReason, HoldReason
+from iris_session.protocol.server_messages import Notice
 
 #: For a participant that says `not_needed` and drives with a headset.
 UNALIGNED_ADVICE: Final = (
@@ -52,6 +53,8 @@ UNALIGNED_ADVICE: Final = (
 )
 #: 95 % quantile of the standard normal distribution.
 Z95: Final = 1.6448536269514722
+#: A look confirms an alignment when its own stated error is at most so many times that of the alignment.
+SAME_ERROR: Final = 1.25
 ADVICE: Final = "step closer to the sheet, look at it from a second place, or add a sheet near the robot"
 
 
@@ -93,8 +96,13 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
         return None
     if _is_news(ctx, p, m, error):
         return offer_measurement(ctx, p, m)
-    if p.correction is None:  # else it agrees with that, not with what is in force
-        confirm_alignment(ctx, p, ctx.now_ns)
+    if p.correction is not None:
+        p.correction.looked_ns, p.correction.walked_m = ctx.now_ns, p.walked_m
+    elif p.alignment is not None:
+        now = p.alignment
+        known = compute_error_at_robots(ctx, p, now.covariance, p.pivot_world, 0.0) if now.covariance else error
+        if error <= SAME_ERROR * max(known, now.error_at_robot_m):
+            confirm_alignment(ctx, p, ctx.now_ns, p.walked_m)
     return None
 
 
@@ -125,7 +133,7 @@ def _is_news(ctx: Context, p: Participant, m: AlignmentProposal, error: float) -
         old: Pose | None = coming.T_world_tracking
         known = compute_error_at_robots(ctx, p, coming.covariance, coming.pivot_world, coming.error_at_anchor_m)
     else:
-        old, known = p.T_world_tracking_measured, now.error_at_robot_m
+        old, known = p.T_world_tracking_measured, compute_stated_errors(ctx, p)[1]
     if old is None or error < 0.8 * known:
         return True
     # Where the anchor's point lies, by the old and the new alignment.
@@ -230,6 +238,8 @@ def offer_measurement(ctx: Context, p: Participant, m: AlignmentProposal) -> Non
         pivot_world,
         float(m.error_at_anchor_m),
         ctx.now_ns + ctx.config.slide_ns,
+        looked_ns=ctx.now_ns,
+        walked_m=p.walked_m,
     )
     if p.alignment is None or p.alignment.kind in AlignmentKind.VIEW_ONLY:
         return _complete_correction(ctx, p, goal, m.kind)
@@ -255,13 +265,14 @@ def apply_placement(ctx: Context, p: Participant, word: Placement) -> None:
     p.offset = p.T_world_tracking_measured = p.correction = None
     p.placed = True
     _set_alignment(ctx, p, AlignmentKind.PLACED, word.T_world_tracking)
-    confirm_alignment(ctx, p, ctx.now_ns)
+    confirm_alignment(ctx, p, ctx.now_ns, p.walked_m)
     return _clear_answered_alarm(ctx, p)
 
 
 def void_alignment(p: Participant) -> None:
     """Clear everything about the alignment, because the tracking frame is another one."""
-    p.alignment = p.offset = p.T_world_tracking_measured = p.correction = p.placing = p.alarm = None
+    p.alignment = p.offset = p.T_world_tracking_measured = p.correction = p.placing = p.alarm = p.aged = None
+    p.stride_from = None
     p.placed = p.in_use = False
     p.aligned_ns = p.refused_ns = None
     p.refusal = p.doubt = ""
@@ -376,14 +387,15 @@ def _slide_correction(ctx: Context, p: Participant, c: Correction, away_m: float
     left = [c.pivot_world[i] - at[i] for i in range(3)] + list(quat_to_rotvec(quat_mul(new.q, quat_conj(T.q))))
     c.slides_ns = ctx.now_ns + ctx.config.slide_ns
     error_at_anchor_m = c.error_at_anchor_m + distance(at, c.pivot_world)
-    return _apply_measured(ctx, p, T, c.pivot_world, widen_covariance(c.covariance, tuple(left)), error_at_anchor_m)
+    _apply_measured(ctx, p, T, c.pivot_world, widen_covariance(c.covariance, tuple(left)), error_at_anchor_m)
+    return confirm_alignment(ctx, p, c.looked_ns, c.walked_m)
 
 
 def _complete_correction(ctx: Context, p: Participant, c: Correction, kind: str = AlignmentKind.MEASURED) -> None:
     """Apply all of a correction."""
     p.correction = None
     _apply_measured(ctx, p, c.T_world_tracking, c.pivot_world, c.covariance, c.error_at_anchor_m, kind)
-    confirm_alignment(ctx, p, ctx.now_ns)
+    confirm_alignment(ctx, p, c.looked_ns, c.walked_m)
     _clear_answered_alarm(ctx, p)
 
 
@@ -415,6 +427,7 @@ def _set_alignment(
     offset: bool = False,
 ) -> None:
     p.alignment_version += 1
+    p.aged = None
     p.refused_ns, p.refusal = None, ""
     if p.aligned_ns is None:
         p.aligned_ns = ctx.now_ns
@@ -429,7 +442,7 @@ def _set_alignment(
         offset,
     )
     warn_wearer(ctx, p, "unaligned", "", same="")
-    ctx.emit(AlignmentChanged(p.id, p.published_alignment or p.alignment))
+    ctx.publish_alignment(p)
 
 
 def _clear_answered_alarm(ctx: Context, p: Participant) -> None:
@@ -450,18 +463,24 @@ def doubt_alignment(ctx: Context, p: Participant, doubt: str, text: str) -> None
     Args:
         ctx: Of this step.
         p: Whose alignment it is; nothing happens without one, or where the configuration lets nothing be doubted.
-        doubt: The `AlignmentDoubt`.
+        doubt: The `AlignmentDoubt`; a contradiction stays one when it ages.
         text: Warning to the wearer: why, and what to do. Empty: another one says it.
     """
-    if not ctx.config.doubts or p.alignment is None:
+    if not ctx.config.doubts or p.alignment is None or p.doubt == AlignmentDoubt.CONTRADICTED:
         return
     p.doubt = doubt
     warn_wearer(ctx, p, "doubt", text, same=doubt)
 
 
-def confirm_alignment(ctx: Context, p: Participant, looked_ns: int) -> None:
-    """Note that a look at `looked_ns` agrees with the alignment in force: doubts end."""
-    p.confirmed_ns = looked_ns
+def confirm_alignment(ctx: Context, p: Participant, looked_ns: int, walked_m: float) -> None:
+    """Note that a look at `looked_ns`, after the head had walked `walked_m`, agrees with the alignment in force: doubts
+    end, and its age starts again.
+    """
+    p.confirmed_ns, p.confirmed_walked_m = looked_ns, walked_m
+    if p.aged is not None:
+        p.aged = None
+        ctx.publish_alignment(p)
+    warn_wearer(ctx, p, "age", "", same="")
     if p.doubt:
         p.doubt = ""
         warn_wearer(ctx, p, "doubt", "", same="")
@@ -515,10 +534,36 @@ def compute_error_at_robots(
     """Return the stated p95 error [m]: the largest at the robots that `p` holds, else at the robot nearest to the
     anchor.
     """
-    held = [g.target for g in ctx.state.robots.values() if any(h.participant == p.id for h in g.grants)]
-    points = {name: ctx.view.tip_pose(name).p for name in held or ctx.robots}
-    errors = [compute_position_p95(covariance, pivot_world, point) for point in points.values()]
+    held = find_robot_points(ctx, p)
+    points = held or [ctx.view.tip_pose(name).p for name in ctx.robots]
+    errors = [compute_position_p95(covariance, pivot_world, point) for point in points]
     return max(errors) if held else min(errors, default=error_at_anchor_m)
+
+
+def find_robot_points(ctx: Context, p: Participant) -> list[Vec3]:
+    """Return the positions of the end effectors that `p` holds, in the world."""
+    leases = ctx.state.robots.values()
+    return [ctx.view.tip_pose(g.target).p for g in leases if any(h.participant == p.id for h in g.grants)]
+
+
+def compute_aged_covariance(ctx: Context, p: Participant) -> tuple[float, ...]:
+    """Return the covariance of the alignment in force as it is now, at its pivot; of one without, that of its drift."""
+    known = (p.alignment.covariance if p.alignment is not None else ()) or (0.0,) * 36
+    if ctx.config.ageing is None:
+        return known
+    minutes = (ctx.now_ns - p.confirmed_ns) / 60e9
+    return grow_covariance(known, ctx.config.ageing, minutes, p.walked_m - p.confirmed_walked_m)
+
+
+def compute_stated_errors(ctx: Context, p: Participant) -> tuple[float, float]:
+    """Return the stated p95 [m] now, at the anchor and at the robot: 0 where none is stated. Age never lowers it."""
+    now = p.alignment
+    if now is None or not now.covariance or ctx.config.ageing is None:
+        return (0.0, 0.0) if now is None else (now.error_at_anchor_m, now.error_at_robot_m)
+    grown = compute_aged_covariance(ctx, p)
+    at_anchor_m = max(now.error_at_anchor_m, compute_position_p95(grown, p.pivot_world, p.pivot_world))
+    at_robot_m = compute_error_at_robots(ctx, p, grown, p.pivot_world, at_anchor_m)
+    return at_anchor_m, max(now.error_at_robot_m, at_robot_m)
 
 
 def widen_covariance(covariance: tuple[float, ...], away: tuple[float, ...]) -> tuple[float, ...]:

@@ -188,13 +188,14 @@ def remove_cross_checks(ctx: Context, p: Participant) -> None:
 def build_alignment_report(ctx: Context, p: Participant) -> AlignmentReport:
     """Return the authority's part of an alignment report; the front adds what it observes."""
     now, last = p.alignment, p.alarm
+    at_anchor_m, at_robot_m = alignment.compute_stated_errors(ctx, p)
     pending_m, pending_rad = alignment.measure_pending_correction(p)
     return AlignmentReport(
         version=0 if now is None else now.version,
         running=p.aligning,
         offset=now is not None and now.offset,
-        error_at_anchor_m=0.0 if now is None else now.error_at_anchor_m,
-        error_at_robot_m=0.0 if now is None else now.error_at_robot_m,
+        error_at_anchor_m=at_anchor_m,
+        error_at_robot_m=at_robot_m,
         pending_m=pending_m,
         pending_rad=pending_rad,
         alarm="" if last is None else last.kind,

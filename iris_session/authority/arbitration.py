@@ -14,7 +14,7 @@ from typing import Final
 import msgspec
 
 from anchors.pose import compose, inverse, quat_rotate
-from iris_session.authority import engagement, roster, samples
+from iris_session.authority import ageing, engagement, roster, samples
 from iris_session.authority.context import HUMAN, Context
 from iris_session.authority.state import DeviceState, FeedbackState, JointReading, LeaseGrant, LeaseState, Participant
 from iris_session.protocol.client_messages import Sample
@@ -48,6 +48,8 @@ def process_sample(ctx: Context, entry: Entry, s: Sample) -> None:
         _update_latch(ctx, p, lease, g, s)
         if g.engagement and g.device == s.device:
             _set_source(ctx, p, lease, g, entry, s)
+    if usable and s.kind == SampleKind.POSE and s.device == Device.HEAD:
+        ageing.measure_walk(ctx, p, s)
     if usable and s.kind == SampleKind.POSE and s.device not in _INVISIBLE:
         _publish_presence(ctx, p, s)
     return None

@@ -12,6 +12,7 @@ from typing import Any, Final
 import msgspec
 
 from iris_session.authority import (
+    ageing,
     alignment,
     anchoring,
     arbitration,
@@ -116,6 +117,7 @@ class Authority:
         roster.expire_participants(ctx)
         arbitration.expire_samples(ctx)
         alignment.advance_corrections(ctx)
+        ageing.check_ages(ctx)
         if ctx.state.queue or ctx.state.consents:
             requests.advance_requests(ctx)
         handover.track_handovers(ctx)

@@ -8,6 +8,7 @@ from typing import Final
 
 import msgspec
 
+from anchors.ageing import AgeingLaw
 from anchors.pose import is_rigid
 from iris_session.protocol.common import Name, Pose
 from iris_session.protocol.names import AssignmentPolicy, Device, LeaseMode, Role
@@ -57,6 +58,7 @@ POSITIVE: Final = (
     "contact_step_n",
     "max_anchor_move_m",
     "max_error_to_view_m",
+    "age_check_ns",
     "slide_ns",
     "slide_m_per_s",
     "slide_rad_per_s",
@@ -68,8 +70,8 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     `assignments`: participant name, or `key:<fingerprint>`, -> robots (policy `config`). `leader_apart`: `ramp`
     (control ramps) or `refuse`. `unaligned`: roles, devices and keys (`key:<fingerprint>`) that may drive without an
-    alignment when they say that they need none. `doubts`: an alignment that later looks contradict begins no
-    engagement. `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
+    alignment when they say that they need none. `doubts`: an alignment that later looks contradict, or that is too old,
+    begins no engagement. `ageing`: how its stated error grows since the last look; None: not. `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
     """
 
     # samples
@@ -111,6 +113,8 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_anchor_move_m: float = 5.0  # at once, unless forced: catches wrong units
     anchors: dict[str, Pose] = {}  # T_world_anchor by id, until a director moves one
     doubts: bool = True
+    ageing: AgeingLaw | None = msgspec.field(default_factory=AgeingLaw)
+    age_check_ns: int = SECOND  # between two looks at the age of an alignment
     settle_ns: int = 15 * SECOND  # after the first alignment of a run; from then on corrections come gently
     slide_ns: int = 500 * MS  # between two parts of a correction that slides in
     slide_m_per_s: float = 0.004  # slow enough not to be noticed in a headset

@@ -17,6 +17,7 @@ from iris_session.protocol.common import Denial, Lease
 from iris_session.protocol.names import DenialReason, LeaseMode, Role, TargetKind
 from iris_session.protocol.server_messages import (
     MAX_LEASES,
+    AlignmentChanged,
     Event,
     EventKind,
     LeaseChanged,
@@ -180,6 +181,12 @@ class Context:
         """Publish the present state of a participant as an event. The host is not in the roster."""
         if p.id != HOST_ID:
             self.emit(ParticipantChanged(self.to_participant_info(p)))
+
+    def publish_alignment(self, p: Participant) -> None:
+        """Publish the alignment of a participant, which has one, as an event."""
+        alignment = p.published_alignment
+        assert alignment is not None
+        self.emit(AlignmentChanged(p.id, alignment))
 
     def list_leases(self, p: Participant) -> list[LeaseState]:
         """Return every target that `p` holds, robots first, in the order of the specification."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from anchors.pose import distance, quat_angle
-from iris_session.authority import alignment, engagement
+from iris_session.authority import ageing, alignment, engagement
 from iris_session.authority.context import Context, find_grant
 from iris_session.authority.state import DeviceState, JointReading, LeaseGrant, LeaseState, Participant, Rejections
 from iris_session.protocol.client_messages import Sample
@@ -194,6 +194,9 @@ def _check_engagement(ctx: Context, p: Participant, s: Sample, drives: list[Driv
             if error > ctx.config.max_error_at_robot_m:
                 alignment.refuse_large_error(ctx, p, lease.target, error)
                 return RejectReason.UNALIGNED
+            if ageing.is_too_old(ctx, p, lease.target):
+                ageing.doubt_age(ctx, p)
+                return RejectReason.UNCONFIRMED
     return ""
 
 

@@ -20,8 +20,10 @@ from iris_session.protocol.steps import CommandSource
 HOST_ID: Final = "host"
 #: `Pending.request_id` of a place in the queue that outlived its connection: no reply is sent.
 NO_REPLY: Final = -1
+#: Fields of `Participant` that say how its alignment ages.
+AGEING_FIELDS: Final = ("aged", "age_due_ns", "confirmed_walked_m", "walked_m", "stride_from")
 #: Fields of `Participant` that snapshots of the first recordings of this format do not have.
-ADDED_FIELDS: Final = frozenset({"roles", "hello_name", "hello_role", "doubt", "confirmed_ns"})
+ADDED_FIELDS: Final = frozenset({"roles", "hello_name", "hello_role", "doubt", "confirmed_ns", *AGEING_FIELDS})
 #: `Participant.connection` while the connection is lost.
 NO_CONNECTION: Final = -1
 
@@ -67,7 +69,7 @@ class Correction(msgspec.Struct):
     """A measured alignment (without the director's offset) that is not wholly in force yet.
 
     `T_told`: its pose when it was announced to the wearer; it may change afterwards. `slides_ns`: when its next part
-    may come into force.
+    may come into force. `looked_ns`, `walked_m`: of the last look that agreed with it, as in `Participant`.
     """
 
     T_world_tracking: Pose
@@ -76,6 +78,8 @@ class Correction(msgspec.Struct):
     error_at_anchor_m: float
     slides_ns: int
     T_told: Pose | None = None
+    looked_ns: int = 0
+    walked_m: float = 0.0
 
 
 class Placement(msgspec.Struct):
@@ -108,7 +112,10 @@ class Participant(msgspec.Struct):
     wearer. `roles`: those that its key may join as; empty: any. `hello_name`, `hello_role`: what it said when it
     joined, empty unless a director changed it since. `refusal`: of a measurement, reported as progress since
     `refusal_from_ns`; empty: none, or it was reported as a warning. `doubt`: why the alignment begins no engagement
-    (`AlignmentDoubt`), empty for none. `confirmed_ns`: of the last look that agreed with it. `devices` empty: none
+    (`AlignmentDoubt`), empty for none. `confirmed_ns`, `confirmed_walked_m`: time of the last look that agreed with it,
+    and the distance walked until then. `walked_m`: by the head, in strides of which the last ended at `stride_from`
+    (tracking frame). `aged`: the alignment with the error that was last stated for its age; None: as it was measured.
+    `age_due_ns`: when its age is looked at again. `devices` empty: none
     declared, all known ones are accepted.
     """
 
@@ -146,6 +153,11 @@ class Participant(msgspec.Struct):
     refusal_from_ns: int = 0
     doubt: str = ""
     confirmed_ns: int = 0
+    confirmed_walked_m: float = 0.0
+    walked_m: float = 0.0
+    stride_from: Vec3 | None = None
+    aged: Alignment | None = None
+    age_due_ns: int = 0
     warnings: dict[str, WarningState] = {}
     seen: dict[str, DeviceState] = {}
     rejected: dict[str, int] = {}
@@ -156,10 +168,13 @@ class Participant(msgspec.Struct):
 
     @property
     def published_alignment(self) -> Alignment | None:
-        """The alignment as clients receive it: with the pivot of its covariance, which the state has beside it."""
-        if self.alignment is None or not self.alignment.covariance:
-            return self.alignment
-        return msgspec.structs.replace(self.alignment, pivot_world=self.pivot_world)
+        """The alignment as clients receive it: as it has aged, and with the pivot of its covariance, which the state
+        has beside it.
+        """
+        alignment = self.aged or self.alignment
+        if alignment is None or not alignment.covariance:
+            return alignment
+        return msgspec.structs.replace(alignment, pivot_world=self.pivot_world)
 
 
 class LeaseGrant(msgspec.Struct):
@@ -339,4 +354,8 @@ def is_same_snapshot(recorded: bytes, snapshot: bytes) -> bool:
         alignment = had[name].get("alignment")
         if isinstance(alignment, dict) and "pivot_world" not in alignment and fields["alignment"] is not None:
             del fields["alignment"]["pivot_world"]
+        correction = had[name].get("correction")
+        if isinstance(correction, dict) and fields["correction"] is not None:
+            for added in {"looked_ns", "walked_m"} - correction.keys():
+                del fields["correction"][added]
     return bool(earlier == present)

@@ -428,6 +428,10 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
         f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
         f"{format_pending_correction(r)}"
     )
+    if r.doubt:
+        yield f"    UNCONFIRMED ({r.doubt}): begins no engagement until a look at a sheet"
+    if aligned and r.confirmed_ns >= 0:
+        yield f"    confirmed {format_duration(r.confirmed_ns)} ago"
     if not aligned and p.alignment_void_ns >= 0:
         yield f"    void for {format_duration(p.alignment_void_ns)}: the tracking frame jumped"
     seen = sorted(r.seen, key=lambda one: one.age_ns)

@@ -115,6 +115,7 @@ def _render_table(title: str, status: dict[str, Any], events: list[str], footer:
         table.add_column(column)
     for row in status["participants"]:
         error = f" {row['alignment_error_m'] * 1e3:.1f} mm" if row["alignment"] == "measured" else ""
+        error += " UNCONFIRMED" if (row.get("alignment_report") or {}).get("doubt") else ""
         delays = [f"{status['input_to_ctrl_ms'][r]:.0f} ms" for r in row["holds"] if r in status["input_to_ctrl_ms"]]
         name = f"{row['name']} ({row['id']})" + ("" if row["connected"] else " [offline]")
         cells = (name, row["role"], ", ".join(row["holds"]), row["alignment"] + error, ", ".join(delays))

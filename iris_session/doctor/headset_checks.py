@@ -12,6 +12,9 @@ from iris_session.protocol.status import CrossCheckReport, ParticipantReport, St
 
 #: Tracking frames drift by millimetres a minute: after this time without a sheet the stated error is no longer true.
 STALE_NS: Final = 600_000_000_000
+#: Half of the default bound of the stated error at the robot: above it a glance is due.
+GLANCE_ERROR_M: Final = 0.025
+GLANCE_NS: Final = 60_000_000_000
 #: An error above the 95 % bound by this factor is not chance, as in `anchors.cross_check`.
 MAX_ERROR_RATIO: Final = 2.0
 #: Older cross-checks say nothing about the present.
@@ -54,17 +57,22 @@ def check_alarms(people: tuple[ParticipantReport, ...]) -> Finding:
 
 
 def check_staleness(people: tuple[ParticipantReport, ...]) -> Finding:
-    """Report measured alignments that no observation has confirmed for ten minutes."""
+    """Report alignments that are unconfirmed, or so old that half of the bound is used up by their age."""
     texts = []
     for p in people:
         r = p.alignment_report
         if r is None or p.alignment != AlignmentKind.MEASURED:
             continue
         seen_ns = min((one.age_ns for one in r.seen if one.age_ns >= 0), default=p.alignment_age_ns)
-        if seen_ns > STALE_NS:
+        if r.doubt:
+            texts.append(f"the alignment of {p.name} is unconfirmed ({r.doubt}): its robots hold at the next clutch")
+        elif r.confirmed_ns > GLANCE_NS and r.error_at_robot_m > GLANCE_ERROR_M:
+            error = f"{r.error_at_robot_m * 1e3:.0f} mm at the robot"
+            texts.append(f"{p.name} has confirmed its alignment {_format_age(r.confirmed_ns)} ago: {error}")
+        elif seen_ns > STALE_NS:
             texts.append(f"{p.name} has seen no sheet for {_format_age(seen_ns)}")
-    fine = "measured alignments were confirmed within ten minutes"
-    why = "tracking frames drift by millimetres a minute, which the stated error does not include"
+    fine = "measured alignments were confirmed recently"
+    why = "tracking frames drift by millimetres a minute, and a later look may contradict an alignment"
     return report_problems("stale", texts, fine, why, "glance at a sheet now and then")
 
 

@@ -140,8 +140,9 @@ class AlignmentDoubt:
     replaces it. Empty: none.
     """
 
+    AGED: Final = "aged"  # no look for so long that drift alone may exceed the bound at the robot
     CONTRADICTED: Final = "contradicted"  # later looks disagree with it
-    ALL: Final = frozenset({"contradicted"})
+    ALL: Final = frozenset({"aged", "contradicted"})
 
 
 class AnchorKind:

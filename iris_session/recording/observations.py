@@ -209,6 +209,9 @@ def _apply_event(event: Event, said: _StepEntries, roster: _Roster, found: Align
     if isinstance(body, AnchorMoved):
         found.anchor_moves.append(AnchorMove(now_ns, body.anchor_id, body.T_world_anchor))
     elif isinstance(body, AlignmentChanged):
+        before = present.get(body.participant)
+        if before is not None and before.alignment.version == body.alignment.version:
+            return  # it has aged: the period goes on
         _end_period(body.participant, now_ns, present, found)
         person = found.participants.get(body.participant)
         run = len(person.runs) if person else 0

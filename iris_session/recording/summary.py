@@ -425,8 +425,8 @@ class SummaryBuilder:
                     self._change_holders(lease, now_ns)
             case AlignmentChanged(participant=name, alignment=alignment):
                 person = self._find_person(name)
-                person.alignment = alignment
-                person.changes += 1
+                before, person.alignment = person.alignment, alignment
+                person.changes += before is None or before.version != alignment.version  # else it has aged
                 person.worst_error_m = max(person.worst_error_m, _finite(alignment.error_at_robot_m))
             case AlignmentAlarmed(participant=name, kind=kind):
                 self._find_person(name).alarms[kind] += 1

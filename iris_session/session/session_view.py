@@ -20,6 +20,7 @@ from iris_session.protocol.server_messages import (
     Event,
     Handover,
     ParticipantChanged,
+    ParticipantInfo,
     ParticipantJoined,
     ParticipantLeft,
     Reply,
@@ -133,6 +134,9 @@ class SessionView:
         """Note since when alignments hold, which events do not say. Call before the mirror applies `event`."""
         body = event.body
         if isinstance(body, AlignmentChanged):
+            known = self.mirror.participants.get(body.participant)
+            if known is not None and known.alignment and known.alignment.version == body.alignment.version:
+                return  # it has aged
             self._aligned_ns[body.participant] = event.session_time
             self._void_ns.pop(body.participant, None)
         elif isinstance(body, ParticipantJoined | ParticipantChanged):
@@ -189,7 +193,7 @@ class SessionView:
                 alignment="none" if info.alignment is None else info.alignment.kind,
                 alignment_age_ns=now_ns - self._aligned_ns[info.id] if info.id in self._aligned_ns else -1,
                 alignment_void_ns=now_ns - self._void_ns[info.id] if info.id in self._void_ns else -1,
-                alignment_error_m=0.0 if info.alignment is None else info.alignment.error_at_robot_m,
+                alignment_error_m=_state_error(info, alignments.get(info.id)),
                 tracking_epoch=info.tracking_epoch,
                 holds=tuple(held.get(info.id, ())),
                 waits_for=tuple(waits.get(info.id, ())),
@@ -206,3 +210,10 @@ class SessionView:
     def compute_input_to_ctrl_ms(self) -> dict[str, float]:
         """Return by robot the age [ms] of the newest applied sample when its step began."""
         return {name: (a.step_ns - a.capture_ns) * 1e-6 for name, a in self.applied.items()}
+
+
+def _state_error(info: ParticipantInfo, report: AlignmentReport | None) -> float:
+    """Return the stated p95 at the robot [m]: with its age, which events say in steps only."""
+    if report is not None:
+        return report.error_at_robot_m
+    return 0.0 if info.alignment is None else info.alignment.error_at_robot_m

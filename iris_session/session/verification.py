@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from anchors.ageing import AgeingLaw
 from iris_session.authority import AuthorityConfig, is_same_snapshot
 from iris_session.journal.environment import use_one_blas_thread
 from iris_session.journal.rows import SNAPSHOTS
@@ -21,6 +22,7 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
     """Configuration in the header of a recording: laws that it does not name were not in force when it was made."""
 
     doubts: bool = False
+    ageing: AgeingLaw | None = None
 
 
 class _RecordedConfig(CoreConfig, frozen=True):

@@ -159,6 +159,7 @@ class EventNarration:
         self._colours: dict[tuple[str, ...], dict[str, Rgb]] = {}  # of lanes of participants
         self._changes: list[LaneChange] = []
         self._plots: list[tuple[str, str, float | None]] = []
+        self._versions: dict[str, int] = {}  # of alignments, by participant
         self._errors_m: dict[str, float] = {}  # stated errors at the anchor, by participant
         self._agreed: dict[tuple[str, str], bool] = {}  # whether the last check of two headsets was as expected
         self.roles: dict[str, str] = {}
@@ -309,6 +310,11 @@ class EventNarration:
         match body:
             case AlignmentChanged(participant=who, alignment=alignment):
                 self._set_alignment(who, alignment)
+                aged = self._versions.get(who) == alignment.version
+                self._versions[who] = alignment.version
+                if aged:
+                    text = f"the alignment of {self._name(who)} is good to {alignment.error_at_robot_m * 1e3:.1f} mm"
+                    return LogLine(DEBUG, text)
                 if alignment.kind == AlignmentKind.NONE:
                     return LogLine(WARN, f"{self._name(who)} is not aligned any more")
                 stated = alignment.kind == AlignmentKind.MEASURED and alignment.error_at_robot_m > 0.0

@@ -1,7 +1,8 @@
 """What must hold of alignments in every step of a random session, kept from outside: from events and entries.
 
-Nobody who uses an alignment sees it leap unannounced, nothing changes while a clutch is engaged, and what a robot is
-told to do is made of the sample and of the alignment at the moment of engagement, whatever was corrected since.
+An alignment in doubt begins no engagement. Nobody who uses an alignment sees it leap unannounced, nothing changes while
+a clutch is engaged, and what a robot is told to do is made of the sample and of the alignment at the moment of
+engagement, whatever was corrected since.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ class Before:
     alignment: Alignment | None
     offset: Pose | None
     engagements: frozenset[int]
+    doubt: str
 
 
 @dataclass
@@ -46,7 +48,7 @@ class AlignmentBooks:
     def begin(self, state: AuthorityState) -> None:
         """Before a step."""
         self._before = {
-            p.id: Before(p.connection, p.tracking_epoch, p.alignment, p.offset, engagements(state, p))
+            p.id: Before(p.connection, p.tracking_epoch, p.alignment, p.offset, engagements(state, p), p.doubt)
             for p in state.participants.values()
         }
 
@@ -59,6 +61,7 @@ class AlignmentBooks:
                 self._used.discard(event.body.participant)
         for p in state.participants.values():
             if p.id in self._before:
+                self._check_doubt(state, p, self._before[p.id])
                 self._check_change(state, p, self._before[p.id], now_ns)
             if p.alignment is None:
                 self._used.discard(p.id)
@@ -69,6 +72,15 @@ class AlignmentBooks:
         for c in state.cross_checks.values():
             assert c.a in state.participants
             assert c.b in state.participants
+
+    def _check_doubt(self, state: AuthorityState, p: Participant, before: Before) -> None:
+        assert p.alignment is not None or not p.doubt
+        if before.doubt and p.doubt:
+            self.came["doubted"] += 1
+            begun = engagements(state, p) - before.engagements
+            leases = (*state.robots.values(), *state.objects.values())
+            devices = {g.device for lease in leases for g in lease.grants if g.engagement in begun}
+            assert devices <= {"joints"}, "an alignment in doubt began an engagement"
 
     def _check_change(self, state: AuthorityState, p: Participant, before: Before, now_ns: int) -> None:
         old, new = before.alignment, p.alignment

@@ -6,6 +6,7 @@ import msgspec
 import pytest
 
 from iris_session.authority import is_same_snapshot
+from iris_session.authority.state import AGEING_FIELDS
 from iris_session.protocol.client_messages import Control, GetSnapshot, Grasp, Rename, SetRole
 from iris_session.protocol.entries import Lost
 from iris_session.protocol.server_messages import (
@@ -157,7 +158,7 @@ class TestEarlierSnapshots:
         now = t.authority.snapshot()
         earlier = msgspec.msgpack.decode(now)
         for fields in earlier["participants"].values():
-            for name in ("roles", "hello_name", "hello_role", "doubt", "confirmed_ns"):
+            for name in ("roles", "hello_name", "hello_role", "doubt", "confirmed_ns", *AGEING_FIELDS):
                 del fields[name]
             if fields["alignment"]:
                 del fields["alignment"]["pivot_world"]

@@ -11,8 +11,10 @@ from typing import Final
 
 import numpy as np
 
+from anchors.ageing import AgeingLaw
 from anchors.pose import PoseTuple, apply, distance
 from anchors.uncertainty import covariance_at_point, length_p95
+from iris_session.authority import AuthorityConfig
 from iris_session.client import Client
 from iris_session.control import ControlConfig
 from iris_session.demo.scenes import n_arms_scene
@@ -190,6 +192,31 @@ def test_drift_raises_an_alarm_until_it_is_measured_again() -> None:
         run_until_driven(rig, watcher, "left")
         rig.run(1.0)
         assert ann.finish_report().alignment_error_mm < 10.0
+
+
+def test_half_an_hour_without_a_look_holds_until_a_glance() -> None:
+    """With drift and law sixty times as fast: 3 mm a minute, and a minute is a second."""
+    law = AgeingLaw(60.0 * AgeingLaw.drift_m_per_min, 60.0 * AgeingLaw.yaw_rad_per_min)
+    with Rig(timestep=TICK, authority=AuthorityConfig(ageing=law, age_check_ns=SECOND // 60)) as rig:
+        watcher = rig.join("watcher", "director")
+        ann = emulate_driver(rig, "ann", "left", 11, model=STEADY, drift_m_per_min=0.18)
+        run_until_driven(rig, watcher, "left")
+        ann.disturb_tracking("drift", rig.simulation.now_ns)
+        hold = lambda: ann.client.feedback["left"].hold_reason  # noqa: E731
+        rig.run_until(lambda: hold() == HoldReason.UNCONFIRMED, "ann is to glance")
+        told = [b for _, b in rig.list_events("ann", Notice) if b.level == "warning" and "glance" in b.text]
+        assert [body.participant for body in told] == [ann.client.participant_id]
+        rig.run(20.0)
+        assert not is_driven(watcher, "left")
+        ann.disturb_tracking("steady", rig.simulation.now_ns)
+        version = find_version(ann)
+        watcher.alignment.start_run(ann.client.participant_id)
+        rig.run_until(lambda: find_version(ann) > version, "ann has glanced")
+        run_until_driven(rig, watcher, "left")
+        rig.run(1.0)
+        alignment = ann.client.alignment.current
+        assert alignment is not None
+        assert ann.finish_report().alignment_error_mm < 1e3 * alignment.error_at_anchor_m
 
 
 def test_unaligned_headset_gets_a_notice_and_moves_nothing() -> None:

@@ -90,6 +90,7 @@ export class PageState {
   private readonly newest = new Map<string, { capture_ms: number; received_ms: number }>();
   /** Names of participants that left, for events about them. */
   private readonly formerNames = new Map<string, string>();
+  private readonly alignmentVersions = new Map<string, number>();
   private readonly listeners: ((state: PageState) => void)[] = [];
   private isQueued = false;
   private nextSeq = 1;
@@ -254,6 +255,11 @@ export class PageState {
     }
     if (body.event === "lease_changed") {
       this.consents = this.consents.filter((asked) => asked.target !== body.lease.target || body.cause === "queue");
+    }
+    if (body.event === "alignment_changed") {
+      const { version } = body.alignment;
+      if (this.alignmentVersions.get(body.participant) === version) return; // it has aged: the panel says by how much
+      this.alignmentVersions.set(body.participant, version);
     }
     const words = eventWords(body, (id) => this.nameOf(id));
     if (words) this.addLog(session_time, words.text, words.level);

@@ -120,6 +120,7 @@ export function formatAge(ns: number): string {
 /** Return why an alignment is unconfirmed, so that robots hold at the next squeeze; empty: it is not. */
 export function doubtWords(report: { doubt: string; confirmed_ns: number } | null | undefined): string {
   if (!report || report.doubt === "") return "";
+  if (report.doubt === AlignmentDoubt.AGED) return `the alignment is ${formatAge(report.confirmed_ns)} old`;
   return report.doubt === AlignmentDoubt.CONTRADICTED ? "later looks contradict the alignment" : `the alignment is doubted: ${report.doubt.replaceAll("_", " ")}`;
 }
 

@@ -29,6 +29,7 @@ test("a denial names the holder once, and the advice", () => {
 
 test("an unconfirmed alignment says why, also for a reason of another version", () => {
   expect(doubtWords({ doubt: "", confirmed_ns: 400e9 })).toBe("");
+  expect(doubtWords({ doubt: "aged", confirmed_ns: 360e9 })).toBe("the alignment is 6 min old");
   expect(doubtWords({ doubt: "contradicted", confirmed_ns: 0 })).toMatch(/contradict/);
   expect(doubtWords({ doubt: "too_hot", confirmed_ns: 0 })).toMatch(/too hot/);
 });
