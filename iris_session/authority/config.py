@@ -71,7 +71,8 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `assignments`: participant name, or `key:<fingerprint>`, -> robots (policy `config`). `leader_apart`: `ramp`
     (control ramps) or `refuse`. `unaligned`: roles, devices and keys (`key:<fingerprint>`) that may drive without an
     alignment when they say that they need none. `doubts`: an alignment that later looks contradict, or that is too old,
-    begins no engagement. `ageing`: how its stated error grows since the last look; None: not. `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
+    begins no engagement. `ageing`: how its stated error grows since the last look; None: not. `user_owned_loop`: the
+    user drives physics, so pause, step and reset are denied.
     """
 
     # samples
