@@ -12,12 +12,13 @@ covariance (Birge ratio: chi-square per degree of freedom). Without a majority t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
+from anchors.evidence import ScaleError, describe_scale, explain_by_scale, weigh_change, weigh_earlier_looks
 from anchors.lie import Array, to_quat, to_vec3
 from anchors.pose import (
     IDENTITY_POSE,
@@ -36,9 +37,13 @@ from anchors.solver import (
     AlignmentPrior,
     AlignmentProblem,
     AlignmentSolution,
+    Mask,
     build_problem,
-    count_agreeing_anchors,
+    count_votes,
+    find_fitting_groups,
+    list_agreeing_anchors,
     median_tilt,
+    select_groups,
     solve_alignment,
     to_world_covariance,
 )
@@ -63,6 +68,10 @@ __all__ = [
     "mirror_pose",
     "position_error_p95",
 ]
+
+
+#: Groups of different eras have viewpoint numbers that differ by multiples of this.
+_ERA: Final = 1 << 64
 
 
 @dataclass(frozen=True)
@@ -113,6 +122,7 @@ class AlignmentEstimate:
 
     `covariance`: 36 values, 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, at `pivot_world`.
     `residual_tilt_rad`: tilt of the frame as the anchors alone show it. `moved`: anchors that all others outvote.
+    `supported`: the newest look agrees; an estimate without it confirms nothing.
     """
 
     T_world_tracking: PoseTuple
@@ -126,6 +136,7 @@ class AlignmentEstimate:
     refused: bool
     advice: str
     moved: tuple[str, ...] = ()
+    supported: bool = True
 
     @classmethod
     def refusal(
@@ -165,6 +176,10 @@ class AlignmentEstimator:
     _against_gravity: int = 0  # in this epoch
     _misprints: dict[str, str] = field(default_factory=dict)  # by sheet: what its last measured size says
     _near: tuple[Array, Array] | None = None  # where the last solution was: the next one is not far
+    _era: int = 0  # looks since the last contradiction are groups of their own
+    _changed: str = ""  # the sheet that contradicted the others since then, while it is not known why
+    _scales: tuple[ScaleError, ...] = ()  # of the last solution
+    _left_out: dict[str, int] = field(default_factory=dict)  # sheets that were moved: era since then
     _memory: ObservationBuffer = field(init=False)
 
     def __post_init__(self) -> None:
@@ -239,7 +254,7 @@ class AlignmentEstimator:
             self._against_gravity += 1
             return False
         self._memory.add(
-            (anchor_id, viewpoint_id),
+            (anchor_id, viewpoint_id % _ERA + _ERA * self._era),
             AnchorObservation(
                 capture_ns,
                 pose[0],
@@ -258,6 +273,70 @@ class AlignmentEstimator:
         """Discard all observations: the tracking frame has changed."""
         self._memory.clear()
         self._against_gravity, self._misprints, self._near = 0, {}, None
+        self._changed, self._left_out = "", {}
+
+    def weigh_alarm(self, anchor_id: str, since_ns: int, is_gradual: bool = True) -> tuple[str, ...] | None:
+        """Take note that an anchor is seen elsewhere than the alignment in force says.
+
+        Earlier observations are kept: later ones decide what was moved (`anchors.evidence`). Where no other anchor was
+        observed, there is nothing to compare with, and the later ones replace them.
+
+        Args:
+            anchor_id: Name of the anchor.
+            since_ns: Capture time of the first observation that contradicts.
+            is_gradual: It was not seen to change: an error of scale could explain it.
+
+        Returns:
+            Two or more anchors that agree with each other, if this one never agreed with them: then it is outvoted, and
+            the alignment stays. `None` if an error of scale explains all looks. Else empty.
+        """
+        if self._changed and self._changed != anchor_id:
+            return ()  # the first contradiction is still open: what is later than that decides
+        # Moved once more: what was seen in between does not count.
+        between = {key for key in self._memory.groups if key[0] == self._changed and key[1] // _ERA == self._era}
+        self._begin_era(since_ns)
+        self._memory.discard_groups(between & self._memory.groups.keys())
+        if is_gradual and not self._changed and self._is_explained_by_scale():
+            return None
+        self._left_out.pop(anchor_id, None)
+        earlier = {key: one for key, one in self._memory.groups.items() if key[1] // _ERA < self._era}
+        keys, merged = self._merge(earlier)
+        if not any(name != anchor_id for name, _ in keys):
+            self._memory.discard_groups(earlier.keys())
+            self._changed, self._near = "", None
+            return ()
+        prior = self.config.prior
+        opinion = weigh_earlier_looks(self._build_problem(keys, merged), anchor_id, prior)
+        if len(opinion.others) >= 2 and not opinion.fitted:
+            return opinion.others
+        self._changed = anchor_id
+        return ()
+
+    def _is_explained_by_scale(self) -> bool:
+        """Return whether an error of scale makes all looks agree that do not without it."""
+        keys, merged = self._merge(self._memory.select_mature_groups(self.config.min_observations))
+        if self._memory.newest_key not in keys:
+            return False
+        b = self._build_problem(keys, merged)
+        found = explain_by_scale(b, solve_alignment(b, self.config.prior), merged, self.config.prior)
+        return found is not None and bool(found[1].inside.all()) and any(one.is_certain for one in found[2])
+
+    def leave_out(self, anchor_id: str, since_ns: int) -> None:
+        """Leave an anchor out that was moved, from `since_ns` on (`weigh_alarm`), until it is seen where it was."""
+        self._begin_era(since_ns)
+        self._left_out[anchor_id] = self._era
+
+    def on_anchors_moved(self) -> None:
+        """Accept new poses of anchors: what was seen of a moved one before it was moved no longer counts."""
+        old = {k for k in self._memory.groups if k[1] // _ERA < self._left_out.get(k[0], 0)}
+        self._memory.discard_groups(old)
+        self._changed, self._left_out, self._near = "", {}, None
+
+    def _begin_era(self, since_ns: int) -> None:
+        """Make observations captured at `since_ns` or later groups of their own."""
+        self._era += 1
+        era = _ERA * self._era
+        self._memory.split_groups(since_ns, lambda key: (key[0], key[1] % _ERA + era))
 
     def _resolve_mirror(
         self, T_world_anchor: PoseTuple, seen: PoseTuple, p_head: Vec3 | None, alternative: PoseTuple | None
@@ -304,12 +383,32 @@ class AlignmentEstimator:
         if not merged:
             return self._refuse(CONTRADICT)
         prior = self.config.prior
-        b = self._problem(keys, merged, prior)
+        b = self._build_problem(keys, merged)
+        if self._changed:
+            later = np.array([key[1] // _ERA == self._era for key in keys])
+            if not self._decide_change(b, later, keys):
+                return self._refuse(change_advice(self._changed, {name for name, _ in self._memory.groups}))
+            return self.estimate()
+        n_groups = len(groups)
+        if self._left_out:
+            trusted = self._select_trusted(b, keys)
+            if not trusted.any():
+                return self._refuse(moved_advice(self._left_out))
+            n_groups -= len(keys) - int(trusted.sum())
+            b = select_groups(b, trusted)
+            keys, merged = (
+                [k for k, ok in zip(keys, trusted, strict=True) if ok],
+                [m for m, ok in zip(merged, trusted, strict=True) if ok],
+            )
         s = solve_alignment(b, prior, self._near)
-        against = prior.gravity and not self._is_majority(b, s, len(groups))
+        against = prior.gravity and not self._is_majority(b, s, n_groups)
         if against and median_tilt(b) > self.config.tilt_warning_rad:  # do they contradict each other, or gravity?
             free = solve_alignment(b, replace(prior, tilt_sigma_rad=math.inf))
-            s = free if self._is_majority(b, free, len(groups)) else s
+            s = free if self._is_majority(b, free, n_groups) else s
+        self._scales = ()
+        scaled = explain_by_scale(b, s, merged, prior)
+        if scaled is not None:
+            b, s, self._scales = scaled
         if not s.inside.any():
             return self._refuse(disagreement_advice(sorted(set(b.anchor))))
         tilt = s.observed_tilt(b)
@@ -319,9 +418,36 @@ class AlignmentEstimator:
             s = solve_alignment(b, replace(prior, tilt_sigma_rad=tilt), (s.q, s.t))
         self._near = (s.q, s.t)
         agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
-        if agreeing < self.config.min_observations or not self._is_majority(b, s, len(groups)):
+        if agreeing < self.config.min_observations or not self._is_majority(b, s, n_groups):
             return self._refuse(disagreement_advice(sorted(set(b.anchor))))
-        return self._to_estimate(b, s, tilt)
+        newest = self._memory.newest_key
+        supported = any(ok and key == newest for key, ok in zip(keys, s.inside.tolist(), strict=True))
+        return self._to_estimate(b, s, tilt, supported)
+
+    def _decide_change(self, b: AlignmentProblem, later: Mask, keys: list[GroupKey]) -> bool:
+        """Decide what a contradiction means (`anchors.evidence`), and keep what still counts; false if it is open."""
+        verdict = weigh_change(b, later, self._changed, self.config.prior)
+        if verdict == "open":
+            return False
+        if verdict == "sheet":
+            self._left_out[self._changed] = self._era
+        elif verdict == "frame":
+            self._memory.discard_groups({key for key in self._memory.groups if key[1] // _ERA < self._era})
+            self._near = None
+            self._left_out.clear()
+        self._changed = ""
+        return True
+
+    def _select_trusted(self, b: AlignmentProblem, keys: list[GroupKey]) -> Mask:
+        """Return the groups without those of sheets that were moved, unless they are seen where they were."""
+        moved = np.array([key[1] // _ERA >= self._left_out.get(key[0], self._era + 1) for key in keys])
+        if moved.any() and not moved.all():
+            s = solve_alignment(select_groups(b, ~moved), self.config.prior, self._near)
+            back = find_fitting_groups(select_groups(b, moved), s)
+            for name in list_agreeing_anchors([n for (n, _), out in zip(keys, moved, strict=True) if out], back):
+                del self._left_out[name]
+                moved &= np.array([key[0] != name for key in keys])
+        return ~moved
 
     def _merge(self, groups: Mapping[GroupKey, ViewpointGroup]) -> tuple[list[GroupKey], list[MergedObservation]]:
         """Return one merged observation per anchor and viewpoint whose observations agree, with their keys."""
@@ -334,9 +460,7 @@ class AlignmentEstimator:
                 merged.append(one)
         return keys, merged
 
-    def _problem(
-        self, keys: list[GroupKey], merged: list[MergedObservation], prior: AlignmentPrior
-    ) -> AlignmentProblem:
+    def _build_problem(self, keys: list[GroupKey], merged: list[MergedObservation]) -> AlignmentProblem:
         times = [self._memory.groups[key].capture_ns for key in keys]
         newest = max(group.observations[-1].capture_ns for group in self._memory.groups.values())
         poses = [self.anchors[anchor_id] for anchor_id, _ in keys]
@@ -346,21 +470,25 @@ class AlignmentEstimator:
             np.array([q for _, q in poses]),
             merged,
             np.array([min(ns - newest, 0) * 1e-9 for ns in times]),
-            prior,
+            self.config.prior,
             self.config.biases,
         )
 
     def _is_majority(self, b: AlignmentProblem, s: AlignmentSolution, n_groups: int) -> bool:
         """Return whether a majority agrees: of the anchors if there are three or more (a moved one may have been
-        observed most often), else of the viewpoints, counting those whose own observations disagree."""
-        anchors = set(b.anchor)
-        if len(anchors) > 2:
-            return 2 * count_agreeing_anchors(b.anchor, s.inside) > len(anchors)
-        return 2 * int(np.count_nonzero(s.inside)) > n_groups
+        observed most often), else of the viewpoints, counting those whose own observations disagree. Two anchors that
+        contradict each other have no majority, however often each was observed."""
+        votes = count_votes(b.anchor, s.inside)
+        if len(votes) > 2:
+            return 2 * sum(1 for n in votes.values() if n > 0) > len(votes)
+        return 2 * int(np.count_nonzero(s.inside)) > n_groups and min(votes.values()) >= 0
 
-    def _to_estimate(self, b: AlignmentProblem, s: AlignmentSolution, tilt: float) -> AlignmentEstimate:
+    def _to_estimate(
+        self, b: AlignmentProblem, s: AlignmentSolution, tilt: float, supported: bool
+    ) -> AlignmentEstimate:
         agreeing = {name for name, ok in zip(b.anchor, s.inside.tolist(), strict=True) if ok}
-        moved = tuple(sorted(set(b.anchor) - agreeing))  # no viewpoint of these agrees with the rest
+        # No viewpoint of these agrees with the rest, or none since they were moved.
+        moved = tuple(sorted(set(b.anchor) - agreeing | self._left_out.keys()))
         wider = s.chi2 / s.freedom if s.freedom > 0.0 and s.chi2 > chi2_quantile(s.freedom, Z99) else 1.0
         pivot = s.inside @ b.p_world / float(s.inside.sum())
         pivot_world = to_vec3(pivot)
@@ -376,6 +504,8 @@ class AlignmentEstimator:
             advice = f"the headset's vertical is off by {math.degrees(tilt):.1f} deg: is the sheet level as configured?"
         else:
             advice = size_advice(self._memory.groups, self.config.size_tolerance) or self._misprint_advice()
+        if not refused:
+            advice = "; ".join(filter(None, [advice, describe_scale(self._scales, self.sizes)]))
         return AlignmentEstimate(
             inverse((to_vec3(s.t), to_quat(s.q))),
             self.tracking_epoch,
@@ -388,6 +518,7 @@ class AlignmentEstimator:
             refused,
             advice,
             moved,
+            supported,
         )
 
     def _refuse(self, advice: str) -> AlignmentEstimate:
@@ -432,6 +563,18 @@ def disagreement_advice(anchor_ids: Sequence[str]) -> str:
     if len(anchor_ids) < 2:
         return CONTRADICT
     return f"{CONTRADICT}; one of these was moved: {', '.join(anchor_ids)}"
+
+
+def change_advice(anchor_id: str, known: Collection[str]) -> str:
+    """Return the advice for a sheet that contradicts others. It names in quotes what is to be looked at."""
+    others = " or ".join(f"'{name}'" for name in sorted(set(known) - {anchor_id}))
+    return f"sheet {anchor_id} is not where the others say: was it moved, or did tracking jump? look at sheet {others}"
+
+
+def moved_advice(anchor_ids: Collection[str]) -> str:
+    """Return the advice when only moved sheets are in view."""
+    names = " and ".join(map(repr, sorted(anchor_ids)))
+    return f"sheet {names} was moved: put it back, or set where it lies now (iris-session anchors move)"
 
 
 def gravity_advice(against_gravity: int, taken: int) -> str:

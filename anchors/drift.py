@@ -41,7 +41,8 @@ class Alarm(NamedTuple):
     alignment.
 
     `size_m`: distance, of a turn that 1 m away; `capture_ns`: time of detection, of a jump the time of its first
-    observation; `beside`: other anchors that did not change meanwhile (then this one was moved).
+    observation; `since_ns`: that time of the others, about; `beside`: other anchors that did not change meanwhile (then
+    this one was moved).
     """
 
     kind: AlarmKind
@@ -49,6 +50,7 @@ class Alarm(NamedTuple):
     size_m: float
     capture_ns: int
     beside: tuple[str, ...] = ()
+    since_ns: int = 0
 
     @property
     def invalidates(self) -> bool:
@@ -174,9 +176,9 @@ class DriftMonitor:
             since_ns = new[-self.config.jump_count].capture_ns
             beside = self._find_unmoved_anchors(anchor_id, since_ns, jumped)
             if beside:
-                return self._raise_alarm("changed", anchor_id, jumped, now_ns, beside)
+                return self._raise_alarm("changed", anchor_id, jumped, now_ns, beside, since_ns)
             self._reset()
-            return Alarm("jump", anchor_id, jumped, since_ns)
+            return Alarm("jump", anchor_id, jumped, since_ns, since_ns=since_ns)
         if len(new) < self.config.min_in_window:
             return None
         now = self._summarize(new)
@@ -184,13 +186,14 @@ class DriftMonitor:
             return None
         changed = self._measure_change(now, reference)
         if changed:
-            beside = self._find_unmoved_anchors(anchor_id, new[len(new) // 2].capture_ns, changed)
-            return self._raise_alarm("changed", anchor_id, changed, now_ns, beside)
+            since_ns = new[len(new) // 2].capture_ns
+            beside = self._find_unmoved_anchors(anchor_id, since_ns, changed)
+            return self._raise_alarm("changed", anchor_id, changed, now_ns, beside, since_ns)
         differs = self._measure_difference(anchor_id, now, alignment)
         differs = differs or self._measure_turn(anchor_id, new, now, alignment)
         if differs:
             beside = self._find_steady_anchors(anchor_id, new[0].capture_ns)
-            return self._raise_alarm("differs", anchor_id, differs, now_ns, beside)
+            return self._raise_alarm("differs", anchor_id, differs, now_ns, beside, new[0].capture_ns)
         self._steady_ns[anchor_id] = now_ns
         return None
 
@@ -208,14 +211,14 @@ class DriftMonitor:
         return new[::-1]
 
     def _raise_alarm(
-        self, kind: AlarmKind, anchor_id: str, size_m: float, now_ns: int, beside: tuple[str, ...]
+        self, kind: AlarmKind, anchor_id: str, size_m: float, now_ns: int, beside: tuple[str, ...], since_ns: int
     ) -> Alarm:
         """Return an alarm, and start over with the new pose of the anchor."""
         self._quiet_until_ns[anchor_id] = now_ns + self.config.quiet_ns
         self._references.pop(anchor_id, None)
         self._steady_ns.pop(anchor_id, None)
         self._detections[anchor_id].clear()
-        return Alarm(kind, anchor_id, size_m, now_ns, beside)
+        return Alarm(kind, anchor_id, size_m, now_ns, beside, since_ns)
 
     def _find_unmoved_anchors(self, anchor_id: str, since_ns: int, size_m: float) -> tuple[str, ...]:
         """Return other anchors that did not move since this one was off by `size_m`."""

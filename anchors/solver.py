@@ -39,6 +39,8 @@ _CONVERGED: Final = 2e-4  # [m], [rad]; with residuals of milliradians the step 
 _MAX_LEFT_OUT: Final = 4  # sheets that are left out in turn
 _MIN_SURE: Final = 2  # more sheets than this do not agree by chance
 _EYE: Final = np.eye(6)
+#: Of an error of scale that is an unknown, share of the distance: far beyond careful prints, so that data decide.
+SCALE_SIGMA: Final = 0.03
 Mask = NDArray[np.bool_]
 
 
@@ -71,6 +73,7 @@ class AlignmentProblem:
     information: Array  # (G, 6, 6), the inverse
     age_s: Array  # (G,)
     bias: Array  # (G, 6, K): shifts of the observed poses by one standard deviation of each of K common biases
+    scale: Array | None = None  # (G, 6, S): lines of sight of what shares each of S unknown errors of scale
 
     @property
     def size(self) -> int:
@@ -92,6 +95,9 @@ class AlignmentSolution:
     drift: Array
     distance2: Array
     turns: Array
+    weighted: Array  # (6 G, 9 + S) information times Jacobian of the groups inside
+    inverse: Array  # (9 + S, 9 + S) covariance of everything unknown
+    scale: Array  # (S,) errors of scale, share of the distance
 
     def observed_tilt(self, b: AlignmentProblem) -> float:
         """Return the tilt [rad] that the agreeing groups show together, without the gravity prior."""
@@ -133,6 +139,41 @@ def _compute_biases(merged: Sequence[MergedObservation], biases: Mapping[str, So
             k = 9 * sources.index(m.source)
             out[g, :, k : k + 9] = biases[m.source].compute_shifts(m.p_head, m.p, m.q)
     return out
+
+
+def select_groups(b: AlignmentProblem, which: Mask) -> AlignmentProblem:
+    """Return the problem with some of its groups."""
+    anchor = tuple(name for name, ok in zip(b.anchor, which.tolist(), strict=True) if ok)
+    p, q, covariance, information = b.p[which], b.q[which], b.covariance[which], b.information[which]
+    scale = None if b.scale is None else b.scale[which]
+    return AlignmentProblem(
+        anchor, b.p_world[which], p, q, covariance, information, b.age_s[which], b.bias[which], scale
+    )
+
+
+def find_fitting_groups(b: AlignmentProblem, s: AlignmentSolution) -> Mask:
+    """Return which groups that took no part agree with a solution (G,)."""
+    r, _ = _residuals(b, s.q, s.t, s.drift)
+    return np.asarray(np.einsum("gi,gij,gj->g", r, b.information, r) <= _CHI2_6_999)
+
+
+def score_scale(b: AlignmentProblem, s: AlignmentSolution, columns: Array) -> Array:
+    """Return how significant errors of scale (G, 6, S) are beside a solution without them, in standard deviations
+    (S,): Rao's score test."""
+    c = columns.reshape(-1, columns.shape[2])
+    r, _ = _residuals(b, s.q, s.t, s.drift)
+    weighted = (b.information @ columns * s.inside[:, None, None]).reshape(len(c), -1)
+    mixed = s.weighted.T @ c
+    information = np.sum(c * weighted, axis=0) - np.sum(mixed * (s.inverse @ mixed), axis=0)
+    return np.asarray((weighted.T @ r.ravel()) / np.sqrt(np.maximum(information, 1e-12)))
+
+
+def solve_with_scale(
+    b: AlignmentProblem, prior: AlignmentPrior, near: tuple[Array, Array], columns: Array
+) -> tuple[AlignmentProblem, AlignmentSolution]:
+    """Return the problem with errors of scale (G, 6, S) as unknowns, and the solution by all groups that agree."""
+    b = replace(b, scale=columns)
+    return b, _refine_inliers(b, np.ones(b.size, dtype=bool), near, prior)
 
 
 def solve_alignment(
@@ -226,29 +267,37 @@ def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: A
     """Run Gauss-Newton over (t, left rotation, drift) with the inliers; return distances of all groups too."""
     q, t = start
     drift = np.zeros(3)
-    J = np.zeros((b.size, 6, 9))
+    n = 9 if b.scale is None else 9 + b.scale.shape[2]
+    scale = np.zeros(n - 9)
+    J = np.zeros((b.size, 6, n))
     J[:, :, :6] = _EYE
+    if b.scale is not None:
+        J[:, :, 9:] = b.scale
     J[:, 0, 6] = J[:, 1, 7] = J[:, 2, 8] = b.age_s
     weights = inside.astype(np.float64)
     tilt_information = 1.0 / prior.tilt_sigma_rad**2 if prior.gravity else 0.0
-    diagonal = np.zeros(9)
+    diagonal = np.zeros(n)
     diagonal[3:5] = tilt_information
-    diagonal[6:] = 1.0 / max(prior.drift_m_per_s, 1e-9) ** 2
+    diagonal[9:] = 1.0 / SCALE_SIGMA**2
+    diagonal[6:9] = 1.0 / max(prior.drift_m_per_s, 1e-9) ** 2
     for _ in range(_ITERATIONS):
         r, P = _residuals(b, q, t, drift)
+        if b.scale is not None:
+            r = r - b.scale @ scale
         J[:, 0, 4], J[:, 0, 5] = P[:, 2], -P[:, 1]  # minus the cross-product matrix of the turned anchor
         J[:, 1, 3], J[:, 1, 5] = -P[:, 2], P[:, 0]
         J[:, 2, 3], J[:, 2, 4] = P[:, 1], -P[:, 0]
-        A = (b.information @ J * weights[:, None, None]).reshape(-1, 9)
+        A = (b.information @ J * weights[:, None, None]).reshape(-1, n)
         g = A.T @ r.ravel()
-        H = A.T @ J.reshape(-1, 9)
-        H.flat[::10] += diagonal
+        H = A.T @ J.reshape(-1, n)
+        H.flat[:: n + 1] += diagonal
         if prior.gravity:
             g[3:5] -= tilt_information * _tilt(q)
-        g[6:] -= diagonal[6:] * drift
+        g[6:9] -= diagonal[6:9] * drift
+        g[9:] -= diagonal[9:] * scale
         inverse = np.asarray(np.linalg.inv(H), dtype=np.float64)
         step = inverse @ g
-        t, drift = t + step[:3], drift + step[6:]
+        t, drift, scale = t + step[:3], drift + step[6:9], scale + step[9:]
         q = quat_multiply(quat_exp(step[3:6]), q)
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
@@ -258,13 +307,13 @@ def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: A
         shift = inverse[:6] @ (A.T @ b.bias.reshape(len(A), -1))
         covariance = covariance + shift @ shift.T
     distance2 = np.add.reduce((b.information @ r[:, :, None])[:, :, 0] * r, axis=1)
-    chi2 = float(weights @ distance2) + float(drift @ (diagonal[6:] * drift))
+    chi2 = float(weights @ distance2) + float(drift @ (diagonal[6:9] * drift)) + float(scale @ (diagonal[9:] * scale))
     freedom = 6.0 * float(weights.sum()) - 6.0
     if prior.gravity:
         tilt = _tilt(q)
         chi2 += tilt_information * float(tilt @ tilt)
         freedom += 2.0
-    return AlignmentSolution(t, q, covariance, inside, chi2, freedom, drift, distance2, r[:, 3:])
+    return AlignmentSolution(t, q, covariance, inside, chi2, freedom, drift, distance2, r[:, 3:], A, inverse, scale)
 
 
 def _tilt(q: Array) -> Array:
@@ -318,10 +367,20 @@ def _votes(b: AlignmentProblem, agree: Mask, misfit: float) -> tuple[int, int, f
 
 def count_agreeing_anchors(anchor: Sequence[str], agree: Mask) -> int:
     """Return the number of anchors of which most groups agree."""
+    return sum(1 for votes in count_votes(anchor, agree).values() if votes > 0)
+
+
+def list_agreeing_anchors(anchor: Sequence[str], agree: Mask) -> set[str]:
+    """Return the anchors of which most groups agree."""
+    return {name for name, votes in count_votes(anchor, agree).items() if votes > 0}
+
+
+def count_votes(anchor: Sequence[str], agree: Mask) -> dict[str, int]:
+    """Return by anchor how many more of its groups agree than do not."""
     balance: dict[str, int] = {}
     for name, ok in zip(anchor, agree.tolist(), strict=True):
         balance[name] = balance.get(name, 0) + (1 if ok else -1)
-    return sum(1 for votes in balance.values() if votes > 0)
+    return balance
 
 
 def to_world_covariance(q: Array, covariance: Array, pivot_world: Array) -> Array:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
@@ -109,6 +110,11 @@ class ObservationBuffer:
     def __len__(self) -> int:
         return len(self._order)
 
+    @property
+    def newest_key(self) -> GroupKey | None:
+        """The group of the newest observation."""
+        return self._order[-1] if self._order else None
+
     def add(self, key: GroupKey, sighting: AnchorObservation) -> None:
         """Add one observation and discard those that are too old or too many."""
         self._discard_outdated(sighting.capture_ns)
@@ -132,6 +138,22 @@ class ObservationBuffer:
     def clear(self) -> None:
         self.groups.clear()
         self._order.clear()
+
+    def split_groups(self, since_ns: int, rename: Callable[[GroupKey], GroupKey]) -> None:
+        """Move observations captured at `since_ns` or later to groups of another name."""
+        old = {key: deque(group.observations) for key, group in self.groups.items()}
+        order = list(self._order)
+        self.clear()
+        for key in order:
+            one = old[key].popleft()
+            new = rename(key) if one.capture_ns >= since_ns else key
+            self.groups.setdefault(new, ViewpointGroup()).observations.append(one)
+            self._order.append(new)
+
+    def discard_groups(self, keys: Set[GroupKey]) -> None:
+        """Discard groups with all their observations."""
+        self._order = deque(key for key in self._order if key not in keys)
+        self.groups = {key: group for key, group in self.groups.items() if key not in keys}
 
     def select_mature_groups(self, enough: int) -> dict[GroupKey, ViewpointGroup]:
         """Return the groups to estimate from.

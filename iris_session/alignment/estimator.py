@@ -15,13 +15,14 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
+from anchors.drift import Alarm
 from anchors.looks import Look
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3
 from iris_session.alignment.touches import MAX_TIPS, TouchEstimator
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import AlignmentProposal
-from iris_session.protocol.names import AlignmentKind, AnchorKind, ObservationSource
+from iris_session.protocol.names import AlarmKind, AlignmentKind, AnchorKind, ObservationSource
 from iris_session.protocol.status import AlignmentReport, AnchorSeen
 
 #: Errors that linear algebra raises for extreme input of a client.
@@ -95,6 +96,29 @@ class ConnectionEstimator:
         self._last: AlignmentEstimate | None = None  # also when it was refused
         self.newest: AlignmentEstimate | None = None
 
+    def weigh_alarm(self, alarm: Alarm) -> tuple[str, ...] | None:
+        """Keep what was seen of other sheets when one contradicts the alignment in force; the next looks decide.
+
+        Returns:
+            The sheets that outvote it (`AlignmentEstimator.weigh_alarm`), `None` if it is no contradiction; else empty,
+            and nothing is proposed that was seen before.
+        """
+        beside: tuple[str, ...] | None
+        try:
+            beside = self._estimator.weigh_alarm(alarm.anchor_id, alarm.since_ns, alarm.kind == AlarmKind.DIFFERS)
+        except NUMERICAL_ERRORS:
+            beside = ()
+            self._estimator.reset()
+        if beside == ():
+            self._touches.reset()
+            self._pending, self._last = False, None
+            self._refused = self._touched = self.newest = None
+        return beside
+
+    def leave_out(self, alarm: Alarm) -> None:
+        """Leave out a sheet that was moved, until it is seen where it was or given a new pose."""
+        self._estimator.leave_out(alarm.anchor_id, alarm.since_ns)
+
     def set_tip(self, device: str, covariance: tuple[float, ...]) -> None:
         """Set the covariance of the tip of a device (3x3 row-major, grip frame [m^2]); its earlier touches no longer
         count."""
@@ -109,6 +133,7 @@ class ConnectionEstimator:
     def on_anchors_moved(self) -> None:
         """Discard estimates, but keep observations: they stay valid when an anchor is given a new pose."""
         self._touches.on_anchors_moved()
+        self._estimator.on_anchors_moved()
         self._refused = self._touched = self.newest = None
         self._pending = self._used > 0
 
@@ -192,8 +217,9 @@ class ConnectionEstimator:
     def propose(self, now_ns: int) -> AlignmentProposal | None:
         """Return a proposal from all observations.
 
-        `None`: the same refusal as before for the same reason, or no improvement on marks that were touched. An invalid
-        touch is reported first, an unknown anchor when nothing usable is new (it may hang beside a known one); once.
+        `None`: the same refusal as before for the same reason, no improvement on marks that were touched, or the
+        newest look contradicts the others, so that they alone confirm nothing. An invalid touch is reported first, an
+        unknown anchor when nothing usable is new (it may hang beside a known one); once.
         """
         self._next_ns = now_ns + self._period_ns
         is_first = self._is_wrong_touch and now_ns - self._refused_ns >= _CLOSE_NS
@@ -211,6 +237,8 @@ class ConnectionEstimator:
         if estimate.refused:
             return self._filter_refusal(_to_proposal(estimate, kind), now_ns)
         self._refused = None
+        if self.newest is not None and not estimate.supported and estimate.moved == self.newest.moved:
+            return None
         if kind == AlignmentKind.MEASURED:
             self.newest = estimate
         return _to_proposal(estimate, kind)

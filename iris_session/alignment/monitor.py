@@ -172,6 +172,10 @@ class AlignmentMonitor:
         self._moved.discard(anchor_id)
         self.mute()
 
+    def accept_moved(self, anchor_id: str) -> None:
+        """Check an anchor no longer against the alignment: others outvote it."""
+        self._moved.add(anchor_id)
+
     def set_estimate(self, estimate: AlignmentEstimate) -> None:
         """Set the newest proposed estimate."""
         self._newest, self._muted, self._jump_ns = estimate, False, None

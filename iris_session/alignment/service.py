@@ -285,8 +285,17 @@ class AlignmentService:
         return state
 
     def _process_alarm(self, number: int, state: _HeadsetState, alarm: Alarm, tracking_epoch: int, now_ns: int) -> None:
-        """Report an alarm and discard the observations it invalidates: of the sheet that was moved, else of the
+        """Report an alarm. The estimator is asked first: a sheet that others outvote is no evidence against the
         headset."""
+        if alarm.anchor_id and not alarm.beside:
+            outvoting = state.estimator.weigh_alarm(alarm)
+            if outvoting is None:
+                return
+            if outvoting:
+                alarm = alarm._replace(kind=AlarmKind.CHANGED, beside=outvoting)
+                state.monitor.accept_moved(alarm.anchor_id)
+        elif alarm.anchor_id:
+            state.estimator.leave_out(alarm)
         if alarm.kind == AlarmKind.JUMP:
             state.last_jump = (tracking_epoch, min(alarm.capture_ns, now_ns))
         message = state.monitor.to_message(alarm, now_ns)
@@ -298,7 +307,8 @@ class AlignmentService:
         if alarm.beside:
             self._cross_check.discard_target(alarm.anchor_id)
             return
-        state.run_or_defer(state.estimator.reset)
+        if not alarm.anchor_id:  # the head jumped: nothing of the old tracking frame counts
+            state.run_or_defer(state.estimator.reset)
         state.monitor.mute()
         self._cross_check.discard_observations(number)
 

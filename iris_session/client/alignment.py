@@ -242,7 +242,7 @@ class ClientAlignment:
                     now_ns,
                     epoch,
                     viewpoint_id,
-                    one.edge_m,
+                    0.0,  # one camera cannot measure the size of a sheet, it is told
                     device=device,
                     covariance=covariance,
                 )

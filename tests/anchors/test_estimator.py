@@ -169,6 +169,16 @@ def test_three_contradicting_sheets_fail() -> None:
     assert got.advice.endswith("one of these was moved: a, b, c")
 
 
+def test_two_contradicting_sheets_fail_however_often_one_was_observed() -> None:
+    rng = np.random.default_rng(5)
+    T = tracking_frame(rng)
+    estimator = AlignmentEstimator(TRIANGLE)
+    for viewpoint, name in enumerate("aaab"):
+        place = shifted(TRIANGLE[name], (0.05, 0.0, 0.0)) if name == "b" else None
+        _observe(estimator, rng, T, name, viewpoint, place=place)
+    assert estimator.estimate().refused
+
+
 @pytest.mark.parametrize("names", ["a", "abc"])
 @pytest.mark.parametrize(("tilt_deg", "followed"), [(1.5, True), (2.5, True), (4.0, False), (8.0, False)])
 def test_tilt_in_all_observations_is_no_contradiction(names: str, tilt_deg: float, followed: bool) -> None:

@@ -70,7 +70,7 @@ def test_sheet_in_a_picture_is_observed_in_the_tracking_frame(ann: FakeClient, p
         "table",
         "board",
         5,
-        0.12,
+        0.0,
         1,
     )
     assert [one.anchor_id for one in found] == ["table"]

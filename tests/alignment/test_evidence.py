@@ -1,0 +1,93 @@
+"""Evidence of several sheets is weighed: what a look that contradicts others means, through the live service."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from anchors.pose import PoseTuple, quat_from_yaw
+from iris_session.protocol.entries import AlignmentProposal
+from tests.alignment.emulated_headsets import SECOND, Lab, Wearer, error_at_anchor
+from tests.anchors.worlds import shifted
+
+SHEETS: dict[str, PoseTuple] = {
+    "a": ((0.0, 0.0, 0.7), quat_from_yaw(0.1)),
+    "b": ((1.5, 0.0, 0.7), quat_from_yaw(2.0)),
+    "c": ((0.75, 1.3, 0.7), quat_from_yaw(-1.0)),
+}
+
+
+def look(ann: Wearer, sheets: Iterable[str]) -> list[AlignmentProposal]:
+    """Look at sheets from a new place each; return the proposals, the last of which is in force after each look."""
+    before = len(ann.proposals())
+    for name in sheets:
+        got = len(ann.proposals())
+        ann.report_observations(ann.place(name, 0.6), 10, name)
+        ann.lab.now_ns += SECOND
+        ann.lab.poll(2)
+        if len(ann.proposals()) > got:
+            ann.accept()
+    return ann.proposals()[before:]
+
+
+def find_refusal(ann: Wearer) -> str:
+    """Return the advice of the newest proposal, which is a refusal."""
+    newest = [e.message for e in ann.entries() if isinstance(e.message, AlignmentProposal)][-1]
+    assert newest.refused
+    return newest.advice
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(st.permutations("aabbcc"), st.sampled_from(["moved", "swapped"]))
+def test_no_order_of_looking_at_the_same_sheets_ends_elsewhere(order: list[str], what: str) -> None:
+    """Two sheets agree; the third one lies elsewhere, by 50 mm or by a metre."""
+    lab = Lab(SHEETS)
+    ann = lab.wearer()
+    lab.world["c"] = shifted(SHEETS["c"], (0.05, 0.0, 0.0) if what == "moved" else (0.0, -1.0, 0.0))
+    newest = look(ann, order)[-1]
+    assert all(error_at_anchor(ann, newest, name) < 0.012 for name in "ab")
+    assert "'c'" in newest.advice
+
+
+@pytest.mark.parametrize("names", ["ab", "abc"])
+def test_moved_tracking_frame_is_known_by_two_sheets(names: str) -> None:
+    lab = Lab(SHEETS)
+    ann = lab.wearer()
+    look(ann, names)
+    lab.now_ns += 30 * SECOND
+    ann.bump(0.05, 0.03)
+    assert look(ann, "aa") == [], "one sheet cannot tell"
+    assert [(a.kind, a.anchor_id, a.beside) for a in ann.alarms()] == [("differs", "a", ())]
+    assert "'b'" in find_refusal(ann)
+    newest = look(ann, "b")[-1]
+    assert all(error_at_anchor(ann, newest, name) < 0.012 for name in "ab")
+
+
+@pytest.mark.parametrize("names", ["ab", "abc"])
+def test_moved_sheet_is_known_by_a_look_at_another(names: str) -> None:
+    lab = Lab(SHEETS)
+    ann = lab.wearer()
+    look(ann, names)
+    lab.now_ns += 30 * SECOND
+    lab.world["a"] = shifted(SHEETS["a"], (0.0, 0.05, 0.0))
+    assert look(ann, "a") == [], "one sheet cannot tell"
+    newest = look(ann, "b")[-1]
+    assert error_at_anchor(ann, newest, "b") < 0.012
+    assert "'a'" in newest.advice
+    assert all(error_at_anchor(ann, one, "b") < 0.012 for one in look(ann, "aaa"))
+    lab.world["a"] = SHEETS["a"]
+    assert "'a'" not in look(ann, "aa")[-1].advice, "it was put back"
+
+
+@pytest.mark.parametrize("order", ["ab", "ba", "aaab", "abab", "bbba"])
+def test_two_sheets_that_contradict_each_other_have_no_majority(order: str) -> None:
+    lab = Lab(SHEETS)
+    ann = lab.wearer()
+    lab.world["b"] = shifted(SHEETS["b"], (0.0, 0.0, 0.05))
+    look(ann, order)
+    assert [a.beside for a in ann.alarms()] == [()]
+    advice = find_refusal(ann)
+    assert all(name in advice for name in "ab")
