@@ -82,9 +82,10 @@ class AlignmentConfig:
     axis) where nothing is. `biases`: by source of observations, what all of them share.
     `dof`: 4, or 6 to measure the tilt without gravity. `tilt_sigma_rad`: how far a headset's
     vertical may be off; `max_tilt_rad`: beyond it a single observation is wrong; `follow_tilt_rad`: so far a tilt that
-    all anchors show is followed, from `tilt_warning_rad` on with a warning. `drift_m_per_s`, `walk_m_per_sqrt_s`:
-    how the tracking frame drifts and wanders, per axis. `max_error_m`: the stated p95 at the anchors above which the
-    estimate is refused. `max_observations`, `max_groups`, and of one viewpoint `max_in_group`: the oldest are forgotten
+    all anchors show is followed, from `tilt_warning_rad` on (and beyond noise) with a warning. `drift_m_per_s`,
+    `walk_m_per_sqrt_s`: how the tracking frame drifts and wanders, per axis. `max_error_m`: the stated p95 at the
+    anchors above which the estimate is refused. `max_observations`, `max_groups`, and of one viewpoint `max_in_group`:
+    the oldest are forgotten
     (counted in `forgotten`), as are those older than the newest by more than `max_age_ns` (`outdated`).
     `min_agreeing`: share of one viewpoint's observations that must agree. `size_tolerance`: by what share a sheet may
     measure otherwise than it should.
@@ -121,8 +122,10 @@ class AlignmentEstimate:
     """Result, or the reason why there is none (`refused`, with `advice` for the wearer of the headset).
 
     `covariance`: 36 values, 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, at `pivot_world`.
-    `residual_tilt_rad`: tilt of the frame as the anchors alone show it. `moved`: anchors that all others outvote.
-    `supported`: the newest look agrees; an estimate without it confirms nothing.
+    `residual_tilt_rad`: tilt of the frame as the anchors alone show it; `tilt_noise_rad`: what noise alone explains of
+    it (99.9 %). `moved`: anchors that all others outvote. `supported`: the newest look agrees; an estimate without it
+    confirms nothing. `look_s`: for so long the wearer should go on looking: a refusal meanwhile, or a large error, is
+    not the last word.
     """
 
     T_world_tracking: PoseTuple
@@ -137,6 +140,8 @@ class AlignmentEstimate:
     advice: str
     moved: tuple[str, ...] = ()
     supported: bool = True
+    tilt_noise_rad: float = 0.0
+    look_s: float = 0.0
 
     @classmethod
     def refusal(
@@ -375,9 +380,8 @@ class AlignmentEstimator:
     def estimate(self) -> AlignmentEstimate:
         """Return the alignment by all observations of the current epoch. Unchanged groups are not merged again."""
         if len(self._memory) < self.config.min_observations:
-            return self._refuse(
-                self._misprint_advice() or gravity_advice(self._against_gravity, len(self._memory)) or LOOK_ADVICE
-            )
+            wrong = self._misprint_advice() or gravity_advice(self._against_gravity, len(self._memory))
+            return self._refuse(wrong or LOOK_ADVICE, 0.0 if wrong else self._remaining_look_s())
         groups = self._memory.select_mature_groups(self.config.min_observations)
         keys, merged = self._merge(groups)
         if not merged:
@@ -411,10 +415,11 @@ class AlignmentEstimator:
             b, s, self._scales = scaled
         if not s.inside.any():
             return self._refuse(disagreement_advice(sorted(set(b.anchor))))
-        tilt = s.observed_tilt(b)
-        if prior.gravity and tilt > self.config.follow_tilt_rad:
+        tilt, noise = s.measure_tilt(b, self.config.tilt_sigma_rad)
+        is_tilted = prior.gravity and tilt > max(noise, self.config.tilt_warning_rad)
+        if is_tilted and tilt > self.config.follow_tilt_rad:
             return self._refuse(tilt_advice(tilt))
-        if prior.gravity and tilt > self.config.tilt_warning_rad:  # all see the same sheet: follow it, and warn
+        if is_tilted:  # all see the same sheet: follow it, and warn
             s = solve_alignment(b, replace(prior, tilt_sigma_rad=tilt), (s.q, s.t))
         self._near = (s.q, s.t)
         agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
@@ -422,7 +427,7 @@ class AlignmentEstimator:
             return self._refuse(disagreement_advice(sorted(set(b.anchor))))
         newest = self._memory.newest_key
         supported = any(ok and key == newest for key, ok in zip(keys, s.inside.tolist(), strict=True))
-        return self._to_estimate(b, s, tilt, supported)
+        return self._to_estimate(b, s, tilt, noise, supported)
 
     def _decide_change(self, b: AlignmentProblem, later: Mask, keys: list[GroupKey]) -> bool:
         """Decide what a contradiction means (`anchors.evidence`), and keep what still counts; false if it is open."""
@@ -484,7 +489,7 @@ class AlignmentEstimator:
         return 2 * int(np.count_nonzero(s.inside)) > n_groups and min(votes.values()) >= 0
 
     def _to_estimate(
-        self, b: AlignmentProblem, s: AlignmentSolution, tilt: float, supported: bool
+        self, b: AlignmentProblem, s: AlignmentSolution, tilt: float, noise: float, supported: bool
     ) -> AlignmentEstimate:
         agreeing = {name for name, ok in zip(b.anchor, s.inside.tolist(), strict=True) if ok}
         # No viewpoint of these agrees with the rest, or none since they were moved.
@@ -500,7 +505,7 @@ class AlignmentEstimator:
             advice = f"the error would be {error * 1e3:.0f} mm: step closer to the sheet, look at it from several sides"
         elif moved:
             advice = f"moved since it was measured: sheet {' and '.join(map(repr, moved))}; it is not used"
-        elif tilt > self.config.tilt_warning_rad and self.config.dof == 4:
+        elif tilt > max(noise, self.config.tilt_warning_rad) and self.config.dof == 4:
             advice = f"the headset's vertical is off by {math.degrees(tilt):.1f} deg: is the sheet level as configured?"
         else:
             advice = size_advice(self._memory.groups, self.config.size_tolerance) or self._misprint_advice()
@@ -519,11 +524,23 @@ class AlignmentEstimator:
             advice,
             moved,
             supported,
+            tilt_noise_rad=noise,
+            look_s=self._remaining_look_s(),
         )
 
-    def _refuse(self, advice: str) -> AlignmentEstimate:
+    def _refuse(self, advice: str, look_s: float = 0.0) -> AlignmentEstimate:
         viewpoints = len({viewpoint for _, viewpoint in self._memory.groups})
-        return AlignmentEstimate.refusal(self.tracking_epoch, advice, len(self._memory), viewpoints)
+        refusal = AlignmentEstimate.refusal(self.tracking_epoch, advice, len(self._memory), viewpoints)
+        return replace(refusal, look_s=look_s)
+
+    def _remaining_look_s(self) -> float:
+        """Return for how long [s] more looks at their present rate sharpen the estimate much: until there are
+        `min_observations`, and `LOOK_S` after the first one."""
+        groups, n = self._memory.groups.values(), len(self._memory)
+        first = min((group.observations[0].capture_ns for group in groups), default=0)
+        span_s = max((group.observations[-1].capture_ns - first for group in groups), default=0) * 1e-9
+        missing_s = max(0, self.config.min_observations - n) * span_s / max(1, n - 1)
+        return min(max(0.0, missing_s, LOOK_S - span_s), MAX_LOOK_S)
 
 
 def mirror_pose(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:
@@ -551,6 +568,8 @@ def _tilt(T_world_anchor: PoseTuple, T_tracking_anchor: PoseTuple) -> float:
 
 # --- advice -----------------------------------------------------------------------------------------------------------
 
+LOOK_S: Final = 2.0
+MAX_LOOK_S: Final = 10.0
 LOOK_ADVICE: Final = "look at the anchor sheet for a few seconds, from about half a metre"
 CONTRADICT: Final = (
     "observations contradict each other: did the sheet move, or the headset lose tracking? hold still, look at the "

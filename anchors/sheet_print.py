@@ -152,8 +152,9 @@ def _lay_out(sheet: Sheet, paper: str) -> _Page:
     texts = [
         *_place_title(x0, y0 - 0.80 * edge, edge, unit, sheet.anchor_id),
         _Text(x0, y0 - 0.70 * edge, unit, f"code {edge:g} mm  ^ up"),
-        _Text(x0, y0 + 0.73 * edge, 0.8 * unit, "print at 100 %, then measure:"),
+        _Text(x0, y0 + 0.73 * edge, 0.8 * unit, "print at 100 %, measure the code's edge"),
         *figures,
+        _Text(x0, y0 + 0.87 * edge, 0.8 * unit, "tape it down, draw its corners"),
     ]
     crosses = []
     for name, (x, y, _) in sheet.marks.items():

@@ -33,6 +33,7 @@ from anchors.viewpoints import MergedObservation, circular_median
 
 _CHI2_6_999: Final = 22.458
 _CHI2_3_999: Final = 16.266
+_CHI2_2_999: Final = 13.816
 _ITERATIONS: Final = 6
 _STEADY_S: Final = 60.0  # for so long the drift is taken as steady, later the frame also wanders
 _CONVERGED: Final = 2e-4  # [m], [rad]; with residuals of milliradians the step after would be below 1e-6
@@ -99,11 +100,22 @@ class AlignmentSolution:
     inverse: Array  # (9 + S, 9 + S) covariance of everything unknown
     scale: Array  # (S,) errors of scale, share of the distance
 
-    def observed_tilt(self, b: AlignmentProblem) -> float:
-        """Return the tilt [rad] that the agreeing groups show together, without the gravity prior."""
+    def measure_tilt(self, b: AlignmentProblem, tilt_sigma_rad: float) -> tuple[float, float]:
+        """Return the tilt [rad] that the agreeing groups show together, without the gravity prior, and the 99.9 %
+        quantile of what noise alone would show that way; `tilt_sigma_rad`: of the headset's vertical, per axis.
+        """
         weight = self.inside / np.add.reduce(b.covariance[:, 3:, 3:].reshape(-1, 9)[:, ::4], axis=1)
-        tilt = _tilt(self.q) + weight @ self.turns[:, :2] / float(weight.sum())
-        return math.hypot(float(tilt[0]), float(tilt[1]))
+        weight = weight / float(weight.sum())
+        x, y = (_tilt(self.q) + weight @ self.turns[:, :2]).tolist()
+        shift = np.tensordot(weight, b.bias[:, 3:5], 1)
+        C = np.tensordot(weight**2, b.covariance[:, 3:5, 3:5], 1) + shift @ shift.T
+        (xx, xy), (_, yy) = C.tolist()
+        if not math.isfinite(tilt_sigma_rad):
+            tilt_sigma_rad = 0.0
+        xx, yy = xx + tilt_sigma_rad**2, yy + tilt_sigma_rad**2
+        chi2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+        tilt = math.hypot(x, y)
+        return tilt, tilt * math.sqrt(_CHI2_2_999 / chi2) if chi2 > 0.0 else 0.0
 
 
 def build_problem(

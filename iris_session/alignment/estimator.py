@@ -332,4 +332,6 @@ def _to_proposal(estimate: AlignmentEstimate, kind: str) -> AlignmentProposal:
         refused=estimate.refused,
         advice=estimate.advice[:MAX_TEXT],  # it may list many sheets
         kind=kind,
+        tilt_noise_rad=estimate.tilt_noise_rad,
+        look_s=estimate.look_s,
     )

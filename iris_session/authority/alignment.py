@@ -43,7 +43,7 @@ from iris_session.authority.state import Correction, Participant, Placement, War
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
 from iris_session.protocol.entries import AlignmentProposal
-from iris_session.protocol.names import AlignmentDoubt, AlignmentKind, DenialReason, HoldReason
+from iris_session.protocol.names import AlignmentDoubt, AlignmentKind, DenialReason, HoldReason, TargetKind
 from iris_session.protocol.server_messages import Notice
 
 #: For a participant that says `not_needed` and drives with a headset.
@@ -55,6 +55,8 @@ UNALIGNED_ADVICE: Final = (
 Z95: Final = 1.6448536269514722
 #: A look confirms an alignment when its own stated error is at most so many times that of the alignment.
 SAME_ERROR: Final = 1.25
+#: Reasons of a hold that a better alignment ends.
+_OF_ALIGNMENT: Final = (HoldReason.UNALIGNED, HoldReason.VIEW_ONLY, HoldReason.UNCONFIRMED)
 ADVICE: Final = "step closer to the sheet, look at it from a second place, or add a sheet near the robot"
 
 
@@ -73,6 +75,8 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
     drives = m.kind not in AlignmentKind.VIEW_ONLY
     if m.refused or not _is_valid_proposal(ctx, m):
         text = "the anchor measurement is not good enough" if m.refused else "the measurement is not a valid pose"
+        if m.refused and m.look_s > 0.0:
+            return _ask_to_look(ctx, p, m.look_s)
         if m.refused and _report_progress(ctx, p, m, text):
             return None
         return _notify_refusal(ctx, p, text, m.advice or ADVICE)
@@ -84,9 +88,11 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
     error = compute_error_at_robots(ctx, p, m.covariance, m.pivot_world, m.error_at_anchor_m)
     bound = ctx.config.max_error_at_robot_m if drives else ctx.config.max_error_to_view_m
     if error > bound:
+        if m.look_s > 0.0:
+            return _ask_to_look(ctx, p, m.look_s)
         text = _describe_large_error("the robot", error, bound)
         return None if _report_progress(ctx, p, m, text) else _notify_refusal(ctx, p, text, m.advice or ADVICE)
-    tilted = m.residual_tilt_rad > ctx.config.max_residual_tilt_rad
+    tilted = m.residual_tilt_rad > max(ctx.config.max_residual_tilt_rad, m.tilt_noise_rad)
     degrees = math.degrees(m.residual_tilt_rad)
     tilt = f"{p.name}: the anchor is tilted by {degrees:.1f} degrees, is the sheet level?"
     warn_wearer(ctx, p, "tilt", tilt if tilted else "", same="tilted")
@@ -140,7 +146,11 @@ def _is_news(ctx: Context, p: Participant, m: AlignmentProposal, error: float) -
     T_new = (m.T_world_tracking.p, quat_normalize(m.T_world_tracking.q))
     p_tracking = apply(inverse(T_new), m.pivot_world)
     moved = distance(apply((old.p, old.q), p_tracking), m.pivot_world)
-    return moved > ctx.config.min_change_m or quat_angle(old.q, T_new[1]) > ctx.config.min_change_rad
+    # What is dropped is in no stated error, so it must be small beside it.
+    share, turn_p95 = ctx.config.min_change_share, Z95 * math.sqrt(sum(m.covariance[21::7]))
+    return moved > min(ctx.config.min_change_m, share * m.error_at_anchor_m) or quat_angle(old.q, T_new[1]) > min(
+        ctx.config.min_change_rad, share * turn_p95
+    )
 
 
 def refuse_large_error(ctx: Context, p: Participant, robot: str, error: float, advice: str = "") -> None:
@@ -150,6 +160,17 @@ def refuse_large_error(ctx: Context, p: Participant, robot: str, error: float, a
 
 def _describe_large_error(robot: str, error: float, bound: float) -> str:
     return f"predicted error {error * 1000:.0f} mm at {robot}, at most {bound * 1000:.0f} mm is allowed"
+
+
+def _ask_to_look(ctx: Context, p: Participant, look_s: float) -> None:
+    """Ask the wearer to go on looking, at most once per `warning_ns`: a look that has begun is no refusal."""
+    said = p.warnings.setdefault("look", WarningState(said_ns=ctx.now_ns - ctx.config.warning_ns))
+    if ctx.now_ns - said.said_ns >= ctx.config.warning_ns:
+        said.said_ns = ctx.now_ns
+        seconds = max(1, round(min(look_s, 60.0)))
+        inform_wearer(
+            ctx, p, f"alignment of {p.name}: look at the sheet for {seconds} more second{'s' * (seconds > 1)}"
+        )
 
 
 def _report_progress(ctx: Context, p: Participant, m: AlignmentProposal, text: str) -> bool:
@@ -443,6 +464,7 @@ def _set_alignment(
     )
     warn_wearer(ctx, p, "unaligned", "", same="")
     ctx.publish_alignment(p)
+    _rearm_holds(ctx, p)
 
 
 def _clear_answered_alarm(ctx: Context, p: Participant) -> None:
@@ -484,10 +506,20 @@ def confirm_alignment(ctx: Context, p: Participant, looked_ns: int, walked_m: fl
     if p.doubt:
         p.doubt = ""
         warn_wearer(ctx, p, "doubt", "", same="")
-        for lease in (*ctx.state.robots.values(), *ctx.held_objects):
-            for g in lease.grants:
-                if g.participant == p.id and g.hold == HoldReason.UNCONFIRMED:
-                    g.hold = HoldReason.REARM
+        _rearm_holds(ctx, p)
+
+
+def _rearm_holds(ctx: Context, p: Participant) -> None:
+    """Ask for another squeeze where the alignment was why a target holds, and is not any more."""
+    if not ctx.config.doubts or p.alignment is None or p.alignment.kind in AlignmentKind.VIEW_ONLY:
+        return
+    for lease in ctx.list_leases(p):
+        for g in lease.grants:
+            if g.participant != p.id or g.hold not in _OF_ALIGNMENT or (g.hold == HoldReason.UNCONFIRMED and p.doubt):
+                continue
+            is_robot = lease.kind == TargetKind.ROBOT
+            if not is_robot or compute_error_at_robot(ctx, p, lease.target) <= ctx.config.max_error_at_robot_m:
+                g.hold = HoldReason.REARM
 
 
 # --- stated errors ---

@@ -58,6 +58,7 @@ POSITIVE: Final = (
     "contact_step_n",
     "max_anchor_move_m",
     "max_error_to_view_m",
+    "min_change_share",
     "age_check_ns",
     "slide_ns",
     "slide_m_per_s",
@@ -111,6 +112,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     patience_ns: int = 2 * SECOND  # of the first refusals of a participant: progress, then a warning
     min_change_m: float = 0.002  # smaller corrections of an accepted alignment are not worth a new version
     min_change_rad: float = 0.002
+    min_change_share: float = 0.25  # and at most this share of the stated error
     max_anchor_move_m: float = 5.0  # at once, unless forced: catches wrong units
     anchors: dict[str, Pose] = {}  # T_world_anchor by id, until a director moves one
     doubts: bool = True

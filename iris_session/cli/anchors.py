@@ -34,6 +34,7 @@ from iris_session.doctor.headset_checks import is_consistent
 from iris_session.protocol.names import AlignAction, AlignmentKind, Role
 
 if TYPE_CHECKING:
+    from anchors.sheet import Sheet
     from iris_session.client import Client
     from iris_session.protocol.server_messages import ParticipantInfo
     from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 #: Edges of the code where none is given: with its marks it must be smaller to fit on A4.
 PLAIN_SHEET_M: Final = 0.160
 MARKED_SHEET_M: Final = 0.140
+#: A printed sheet that is further off its size is no print of that sheet at 100 %.
+MAX_MISPRINT: Final = 0.05
 ALL_PARTICIPANTS: Final = "all"
 #: Sheets listed per headset, most recently observed first.
 MAX_LISTED_SHEETS: Final = 8
@@ -89,12 +92,19 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
             iris-session anchors print --size 160mm --id table --out table.pdf
             iris-session anchors print --id shelf --paper a3 --size 200mm
             iris-session anchors print --marks --out table.pdf
+            iris-session anchors print --id table --measured 159.2mm
         """,
     )
     one.add_argument(
         "--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (160mm; with --marks 140mm)"
     )
     one.add_argument("--marks", action="store_true", help="four crosses around the frame; a4 holds sizes up to 143mm")
+    one.add_argument(
+        "--measured",
+        type=parse_length,
+        metavar="LENGTH",
+        help="edge of the printed code by a ruler: print the lines for the anchors file, write no sheet",
+    )
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
     one.add_argument("--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
@@ -224,7 +234,9 @@ def run_print(arguments: argparse.Namespace) -> int:
         raise CommandError(f"{out}: the file must end in .pdf or .svg")
     try:
         size_m = arguments.size or (MARKED_SHEET_M if arguments.marks else PLAIN_SHEET_M)
-        sheet = Sheet(arguments.id, size_m, arguments.marks)
+        sheet = Sheet(arguments.id, arguments.measured or size_m, arguments.marks)
+        if arguments.measured:
+            return _print_measured(arguments, sheet, size_m)
         drawn = to_pdf(sheet, arguments.paper) if out.suffix.lower() == ".pdf" else to_svg(sheet, arguments.paper)
     except SheetError as error:
         raise CommandError(str(error)) from error
@@ -232,20 +244,39 @@ def run_print(arguments: argparse.Namespace) -> int:
     mm = f"{1e3 * sheet.edge_m:g} mm"
     lines = [
         f"{out}: anchor {sheet.anchor_id!r}, code {mm}, for {arguments.paper}",
-        f"print at 100 % (not 'fit to page'), then measure the code: {mm} from edge to edge",
+        f"print at 100 % (not 'fit to page'), then measure the code with a ruler: {mm} from edge to edge; what you "
+        "measure: `anchors print --measured LENGTH`, or `size_m` in the anchors file",
+        "tape the sheet down and draw its corners; a second sheet, 1 m away or more, shows when one has moved",
     ]
     if sheet.has_marks:
-        lines += [
-            "prick the crosses with a needle; the session must know them: lines for the anchors file",
-            "",
-            f"size_m = {sheet.edge_m!r}",
-            f"[anchors.{json.dumps(sheet.anchor_id)}.marks_m]",
-            *(f'"{name}" = [{", ".join(f"{c:.6g}" for c in p)}]' for name, p in sheet.marks.items()),
-        ]
+        lines += ["prick the crosses with a needle; the session must know them: lines for the anchors file", ""]
+        lines += _list_file_lines(sheet)
     result = {"file": str(out), "id": sheet.anchor_id, "size_m": sheet.edge_m, "paper": arguments.paper}
     result |= {"markers": sheet.marker_ids, "marker_edge_m": sheet.marker_edge_m, "marks_m": sheet.marks}
     print_result(arguments, result, lines)
     return 0
+
+
+def _print_measured(arguments: argparse.Namespace, sheet: Sheet, size_m: float) -> int:
+    """Print the lines of the anchors file for a sheet as it was measured. Raises `CommandError` for a misprint."""
+    scale = sheet.edge_m / size_m - 1.0
+    if abs(scale) > MAX_MISPRINT:
+        raise CommandError(
+            f"{1e3 * sheet.edge_m:g} mm is {scale:+.1%} off {1e3 * size_m:g} mm: print at 100 % again, or give the "
+            "size that it was printed for by --size"
+        )
+    result = {"id": sheet.anchor_id, "size_m": sheet.edge_m, "printed_for_m": size_m, "marks_m": sheet.marks}
+    print_result(arguments, result, [f"[anchors.{json.dumps(sheet.anchor_id)}]", *_list_file_lines(sheet)])
+    return 0
+
+
+def _list_file_lines(sheet: Sheet) -> list[str]:
+    """Return the lines of the anchors file with size and marks of a sheet."""
+    lines = [f"size_m = {sheet.edge_m!r}"]
+    if sheet.has_marks:
+        lines.append(f"[anchors.{json.dumps(sheet.anchor_id)}.marks_m]")
+        lines += [f'"{name}" = [{", ".join(f"{c:.6g}" for c in p)}]' for name, p in sheet.marks.items()]
+    return lines
 
 
 def run_example(arguments: argparse.Namespace) -> int:

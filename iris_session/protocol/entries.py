@@ -77,6 +77,8 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
     Covariance: 6x6 row-major at the anchor, order (x, y, z, rx, ry, rz), world frame. `advice` is set when the
     estimator refuses (`refused` true): "step closer", "add a sheet near the robot".
     `pivot_world`: the point that the covariance is stated at (the anchor). `kind`: the `AlignmentKind` that it makes.
+    `tilt_noise_rad`: what noise alone explains of the tilt. `look_s`: so many seconds of looking mend much; 0: they do
+    not.
     """
 
     T_world_tracking: Pose
@@ -90,6 +92,8 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
     refused: bool = False
     advice: Text = ""
     kind: Name = "measured"
+    tilt_noise_rad: float = 0.0
+    look_s: float = 0.0
 
 
 class TipSolved(Message, frozen=True, tag="tip_solved"):

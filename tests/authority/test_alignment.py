@@ -114,6 +114,53 @@ def test_first_refusals_are_progress_and_only_later_ones_a_warning() -> None:
     assert t.since(Notice)[0].level == "warning"
 
 
+def test_a_look_that_has_begun_is_no_refusal() -> None:
+    """Also where an alignment is in force; the same without more to look for is a refusal."""
+    t = Table()
+    anna = t.operator()
+    poor = {"refused": True, "advice": "look at the sheet", "n_observations": 1}
+    for _ in range(10):
+        t.step(anna.says(proposal(**poor, look_s=2.0)), dt_ns=100 * MS)
+    t.step(anna.says(proposal(covariance=covariance(0.03, 0.0), look_s=1.0)))
+    assert [(e.level, e.reason) for e in t.events if isinstance(e, Notice)] == [("info", "")]
+    t.step(anna.says(proposal(**poor)))
+    assert [e.reason for e in t.since(Notice)] == ["alignment_refused"]
+
+
+def test_after_a_new_alignment_a_held_squeeze_is_asked_for_again() -> None:
+    t = Table()
+    anna = t.operator("left")
+    anna.engage("left")
+    anna.does(TrackingEpoch(1))
+    anna.tracking_epoch = 1
+    anna.sends("left", clutch=True)
+    assert t.hold() == "unaligned"
+    t.step(anna.says(proposal(tracking_epoch=1)))
+    anna.alignment_version = 2
+    anna.sends("left", clutch=True)
+    assert t.hold() == "rearm"
+    anna.engage("left")
+    assert t.command().kind == "pose"
+
+
+def test_a_tilt_that_noise_explains_is_no_warning() -> None:
+    t = Table()
+    anna, bert = t.join(), t.join()
+    t.step(anna.says(proposal(residual_tilt_rad=0.03, tilt_noise_rad=0.04)))
+    assert t.since(Notice) == []
+    t.step(bert.says(proposal(residual_tilt_rad=0.03, tilt_noise_rad=0.02)))
+    assert [(e.level, e.participant) for e in t.since(Notice)] == [("warning", bert.id)]
+
+
+def test_what_is_dropped_is_small_beside_the_stated_error() -> None:
+    t = Table()
+    anna = t.operator()
+    t.step(anna.says(proposal(T_world_tracking=yawed(0.0, 1.001))))
+    assert len(t.since(AlignmentChanged)) == 1, "1 mm beside 2 mm stated"
+    t.step(anna.says(proposal(T_world_tracking=yawed(0.0, 1.0013))))
+    assert t.since(AlignmentChanged) == []
+
+
 def test_error_counts_at_the_robots_one_holds() -> None:
     lever = covariance(0.001, 0.02)
     t = Table()

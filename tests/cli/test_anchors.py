@@ -61,6 +61,19 @@ def test_printed_marks_are_those_of_the_anchors_file(tmp_path: Path, capsys: Cap
     assert main(["anchors", "print", "--marks", "--size", "200mm", "--paper", "a3", "--out", out]) == 0
 
 
+def test_measured_sheet_gives_the_lines_of_the_anchors_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["anchors", "print", "--marks", "--measured", "139mm"]) == 0
+    table = tomllib.loads(capsys.readouterr().out)["anchors"]["table"]
+    assert table["size_m"] == 0.139
+    assert table["marks_m"]["1"] == [-0.09174, 0.13066, 0.0], "the crosses are as far off as the code"
+    assert main(["anchors", "print", "--measured", "182mm"]) == 2
+    assert "print at 100 %" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
