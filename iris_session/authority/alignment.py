@@ -226,7 +226,7 @@ def set_tracking_epoch(ctx: Context, p: Participant, m: TrackingEpoch) -> None:
 def void_tracking_frame(ctx: Context, p: Participant) -> None:
     """Void poses and alignment of the old tracking frame, and hold everything that they moved."""
     for device in p.seen.values():
-        device.pose = None
+        device.pose = device.track = None
     if p.needs_alignment:
         void_alignment(p)
     engagement.rearm_participant(ctx, p, HoldReason.REARM)

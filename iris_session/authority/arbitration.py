@@ -14,7 +14,7 @@ from typing import Final
 import msgspec
 
 from anchors.pose import compose, inverse, quat_rotate
-from iris_session.authority import ageing, engagement, roster, samples
+from iris_session.authority import ageing, engagement, roster, samples, tracking
 from iris_session.authority.context import HUMAN, Context
 from iris_session.authority.state import DeviceState, FeedbackState, JointReading, LeaseGrant, LeaseState, Participant
 from iris_session.protocol.client_messages import Sample
@@ -40,19 +40,42 @@ def process_sample(ctx: Context, entry: Entry, s: Sample) -> None:
     reason = samples.check_sample(ctx, p, entry, s, drives)
     if reason:
         return samples.reject_sample(ctx, p, s, reason)
-    usable = s.tracked and s.worn and not s.emulated
+    usable = samples.is_measured(ctx, p, s)
     _store_payload(p, s, usable)
     if s.worn != p.worn:
         roster.set_worn(ctx, p, s.worn)
+    way = samples.follow_device(ctx, p, s) if usable else tracking.STEADY
+    if way == tracking.JUMP and _stop_device(ctx, p, s.device):
+        return samples.reject_sample(ctx, p, s, RejectReason.JUMP)
+    if way == tracking.OUTLIER:
+        samples.count_rejection(ctx, p, s.device, RejectReason.JUMP)
     for lease, g in drives:
-        _update_latch(ctx, p, lease, g, s)
+        waits = way == tracking.SURPRISE and s.clutch
+        if not waits:
+            _update_latch(ctx, p, lease, g, s)
         if g.engagement and g.device == s.device:
-            _set_source(ctx, p, lease, g, entry, s)
+            if waits:
+                g.counted_ns = ctx.now_ns
+            else:
+                _set_source(ctx, p, lease, g, entry, s)
     if usable and s.kind == SampleKind.POSE and s.device == Device.HEAD:
         ageing.measure_walk(ctx, p, s)
     if usable and s.kind == SampleKind.POSE and s.device not in _INVISIBLE:
         _publish_presence(ctx, p, s)
     return None
+
+
+def _stop_device(ctx: Context, p: Participant, device: str) -> bool:
+    """End every engagement of a device that jumped. Return false when there was none: then nothing moves by it."""
+    engaged = [
+        (lease, g)
+        for lease in ctx.list_leases(p)
+        for g in lease.grants
+        if g.participant == p.id and g.engagement and g.device == device
+    ]
+    for lease, g in engaged:
+        engagement.end_engagement(ctx, lease, g, HoldReason.JUMP)
+    return bool(engaged)
 
 
 def _store_payload(p: Participant, s: Sample, usable: bool) -> None:

@@ -12,6 +12,7 @@ from anchors.pose import distance, quat_angle
 from iris_session.authority import ageing, alignment, engagement
 from iris_session.authority.context import Context, find_grant
 from iris_session.authority.state import DeviceState, JointReading, LeaseGrant, LeaseState, Participant, Rejections
+from iris_session.authority.tracking import STEADY, Track, follow_pose, is_repeat, is_zero_pose
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import (
@@ -35,7 +36,10 @@ _HOLDS = {
     RejectReason.VIEW_ONLY: HoldReason.VIEW_ONLY,
     RejectReason.EMULATED: HoldReason.EMULATED,
     RejectReason.UNCONFIRMED: HoldReason.UNCONFIRMED,
+    RejectReason.ZERO_POSE: HoldReason.ZERO_POSE,
 }
+#: Reasons of a hold of their own, said to one who drives or means to.
+_STOPS = {RejectReason.FROZEN: HoldReason.FROZEN, RejectReason.JUMP: HoldReason.JUMP}
 
 
 def check_sample(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: list[Drive]) -> str:
@@ -62,10 +66,10 @@ def check_sample(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: 
         reason = _check_alignment(ctx, p, s, drives)
     if not reason:
         reason = _check_numbers(ctx, s)
-    if not reason and s.emulated and drives and s.tracked and s.worn:
-        reason = RejectReason.EMULATED
     if not reason and s.tracked and s.worn:
-        reason = _check_payload(ctx, s, seen) or (_check_engagement(ctx, p, s, drives) if s.clutch else "")
+        reason = _check_payload(ctx, p, s, seen) or (_check_measured(ctx, p, s, seen) if drives else "")
+        if not reason and s.clutch:
+            reason = _check_engagement(ctx, p, s, drives)
     return reason
 
 
@@ -134,7 +138,50 @@ def _check_numbers(ctx: Context, s: Sample) -> str:
     return "" if math.isfinite(total) else RejectReason.NOT_FINITE
 
 
-def _check_payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
+def is_measuring(ctx: Context, p: Participant, device: str) -> bool:
+    """Return true for a device whose poses are measured: no two are the same, and they never jump. Agents compute
+    theirs.
+    """
+    return ctx.config.speed_limits[device].linear_acceleration > 0.0 and p.role != Role.AGENT
+
+
+def is_measured(ctx: Context, p: Participant, s: Sample) -> bool:
+    """Return false for a sample that says, or shows, that no measurement is behind it."""
+    if not (s.tracked and s.worn) or s.emulated:
+        return False
+    return s.kind != SampleKind.POSE or s.pose is None or not (is_measuring(ctx, p, s.device) and is_zero_pose(s.pose))
+
+
+def follow_device(ctx: Context, p: Participant, s: Sample) -> str:
+    """Take the pose of a measured sample into the track of its device; returns as `tracking.follow_pose`."""
+    if s.kind != SampleKind.POSE or s.pose is None or not is_measuring(ctx, p, s.device):
+        return STEADY
+    seen = p.seen[s.device]
+    if seen.track is None:
+        seen.track = Track(s.pose, s.capture_ns, s.capture_ns)
+        return STEADY
+    return follow_pose(seen.track, ctx.config.speed_limits[s.device], s.pose, s.capture_ns)
+
+
+def _check_measured(ctx: Context, p: Participant, s: Sample, seen: DeviceState) -> str:
+    """Reject a sample with targets whose pose is no measurement: it must not drive."""
+    if s.emulated:
+        return RejectReason.EMULATED
+    if not is_measured(ctx, p, s):
+        return RejectReason.ZERO_POSE
+    if not s.clutch or s.pose is None or s.kind != SampleKind.POSE or not is_measuring(ctx, p, s.device):
+        return ""
+    limit_ns, track = ctx.config.frozen_ns, seen.track
+    if track is not None and is_repeat(track, s.pose) and s.capture_ns - track.same_ns >= limit_ns:
+        return RejectReason.FROZEN
+    # A headset whose head stands still to the last bit does not know where its hands are either.
+    head = p.seen.get(Device.HEAD, UNSEEN)
+    if p.needs_alignment and head.track is not None and head.pose_ns - head.track.same_ns >= limit_ns:
+        return RejectReason.FROZEN if s.capture_ns - head.pose_ns <= ctx.config.freshness_ns else ""
+    return ""
+
+
+def _check_payload(ctx: Context, p: Participant, s: Sample, seen: DeviceState) -> str:
     """Reject a wrong shape or an impossible speed of the payload that `kind` names."""
     limit = ctx.config.speed_limits[s.device]
     if s.kind == SampleKind.POSE:
@@ -143,7 +190,7 @@ def _check_payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
         w, x, y, z = s.pose.q
         if not abs(math.sqrt(w * w + x * x + y * y + z * z) - 1.0) <= ctx.config.quaternion_tolerance:
             return RejectReason.NOT_UNIT
-        if seen.pose is None:
+        if seen.pose is None or is_measuring(ctx, p, s.device):
             return ""
         dt = max(0, s.capture_ns - seen.pose_ns) * 1e-9
         possible = (
@@ -214,7 +261,7 @@ def reject_sample(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
     count_rejection(ctx, p, s.device, reason)
     if reason == RejectReason.SEQ:
         return
-    hold = _HOLDS.get(reason, HoldReason.REJECTED)
+    hold = _HOLDS.get(reason) or _STOPS.get(reason, HoldReason.REJECTED)
     if reason == RejectReason.UNALIGNED and p.alignment is None:
         advice = "look at an anchor sheet" if p.aligning else "start its alignment run"
         alignment.warn_wearer(ctx, p, "unaligned", f"{p.name} is not aligned and moves nothing: {advice}", same=advice)

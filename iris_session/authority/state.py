@@ -9,6 +9,7 @@ from typing import Final
 
 import msgspec
 
+from iris_session.authority.tracking import Track
 from iris_session.protocol.common import IDENTITY, Alignment, Pose, Vec3
 from iris_session.protocol.entries import SceneLoaded
 from iris_session.protocol.names import HoldReason
@@ -38,13 +39,14 @@ class JointReading(msgspec.Struct, array_like=True):
 class DeviceState(msgspec.Struct):
     """Newest usable payloads of one device, which the next ones are compared with, regardless of samples in between.
 
-    `pose`: in the tracking frame, sampled at `pose_ns`. `joints`: by their number.
+    `pose`: in the tracking frame, sampled at `pose_ns`. `joints`: by their number. `track`: of a device that measures.
     """
 
     seq: int = -1
     pose_ns: int = 0
     pose: Pose | None = None
     joints: dict[int, JointReading] = {}
+    track: Track | None = None
 
 
 class Rejections(msgspec.Struct):
@@ -351,6 +353,10 @@ def is_same_snapshot(recorded: bytes, snapshot: bytes) -> bool:
             return False
         for added in ADDED_FIELDS - had[name].keys():
             del fields[added]
+        seen = had[name].get("seen")
+        for device, state in fields["seen"].items():
+            if isinstance(seen, dict) and "track" not in seen.get(device, ()):
+                del state["track"]
         alignment = had[name].get("alignment")
         if isinstance(alignment, dict) and "pivot_world" not in alignment and fields["alignment"] is not None:
             del fields["alignment"]["pivot_world"]

@@ -181,7 +181,7 @@ class StopScenario:
             "alignment_version": 1,
             "targets": (Target("arm", 1),),
             "gripper": 0.5,
-            "pose": Pose((0.0, moved, 1.0), (1.0, 0.0, 0.0, 0.0)),
+            "pose": Pose((0.0, moved, 1.0 + 1e-9 * self.step_number), (1.0, 0.0, 0.0, 0.0)),
         }
         return Sample(**{**fields, **self.changes})
 

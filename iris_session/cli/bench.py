@@ -52,6 +52,7 @@ _BENCHMARKS: Final = {
         {**_CLIENTS, "objects": (1, 2000), "assets_mb": (1, 2000)}, _BOTH, "its bars are for plain loopback"
     ),
     "stop": _Benchmark({}, _BOTH, "it uses no network"),
+    "hands": _Benchmark({}, _BOTH, "it uses no network"),
     "record": _Benchmark({"kills": (1, 1000)}, _BOTH, "its bars are for loopback"),
     # A tab, one that is disturbed and one that is not; a gateway has three quarters of all connections.
     "web": _Benchmark({"clients": (3, 48), **_VERTICES}, "profile", "its bars are for loopback"),
@@ -82,6 +83,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session bench cloud-stream --points 50000 --hz 60 --check
             iris-session bench join --check
             iris-session bench stop --check
+            iris-session bench hands --check
             iris-session bench record --check
             iris-session bench record --seconds 20 --kills 4
             iris-session bench web --clients 8 --curve --check
@@ -132,7 +134,8 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             "seconds",
             parse_seconds,
             None,
-            "measured part (default: 20; slow-client: 50; record: 60; web: 65; stop: 1)",
+            "measured part (default: 20; slow-client: 50; record: 60; web: 65; stop: 1; "
+            "hands: 300, simulated, of every device and rate)",
         ),
         ("kills", int, 21, "record: kills of recorder, authority and both (default: %(default)s)"),
         ("seed", int, 0, "random seed (default: %(default)s)"),

@@ -193,9 +193,7 @@ class CommandKind:
 
 
 class HoldReason:
-    """Reason why a robot holds. Exactly one is given with every hold command. `zero_pose`, `frozen` and `jump` are
-    reserved: no session gives them yet.
-    """
+    """Reason why a robot holds. Exactly one is given with every hold command."""
 
     NO_LEASE: Final = "no_lease"
     NO_SAMPLE: Final = "no_sample"  # a lease, but nothing counted yet
@@ -220,9 +218,7 @@ class HoldReason:
 
 
 class RejectReason:
-    """Reason why a sample was rejected. Counted per participant, device and reason. `zero_pose`, `frozen` and `jump`
-    are reserved: no session gives them yet.
-    """
+    """Reason why a sample was rejected. Counted per participant, device and reason."""
 
     CONNECTION_EPOCH: Final = "connection_epoch"
     SCENE_EPOCH: Final = "scene_epoch"

@@ -43,9 +43,14 @@ class Table:
     """An authority whose time moves by one period per step."""
 
     def __init__(
-        self, config: AuthorityConfig | None = None, robots: Sequence[RobotSpec] = (), objects: Sequence[str] = ()
+        self,
+        config: AuthorityConfig | None = None,
+        robots: Sequence[RobotSpec] = (),
+        objects: Sequence[str] = (),
+        frozen_ns: int = 3600 * SECOND,
     ) -> None:
-        self.config = config or AuthorityConfig()
+        # Hands here keep still to the last bit.
+        self.config = msgspec.structs.replace(config or AuthorityConfig(), frozen_ns=frozen_ns)
         self.robots = tuple(robots) or (robot("left"), robot("right"))
         self.objects = tuple(ObjectSpec(n, n) for n in (objects or ("hammer", "board")))
         self.authority = Authority(self.config, self.robots, self.objects)

@@ -67,7 +67,8 @@ class Hand:
         if self.sending and self.client.ready and not self._rig.is_hanging(self.client):
             (x, y, z), q = self.pose
             vx, vy, vz = (v * SAMPLE_NS / SECOND for v in self.velocity)
-            self.pose = ((x + vx, y + vy, z + vz), q)
+            tremble = 1e-12 if self.device.startswith(("controller", "hand")) else 0.0
+            self.pose = ((x + vx, y + vy, z + vz + tremble), q)
             more = {} if self.gripper is None else {"gripper": self.gripper}
             self.client.send_sample(self.device, self.pose, robots=[self.robot], clutch=self.clutch, **more)
 

@@ -142,6 +142,7 @@ namespace IrisSession.Protocol
     /// </summary>
     public static class AlignmentDoubt
     {
+        public const string Aged = "aged";
         public const string Contradicted = "contradicted";
     }
 
@@ -196,8 +197,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Reason why a robot holds. Exactly one is given with every hold command. zero_pose, frozen and jump are
-    /// reserved: no session gives them yet.
+    /// Reason why a robot holds. Exactly one is given with every hold command.
     /// </summary>
     public static class HoldReason
     {
@@ -224,8 +224,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Reason why a sample was rejected. Counted per participant, device and reason. zero_pose, frozen and jump
-    /// are reserved: no session gives them yet.
+    /// Reason why a sample was rejected. Counted per participant, device and reason.
     /// </summary>
     public static class RejectReason
     {

@@ -122,6 +122,7 @@ export type AlarmKind = (typeof AlarmKind)[keyof typeof AlarmKind] | (string & {
  * replaces it. Empty: none.
  */
 export const AlignmentDoubt = {
+  AGED: "aged",
   CONTRADICTED: "contradicted",
 } as const;
 export type AlignmentDoubt = (typeof AlignmentDoubt)[keyof typeof AlignmentDoubt] | (string & {});
@@ -172,10 +173,7 @@ export const CommandKind = {
 } as const;
 export type CommandKind = (typeof CommandKind)[keyof typeof CommandKind] | (string & {});
 
-/**
- * Reason why a robot holds. Exactly one is given with every hold command. `zero_pose`, `frozen` and `jump` are
- * reserved: no session gives them yet.
- */
+/** Reason why a robot holds. Exactly one is given with every hold command. */
 export const HoldReason = {
   NO_LEASE: "no_lease",
   NO_SAMPLE: "no_sample",
@@ -200,10 +198,7 @@ export const HoldReason = {
 } as const;
 export type HoldReason = (typeof HoldReason)[keyof typeof HoldReason] | (string & {});
 
-/**
- * Reason why a sample was rejected. Counted per participant, device and reason. `zero_pose`, `frozen` and `jump`
- * are reserved: no session gives them yet.
- */
+/** Reason why a sample was rejected. Counted per participant, device and reason. */
 export const RejectReason = {
   CONNECTION_EPOCH: "connection_epoch",
   SCENE_EPOCH: "scene_epoch",
