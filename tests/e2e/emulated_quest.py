@@ -60,6 +60,14 @@ const tremble = () => {
 // The emulator says of every pose that it is an estimate; headsets say so of devices that their cameras do not see.
 window.isGuess = false;
 Object.defineProperty(XRPose.prototype, "emulatedPosition", { get: () => window.isGuess });
+// Some runtimes report the origin before they have a pose.
+window.isZero = false;
+const { get: readTransform } = Object.getOwnPropertyDescriptor(XRPose.prototype, "transform");
+Object.defineProperty(XRPose.prototype, "transform", {
+  get() {
+    return window.isZero ? new XRRigidTransform() : readTransform.call(this);
+  },
+});
 window.place = (input, [x, y, z, qx, qy, qz, qw]) => {
   input.position.set(x, y, z);
   input.quaternion.set(qx, qy, qz, qw);
@@ -253,6 +261,38 @@ class EmulatedQuest:
                 return math.dist(tip[0], target)
             assert_only_late(rejected, self.read_feedback(robot)["rejected"], [b.reason for b in held])
         raise AssertionError(f"{robot} held in each of {ATTEMPTS} attempts\n{self.page.describe()}")
+
+    def disturb(self, robot: str, begin: PoseTuple, disturbance: str, end: str) -> tuple[str, float]:
+        """Engage with the right controller at `begin`, and disturb its poses until the robot holds.
+
+        Args:
+            robot: Name of a robot that the right controller drives.
+            begin: Pose of the controller in the aligned world.
+            disturbance: Script that begins it.
+            end: Script that ends it.
+
+        Returns:
+            Why the robot holds, and how far its end effector has moved [m]. Holds for what comes late on a busy machine
+            count for nothing: the robot is engaged again.
+        """
+        for _ in range(ATTEMPTS):
+            self.press("squeeze", 0.0)
+            self.place("quest.controllers.right", begin)
+            self.engage(robot)
+            tip, seen = self.host.scene.tip_pose(robot), len(self.scenario.events["host"])
+            self.evaluate(disturbance)
+            self.run_until(lambda: not is_driven(self.host, robot, self.person.id), f"{robot} holds: {disturbance}")
+            self.evaluate(end)
+            rested_ns = self.host.session_now_ns() + 500_000_000
+            self.run_until(lambda: self.has_state_since(rested_ns), "it has come to rest")  # noqa: B023
+            now = self.host.scene.tip_pose(robot)
+            bodies = [event.body for event in self.scenario.events["host"][seen:]]
+            reasons = [b.reason for b in bodies if isinstance(b, EngagementChanged) and b.robot == robot and b.reason]
+            assert tip
+            assert now
+            if reasons[0] not in {HoldReason.STALE, HoldReason.REJECTED, HoldReason.GAP}:
+                return reasons[0], math.dist(tip[0], now[0])
+        raise AssertionError(f"{robot} held for late samples only\n{self.page.describe()}")
 
     @property
     def person(self) -> ParticipantInfo:

@@ -6,7 +6,6 @@
 // are touched, only answers are given. Buttons that are held when a hand appears count from their next press; only the e-stop counts always.
 
 import type { SampleInput } from "../core/api.ts";
-import type * as wire from "../protocol/messages.g.ts";
 import { Grips } from "./grips.ts";
 import type { MenuItem } from "./picture_places.ts";
 import type { Answer } from "./question.ts";
@@ -25,8 +24,6 @@ const GAP_MS = 500;
 const GRANTED_MS = 2000;
 /** The clutch of a hand that has got a robot stays open this long [ms]: a session engages after it has seen it open. */
 const OPEN_MS = 100;
-/** Samples of an estimated pose name the robot of the hand for this long [ms]: it holds and says why. More would be as many rejections. */
-const EMULATED_MS = 500;
 
 /** What a hand can point at, and press, that is no robot. */
 export type Target = Answer | MenuItem;
@@ -47,6 +44,8 @@ export interface Context {
   tenures: ReadonlyMap<string, string>;
   /** Robots that the session moves for this participant. */
   following: readonly string[];
+  /** Robots that hold because the pose of their device is an estimate. */
+  guessed: readonly string[];
   /** The robot that each hand points at. */
   pointed: Partial<Record<Side, string>>;
   /** The answer to a question, or the item of a menu, that each hand points at; it is nearer than robots. */
@@ -83,8 +82,8 @@ export class Hands {
   private readonly wanted = new Map<Side, { robot: string; until_ms: number }>();
   /** When each hand got its robot [ms]. */
   private readonly bound_ms = new Map<Side, number>();
-  /** Since when the position of a device is an estimate [ms]. */
-  private readonly emulated_ms = new Map<string, number>();
+  /** Robots that hold for an estimated pose, as the session says. */
+  private guessed: readonly string[] = [];
   private readonly grips = new Grips();
   /** What is asked of the gripper of each hand in this frame. */
   private readonly grasps = new Map<Side, number | null>();
@@ -105,6 +104,7 @@ export class Hands {
     const dt_ms = capture_ms - this.frame_ms;
     if (dt_ms > GAP_MS) this.suspend();
     this.frame_ms = capture_ms;
+    this.guessed = context.guessed;
     for (const [side, robot] of this.driven) if (!context.held.includes(robot)) this.driven.delete(side);
     const intents: Intent[] = [];
     const inputs = reading.inputs.filter(({ tracked }) => tracked);
@@ -156,18 +156,16 @@ export class Hands {
     for (const input of reading.inputs) {
       if (!input.pose) continue;
       const { side } = input;
-      const device: wire.Device = `${input.kind}/${side}`;
-      if (!input.emulated) this.emulated_ms.delete(device);
-      else if (!this.emulated_ms.has(device)) this.emulated_ms.set(device, capture_ms);
-      const isNamed = capture_ms - (this.emulated_ms.get(device) ?? capture_ms) < EMULATED_MS;
-      const robot = isNamed ? this.driven.get(side) : undefined;
+      const robot = this.driven.get(side);
+      // A sample of an estimated pose that names its robot is rejected: until the session says that it holds for that.
+      const isNamed = robot !== undefined && !(input.emulated && this.guessed.includes(robot));
       const clutch = this.isSqueezing(side) && capture_ms - (this.bound_ms.get(side) ?? 0) >= OPEN_MS;
       samples.push({
-        device,
+        device: `${input.kind}/${side}`,
         pose: input.pose,
         capture_ms,
         ...judge(input.tracked, input.emulated),
-        robots: robot === undefined ? [] : [robot],
+        robots: isNamed ? [robot] : [],
         clutch,
         gripper: clutch ? (this.grasps.get(side) ?? null) : null,
         buttons: input.buttons,

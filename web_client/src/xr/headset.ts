@@ -5,6 +5,7 @@ import { Group } from "three";
 
 import { type FromWorker, nowMs, type RobotInfo, type SceneSpec } from "../core/api.ts";
 import type { WorkerClient } from "../core/page_client.ts";
+import { HoldReason } from "../protocol/messages.g.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import type { Actions } from "../ui/actions.ts";
 import { DESKTOP, type Entry, type PageState } from "../ui/state.ts";
@@ -200,6 +201,7 @@ export class Headset {
       held,
       tenures: new Map(own.map((lease) => [lease!.target, `${lease!.lease_version} ${state.session?.scene_epoch}`])),
       following: [...robots].filter((name) => state.feedback.get(name)?.hold_reason === ""),
+      guessed: [...robots].filter((name) => state.feedback.get(name)?.hold_reason === HoldReason.EMULATED),
       pointed: this.pointed,
       aimed: this.aimed,
       isEpisodeRunning: state.session?.episode?.state === "running",
