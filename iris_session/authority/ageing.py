@@ -1,8 +1,8 @@
 """Alignments age: their stated error grows since the last look that confirmed them, until they are *unconfirmed*.
 
 The law is `anchors.ageing`, its constants are in the configuration. An alignment whose error by age alone is above the
-bound at the robot begins no engagement until a glance; an engagement under way goes on. What clients are told follows
-in steps of 20 %, as `AlignmentChanged` of the same version.
+bound at the robot begins no engagement until a glance; an engagement under way goes on. Clients get the error in steps
+of 20 %, as `AlignmentChanged` of the same version.
 
 A placement and an offset by a director have no stated error. An offset lies on a measurement, which ages as any other.
 A placement cannot be confirmed by a look, so that it would hold its wearer for ever: its age is said, nothing else.
@@ -24,7 +24,7 @@ from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.common import Pose, Vec3
 from iris_session.protocol.names import AlignmentDoubt, AlignmentKind
 
-#: Growth of the stated error that clients are told.
+#: Growth of the stated error that is published.
 STATED_STEP: Final = 1.2
 MIN_STATED_STEP_M: Final = 0.0005
 _MINUTE_NS: Final = 60e9

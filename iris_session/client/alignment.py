@@ -242,7 +242,7 @@ class ClientAlignment:
                     now_ns,
                     epoch,
                     viewpoint_id,
-                    0.0,  # one camera cannot measure the size of a sheet, it is told
+                    0.0,  # one camera cannot measure the size of a sheet, it takes it as given
                     device=device,
                     covariance=covariance,
                 )
