@@ -48,7 +48,7 @@ def check_ages(ctx: Context) -> None:
     if ctx.config.ageing is None:
         return
     for p in ctx.state.participants.values():
-        if p.alignment is not None and ctx.now_ns >= p.age_due_ns:
+        if p.alignment is not None and p.needs_alignment and ctx.now_ns >= p.age_due_ns:
             p.age_due_ns = ctx.now_ns + ctx.config.age_check_ns
             _check_age(ctx, p)
 

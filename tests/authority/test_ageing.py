@@ -124,6 +124,7 @@ def test_a_placement_is_said_to_be_old_and_never_holds_its_wearer() -> None:
     anna.alignment_version = report(t, anna).version
     pass_minutes(t, 20)
     assert len(warnings(t, anna)) == 1
+    assert not warnings(t, boss), "who needs no alignment has none that ages"
     anna.engage("left")
     assert t.command().kind == "pose"
 

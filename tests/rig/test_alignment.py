@@ -195,19 +195,21 @@ def test_drift_raises_an_alarm_until_it_is_measured_again() -> None:
 
 
 def test_half_an_hour_without_a_look_holds_until_a_glance() -> None:
-    """With drift and law sixty times as fast: 3 mm a minute, and a minute is a second."""
-    law = AgeingLaw(60.0 * AgeingLaw.drift_m_per_min, 60.0 * AgeingLaw.yaw_rad_per_min)
+    """With drift and law sixty times as fast: 1 mm a minute, and a minute is a second."""
+    usual = AgeingLaw()
+    law = AgeingLaw(60.0 * usual.drift_m_per_min, 60.0 * usual.yaw_rad_per_min)
     with Rig(timestep=TICK, authority=AuthorityConfig(ageing=law, age_check_ns=SECOND // 60)) as rig:
         watcher = rig.join("watcher", "director")
-        ann = emulate_driver(rig, "ann", "left", 11, model=STEADY, drift_m_per_min=0.18)
+        ann = emulate_driver(rig, "ann", "left", 11, model=STEADY, drift_m_per_min=0.06)
         run_until_driven(rig, watcher, "left")
+        watcher.alignment.stop_run(ann.client.participant_id)
         ann.disturb_tracking("drift", rig.simulation.now_ns)
         hold = lambda: ann.client.feedback["left"].hold_reason  # noqa: E731
         rig.run_until(lambda: hold() == HoldReason.UNCONFIRMED, "ann is to glance")
-        told = [b for _, b in rig.list_events("ann", Notice) if b.level == "warning" and "glance" in b.text]
-        assert [body.participant for body in told] == [ann.client.participant_id]
         rig.run(20.0)
         assert not is_driven(watcher, "left")
+        told = [b for _, b in rig.list_events("watcher", Notice) if b.level == "warning" and "glance" in b.text]
+        assert [body.participant for body in told] == [ann.client.participant_id]
         ann.disturb_tracking("steady", rig.simulation.now_ns)
         version = find_version(ann)
         watcher.alignment.start_run(ann.client.participant_id)
