@@ -212,7 +212,7 @@ def _format_session_choice(name: str, here: list[RegisteredSession], found: list
     if not here:
         return (
             "no encrypted session of yours runs on this machine: start one with `iris-session serve SCENE "
-            "--host 0.0.0.0`, or give its address with --address HOST:PORT"
+            "--interface NAME`, or give its address with --address HOST:PORT"
         )
     names = ", ".join(sorted(note.name for note in here))
     if not found:

@@ -54,6 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.web.certificate import load_certificate, load_or_make_certificate
     from iris_session.web.config import WEB_PORT, GatewayConfig, GatewayStart, format_page_address
     from iris_session.web.gateway import serve
+    from iris_session.web.page import describe_missing_page
 
     if bool(arguments.web_cert) != bool(arguments.web_key):
         raise CommandError("--web-cert and --web-key belong together: give both, or none")
@@ -86,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
         session_name=endpoint.session,
     )
     pages = [format_page_address(one, config.port, secure=certificate is not None) for one in hosts]
-    print(f"in a browser: {'  or  '.join(pages)}", flush=True)
+    print(f"in a browser: {'  or  '.join(pages)}{describe_missing_page()}", flush=True)
     if certificate is not None:
         print(f"certificate {certificate.fingerprint}", flush=True)
     endpoint.store_key()

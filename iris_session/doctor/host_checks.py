@@ -119,7 +119,7 @@ def check_ports(control: int) -> Finding:
         f"{', '.join(f'{port} ({wanted[port]})' for port, one in sorted(taken.items()) if one == who)}: {who}"
         for who in dict.fromkeys(taken[port] for port in sorted(taken))
     )
-    if all("iris_session.front" in who for who in taken.values()):
+    if all("iris_session." in who or "iris-session" in who for who in taken.values()):
         return ok("ports", f"used by a session: {text}; a second session on this machine needs --port-base")
     advice = "end that program, or start the session with --port-base"
     return warning("ports", f"in use: {text}", "another program uses ports of a session", advice)

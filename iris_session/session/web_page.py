@@ -26,6 +26,7 @@ from iris_session.system.supervised import SupervisedProcess
 from iris_session.web.certificate import Certificate, load_certificate, load_or_make_certificate
 from iris_session.web.config import WEB_FROM_STATE, GatewayConfig, GatewayReport, GatewayStart, format_page_address
 from iris_session.web.listener import open_listening_sockets
+from iris_session.web.page import describe_missing_page
 
 PACKAGES: Final = ("aiohttp", "cryptography")
 #: Time for browsers to read that the session has ended.
@@ -110,7 +111,7 @@ class WebPage:
                 names=(*names, *self.certificate.names),
             )
         self._gateway = made
-        return [f"in a browser: {self.address}{note}"]
+        return [f"in a browser: {self.address}{note}{describe_missing_page()}"]
 
     @property
     def pid(self) -> int:

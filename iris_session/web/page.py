@@ -41,6 +41,11 @@ class PageFile(NamedTuple):
     immutable: bool
 
 
+def describe_missing_page(folder: Path = PAGE_FOLDER) -> str:
+    """Return a remark for people where the page is not built, to follow its address; else nothing."""
+    return "" if (folder / INDEX).exists() else " (the page is not built yet: run `make web`)"
+
+
 class PageFiles:
     """Files of the page by path, read into memory when the page is first requested, and again after it was built."""
 

@@ -36,10 +36,12 @@ def test_ports_used_by_a_session_are_ok(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(host_checks, "_list_connections", list)
     assert host_checks.check_ports(7721).state == "warning"
     listening = [
-        SimpleNamespace(status="LISTEN", laddr=SimpleNamespace(port=port), pid=1) for port in range(7720, 7727)
+        SimpleNamespace(status="LISTEN", laddr=SimpleNamespace(port=port), pid=1 + port // 7724)
+        for port in range(7720, 7727)
     ]
+    programs = {1: "python -m iris_session.front.main (process 1)", 2: "python iris-session (process 2)"}
     monkeypatch.setattr(host_checks, "_list_connections", lambda: listening)
-    monkeypatch.setattr(host_checks, "_describe_process", lambda pid: "python -m iris_session.front.main (process 1)")
+    monkeypatch.setattr(host_checks, "_describe_process", programs.__getitem__)
     found = host_checks.check_ports(7721)
     assert found.state == "ok"
     assert found.text.count("process 1") == 1
