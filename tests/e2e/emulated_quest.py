@@ -39,18 +39,14 @@ IWER: Final = WEB_CLIENT / "node_modules" / "iwer" / "build" / "iwer.min.js"
 INSTALL: Final = """
 // A headset with 30 frames a second: without a graphics card more leave nothing for the session on the same machine.
 const request = window.requestAnimationFrame.bind(window);
-window.requestAnimationFrame = (callback) => setTimeout(() => request((time) => (tremble(), callback(time))), 25);
+const moveOn = (callback) => (time) => (advance(), tremble(), callback(time));
+window.requestAnimationFrame = (callback) => setTimeout(() => request(moveOn(callback)), 25);
 window.quest = new IWER.XRDevice(IWER.metaQuest3);
-// What is measured is never twice the same: it trembles by a tenth of a micrometre.
-setInterval(() => {
-  const { controllers, hands } = quest;
-  const devices = [quest, controllers.left, controllers.right, hands.left, hands.right];
-  for (const { position } of devices) position.y += 1e-7 * (Math.random() - 0.5);
-}, 20);
 quest.installRuntime({ forceInstall: true });
 // Measured poses are never the same twice, to the last bit: these move by less than 0.1 mm, unless they are frozen.
 window.isFrozen = false;
 let beat = 0;
+let advance = () => {};
 const tremble = () => {
   if (isFrozen) return;
   const shift = 5e-5 * (Math.cos(beat + 1) - Math.cos(beat++));
@@ -60,12 +56,21 @@ const tremble = () => {
 // The emulator says of every pose that it is an estimate; headsets say so of devices that their cameras do not see.
 window.isGuess = false;
 Object.defineProperty(XRPose.prototype, "emulatedPosition", { get: () => window.isGuess });
-// Some runtimes report the origin before they have a pose.
+// Some runtimes report the origin of a device before they have a pose of it; the head is where it is.
 window.isZero = false;
 const { get: readTransform } = Object.getOwnPropertyDescriptor(XRPose.prototype, "transform");
+const { getViewerPose } = XRFrame.prototype;
+let isHead = false;
+XRFrame.prototype.getViewerPose = function (space) {
+  isHead = true;
+  const pose = getViewerPose.call(this, space);
+  isHead = false;
+  return pose;
+};
 Object.defineProperty(XRPose.prototype, "transform", {
   get() {
-    return window.isZero ? new XRRigidTransform() : readTransform.call(this);
+    const isDevice = !isHead && !(this instanceof XRViewerPose);
+    return window.isZero && isDevice ? new XRRigidTransform() : readTransform.call(this);
   },
 });
 window.place = (input, [x, y, z, qx, qy, qz, qw]) => {
@@ -84,17 +89,18 @@ window.tap = () => new Promise((resolve) => {
   set(1);
   wait();
 });
+// A hand is where it is at the time of each frame, also after a pause of the page.
 window.glide = (to, seconds) => new Promise((resolve) => {
   const { position } = quest.controllers.right;
   const from = [position.x, position.y, position.z];
   const begin = performance.now();
-  const step = () => {
+  advance = () => {
     const share = Math.min(1, (performance.now() - begin) / (1000 * seconds));
     position.set(...from.map((value, i) => value + share * (to[i] - value)));
-    if (share < 1) requestAnimationFrame(step);
-    else resolve(null);
+    if (share < 1) return;
+    advance = () => {};
+    resolve(null);
   };
-  step();
 });
 """
 HEADSET: Final = "irisSession.headset.headset"
@@ -281,18 +287,21 @@ class EmulatedQuest:
             self.engage(robot)
             tip, seen = self.host.scene.tip_pose(robot), len(self.scenario.events["host"])
             self.evaluate(disturbance)
-            self.run_until(lambda: not is_driven(self.host, robot, self.person.id), f"{robot} holds: {disturbance}")
+            self.run_until(lambda: self.list_hold_reasons(robot, seen), f"{robot} holds: {disturbance}")  # noqa: B023
             self.evaluate(end)
             rested_ns = self.host.session_now_ns() + 500_000_000
             self.run_until(lambda: self.has_state_since(rested_ns), "it has come to rest")  # noqa: B023
-            now = self.host.scene.tip_pose(robot)
-            bodies = [event.body for event in self.scenario.events["host"][seen:]]
-            reasons = [b.reason for b in bodies if isinstance(b, EngagementChanged) and b.robot == robot and b.reason]
+            now, reason = self.host.scene.tip_pose(robot), self.list_hold_reasons(robot, seen)[0]
             assert tip
             assert now
-            if reasons[0] not in {HoldReason.STALE, HoldReason.REJECTED, HoldReason.GAP}:
-                return reasons[0], math.dist(tip[0], now[0])
+            if reason not in {HoldReason.STALE, HoldReason.REJECTED, HoldReason.GAP}:
+                return reason, math.dist(tip[0], now[0])
         raise AssertionError(f"{robot} held for late samples only\n{self.page.describe()}")
+
+    def list_hold_reasons(self, robot: str, seen: int) -> list[str]:
+        """Return why engagements of a robot ended, by the events after the first `seen`."""
+        bodies = [event.body for event in self.scenario.events["host"][seen:]]
+        return [b.reason for b in bodies if isinstance(b, EngagementChanged) and b.robot == robot and b.reason]
 
     @property
     def person(self) -> ParticipantInfo:

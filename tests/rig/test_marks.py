@@ -6,9 +6,11 @@ from typing import Final
 
 import numpy as np
 
+from anchors.ageing import AgeingLaw
 from anchors.lie import Array, quat_exp, quat_to_matrix
 from anchors.persistent import covariance_at_anchor
 from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_from_yaw
+from iris_session.authority import AuthorityConfig
 from iris_session.protocol.common import Alignment
 from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason, RejectReason
 from iris_session.protocol.server_messages import EngagementChanged, Notice, SamplesRejected, TipCalibrated
@@ -129,6 +131,24 @@ def test_fingertip_may_look_and_is_denied_to_drive_until_a_tip_is_calibrated() -
         hand.clutch, hand.velocity, hand.device, ann.device = False, (0.0, 0.0, 0.0), RIGHT, RIGHT
         found = ann.turn_in_a_hole()
         assert ann.touch_marks(found.p_grip_tip, "1234").kind == AlignmentKind.MEASURED
+        rig.engage(hand)
+
+
+def test_a_touch_confirms_an_alignment_that_has_grown_old() -> None:
+    """A hundred times as fast as it drifts in use."""
+    law = AgeingLaw(drift_m_per_min=0.2, yaw_rad_per_min=0.4)
+    config = AuthorityConfig(ageing=law, age_check_ns=10_000_000)
+    with Rig(timestep=0.01, anchor_marks={"table": MARKS}, authority=config) as rig:
+        ann = Toucher(rig)
+        found = ann.turn_in_a_hole()
+        ann.touch_marks(found.p_grip_tip, "1234")
+        hand = ann.hold_robot()
+        rig.run(20.0)
+        hand.clutch = True
+        rig.run(0.3)
+        assert ann.client.feedback["left"].hold_reason == HoldReason.UNCONFIRMED
+        hand.clutch = False
+        ann.touch_marks(found.p_grip_tip, "1")
         rig.engage(hand)
 
 
