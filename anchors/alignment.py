@@ -85,10 +85,9 @@ class AlignmentConfig:
     all anchors show is followed, from `tilt_warning_rad` on (and beyond noise) with a warning. `drift_m_per_s`,
     `walk_m_per_sqrt_s`: how the tracking frame drifts and wanders, per axis. `max_error_m`: the stated p95 at the
     anchors above which the estimate is refused. `max_observations`, `max_groups`, and of one viewpoint `max_in_group`:
-    the oldest are forgotten
-    (counted in `forgotten`), as are those older than the newest by more than `max_age_ns` (`outdated`).
-    `min_agreeing`: share of one viewpoint's observations that must agree. `size_tolerance`: by what share a sheet may
-    measure otherwise than it should.
+    the oldest are forgotten (counted in `forgotten`), as are those older than the newest by more than `max_age_ns`
+    (`outdated`). `min_agreeing`: share of one viewpoint's observations that must agree. `size_tolerance`: by what share
+    a sheet may measure otherwise than it should.
     """
 
     position_sigma_m: float = 0.005
@@ -183,7 +182,6 @@ class AlignmentEstimator:
     _near: tuple[Array, Array] | None = None  # where the last solution was: the next one is not far
     _era: int = 0  # looks since the last contradiction are groups of their own
     _changed: str = ""  # the sheet that contradicted the others since then, while it is not known why
-    _scales: tuple[ScaleError, ...] = ()  # of the last solution
     _left_out: dict[str, int] = field(default_factory=dict)  # sheets that were moved: era since then
     _memory: ObservationBuffer = field(init=False)
 
@@ -409,10 +407,10 @@ class AlignmentEstimator:
         if against and median_tilt(b) > self.config.tilt_warning_rad:  # do they contradict each other, or gravity?
             free = solve_alignment(b, replace(prior, tilt_sigma_rad=math.inf))
             s = free if self._is_majority(b, free, n_groups) else s
-        self._scales = ()
+        scales: tuple[ScaleError, ...] = ()
         scaled = explain_by_scale(b, s, merged, prior)
         if scaled is not None:
-            b, s, self._scales = scaled
+            b, s, scales = scaled
         if not s.inside.any():
             return self._refuse(disagreement_advice(sorted(set(b.anchor))))
         tilt, noise = s.measure_tilt(b, self.config.tilt_sigma_rad)
@@ -427,7 +425,7 @@ class AlignmentEstimator:
             return self._refuse(disagreement_advice(sorted(set(b.anchor))))
         newest = self._memory.newest_key
         supported = any(ok and key == newest for key, ok in zip(keys, s.inside.tolist(), strict=True))
-        return self._to_estimate(b, s, tilt, noise, supported)
+        return self._to_estimate(b, s, (tilt, noise), supported, scales)
 
     def _decide_change(self, b: AlignmentProblem, later: Mask, keys: list[GroupKey]) -> bool:
         """Decide what a contradiction means (`anchors.evidence`), and keep what still counts; false if it is open."""
@@ -489,8 +487,14 @@ class AlignmentEstimator:
         return 2 * int(np.count_nonzero(s.inside)) > n_groups and min(votes.values()) >= 0
 
     def _to_estimate(
-        self, b: AlignmentProblem, s: AlignmentSolution, tilt: float, noise: float, supported: bool
+        self,
+        b: AlignmentProblem,
+        s: AlignmentSolution,
+        tilt_and_noise: tuple[float, float],
+        supported: bool,
+        scales: tuple[ScaleError, ...],
     ) -> AlignmentEstimate:
+        tilt, noise = tilt_and_noise
         agreeing = {name for name, ok in zip(b.anchor, s.inside.tolist(), strict=True) if ok}
         # No viewpoint of these agrees with the rest, or none since they were moved.
         moved = tuple(sorted(set(b.anchor) - agreeing | self._left_out.keys()))
@@ -510,7 +514,7 @@ class AlignmentEstimator:
         else:
             advice = size_advice(self._memory.groups, self.config.size_tolerance) or self._misprint_advice()
         if not refused:
-            advice = "; ".join(filter(None, [advice, describe_scale(self._scales, self.sizes)]))
+            advice = "; ".join(filter(None, [advice, describe_scale(scales, self.sizes)]))
         return AlignmentEstimate(
             inverse((to_vec3(s.t), to_quat(s.q))),
             self.tracking_epoch,

@@ -65,7 +65,8 @@ def is_too_old(ctx: Context, p: Participant, robot: str) -> bool:
 def doubt_age(ctx: Context, p: Participant) -> None:
     """Make an alignment that is too old unconfirmed, and ask its wearer for a glance."""
     sheet = min(ctx.state.anchors.items(), key=lambda item: _distance_to(item[1], p), default=("", None))[0]
-    glance = f"glance at sheet '{sheet}'" if sheet else "glance at a sheet"
+    where = f"sheet '{sheet}'" if sheet else "a sheet"
+    glance = f"glance at {where}, or touch one of its marks"
     text = f"{describe_age(ctx, p)}: {'' if p.aligning else 'start its alignment run and '}{glance}"
     alignment.doubt_alignment(ctx, p, AlignmentDoubt.AGED, f"{text}; until then the next clutch moves nothing")
 

@@ -1,8 +1,8 @@
 """What must hold of alignments in every step of a random session, kept from outside: from events and entries.
 
-An alignment in doubt begins no engagement. Nobody who uses an alignment sees it leap unannounced, nothing changes while
-a clutch is engaged, and what a robot is told to do is made of the sample and of the alignment at the moment of
-engagement, whatever was corrected since.
+An alignment in doubt begins no engagement. One in use never leaps unannounced, and never changes while a clutch is
+engaged. The command of a robot is made of the sample and of the alignment at the moment of engagement, whatever was
+corrected since.
 """
 
 from __future__ import annotations

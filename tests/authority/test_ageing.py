@@ -1,4 +1,4 @@
-"""Alignments that age: what is stated, what clients are told, and the glance that makes them young again."""
+"""Alignments that age: their stated error, its publication, and the look that confirms them."""
 
 from __future__ import annotations
 

@@ -90,6 +90,7 @@ export class PageState {
   private readonly newest = new Map<string, { capture_ms: number; received_ms: number }>();
   /** Names of participants that left, for events about them. */
   private readonly formerNames = new Map<string, string>();
+  /** Versions of alignments that the history has. */
   private readonly alignmentVersions = new Map<string, number>();
   private readonly listeners: ((state: PageState) => void)[] = [];
   private isQueued = false;
@@ -116,6 +117,7 @@ export class PageState {
       this.welcome = welcome;
       this.feedback.clear();
       this.consents = [];
+      this.alignmentVersions.clear(); // of another session they may be the same
       this.touch();
     });
     client.on("status", ({ status }) => {
