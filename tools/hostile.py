@@ -1,7 +1,7 @@
 """Hostile keys against a real session: each case attacks it with listed keys while four honest clients work.
 
     python tools/hostile.py --json --quick
-    python tools/hostile.py --case estops --case topics
+    python tools/hostile.py --case estops --case topics --case web_pings
     python tools/hostile.py --list
 
 The session is `iris-session serve --curve` with a recording; one honest client is behind the impairment proxy, on a
@@ -16,8 +16,9 @@ slow link. For each case, checked against the same session without the attack, j
 - the attack was counted under its reason, and named where the case says so.
 
 At the end the recording must be whole and verify. A new case is a function with `@case`; the attack itself is in
-`tools/hostile_worker.py`. Prints progress to standard error, and as its last line one JSON object with `--json`,
-`{"cases": [{"name", "ok", ...}], "ok": bool}`, else a table; exit status 0 if all is well.
+`tools/hostile_worker.py`. The cases `web_...` are those of `tools/hostile_web.py`. Prints progress to standard
+error, and as its last line one JSON object with `--json`, `{"cases": [{"name", "ok", ...}], "web": {...}, "ok": bool}`,
+else tables; exit status 0 if all is well.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
 
+import hostile_web
 import msgspec
 import numpy as np
 import psutil
@@ -76,6 +78,8 @@ AGE_SHARE: Final = 0.5
 AGE_MS: Final = 2.0
 #: Longest time without a state at honest clients on this machine [ms]. The session replaces a front after 1,500.
 PAUSE_MS: Final = 500.0
+#: Beginning of the names of the cases of `hostile_web`.
+WEB: Final = "web_"
 #: An age that is too high once may be that of a busy machine: the case is measured again, and the best counts.
 TRIES: Final = 3
 
@@ -617,6 +621,20 @@ def run_once(lab: Lab, chosen: Case, seconds: float) -> Result:
     return result
 
 
+def run_lab(folder: Path, names: list[str], seconds: float) -> list[Result]:
+    """Run cases against one session, and verify its recording."""
+    results = []
+    with ExitStack() as stack:
+        lab = Lab(folder, stack)
+        lab.start()
+        for name in names:
+            results.append(run_case(lab, CASES[name], seconds))
+            print(f"{name}: {'ok' if results[-1].ok else results[-1].problems}", file=sys.stderr, flush=True)
+        results.append(lab.finish())
+        print(f"recording: {'ok' if results[-1].ok else results[-1].problems}", file=sys.stderr, flush=True)
+    return results
+
+
 def find_age_bound_ms(usual_ms: float) -> float:
     """Return the largest p99 of the age of state that is well, for that without the attack [ms]."""
     return usual_ms + max(AGE_SHARE * usual_ms, AGE_MS)
@@ -658,43 +676,43 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.add_argument("--quick", action="store_true", help="4 s a window instead of 10")
-    parser.add_argument("--case", action="append", choices=sorted(CASES), help="only this case, repeatable")
+    every = [*CASES, *(WEB + name for name in hostile_web.CASES)]
+    parser.add_argument("--case", action="append", choices=every, help="only this case, repeatable")
     parser.add_argument("--list", action="store_true", help="list the cases")
     options = parser.parse_args()
     if options.list:
         for name, one in CASES.items():
             print(f"{name:14} {one.item:24} {(one.check.__doc__ or '').splitlines()[0]}")
+        print("\n".join(f"{WEB}{name}" for name in hostile_web.CASES))
         return 0
     seconds = 4.0 if options.quick else 10.0
     results: list[Result] = []
+    web_figures: dict[str, Any] = {"cases": [], "ok": True}
     folder = Path(tempfile.mkdtemp(prefix="iris-hostile-"))  # kept when something fails
     try:
-        with ExitStack() as stack:
-            lab = Lab(folder, stack)
-            lab.start()
-            for name, chosen in CASES.items():
-                if options.case and name not in options.case:
-                    continue
-                results.append(run_case(lab, chosen, seconds))
-                print(f"{name}: {'ok' if results[-1].ok else results[-1].problems}", file=sys.stderr, flush=True)
-            results.append(lab.finish())
-            print(f"recording: {'ok' if results[-1].ok else results[-1].problems}", file=sys.stderr, flush=True)
+        chosen = options.case or every
+        if any(name in CASES for name in chosen):
+            results += run_lab(folder, [name for name in CASES if name in chosen], seconds)
+        if web := [name for name in hostile_web.CASES if WEB + name in chosen]:
+            web_figures = hostile_web.run(web, seconds)
     except KeyboardInterrupt:
         shutil.rmtree(folder)
         return 130
-    ok = all(one.ok for one in results)
+    ok = all(one.ok for one in results) and web_figures["ok"]
     if ok:
         shutil.rmtree(folder)
     else:
         print(f"logs and recording: {folder}", file=sys.stderr)
     if options.json:
         cases = [{"name": r.name, "ok": r.ok, "item": r.item, "problems": r.problems, **r.figures} for r in results]
-        print(json.dumps({"cases": cases, "ok": ok}))
+        print(json.dumps({"cases": cases, "web": web_figures, "ok": ok}))
     else:
         print(format_table(results))
         for one in results:
             for problem in one.problems:
                 print(f"{one.name}: {problem}")
+        if web_figures["cases"]:
+            print(hostile_web.format_table(web_figures))
     return 0 if ok else 1
 
 

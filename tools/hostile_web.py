@@ -1,13 +1,16 @@
-"""Attacks on the web gateway by peers without a key, while an honest browser drives an e-stop again and again.
+"""Attacks on the web gateway by peers without a key and by observers, while an honest browser drives and stops.
 
     python tools/hostile_web.py --json --quick
-    python tools/hostile_web.py --case pings --case large
+    python tools/hostile_web.py --case pings --case observer_pings
+
+`tools/hostile.py` runs it too.
 
 The session is `iris-session serve handover` on loopback, so that everything an attacker may send reaches the gateway
-without TLS. For each case, at 0.1 and at 5 MB/s, an e-stop of the honest browser must reach the session and come back
-as an event within 200 ms, or three times what it takes without the attack; its WebSocket must stay open. After all
-cases the gateway may keep 50 MiB and the log may have grown by 100 lines. Prints progress to standard error, and as its
-last line one JSON object with `--json`, else a table; exit status 0 if all is well.
+without TLS; attackers have the address of the honest browser. For each case, frames at 0.1 and at 5 MB/s, each e-stop
+of the honest browser must reach the session and come back as an event within 200 ms, or three times what it takes
+without the attack; its WebSocket must stay open, the gateway keep running. Afterwards the gateway gives back what it
+took but for 50 MiB, and the log has grown by less than 100 lines. Prints progress to standard error, and as its last
+line one JSON object with `--json`, else a table; exit status 0 if all is well.
 """
 
 from __future__ import annotations
@@ -32,8 +35,17 @@ from typing import Any, Final
 import aiohttp
 import psutil
 
-from iris_session.protocol.client_messages import ClientMessage, EStop, Heartbeat, Hello, wrap_message
+from iris_session.protocol.client_messages import (
+    ClientMessage,
+    EStop,
+    GetSnapshot,
+    Heartbeat,
+    Hello,
+    Sample,
+    wrap_message,
+)
 from iris_session.protocol.codec import decode_server, encode_client
+from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.server_messages import EStopChanged, Event, Welcome
 from iris_session.web import wire
 
@@ -49,14 +61,20 @@ LOG_LINES: Final = 100
 RATES: Final = (0.1e6, 5e6)
 #: Frames of WebSockets by case: first byte (mark of the end, opcode), and bytes of the payload (0, or 126 and more).
 FRAMES: Final = {
-    "large": (0x82, 47_000),
+    "large": (0x82, 48_006),
     "too_large": (0x82, 60_000),
     "pings": (0x89, 0),
     "pongs": (0x8A, 0),
     "fragments": (0x00, 0),
 }
-OTHERS: Final = ("half_open", "unread")
-CASES: Final = (*FRAMES, *OTHERS)
+#: Cases without a rate: sockets that say nothing, that read nothing, WebSockets opened and closed, unknown assets.
+OTHERS: Final = ("half_open", "unread", "observer_unread", "handshakes", "observer_assets")
+#: An attack by one that the session has welcomed.
+OBSERVER: Final = "observer_"
+CASES: Final = (*FRAMES, *(OBSERVER + kind for kind in FRAMES), *OTHERS)
+SAMPLE_S: Final = 1 / 72
+#: Time in which memory is given back: who reads nothing is closed after 6 s, who requests nothing after 15.
+SETTLE_S: Final = 25.0
 
 
 # --- the honest browser -----------------------------------------------------------------------------------------------
@@ -67,7 +85,7 @@ class NotWelcomedError(Exception):
 
 
 class HonestBrowser:
-    """A browser that joins, beats, and stops."""
+    """A browser that joins, beats, drives, and stops."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket = socket
@@ -103,6 +121,15 @@ class HonestBrowser:
             await self.send(Heartbeat())
             await asyncio.sleep(0.3)
 
+    async def drive(self) -> None:
+        """Send the head and a hand as a headset does."""
+        n = 0
+        while not self.is_closed:
+            n += 1
+            for device in ("head", "controller/right"):
+                await self.send(Sample(device, "pose", n, time.monotonic_ns(), 1, 0, 0, pose=IDENTITY))
+            await asyncio.sleep(SAMPLE_S)
+
     async def wait(self, condition: Callable[[], bool], seconds: float) -> bool:
         """Return whether a condition came true in time."""
         with contextlib.suppress(TimeoutError):
@@ -115,12 +142,10 @@ class HonestBrowser:
     async def measure_stop(self) -> float:
         """Return the time from an e-stop to its event [ms], infinity for one that is lost."""
         before, began = self.stops, time.perf_counter()
-        try:
+        with contextlib.suppress(ConnectionError):
             await self.send(EStop())
-        except ConnectionError:
-            return float("inf")
-        is_there = await self.wait(lambda: self.stops > before, LOST_S)
-        return (time.perf_counter() - began) * 1e3 if is_there else float("inf")
+            await self.wait(lambda: self.stops > before, LOST_S)
+        return (time.perf_counter() - began) * 1e3 if self.stops > before else float("inf")
 
 
 @contextlib.asynccontextmanager
@@ -138,11 +163,11 @@ async def open_honest(page: str) -> AsyncIterator[HonestBrowser]:
         await browser.send(hello)
         if not await browser.wait(lambda: browser.epoch > 0, 30.0):
             raise NotWelcomedError
-        beating = asyncio.create_task(browser.beat())
+        beating, driving = asyncio.create_task(browser.beat()), asyncio.create_task(browser.drive())
         try:
             yield browser
         finally:
-            for task in (reading, beating):
+            for task in (reading, beating, driving):
                 task.cancel()
 
 
@@ -154,9 +179,18 @@ def make_frame(first: int, length: int) -> bytes:
     if not length:
         return struct.pack(">BB", first, 0x80) + bytes(4)
     head = struct.pack(">BBH", first, 0x80 | 126, length)
-    n_pad = length - 29  # what is around it: 6 bytes of the web channel, 23 of the envelope
-    envelope = b"\x94\x01\x00\xa0\x82\xa4type\xa5hello\xa3pad\xc5" + struct.pack(">H", n_pad) + bytes(n_pad)
-    return head + bytes(4) + wire.encode_frames(wire.CONTROL, [envelope])
+    envelope = b"\x94\x01\x00\xa0\x82\xa4type\xa5hello\xa3pad\xc5" + struct.pack(">H", length - 29) + bytes(length)
+    body = wire.encode_frames(wire.CONTROL, [envelope[: length - 6]])
+    return head + bytes(4) + body[:length].ljust(length, b"\0")
+
+
+def make_request(host: str, port: int) -> bytes:
+    """Return the handshake of a WebSocket."""
+    return (
+        f"GET /v1/session HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Protocol: {wire.SUBPROTOCOL}\r\n\r\n"
+    ).encode()
 
 
 async def read_all(reader: asyncio.StreamReader) -> None:
@@ -166,23 +200,35 @@ async def read_all(reader: asyncio.StreamReader) -> None:
             pass
 
 
-async def attack_with_frames(host: str, port: int, kind: str, bytes_per_s: float) -> None:
+async def open_websocket(
+    host: str, port: int, *, joins: bool
+) -> tuple[asyncio.StreamReader, asyncio.StreamWriter, bytes]:
+    """Open a WebSocket; with `joins` say hello as an observer, and wait for the ticket. Return that, too."""
+    reader, writer = await asyncio.open_connection(host, port, limit=8 * MIB)
+    writer.write(make_request(host, port))
+    await reader.readuntil(b"\r\n\r\n")
+    ticket = b""
+    if joins:
+        hello = Hello("observer", "mallory", secret=secrets.token_bytes(32), alignment="not_needed")
+        body = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(hello, 0))])
+        writer.write(struct.pack(">BBH", 0x82, 0x80 | 126, len(body)) + bytes(4) + body)
+        async with asyncio.timeout(10.0):
+            await reader.readuntil(b"\xa6ticket\xa6ticket\xd9")  # the type, then the field: a text
+            length = (await reader.readexactly(1))[0]
+            ticket = await reader.readexactly(length)
+    print("connected", flush=True)
+    return reader, writer, ticket
+
+
+async def attack_with_frames(host: str, port: int, kind: str, bytes_per_s: float, *, joins: bool) -> None:
     """Send frames of one kind on one WebSocket after the other, each opened as soon as the last is cut."""
     frame = make_frame(*FRAMES[kind])
     begin = make_frame(0x02, 0) if kind == "fragments" else b""  # the message whose empty rest follows
     piece = frame * max(1, round(min(bytes_per_s * 0.02, 256e3) / len(frame)))
-    key = "dGhlIHNhbXBsZSBub25jZQ=="
-    request = (
-        f"GET /v1/session HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {wire.SUBPROTOCOL}\r\n\r\n"
-    ).encode()
     while True:
         with contextlib.suppress(OSError, asyncio.IncompleteReadError):
-            reader, writer = await asyncio.open_connection(host, port)
+            reader, writer, _ = await open_websocket(host, port, joins=joins)
             try:
-                writer.write(request)
-                await reader.readuntil(b"\r\n\r\n")
-                print("connected", flush=True)
                 writer.write(begin)
                 reading = asyncio.create_task(read_all(reader))
                 while not reading.done():
@@ -192,6 +238,50 @@ async def attack_with_frames(host: str, port: int, kind: str, bytes_per_s: float
             finally:
                 writer.close()
         await asyncio.sleep(0.02)
+
+
+async def attack_with_handshakes(host: str, port: int) -> None:
+    """Open a WebSocket and leave, a hundred times a second."""
+    while True:
+        with contextlib.suppress(OSError, asyncio.IncompleteReadError):
+            _, writer, _ = await open_websocket(host, port, joins=False)
+            writer.close()
+        await asyncio.sleep(0.01)
+
+
+async def attack_with_assets(host: str, port: int) -> None:
+    """Request assets that nobody serves, as fast as answers come, by one observer after the other."""
+    while True:
+        with contextlib.suppress(OSError, asyncio.IncompleteReadError):
+            _, writer, ticket = await open_websocket(host, port, joins=True)
+            reader, http = await asyncio.open_connection(host, port)
+            for _ in range(5000):
+                name = secrets.token_hex(32)
+                head = f"GET /v1/asset/{name} HTTP/1.1\r\nHost: {host}:{port}\r\nX-Iris-Ticket: ".encode()
+                http.write(head + ticket + b"\r\n\r\n")
+                answer = await reader.readuntil(b"\r\n\r\n")
+                if b" 401 " in answer:
+                    break
+                length = int(answer.lower().split(b"content-length: ")[1].split(b"\r")[0])
+                await reader.readexactly(length)
+            http.close()
+            writer.close()
+        await asyncio.sleep(0.02)
+
+
+async def attack_by_reading_nothing(host: str, port: int) -> None:
+    """Join, ask for snapshots, and read none of them nor any state."""
+    frame = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(GetSnapshot(), 0))])
+    held: list[asyncio.StreamWriter] = []
+    while True:
+        with contextlib.suppress(OSError, TimeoutError, asyncio.IncompleteReadError):
+            reader, writer, _ = await open_websocket(host, port, joins=True)
+            reader._transport.pause_reading()  # type: ignore[attr-defined]
+            writer.write(8 * (struct.pack(">BB", 0x82, 0x80 | len(frame)) + bytes(4) + frame))
+            held.append(writer)
+        while len(held) > 30:
+            held.pop(0).close()
+        await asyncio.sleep(0.1)
 
 
 async def attack_with_sockets(host: str, port: int, kind: str, n: int = 200) -> None:
@@ -212,8 +302,15 @@ async def attack_with_sockets(host: str, port: int, kind: str, n: int = 200) -> 
 
 def attack(kind: str, host: str, port: int, bytes_per_s: float) -> None:
     """Attack until the process is ended."""
-    if kind in FRAMES:
-        asyncio.run(attack_with_frames(host, port, kind, bytes_per_s))
+    base = kind.removeprefix(OBSERVER)
+    if base in FRAMES:
+        asyncio.run(attack_with_frames(host, port, base, bytes_per_s, joins=kind != base))
+    elif kind == "handshakes":
+        asyncio.run(attack_with_handshakes(host, port))
+    elif kind == "observer_assets":
+        asyncio.run(attack_with_assets(host, port))
+    elif kind == "observer_unread":
+        asyncio.run(attack_by_reading_nothing(host, port))
     else:
         asyncio.run(attack_with_sockets(host, port, kind))
 
@@ -221,33 +318,45 @@ def attack(kind: str, host: str, port: int, bytes_per_s: float) -> None:
 # --- the lab ----------------------------------------------------------------------------------------------------------
 
 
-async def measure(page: str, browser: HonestBrowser, seconds: float) -> tuple[float, int]:
-    """Return the longest time of an e-stop [ms], and how many there were."""
-    until, slowest, n = time.monotonic() + seconds, 0.0, 0
+async def measure(browser: HonestBrowser, seconds: float) -> list[float]:
+    """Return the times of e-stops [ms]."""
+    until, times_ms = time.monotonic() + seconds, []
     while time.monotonic() < until and not browser.is_closed:
-        slowest, n = max(slowest, await browser.measure_stop()), n + 1
+        times_ms.append(await browser.measure_stop())
         await asyncio.sleep(STOP_PERIOD_S)
-    return slowest, n
+    return times_ms
+
+
+async def count_lines(stream: asyncio.StreamReader) -> int:
+    """Return the number of lines until the end: of an attacker, its connections."""
+    n = 0
+    while await stream.readline():
+        n += 1
+    return n
 
 
 async def run_case(kind: str, port: int, bytes_per_s: float, seconds: float) -> dict[str, Any]:
     """Return what an honest browser has measured during an attack."""
-    page = f"http://127.0.0.1:{port}/"
-    async with open_honest(page) as browser:
-        usual, _ = await measure(page, browser, seconds)
+    async with open_honest(f"http://127.0.0.1:{port}/") as browser:
+        usual = await measure(browser, seconds)
         command = [sys.executable, __file__, "--attack", kind, str(port), str(bytes_per_s)]
         attacker = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE)
         try:
             assert attacker.stdout is not None
             await attacker.stdout.readline()  # it is connected
-            slowest, n = await measure(page, browser, seconds)
-            is_open = not browser.is_closed
+            counting = asyncio.create_task(count_lines(attacker.stdout))
+            times_ms = await measure(browser, seconds)
+            is_open, is_attacking = not browser.is_closed, attacker.returncode is None
         finally:
             attacker.kill()
             await attacker.wait()
-    ok = is_open and slowest <= max(STOP_MS, STOP_SHARE * usual)
-    row = {"case": kind, "mb_per_s": bytes_per_s / 1e6, "stops": n, "usual_ms": round(usual, 1)}
-    return {**row, "slowest_ms": round(slowest, 1), "is_open": is_open, "ok": ok}
+        n_connections = 1 + await counting
+    slowest, n_lost = max(times_ms, default=float("inf")), times_ms.count(float("inf"))
+    ok = is_open and is_attacking and slowest <= max(STOP_MS, STOP_SHARE * max(usual, default=0.0))
+    row = {"case": kind, "mb_per_s": bytes_per_s / 1e6, "connections": n_connections}
+    row |= {"stops": len(times_ms), "lost": n_lost}
+    row |= {"usual_ms": round(max(usual, default=0.0), 1), "slowest_ms": None if n_lost else round(slowest, 1)}
+    return {**row, "is_open": is_open, "ok": ok}
 
 
 def find_gateway(server: subprocess.Popen[bytes]) -> psutil.Process:
@@ -256,6 +365,14 @@ def find_gateway(server: subprocess.Popen[bytes]) -> psutil.Process:
         if "iris_session.web.gateway" in child.cmdline():
             return child
     raise SystemExit("hostile_web: the session has no gateway")
+
+
+def read_memory_mib(process: psutil.Process) -> float:
+    """Return the memory of a process, infinity for one that has ended."""
+    try:
+        return float(process.memory_info().rss) / MIB
+    except psutil.NoSuchProcess:
+        return float("inf")
 
 
 def wait_for_page(server: subprocess.Popen[bytes], port: int) -> None:
@@ -286,20 +403,32 @@ def run(cases: list[str], seconds: float) -> dict[str, Any]:
             gateway, rows = find_gateway(server), []
             base_mib = gateway.memory_info().rss / MIB
             for kind in cases:
-                for bytes_per_s in RATES if kind in FRAMES else RATES[:1]:
+                for bytes_per_s in RATES if kind.removeprefix(OBSERVER) in FRAMES else RATES[:1]:
                     try:
                         rows.append(asyncio.run(run_case(kind, port, bytes_per_s, seconds)))
                     except NotWelcomedError:
-                        rows.append({"case": kind, "mb_per_s": bytes_per_s / 1e6, "is_open": False, "ok": False})
+                        rows.append({"case": kind, "is_open": False, "ok": False})
+                    rows[-1]["grown_mib"] = round(read_memory_mib(gateway) - base_mib, 1)
                     print(f"hostile_web: {rows[-1]}", file=sys.stderr, flush=True)
-            time.sleep(2.0)
-            kept_mib = gateway.memory_info().rss / MIB - base_mib
+            until = time.monotonic() + SETTLE_S
+            while (kept_mib := read_memory_mib(gateway) - base_mib) > MEMORY_MIB and time.monotonic() < until:
+                time.sleep(0.5)
             n_lines = (Path(folder) / "log").read_bytes().count(b"\n")
         finally:
             server.send_signal(signal.SIGINT)
             server.wait(60.0)
-    ok = all(row["ok"] for row in rows) and kept_mib <= MEMORY_MIB and n_lines <= LOG_LINES
+    ok = all(row["ok"] for row in rows) and kept_mib <= MEMORY_MIB and n_lines < LOG_LINES
     return {"cases": rows, "kept_mib": round(kept_mib, 1), "log_lines": n_lines, "ok": ok}
+
+
+def format_table(figures: dict[str, Any]) -> str:
+    """Return the figures of `run` as the Markdown table of docs/evidence/hostile.md."""
+    columns = list(figures["cases"][0])
+    rows = ["| " + " | ".join(str(row.get(column, "")) for column in columns) + " |" for row in figures["cases"]]
+    head = [f"| {' | '.join(columns)} |", f"{'|---' * len(columns)}|"]
+    return "\n".join(
+        [*head, *rows, f"the gateway keeps {figures['kept_mib']} MiB, the log has {figures['log_lines']} lines"]
+    )
 
 
 def main() -> int:
@@ -318,12 +447,7 @@ def main() -> int:
     if options.json:
         print(json.dumps(figures))
     else:
-        print(
-            "| case | MB/s | e-stops | slowest, usual [ms] | slowest [ms] | open | ok |\n|---|---|---|---|---|---|---|"
-        )
-        for row in figures["cases"]:
-            print("| " + " | ".join(str(value) for value in row.values()) + " |")
-        print(f"the gateway keeps {figures['kept_mib']} MiB, the log has {figures['log_lines']} lines")
+        print(format_table(figures))
     return 0 if figures["ok"] else 1
 
 

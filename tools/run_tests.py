@@ -107,7 +107,6 @@ def make_long_stages() -> tuple[Stage, ...]:
         make_pytest("long", "e2e and long", "-p", "no:xdist", "tests"),
         Stage("fuzz", (sys.executable, "tools/fuzz.py", "--target", "all", "--inputs", "100000", "--seed", "1")),
         Stage("hostile", (sys.executable, "tools/hostile.py", "--quick")),
-        Stage("hostile web", (sys.executable, "tools/hostile_web.py", "--quick")),
         Stage("soak", (sys.executable, "tools/soak.py", "--seconds", "120", "--operators", "3", "--observers", "1")),
     )
 
