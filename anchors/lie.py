@@ -58,14 +58,15 @@ def quat_log(q: Array) -> Array:
 def quat_to_matrix(q: Array) -> Array:
     """Return rotation matrices `(..., 3, 3)` of unit quaternions `(..., 4)`."""
     w, x, y, z = q.tolist() if q.ndim == 1 else (q[..., 0], q[..., 1], q[..., 2], q[..., 3])
-    rows = (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    values = (
+        *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        *(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        *(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
-    if q.ndim == 1:
-        return np.array(rows)
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    R = np.empty((*q.shape[:-1], 9))
+    for i, value in enumerate(values):
+        R[..., i] = value
+    return R.reshape(*q.shape[:-1], 3, 3)
 
 
 def quat_from_matrix(R: Array) -> Array:

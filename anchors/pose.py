@@ -136,9 +136,10 @@ def pose_to_dict(T: PoseTuple) -> dict[str, list[float]]:
 
 def is_rigid(T: PoseTuple, reach_m: float = 1e3) -> bool:
     """Return whether untrusted numbers are a pose: finite, unit quaternion (to 1 %), coordinates within `reach_m`."""
-    p, q = T
-    norm = math.sqrt(sum(c * c for c in q))
-    return all(map(math.isfinite, (*p, *q))) and abs(norm - 1.0) <= 1e-2 and max(map(abs, p)) <= reach_m
+    (x, y, z), (a, b, c, d) = T
+    norm = math.sqrt(a * a + b * b + c * c + d * d)
+    # Comparisons with nan are false.
+    return abs(norm - 1.0) <= 1e-2 and abs(x) <= reach_m and abs(y) <= reach_m and abs(z) <= reach_m
 
 
 def is_valid_point(p: Vec3 | None, reach_m: float = 1e3) -> bool:

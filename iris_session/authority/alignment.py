@@ -532,19 +532,22 @@ def compute_position_p95(covariance: tuple[float, ...], pivot: Vec3, point: Vec3
     The error at the point is dp + dtheta x r with r = point - pivot. Its squared length is a weighted sum of chi-square
     variables, approximated by one with the same mean and variance (Satterthwaite), its quantile by Wilson-Hilferty.
     """
-    r = (point[0] - pivot[0], point[1] - pivot[1], point[2] - pivot[2])
-    # Rows of [I | -[r]x]: how (dp, dtheta) moves the point.
-    J = (
-        (1.0, 0.0, 0.0, 0.0, r[2], -r[1]),
-        (0.0, 1.0, 0.0, -r[2], 0.0, r[0]),
-        (0.0, 0.0, 1.0, r[1], -r[0], 0.0),
-    )
-    CJ = [[sum(covariance[6 * i + k] * row[k] for k in range(6)) for i in range(6)] for row in J]
-    C = [[sum(J[i][k] * CJ[j][k] for k in range(6)) for j in range(3)] for i in range(3)]
-    mean = C[0][0] + C[1][1] + C[2][2]
+    x, y, z = point[0] - pivot[0], point[1] - pivot[1], point[2] - pivot[2]
+    # C = J covariance J^T, J = [I | -[r]x]: how (dp, dtheta) moves the point. Written out: it is asked often.
+    CJ0, CJ1, CJ2 = [], [], []
+    for i in range(0, 36, 6):
+        px, py, pz, rx, ry, rz = covariance[i : i + 6]
+        CJ0.append(px + ry * z - rz * y)
+        CJ1.append(py - rx * z + rz * x)
+        CJ2.append(pz + rx * y - ry * x)
+    columns = (CJ0, CJ1, CJ2)
+    C = [px + ry * z - rz * y for px, _, _, _, ry, rz in columns]
+    C += [py - rx * z + rz * x for _, py, _, rx, _, rz in columns]
+    C += [pz + rx * y - ry * x for _, _, pz, rx, ry, _ in columns]
+    mean = C[0] + C[4] + C[8]
     if not (0.0 < mean < math.inf):
         return 0.0 if mean == 0.0 else math.inf
-    spread = sum(c * c for row in C for c in row)
+    spread = sum([c * c for c in C])
     freedom = min(3.0, max(1.0, mean * mean / spread)) if math.isfinite(spread) and spread > 0.0 else 1.0
     a = 2.0 / (9.0 * freedom)
     return math.sqrt(mean * (1.0 - a + Z95 * math.sqrt(a)) ** 3)

@@ -9,10 +9,14 @@ there. Naive alignments are computed beside ours for comparison.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -148,6 +152,7 @@ BOUNDS: Final = (
     *(("three_sheets", "hull_mm_p95", 6.0), ("holder", "sheet_mm_p95", 5.0), ("touch", "hull_mm_p95", 5.0)),
 )
 _TIMED: Final = 8  # headsets, at most, whose updates are timed one by one
+_PAIRS_AT_ONCE: Final = 100  # of one job; fewer are not worth another process
 
 
 class HeadsetError(NamedTuple):
@@ -167,6 +172,19 @@ class CaseStatistics:
     covered: dict[str, list[bool]] = field(default_factory=dict)
     pairs: int = 0
     refused: int = 0
+
+    def add(self, other: CaseStatistics) -> None:
+        """Add the errors of more pairs."""
+        for name, errors in other.errors.items():
+            self.errors.setdefault(name, []).extend(errors)
+        for name, covered in other.covered.items():
+            self.covered.setdefault(name, []).extend(covered)
+        self.pairs += other.pairs
+        self.refused += other.refused
+
+
+#: Of our estimate, of the last observation alone, and of the mean of all.
+CaseResult = tuple[CaseStatistics, CaseStatistics, CaseStatistics]
 
 
 def run_alignment(
@@ -191,11 +209,8 @@ def run_alignment(
     names = select_worlds(worlds)
     results: dict[str, Any] = {}
     bars: list[Bar] = []
-    for k, case in enumerate(CASES):
-        progress(f"{case}, {pairs} pairs")
-        rngs = [np.random.default_rng(s) for s in np.random.SeedSequence((seed, k)).spawn(3 * pairs)]
-        results[case] = _run_case(case, rngs)
-    results |= _measure_update_times(seed, min(_TIMED, pairs))
+    timed = _measure_update_times(seed, min(_TIMED, pairs))  # while nothing else runs
+    results |= _run_cases(pairs, seed, progress) | timed
     for case, key, bound in BOUNDS:
         bars.append(make_bar(results, f"{case}.{key}", "<=", bound))
     for case in CASES:
@@ -211,7 +226,40 @@ def run_alignment(
     return BenchReport("alignment", params, results, tuple(bars))
 
 
-def _run_case(case: str, rngs: Sequence[np.random.Generator]) -> dict[str, float]:
+def _run_cases(pairs: int, seed: int, progress: Callable[[str], None]) -> dict[str, Any]:
+    """Return the figures of all cases, computed on all processors where that is worth it."""
+    jobs = []
+    for k, case in enumerate(CASES):
+        seeds = np.random.SeedSequence((seed, k)).spawn(3 * pairs)
+        step = 3 * _PAIRS_AT_ONCE
+        jobs += [(case, seeds[i : i + step]) for i in range(0, len(seeds), step)]
+    found = {case: (CaseStatistics(), CaseStatistics(), CaseStatistics()) for case in CASES}
+    workers = min(os.cpu_count() or 1, pairs // _PAIRS_AT_ONCE)
+    with contextlib.ExitStack() as stack:
+        run_all: Callable[..., Iterator[CaseResult]] = map
+        if workers > 1:
+            run_all = stack.enter_context(ProcessPoolExecutor(workers, get_context("spawn"))).map
+        begun = ""
+        for (case, _), result in zip(jobs, run_all(_run_case, *zip(*jobs, strict=True)), strict=True):
+            if case != begun:
+                begun = case
+                progress(f"{case}, {pairs} pairs")
+            for total, part in zip(found[case], result, strict=True):
+                total.add(part)
+    return {case: _summarize_case(case, *result) for case, result in found.items()}
+
+
+def _summarize_case(case: str, ours: CaseStatistics, last: CaseStatistics, mean: CaseStatistics) -> dict[str, float]:
+    hull = case not in ("one_sheet", "holder")
+    out = _summarize(ours, "", hull)
+    if case != "touch":
+        out |= _summarize(last, "naive_last_", hull) | _summarize(mean, "naive_mean_", hull)
+    return out
+
+
+def _run_case(case: str, seeds: Sequence[np.random.SeedSequence]) -> CaseResult:
+    """Run pairs of one case, from three seeds each."""
+    rngs = [np.random.default_rng(s) for s in seeds]
     anchors: dict[str, PoseTuple] = TRIANGLE if case.startswith("three") else ONE
     hull = [np.array(p) for p in MARKS.values()] if case == "touch" else [np.array(p) for p, _ in anchors.values()]
     ours, last, mean = CaseStatistics(), CaseStatistics(), CaseStatistics()
@@ -230,10 +278,7 @@ def _run_case(case: str, rngs: Sequence[np.random.Generator]) -> dict[str, float
         ]
         for tally, (x, y) in zip((ours, last, mean), zip(*found, strict=True), strict=False):
             _evaluate_pair(tally, x, y, points, hull)
-    out = _summarize(ours, "", len(hull) > 1)
-    if case != "touch":
-        out |= _summarize(last, "naive_last_", len(hull) > 1) | _summarize(mean, "naive_mean_", len(hull) > 1)
-    return out
+    return ours, last, mean
 
 
 def _simulate_looking_headset(

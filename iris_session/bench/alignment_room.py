@@ -46,7 +46,7 @@ HEAD_HZ: Final = 36.0
 PAUSE_HEAD_HZ: Final = 2.5
 LONG_PAUSE_HEAD_HZ: Final = 1.0
 #: The authority steps at least so often, and gets a head pose in so many.
-STEP_NS: Final = 250 * MS
+STEP_NS: Final = 500 * MS
 HEADS_PER_SAMPLE: Final = 8
 WALK_S: Final = 3.0
 #: Without head poses, as a wearer turns to something else: paths need not join, and longer gaps than 0.5 s are no jump.
@@ -136,7 +136,7 @@ class Wearer:
         """Walk about and look at no sheet; `heeds`: glance at one when a notice asks for it."""
         room = self.room
         end_s = room.now_s + seconds
-        hz = PAUSE_HEAD_HZ if seconds <= 60.0 else LONG_PAUSE_HEAD_HZ
+        hz = PAUSE_HEAD_HZ if seconds <= 30.0 else LONG_PAUSE_HEAD_HZ
         yield room.now_ns + TURN_NS
         while room.now_s + 1.0 / hz <= end_s:
             yield round((room.now_s + 1.0 / hz) * SECOND)

@@ -140,10 +140,11 @@ class HeadsetMotion:
 
     def T_world_tracking(self, at_s: float) -> tuple[Array, Array]:
         """Return the true pose of the tracking frame at a time."""
+        p = self._p0 + at_s * self.velocity
         if not self.yaw_rad_per_s:
-            return self._p0 + at_s * self.velocity, self._q0
-        p, q = self.compute_frames(np.array([at_s]))
-        return p[0], q[0]
+            return p, self._q0
+        dq = quat_exp(np.array([0.0, 0.0, self.yaw_rad_per_s * max(at_s - self._turned_from_s, 0.0)]))
+        return self._turned_about + quat_to_matrix(dq) @ (p - self._turned_about), quat_multiply(dq, self._q0)
 
     def shift_frame(self, by: Array) -> None:
         """Move the tracking frame at once, without a word."""
