@@ -29,6 +29,8 @@ JUMP: Final = "jump"
 
 #: Interval of the slowest device [s]: no longer time makes room for motion.
 LONGEST_S: Final = 1.0 / 30.0
+#: A longer time between two poses is a silence [s].
+SILENCE_S: Final = 1.5 * LONGEST_S
 #: Times of capture may be coarse, or go back [s].
 SHORTEST_S: Final = 0.004
 #: Share of the way in one interval at recent speed, by which a way may change before it surprises: a hand that is
@@ -119,7 +121,7 @@ def _judge_pose(track: Track, limit: SpeedLimit, pose: Pose, capture_ns: int) ->
     turn_speed = max(track.turn_speed, math.hypot(*after.r) / after.dt)
     excess = _find_excess(step.d, step.dt, track.v, after.d, after.dt)
     excess_rad = _find_excess(step.r, step.dt, track.w, after.r, after.dt)
-    if excess > limit.noise_m + _find_change(speed, dt) or excess_rad > limit.noise_rad + TURN_SHARE * turn_speed * dt:
+    if excess > _find_slack(limit, speed, step.dt) or excess_rad > limit.noise_rad + TURN_SHARE * turn_speed * dt:
         return JUMP
     _advance(track, step, surprise, surprise_ns)
     if _judge_step(track, limit, after) == JUMP:
@@ -150,15 +152,20 @@ def _judge_step(track: Track, limit: SpeedLimit, step: _Step) -> str:
     if not possible:
         return JUMP
     steady = (
-        apart <= limit.noise_m + _find_change(track.speed, dt)
+        apart <= _find_slack(limit, track.speed, step.dt)
         and apart_rad <= limit.noise_rad + TURN_SHARE * track.turn_speed * dt
     )
     return STEADY if steady else SURPRISE
 
 
-def _find_change(speed: float, dt: float) -> float:
-    """Return by how much the way in `dt` may change from one interval to the next [m]."""
-    return (SHARE * speed + max(0.0, speed - FAST_M_PER_S)) * dt
+def _find_slack(limit: SpeedLimit, speed: float, dt: float) -> float:
+    """Return by how much the way in `dt` may differ from that of the interval before, without a surprise [m].
+
+    After a silence it is a choice, not a sum: the next pose tells a device that was accelerated from one that jumped.
+    """
+    counted = min(dt, LONGEST_S)
+    change = (SHARE * speed + max(0.0, speed - FAST_M_PER_S)) * counted
+    return max(limit.noise_m, change) if dt > SILENCE_S else limit.noise_m + change
 
 
 def _find_excess(way: Vec3, dt: float, v: Vec3, next_way: Vec3, next_dt: float) -> float:

@@ -17,16 +17,16 @@ from iris_session.protocol.server_messages import EngagementChanged, SamplesReje
 
 from .table import MS, SECOND, Table, proposal
 
-HAND = SPEED_LIMITS["controller/right"]
+HAND = SPEED_LIMITS["hand/right"]
 RATES_HZ = (30, 60, 72, 90)
 
 
-def follow(points: Sequence[tuple[float, float]], turn: float = 0.0) -> list[str]:
-    """Return the verdicts on positions [m] along an axis at times [s]; `turn`: radians per metre."""
+def follow(points: Sequence[tuple[float, ...]], turn: float = 0.0) -> list[str]:
+    """Return the verdicts on positions [m], along one or two axes, at times [s]; `turn`: radians per metre."""
     track: Track | None = None
     verdicts = []
-    for seconds, x in points:
-        pose = Pose((x, 0.0, 1.0), (math.cos(turn * x / 2), 0.0, 0.0, math.sin(turn * x / 2)))
+    for seconds, x, *aside in points:
+        pose = Pose((x, sum(aside), 1.0), (math.cos(turn * x / 2), 0.0, 0.0, math.sin(turn * x / 2)))
         if track is None:
             track = Track(pose, round(seconds * 1e9), round(seconds * 1e9))
         else:
@@ -57,11 +57,20 @@ def test_a_stroke_of_table_tennis_is_no_jump_wherever_it_is_sampled(rate_hz: int
 def test_a_jump_never_drives(rate_hz: int, speed: float, size: float, silence_s: float) -> None:
     times = [k / rate_hz for k in range(8)]
     later = [silence_s + k / rate_hz for k in range(8, 12)]
-    points = [(t, speed * t) for t in times] + [(t, speed * t + size) for t in later]
-    verdicts = follow([(t, x + 1e-7 * k) for k, (t, x) in enumerate(points)])
-    assert verdicts[2:7] == [STEADY] * 5
-    first = verdicts.index(JUMP)
-    assert verdicts[7:first] in ([], [SURPRISE])
+    for along, aside in ((size, 0.0), (0.0, size)):
+        points = [(t, speed * t, 0.0) for t in times] + [(t, speed * t + along, aside) for t in later]
+        verdicts = follow([(t, x + 1e-7 * k, y) for k, (t, x, y) in enumerate(points)])
+        assert verdicts[2:7] == [STEADY] * 5
+        first = verdicts.index(JUMP)
+        assert verdicts[7:first] in ([], [SURPRISE])
+
+
+@pytest.mark.parametrize(("silence_s", "jumps"), [(0.0, False), (0.05, True), (0.1, True)])
+def test_after_a_silence_less_is_a_jump(silence_s: float, jumps: bool) -> None:
+    """20 mm aside: at 30 Hz a turn of a fast hand; but nothing is known of the way in a silence."""
+    times = [k / 30 for k in range(8)]
+    later = [silence_s + k / 30 for k in range(8, 12)]
+    assert (JUMP in follow([(t, t, 0.0) for t in times] + [(t, t, 0.02) for t in later])) == jumps
 
 
 def test_an_outlier_of_one_sample_waits_and_is_dropped() -> None:
