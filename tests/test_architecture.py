@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 #: A file is one concept; longer ones hold two.
 MAX_LINES = 800
@@ -121,9 +123,27 @@ def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
-def imports(path: Path) -> Iterator[str]:
-    """Yield dotted names that a module imports, also lazily and for type checkers only."""
-    for node in ast.walk(tree(path)):
+@cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(tree(path)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _release_trees() -> Iterator[None]:
+    """Release the trees after these tests: a million objects would slow down every later garbage collection."""
+    yield
+    nodes.cache_clear()
+    tree.cache_clear()
+
+
+@cache
+def imports(path: Path) -> frozenset[str]:
+    """Return dotted names that a module imports, also lazily and for type checkers only."""
+    return frozenset(_find_imports(path))
+
+
+def _find_imports(path: Path) -> Iterator[str]:
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -144,6 +164,7 @@ def rooms_imported(path: Path) -> set[str]:
     return found
 
 
+@cache
 def table() -> dict[str, set[str] | None]:
     """Return room -> rooms that it may import, by docs/architecture.md; `None` for everything."""
     rows = re.findall(r"^\| (`.+?) \| (.+?) \| .*\|$", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE)
@@ -193,9 +214,9 @@ def test_rooms_import_what_the_table_allows() -> None:
     assert not offenders, "\n".join(offenders)
 
 
-def impurities(module: ast.Module) -> Iterator[str]:
+def impurities(path: Path) -> Iterator[str]:
     """Yield places where a result could depend on hash order, addresses, or hidden random state."""
-    for node in ast.walk(module):
+    for node in nodes(path):
         looped = node.iter if isinstance(node, ast.For | ast.comprehension) else None
         calls_set = (
             isinstance(looped, ast.Call)
@@ -212,13 +233,13 @@ def impurities(module: ast.Module) -> Iterator[str]:
 
 def test_pure_rooms_depend_on_their_arguments_only() -> None:
     pure = [path for path in modules() if room_of(path) in PURE]
-    offenders = [f"{path.relative_to(ROOT)}: {found}" for path in pure for found in impurities(tree(path))]
+    offenders = [f"{path.relative_to(ROOT)}: {found}" for path in pure for found in impurities(path)]
     assert not offenders, "\n".join(offenders)
 
 
 def calls(path: Path) -> Iterator[str]:
     """Yield the last two names of every dotted call of a module, such as `time.sleep`."""
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
         if isinstance(node, ast.Call):
             yield ".".join(ast.unparse(node.func).split(".")[-2:])
 
@@ -249,7 +270,7 @@ def importers() -> dict[str, set[str]]:
     known = {dotted_name(path) for path in modules()}
     found: dict[str, set[str]] = {name: set() for name in known}
     for path in (*modules(), *(ROOT / "tools").glob("*.py"), *(ROOT / "examples").glob("*.py")):
-        for name in set(imports(path)) & known - {dotted_name(path)}:
+        for name in imports(path) & known - {dotted_name(path)}:
             found[name].add(dotted_name(path))
     return found
 
@@ -292,7 +313,7 @@ def test_no_slivers() -> None:
 def test_constructors_have_few_parameters() -> None:
     offenders = []
     for path in modules():
-        for node in ast.walk(tree(path)):
+        for node in nodes(path):
             if isinstance(node, ast.FunctionDef) and node.name == "__init__":
                 n = len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs) - 1
                 if n > MAX_PARAMETERS and str(path.relative_to(ROOT)) not in KEYWORD_CONSTRUCTORS:
@@ -304,7 +325,7 @@ def documented(path: Path) -> Iterator[tuple[int, str]]:
     """Yield comments and docstrings of a module with their lines."""
     docstrings = {
         node.body[0].lineno
-        for node in ast.walk(tree(path))
+        for node in nodes(path)
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
         and ast.get_docstring(node)
     }
@@ -328,7 +349,7 @@ def test_texts_for_people_have_standard_words() -> None:
     offenders = [
         f"{path.relative_to(ROOT)}:{node.lineno}: {found[0]}"
         for path in modules()
-        for node in ast.walk(tree(path))
+        for node in nodes(path)
         if isinstance(node, ast.Constant)
         and isinstance(node.value, str)
         and (found := DENIED_IN_TEXTS.search(node.value))
@@ -343,7 +364,7 @@ def test_texts_for_people_have_standard_words() -> None:
 def test_docstrings_are_statements() -> None:
     offenders = []
     for path in modules():
-        for node in ast.walk(tree(path)):
+        for node in nodes(path):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 text = ast.get_docstring(node) or ""
                 if QUESTION.match(text):

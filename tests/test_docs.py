@@ -301,6 +301,8 @@ def test_every_example_is_run() -> None:
 
 # --- commands ---
 
+PARSER = build_parser()
+
 
 def commands() -> Iterator[tuple[str, list[str]]]:
     """Return every `iris-session` command that a page shows, as `(where, arguments)`."""
@@ -318,7 +320,6 @@ def commands() -> Iterator[tuple[str, list[str]]]:
 
 @pytest.mark.parametrize(("where", "arguments"), sorted({(w, tuple(a)) for w, a in commands()}), ids=str)
 def test_command_parses(where: str, arguments: tuple[str, ...]) -> None:
-    parser = build_parser()
     kind = {"verify": ["FILE"], "serve": ["SCENE"], "robots": ["SCENE"], "demo": ["handover"]}
     bare = len(arguments) == 1 or (len(arguments) > 1 and arguments[1].startswith("--") and arguments[0] in kind)
     # In running text a command may be named without its arguments.
@@ -326,7 +327,7 @@ def test_command_parses(where: str, arguments: tuple[str, ...]) -> None:
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors):
         try:
-            parser.parse_args(list(completed))
+            PARSER.parse_args(list(completed))
         except SystemExit:
             pytest.fail(f"{where}: iris-session {shlex.join(arguments)}: {errors.getvalue().splitlines()[-1]}")
 
@@ -358,7 +359,7 @@ def test_command_line_reference_has_every_option() -> None:
 
 def _commands() -> dict[str, argparse.ArgumentParser]:
     """Return every command of `iris-session` and its parser."""
-    actions = build_parser()._subparsers
+    actions = PARSER._subparsers
     assert actions is not None
     subparsers = next(a for a in actions._group_actions if isinstance(a, argparse._SubParsersAction))
     return dict(subparsers.choices)

@@ -251,6 +251,7 @@ class WebServer:
             logger=quiet,
             keepalive_timeout=10.0,
             lingering_time=1.0,
+            shutdown_timeout=_CLOSE_S,
             max_line_size=2048,
             max_field_size=4096,
         )
@@ -267,7 +268,7 @@ class WebServer:
         self._listener = listener
 
     async def close(self) -> None:
-        """End all requests."""
+        """End all requests, those that are being answered within `_CLOSE_S`."""
         await self._runner.cleanup()
 
     # --- every request ------------------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ def test_every_command_has_help_for_its_options_and_valid_examples(name: str) ->
     assert examples
     for example in examples:
         words = re.split(r" {2,}|>", example)[0].split()[1:]  # the rest is a comment, or a file
-        build_parser().parse_args(join_negative_poses([word.strip('"') for word in words]))
+        PARSERS["iris-session"].parse_args(join_negative_poses([word.strip('"') for word in words]))
     silent = [action.option_strings for action in PARSERS[name]._actions if action.option_strings and not action.help]
     assert silent == []
 
