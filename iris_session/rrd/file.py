@@ -6,11 +6,13 @@ cannot be decoded is found by `salvage.py`.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import struct
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
 
@@ -74,6 +76,7 @@ class Mark(NamedTuple):
 
 def scan_file(path: str | Path) -> Scan:
     """List the messages of a file without decoding them. Raises `NotARecordingError`."""
+    wait_for_index(path)
     size = os.path.getsize(path)
     found: list[RrdMessage] = []
     holes: list[tuple[int, int]] = []
@@ -215,6 +218,7 @@ def read_chunks(path: str | Path, entities: str | Sequence[str]) -> Iterator[Any
 
     done: set[str] = set()
     while True:
+        wait_for_index(path)
         size, taken = get_size(path), set(done)
         try:
             with warnings.catch_warnings():
@@ -231,6 +235,12 @@ def read_chunks(path: str | Path, entities: str | Sequence[str]) -> Iterator[Any
             done = taken  # the index was added meanwhile: read on
         else:
             return
+
+
+def wait_for_index(path: str | Path) -> None:
+    """Wait while an index is being written: on a busy machine the file has a part of it for a while."""
+    with suppress(OSError), open(path, "rb") as file:
+        fcntl.lockf(file, fcntl.LOCK_SH)  # apart from `flock`, which those that record hold
 
 
 def get_size(path: str | Path) -> int:

@@ -15,6 +15,7 @@ idle: neither the end of this session nor the next one waits for it. It takes ab
 
 from __future__ import annotations
 
+import fcntl
 import os
 import sys
 from contextlib import suppress
@@ -125,13 +126,15 @@ def _is_index(data: bytes) -> bool:
 def _append(file: BinaryIO, size: int, index: bytes) -> bool:
     """Replace the end message of a file of `size` bytes, unless it was changed or removed, or the disk is full."""
     descriptor, end = file.fileno(), size - len(END_MESSAGE)
+    with suppress(OSError):  # a file system without locks
+        fcntl.lockf(file, fcntl.LOCK_EX)  # readers wait (`wait_for_index`)
     now, disk = os.fstat(descriptor), os.fstatvfs(descriptor)
     if now.st_size != size or not now.st_nlink or disk.f_bavail * disk.f_frsize < len(index) + RESERVE_BYTES:
         return False
     if os.pread(descriptor, len(END_MESSAGE), end) != END_MESSAGE:
         return False
     try:
-        # One call: a reader, or a kill, finds the old end or the new one.
+        # One call: a kill hardly ever finds a part of it.
         is_whole = os.pwrite(descriptor, index, end) == len(index)
         os.utime(descriptor, ns=(now.st_atime_ns, now.st_mtime_ns))  # what was recorded is as old as before
         os.fsync(descriptor)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import random
 import shutil
 from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
 from iris_session.recording import NotARecordingError, Recording, verify
-from iris_session.rrd.file import END_MESSAGE, FILE_TAIL, scan_file
+from iris_session.rrd.file import END_MESSAGE, FILE_TAIL, read_chunks, scan_file
 from iris_session.rrd.index import add_index
 from iris_session.rrd.rerun_tool import find_rerun
 from tests.recording.support import SmallCore, has_index, journal, write
@@ -56,6 +58,25 @@ def test_indexed_file_reads_and_verifies_like_before(closed: Path, indexed: Path
     report = verify(indexed, SmallCore)
     assert report.ok, report.line()
     assert report.finished
+
+
+def test_readers_wait_while_it_is_being_written(
+    closed: Path, indexed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, locks = indexed.read_bytes(), []
+    path = tmp_path / "session.rrd"
+    path.write_bytes(whole[:-1000])
+
+    def lock(file: BinaryIO, kind: int) -> None:
+        """Finish the write when a reader waits for it."""
+        locks.append(kind)
+        if path.stat().st_size == len(whole) - 1000:
+            path.write_bytes(whole)
+
+    monkeypatch.setattr(fcntl, "lockf", lock)
+    assert [chunk.id for chunk in read_chunks(path, "/**")] == [chunk.id for chunk in read_chunks(indexed, "/**")]
+    assert add_index(shutil.copy(closed, path))
+    assert locks[-1] == fcntl.LOCK_EX
 
 
 def test_changed_bytes_of_an_indexed_file_are_found(indexed: Path, tmp_path: Path) -> None:
