@@ -101,13 +101,13 @@ def test_extrinsics_of_two_cameras_at_a_table_are_mended() -> None:
 
 
 def make_walls(normals: list[tuple[float, float, float]], seed: int, noise_m: float = 0.004) -> Floats:
-    """Return squares of 2 m through the origin, 8,000 points each."""
+    """Return squares of 2 m through the origin, 3,000 points each."""
     random = np.random.default_rng(seed)
     walls = []
     for normal in normals:
         _, _, axes = np.linalg.svd(np.array([normal]))
-        flat = random.uniform(-1.0, 1.0, (8000, 2)) @ axes[1:]
-        walls.append(flat + random.normal(0.0, noise_m, (8000, 1)) * axes[:1])
+        flat = random.uniform(-1.0, 1.0, (3000, 2)) @ axes[1:]
+        walls.append(flat + random.normal(0.0, noise_m, (3000, 1)) * axes[:1])
     return np.concatenate(walls)
 
 

@@ -13,6 +13,7 @@ from .play import ACTIONS, Play
 POLICIES = ("join-order", "config", "nearest", "director")
 
 
+@pytest.mark.usefixtures("untraced")
 @pytest.mark.parametrize("seed", [*range(13), 15, 22, 26])
 def test_long_sessions(seed: int) -> None:
     policy = POLICIES[seed % 4] if seed < 8 else "join-order"

@@ -18,15 +18,22 @@ from iris_session.bench.stop import (
     run_stop,
 )
 
+#: Each kind of actuator with a third of the causes, each cause with a third of the kinds; all pairs in the long run.
+CASES = [
+    pytest.param(kind, cause, marks=[pytest.mark.long] if (i + j) % 3 else [])
+    for i, kind in enumerate(KINDS)
+    for j, cause in enumerate(CAUSES)
+]
 
-@pytest.fixture(scope="module", params=KINDS)
+
+@pytest.fixture(scope="module")
 def pressed(request: pytest.FixtureRequest) -> tuple[StopScenario, Callable[[], None]]:
     """A session whose arm presses against the wall, and what puts it back there."""
     run = StopScenario(request.param, 0.5)
     return run, run.save()
 
 
-@pytest.mark.parametrize("cause", CAUSES)
+@pytest.mark.parametrize(("pressed", "cause"), CASES, indirect=["pressed"])
 def test_every_cause_of_a_hold_lets_go(pressed: tuple[StopScenario, Callable[[], None]], cause: str) -> None:
     run, restore = pressed
     restore()

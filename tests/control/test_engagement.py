@@ -21,6 +21,8 @@ from tests.control.rigs import (
     pose_command,
 )
 
+pytestmark = pytest.mark.usefixtures("untraced")
+
 KINDS = ["position", "velocity", "torque"]
 
 
