@@ -20,19 +20,25 @@ help:
 	@echo "make screenshots  records the demo anew and makes the pictures of README and docs"
 	@echo "make install  only makes $(VENV) and installs"
 
-$(VENV)/.installed: pyproject.toml
+$(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "$(PYTHON) is too old: Python >= 3.11 is needed; make PYTHON=python3.12"; exit 2; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(PYTHON) -m venv $(VENV)
+
+PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+$(VENV)/.installed: pyproject.toml | $(BIN)/python
 	@echo "installing into $(VENV) ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[all]'
+	@$(PIP_INSTALL) -e '.[all]'
 	@touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[all,dev]'
-	@touch $@
+# The extra `dev` has what the two others install: pip resolves everything once.
+$(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
+	@echo "installing into $(VENV) ..."
+	@$(PIP_INSTALL) -e '.[all,dev]'
+	@touch $(VENV)/.installed $(VENV)/.installed-node $@
 
 $(VENV)/.installed-node: $(VENV)/.installed
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[node]'
+	@$(PIP_INSTALL) -e '.[node]'
 	@touch $@
 
 # Node from the wheel, and its npm: the wheel's own scripts do not find each other where links are resolved.
