@@ -32,6 +32,11 @@ _CHI2_1_ONE_IN_A_MILLION: Final = 23.93
 _MIN_BESIDE: Final = 2  # detections of another anchor: one alone may be wrong
 _MEDIAN_VARIANCE: Final = math.pi / 2.0  # of a median over that of a mean, Gaussian noise
 _MIN_AGREEING: Final = 0.6  # share of a window near its median: fewer say nothing
+#: Share of a deviation by which the looks that show it may move, and those before it; and noise explains as much.
+_MAX_MOVING: Final = 0.15
+_MAX_MOVING_BEFORE: Final = 0.3
+_MOVING_SIGMAS: Final = 2.0
+_MIN_AGREEING_BEFORE: Final = 0.75  # of those before a change: a smeared wrong detection may be among them
 _AT_REST: Final = (0.0,) * 6
 _AGREEING_M: Final = 0.015  # or three sigma
 
@@ -100,17 +105,20 @@ class _Detection(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """Median position of some observations of one viewpoint, its own covariance (6, 6), and that of what they share.
-    `away`: position of the head from the anchor. `shift` (6,): displacement and turn per second of lateness."""
+    """Median position of some observations of one viewpoint, its own covariance (6, 6), that of `each` of them, and
+    that of what they share. `looks` (n, 3): positions of those near it, oldest first. `away`: position of the head from
+    the anchor. `shift` (6,): displacement and turn per second of lateness."""
 
     p: Array
     own: Array
+    each: Array
     common: Array
+    looks: Array
     viewpoint_id: int
     capture_ns: int
     away: Array | None
     shift: Array
-    has_majority: bool
+    agreeing: float  # share of the looks near the median
 
 
 @dataclass
@@ -182,14 +190,16 @@ class DriftMonitor:
         if len(new) < self.config.min_in_window:
             return None
         now = self._summarize(new)
-        if not now.has_majority:
+        if now.agreeing < _MIN_AGREEING:
             return None
         changed = self._measure_change(now, reference)
+        differs = 0.0 if changed else self._measure_difference(anchor_id, now, alignment)
+        if not self._is_settled(now, changed or differs):
+            return None
         if changed:
             since_ns = new[len(new) // 2].capture_ns
             beside = self._find_unmoved_anchors(anchor_id, since_ns, changed)
             return self._raise_alarm("changed", anchor_id, changed, now_ns, beside, since_ns)
-        differs = self._measure_difference(anchor_id, now, alignment)
         differs = differs or self._measure_turn(anchor_id, new, now, alignment)
         if differs:
             beside = self._find_steady_anchors(anchor_id, new[0].capture_ns)
@@ -275,7 +285,7 @@ class DriftMonitor:
         if len(rows) < self.config.min_in_window:
             return None
         window = self._summarize(rows)
-        return window if window.has_majority else None
+        return window if window.agreeing >= _MIN_AGREEING_BEFORE else None
 
     def _summarize(self, rows: list[_Detection]) -> _Window:
         every = np.array([s.p for s in rows])
@@ -288,20 +298,22 @@ class DriftMonitor:
             away = fast_median(np.array([s.p_head for s in rows]) - every)
             common, each = self.noise.compute_covariances(p + away, p)
         near_m = max(_AGREEING_M, 3.0 * math.sqrt(float(np.trace(each[:3, :3]))))
-        n_near = int(np.count_nonzero(np.linalg.norm(every - p, axis=1) <= near_m))
+        looks = every[np.linalg.norm(every - p, axis=1) <= near_m]
         own = each * (_MEDIAN_VARIANCE / len(rows))
-        has_majority = n_near >= _MIN_AGREEING * len(rows)
+        agreeing = len(looks) / len(rows)
         shift = np.mean([s.shift or _AT_REST for s in rows], axis=0)
-        return _Window(p, own, common, middle.viewpoint_id, middle.capture_ns, away, shift, has_majority)
+        return _Window(p, own, each, common, looks, middle.viewpoint_id, middle.capture_ns, away, shift, agreeing)
 
     def _measure_change(self, now: _Window, before: _Window | None, least_m: float = 0.0) -> float:
-        """Return the distance [m] from the reference, 0 if not significant."""
+        """Return the distance [m] from the reference, 0 if not significant, or if the reference moved by much of it."""
         if before is None:
             return 0.0
         drift_m = self.config.drift_m_per_s * (now.capture_ns - before.capture_ns) * 1e-9
         C = now.own + before.own + self._independent_share(now, before) * (now.common + before.common)
         C = C + _late_covariance(now.shift - before.shift)
-        return _significant(now.p - before.p, C[:3, :3] + drift_m**2 * np.eye(3), least_m or self.config.min_change_m)
+        C = C[:3, :3] + drift_m**2 * np.eye(3)
+        size = _significant(now.p - before.p, C, least_m or self.config.min_change_m)
+        return 0.0 if _is_moving(before.looks, before.each[:3, :3], _MAX_MOVING_BEFORE * size) else size
 
     def _independent_share(self, a: _Window, b: _Window) -> float:
         """Return the share of the common errors of two windows that does not cancel, by how far apart the head was. A
@@ -310,6 +322,12 @@ class DriftMonitor:
             return 1.0
         apart = a.away - b.away
         return 1.0 - math.exp2(-float(apart @ apart) / self.config.same_place_m**2)
+
+    def _is_settled(self, now: _Window, size_m: float) -> bool:
+        """Return whether the newest looks, which are off by `size_m`, stay there: a source that smooths its poses
+        smears a wrong detection over many of them, which then go back."""
+        newest = now.looks[-self.config.min_in_window :]
+        return not size_m or not _is_moving(newest, now.each[:3, :3], _MAX_MOVING * size_m)
 
     def _measure_difference(self, anchor_id: str, now: _Window, alignment: AlignmentEstimate | None) -> float:
         """Return the distance [m] from the pose that the alignment predicts, 0 if not significant."""
@@ -335,7 +353,8 @@ class DriftMonitor:
         )
         turns = quat_log(quat_multiply(np.array([s.q for s in rows]), quat_conjugate(q_predicted)))
         R = quat_to_matrix(np.array(alignment.T_world_tracking[1]))
-        yaws = np.sort(turns @ R[2])  # about the world's vertical
+        in_order = turns @ R[2]  # about the world's vertical
+        yaws = np.sort(in_order)
         yaw = float(0.5 * (yaws[(len(yaws) - 1) // 2] + yaws[len(yaws) // 2]))
         C = (now.own + now.common + _late_covariance(now.shift))[3:, 3:]
         variance = alignment.covariance[35] + float(R[2] @ C @ R[2])
@@ -343,7 +362,11 @@ class DriftMonitor:
         if int(np.count_nonzero(np.abs(yaws - yaw) <= near)) < _MIN_AGREEING * len(yaws):
             return 0.0
         sure = yaw * yaw > _CHI2_1_ONE_IN_A_MILLION * variance
-        return abs(yaw) if sure and abs(yaw) >= self.config.min_turn_rad else 0.0
+        if not sure or abs(yaw) < self.config.min_turn_rad:
+            return 0.0
+        n, each = self.config.min_in_window, R[2:] @ now.each[3:, 3:] @ R[2:].T
+        is_moving = _is_moving(now.looks[-n:], now.each[:3, :3], self.config.min_change_m)
+        return 0.0 if is_moving or _is_moving(in_order[-n:, None], each, _MAX_MOVING * abs(yaw)) else abs(yaw)
 
     def _measure_jump(self, new: list[_Detection], reference: _Window | None) -> float:
         """Return the distance [m] of the last few detections from the reference, 0 unless they agree with each other:
@@ -358,7 +381,9 @@ class DriftMonitor:
         together = float(np.max(np.linalg.norm(away - away.mean(axis=0), axis=1)))
         if together > max(0.5 * self.config.jump_m, 0.1 * float(np.linalg.norm(away[0]))):
             return 0.0
-        return self._measure_change(self._summarize(last), reference, self.config.jump_m)
+        now = self._summarize(last)
+        size = self._measure_change(now, reference, self.config.jump_m)
+        return size if self._is_settled(now, size) else 0.0
 
     def _update_epoch(self, capture_ns: int, tracking_epoch: int) -> Alarm | None:
         if tracking_epoch <= self.tracking_epoch:
@@ -373,6 +398,17 @@ class DriftMonitor:
         self._quiet_until_ns.clear()
         self._steady_ns.clear()
         self._head = None
+
+
+def _is_moving(x: Array, each: Array, least: float) -> bool:
+    """Return whether values (n, m), oldest first, move by more than `least` and than their noise, `each` (m, m)."""
+    if len(x) < 2:
+        return True
+    k = len(x) // 2
+    by = fast_median(x[-k:]) - fast_median(x[:k])
+    far2 = float(by @ by)
+    noise2 = float(by @ each @ by) / max(far2, 1e-18) * (2.0 / k)  # along it
+    return far2 > max(least**2, _MOVING_SIGMAS**2 * noise2)
 
 
 def _late_covariance(shift: Array) -> Array:

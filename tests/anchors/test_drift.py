@@ -10,7 +10,7 @@ import pytest
 from anchors.alignment import AlignmentEstimate
 from anchors.drift import Alarm, DriftConfig, DriftMonitor
 from anchors.looks import Look
-from anchors.pose import PoseTuple, Vec3, compose, inverse, quat_from_rotvec, quat_from_yaw
+from anchors.pose import PoseTuple, Vec3, compose, interpolate_about_pivot, inverse, quat_from_rotvec, quat_from_yaw
 from tests.anchors.worlds import Viewpoint, align_to_sheet, shifted, tracking_frame, viewpoint_around
 
 SHEET: PoseTuple = ((0.2, -0.4, 0.75), quat_from_yaw(0.5))
@@ -111,6 +111,28 @@ def test_few_detections_that_disagree_raise_no_alarm() -> None:
         (x, y, z), q = view.observe(T_world_tracking)
         look = Look(0, view.head_pose(T_world_tracking))
         assert monitor.add_observation("sheet", ((x + off, y, z), q), look, i * 10 * PERIOD, 0, alignment) is None
+
+
+@pytest.mark.parametrize("weight", [0.2, 0.5])
+@pytest.mark.parametrize("seed", range(2))
+def test_smoothed_source_smears_a_wrong_detection_but_shows_a_change(weight: float, seed: int) -> None:
+    """At 1 Hz; `weight`: of a new pose. What a wrong detection leaves goes back, a change stays."""
+    rng = np.random.default_rng(seed)
+    frame = tracking_frame(rng)
+    alignment = align_to_sheet(rng, SHEET, frame)
+    view, monitor = Viewpoint(rng, SHEET, viewpoint_around(rng, SHEET[0], 0.7)), DriftMonitor(ANCHORS)
+    moved = shifted(frame, (0.03, 0.04, 0.0))
+    look = Look(0, view.head_pose(frame))
+    last, alarms = view.observe(frame), []
+    for i in range(80):
+        p, q = view.observe(moved if i >= 40 else frame)
+        if i == 15:
+            p = (p[0] + 0.3, p[1] - 0.3, p[2])
+        last = interpolate_about_pivot(last, (p, q), (0.0, 0.0, 0.0), weight)
+        alarm = monitor.add_observation("sheet", last, look, i * 10 * PERIOD, 0, alignment)
+        alarms += [i] if alarm is not None else []
+    assert alarms
+    assert 40 <= alarms[0] <= 55
 
 
 def test_jump_alarm_needs_three_detections() -> None:
