@@ -124,7 +124,7 @@ class AlignmentEstimate:
     `residual_tilt_rad`: tilt of the frame as the anchors alone show it; `tilt_noise_rad`: what noise alone explains of
     it (99.9 %). `moved`: anchors that all others outvote. `supported`: the newest look agrees; an estimate without it
     confirms nothing. `look_s`: for so long the wearer should go on looking: a refusal meanwhile, or a large error, is
-    not the last word.
+    not the last word. `looks`: the anchors that agree, with the times of their first and last look.
     """
 
     T_world_tracking: PoseTuple
@@ -141,6 +141,7 @@ class AlignmentEstimate:
     supported: bool = True
     tilt_noise_rad: float = 0.0
     look_s: float = 0.0
+    looks: tuple[tuple[str, int, int], ...] = ()
 
     @classmethod
     def refusal(
@@ -287,7 +288,7 @@ class AlignmentEstimator:
         Args:
             anchor_id: Name of the anchor.
             since_ns: Capture time of the first observation that contradicts.
-            is_gradual: It was not seen to change: an error of scale could explain it.
+            is_gradual: It did not jump: an error of scale could explain it, as looks from other distances show one.
 
         Returns:
             Two or more anchors that agree with each other, if this one never agreed with them: then it is outvoted, and
@@ -425,7 +426,25 @@ class AlignmentEstimator:
             return self._refuse(disagreement_advice(sorted(set(b.anchor))))
         newest = self._memory.newest_key
         supported = any(ok and key == newest for key, ok in zip(keys, s.inside.tolist(), strict=True))
-        return self._to_estimate(b, s, (tilt, noise), supported, scales)
+        return replace(
+            self._to_estimate(b, s, (tilt, noise), supported, scales), looks=self._list_looks(keys, s.inside.tolist())
+        )
+
+    def _list_looks(self, keys: list[GroupKey], inside: list[bool]) -> tuple[tuple[str, int, int], ...]:
+        """Return the anchors that agree, with the times of the first and the last of those looks."""
+        looks: dict[str, tuple[int, int]] = {}
+        for key, ok in zip(keys, inside, strict=True):
+            if ok:
+                seen = self._memory.groups[key].observations
+                first, last = looks.get(key[0], (seen[0].capture_ns, seen[-1].capture_ns))
+                looks[key[0]] = min(first, seen[0].capture_ns), max(last, seen[-1].capture_ns)
+        return tuple((name, *times) for name, times in looks.items())
+
+    def discard_anchor(self, anchor_id: str) -> None:
+        """Discard what was seen of an anchor: there are two prints of it."""
+        self._memory.discard_groups({key for key in self._memory.groups if key[0] == anchor_id})
+        self._left_out.pop(anchor_id, None)
+        self._changed, self._near = "" if self._changed == anchor_id else self._changed, None
 
     def _decide_change(self, b: AlignmentProblem, later: Mask, keys: list[GroupKey]) -> bool:
         """Decide what a contradiction means (`anchors.evidence`), and keep what still counts; false if it is open."""

@@ -25,7 +25,7 @@ from anchors.pose import PoseTuple, Quat, Vec3, apply, distance, is_rigid, is_va
 from anchors.uncertainty import NoiseModel, isotropic_covariance
 from anchors.viewpoints import MAX_LATE_S, fast_median
 
-AlarmKind = Literal["changed", "differs", "jump", "epoch"]
+AlarmKind = Literal["changed", "differs", "jump", "epoch", "two_places"]
 
 _CHI2_3_ONE_IN_A_MILLION: Final = 30.66
 _CHI2_1_ONE_IN_A_MILLION: Final = 23.93
@@ -47,7 +47,7 @@ class Alarm(NamedTuple):
 
     `size_m`: distance, of a turn that 1 m away; `capture_ns`: time of detection, of a jump the time of its first
     observation; `since_ns`: that time of the others, about; `beside`: other anchors that did not change meanwhile (then
-    this one was moved).
+    this one was moved). `p`: where the anchor is now, tracking frame.
     """
 
     kind: AlarmKind
@@ -56,6 +56,7 @@ class Alarm(NamedTuple):
     capture_ns: int
     beside: tuple[str, ...] = ()
     since_ns: int = 0
+    p: Vec3 | None = None
 
     @property
     def invalidates(self) -> bool:
@@ -186,7 +187,8 @@ class DriftMonitor:
             if beside:
                 return self._raise_alarm("changed", anchor_id, jumped, now_ns, beside, since_ns)
             self._reset()
-            return Alarm("jump", anchor_id, jumped, since_ns, since_ns=since_ns)
+            p = to_vec3(np.mean([s.p for s in new[-self.config.jump_count :]], axis=0))
+            return Alarm("jump", anchor_id, jumped, since_ns, since_ns=since_ns, p=p)
         if len(new) < self.config.min_in_window:
             return None
         now = self._summarize(new)
@@ -199,11 +201,12 @@ class DriftMonitor:
         if changed:
             since_ns = new[len(new) // 2].capture_ns
             beside = self._find_unmoved_anchors(anchor_id, since_ns, changed)
-            return self._raise_alarm("changed", anchor_id, changed, now_ns, beside, since_ns)
+            return self._raise_alarm("changed", anchor_id, changed, now_ns, beside, since_ns)._replace(p=to_vec3(now.p))
         differs = differs or self._measure_turn(anchor_id, new, now, alignment)
         if differs:
             beside = self._find_steady_anchors(anchor_id, new[0].capture_ns)
-            return self._raise_alarm("differs", anchor_id, differs, now_ns, beside, new[0].capture_ns)
+            alarm = self._raise_alarm("differs", anchor_id, differs, now_ns, beside, new[0].capture_ns)
+            return alarm._replace(p=to_vec3(now.p))
         self._steady_ns[anchor_id] = now_ns
         return None
 

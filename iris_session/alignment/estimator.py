@@ -17,11 +17,12 @@ from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
 from anchors.drift import Alarm
 from anchors.looks import Look
+from anchors.places import TWO_PRINTS
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3
 from iris_session.alignment.touches import MAX_TIPS, TouchEstimator
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import MAX_TEXT, Pose
-from iris_session.protocol.entries import AlignmentProposal
+from iris_session.protocol.entries import AlignmentProposal, AnchorLooks
 from iris_session.protocol.names import AlarmKind, AlignmentKind, AnchorKind, ObservationSource
 from iris_session.protocol.status import AlignmentReport, AnchorSeen
 
@@ -37,6 +38,7 @@ _MANY_FAULTS: Final = 50
 #: How fast a tracking frame may drift (docs/anchors.md).
 _DRIFT_M_PER_S: Final = 0.003 / 60.0
 _CONTROLLER: Final = controller_covariance()
+_MAX_NAMES: Final = 32  # in one message
 
 
 class ConnectionEstimator:
@@ -105,7 +107,7 @@ class ConnectionEstimator:
         """
         beside: tuple[str, ...] | None
         try:
-            beside = self._estimator.weigh_alarm(alarm.anchor_id, alarm.since_ns, alarm.kind == AlarmKind.DIFFERS)
+            beside = self._estimator.weigh_alarm(alarm.anchor_id, alarm.since_ns, alarm.kind != AlarmKind.JUMP)
         except NUMERICAL_ERRORS:
             beside = ()
             self._estimator.reset()
@@ -118,6 +120,12 @@ class ConnectionEstimator:
     def leave_out(self, alarm: Alarm) -> None:
         """Leave out a sheet that was moved, until it is seen where it was or given a new pose."""
         self._estimator.leave_out(alarm.anchor_id, alarm.since_ns)
+
+    def refuse_prints(self, anchor_id: str, tracking_epoch: int) -> None:
+        """Discard what was seen of an anchor of which there are two prints, and report it as refused."""
+        self._estimator.discard_anchor(anchor_id)
+        self._pending, self._last, self.newest = False, None, None
+        self._note_wrong((tracking_epoch, f"sheet '{anchor_id}' is {TWO_PRINTS}"), False)
 
     def set_tip(self, device: str, covariance: tuple[float, ...]) -> None:
         """Set the covariance of the tip of a device (3x3 row-major, grip frame [m^2]); its earlier touches no longer
@@ -334,4 +342,6 @@ def _to_proposal(estimate: AlignmentEstimate, kind: str) -> AlignmentProposal:
         kind=kind,
         tilt_noise_rad=estimate.tilt_noise_rad,
         look_s=estimate.look_s,
+        looks=tuple(AnchorLooks(name, first, last) for name, first, last in estimate.looks[:_MAX_NAMES]),
+        moved=estimate.moved[:_MAX_NAMES],
     )

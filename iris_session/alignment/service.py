@@ -14,10 +14,13 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, Protocol
 
+import msgspec
+
 from anchors.alignment import AlignmentEstimate
 from anchors.drift import Alarm
 from anchors.looks import Look
-from anchors.pose import PoseTuple, Vec3, is_rigid
+from anchors.places import TWO_PRINTS, PrintWatch
+from anchors.pose import PoseTuple, Vec3, apply, is_rigid, is_valid_point
 from iris_session.alignment.cross_check import CrossCheckScheduler, Job
 from iris_session.alignment.estimator import NUMERICAL_ERRORS, ConnectionEstimator
 from iris_session.alignment.monitor import AlignmentMonitor
@@ -113,7 +116,7 @@ class _HeadsetState:
     is in the old tracking frame, though it may arrive later (sheets are detected in pictures that are tenths of a
     second old). While an estimate is computed (`busy`), the estimator belongs to the worker: `waiting` holds what is to
     be done with it afterwards, and `is_outdated` is set when the result will not count. `tips`: the newest observation
-    of kind `tip` of each device, calibrated from `next_tip_ns` on.
+    of kind `tip` of each device, calibrated from `next_tip_ns` on. `prints`: the anchors of which there are two prints.
     """
 
     __slots__ = (
@@ -125,9 +128,11 @@ class _HeadsetState:
         "last_jump",
         "monitor",
         "next_tip_ns",
+        "prints",
         "proposal_ns",
         "tips",
         "waiting",
+        "watch",
     )
 
     def __init__(
@@ -142,6 +147,8 @@ class _HeadsetState:
         self.waiting: deque[Callable[[], object]] = deque()
         self.tips: dict[str, Observation] = {}
         self.next_tip_ns = 0
+        self.watch = PrintWatch()
+        self.prints: set[str] = set()
 
     def run_or_defer(self, change: Callable[[], object]) -> None:
         """Run a change of the estimator now, or after the estimate that is being computed, which is then discarded."""
@@ -248,6 +255,10 @@ class AlignmentService:
             state.estimator.count_fault(look, observation.tracking_epoch, known)
             self._drops.count("observation_unusable", number)
             return
+        if known and seen and not tracked and self._has_two_prints(number, state, observation, now_ns):
+            state.estimator.count_fault(TWO_PRINTS, observation.tracking_epoch, known)
+            self._drops.count("observation_unusable", number)
+            return
         if known and seen:
             alarm = state.monitor.check_observation(observation, look)
             if alarm is not None:
@@ -260,6 +271,18 @@ class AlignmentService:
             used = kept if not known else used
         if not used:
             self._drops.count("observation_unusable", number)
+
+    def _has_two_prints(self, number: int, state: _HeadsetState, observation: Observation, now_ns: int) -> bool:
+        """Return whether this headset sees an anchor in two places, to and fro; report it when it begins."""
+        name, epoch, pose = observation.anchor_id, observation.tracking_epoch, observation.T_tracking_anchor
+        apart_m = state.watch.add_look(name, pose.p, observation.capture_ns, epoch) if is_valid_point(pose.p) else 0.0
+        if not apart_m:
+            state.prints.discard(name)
+        elif name not in state.prints:
+            state.prints.add(name)
+            state.estimator.refuse_prints(name, epoch)
+            self._process_alarm(number, state, Alarm(AlarmKind.TWO_PLACES, name, apart_m, now_ns), epoch, now_ns)
+        return apart_m > 0.0
 
     def _add_to_cross_check(self, number: int, observation: Observation, look: Look, now_ns: int) -> bool:
         pose = observation.T_tracking_anchor
@@ -287,18 +310,24 @@ class AlignmentService:
     def _process_alarm(self, number: int, state: _HeadsetState, alarm: Alarm, tracking_epoch: int, now_ns: int) -> None:
         """Report an alarm. The estimator is asked first: a sheet that others outvote is no evidence against the
         headset."""
-        if alarm.anchor_id and not alarm.beside:
+        in_force = state.monitor.in_force
+        if alarm.anchor_id and not alarm.beside and alarm.kind != AlarmKind.TWO_PLACES:
             outvoting = state.estimator.weigh_alarm(alarm)
             if outvoting is None:
                 return
             if outvoting:
                 alarm = alarm._replace(kind=AlarmKind.CHANGED, beside=outvoting)
                 state.monitor.accept_moved(alarm.anchor_id)
-        elif alarm.anchor_id:
+        elif alarm.beside:
             state.estimator.leave_out(alarm)
         if alarm.kind == AlarmKind.JUMP:
             state.last_jump = (tracking_epoch, min(alarm.capture_ns, now_ns))
         message = state.monitor.to_message(alarm, now_ns)
+        if message is not None and in_force is not None and alarm.p is not None and not alarm.beside:
+            x, y, z = apply(in_force.T_world_tracking, alarm.p)
+            x0, y0, z0 = self.anchors[alarm.anchor_id][0]
+            is_known = in_force.tracking_epoch == tracking_epoch
+            message = msgspec.structs.replace(message, shift_m=(x - x0, y - y0, z - z0) if is_known else ())
         if message is None:
             self._drops.count("alarms_repeated", number)
         else:
@@ -309,6 +338,7 @@ class AlignmentService:
             return
         if not alarm.anchor_id:  # the head jumped: nothing of the old tracking frame counts
             state.run_or_defer(state.estimator.reset)
+            state.watch.forget()
         state.monitor.mute()
         self._cross_check.discard_observations(number)
 

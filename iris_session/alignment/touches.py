@@ -114,6 +114,7 @@ class TouchEstimator:
         self._touches: dict[_Point, deque[Touch]] = {}
         self._suspects: frozenset[str] = frozenset()
         self._kept: _Kept | None = None
+        self._looks: dict[str, tuple[int, int]] = {}  # by anchor: times of the first and the last touch
         self._tracking_epoch = 0
         self.pending = False
 
@@ -142,6 +143,8 @@ class TouchEstimator:
         turned = quat_normalize(pose.q) if is_rigid((pose.p, pose.q)) else IDENTITY_POSE[1]
         kept.append(Touch(point.name, pose.p, sigma, observation.device, turned))
         self._touches[point] = kept
+        first_ns, _ = self._looks.get(point.anchor_id, (observation.capture_ns, 0))
+        self._looks[point.anchor_id] = first_ns, observation.capture_ns
         while len(self._touches) > MAX_POINTS:
             del self._touches[next(iter(self._touches))]
         self.pending = self._suffice()
@@ -231,6 +234,7 @@ class TouchEstimator:
     def reset(self) -> None:
         """Discard all touches and the kept anchor."""
         self._touches.clear()
+        self._looks.clear()
         self._suspects = frozenset()
         self._kept = None
         self.pending = False
@@ -240,8 +244,10 @@ class TouchEstimator:
         cannot be solved."""
         self.pending = False
         estimate, kind = self._estimate()
+        touched = {point.anchor_id for point in self._touches}
+        looks = tuple((name, *times) for name, times in self._looks.items() if name in touched)
         # More of the same would mend no refusal: the wearer is to hear of it at once (0), not to go on looking.
-        return replace(estimate, n_viewpoints=0, n_observations=0), kind
+        return replace(estimate, n_viewpoints=0, n_observations=0, looks=looks), kind
 
     def _estimate(self) -> tuple[AlignmentEstimate, str]:
         precise, points = self._list_precise(), self._list_points()

@@ -99,7 +99,7 @@ def _check_age(ctx: Context, p: Participant) -> None:
             )
             ctx.publish_alignment(p)
     points = alignment.find_robot_points(ctx, p) or [p.pivot_world]
-    if not p.doubt and any(_exceeds(p, grown, point, bound) for point in points):
+    if p.doubt in ("", AlignmentDoubt.AGED) and any(_exceeds(p, grown, point, bound) for point in points):
         doubt_age(ctx, p)
 
 

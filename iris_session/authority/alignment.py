@@ -42,7 +42,7 @@ from iris_session.authority.context import Context, build_absent_denial
 from iris_session.authority.state import Correction, Participant, Placement, WarningState
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
-from iris_session.protocol.entries import AlignmentProposal
+from iris_session.protocol.entries import AlignmentProposal, AnchorLooks
 from iris_session.protocol.names import AlignmentDoubt, AlignmentKind, DenialReason, HoldReason, TargetKind
 from iris_session.protocol.server_messages import Notice
 
@@ -53,6 +53,13 @@ UNALIGNED_ADVICE: Final = (
 )
 #: 95 % quantile of the standard normal distribution.
 Z95: Final = 1.6448536269514722
+#: A look agrees with what is in force when it is not further away than so many times the p95 of both.
+AGREES_WITHIN: Final = 2.0
+#: A doubt is replaced by another one that says more.
+_RANKS: Final = {
+    doubt: i
+    for i, doubt in enumerate(("", AlignmentDoubt.AGED, AlignmentDoubt.UNVERIFIED, AlignmentDoubt.CONTRADICTED))
+}
 #: A look confirms an alignment when its own stated error is at most so many times that of the alignment.
 SAME_ERROR: Final = 1.25
 #: Reasons of a hold that a better alignment ends.
@@ -100,6 +107,8 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
     warn_wearer(ctx, p, "advice", advice, same=m.advice)
     if p.placed:
         return None
+    if drives:
+        _note_looks(ctx, p, m)
     if _is_news(ctx, p, m, error):
         return offer_measurement(ctx, p, m)
     if p.correction is not None:
@@ -151,6 +160,33 @@ def _is_news(ctx: Context, p: Participant, m: AlignmentProposal, error: float) -
     return moved > min(ctx.config.min_change_m, share * m.error_at_anchor_m) or quat_angle(old.q, T_new[1]) > min(
         ctx.config.min_change_rad, share * turn_p95
     )
+
+
+def _note_looks(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
+    """Note by which anchors `p` is aligned, and when it has looked at them. What contradicts earlier looks begins
+    anew, in the next alignment.
+    """
+    if not ctx.config.verify_pairs or not m.looks:
+        return
+    now_ns, earlier = ctx.now_ns, p.looks if _is_agreeing(ctx, p, m) else {}
+    looks = {name: one for name, one in earlier.items() if name not in m.moved}
+    for one in m.looks:
+        if one.anchor_id in ctx.state.anchors:
+            known = looks.get(one.anchor_id, one)
+            first_ns, last_ns = min(known.first_ns, one.first_ns), max(known.last_ns, one.last_ns)
+            looks[one.anchor_id] = AnchorLooks(one.anchor_id, min(first_ns, now_ns), min(last_ns, now_ns))
+    p.looks = looks
+
+
+def _is_agreeing(ctx: Context, p: Participant, m: AlignmentProposal) -> bool:
+    """Return true when a measurement lies where the alignment in force says, within the stated errors of both. An alarm
+    about less is no reason to make others glance.
+    """
+    if p.alignment is None or p.alignment.kind != AlignmentKind.MEASURED:
+        return False
+    moved_m, _ = _measure_difference(_get_measured_pose(p), m.T_world_tracking, m.pivot_world)
+    known_m = compute_position_p95(compute_aged_covariance(ctx, p), p.pivot_world, m.pivot_world)
+    return moved_m <= AGREES_WITHIN * math.hypot(known_m, m.error_at_anchor_m)
 
 
 def refuse_large_error(ctx: Context, p: Participant, robot: str, error: float, advice: str = "") -> None:
@@ -284,7 +320,7 @@ def apply_placement(ctx: Context, p: Participant, word: Placement) -> None:
         T = compose_poses(p.offset, p.T_world_tracking_measured)
         return _set_alignment(ctx, p, p.alignment.kind, T, offset=True)
     p.offset = p.T_world_tracking_measured = p.correction = None
-    p.placed = True
+    p.placed, p.looks = True, {}
     _set_alignment(ctx, p, AlignmentKind.PLACED, word.T_world_tracking)
     confirm_alignment(ctx, p, ctx.now_ns, p.walked_m)
     return _clear_answered_alarm(ctx, p)
@@ -293,7 +329,7 @@ def apply_placement(ctx: Context, p: Participant, word: Placement) -> None:
 def void_alignment(p: Participant) -> None:
     """Clear everything about the alignment, because the tracking frame is another one."""
     p.alignment = p.offset = p.T_world_tracking_measured = p.correction = p.placing = p.alarm = p.aged = None
-    p.stride_from = None
+    p.stride_from, p.looks = None, {}
     p.placed = p.in_use = False
     p.aligned_ns = p.refused_ns = None
     p.refusal = p.doubt = ""
@@ -485,10 +521,10 @@ def doubt_alignment(ctx: Context, p: Participant, doubt: str, text: str) -> None
     Args:
         ctx: Of this step.
         p: Whose alignment it is; nothing happens without one, or where the configuration lets nothing be doubted.
-        doubt: The `AlignmentDoubt`; a contradiction stays one when it ages.
+        doubt: The `AlignmentDoubt`; it replaces one that says less.
         text: Warning to the wearer: why, and what to do. Empty: another one says it.
     """
-    if not ctx.config.doubts or p.alignment is None or p.doubt == AlignmentDoubt.CONTRADICTED:
+    if not ctx.config.doubts or p.alignment is None or _RANKS[doubt] < _RANKS.get(p.doubt, 0):
         return
     p.doubt = doubt
     warn_wearer(ctx, p, "doubt", text, same=doubt)
@@ -503,10 +539,15 @@ def confirm_alignment(ctx: Context, p: Participant, looked_ns: int, walked_m: fl
         p.aged = None
         ctx.publish_alignment(p)
     warn_wearer(ctx, p, "age", "", same="")
-    if p.doubt:
-        p.doubt = ""
-        warn_wearer(ctx, p, "doubt", "", same="")
-        _rearm_holds(ctx, p)
+    if p.doubt and not (p.doubt == AlignmentDoubt.UNVERIFIED and p.looks):  # that one is about a certain anchor
+        end_doubt(ctx, p)
+
+
+def end_doubt(ctx: Context, p: Participant) -> None:
+    """End what `doubt_alignment` began."""
+    p.doubt = ""
+    warn_wearer(ctx, p, "doubt", "", same="")
+    _rearm_holds(ctx, p)
 
 
 def _rearm_holds(ctx: Context, p: Participant) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from iris_session.authority import alignment
+from iris_session.authority import alignment, pairs, shifts
 from iris_session.authority.context import (
     Context,
     build_absent_denial,
@@ -15,7 +15,7 @@ from iris_session.authority.context import (
 )
 from iris_session.authority.state import HOST_ID, AlarmState, CrossCheckState, Participant
 from iris_session.protocol.client_messages import Align, MoveAnchor, TrackingEpoch
-from iris_session.protocol.common import Denial, Pose
+from iris_session.protocol.common import MAX_TEXT, Denial, Pose
 from iris_session.protocol.entries import AlignmentAlarm, CrossChecked, TipSolved
 from iris_session.protocol.names import AlarmKind, AlignAction, AlignmentDoubt, AlignmentKind, DenialReason, Role
 from iris_session.protocol.server_messages import (
@@ -23,12 +23,15 @@ from iris_session.protocol.server_messages import (
     AlignmentRun,
     AnchorMoved,
     HeadsetsCompared,
+    Notice,
     TipCalibrated,
 )
 from iris_session.protocol.status import AlignmentReport, CrossCheckReport
 
 #: Comparisons in a report: of 64 people there are 2,016 pairs.
 MAX_REPORTED: Final = 64
+#: Names in one event.
+MAX_NAMES: Final = 32
 
 
 def control_alignment_run(ctx: Context, p: Participant, m: Align) -> None:
@@ -112,7 +115,7 @@ def replace_anchors(ctx: Context, anchors: dict[str, Pose]) -> None:
 
 def raise_alarm(ctx: Context, p: Participant, m: AlignmentAlarm) -> None:
     """Record an alarm of the front's drift monitor. A jump voids the alignment at once, the others ask for a new
-    measurement.
+    measurement. Where other headsets see the same shift of an anchor, the tracking frame did not jump.
     """
     if not p.needs_alignment or m.kind not in AlarmKind.ALL or m.tracking_epoch < p.tracking_epoch:
         return
@@ -121,19 +124,44 @@ def raise_alarm(ctx: Context, p: Participant, m: AlignmentAlarm) -> None:
     if m.kind == AlarmKind.DIFFERS and not m.beside and (p.correction is not None or p.alignment is None):
         return  # known: the measurement is not in force (yet)
     size_m = min(max(0.0, m.size_m), ctx.config.reach_m) if math.isfinite(m.size_m) else ctx.config.reach_m
+    witnesses = shifts.note_shift(ctx, p, m)
+    kind = AlarmKind.CHANGED if witnesses and m.kind == AlarmKind.JUMP else m.kind
     if m.kind == AlarmKind.JUMP:
         p.proposals_from_ns = max(p.proposals_from_ns, ctx.entry_ns)
+    if kind == AlarmKind.JUMP:
         alignment.void_tracking_frame(ctx, p)
     elif not m.beside:
         p.correction = None  # its measurements contradict the present observations
-    p.alarm = AlarmState(m.kind, m.anchor_id, size_m, m.beside, ctx.now_ns)
-    ctx.emit(AlignmentAlarmed(p.id, m.kind, m.anchor_id, size_m, m.beside))
-    if m.kind == AlarmKind.JUMP:
+    p.alarm = AlarmState(kind, m.anchor_id, size_m, m.beside, ctx.now_ns)
+    ctx.emit(AlignmentAlarmed(p.id, kind, m.anchor_id, size_m, m.beside, tuple(q.id for q in witnesses[:MAX_NAMES])))
+    if kind == AlarmKind.JUMP:
         ctx.publish_participant(p)
-    placed = m.kind == AlarmKind.DIFFERS and p.placed  # a director's word is to count more than what is measured
-    if m.kind != AlarmKind.JUMP and not m.beside and not placed:
+    placed = kind == AlarmKind.DIFFERS and p.placed  # a director's word is to count more than what is measured
+    if kind != AlarmKind.JUMP and not m.beside and not placed:
         alignment.doubt_alignment(ctx, p, AlignmentDoubt.CONTRADICTED, "")  # the warning of the alarm says it
-    alignment.warn_wearer(ctx, p, "alarm", _describe_alarm(p, m, size_m), same=f"{m.kind} {m.anchor_id}")
+    if kind == AlarmKind.TWO_PLACES:
+        _doubt_prints(ctx, p, m.anchor_id, size_m)
+        return
+    if m.beside and m.anchor_id in p.looks:
+        known = p.looks[m.anchor_id]
+        p.looks = {name: one for name, one in p.looks.items() if name != m.anchor_id}
+        pairs.doubt_anchor(ctx, p, m.anchor_id, known)
+    text = _describe_alarm(p, m, size_m)
+    if witnesses:
+        shifts.announce_shift(ctx, p, witnesses)
+    elif not shifts.warn_later(ctx, p, text):
+        alignment.warn_wearer(ctx, p, "alarm", text, same=f"{kind} {m.anchor_id}")
+
+
+def _doubt_prints(ctx: Context, p: Participant, anchor_id: str, apart_m: float) -> None:
+    """Doubt all alignments that rest on an anchor of which there are two prints, and nothing else: it is not known
+    who looked at which.
+    """
+    for other in ctx.state.participants.values():
+        if set(other.looks) == {anchor_id}:
+            alignment.doubt_alignment(ctx, other, AlignmentDoubt.CONTRADICTED, "")
+    text = f"sheet '{anchor_id}' is in two places, {apart_m:.2f} m apart, as {p.name} sees it: print each id once"
+    ctx.emit(Notice("warning", text[:MAX_TEXT]))
 
 
 def _describe_alarm(p: Participant, m: AlignmentAlarm, size_m: float) -> str:

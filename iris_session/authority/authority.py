@@ -18,10 +18,12 @@ from iris_session.authority import (
     arbitration,
     handover,
     leases,
+    pairs,
     requests,
     roster,
     samples,
     session_control,
+    shifts,
 )
 from iris_session.authority.config import AuthorityConfig, check_config
 from iris_session.authority.context import Context
@@ -39,7 +41,7 @@ from iris_session.protocol.names import (
 from iris_session.protocol.scene import PatchOp
 from iris_session.protocol.server_messages import Audited, Gap, MarkerAdded, Reply
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
-from iris_session.protocol.status import AlignmentReport, CrossCheckReport, StopReport
+from iris_session.protocol.status import AlignmentReport, CrossCheckReport, StopReport, UnverifiedReport
 from iris_session.protocol.steps import ControlStatus, Decision, OutgoingMessage, WorldView
 
 #: Requests that only a director (or the host) may make.
@@ -118,6 +120,8 @@ class Authority:
         arbitration.expire_samples(ctx)
         alignment.advance_corrections(ctx)
         ageing.check_ages(ctx)
+        pairs.check_pairs(ctx)
+        shifts.warn_due(ctx)
         if ctx.state.queue or ctx.state.consents:
             requests.advance_requests(ctx)
         handover.track_handovers(ctx)
@@ -222,6 +226,10 @@ class Authority:
     def build_cross_check_reports(self) -> tuple[CrossCheckReport, ...]:
         """Return the newest cross-checks of headsets."""
         return anchoring.build_cross_check_reports(self._ctx)
+
+    def build_unverified_reports(self) -> tuple[UnverifiedReport, ...]:
+        """Return the pairs of headsets of which one is to glance at an anchor."""
+        return pairs.build_unverified_reports(self._ctx)
 
     # --- phases of a step ---
 
@@ -413,7 +421,7 @@ _HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
     cm.SetScale: requests.set_scale,
     cm.Grasp: requests.grasp_object,
     cm.Observation: _ignore_observation,
-    em.AlignmentProposal: alignment.process_proposal,
+    em.AlignmentProposal: pairs.process_proposal,
     em.AlignmentAlarm: anchoring.raise_alarm,
     em.TipSolved: anchoring.publish_tip,
     em.CrossChecked: anchoring.record_cross_check,

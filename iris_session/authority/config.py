@@ -86,8 +86,9 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `assignments`: participant name, or `key:<fingerprint>`, -> robots (policy `config`). `leader_apart`: `ramp`
     (control ramps) or `refuse`. `unaligned`: roles, devices and keys (`key:<fingerprint>`) that may drive without an
     alignment when they say that they need none. `doubts`: an alignment that later looks contradict, or that is too old,
-    begins no engagement. `ageing`: how its stated error grows since the last look; None: not. `user_owned_loop`: the
-    user drives physics, so pause, step and reset are denied.
+    begins no engagement. `ageing`: how its stated error grows since the last look; None: not. `verify_pairs`: those who
+    saw an anchor last before another participant aligned by it are to glance at it, and headsets that see the same
+    shift of an anchor outvote it. `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
     """
 
     # samples
@@ -132,7 +133,9 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     anchors: dict[str, Pose] = {}  # T_world_anchor by id, until a director moves one
     doubts: bool = True
     ageing: AgeingLaw | None = msgspec.field(default_factory=AgeingLaw)
-    age_check_ns: int = SECOND  # between two looks at the age of an alignment
+    age_check_ns: int = SECOND  # between two looks at the age of an alignment, and at its pairs
+    verify_pairs: bool = True
+    vote_ns: int = 2 * SECOND  # a warning waits for others that may see the same: five looks of a source at 3 Hz
     settle_ns: int = 15 * SECOND  # after the first alignment of a run; from then on corrections come gently
     slide_ns: int = 500 * MS  # between two parts of a correction that slides in
     slide_m_per_s: float = 0.004  # slow enough not to be noticed in a headset

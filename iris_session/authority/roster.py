@@ -108,6 +108,7 @@ def _resume_participant(ctx: Context, connection: int, m: Join, p: Participant) 
     if m.name != p.hello_name:  # else a director has renamed it
         p.name, p.hello_name = m.name, ""
     p.needs_alignment = needs_alignment
+    p.warnings.pop("doubt", None)  # it may not have arrived: it is said again
     p.seen.clear()
     return _admit_participant(ctx, p, connection, m, resumed=True)
 

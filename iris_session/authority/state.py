@@ -11,7 +11,7 @@ import msgspec
 
 from iris_session.authority.tracking import Track
 from iris_session.protocol.common import IDENTITY, Alignment, Pose, Vec3
-from iris_session.protocol.entries import SceneLoaded
+from iris_session.protocol.entries import AnchorLooks, SceneLoaded
 from iris_session.protocol.names import HoldReason
 from iris_session.protocol.scene import PatchOp
 from iris_session.protocol.server_messages import EpisodeChanged, Feedback
@@ -24,7 +24,9 @@ NO_REPLY: Final = -1
 #: Fields of `Participant` that say how its alignment ages.
 AGEING_FIELDS: Final = ("aged", "age_due_ns", "confirmed_walked_m", "walked_m", "stride_from")
 #: Fields of `Participant` that snapshots of the first recordings of this format do not have.
-ADDED_FIELDS: Final = frozenset({"roles", "hello_name", "hello_role", "doubt", "confirmed_ns", *AGEING_FIELDS})
+ADDED_FIELDS: Final = frozenset(
+    {"roles", "hello_name", "hello_role", "doubt", "confirmed_ns", "looks", "pairs_due_ns", "shift", *AGEING_FIELDS}
+)
 #: `Participant.connection` while the connection is lost.
 NO_CONNECTION: Final = -1
 
@@ -101,6 +103,23 @@ class AlarmState(msgspec.Struct):
     raised_ns: int
 
 
+class SheetShift(msgspec.Struct):
+    """The newest shift of an anchor that a headset has seen, in the world, by the alignment that was in force.
+
+    `p95_m`: of the stated error of that alignment at the anchor. `seen_ns`: session time. `is_said`: as a shift of the
+    anchor. `text`: the warning that the headset itself is aligned wrongly, which waits until `due_ns` for others that
+    see the same; empty: none waits.
+    """
+
+    anchor_id: str
+    shift_m: Vec3
+    p95_m: float
+    seen_ns: int
+    is_said: bool = False
+    text: str = ""
+    due_ns: int = 0
+
+
 class Participant(msgspec.Struct):
     """One member of the session. `expires_ns` is 0 while connected, else the end of the grace period.
 
@@ -117,8 +136,9 @@ class Participant(msgspec.Struct):
     (`AlignmentDoubt`), empty for none. `confirmed_ns`, `confirmed_walked_m`: time of the last look that agreed with it,
     and the distance walked until then. `walked_m`: by the head, in strides of which the last ended at `stride_from`
     (tracking frame). `aged`: the alignment with the error that was last stated for its age; None: as it was measured.
-    `age_due_ns`: when its age is looked at again. `devices` empty: none
-    declared, all known ones are accepted.
+    `age_due_ns`: when its age is looked at again. `looks`: of the anchors that the alignment rests on, by id, without a
+    contradiction from the first to the last. `pairs_due_ns`: when it is compared with everybody else's again. `shift`:
+    of an anchor that contradicted the alignment. `devices` empty: none declared, all known ones are accepted.
     """
 
     id: str
@@ -160,6 +180,9 @@ class Participant(msgspec.Struct):
     stride_from: Vec3 | None = None
     aged: Alignment | None = None
     age_due_ns: int = 0
+    looks: dict[str, AnchorLooks] = {}
+    pairs_due_ns: int = 0
+    shift: SheetShift | None = None
     warnings: dict[str, WarningState] = {}
     seen: dict[str, DeviceState] = {}
     rejected: dict[str, int] = {}

@@ -416,6 +416,7 @@ def to_dict(report: StatusReport) -> dict[str, Any]:
         "participants": people,
         "anchors": report.anchors,
         "cross_checks": checks,
+        "unverified": report.unverified,
     }
 
 
@@ -442,6 +443,9 @@ def format_alignment_status(report: StatusReport) -> Iterator[str]:
     names = {p.id: p.name for p in report.participants}
     for check in report.cross_checks:
         yield _format_cross_check(check, names)
+    for pair in report.unverified:
+        who, other = names.get(pair.participant, pair.participant), names.get(pair.other, pair.other)
+        yield f"{who} - {other}: UNVERIFIED: {other} has aligned by '{pair.anchor_id}' since {who} last saw it"
 
 
 def _format_headset(p: ParticipantReport) -> Iterator[str]:

@@ -8,7 +8,7 @@ from typing import Final
 from iris_session.doctor.findings import FAILED, WARNING, Finding, ok, report_problems, warning
 from iris_session.protocol.common import Nanoseconds
 from iris_session.protocol.names import AlarmKind, AlignmentKind
-from iris_session.protocol.status import CrossCheckReport, ParticipantReport, StatusReport
+from iris_session.protocol.status import CrossCheckReport, ParticipantReport, StatusReport, UnverifiedReport
 
 #: Tracking frames drift by millimetres a minute: after this time without a sheet the stated error is no longer true.
 STALE_NS: Final = 600_000_000_000
@@ -23,6 +23,7 @@ ALARMS: Final = {
     AlarmKind.JUMP: "the tracking frame jumped",
     AlarmKind.CHANGED: "a sheet was seen elsewhere than seconds before",
     AlarmKind.DIFFERS: "a sheet was seen elsewhere than the alignment says",
+    AlarmKind.TWO_PLACES: "a sheet was seen in two places: print each id once",
 }
 
 
@@ -35,6 +36,7 @@ def check_headsets(people: tuple[ParticipantReport, ...], report: StatusReport) 
         check_runs(here),
         check_corrections(here),
         check_agreement(people, report.cross_checks),
+        check_pairs(people, report.unverified),
     ]
 
 
@@ -119,6 +121,20 @@ def check_agreement(people: tuple[ParticipantReport, ...], checks: tuple[CrossCh
         fine = f"{len(recent)} pairs compared, at most {worst_mm:.0f} mm apart, as expected"
     why = "one of the two is aligned wrongly, or a sheet is not at the configured place"
     return report_problems("agreement", texts, fine, why, "let both headsets observe the same sheet from two sides")
+
+
+def check_pairs(people: tuple[ParticipantReport, ...], pairs: tuple[UnverifiedReport, ...]) -> Finding:
+    """Report pairs of headsets of which one has aligned by an anchor since the other last saw it."""
+    names = {p.id: p.name for p in people}
+    texts = [
+        f"{names.get(one.other, one.other)} has aligned by '{one.anchor_id}' since "
+        f"{names.get(one.participant, one.participant)} last saw it"
+        for one in pairs
+    ]
+    why = "if the sheet was moved in between, the two have different worlds"
+    return report_problems(
+        "pairs", texts, "no pair of headsets is unverified", why, "glance at the sheet, each of them"
+    )
 
 
 def _format_age(duration_ns: Nanoseconds) -> str:

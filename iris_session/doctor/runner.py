@@ -22,8 +22,8 @@ from iris_session.security import KeyHome, KeysError
 
 LOCAL: Final = "127.0.0.1:7721"
 SESSION_CHECKS: Final = (
-    "session", "alignment", "alarm", "stale", "align_run", "correction", "agreement", "leases", "robots", "clients",
-    "age", "ticks", "streams", "media", "recorder", "disk", "drops",
+    "session", "alignment", "alarm", "stale", "align_run", "correction", "agreement", "pairs", "leases", "robots",
+    "clients", "age", "ticks", "streams", "media", "recorder", "disk", "drops",
 )  # fmt: skip
 #: As a user asks: is there a route, am I admitted, does state arrive, how is the session?
 ORDER: Final = (

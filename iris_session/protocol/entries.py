@@ -71,6 +71,14 @@ class Lost(Message, frozen=True, tag="lost"):
     reason: Name = ""
 
 
+class AnchorLooks(msgspec.Struct, frozen=True):
+    """Session times of the first and the last look at an anchor that an estimate rests on."""
+
+    anchor_id: Name
+    first_ns: Nanoseconds
+    last_ns: Nanoseconds
+
+
 class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
     """Result of the estimator in the front, for the participant of this entry's connection.
 
@@ -78,7 +86,7 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
     estimator refuses (`refused` true): "step closer", "add a sheet near the robot".
     `pivot_world`: the point that the covariance is stated at (the anchor). `kind`: the `AlignmentKind` that it makes.
     `tilt_noise_rad`: what noise alone explains of the tilt. `look_s`: so many seconds of looking mend much; 0: they do
-    not.
+    not. `looks`: of the anchors that it rests on. `moved`: anchors that others outvote.
     """
 
     T_world_tracking: Pose
@@ -94,6 +102,8 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
     kind: Name = "measured"
     tilt_noise_rad: float = 0.0
     look_s: float = 0.0
+    looks: tuple[AnchorLooks, ...] = ()
+    moved: Names = ()
 
 
 class TipSolved(Message, frozen=True, tag="tip_solved"):
@@ -116,7 +126,8 @@ class AlignmentAlarm(Message, frozen=True, tag="alignment_alarm"):
     `size_m`.
 
     `anchor_id`: where it was observed, empty for the head's own motion. `beside`: anchors that stayed in place
-    meanwhile: then `anchor_id` was moved, not the headset.
+    meanwhile: then `anchor_id` was moved, not the headset. `shift_m`: from its place to where it is seen now, in the
+    world by the alignment in force; empty: not known.
     """
 
     kind: Name
@@ -125,6 +136,7 @@ class AlignmentAlarm(Message, frozen=True, tag="alignment_alarm"):
     size_m: float = 0.0
     capture_ns: Nanoseconds = 0
     beside: Names = ()
+    shift_m: tuple[float, ...] = ()
 
 
 class CrossChecked(Message, frozen=True, tag="cross_checked"):

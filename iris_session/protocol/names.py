@@ -126,13 +126,15 @@ class AlarmKind:
     """Evidence that an alignment is wrong.
 
     `changed`: an anchor is observed elsewhere than seconds ago. `differs`: and elsewhere than by the alignment. `jump`:
-    the tracking frame moved at once, which voids the alignment.
+    the tracking frame moved at once, which voids the alignment. `two_places`: one id is observed in two places, to and
+    fro: there are two prints of it.
     """
 
     CHANGED: Final = "changed"
     DIFFERS: Final = "differs"
     JUMP: Final = "jump"
-    ALL: Final = frozenset({"changed", "differs", "jump"})
+    TWO_PLACES: Final = "two_places"
+    ALL: Final = frozenset({"changed", "differs", "jump", "two_places"})
 
 
 class AlignmentDoubt:
@@ -141,8 +143,9 @@ class AlignmentDoubt:
     """
 
     AGED: Final = "aged"  # no look for so long that drift alone may exceed the bound at the robot
+    UNVERIFIED: Final = "unverified"  # another one has aligned by a sheet since this headset last saw it
     CONTRADICTED: Final = "contradicted"  # later looks disagree with it
-    ALL: Final = frozenset({"aged", "contradicted"})
+    ALL: Final = frozenset({"aged", "unverified", "contradicted"})
 
 
 class AnchorKind:

@@ -284,7 +284,8 @@ class AlignmentRun(EventBody, frozen=True, tag="alignment_run"):
 
 class AlignmentAlarmed(EventBody, frozen=True, tag="alignment_alarmed"):
     """The alignment of a participant was found wrong by `size_m` (`AlarmKind`); a `jump` has voided it. `beside`:
-    anchors that stayed in place meanwhile: then the anchor was moved, not the headset.
+    anchors that stayed in place meanwhile: then the anchor was moved, not the headset. `witnesses`: other participants
+    whose headsets see the same shift of the anchor: then it was moved too.
     """
 
     participant: Name
@@ -292,6 +293,7 @@ class AlignmentAlarmed(EventBody, frozen=True, tag="alignment_alarmed"):
     anchor_id: Name
     size_m: float
     beside: Names = ()
+    witnesses: Names = ()
 
 
 class AnchorMoved(EventBody, frozen=True, tag="anchor_moved"):

@@ -127,6 +127,16 @@ class CrossCheckReport(msgspec.Struct, frozen=True):
     n: Count = 0
 
 
+class UnverifiedReport(msgspec.Struct, frozen=True):
+    """Two headsets that are not known to have the same world: `other` has aligned by an anchor since `participant` last
+    saw it, and the anchor may have been moved in between. A glance of `participant` at it verifies the pair.
+    """
+
+    participant: Name
+    other: Name
+    anchor_id: Name
+
+
 class AnchorReport(msgspec.Struct, frozen=True):
     """One anchor of the session. `size_m`: edge of the printed sheet, 0 for not known."""
 
@@ -260,7 +270,7 @@ class StatusReport(Message, frozen=True, tag="status_report"):
     front and recorder. `authority_silent_ns`: since the authority's last message to the front; its part (ticks, roster,
     robots, recorder) is as old. -1: it has sent none yet. `cpu_share`: of one processor, by the authority's process;
     `load`: of the machine, over a minute. `stops`: the e-stops in force, newest first, the newest of each participant.
-    `pause_reason`: why physics stands still until a reset, empty otherwise.
+    `pause_reason`: why physics stands still until a reset, empty otherwise. `unverified`: pairs of headsets.
     """
 
     request_id: Count
@@ -297,3 +307,4 @@ class StatusReport(Message, frozen=True, tag="status_report"):
     assets: AssetsReport | None = None
     stops: tuple[StopReport, ...] = ()
     pause_reason: Text = ""
+    unverified: tuple[UnverifiedReport, ...] = ()

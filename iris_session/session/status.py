@@ -205,6 +205,7 @@ class StatusReporter:
             warnings=tuple(collect_warnings(stepper, recorder, self.scheduling, warnings)),
             anchors=tuple(AnchorReport(name, T, sizes.get(name, 0.0)) for name, T in core.authority.anchors.items()),
             cross_checks=core.authority.build_cross_check_reports(),
+            unverified=core.authority.build_unverified_reports(),
         )
 
     def _measure_cpu_share(self) -> float:

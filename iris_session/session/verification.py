@@ -23,6 +23,7 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
 
     doubts: bool = False
     ageing: AgeingLaw | None = None
+    verify_pairs: bool = False
     min_change_share: float = 1e9
 
 

@@ -16,7 +16,7 @@ from iris_session.journal.messages import DenialRecord
 from iris_session.journal.rows import CLOSED as CLASS_CLOSED
 from iris_session.journal.rows import SessionHeader
 from iris_session.protocol.common import Alignment
-from iris_session.protocol.names import AlignmentKind, HoldReason
+from iris_session.protocol.names import AlarmKind, AlignmentKind, HoldReason
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentChanged,
@@ -322,6 +322,11 @@ class EventNarration:
                 return LogLine(INFO, f"{self._name(who)} is aligned{error} ({_to_words(alignment.kind)})")
             case AlignmentRun(participant=who, running=running):
                 return LogLine(INFO, f"the alignment of {self._name(who)} {'begins' if running else 'ends'}")
+            case AlignmentAlarmed(witnesses=witnesses, anchor_id=anchor, size_m=size_m) if witnesses:
+                return LogLine(WARN, f"{anchor} was moved by {size_m * 1e3:.1f} mm, several headsets see it")
+            case AlignmentAlarmed(participant=who, kind=AlarmKind.TWO_PLACES, anchor_id=anchor, size_m=size_m):
+                text = f"{self._name(who)} sees {anchor} in two places, {size_m:.2f} m apart"
+                return LogLine(WARN, text)
             case AlignmentAlarmed(participant=who, kind=kind, anchor_id=anchor, size_m=size_m):
                 text = f"the alignment of {self._name(who)} is wrong by {size_m * 1e3:.1f} mm at {anchor} ({kind})"
                 return LogLine(WARN, text)

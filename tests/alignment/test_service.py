@@ -13,6 +13,7 @@ from anchors.uncertainty import isotropic_covariance
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import AlignmentAlarm, AlignmentProposal, CrossChecked, decode_entry, encode_entry
+from iris_session.protocol.names import AlarmKind
 from iris_session.protocol.server_messages import (
     AlignmentRun,
     AnchorInfo,
@@ -406,3 +407,52 @@ def test_report_combines_front_and_authority() -> None:
     alone = lab.service.complete_report(1, None, lab.now_ns)
     assert alone is not None
     assert alone.observations == 30
+
+
+def test_a_proposal_says_what_was_looked_at_and_an_alarm_where_the_sheet_is_now() -> None:
+    lab = Lab()
+    ann = lab.wearer()
+    began_ns = lab.now_ns
+    ann.survey(2, ("sheet", "other"))
+    looks = {one.anchor_id: one for one in ann.proposals()[-1].looks}
+    assert looks.keys() == {"sheet", "other"}
+    assert began_ns < looks["sheet"].first_ns < looks["other"].first_ns
+    assert lab.now_ns - SECOND < looks["other"].last_ns <= lab.now_ns
+    lab = Lab({"sheet": SHEET})
+    ann = lab.wearer()
+    ann.survey()
+    lab.now_ns += 60 * SECOND
+    lab.world["sheet"] = shifted(SHEET, (0.04, -0.03, 0.0))
+    bumped_ns = lab.now_ns
+    ann.report_observations(ann.place(d=0.5), 15)
+    (alarm,) = ann.alarms()
+    assert alarm.shift_m == pytest.approx((0.04, -0.03, 0.0), abs=0.012)
+    (look,) = ann.proposals()[-1].looks
+    assert look.first_ns > bumped_ns, "earlier looks are discarded"
+
+
+def test_two_prints_of_one_id_are_refused_by_name() -> None:
+    lab = Lab()
+    ann = lab.wearer()
+    ann.survey()
+    for i in range(8):
+        lab.world["sheet"] = shifted(SHEET, (0.6 * (i % 2), 0.0, 0.0))
+        ann.report_observations(ann.place(d=0.6), 8)
+        lab.now_ns += 2 * SECOND
+        lab.poll()
+    alarm = ann.alarms()[-1]
+    assert (alarm.kind, alarm.anchor_id) == (AlarmKind.TWO_PLACES, "sheet")
+    assert alarm.size_m == pytest.approx(0.6, abs=0.03)
+    assert [a.kind for a in ann.alarms()].count(AlarmKind.TWO_PLACES) == 1
+    refused = [e.message for e in ann.entries() if isinstance(e.message, AlignmentProposal)][-1]
+    assert refused.refused
+    assert "'sheet'" in refused.advice
+    known = len(ann.proposals())
+    ann.report_observations(ann.place(d=0.6), 20)
+    assert len(ann.proposals()) == known, "nobody knows which one is meant"
+    ann.report_observations(ann.place("other", d=0.6), 20, "other")
+    assert {one.anchor_id for one in ann.proposals()[-1].looks} == {"other"}
+    lab.now_ns += 130 * SECOND
+    lab.world["sheet"] = SHEET  # the second print was thrown away
+    ann.report_observations(ann.place(d=0.6), 20)
+    assert "sheet" in {one.anchor_id for one in ann.proposals()[-1].looks}

@@ -21,6 +21,7 @@ from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import (
     AlignmentAlarm,
     AlignmentProposal,
+    AnchorLooks,
     CrossChecked,
     Entry,
     FrontRestarted,
@@ -307,7 +308,8 @@ class Play:
         """A measurement that says something else than the last one, a little or a lot."""
         x, yaw = self.rng.choice([1.0, 1.0, 1.003, 1.005, 1.009, 1.05, 1.1]), self.rng.choice([0.0, 0.01, 0.05])
         T = Pose((x, 0.0, 0.0), quat_from_yaw(yaw))
-        return proposal(tracking_epoch=client.tracking_epoch, T_world_tracking=T, **fields)
+        looks = (AnchorLooks("table", self.now_ns - SECOND, self.now_ns),) if x == 1.05 else ()
+        return proposal(tracking_epoch=client.tracking_epoch, T_world_tracking=T, looks=looks, **fields)
 
     def watch(self) -> None:
         """What the front says of its own: alarms, comparisons of headsets, and a run that somebody starts or stops."""
@@ -318,6 +320,7 @@ class Play:
             rng.choice(["table", "door", ""]),
             rng.choice([0.01, 0.2, math.nan]),
             beside=rng.choice([(), (), ("door",)]),
+            shift_m=(0.05, 0.0, 0.0),
         )
         compared = CrossChecked(self.who().connection, "table", rng.choice([0.004, math.nan]), 0.0, 0.01, (0.0,) * 3, 9)
         self.say(client, rng.choice([alarm, compared, cm.Align(1, "start"), cm.Align(1, "stop")]))

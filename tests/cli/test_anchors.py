@@ -25,6 +25,7 @@ from iris_session.protocol.status import (
     CrossCheckReport,
     ParticipantReport,
     StatusReport,
+    UnverifiedReport,
 )
 
 Capture = pytest.CaptureFixture[str]
@@ -137,6 +138,7 @@ REPORT = StatusReport(
         CrossCheckReport("p1", "p2", "table", 0.031, 0.01, 0.0082, 4 * S, 40),
         CrossCheckReport("p1", "gone", "door", 0.003, 0.0, 0.0082, 4 * S, 40),
     ),
+    unverified=(UnverifiedReport("p2", "p1", "table"),),
 )
 
 
@@ -159,6 +161,8 @@ def test_screen_shows_basis_of_every_alignment() -> None:
     assert pair.endswith("TOO FAR APART")
     assert " - gone: 3.0 mm" in other
     assert not other.endswith("TOO FAR APART")
+    assert "bob - ann" in text
+    assert "UNVERIFIED" in text
     assert "desk" not in text
     for fields in (
         {"alignment": "placed"},
@@ -173,6 +177,7 @@ def test_json_has_everything() -> None:
     assert [one["id"] for one in result["participants"]] == ["p1", "p2"]
     assert result["participants"][0]["alignment_report"]["seen"][0]["anchor_id"] == "table"
     assert [one["as_expected"] for one in result["cross_checks"]] == [False, True]
+    assert result["unverified"] == [{"participant": "p2", "other": "p1", "anchor_id": "table"}]
     assert result["anchors"][0]["T_world_anchor"] == [[0.0, -0.45, 0.0], [1.0, 0.0, 0.0, 0.0]]
 
 

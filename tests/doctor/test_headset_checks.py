@@ -10,7 +10,7 @@ from iris_session.doctor.headset_checks import ALARMS, STALE_NS, is_consistent
 from iris_session.doctor.runner import SESSION_CHECKS
 from iris_session.doctor.session_checks import check_session_report
 from iris_session.protocol.names import AlarmKind
-from iris_session.protocol.status import AlignmentReport, AnchorSeen, CrossCheckReport, StatusReport
+from iris_session.protocol.status import AlignmentReport, AnchorSeen, CrossCheckReport, StatusReport, UnverifiedReport
 from tests.doctor.test_session_checks import ANN, DOCTOR, LEFT, WELL, S, assert_only, change
 
 ALIGNED = AlignmentReport(3, observations=200, viewpoints=3, seen=(AnchorSeen("table", 120, 4 * S),))
@@ -67,6 +67,11 @@ def test_cross_check_differences_are_reported() -> None:
         "warning",
         "ann and bob put 'table' 30 mm apart, expected is below 8 mm",
     )
+
+
+def test_unverified_pairs_are_reported() -> None:
+    report = change(with_ann(), unverified=(UnverifiedReport("p1", "p2", "table"),))
+    assert_only(report, "pairs", "warning", "bob has aligned by 'table' since ann last saw it")
 
 
 def test_expected_and_old_differences_are_ok() -> None:

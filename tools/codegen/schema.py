@@ -115,6 +115,7 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         status.AnchorSeen,
         status.AlignmentReport,
         status.CrossCheckReport,
+        status.UnverifiedReport,
         status.AnchorReport,
         status.StopReport,
         status.ParticipantReport,

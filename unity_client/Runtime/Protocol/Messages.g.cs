@@ -127,13 +127,15 @@ namespace IrisSession.Protocol
     /// Evidence that an alignment is wrong.
     ///
     /// changed: an anchor is observed elsewhere than seconds ago. differs: and elsewhere than by the alignment. jump:
-    /// the tracking frame moved at once, which voids the alignment.
+    /// the tracking frame moved at once, which voids the alignment. two_places: one id is observed in two places, to and
+    /// fro: there are two prints of it.
     /// </summary>
     public static class AlarmKind
     {
         public const string Changed = "changed";
         public const string Differs = "differs";
         public const string Jump = "jump";
+        public const string TwoPlaces = "two_places";
     }
 
     /// <summary>
@@ -143,6 +145,7 @@ namespace IrisSession.Protocol
     public static class AlignmentDoubt
     {
         public const string Aged = "aged";
+        public const string Unverified = "unverified";
         public const string Contradicted = "contradicted";
     }
 
@@ -2159,6 +2162,46 @@ namespace IrisSession.Protocol
             writer.Write(AgeNs);
             writer.Write("n");
             writer.Write(N);
+        }
+    }
+
+    /// <summary>
+    /// Two headsets that are not known to have the same world: other has aligned by an anchor since participant last
+    /// saw it, and the anchor may have been moved in between. A glance of participant at it verifies the pair.
+    /// </summary>
+    public sealed class UnverifiedReport : WireValue
+    {
+        public string Participant = "";
+        public string Other = "";
+        public string AnchorId = "";
+
+        public static UnverifiedReport Read(WireReader reader)
+        {
+            UnverifiedReport value = new UnverifiedReport();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
+                    case "other": value.Other = reader.ReadString(64); seen |= 2u; break;
+                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 4u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 7u) != 7u) throw new WireException("missing field of UnverifiedReport");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(3);
+            writer.Write("participant");
+            writer.Write(Participant);
+            writer.Write("other");
+            writer.Write(Other);
+            writer.Write("anchor_id");
+            writer.Write(AnchorId);
         }
     }
 
@@ -4688,7 +4731,7 @@ namespace IrisSession.Protocol
     /// front and recorder. authority_silent_ns: since the authority's last message to the front; its part (ticks, roster,
     /// robots, recorder) is as old. -1: it has sent none yet. cpu_share: of one processor, by the authority's process;
     /// load: of the machine, over a minute. stops: the e-stops in force, newest first, the newest of each participant.
-    /// pause_reason: why physics stands still until a reset, empty otherwise.
+    /// pause_reason: why physics stands still until a reset, empty otherwise. unverified: pairs of headsets.
     /// </summary>
     public sealed class StatusReport : ServerMessage
     {
@@ -4728,6 +4771,7 @@ namespace IrisSession.Protocol
         public AssetsReport Assets = null;
         public StopReport[] Stops = new StopReport[0];
         public string PauseReason = "";
+        public UnverifiedReport[] Unverified = new UnverifiedReport[0];
 
         public static StatusReport Read(WireReader reader)
         {
@@ -4771,6 +4815,7 @@ namespace IrisSession.Protocol
                     case "assets": value.Assets = reader.TryReadNil() ? null : AssetsReport.Read(reader); break;
                     case "stops": value.Stops = reader.ReadArray(Protocol.StopReport.Read, 0); break;
                     case "pause_reason": value.PauseReason = reader.ReadString(512); break;
+                    case "unverified": value.Unverified = reader.ReadArray(Protocol.UnverifiedReport.Read, 0); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -4780,7 +4825,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(35);
+            writer.WriteMapHeader(36);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("request_id");
@@ -4851,6 +4896,8 @@ namespace IrisSession.Protocol
             writer.Write(Stops);
             writer.Write("pause_reason");
             writer.Write(PauseReason);
+            writer.Write("unverified");
+            writer.Write(Unverified);
         }
     }
 
@@ -5384,7 +5431,8 @@ namespace IrisSession.Protocol
 
     /// <summary>
     /// The alignment of a participant was found wrong by size_m (AlarmKind); a jump has voided it. beside:
-    /// anchors that stayed in place meanwhile: then the anchor was moved, not the headset.
+    /// anchors that stayed in place meanwhile: then the anchor was moved, not the headset. witnesses: other participants
+    /// whose headsets see the same shift of the anchor: then it was moved too.
     /// </summary>
     public sealed class AlignmentAlarmed : EventKind
     {
@@ -5395,6 +5443,7 @@ namespace IrisSession.Protocol
         public string AnchorId = "";
         public double SizeM = 0.0;
         public string[] Beside = new string[0];
+        public string[] Witnesses = new string[0];
 
         public static AlignmentAlarmed Read(WireReader reader)
         {
@@ -5409,6 +5458,7 @@ namespace IrisSession.Protocol
                     case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 4u; break;
                     case "size_m": value.SizeM = reader.ReadDouble(); seen |= 8u; break;
                     case "beside": value.Beside = reader.ReadStrings(32, 64); break;
+                    case "witnesses": value.Witnesses = reader.ReadStrings(32, 64); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -5418,7 +5468,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(6);
+            writer.WriteMapHeader(7);
             writer.Write("event");
             writer.Write(TagName);
             writer.Write("participant");
@@ -5431,6 +5481,8 @@ namespace IrisSession.Protocol
             writer.Write(SizeM);
             writer.Write("beside");
             writer.Write(Beside);
+            writer.Write("witnesses");
+            writer.Write(Witnesses);
         }
     }
 

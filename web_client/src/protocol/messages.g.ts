@@ -108,12 +108,14 @@ export type AlignAction = (typeof AlignAction)[keyof typeof AlignAction] | (stri
  * Evidence that an alignment is wrong.
  *
  * `changed`: an anchor is observed elsewhere than seconds ago. `differs`: and elsewhere than by the alignment. `jump`:
- * the tracking frame moved at once, which voids the alignment.
+ * the tracking frame moved at once, which voids the alignment. `two_places`: one id is observed in two places, to and
+ * fro: there are two prints of it.
  */
 export const AlarmKind = {
   CHANGED: "changed",
   DIFFERS: "differs",
   JUMP: "jump",
+  TWO_PLACES: "two_places",
 } as const;
 export type AlarmKind = (typeof AlarmKind)[keyof typeof AlarmKind] | (string & {});
 
@@ -123,6 +125,7 @@ export type AlarmKind = (typeof AlarmKind)[keyof typeof AlarmKind] | (string & {
  */
 export const AlignmentDoubt = {
   AGED: "aged",
+  UNVERIFIED: "unverified",
   CONTRADICTED: "contradicted",
 } as const;
 export type AlignmentDoubt = (typeof AlignmentDoubt)[keyof typeof AlignmentDoubt] | (string & {});
@@ -752,6 +755,16 @@ export interface CrossCheckReport {
   n?: number;
 }
 
+/**
+ * Two headsets that are not known to have the same world: `other` has aligned by an anchor since `participant` last
+ * saw it, and the anchor may have been moved in between. A glance of `participant` at it verifies the pair.
+ */
+export interface UnverifiedReport {
+  participant: string;
+  other: string;
+  anchor_id: string;
+}
+
 /** One anchor of the session. `size_m`: edge of the printed sheet, 0 for not known. */
 export interface AnchorReport {
   anchor_id: string;
@@ -1369,7 +1382,7 @@ export interface Paired {
  * front and recorder. `authority_silent_ns`: since the authority's last message to the front; its part (ticks, roster,
  * robots, recorder) is as old. -1: it has sent none yet. `cpu_share`: of one processor, by the authority's process;
  * `load`: of the machine, over a minute. `stops`: the e-stops in force, newest first, the newest of each participant.
- * `pause_reason`: why physics stands still until a reset, empty otherwise.
+ * `pause_reason`: why physics stands still until a reset, empty otherwise. `unverified`: pairs of headsets.
  */
 export interface StatusReport {
   type: "status_report";
@@ -1407,6 +1420,7 @@ export interface StatusReport {
   assets?: AssetsReport | null;
   stops?: StopReport[];
   pause_reason?: string;
+  unverified?: UnverifiedReport[];
 }
 
 /**
@@ -1524,7 +1538,8 @@ export interface AlignmentRun {
 
 /**
  * The alignment of a participant was found wrong by `size_m` (`AlarmKind`); a `jump` has voided it. `beside`:
- * anchors that stayed in place meanwhile: then the anchor was moved, not the headset.
+ * anchors that stayed in place meanwhile: then the anchor was moved, not the headset. `witnesses`: other participants
+ * whose headsets see the same shift of the anchor: then it was moved too.
  */
 export interface AlignmentAlarmed {
   event: "alignment_alarmed";
@@ -1533,6 +1548,7 @@ export interface AlignmentAlarmed {
   anchor_id: string;
   size_m: number;
   beside?: string[];
+  witnesses?: string[];
 }
 
 /** A director moved an anchor: alignments to it follow. */
@@ -2330,7 +2346,7 @@ export const DEFAULTS = {
   event: {},
   snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0, tick_period_ns: 0, stop_seq: 0, consent_timeout_ns: 0, anchors: [] },
   paired: { roles: [] },
-  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [], assets: null, stops: [], pause_reason: "" },
+  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [], assets: null, stops: [], pause_reason: "", unverified: [] },
   delivery_budget: { mbit_per_s: 0.0, reason: "", streams: [] },
   participant_joined: { resumed: false },
   participant_changed: {},
@@ -2343,7 +2359,7 @@ export const DEFAULTS = {
   scale_changed: {},
   alignment_changed: {},
   alignment_run: { by: "" },
-  alignment_alarmed: { beside: [] },
+  alignment_alarmed: { beside: [], witnesses: [] },
   anchor_moved: { by: "" },
   tip_calibrated: { p_grip_tip: [0.0, 0.0, 0.0], covariance: [], error_m: 0.0, residual_m: 0.0, n_poses: 0, refused: false, advice: "" },
   headsets_compared: {},

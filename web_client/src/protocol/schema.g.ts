@@ -268,6 +268,15 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["n", ["int", 0, null], [0]],
     ],
   },
+  UnverifiedReport: {
+    array: false,
+    tag: null,
+    fields: [
+      ["participant", ["str", 64, ""], []],
+      ["other", ["str", 64, ""], []],
+      ["anchor_id", ["str", 64, ""], []],
+    ],
+  },
   AnchorReport: {
     array: false,
     tag: null,
@@ -844,6 +853,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["assets", ["null", ["struct", "AssetsReport"]], [null]],
       ["stops", ["array", ["struct", "StopReport"], 0, 0], [[]]],
       ["pause_reason", ["str", 512, ""], [""]],
+      ["unverified", ["array", ["struct", "UnverifiedReport"], 0, 0], [[]]],
     ],
   },
   DeliveryBudget: {
@@ -964,6 +974,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["anchor_id", ["str", 64, ""], []],
       ["size_m", ["float"], []],
       ["beside", ["array", ["str", 64, ""], 0, 32], [[]]],
+      ["witnesses", ["array", ["str", 64, ""], 0, 32], [[]]],
     ],
   },
   AnchorMoved: {

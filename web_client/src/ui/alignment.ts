@@ -32,7 +32,11 @@ export function makeAlignmentPanel(state: PageState, actions: Actions): Panel {
           `${state.nameOf(check.a)} and ${state.nameOf(check.b)} see ${check.anchor_id} ${formatMillimetres(check.error_m)} ` +
           `apart (expected up to ${formatMillimetres(check.expected_p95_m)}), ${formatAge(check.age_ns)} ago`,
       );
-      crossChecks.update(found, (text) => text);
+      const unverified = (state.status?.unverified ?? []).map(
+        (pair) =>
+          `${state.nameOf(pair.participant)} is to glance at ${pair.anchor_id}: ${state.nameOf(pair.other)} has aligned by it since`,
+      );
+      crossChecks.update([...found, ...unverified], (text) => text);
     },
   };
 }

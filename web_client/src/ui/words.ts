@@ -2,7 +2,7 @@
 
 import type { Filled } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { AlignmentDoubt, BudgetClass, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
+import { AlarmKind, AlignmentDoubt, BudgetClass, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
 
 const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string> = {
   no_lease: "no participant has its lease",
@@ -120,6 +120,7 @@ export function formatAge(ns: number): string {
 /** Return why an alignment is unconfirmed, so that robots hold at the next squeeze; empty: it is not. */
 export function doubtWords(report: { doubt: string; confirmed_ns: number } | null | undefined): string {
   if (!report || report.doubt === "") return "";
+  if (report.doubt === AlignmentDoubt.UNVERIFIED) return "another wearer has aligned by a sheet since this headset last saw it";
   if (report.doubt === AlignmentDoubt.AGED) return `the alignment is ${formatAge(report.confirmed_ns)} old`;
   return report.doubt === AlignmentDoubt.CONTRADICTED ? "later looks contradict the alignment" : `the alignment is doubted: ${report.doubt.replaceAll("_", " ")}`;
 }
@@ -226,6 +227,8 @@ export function eventWords(
     case "alignment_run":
       return info(`${nameOf(body.participant)} ${body.running ? "measures its alignment" : "keeps its alignment"}`);
     case "alignment_alarmed":
+      if (body.witnesses.length > 0) return null; // a notice says once that the sheet was moved
+      if (body.kind === AlarmKind.TWO_PLACES) return warning(`${nameOf(body.participant)} sees ${body.anchor_id} in two places: print each id once`);
       return warning(
         body.kind === "jump"
           ? `the tracking of ${nameOf(body.participant)} jumped by ${formatMillimetres(body.size_m)}: look at the sheet again`

@@ -31,7 +31,14 @@ test("an unconfirmed alignment says why, also for a reason of another version", 
   expect(doubtWords({ doubt: "", confirmed_ns: 400e9 })).toBe("");
   expect(doubtWords({ doubt: "aged", confirmed_ns: 360e9 })).toBe("the alignment is 6 min old");
   expect(doubtWords({ doubt: "contradicted", confirmed_ns: 0 })).toMatch(/contradict/);
+  expect(doubtWords({ doubt: "unverified", confirmed_ns: 0 })).toMatch(/since this headset last saw it/);
   expect(doubtWords({ doubt: "too_hot", confirmed_ns: 0 })).toMatch(/too hot/);
+});
+
+test("a sheet that was moved, and one of two prints, is said of the sheet", () => {
+  const alarm = { event: "alignment_alarmed", participant: "p1", kind: "two_places", anchor_id: "table", size_m: 0.8, beside: [], witnesses: [] };
+  expect(eventWords(alarm as Body, nameOf)!.text).toMatch(/table in two places/);
+  expect(eventWords({ ...alarm, kind: "changed", witnesses: ["p2"] } as Body, nameOf)).toBeNull();
 });
 
 test("numbers have units that fit", () => {
