@@ -57,8 +57,8 @@ class LinkModel(msgspec.Struct, frozen=True):
 class HeadsetModel(msgspec.Struct, frozen=True):
     """Properties of a headset model. The defaults are those of a good standalone headset of 2024.
 
-    `sheet`: the noise that docs/anchors.md fixes. Tracking noise and drift: our assumption for inside-out tracking in a
-    textured room.
+    `sheet`: the noise that docs/anchors.md fixes. `near_share`: sheets seem nearer by this share of their distance, as
+    prints that are too large do. Tracking noise and drift: our assumption for inside-out tracking in a textured room.
     """
 
     rate_hz: float = 72.0
@@ -69,6 +69,7 @@ class HeadsetModel(msgspec.Struct, frozen=True):
     tilt_sigma_rad: float = math.radians(0.2)
     detection_hz: float = 10.0
     sheet: SheetNoise = SheetNoise()
+    near_share: float = 0.0
     field_of_view_rad: float = math.radians(80.0)  # full cone of the cameras
     max_distance_m: float = 1.5
     max_incidence_rad: float = math.radians(65.0)
@@ -193,6 +194,7 @@ class EmulatedHeadset:
             e2 = np.cross(e1, (0.0, 0.0, 1.0) if abs(view[2]) < 0.9 else (1.0, 0.0, 0.0))
             e2 /= np.linalg.norm(e2)
             p, q = noise.observe(p, q, np.array((e1, e2, np.cross(e1, e2))), d, units[None], scale_unit)
+        p[0] -= self.model.near_share * (p[0] - np.array(T_world_head[0]))
         (x, y, z), (w, a, b, c) = p[0].tolist(), q[0].tolist()
         return compose(inverse(self.get_T_world_tracking(now_ns)), ((x, y, z), quat_normalize((w, a, b, c))))
 

@@ -177,6 +177,10 @@ class EmulatedOperator:
             self._slip = (self.headset.bump_frame(spec.bump_m, spec.bump_yaw_rad, self.gaze.pose[0], now_ns), now_ns)
         self.report.disturbed_ns[kind] = self.client.session_now_ns()
 
+    def glance(self) -> None:
+        """Look at the sheet once more, as a notice advises, and go on."""
+        self._must_realign = True
+
     def finish_report(self) -> HeadsetReport:
         """Fill in the fields that are computed at the end, and return the report."""
         report, client = self.report, self.client

@@ -7,26 +7,30 @@ world.
 from __future__ import annotations
 
 import itertools
-from typing import Final
+from collections import Counter
+from typing import Any, Final
 
+import msgspec
 import numpy as np
+import pytest
 
-from anchors.ageing import AgeingLaw
 from anchors.pose import PoseTuple, apply, distance
 from anchors.uncertainty import covariance_at_point, length_p95
-from iris_session.authority import AuthorityConfig
 from iris_session.client import Client
+from iris_session.client.core.state_stream import SceneState
 from iris_session.control import ControlConfig
 from iris_session.demo.scenes import n_arms_scene
-from iris_session.emulator.headset import HeadsetModel
+from iris_session.emulator.headset import DEFAULT_T_WORLD_ANCHOR, HeadsetModel
 from iris_session.emulator.operator import EmulatedOperator
-from iris_session.protocol.names import AlarmKind, HoldReason, RejectReason
+from iris_session.protocol.names import AlarmKind, AlignmentDoubt, HoldReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentAlarmed, HeadsetsCompared, Notice, SamplesRejected
 from tests.rig.session import Rig, is_driven
 
 SECOND = 1_000_000_000
 TICK = 0.02  # [s]
 STEADY: Final = HeadsetModel(drift_m_per_min=0.0, drift_rad_per_min=0.0)
+#: Where people look who do not look at the sheet [m].
+AWAY: Final = (3.0, -0.9, 0.5)
 #: A pair may differ by this multiple of its p95 by chance (`anchors.cross_check.Disagreement.as_expected`).
 CHANCE_FACTOR: Final = 2.0
 #: Bound of the speed of a tip [m/s], also of one whose hand was bumped with the clutch closed.
@@ -40,9 +44,13 @@ class Tips:
         self.client = client
         self.robot = robot
         self._seen: list[tuple[float, PoseTuple, bool]] = []
-        client.on_state = lambda state: self._seen.append(
-            (state.header.sim_time, client.scene.tip_pose(robot), is_driven(client, robot))  # type: ignore[arg-type]
-        )
+        before = client.on_state
+        client.on_state = lambda state: (before and before(state), self._add(state))  # type: ignore[assignment]
+
+    def _add(self, state: SceneState) -> None:
+        tip = self.client.scene.tip_pose(self.robot)
+        assert tip is not None
+        self._seen.append((state.header.sim_time, tip, is_driven(self.client, self.robot)))
 
     def check_speed(self) -> None:
         assert len(self._seen) > 100
@@ -59,6 +67,95 @@ class Tips:
                 rests += 1
                 assert max(distance(p, resting[0]) for p in resting) < 1e-3
         assert rests, "it never rested"
+
+
+class Afternoon:
+    """People at one sheet, `table`, that all of them look at. `bump_sheet` moves it, as long as nobody looks."""
+
+    def __init__(self, rig: Rig, watcher: Client) -> None:
+        self.rig = rig
+        self.watcher = watcher
+        self.operators: list[EmulatedOperator] = []
+        self.T_world_sheet = DEFAULT_T_WORLD_ANCHOR
+        self._told = 0
+
+    def seat(self, name: str, robot: str, **spec: Any) -> EmulatedOperator:
+        """Let an operator join with a headset that sends little, by default with nothing to do."""
+        fields = {field: spec.pop(field) for field in ("detection_hz", "near_share") if field in spec}
+        model = HeadsetModel(rate_hz=12.0, **fields)
+        looks = {"viewpoints": 2, "observations_per_viewpoint": 8}
+        usual = {"behaviour": "idle", "seed": 11 + len(self.operators), "T_world_anchor": self.T_world_sheet, **looks}
+        self.operators.append(self.rig.emulate(name=name, robot=robot, model=model, **{**usual, **spec}))
+        return self.operators[-1]
+
+    def bump_sheet(self, x: float) -> None:
+        """Move the sheet by `x` [m]."""
+        p, q = self.T_world_sheet
+        self.T_world_sheet = ((p[0] + x, p[1], p[2]), q)
+        for one in self.operators:
+            msgspec.structs.force_setattr(one.spec, "T_world_anchor", self.T_world_sheet)
+
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass in which the machine and everybody's programs stand still."""
+        for client in self.rig.clients:
+            self.rig.hang(client, seconds)
+        self.rig.suspend_machine(seconds)
+        self.rig.run(seconds + 1.0)
+
+    def forget(self) -> None:
+        """Count warnings from now on."""
+        self._told = len(self.rig.list_events("watcher", Notice))
+
+    def count_warnings(self) -> dict[str, int]:
+        """Return the number of warnings by name of whom they concern; empty: everybody."""
+        names = {one.client.participant_id: one.client.name for one in self.operators} | {"": ""}
+        told = [b for _, b in self.rig.list_events("watcher", Notice)[self._told :] if b.level == "warning"]
+        return dict(Counter(names[body.participant] for body in told))
+
+    def list_doubts(self) -> dict[str, str]:
+        """Return the doubts about alignments by name, of those who have any."""
+        reports = {p.name: p.alignment_report for p in self.watcher.status().participants}
+        return {name: r.doubt for name, r in reports.items() if r is not None and r.doubt}
+
+    def list_unverified(self) -> set[tuple[str, str]]:
+        """Return the names of the pairs that are unverified: who is to glance, because of whom."""
+        status = self.watcher.status()
+        names = {p.id: p.name for p in status.participants}
+        return {(names[one.participant], names[one.other]) for one in status.unverified}
+
+    def run_until_working(self, *operators: EmulatedOperator) -> None:
+        """Wait until operators are aligned and have their robots."""
+        self.rig.run_until(lambda: all(one.report.phase == "work" for one in operators), "they are aligned")
+
+    def run_until_held(self, operator: EmulatedOperator) -> None:
+        """Wait until the robot of an operator holds because its alignment is unconfirmed."""
+        told, robot = operator.client.feedback, operator.spec.robot
+        self.rig.run_until(lambda: told[robot].hold_reason == HoldReason.UNCONFIRMED, f"{robot} holds")
+
+    def glance_until_confident(self) -> None:
+        """Let those who are asked for it glance at the sheet, until nobody is in doubt and no correction waits."""
+        for _ in range(3):
+            doubts = self.list_doubts()
+            for one in self.operators:
+                if one.client.name in doubts:
+                    one.glance()
+            self.rig.run(0.5)
+            self.run_until_working(*self.operators)
+            for _ in range(5):
+                self.rig.run(0.5)
+                reports = [p.alignment_report for p in self.watcher.status().participants if p.alignment_report]
+                if not any(r.doubt or r.pending_m for r in reports):
+                    return
+        pytest.fail(f"somebody is in doubt: {self.list_doubts()}")
+
+    def check_errors(self) -> None:
+        """Check that everybody shows the world where the sheet lies now, within the stated error at the sheet."""
+        for one in self.operators:
+            report, alignment = one.finish_report(), one.client.alignment.current
+            assert report.T_true_shown is not None
+            assert alignment is not None
+            off_m = distance(apply(report.T_true_shown, DEFAULT_T_WORLD_ANCHOR[0]), self.T_world_sheet[0])
+            assert off_m <= alignment.error_at_anchor_m, one.client.name
 
 
 def emulate_driver(rig: Rig, name: str, robot: str, seed: int, **spec: object) -> EmulatedOperator:
@@ -99,7 +196,7 @@ def test_four_headsets_show_the_hammer_at_one_place() -> None:
     with Rig(n_arms_scene(4), timestep=TICK) as rig:
         watcher = rig.join("watcher", "director")
         operators = [emulate_driver(rig, f"op{i}", f"arm{i + 1}", 11 + i) for i in range(3)]
-        away = {"gaze": (3.0, -0.9, 0.5), "glance_every_s": 3.0, "glance_s": 1.5}
+        away = {"gaze": AWAY, "glance_every_s": 3.0, "glance_s": 1.5}
         operators.append(rig.emulate(name="dan", behaviour="idle", robot="arm4", seed=14, **away))
         run_until_driven(rig, watcher, "arm1", "arm2", "arm3")
         ids = {one.client.participant_id for one in operators}
@@ -194,31 +291,49 @@ def test_drift_raises_an_alarm_until_it_is_measured_again() -> None:
         assert ann.finish_report().alignment_error_mm < 10.0
 
 
-def test_half_an_hour_without_a_look_holds_until_a_glance() -> None:
-    """With drift and law sixty times as fast: 1 mm a minute, and a minute is a second."""
-    usual = AgeingLaw()
-    law = AgeingLaw(60.0 * usual.drift_m_per_min, 60.0 * usual.yaw_rad_per_min)
-    with Rig(timestep=TICK, authority=AuthorityConfig(ageing=law, age_check_ns=SECOND // 60)) as rig:
+def test_an_afternoon_at_one_table() -> None:
+    """The sheet is bumped between alignments, one headset has a slow source, one sees a wrong print, and then half an
+    hour passes. Everybody is told, nothing moves by itself, and a glance mends it.
+    """
+    with Rig(n_arms_scene(4), timestep=TICK, state_hz=10) as rig:
         watcher = rig.join("watcher", "director")
-        ann = emulate_driver(rig, "ann", "left", 11, model=STEADY, drift_m_per_min=0.06)
-        run_until_driven(rig, watcher, "left")
-        watcher.alignment.stop_run(ann.client.participant_id)
-        ann.disturb_tracking("drift", rig.simulation.now_ns)
-        hold = lambda: ann.client.feedback["left"].hold_reason  # noqa: E731
-        rig.run_until(lambda: hold() == HoldReason.UNCONFIRMED, "ann is to glance")
-        rig.run(20.0)
-        assert not is_driven(watcher, "left")
-        told = [b for _, b in rig.list_events("watcher", Notice) if b.level == "warning" and "glance" in b.text]
-        assert [body.participant for body in told] == [ann.client.participant_id]
-        ann.disturb_tracking("steady", rig.simulation.now_ns)
-        version = find_version(ann)
-        watcher.alignment.start_run(ann.client.participant_id)
-        rig.run_until(lambda: find_version(ann) > version, "ann has glanced")
-        run_until_driven(rig, watcher, "left")
-        rig.run(1.0)
-        alignment = ann.client.alignment.current
-        assert alignment is not None
-        assert ann.finish_report().alignment_error_mm < 1e3 * alignment.error_at_anchor_m
+        tips = [Tips(watcher, f"arm{i}") for i in range(1, 5)]
+        table = Afternoon(rig, watcher)
+        ann = table.seat("ann", "arm1", gaze=AWAY, behaviour="wander")
+        cid = table.seat("cid", "arm2", gaze=AWAY, detection_hz=1.0, viewpoints=1, observations_per_viewpoint=6)
+        table.run_until_working(ann, cid)
+        run_until_driven(rig, watcher, "arm1")
+        table.forget()
+
+        table.bump_sheet(0.05)
+        bob, eve = table.seat("bob", "arm3"), table.seat("eve", "arm4", near_share=0.02, viewpoints=3)
+        table.run_until_working(bob, eve)
+        told = table.count_warnings()
+        assert told.pop("eve") > 0, "two percent"
+        assert told == {"ann": 1, "cid": 1}
+        assert table.list_doubts() == {"ann": AlignmentDoubt.UNVERIFIED, "cid": AlignmentDoubt.UNVERIFIED}
+        assert {who for who, _ in table.list_unverified()} == {"ann", "cid"}
+        table.run_until_held(ann)
+        table.glance_until_confident()
+        eve.headset.model = msgspec.structs.replace(eve.headset.model, near_share=0.0)  # she prints it again
+        eve.glance()
+        table.glance_until_confident()
+        (seen,) = [b for _, b in rig.list_events("watcher", AlignmentAlarmed) if b.witnesses]
+        assert (seen.participant, seen.witnesses) == (cid.client.participant_id, (ann.client.participant_id,))
+        assert table.count_warnings()[""] == 1, "the sheet was moved, not they"
+        table.check_errors()
+        run_until_driven(rig, watcher, "arm1")
+        table.forget()
+
+        table.pass_time(1800.0)
+        table.run_until_held(ann)
+        assert table.list_doubts() == dict.fromkeys(("ann", "bob", "cid", "eve"), AlignmentDoubt.AGED)
+        rig.run_until(lambda: len(table.count_warnings()) == 4, "all are told, after a reconnection too", 5.0)
+        table.glance_until_confident()
+        table.check_errors()
+        run_until_driven(rig, watcher, "arm1")
+        for one in tips:
+            one.check_rest()
 
 
 def test_unaligned_headset_gets_a_notice_and_moves_nothing() -> None:
