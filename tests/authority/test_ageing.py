@@ -8,6 +8,7 @@ from anchors.ageing import AgeingLaw
 from iris_session.authority import AuthorityConfig
 from iris_session.protocol.client_messages import Align, Heartbeat, PlaceAlignment
 from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.entries import Join, Lost
 from iris_session.protocol.names import AlignmentDoubt, HoldReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentChanged, Notice, SamplesRejected
 from iris_session.protocol.status import AlignmentReport
@@ -64,6 +65,21 @@ def test_half_an_hour_without_a_look_is_stated_told_and_held_until_a_glance() ->
     anna.alignment_version = report(t, anna).version
     anna.engage("left")
     assert t.command().kind == "pose"
+
+
+def test_who_was_away_when_it_was_said_hears_it_again() -> None:
+    t = Table(CONFIG)
+    anna = t.join(capabilities=("run:1",))
+    t.step(anna.says(proposal()))
+    t.step(anna.says(Lost("closed")))
+    again = Join("key1", "operator", "person1", capabilities=("run:1",), resume_of=anna.id)
+    for _ in range(2):
+        t.people += 1
+        back = Person(t, t.people, "person1")
+        t.step(back.says(again))
+        pass_minutes(t, 20)
+        t.step(back.says(Lost("closed")))
+    assert len(warnings(t, anna)) == 2
 
 
 def test_what_is_engaged_when_it_becomes_old_goes_on() -> None:

@@ -193,7 +193,8 @@ class RigFrontProcess:
     def _tick(self, front: Front) -> None:
         if front is self.front and not front.ended:
             self._run_front()
-            self._simulation.call_at(self._simulation.now_ns + SERVICES_PERIOD_NS, lambda: self._tick(front))
+            due_ns = max(self._simulation.now_ns + SERVICES_PERIOD_NS, self.stands_until_ns)
+            self._simulation.call_at(due_ns, lambda: self._tick(front))
 
 
 def install_front(network: Network, patch: pytest.MonkeyPatch) -> None:

@@ -295,7 +295,7 @@ def test_an_afternoon_at_one_table() -> None:
     """The sheet is bumped between alignments, one headset has a slow source, one sees a wrong print, and then half an
     hour passes. Everybody is told, nothing moves by itself, and a glance mends it.
     """
-    with Rig(n_arms_scene(4), timestep=TICK, state_hz=10) as rig:
+    with Rig(n_arms_scene(4, 0), timestep=TICK, state_hz=10) as rig:
         watcher = rig.join("watcher", "director")
         tips = [Tips(watcher, f"arm{i}") for i in range(1, 5)]
         table = Afternoon(rig, watcher)
@@ -309,12 +309,11 @@ def test_an_afternoon_at_one_table() -> None:
         bob, eve = table.seat("bob", "arm3"), table.seat("eve", "arm4", near_share=0.02, viewpoints=3)
         table.run_until_working(bob, eve)
         told = table.count_warnings()
-        assert told.pop("eve") > 0, "two percent"
-        assert told == {"ann": 1, "cid": 1}
+        assert told["eve"] > 0, "two percent"
+        assert told["ann"] == told["cid"] == 1
         assert table.list_doubts() == {"ann": AlignmentDoubt.UNVERIFIED, "cid": AlignmentDoubt.UNVERIFIED}
         assert {who for who, _ in table.list_unverified()} == {"ann", "cid"}
         table.run_until_held(ann)
-        table.glance_until_confident()
         eve.headset.model = msgspec.structs.replace(eve.headset.model, near_share=0.0)  # she prints it again
         eve.glance()
         table.glance_until_confident()
