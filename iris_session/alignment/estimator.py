@@ -31,6 +31,9 @@ NUMERICAL_ERRORS: Final = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 AGAINST_GRAVITY: Final = (
     "against gravity (seen wrongly: step closer; if it is most of them, configure how the sheet lies)"
 )
+#: An observation that is older or newer than this is none of now.
+MAX_LATE_NS: Final = 5_000_000_000
+LATE: Final = "captured more than 5 s before or after now (capture_ns is session time)"
 #: The authority notifies a wearer of at most one refusal a second; one that follows another sooner may be lost.
 _CLOSE_NS: Final = 1_500_000_000
 #: So many poses in a row that are no looks are reported: a headset at 72 Hz repeats some that its source did not renew.
@@ -77,6 +80,7 @@ class ConnectionEstimator:
         self._touches = TouchEstimator(self._anchors, self._marks, self._tips)
         self._observed: dict[str, tuple[int, int]] = {}  # anchor -> number of observations, time of the last [ns]
         self._used = self._unusable = 0
+        self._looked_ns = 0  # when the newest sheet or controller that was used was received
         self._faults: dict[str, int] = {}  # poses that were no looks, by reason
         self._in_a_row = 0
         self._next_ns = 0
@@ -160,7 +164,7 @@ class ConnectionEstimator:
             used = False
             self._note_wrong((observation.tracking_epoch, wrong), observation.kind == AnchorKind.TOUCH)
         else:
-            used = self._use_observation(observation, look or Look(observation.viewpoint_id))
+            used = self._use_observation(observation, look or Look(observation.viewpoint_id), now_ns)
             if used and observation.kind == AnchorKind.TOUCH and self._is_wrong_touch:
                 self._wrong = None
         if used:
@@ -187,12 +191,20 @@ class ConnectionEstimator:
         if self._in_a_row >= _MANY_FAULTS:
             self._note_wrong((tracking_epoch, f"poses of the sheet are not used: {fault}"), False)
 
-    def _use_observation(self, observation: Observation, look: Look) -> bool:
+    def refuse_late(self, observation: Observation) -> None:
+        """Count an observation that was not captured just now; of a touch or a kept anchor it is reported at once."""
+        is_known = observation.anchor_id in self._anchors
+        self.count_fault(LATE, observation.tracking_epoch, is_known)
+        if self.running and is_known and observation.kind in AnchorKind.NOT_SEEN:
+            text = f"the {observation.kind} observation of '{observation.anchor_id}' is not used: {LATE}"
+            self._note_wrong((observation.tracking_epoch, text), observation.kind == AnchorKind.TOUCH)
+
+    def _use_observation(self, observation: Observation, look: Look, now_ns: int) -> bool:
         pose, covariance, p_tracking_head = observation.T_tracking_anchor, observation.covariance, look.p_tracking_head
         if observation.kind == AnchorKind.TOUCH:
-            return self._touches.add_touch(observation)
+            return self._touches.add_touch(observation, now_ns)
         if observation.kind == AnchorKind.PERSISTENT:
-            return self._touches.add_persistent(observation)
+            return self._touches.add_persistent(observation, now_ns)
         if observation.kind == AnchorKind.CONTROLLER:  # tracked: neither distance nor mirrored poses matter
             covariance, p_tracking_head = covariance or _CONTROLLER, None
         source = ObservationSource.HOLDER if observation.kind == AnchorKind.CONTROLLER else ObservationSource.QR_CAMERA
@@ -215,6 +227,8 @@ class ConnectionEstimator:
             return False
         # A sheet of the wrong size is unusable, but the advice must mention it.
         self._pending = self._pending or used or self._estimator.wrong_size > misprints
+        if used:
+            self._looked_ns = now_ns
         return used
 
     def is_due(self, now_ns: int) -> bool:
@@ -243,13 +257,20 @@ class ConnectionEstimator:
             return None
         self._last = estimate
         if estimate.refused:
-            return self._filter_refusal(_to_proposal(estimate, kind), now_ns)
+            return self._filter_refusal(_to_proposal(estimate, kind, 0), now_ns)
         self._refused = None
         if self.newest is not None and not estimate.supported and estimate.moved == self.newest.moved:
             return None
         if kind == AlignmentKind.MEASURED:
             self.newest = estimate
-        return _to_proposal(estimate, kind)
+        return _to_proposal(estimate, kind, self._find_look(estimate))
+
+    def _find_look(self, estimate: AlignmentEstimate) -> int:
+        """Return when the newest look was received that agrees with the last estimate; capture times are a client's."""
+        looked_ns = self._touches.looked_ns if self._touches_last else self._looked_ns
+        if estimate.supported:
+            return looked_ns
+        return max(1, min(looked_ns, max((last_ns for _, _, last_ns in estimate.looks), default=0)))
 
     def _estimate(self, now_ns: int) -> tuple[AlignmentEstimate | None, str]:
         """Return an estimate by touched marks or a kept anchor if any are new, else by observations, and its
@@ -326,7 +347,7 @@ def _to_refusal(tracking_epoch: int, advice: str) -> AlignmentProposal:
     return AlignmentProposal(Pose(p, q), tracking_epoch, (), p, 0.0, refused=True, advice=advice[:MAX_TEXT])
 
 
-def _to_proposal(estimate: AlignmentEstimate, kind: str) -> AlignmentProposal:
+def _to_proposal(estimate: AlignmentEstimate, kind: str, looked_ns: int) -> AlignmentProposal:
     p, q = estimate.T_world_tracking
     return AlignmentProposal(
         Pose(p, q),
@@ -344,4 +365,5 @@ def _to_proposal(estimate: AlignmentEstimate, kind: str) -> AlignmentProposal:
         look_s=estimate.look_s,
         looks=tuple(AnchorLooks(name, first, last) for name, first, last in estimate.looks[:_MAX_NAMES]),
         moved=estimate.moved[:_MAX_NAMES],
+        looked_ns=looked_ns,
     )

@@ -22,7 +22,7 @@ from anchors.looks import Look
 from anchors.places import TWO_PRINTS, PrintWatch
 from anchors.pose import PoseTuple, Vec3, apply, is_rigid, is_valid_point
 from iris_session.alignment.cross_check import CrossCheckScheduler, Job
-from iris_session.alignment.estimator import NUMERICAL_ERRORS, ConnectionEstimator
+from iris_session.alignment.estimator import MAX_LATE_NS, NUMERICAL_ERRORS, ConnectionEstimator
 from iris_session.alignment.monitor import AlignmentMonitor
 from iris_session.alignment.touches import MAX_TIPS, solve_tip
 from iris_session.protocol.client_messages import Observation, Sample
@@ -247,6 +247,10 @@ class AlignmentService:
     def _add_observation(self, number: int, state: _HeadsetState, observation: Observation, now_ns: int) -> None:
         if state.is_before_jump(observation):
             self._drops.count("observation_before_jump", number)
+            return
+        if abs(now_ns - observation.capture_ns) > MAX_LATE_NS:
+            state.estimator.refuse_late(observation)
+            self._drops.count("observation_unusable", number)
             return
         known = observation.anchor_id in self.anchors
         seen, tracked = observation.kind not in AnchorKind.NOT_SEEN, observation.kind == AnchorKind.CONTROLLER

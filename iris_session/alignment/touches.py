@@ -92,7 +92,8 @@ class _Kept(NamedTuple):
 class TouchEstimator:
     """Touches of one connection and its kept anchor, in one tracking frame.
 
-    `pending`: they suffice for an estimate, and something is new since the last one.
+    `pending`: they suffice for an estimate, and something is new since the last one. `looked_ns`: when the newest that
+    counts was received.
     """
 
     def __init__(
@@ -117,6 +118,7 @@ class TouchEstimator:
         self._looks: dict[str, tuple[int, int]] = {}  # by anchor: times of the first and the last touch
         self._tracking_epoch = 0
         self.pending = False
+        self.looked_ns = 0
 
     def has_mark(self, anchor_id: str, mark: str) -> bool:
         """Return whether a known anchor has this mark; every anchor has its origin."""
@@ -126,7 +128,7 @@ class TouchEstimator:
         """Return whether a touch states no covariance, or one whose position is usable."""
         return self._find_sigma(observation) is not None
 
-    def add_touch(self, observation: Observation) -> bool:
+    def add_touch(self, observation: Observation, now_ns: int) -> bool:
         """Add one touch of a known anchor; return false if it is of an older tracking frame, no mark of it, or not a
         finite point, or its covariance is invalid."""
         pose = observation.T_tracking_anchor
@@ -147,7 +149,7 @@ class TouchEstimator:
         self._looks[point.anchor_id] = first_ns, observation.capture_ns
         while len(self._touches) > MAX_POINTS:
             del self._touches[next(iter(self._touches))]
-        self.pending = self._suffice()
+        self.pending, self.looked_ns = self._suffice(), now_ns
         return True
 
     def _find_sigma(self, observation: Observation) -> float | None:
@@ -161,7 +163,7 @@ class TouchEstimator:
         largest = float(np.linalg.eigvalsh(np.reshape(stated, (3, 3)))[-1])
         return max(math.sqrt(largest), FINGERTIP_SIGMA_M if is_finger else MIN_SIGMA_M)
 
-    def add_persistent(self, observation: Observation) -> bool:
+    def add_persistent(self, observation: Observation, now_ns: int) -> bool:
         """Set where a known anchor lies by a kept place; return false if that is of an older tracking frame, not a
         pose, or contradicts gravity."""
         pose = observation.T_tracking_anchor
@@ -174,7 +176,7 @@ class TouchEstimator:
         if self._align_kept(kept) is None:
             return False
         self._kept = kept
-        self.pending = True
+        self.pending, self.looked_ns = True, now_ns
         return True
 
     def _align_kept(self, kept: _Kept) -> AlignmentEstimate | None:

@@ -62,6 +62,10 @@ _RANKS: Final = {
 }
 #: A look confirms an alignment when its own stated error is at most so many times that of the alignment.
 SAME_ERROR: Final = 1.25
+#: A correction without a look since the last one: its age and doubt stay.
+_NO_LOOK: Final = -1
+#: Walking since a look that is not older than this is neglected.
+_FRESH_NS: Final = 2_000_000_000
 #: Reasons of a hold that a better alignment ends.
 _OF_ALIGNMENT: Final = (HoldReason.UNALIGNED, HoldReason.VIEW_ONLY, HoldReason.UNCONFIRMED)
 ADVICE: Final = "step closer to the sheet, look at it from a second place, or add a sheet near the robot"
@@ -105,20 +109,45 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
     warn_wearer(ctx, p, "tilt", tilt if tilted else "", same="tilted")
     advice = f"alignment of {p.name}: {m.advice}" if m.advice and not tilted else ""
     warn_wearer(ctx, p, "advice", advice, same=m.advice)
-    if p.placed:
+    looked_ns, walked_m = _find_look(ctx, p, m)
+    if p.placed or (looked_ns is None and not _is_after_move(ctx, p, m)):
         return None
     if drives:
         _note_looks(ctx, p, m)
     if _is_news(ctx, p, m, error):
-        return offer_measurement(ctx, p, m)
+        return offer_measurement(ctx, p, m, looked_ns, walked_m)
+    if looked_ns is None:
+        return None
     if p.correction is not None:
-        p.correction.looked_ns, p.correction.walked_m = ctx.now_ns, p.walked_m
+        p.correction.looked_ns, p.correction.walked_m = looked_ns, walked_m
     elif p.alignment is not None:
         now = p.alignment
         known = compute_error_at_robots(ctx, p, now.covariance, p.pivot_world, 0.0) if now.covariance else error
         if error <= SAME_ERROR * max(known, now.error_at_robot_m):
-            confirm_alignment(ctx, p, ctx.now_ns, p.walked_m)
+            confirm_alignment(ctx, p, looked_ns, walked_m)
     return None
+
+
+def _find_look(ctx: Context, p: Participant, m: AlignmentProposal) -> tuple[int | None, float]:
+    """Return the time of the newest look that a proposal agrees with, and how far the head had walked by then. `None`:
+    it is not later than the last look at what is in force or under way, so it says nothing about the drift since then.
+    """
+    if m.looked_ns == 0:
+        return ctx.now_ns, p.walked_m  # recorded before the front stated it
+    looked_ns, now = min(m.looked_ns, ctx.now_ns), p.alignment
+    # How far the head has walked since an old look is not known: all since the last one counts.
+    walked_m = p.walked_m if ctx.now_ns - looked_ns <= _FRESH_NS else p.confirmed_walked_m
+    is_first = now is None or (now.kind in AlignmentKind.VIEW_ONLY and m.kind not in AlignmentKind.VIEW_ONLY)
+    is_later = looked_ns > p.confirmed_ns and (p.correction is None or looked_ns >= p.correction.looked_ns)
+    return (looked_ns if is_first or is_later else None), walked_m
+
+
+def _is_after_move(ctx: Context, p: Participant, m: AlignmentProposal) -> bool:
+    """Return true when an anchor was moved since the look that confirmed what is in force, and the proposal rests on
+    that look: it is the same measurement at the new places.
+    """
+    is_free = p.correction is None or p.correction.looked_ns == _NO_LOOK
+    return is_free and ctx.state.anchors_ns >= p.confirmed_ns and m.looked_ns >= p.confirmed_ns
 
 
 def _is_valid_proposal(ctx: Context, m: AlignmentProposal) -> bool:
@@ -284,8 +313,18 @@ def is_in_use(ctx: Context, p: Participant) -> bool:
     return p.in_use or (p.aligned_ns is not None and ctx.now_ns - p.aligned_ns >= ctx.config.settle_ns)
 
 
-def offer_measurement(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
-    """Put a measurement that passed the gate in force at once, or make it the goal of a correction."""
+def offer_measurement(
+    ctx: Context, p: Participant, m: AlignmentProposal, looked_ns: int | None, walked_m: float
+) -> None:
+    """Put a measurement that passed the gate in force at once, or make it the goal of a correction.
+
+    Args:
+        ctx: Of this step.
+        p: Whose measurement it is.
+        m: The measurement.
+        looked_ns: Time of the newest look that it agrees with; `None`: no look since what is in force was confirmed.
+        walked_m: How far the head had walked by then.
+    """
     covariance = tuple(map(float, m.covariance))
     x, y, z = m.pivot_world
     pivot_world = (float(x), float(y), float(z))
@@ -295,8 +334,8 @@ def offer_measurement(ctx: Context, p: Participant, m: AlignmentProposal) -> Non
         pivot_world,
         float(m.error_at_anchor_m),
         ctx.now_ns + ctx.config.slide_ns,
-        looked_ns=ctx.now_ns,
-        walked_m=p.walked_m,
+        looked_ns=_NO_LOOK if looked_ns is None else looked_ns,
+        walked_m=walked_m,
     )
     if p.alignment is None or p.alignment.kind in AlignmentKind.VIEW_ONLY:
         return _complete_correction(ctx, p, goal, m.kind)
@@ -445,15 +484,23 @@ def _slide_correction(ctx: Context, p: Participant, c: Correction, away_m: float
     c.slides_ns = ctx.now_ns + ctx.config.slide_ns
     error_at_anchor_m = c.error_at_anchor_m + distance(at, c.pivot_world)
     _apply_measured(ctx, p, T, c.pivot_world, widen_covariance(c.covariance, tuple(left)), error_at_anchor_m)
-    return confirm_alignment(ctx, p, c.looked_ns, c.walked_m)
+    return _confirm_correction(ctx, p, c)
 
 
 def _complete_correction(ctx: Context, p: Participant, c: Correction, kind: str = AlignmentKind.MEASURED) -> None:
     """Apply all of a correction."""
     p.correction = None
     _apply_measured(ctx, p, c.T_world_tracking, c.pivot_world, c.covariance, c.error_at_anchor_m, kind)
-    confirm_alignment(ctx, p, c.looked_ns, c.walked_m)
-    _clear_answered_alarm(ctx, p)
+    _confirm_correction(ctx, p, c)
+    if c.looked_ns != _NO_LOOK:
+        _clear_answered_alarm(ctx, p)
+
+
+def _confirm_correction(ctx: Context, p: Participant, c: Correction) -> None:
+    if c.looked_ns == _NO_LOOK:
+        p.age_due_ns = ctx.now_ns  # its error as aged is stated at once
+    else:
+        confirm_alignment(ctx, p, c.looked_ns, c.walked_m)
 
 
 def _apply_measured(

@@ -86,7 +86,8 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
     estimator refuses (`refused` true): "step closer", "add a sheet near the robot".
     `pivot_world`: the point that the covariance is stated at (the anchor). `kind`: the `AlignmentKind` that it makes.
     `tilt_noise_rad`: what noise alone explains of the tilt. `look_s`: so many seconds of looking mend much; 0: they do
-    not. `looks`: of the anchors that it rests on. `moved`: anchors that others outvote.
+    not. `looks`: of the anchors that it rests on. `moved`: anchors that others outvote. `looked_ns`: session time when
+    the newest look or touch was received that it agrees with; 0: the time of this entry.
     """
 
     T_world_tracking: Pose
@@ -104,6 +105,7 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
     look_s: float = 0.0
     looks: tuple[AnchorLooks, ...] = ()
     moved: Names = ()
+    looked_ns: Nanoseconds = 0
 
 
 class TipSolved(Message, frozen=True, tag="tip_solved"):

@@ -91,3 +91,14 @@ def test_two_sheets_that_contradict_each_other_have_no_majority(order: str) -> N
     assert [a.beside for a in ann.alarms()] == [()]
     advice = find_refusal(ann)
     assert all(name in advice for name in "ab")
+
+
+def test_estimate_that_the_newest_look_contradicts_is_as_old_as_the_looks_that_agree() -> None:
+    lab = Lab(SHEETS)
+    ann = lab.wearer()
+    lab.world["c"] = shifted(SHEETS["c"], (0.05, 0.0, 0.0))
+    looked_ns = look(ann, "aabb")[-1].looked_ns
+    lab.now_ns += 60 * SECOND
+    ann.report_observations(ann.place("c", 0.6), 10, "c")
+    assert "c" in ann.proposals()[-1].moved
+    assert ann.proposals()[-1].looked_ns <= looked_ns

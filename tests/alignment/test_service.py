@@ -10,6 +10,7 @@ import pytest
 
 from anchors.pose import PoseTuple, apply, compose, inverse, quat_from_yaw
 from anchors.uncertainty import isotropic_covariance
+from iris_session.alignment.estimator import LATE
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import AlignmentAlarm, AlignmentProposal, CrossChecked, decode_entry, encode_entry
@@ -456,3 +457,44 @@ def test_two_prints_of_one_id_are_refused_by_name() -> None:
     lab.world["sheet"] = SHEET  # the second print was thrown away
     ann.report_observations(ann.place(d=0.6), 20)
     assert "sheet" in {one.anchor_id for one in ann.proposals()[-1].looks}
+
+
+def test_estimate_without_a_new_look_says_when_its_newest_look_was() -> None:
+    lab = Lab(sizes={"sheet": 0.16})
+    ann = lab.wearer()
+    ann.survey()
+    looked_ns = ann.proposals()[-1].looked_ns
+    assert lab.now_ns - SECOND < looked_ns <= lab.now_ns
+    lab.now_ns += 60 * SECOND
+    x, y, z = ANCHORS["other"][0]
+    lab.service.process_event(AnchorMoved("other", Pose((x, y, z + 0.001), ANCHORS["other"][1]), "boss"))
+    lab.poll(300)
+    p, q = ann.place().observe(ann.frame)
+    ann.observe(Observation("sheet", "qr", Pose(p, q), lab.now_ns, ann.epoch, size_m=0.2))
+    lab.poll(300)
+    assert "200 mm" in ann.proposals()[-1].advice
+    assert ann.proposals()[-1].looked_ns == looked_ns
+    began_ns = lab.now_ns
+    ann.report_observations(ann.place(), 10)
+    assert began_ns < ann.proposals()[-1].looked_ns <= lab.now_ns
+
+
+@pytest.mark.parametrize("kind", ["qr", "touch", "persistent", "controller"])
+@pytest.mark.parametrize("late_ns", [6 * SECOND, -6 * SECOND])
+def test_what_was_not_captured_just_now_is_refused(kind: str, late_ns: int) -> None:
+    lab = Lab()
+    ann = lab.wearer()
+    view = ann.place()
+    for i in range(10):
+        lab.now_ns += 10 * SECOND
+        p, q = view.observe(ann.frame)
+        ann.observe(Observation("sheet", kind, Pose(p, q), lab.now_ns - late_ns, ann.epoch, device="controller/right"))
+        lab.poll()
+        assert lab.drops.by_reason["observation_unusable"] == i + 1
+    assert ann.proposals() == []
+    report = lab.service.complete_report(1, None, lab.now_ns)
+    assert report is not None
+    assert (report.observations, report.unusable) == (0, 10)
+    assert LATE in report.advice
+    told = [e.message for e in ann.entries() if isinstance(e.message, AlignmentProposal) and LATE in e.message.advice]
+    assert len(told) == (kind in ("touch", "persistent")), "at once, to who waits for an answer"

@@ -281,7 +281,7 @@ def test_touches_are_bounded() -> None:
     many = {"sheet": {str(n): (0.01 * n, 0.03 * (n % 3), 0.0) for n in range(16)}}
     touches = TouchEstimator(ANCHORS, many, {})
     for n in range(200):
-        assert touches.add_touch(Observation("sheet", "touch", IDENTITY, n, 1, device=RIGHT, mark=str(n % 16)))
+        assert touches.add_touch(Observation("sheet", "touch", IDENTITY, n, 1, device=RIGHT, mark=str(n % 16)), n)
     assert len(touches._touches) == MAX_POINTS
     assert max(len(kept) for kept in touches._touches.values()) <= 5
     assert touches._touches[next(iter(touches._touches))][0].sigma_m == FINGERTIP_SIGMA_M

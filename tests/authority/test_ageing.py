@@ -6,7 +6,7 @@ import pytest
 
 from anchors.ageing import AgeingLaw
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Align, Heartbeat, PlaceAlignment
+from iris_session.protocol.client_messages import Align, Heartbeat, MoveAnchor, PlaceAlignment
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Join, Lost
 from iris_session.protocol.names import AlignmentDoubt, HoldReason, RejectReason
@@ -173,3 +173,39 @@ def test_without_the_law_nothing_ages() -> None:
     assert report(t, anna).error_at_robot_m == before
     anna.engage("left")
     assert t.command().kind == "pose"
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_an_estimate_without_a_new_look_ends_neither_age_nor_doubt(moved: bool) -> None:
+    """A front estimates again what it saw half an hour ago: an anchor was moved, or a sheet of a wrong size refused."""
+    t = Table(CONFIG)
+    boss = t.join("director", alignment="not_needed")
+    anna = t.operator("left")
+    looked_ns = t.now_ns
+    t.step(anna.says(proposal(looked_ns=looked_ns)))
+    pass_minutes(t, 30)
+    before = report(t, anna)
+    assert before.doubt == AlignmentDoubt.AGED
+    if moved:
+        boss.asks(MoveAnchor(1, "table", Pose((0.0, -0.55, 0.0), IDENTITY.q)))
+        t.step()
+    t.step(anna.says(proposal(T_world_tracking=Pose((1.05, 0.0, 0.0), IDENTITY.q), looked_ns=looked_ns)))
+    t.wait(5 * SECOND)
+    after = report(t, anna)
+    assert after.doubt == AlignmentDoubt.AGED
+    assert after.confirmed_ns > before.confirmed_ns
+    assert after.error_at_robot_m >= before.error_at_robot_m
+    assert after.version == before.version + moved, "the same looks at the new place of the anchor"
+    t.step(anna.says(proposal(looked_ns=t.now_ns + SECOND)))
+    t.wait(5 * SECOND)
+    assert report(t, anna).doubt == ""
+    assert 0 <= report(t, anna).confirmed_ns <= 6 * SECOND
+
+
+def test_an_estimate_is_as_old_as_its_newest_look() -> None:
+    t = Table(CONFIG)
+    anna = t.operator("left")
+    pass_minutes(t, 10)
+    t.step(anna.says(proposal(looked_ns=t.now_ns - 4 * MINUTE)))
+    t.wait(SECOND)
+    assert report(t, anna).confirmed_ns >= 4 * MINUTE
