@@ -94,7 +94,7 @@ EXPLANATIONS: Final[Mapping[str, str]] = {
     "pair_shut_out": _PAIRING,
     "pair_busy": "pairing postponed; the client asks again",
     "observation_before_jump": "observations from before a jump of the tracking frame",
-    "observation_unusable": "observations of anchors that are too far away, captured more than 5 s ago, or unknown to the session",
+    "observation_unusable": "observations of anchors that are too far away, 5 s old, or unknown to the session",
     "observation_waiting": f"observations of anchors: {_FAST}",
     "tip_superseded": "poses of a tip, before those that came earlier were solved",
     "tip_waiting": "poses of the tips of more devices than are solved at a time",
