@@ -37,7 +37,7 @@ class Touch:
     """The tip rested on a marked point: `p_tracking_tip` averaged over that time.
 
     `sigma_m`: noise of this touch per axis. `tip`: the device that touched; if the covariance of its tip is known, that
-    counts too, turned by `q_tracking_tip`, the rotation of that controller.
+    counts too, turned by `q_tracking_tip`, the rotation of that controller. `capture_ns`: when it touched.
     """
 
     point: str
@@ -45,6 +45,7 @@ class Touch:
     sigma_m: float = TOUCH_SIGMA_M
     tip: str = ""
     q_tracking_tip: Quat = IDENTITY_POSE[1]
+    capture_ns: int = 0
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -48,6 +48,8 @@ FINGERTIP_SIGMA_M: Final = 0.010
 UNCALIBRATED_TIP_SIGMA_M: Final = 0.003 / math.sqrt(3.0)
 #: Coarser touches do not make an alignment to drive with.
 MAX_DRIVING_SIGMA_M: Final = 0.004
+#: The frame drifts by 3 mm meanwhile: older touches and kept anchors do not count beside a new touch.
+MAX_AGE_NS: Final = 60_000_000_000
 #: No client can state that its touches are better.
 MIN_SIGMA_M: Final = 0.0005
 #: A kept anchor that has moved by less is where it was.
@@ -115,7 +117,7 @@ class TouchEstimator:
         self._touches: dict[_Point, deque[Touch]] = {}
         self._suspects: frozenset[str] = frozenset()
         self._kept: _Kept | None = None
-        self._looks: dict[str, tuple[int, int]] = {}  # by anchor: times of the first and the last touch
+        self._kept_ns = 0  # when it was reported last
         self._tracking_epoch = 0
         self.pending = False
         self.looked_ns = 0
@@ -138,15 +140,19 @@ class TouchEstimator:
             return False
         if not self._begin_epoch(observation.tracking_epoch):
             return False
+        turned = quat_normalize(pose.q) if is_rigid((pose.p, pose.q)) else IDENTITY_POSE[1]
+        touch = Touch(point.name, pose.p, sigma, observation.device, turned, observation.capture_ns)
+        if any(replace(t, capture_ns=touch.capture_ns) == touch for t in self._touches.get(point, ())):
+            return True  # sent once more
+        self._keep_touches(lambda t: observation.capture_ns - t.capture_ns <= MAX_AGE_NS)
+        if observation.capture_ns - self._kept_ns > MAX_AGE_NS:
+            self._kept = None
         kept = self._touches.pop(point, None) or deque(maxlen=MAX_TOUCHES_PER_POINT)
         if point.name in self._suspects:  # touched again after a refusal: the earlier touches were wrong
             kept.clear()
             self._suspects -= {point.name}
-        turned = quat_normalize(pose.q) if is_rigid((pose.p, pose.q)) else IDENTITY_POSE[1]
-        kept.append(Touch(point.name, pose.p, sigma, observation.device, turned))
+        kept.append(touch)
         self._touches[point] = kept
-        first_ns, _ = self._looks.get(point.anchor_id, (observation.capture_ns, 0))
-        self._looks[point.anchor_id] = first_ns, observation.capture_ns
         while len(self._touches) > MAX_POINTS:
             del self._touches[next(iter(self._touches))]
         self.pending, self.looked_ns = self._suffice(), now_ns
@@ -172,10 +178,11 @@ class TouchEstimator:
         covariance = validate_covariance(observation.covariance)
         kept = _Kept(observation.anchor_id, (pose.p, quat_normalize(pose.q)), covariance)
         if self._kept is not None and kept.is_like(self._kept):
+            self._kept_ns = max(self._kept_ns, observation.capture_ns)
             return True
         if self._align_kept(kept) is None:
             return False
-        self._kept = kept
+        self._kept, self._kept_ns = kept, observation.capture_ns
         self.pending, self.looked_ns = True, now_ns
         return True
 
@@ -225,18 +232,20 @@ class TouchEstimator:
 
     def discard_touches(self, device: str) -> None:
         """Discard the touches of a device: they were made with another tip."""
-        for point, kept in list(self._touches.items()):
-            left = [t for t in kept if t.tip != device]
+        self._keep_touches(lambda t: t.tip != device)
+        self.pending = self._suffice() or self._kept is not None
+
+    def _keep_touches(self, is_kept: Callable[[Touch], bool]) -> None:
+        for point, touches in list(self._touches.items()):
+            left = [t for t in touches if is_kept(t)]
             if left:
                 self._touches[point] = deque(left, maxlen=MAX_TOUCHES_PER_POINT)
             else:
                 del self._touches[point]
-        self.pending = self._suffice() or self._kept is not None
 
     def reset(self) -> None:
         """Discard all touches and the kept anchor."""
         self._touches.clear()
-        self._looks.clear()
         self._suspects = frozenset()
         self._kept = None
         self.pending = False
@@ -246,8 +255,10 @@ class TouchEstimator:
         cannot be solved."""
         self.pending = False
         estimate, kind = self._estimate()
-        touched = {point.anchor_id for point in self._touches}
-        looks = tuple((name, *times) for name, times in self._looks.items() if name in touched)
+        times: dict[str, list[int]] = {}
+        for point, touches in self._touches.items():
+            times.setdefault(point.anchor_id, []).extend(t.capture_ns for t in touches)
+        looks = tuple((name, min(ns), max(ns)) for name, ns in times.items())
         # More of the same would mend no refusal: the wearer is to hear of it at once (0), not to go on looking.
         return replace(estimate, n_viewpoints=0, n_observations=0, looks=looks), kind
 

@@ -66,7 +66,7 @@ def doubt_age(ctx: Context, p: Participant) -> None:
     """Make an alignment that is too old unconfirmed, and ask its wearer for a glance."""
     sheet = min(ctx.state.anchors.items(), key=lambda item: _distance_to(item[1], p), default=("", None))[0]
     where = f"sheet '{sheet}'" if sheet else "a sheet"
-    glance = f"glance at {where}, or touch one of its marks"
+    glance = f"glance at {where}, or touch three of its marks"
     text = f"{describe_age(ctx, p)}: {'' if p.aligning else 'start its alignment run and '}{glance}"
     alignment.doubt_alignment(ctx, p, AlignmentDoubt.AGED, f"{text}; until then the next clutch moves nothing")
 

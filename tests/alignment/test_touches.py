@@ -358,3 +358,34 @@ def test_kept_anchor_of_an_old_tracking_frame_or_on_a_wall_is_not_used() -> None
     lab.poll()
     assert ann.proposals() == []
     assert lab.drops.by_reason["observation_unusable"] == 2
+
+
+def test_old_touches_do_not_outvote_a_new_one() -> None:
+    lab, ann = _lab()
+    _calibrate(ann)
+    for mark in "1234":
+        _touch(ann, mark)
+    known = len(ann.proposals())
+    assert known
+    lab.now_ns += 1800 * SECOND
+    ann.bump(0.05)
+    for mark in "12":
+        _touch(ann, mark)
+    assert len(ann.proposals()) == known
+    _touch(ann, "4")
+    got = ann.proposals()[-1]
+    assert len(ann.proposals()) == known + 1
+    assert _error_at(ann, got, ROBOT) < 0.012
+
+
+def test_touch_that_is_sent_once_more_is_no_news() -> None:
+    lab, ann = _lab()
+    _calibrate(ann)
+    for mark in "1234":
+        _touch(ann, mark)
+    before = len(ann.proposals())
+    lab.now_ns += 30 * SECOND
+    _touch(ann, "4")
+    lab.now_ns += SECOND
+    lab.poll()
+    assert len(ann.proposals()) == before

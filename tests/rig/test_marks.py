@@ -134,7 +134,7 @@ def test_fingertip_may_look_and_is_denied_to_drive_until_a_tip_is_calibrated() -
         rig.engage(hand)
 
 
-def test_a_touch_confirms_an_alignment_that_has_grown_old() -> None:
+def test_three_touches_confirm_an_alignment_that_has_grown_old() -> None:
     """A hundred times as fast as it drifts in use."""
     law = AgeingLaw(drift_m_per_min=0.2, yaw_rad_per_min=0.4)
     config = AuthorityConfig(ageing=law, age_check_ns=10_000_000)
@@ -148,7 +148,7 @@ def test_a_touch_confirms_an_alignment_that_has_grown_old() -> None:
         rig.run(0.3)
         assert ann.client.feedback["left"].hold_reason == HoldReason.UNCONFIRMED
         hand.clutch = False
-        ann.touch_marks(found.p_grip_tip, "1")
+        ann.touch_marks(found.p_grip_tip, "123")
         rig.engage(hand)
 
 
