@@ -12,7 +12,7 @@ covariance (Birge ratio: chi-square per degree of freedom). Without a majority t
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -72,6 +72,8 @@ __all__ = [
 
 #: Groups of different eras have viewpoint numbers that differ by multiples of this.
 _ERA: Final = 1 << 64
+#: Looks at other anchors vouch for the frame for so long [ns]: it may jump between looks.
+_JUST_BEFORE_NS: Final = 10_000_000_000
 
 
 @dataclass(frozen=True)
@@ -291,8 +293,9 @@ class AlignmentEstimator:
             is_gradual: It did not jump: an error of scale could explain it, as looks from other distances show one.
 
         Returns:
-            Two or more anchors that agree with each other, if this one never agreed with them: then it is outvoted, and
-            the alignment stays. `None` if an error of scale explains all looks. Else empty.
+            Two or more anchors that agree with each other, if two of them were seen just before and this one never
+            agreed with them: then it is outvoted, and the alignment stays. `None` if an error of scale explains all
+            looks. Else empty.
         """
         if self._changed and self._changed != anchor_id:
             return ()  # the first contradiction is still open: what is later than that decides
@@ -311,10 +314,19 @@ class AlignmentEstimator:
             return ()
         prior = self.config.prior
         opinion = weigh_earlier_looks(self._build_problem(keys, merged), anchor_id, prior)
-        if len(opinion.others) >= 2 and not opinion.fitted:
+        if len(self._select_recent(earlier, opinion.others, since_ns)) >= 2 and not opinion.fitted:
             return opinion.others
         self._changed = anchor_id
         return ()
+
+    def _select_recent(
+        self, groups: Mapping[GroupKey, ViewpointGroup], names: Iterable[str], since_ns: int
+    ) -> list[str]:
+        """Return the anchors that were seen shortly before `since_ns`: older looks may be of a frame that jumped."""
+        last: dict[str, int] = {}
+        for key, group in groups.items():
+            last[key[0]] = max(last.get(key[0], 0), group.observations[-1].capture_ns)
+        return [name for name in names if name in last and since_ns - last[name] <= _JUST_BEFORE_NS]
 
     def _is_explained_by_scale(self) -> bool:
         """Return whether an error of scale makes all looks agree that do not without it."""

@@ -207,7 +207,8 @@ class DriftMonitor:
             beside = self._find_steady_anchors(anchor_id, new[0].capture_ns)
             alarm = self._raise_alarm("differs", anchor_id, differs, now_ns, beside, new[0].capture_ns)
             return alarm._replace(p=to_vec3(now.p))
-        self._steady_ns[anchor_id] = now_ns
+        if alignment is not None and not alignment.refused and alignment.tracking_epoch == self.tracking_epoch:
+            self._steady_ns[anchor_id] = now_ns  # what was compared with nothing says nothing of the frame
         return None
 
     def _select_window(self, seen: deque[_Detection]) -> list[_Detection]:

@@ -207,7 +207,6 @@ class ConnectionEstimator:
             return self._touches.add_persistent(observation, now_ns)
         if observation.kind == AnchorKind.CONTROLLER:  # tracked: neither distance nor mirrored poses matter
             covariance, p_tracking_head = covariance or _CONTROLLER, None
-        source = ObservationSource.HOLDER if observation.kind == AnchorKind.CONTROLLER else ObservationSource.QR_CAMERA
         misprints = self._estimator.wrong_size
         try:
             used = self._estimator.add(
@@ -220,7 +219,7 @@ class ConnectionEstimator:
                 size_m=observation.size_m,
                 covariance=covariance,
                 p_tracking_head=p_tracking_head,
-                source=observation.source or source,
+                source=_choose_source(observation),
                 shift=look.shift,
             )
         except NUMERICAL_ERRORS:
@@ -345,6 +344,14 @@ class ConnectionEstimator:
 def _to_refusal(tracking_epoch: int, advice: str) -> AlignmentProposal:
     p, q = IDENTITY_POSE
     return AlignmentProposal(Pose(p, q), tracking_epoch, (), p, 0.0, refused=True, advice=advice[:MAX_TEXT])
+
+
+def _choose_source(observation: Observation) -> str:
+    """Return the source whose biases count: one that fits the kind, and of an unknown name the one that errs most."""
+    if observation.kind == AnchorKind.CONTROLLER:
+        return ObservationSource.HOLDER
+    is_camera = observation.source in ("", ObservationSource.QR_CAMERA)
+    return ObservationSource.QR_CAMERA if is_camera else ObservationSource.QR_SYSTEM
 
 
 def _to_proposal(estimate: AlignmentEstimate, kind: str, looked_ns: int) -> AlignmentProposal:

@@ -121,8 +121,9 @@ def raise_alarm(ctx: Context, p: Participant, m: AlignmentAlarm) -> None:
         return
     if m.tracking_epoch > p.tracking_epoch:
         alignment.set_tracking_epoch(ctx, p, TrackingEpoch(m.tracking_epoch))
-    if m.kind == AlarmKind.DIFFERS and not m.beside and (p.correction is not None or p.alignment is None):
-        return  # known: the measurement is not in force (yet)
+    is_known = p.alignment is None or (p.correction is not None and not ctx.config.doubts)
+    if m.kind == AlarmKind.DIFFERS and not m.beside and is_known:
+        return
     size_m = min(max(0.0, m.size_m), ctx.config.reach_m) if math.isfinite(m.size_m) else ctx.config.reach_m
     witnesses = shifts.note_shift(ctx, p, m)
     kind = AlarmKind.CHANGED if witnesses and m.kind == AlarmKind.JUMP else m.kind
@@ -170,6 +171,7 @@ def _describe_alarm(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
         others = join_names(m.beside)
         return f"{p.name} sees anchor {m.anchor_id} {size} elsewhere, and {others} where it was: was the sheet moved?"
     advice = "look at an anchor sheet again" if p.aligning else "start its alignment run again"
+    advice = "have it placed again" if p.placed else advice
     if m.kind == AlarmKind.JUMP:
         return f"the tracking of {p.name} jumped by {size}: it is not aligned, robots hold; {advice}"
     holds = ", robots hold at the next engagement" if p.doubt else ""

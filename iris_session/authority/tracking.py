@@ -106,7 +106,8 @@ def _judge_pose(track: Track, limit: SpeedLimit, pose: Pose, capture_ns: int) ->
     verdict = _judge_step(track, limit, whole)
     if track.surprise is None:
         if verdict == STEADY:
-            _advance(track, whole, pose, capture_ns)
+            if not 0 <= capture_ns - track.pose_ns < SHORTEST_S * 1e9:  # else no velocity: measured with the next one
+                _advance(track, whole, pose, capture_ns)
         elif verdict == SURPRISE:
             track.surprise, track.surprise_ns = pose, capture_ns
         return verdict

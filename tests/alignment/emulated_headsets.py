@@ -50,12 +50,14 @@ class Wearer:
         T = self.lab.world[anchor]
         return Viewpoint(self.rng, T, p_head_world or viewpoint_around(self.rng, T[0], d))
 
-    def report_observation(self, view: Viewpoint, anchor: str = "sheet", kind: str = "qr", head: bool = True) -> None:
+    def report_observation(
+        self, view: Viewpoint, anchor: str = "sheet", kind: str = "qr", head: bool = True, source: str = ""
+    ) -> None:
         """Send one observation and the head pose of that time."""
         if head:
             self.report_head(head_in_tracking(self.frame, view))
         p, q = view.observe(self.frame, self.lab.world.get(anchor))
-        self.observe(Observation(anchor, kind, Pose(p, q), self.lab.now_ns, self.epoch, self.viewpoint))
+        self.observe(Observation(anchor, kind, Pose(p, q), self.lab.now_ns, self.epoch, self.viewpoint, source=source))
 
     def observe(self, observation: Observation) -> None:
         self.lab.service.process_observation(self.connection, observation, self.lab.now_ns)

@@ -102,3 +102,49 @@ def test_estimate_that_the_newest_look_contradicts_is_as_old_as_the_looks_that_a
     ann.report_observations(ann.place("c", 0.6), 10, "c")
     assert "c" in ann.proposals()[-1].moved
     assert ann.proposals()[-1].looked_ns <= looked_ns
+
+
+@pytest.mark.parametrize("names", ["ab", "abab"])
+def test_looks_before_a_silent_jump_do_not_outvote_a_sheet_seen_after_it(names: str) -> None:
+    lab = Lab(SHEETS)
+    ann = lab.wearer()
+    look(ann, names)
+    lab.now_ns += 20 * SECOND
+    ann.bump(0.05, 0.03)
+    look(ann, "c")
+    assert [(a.kind, a.anchor_id, a.beside) for a in ann.alarms()] == [("differs", "c", ())], "no other vouches"
+    assert look(ann, "a") == [], "one sheet cannot tell"
+    newest = look(ann, "b")[-1]
+    assert all(error_at_anchor(ann, newest, name) < 0.012 for name in "abc")
+
+
+def test_a_sheet_that_is_known_to_be_moved_vouches_for_no_frame() -> None:
+    lab = Lab(SHEETS)
+    ann = lab.wearer()
+    lab.world["c"] = shifted(SHEETS["c"], (0.05, 0.0, 0.0))
+    look(ann, "ababc")
+    known = len(ann.alarms())
+    lab.now_ns += 30 * SECOND
+    ann.bump(0.05, 0.03)
+    views = {name: ann.place(name, p_head_world=(0.4, 0.5, 1.4)) for name in "ca"}
+    for _ in range(20):
+        lab.now_ns += SECOND // 10
+        for name, view in views.items():
+            ann.report_observation(view, name)
+        lab.poll(2)
+    assert [(a.anchor_id, a.beside) for a in ann.alarms()[known:]][:1] == [("a", ())]
+
+
+@pytest.mark.parametrize("source", ["my_detector", "touch", "holder"])
+def test_a_source_that_does_not_fit_states_the_largest_error(source: str) -> None:
+    def measure(name: str) -> float:
+        lab = Lab(SHEETS)
+        ann = lab.wearer(seed=3)
+        view = ann.place("a", 0.6)
+        for _ in range(10):
+            lab.now_ns += SECOND // 10
+            ann.report_observation(view, "a", source=name)
+        lab.poll(2)
+        return ann.proposals()[-1].error_at_anchor_m
+
+    assert measure(source) == measure("qr_system") >= measure("qr_camera") == measure("")

@@ -98,6 +98,21 @@ def test_a_look_that_agrees_with_a_pending_correction_confirms_nothing() -> None
     assert report(t, anna).confirmed_ns > before
 
 
+def test_what_contradicts_a_pending_correction_ends_it() -> None:
+    t = Table()
+    anna = t.operator("left")
+    anna.engage("left")
+    t.step(anna.says(proposal(T_world_tracking=Pose((1.05, 0.0, 0.0), IDENTITY.q))))
+    anna.sends("left", clutch=True)
+    t.step(anna.says(AlignmentAlarm(AlarmKind.DIFFERS, 0, "table", 0.05)))
+    assert report(t, anna).doubt == AlignmentDoubt.CONTRADICTED
+    assert report(t, anna).pending_m == 0.0
+    anna.sends("left", clutch=False)
+    t.wait(2 * SECOND)
+    anna.engage("left")
+    assert t.hold() == HoldReason.UNCONFIRMED
+
+
 def test_where_nothing_is_doubted_an_engagement_begins() -> None:
     """As in recordings of earlier versions."""
     t = Table(AuthorityConfig(doubts=False))

@@ -73,6 +73,17 @@ def test_after_a_silence_less_is_a_jump(silence_s: float, jumps: bool) -> None:
     assert (JUMP in follow([(t, t, 0.0) for t in times] + [(t, t, 0.02) for t in later])) == jumps
 
 
+@pytest.mark.parametrize("tick_s", [0.0157, 0.020])
+def test_a_coarse_clock_makes_no_room_for_jumps(tick_s: float) -> None:
+    """72 Hz, two poses with one time of capture now and then, 0.5 m/s, 30 mm aside."""
+    for phase in range(20):
+        times = [k / 72 + phase / 1000 for k in range(72)]
+        points = [(t // tick_s * tick_s, 0.5 * t, 0.03 if k > 60 else 0.0) for k, t in enumerate(times)]
+        verdicts = follow(points)
+        assert JUMP in verdicts[60:]
+        assert JUMP not in verdicts[:60]
+
+
 def test_an_outlier_of_one_sample_waits_and_is_dropped() -> None:
     verdicts = follow([(k / 72, 0.001 * k + (0.03 if k == 6 else 0.0)) for k in range(10)])
     assert verdicts == [STEADY] * 5 + [SURPRISE, OUTLIER] + [STEADY] * 2
