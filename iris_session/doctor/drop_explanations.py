@@ -32,6 +32,7 @@ WEB_EXPLANATIONS: Final[Mapping[str, str]] = {
     "web_full": "web gateway: clients above the number that it takes",
     "web_gateway_only": "web gateway: clients that spoke in another name",
     "web_handshake": "web gateway: connections without a handshake of TLS: a certificate that is not trusted",
+    "web_body": "web gateway: requests with a body, which no request of the page has",
     "web_host": "web gateway: requests under a name that is not this machine's: use its address",
     "web_idle": "web gateway: connections that sent no request",
     "web_malformed": "web gateway: messages that are none",

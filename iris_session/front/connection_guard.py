@@ -198,7 +198,8 @@ class ConnectionGuard:
         )
         self._banned: dict[str, int] = {}  # key id -> session time until which it may not say hello
         self._flooded: dict[str, int] = {}  # address -> until when connections without hello have a lower limit
-        self._warnings: dict[tuple[str, str], tuple[int, str]] = {}
+        self._warnings: dict[str, tuple[int, str]] = {}  # participant id or address -> when, text
+        self._logged = TokenBucket(MAX_WARNINGS * SECOND / LOG_NS, MAX_WARNINGS)
         self._accepted = KeyedBuckets(CONNECTIONS_PER_S, CONNECTIONS_PER_S, 256)
         self._next_ns = 0
 
@@ -275,12 +276,14 @@ class ConnectionGuard:
         self._drops.count("flood")
         peer = " ".join(part for part in (address, f"({name})" if name else "") if part) or "an unknown address"
         text = (warning or f"flood from {peer}: {detail}")[:MAX_TEXT]
-        if now_ns - self._warnings.pop((address, detail), (-LOG_NS, ""))[0] >= LOG_NS:
+        flooder = subject or address
+        is_new = now_ns - self._warnings.pop(flooder, (-LOG_NS, ""))[0] >= LOG_NS
+        if is_new and self._logged.take(now_ns):
             log.warning("%s", text)
         self._audit.record(AuditKind.FLOOD, now_ns, subject=subject, name=name, address=address, detail=detail)
         while len(self._warnings) >= MAX_WARNINGS:
             del self._warnings[next(iter(self._warnings))]
-        self._warnings[address, detail] = (now_ns, text)
+        self._warnings[flooder] = (now_ns, text)
 
     def _report_subscriber_flood(self, address: str, key_id: str, now_ns: int) -> None:
         self.report_flood(address, "subscriptions", now_ns)

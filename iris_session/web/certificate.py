@@ -121,6 +121,9 @@ def make_tls_context(certificate_path: Path, key_path: Path) -> ssl.SSLContext:
     """Return the TLS settings of a server. Raises `ssl.SSLError` or `OSError`."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
+    # Not 1.3: a KeyUpdate is a record of 27 bytes that costs 56 us, never becomes data, and cannot be switched off.
+    context.maximum_version = ssl.TLSVersion.TLSv1_2
+    context.options |= ssl.OP_NO_RENEGOTIATION
     context.set_alpn_protocols(["http/1.1"])
     context.load_cert_chain(certificate_path, key_path, password=lambda: b"")  # never ask at a terminal
     return context

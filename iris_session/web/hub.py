@@ -133,7 +133,6 @@ class Browser:
         self.queued_bytes = 0
         self.opened_ns = now_ns
         self.heard_ns = now_ns
-        self.joined_ns = 0
         self.said_hello = False
         self.ticket = b""
         self.ticket_ns = 0
@@ -339,7 +338,7 @@ class Hub:
         if head.type == _WELCOME:
             self._leave(browser)
             browser.said_hello = True
-            browser.epoch, browser.joined_ns = head.connection_epoch, now_ns
+            browser.epoch = head.connection_epoch
         elif head.type == _BUDGET:
             browser.has_budget = True
             browser.wake()

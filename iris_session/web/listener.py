@@ -180,11 +180,11 @@ class Listener:
         if sum(one.owner == browser for one in self._guard.table.values()) < MAX_PER_BROWSER:
             connection.is_established, connection.owner = True, browser
 
-    def count_frames(self, transport: asyncio.BaseTransport | None) -> None:
-        """Count and limit the frames of a connection that becomes a WebSocket."""
+    def count_frames(self, transport: asyncio.BaseTransport | None) -> bool:
+        """Count and limit the frames of a connection that becomes a WebSocket. False: it is none of ours."""
         connection, protocol = self.find(transport), transport.get_protocol() if transport is not None else None
         if connection is None or not isinstance(protocol, WatchedProtocol):
-            return
+            return False
         network = find_network(connection.address[0])
 
         def take_extra(now_ns: int) -> bool:
@@ -199,6 +199,7 @@ class Listener:
             return False
 
         protocol.count_frames(take_frames)
+        return True
 
     def allow_handshake(self, address: str) -> bool:
         """Return whether an address may make one more handshake of TLS now."""
@@ -235,6 +236,7 @@ class Listener:
                 self._drops.count("web_accept")
                 await asyncio.sleep(_ACCEPT_PAUSE_S)
                 continue
+            await asyncio.sleep(0)  # `sock_accept` does not wait while connections do
             if self._tls is not None and not self.allow_handshake(str(peer[0])):
                 sock.close()
                 continue

@@ -188,15 +188,19 @@ class SocketWriter:
             return False
 
     async def send_pieces(self, message: bytes) -> bool:
-        """Send a large message, and let others send between its pieces. Return false if the WebSocket has closed.
+        """Send a large message, and let others send between its pieces. False: the client reads nothing, or has closed.
 
-        Does not wait for room. No other message may be sent meanwhile; what aiohttp sends by itself may come between.
+        No other message may be sent meanwhile; what aiohttp sends by itself may come between.
         """
         for begin in range(0, len(message), MEDIA_PIECE):
             if self.socket.closed or self._transport.is_closing():
                 return False
             self._transport.write(make_fragment(message, begin, min(begin + MEDIA_PIECE, len(message))))
             await asyncio.sleep(0)
+            while self._transport.get_write_buffer_size() > MEDIA_WINDOW and not self._transport.is_closing():
+                if self.is_slow():
+                    return False
+                await asyncio.sleep(_LOOK_S / 10)
         return True
 
     async def close(self, closing: Closing) -> None:
@@ -238,9 +242,9 @@ class WebServer:
         self._fault_logged = 0.0
         application = web.Application(middlewares=[self._guard], client_max_size=4096)
         application.router.add_get("/v1/info", self._info)
-        application.router.add_get("/v1/session", self._serve_session)
-        application.router.add_get("/v1/media", self._serve_media)
-        application.router.add_get("/v1/asset/{address}", self._serve_asset)
+        application.router.add_get("/v1/session", self._serve_session, allow_head=False)
+        application.router.add_get("/v1/media", self._serve_media, allow_head=False)
+        application.router.add_get("/v1/asset/{address}", self._serve_asset, allow_head=False)
         application.router.add_get("/{path:.*}", self._serve_page)
         quiet = logging.getLogger(f"{__name__}.http")
         quiet.setLevel(logging.CRITICAL)  # aiohttp logs every malformed request with a traceback
@@ -251,6 +255,7 @@ class WebServer:
             logger=quiet,
             keepalive_timeout=10.0,
             lingering_time=1.0,
+            auto_decompress=False,  # of bodies, which are refused, but read for `lingering_time`
             shutdown_timeout=_CLOSE_S,
             max_line_size=2048,
             max_field_size=4096,
@@ -298,10 +303,14 @@ class WebServer:
         hosts = request.headers.getall("Host", [])
         host = self._hosts.find_host(hosts[0]) if len(hosts) == 1 else ""
         try:
-            if not host:
+            if request.body_exists:
+                self._drops.count("web_body")
+                response: web.StreamResponse = web.Response(status=400, text="no request here has a body\n")
+                response.force_close()
+            elif not host:
                 self._drops.count("web_host")
                 text = "this name is not one of the session's machine: use its address"
-                response: web.StreamResponse = web.Response(status=421, text=f"{text}\n")
+                response = web.Response(status=421, text=f"{text}\n")
             elif not self._is_from_own_page(request, host):
                 self._drops.count("web_origin")
                 response = web.Response(status=403, text="pages of other sites may not use this session\n")
@@ -450,10 +459,10 @@ class WebServer:
         )
         if not socket.can_prepare(request).ok:
             raise web.HTTPBadRequest(reason=f"expected a WebSocket with subprotocol {SUBPROTOCOL}")
-        if getattr(request.protocol, "_message_tail", b""):  # no frame was counted that came before the answer
+        if request.protocol._message_tail:  # no frame was counted that came before the answer
             raise web.HTTPBadRequest(reason="a client waits for the answer to its handshake")
-        if self._listener is not None:
-            self._listener.count_frames(request.transport)
+        if self._listener is not None and not self._listener.count_frames(request.transport):
+            raise web.HTTPInternalServerError
         await socket.prepare(request)
         return socket
 

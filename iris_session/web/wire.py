@@ -47,6 +47,8 @@ CLOSE_TRY_AGAIN: Final = 1013
 
 _MAX_FRAMES: Final = 255
 _ENVELOPE_ELEMENTS: Final = 4
+#: More bytes than an envelope has up to its message: 5 for the array, 9 for each number, 5 + 31 for a name.
+_MAX_ENVELOPE_HEAD: Final = 64
 #: Bytes of a name that MessagePack encodes with one byte of length.
 _MAX_NAME: Final = 31
 
@@ -205,8 +207,11 @@ def splice_name(envelope: Bytes, name: str) -> bytes:
     encoded = name.encode()
     if len(encoded) > _MAX_NAME:
         raise TooLargeError("name", len(encoded), _MAX_NAME)
-    unpacker = msgpack.Unpacker(read_size=64)
-    unpacker.feed(envelope)
+    # An element that holds others would be filled in before they come: the head has none.
+    unpacker = msgpack.Unpacker(
+        max_buffer_size=_MAX_ENVELOPE_HEAD, max_array_len=0, max_map_len=0, max_bin_len=0, max_ext_len=0
+    )
+    unpacker.feed(memoryview(envelope)[:_MAX_ENVELOPE_HEAD])
     try:
         n_elements, version, epoch = unpacker.read_array_header(), unpacker.unpack(), unpacker.unpack()
         begin = unpacker.tell()

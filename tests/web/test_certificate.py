@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import ssl
 import stat
@@ -38,6 +39,30 @@ def test_it_is_made_once_and_private(home: KeyHome) -> None:
     der = ssl.PEM_cert_to_DER_cert(made.certificate_path.read_text())
     assert made.fingerprint.replace(":", "") == hashlib.sha256(der).hexdigest().upper()
     make_tls_context(made.certificate_path, made.key_path)
+
+
+def test_clients_get_tls_in_which_every_record_becomes_data_or_ends_it(home: KeyHome) -> None:
+    """TLS 1.3 has KeyUpdate, which does neither and cannot be switched off."""
+    made = load_or_make_certificate(home, [])
+    serving = make_tls_context(made.certificate_path, made.key_path)
+    assert serving.options & ssl.OP_NO_RENEGOTIATION
+
+    def connect(client: ssl.SSLContext) -> tuple[str | None, str | None]:
+        client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
+        client.set_alpn_protocols(["http/1.1"])
+        to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+        ends = [client.wrap_bio(to_client, to_server), serving.wrap_bio(to_server, to_client, server_side=True)]
+        for _ in range(4):
+            for end in ends:
+                with contextlib.suppress(ssl.SSLWantReadError):
+                    end.do_handshake()
+        return ends[0].version(), ends[0].selected_alpn_protocol()
+
+    assert connect(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)) == ("TLSv1.2", "http/1.1")
+    newest = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    newest.minimum_version = ssl.TLSVersion.TLSv1_3
+    with pytest.raises(ssl.SSLError):
+        connect(newest)
 
 
 def test_spki_hash_is_that_of_openssl(home: KeyHome) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import ssl
 from typing import Any
 from unittest.mock import Mock
 
@@ -196,6 +197,46 @@ def test_frames_that_are_no_message_end_their_websocket(path: str, frame: bytes)
     assert drops == {"web_flood": 1}
     answer, _ = asyncio.run(send(frame, b""))
     assert answer.startswith(b"HTTP/1.1 400")
+
+
+@pytest.mark.parametrize("is_allowed", [True, False])
+def test_others_have_their_turn_between_connections_that_wait(
+    monkeypatch: pytest.MonkeyPatch, *, is_allowed: bool
+) -> None:
+    async def count_turns() -> int:
+        served, turns = 0, 0
+
+        class Counting(Listener):
+            async def _serve(self, sock: socket.socket) -> None:
+                nonlocal served
+                served += 1
+                sock.close()
+
+            def allow_handshake(self, address: str) -> bool:
+                nonlocal served
+                served += not is_allowed
+                return is_allowed
+
+        (listening,) = open_listening_sockets(["127.0.0.1"], 0)
+        waiting = [socket.create_connection(listening.getsockname()) for _ in range(50)]
+        serving = Counting(asyncio.Protocol, ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), Drops())
+        serving.listen([listening])
+        while served < len(waiting):
+            turns += 1
+            await asyncio.sleep(0)
+        await serving.close()
+        for one in (listening, *waiting):
+            one.close()
+        return turns
+
+    assert asyncio.run(count_turns()) >= 50
+
+
+def test_frames_of_a_connection_that_is_not_ours_are_not_counted() -> None:
+    async def count() -> bool:
+        return Listener(asyncio.Protocol, None, Drops()).count_frames(None)
+
+    assert not asyncio.run(count())
 
 
 def test_listening_sockets_share_one_free_port() -> None:

@@ -10,9 +10,10 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
-from aiohttp import ClientError, ClientSession, WSMessage, WSMsgType, web
+from aiohttp import ClientError, ClientSession, WSMessage, WSMsgType, WSServerHandshakeError, web
 
 from iris_session.web import server, wire
 from iris_session.web.assets import ByteRate
@@ -156,6 +157,69 @@ def test_a_download_ends_with_the_admission(monkeypatch: pytest.MonkeyPatch) -> 
         return n
 
     assert 0 < asyncio.run(download()) < total
+
+
+@pytest.mark.parametrize(
+    ("request_line", "more", "status"),
+    [
+        ("GET /", "Content-Encoding: deflate\r\nContent-Length: 9\r\n\r\nx", 400),
+        ("GET /", "Transfer-Encoding: chunked\r\n\r\n", 400),
+        ("GET /", "Content-Length: 0\r\n\r\n", 200),
+        (f"HEAD /v1/asset/{'ab' * 32}", "\r\n", 404),
+        ("HEAD /v1/session", "\r\n", 404),
+        ("HEAD /", "\r\n", 200),
+    ],
+)
+def test_requests_with_a_body_and_heads_of_no_page(request_line: str, more: str, status: int) -> None:
+    async def request() -> tuple[bytes, bytes]:
+        async with serve(Hub()) as (page, serving):
+            host, port = page.removeprefix("http://").rstrip("/").split(":")
+            reader, writer = await asyncio.open_connection(host, int(port))
+            writer.write(f"{request_line} HTTP/1.1\r\nHost: {host}:{port}\r\n{more}".encode())
+            head = await reader.readuntil(b"\r\n\r\n")
+            assert serving._runner._kwargs["auto_decompress"] is False
+            writer.close()
+            return head.split()[1], head.lower()
+
+    got, head = asyncio.run(request())
+    assert got == str(status).encode()
+    assert (b"connection: close" in head) == (status == 400)
+
+
+def test_a_websocket_whose_frames_are_not_counted_is_refused() -> None:
+    class Listening:
+        def find(self, _transport: object) -> None:
+            return None
+
+        def count_frames(self, _transport: object) -> bool:
+            return False
+
+    async def connect() -> int:
+        async with serve(Hub()) as (page, serving), ClientSession() as session:
+            listening: Any = Listening()
+            serving.attach(listening)
+            with pytest.raises(WSServerHandshakeError) as error:
+                await open_socket(session, page)
+            return error.value.status
+
+    assert asyncio.run(connect()) == 500
+
+
+def test_media_waits_for_a_reader() -> None:
+    transport = Mock(spec=asyncio.Transport)
+    transport.get_extra_info.return_value = None
+    transport.is_closing.return_value = False
+    transport.get_write_buffer_size.side_effect = lambda: sum(len(one.args[0]) for one in transport.write.mock_calls)
+
+    async def write() -> None:
+        request, media = Mock(transport=transport), Mock(closed=False)
+        writing = asyncio.create_task(SocketWriter(media, request).send_pieces(bytes(64 * MEDIA_PIECE)))
+        for _ in range(100):
+            await asyncio.sleep(0)
+        writing.cancel()
+
+    asyncio.run(write())
+    assert transport.write.call_count <= 2
 
 
 @contextlib.asynccontextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,24 @@ def test_what_a_gateway_takes_the_session_takes_with_the_name_in_it() -> None:
     assert len(spliced) + CURVE_BYTES <= MAX_CONTROL_BYTES
     with pytest.raises(TooLargeError):
         decode_client(wire.splice_name(make(MAX_CLIENT_BYTES), "w" * NAME_LENGTH))
+
+
+@pytest.mark.parametrize("nested", [b"\xdd\x00\x0f\x42\x40", b"\xdf\x00\x0f\x42\x40"])
+def test_nested_heads_are_refused_before_they_take_memory(nested: bytes) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises(MalformedError):
+            wire.splice_name(b"\x94" + nested * 1000, "web-00112233aabb")
+        assert tracemalloc.get_traced_memory()[1] < 100_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_longest_head_of_an_envelope_is_read() -> None:
+    head = b"\xdd\0\0\0\4" + b"\xcf" + (1).to_bytes(8, "big") + b"\xcf" + (2**64 - 1).to_bytes(8, "big")
+    assert wire.splice_name(head + b"\xdb\0\0\0\0" + b"rest", "web-1") == head + b"\xa5web-1" + b"rest"
+    with pytest.raises(wire.ForgedNameError):
+        wire.splice_name(head + b"\xdb\0\0\0\x1f" + b"n" * 31, "web-1")
 
 
 def test_names_have_one_byte_of_length() -> None:
