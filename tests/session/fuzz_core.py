@@ -154,7 +154,7 @@ class Fuzz:
         number = rng.choice(FLOATS) if rng.random() < 0.2 else rng.uniform(0.1, 2.0)
         if name in ("tracking_epoch", "ticks", "request_id"):
             return 0 if rng.random() < 0.95 else rng.choice((1, 2**63 - 1))
-        if name in ("robots", "objects", "devices", "capabilities", "beside"):
+        if name in ("robots", "objects", "devices", "capabilities", "beside", "moved"):
             known = [r.name for r in self.core.scene.robots] if name == "robots" else WORDS
             return tuple(rng.choice(known if rng.random() < 0.9 else WORDS) for _ in range(rng.randrange(4)))
         if name == "targets":
@@ -167,10 +167,13 @@ class Fuzz:
             return tuple(self.pose() for _ in range(rng.randrange(4)))
         if name == "anchors":
             return {"table": self.pose()} if rng.random() < 0.5 else {}
+        if name == "looks":
+            times = ((rng.choice(COUNTS), self.now_ns - rng.randrange(10**10)) for _ in range(rng.randrange(3)))
+            return tuple(em.AnchorLooks(rng.choice(("table", *WORDS)), *rng.sample(pair, 2)) for pair in times)
         if name == "anchor_id":
             return rng.choice(("table", *WORDS))
-        if name in ("covariance", "q", "qd", "hand_joints"):
-            return (number,) * rng.choice([0, 1, 6, 7, 9, 36])
+        if name in ("covariance", "q", "qd", "hand_joints", "shift_m"):
+            return (number,) * rng.choice([0, 1, 3, 6, 7, 9, 36])
         if name in ("pivot_world", "p_world", "p_grip_tip"):
             return (number, 0.0, rng.choice(FLOATS))
         if "float" in kind:
