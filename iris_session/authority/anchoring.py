@@ -102,6 +102,7 @@ def _set_anchors(ctx: Context, anchors: dict[str, Pose], by: str) -> None:
         ctx.emit(AnchorMoved(name, anchors[name], by))
     for p in ctx.state.participants.values():
         p.correction = None
+        p.looks = {name: one for name, one in p.looks.items() if name in anchors}
         about = "" if p.alarm is None else p.alarm.anchor_id  # empty too where a head jumped: no anchor resolves that
         if about and (about in moved or about not in anchors):
             _clear_alarm(ctx, p)

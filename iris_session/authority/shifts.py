@@ -29,12 +29,12 @@ _MAX_WITNESSES: Final = 8
 
 def note_shift(ctx: Context, p: Participant, m: AlignmentAlarm) -> list[Participant]:
     """Note a shift of an anchor by which `p` is aligned, and return the others who see the same."""
-    looks = p.looks.get(m.anchor_id)
+    looks, T_world_anchor = p.looks.get(m.anchor_id), ctx.state.anchors.get(m.anchor_id)
     is_usable = len(m.shift_m) == 3 and all(math.isfinite(v) and abs(v) < ctx.config.reach_m for v in m.shift_m)
-    if not ctx.config.verify_pairs or looks is None or m.beside or not is_usable or m.kind == AlarmKind.TWO_PLACES:
+    is_usable = is_usable and not m.beside and m.kind != AlarmKind.TWO_PLACES
+    if not ctx.config.verify_pairs or looks is None or T_world_anchor is None or not is_usable:
         return []
     x, y, z = m.shift_m
-    T_world_anchor = ctx.state.anchors[m.anchor_id]
     covariance = alignment.compute_aged_covariance(ctx, p)
     p95_m = math.hypot(alignment.compute_position_p95(covariance, p.pivot_world, T_world_anchor.p), LOOKS_P95_M)
     p.shift = SheetShift(m.anchor_id, (float(x), float(y), float(z)), p95_m, ctx.now_ns)

@@ -6,7 +6,6 @@ cannot be decoded is found by `salvage.py`.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import struct
 import warnings
@@ -17,6 +16,11 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
 
 from iris_session.journal.errors import NotARecordingError
+
+try:
+    import fcntl
+except ImportError:  # a system without these locks, on which nothing records
+    fcntl = None  # type: ignore[assignment]
 
 MAGIC: Final = b"RRF2"
 FILE_HEAD: Final = 12
@@ -239,6 +243,8 @@ def read_chunks(path: str | Path, entities: str | Sequence[str]) -> Iterator[Any
 
 def wait_for_index(path: str | Path) -> None:
     """Wait while an index is being written: on a busy machine the file has a part of it for a while."""
+    if fcntl is None:
+        return
     with suppress(OSError), open(path, "rb") as file:
         fcntl.lockf(file, fcntl.LOCK_SH)  # apart from `flock`, which those that record hold
 

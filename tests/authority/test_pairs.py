@@ -8,7 +8,7 @@ import pytest
 from iris_session.authority import AuthorityConfig
 from iris_session.protocol.client_messages import Align, PlaceAlignment
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.protocol.entries import AlignmentAlarm, AnchorLooks, Join, Lost
+from iris_session.protocol.entries import AlignmentAlarm, AnchorLooks, Join, Lost, SessionResumed
 from iris_session.protocol.names import AlarmKind, AlignmentDoubt, HoldReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentAlarmed, Notice, SamplesRejected
 
@@ -40,6 +40,15 @@ def two(config: AuthorityConfig = CONFIG) -> tuple[Table, Person, Person]:
     ann = aligned(t, "ann", "left")
     t.wait(10 * SECOND)
     return t, ann, aligned(t, "bob", "right")
+
+
+def reconnect(t: Table, person: Person, run: str) -> Person:
+    """Let the first one who joined come back with the same tracking frame."""
+    t.people += 1
+    back = t.persons[t.people] = Person(t, t.people, "ann")
+    t.step(back.says(Join("key1", "operator", "ann", capabilities=(run,), resume_of=person.id)))
+    back.id = person.id
+    return back
 
 
 def doubt(t: Table, person: Person) -> str:
@@ -119,31 +128,22 @@ def test_a_look_that_disagrees_makes_everybody_glance() -> None:
 
 def test_a_reconnection_with_the_alignment_kept_costs_nothing() -> None:
     t = Table(CONFIG)
-    keep = {"capabilities": ("run:1",)}
-    ann, bob = aligned(t, "ann", **keep), aligned(t, "bob")
+    ann, bob = aligned(t, "ann", capabilities=("run:1",)), aligned(t, "bob")
     t.step(bob.says(Lost("closed")))
     t.step(ann.says(Lost("closed")))
     t.wait(10 * SECOND)
-    t.people += 1
-    again = msgspec.structs.replace(Join("key1", "operator", "ann", **keep), resume_of=ann.id)
-    back = t.persons[t.people] = Person(t, t.people, "ann")
-    t.step(back.says(again))
-    back.id = ann.id
-    see(t, back, "a")
+    see(t, reconnect(t, ann, "run:1"), "a")
     assert pairs(t) == []
 
 
 def test_who_was_away_is_asked_when_back() -> None:
     t = Table(CONFIG)
-    keep = {"capabilities": ("run:1",)}
-    ann = aligned(t, "ann", **keep)
+    ann = aligned(t, "ann", capabilities=("run:1",))
     t.step(ann.says(Lost("closed")))
     t.wait(5 * SECOND)
     bob = aligned(t, "bob")
     assert prompts(t, ann) == []
-    t.people += 1
-    back = t.persons[t.people] = Person(t, t.people, "ann")
-    t.step(back.says(msgspec.structs.replace(Join("key1", "operator", "ann", **keep), resume_of=ann.id)))
+    reconnect(t, ann, "run:1")
     t.wait(2 * SECOND)
     assert len(prompts(t, ann)) == 1
     t.step(bob.says(Lost("closed")))
@@ -269,6 +269,16 @@ def test_two_prints_of_one_id_hold_everybody_who_knows_no_other_sheet() -> None:
     t.step(ann.says(AlignmentAlarm(AlarmKind.TWO_PLACES, 0, "a", 0.8)))
     assert (doubt(t, ann), doubt(t, bob)) == (AlignmentDoubt.CONTRADICTED, "")
     assert [e.participant for e in t.events if isinstance(e, Notice) and e.level == "warning"] == [""]
+
+
+def test_a_sheet_that_the_resumed_session_does_not_have_is_not_looked_at() -> None:
+    t = Table(CONFIG)
+    ann = aligned(t, "ann", capabilities=("run:1",))
+    t.step(t.host(SessionResumed(SECOND, {"b": SHEETS["b"]})))
+    back = reconnect(t, ann, "run:1")
+    assert t.authority.build_alignment_reports()[back.id].error_at_robot_m > 0.0, "its alignment is kept"
+    t.step(back.says(shift()))
+    assert t.last(AlignmentAlarmed).witnesses == ()
 
 
 def test_bad_numbers_of_a_front_change_nothing() -> None:

@@ -13,7 +13,7 @@ const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string>
   untracked: "tracking lost",
   unaligned: "its holder is not aligned",
   view_only: "its holder is aligned well enough to look, not to drive",
-  unconfirmed: "the alignment of its holder is doubted: glance at a sheet, or touch a mark",
+  unconfirmed: "the alignment of its holder is doubted: glance at a sheet, or touch three marks",
   rejected: "a sample was rejected: open and close the clutch",
   estop: "e-stop",
   disconnected: "its holder is disconnected",
