@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
+import sys
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
@@ -17,10 +18,8 @@ from typing import Any, BinaryIO, Final, NamedTuple
 
 from iris_session.journal.errors import NotARecordingError
 
-try:
+if sys.platform != "win32":  # where nothing is recorded, and recordings are read
     import fcntl
-except ImportError:  # a system without these locks, on which nothing records
-    fcntl = None  # type: ignore[assignment]
 
 MAGIC: Final = b"RRF2"
 FILE_HEAD: Final = 12
@@ -243,10 +242,9 @@ def read_chunks(path: str | Path, entities: str | Sequence[str]) -> Iterator[Any
 
 def wait_for_index(path: str | Path) -> None:
     """Wait while an index is being written: on a busy machine the file has a part of it for a while."""
-    if fcntl is None:
-        return
-    with suppress(OSError), open(path, "rb") as file:
-        fcntl.lockf(file, fcntl.LOCK_SH)  # apart from `flock`, which those that record hold
+    if sys.platform != "win32":
+        with suppress(OSError), open(path, "rb") as file:
+            fcntl.lockf(file, fcntl.LOCK_SH)  # apart from `flock`, which those that record hold
 
 
 def get_size(path: str | Path) -> int:
