@@ -20,8 +20,10 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import secrets
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -33,6 +35,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import aiohttp
+import msgpack
 import psutil
 
 from iris_session.protocol.client_messages import (
@@ -202,22 +205,26 @@ async def read_all(reader: asyncio.StreamReader) -> None:
 
 async def open_websocket(
     host: str, port: int, *, joins: bool
-) -> tuple[asyncio.StreamReader, asyncio.StreamWriter, bytes]:
-    """Open a WebSocket; with `joins` say hello as an observer, and wait for the ticket. Return that, too."""
+) -> tuple[asyncio.StreamReader, asyncio.StreamWriter, bytes, int]:
+    """Open a WebSocket; with `joins` say hello as an observer, and wait for the ticket. Return that and the epoch of
+    the connection, too."""
     reader, writer = await asyncio.open_connection(host, port, limit=8 * MIB)
     writer.write(make_request(host, port))
     await reader.readuntil(b"\r\n\r\n")
-    ticket = b""
+    ticket, epoch = b"", 0
     if joins:
         hello = Hello("observer", "mallory", secret=secrets.token_bytes(32), alignment="not_needed")
         body = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(hello, 0))])
         writer.write(struct.pack(">BBH", 0x82, 0x80 | 126, len(body)) + bytes(4) + body)
         async with asyncio.timeout(10.0):
-            await reader.readuntil(b"\xa6ticket\xa6ticket\xd9")  # the type, then the field: a text
+            before = await reader.readuntil(b"\xa6ticket\xa6ticket\xd9")  # the type, then the field: a text
             length = (await reader.readexactly(1))[0]
             ticket = await reader.readexactly(length)
+        unpacker = msgpack.Unpacker()
+        unpacker.feed(before.split(b"\xb0connection_epoch")[1])
+        epoch = int(unpacker.unpack())
     print("connected", flush=True)
-    return reader, writer, ticket
+    return reader, writer, ticket, epoch
 
 
 async def attack_with_frames(host: str, port: int, kind: str, bytes_per_s: float, *, joins: bool) -> None:
@@ -227,7 +234,7 @@ async def attack_with_frames(host: str, port: int, kind: str, bytes_per_s: float
     piece = frame * max(1, round(min(bytes_per_s * 0.02, 256e3) / len(frame)))
     while True:
         with contextlib.suppress(OSError, asyncio.IncompleteReadError):
-            reader, writer, _ = await open_websocket(host, port, joins=joins)
+            reader, writer, _, _ = await open_websocket(host, port, joins=joins)
             try:
                 writer.write(begin)
                 reading = asyncio.create_task(read_all(reader))
@@ -244,7 +251,7 @@ async def attack_with_handshakes(host: str, port: int) -> None:
     """Open a WebSocket and leave, a hundred times a second."""
     while True:
         with contextlib.suppress(OSError, asyncio.IncompleteReadError):
-            _, writer, _ = await open_websocket(host, port, joins=False)
+            _, writer, _, _ = await open_websocket(host, port, joins=False)
             writer.close()
         await asyncio.sleep(0.01)
 
@@ -253,7 +260,7 @@ async def attack_with_assets(host: str, port: int) -> None:
     """Request assets that nobody serves, as fast as answers come, by one observer after the other."""
     while True:
         with contextlib.suppress(OSError, asyncio.IncompleteReadError):
-            _, writer, ticket = await open_websocket(host, port, joins=True)
+            _, writer, ticket, _ = await open_websocket(host, port, joins=True)
             reader, http = await asyncio.open_connection(host, port)
             for _ in range(5000):
                 name = secrets.token_hex(32)
@@ -271,12 +278,12 @@ async def attack_with_assets(host: str, port: int) -> None:
 
 async def attack_by_reading_nothing(host: str, port: int) -> None:
     """Join, ask for snapshots, and read none of them nor any state."""
-    frame = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(GetSnapshot(), 0))])
     held: list[asyncio.StreamWriter] = []
     while True:
         with contextlib.suppress(OSError, TimeoutError, asyncio.IncompleteReadError):
-            reader, writer, _ = await open_websocket(host, port, joins=True)
+            reader, writer, _, epoch = await open_websocket(host, port, joins=True)
             reader._transport.pause_reading()  # type: ignore[attr-defined]
+            frame = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(GetSnapshot(), epoch))])
             writer.write(8 * (struct.pack(">BB", 0x82, 0x80 | len(frame)) + bytes(4) + frame))
             held.append(writer)
         while len(held) > 30:
@@ -285,12 +292,19 @@ async def attack_by_reading_nothing(host: str, port: int) -> None:
 
 
 async def attack_with_sockets(host: str, port: int, kind: str, n: int = 200) -> None:
-    """Keep connections that say nothing (`half_open`), or that request the page and read nothing (`unread`)."""
-    request = b"" if kind == "half_open" else f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode()
+    """Keep connections that say nothing (`half_open`), or that request the page's program and read nothing
+    (`unread`)."""
+    with urllib.request.urlopen(f"http://{host}:{port}/", timeout=5.0) as page:
+        program = re.findall(rb"assets/[\w.-]+\.js", page.read())[0].decode()
+    request = b"" if kind == "half_open" else f"GET /{program} HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode()
     writers: list[asyncio.StreamWriter] = []
     while True:
         with contextlib.suppress(OSError):
-            reader, writer = await asyncio.open_connection(host, port, limit=1)
+            sock = socket.socket()
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            sock.setblocking(False)
+            await asyncio.get_running_loop().sock_connect(sock, (host, port))
+            reader, writer = await asyncio.open_connection(sock=sock, limit=1)
             reader._transport.pause_reading()  # type: ignore[attr-defined]
             print("connected", flush=True)
             writer.write(request * 8)
@@ -343,7 +357,8 @@ async def run_case(kind: str, port: int, bytes_per_s: float, seconds: float) -> 
         attacker = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE)
         try:
             assert attacker.stdout is not None
-            await attacker.stdout.readline()  # it is connected
+            async with asyncio.timeout(LOST_S):
+                await attacker.stdout.readline()  # it is connected
             counting = asyncio.create_task(count_lines(attacker.stdout))
             times_ms = await measure(browser, seconds)
             is_open, is_attacking = not browser.is_closed, attacker.returncode is None
@@ -406,7 +421,7 @@ def run(cases: list[str], seconds: float) -> dict[str, Any]:
                 for bytes_per_s in RATES if kind.removeprefix(OBSERVER) in FRAMES else RATES[:1]:
                     try:
                         rows.append(asyncio.run(run_case(kind, port, bytes_per_s, seconds)))
-                    except NotWelcomedError:
+                    except (NotWelcomedError, TimeoutError):
                         rows.append({"case": kind, "is_open": False, "ok": False})
                     rows[-1]["grown_mib"] = round(read_memory_mib(gateway) - base_mib, 1)
                     print(f"hostile_web: {rows[-1]}", file=sys.stderr, flush=True)
