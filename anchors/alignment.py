@@ -186,6 +186,7 @@ class AlignmentEstimator:
     _era: int = 0  # looks since the last contradiction are groups of their own
     _changed: str = ""  # the sheet that contradicted the others since then, while it is not known why
     _left_out: dict[str, int] = field(default_factory=dict)  # sheets that were moved: era since then
+    _tested: dict[str, float] = field(default_factory=dict)  # how well the scale of each source is tested, in any frame
     _memory: ObservationBuffer = field(init=False)
 
     def __post_init__(self) -> None:
@@ -281,7 +282,7 @@ class AlignmentEstimator:
         self._against_gravity, self._misprints, self._near = 0, {}, None
         self._changed, self._left_out = "", {}
 
-    def weigh_alarm(self, anchor_id: str, since_ns: int, is_gradual: bool = True) -> tuple[str, ...] | None:
+    def weigh_alarm(self, anchor_id: str, since_ns: int) -> tuple[str, ...] | None:
         """Take note that an anchor is seen elsewhere than the alignment in force says.
 
         Earlier observations are kept: later ones decide what was moved (`anchors.evidence`). Where no other anchor was
@@ -290,7 +291,6 @@ class AlignmentEstimator:
         Args:
             anchor_id: Name of the anchor.
             since_ns: Capture time of the first observation that contradicts.
-            is_gradual: It did not jump: an error of scale could explain it, as looks from other distances show one.
 
         Returns:
             Two or more anchors that agree with each other, if two of them were seen just before and this one never
@@ -303,7 +303,8 @@ class AlignmentEstimator:
         between = {key for key in self._memory.groups if key[0] == self._changed and key[1] // _ERA == self._era}
         self._begin_era(since_ns)
         self._memory.discard_groups(between & self._memory.groups.keys())
-        if is_gradual and not self._changed and self._is_explained_by_scale():
+        if not self._changed and self._is_explained_by_scale(anchor_id):
+            self._undo_era(since_ns)
             return None
         self._left_out.pop(anchor_id, None)
         earlier = {key: one for key, one in self._memory.groups.items() if key[1] // _ERA < self._era}
@@ -328,10 +329,12 @@ class AlignmentEstimator:
             last[key[0]] = max(last.get(key[0], 0), group.observations[-1].capture_ns)
         return [name for name in names if name in last and since_ns - last[name] <= _JUST_BEFORE_NS]
 
-    def _is_explained_by_scale(self) -> bool:
+    def _is_explained_by_scale(self, anchor_id: str) -> bool:
         """Return whether an error of scale makes all looks agree that do not without it."""
-        keys, merged = self._merge(self._memory.select_mature_groups(self.config.min_observations))
-        if self._memory.newest_key not in keys:
+        new = {k: one for k, one in self._memory.groups.items() if k[0] == anchor_id and k[1] // _ERA == self._era}
+        # The looks that contradict agree with each other, so two of them count.
+        keys, merged = self._merge(self._memory.select_mature_groups(self.config.min_observations) | new)
+        if not new.keys() & set(keys):
             return False
         b = self._build_problem(keys, merged)
         found = explain_by_scale(b, solve_alignment(b, self.config.prior), merged, self.config.prior)
@@ -351,6 +354,12 @@ class AlignmentEstimator:
     def _begin_era(self, since_ns: int) -> None:
         """Make observations captured at `since_ns` or later groups of their own."""
         self._era += 1
+        era = _ERA * self._era
+        self._memory.split_groups(since_ns, lambda key: (key[0], key[1] % _ERA + era))
+
+    def _undo_era(self, since_ns: int) -> None:
+        """Undo `_begin_era`: looks from one viewpoint have common errors."""
+        self._era -= 1
         era = _ERA * self._era
         self._memory.split_groups(since_ns, lambda key: (key[0], key[1] % _ERA + era))
 
@@ -436,6 +445,7 @@ class AlignmentEstimator:
         agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
         if agreeing < self.config.min_observations or not self._is_majority(b, s, n_groups):
             return self._refuse(disagreement_advice(sorted(set(b.anchor))))
+        self._tested = {} if scales else self._tested | dict(zip(b.sources, s.tested.tolist(), strict=True))
         newest = self._memory.newest_key
         supported = any(ok and key == newest for key, ok in zip(keys, s.inside.tolist(), strict=True))
         return replace(
@@ -506,6 +516,7 @@ class AlignmentEstimator:
             np.array([min(ns - newest, 0) * 1e-9 for ns in times]),
             self.config.prior,
             self.config.biases,
+            self._tested,
         )
 
     def _is_majority(self, b: AlignmentProblem, s: AlignmentSolution, n_groups: int) -> bool:

@@ -44,7 +44,7 @@ _CERTAIN: Final = 4.0
 _WORTH_WORDS: Final = 0.01
 #: No printer is off by more: beyond it is the camera, if only one sheet was seen [share].
 _MAX_PRINT: Final = 0.03
-_MIN_LOOKS: Final = 3  # with fewer, an error of scale and a moved sheet look alike
+_MIN_LOOKS: Final = 2
 _MAX_SHEETS: Final = 8
 
 

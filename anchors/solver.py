@@ -74,6 +74,9 @@ class AlignmentProblem:
     information: Array  # (G, 6, 6), the inverse
     age_s: Array  # (G,)
     bias: Array  # (G, 6, K): shifts of the observed poses by one standard deviation of each of K common biases
+    untested: Array  # (G, 6, U): the same, of the untested scale of each source
+    sources: tuple[str, ...]  # (U,) their names
+    tested: Array  # (U,) how well earlier looks have tested it: variance of the prior over that by the looks
     scale: Array | None = None  # (G, 6, S): lines of sight of what shares each of S unknown errors of scale
 
     @property
@@ -99,6 +102,7 @@ class AlignmentSolution:
     weighted: Array  # (6 G, 9 + S) information times Jacobian of the groups inside
     inverse: Array  # (9 + S, 9 + S) covariance of everything unknown
     scale: Array  # (S,) errors of scale, share of the distance
+    tested: Array  # (U,) how well these looks, or earlier ones, test the scale of each source
 
     def measure_tilt(self, b: AlignmentProblem, tilt_sigma_rad: float) -> tuple[float, float]:
         """Return the tilt [rad] that the agreeing groups show together, without the gravity prior, and the 99.9 %
@@ -126,9 +130,10 @@ def build_problem(
     age_s: Array,
     prior: AlignmentPrior,
     biases: Mapping[str, SourceBias] = MappingProxyType({}),
+    tested: Mapping[str, float] = MappingProxyType({}),
 ) -> AlignmentProblem:
     """Return merged observations as arrays. Older ones are less certain: the tracking frame wanders. `biases`: what all
-    observations of one source share."""
+    observations of one source share; `tested`: how well earlier looks have tested the scale of each."""
     # Joined, not stacked: of small arrays that takes a third of the time.
     p = np.concatenate([m.p for m in merged]).reshape(-1, 3)
     q = quat_multiply(np.concatenate([m.q for m in merged]).reshape(-1, 4), quat_conjugate(q_world))
@@ -137,29 +142,43 @@ def build_problem(
         walked = prior.walk_m_per_sqrt_s**2 * np.maximum(-age_s - _STEADY_S, 0.0)
         covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
     information = np.linalg.inv(covariance)
+    sources = tuple(sorted({m.source for m in merged} & biases.keys()))
+    bias, untested = _compute_biases(merged, biases, sources)
+    known = np.array([tested.get(name, 0.0) for name in sources])
     return AlignmentProblem(
-        tuple(anchor), p_world, p, q, covariance, information, age_s, _compute_biases(merged, biases)
+        tuple(anchor), p_world, p, q, covariance, information, age_s, bias, untested, sources, known
     )
 
 
-def _compute_biases(merged: Sequence[MergedObservation], biases: Mapping[str, SourceBias]) -> Array:
-    """Return the shifts (G, 6, K) of all groups; sources have no bias in common."""
-    sources = sorted({m.source for m in merged} & biases.keys())
-    out = np.zeros((len(merged), 6, 9 * len(sources)))
+def _compute_biases(
+    merged: Sequence[MergedObservation], biases: Mapping[str, SourceBias], sources: tuple[str, ...]
+) -> tuple[Array, Array]:
+    """Return the shifts (G, 6, K) of all groups, and those (G, 6, U) by an untested scale; sources have no bias in
+    common."""
+    out, untested = np.zeros((len(merged), 6, 9 * len(sources))), np.zeros((len(merged), 6, len(sources)))
     for g, m in enumerate(merged):
         if m.source in sources:
-            k = 9 * sources.index(m.source)
-            out[g, :, k : k + 9] = biases[m.source].compute_shifts(m.p_head, m.p, m.q)
-    return out
+            i = sources.index(m.source)
+            out[g, :, 9 * i : 9 * i + 9] = biases[m.source].compute_shifts(m.p_head, m.p, m.q)
+            if m.p_head is not None:
+                untested[g, :3, i] = biases[m.source].untested_scale * (m.p - m.p_head)
+    return out, untested
 
 
 def select_groups(b: AlignmentProblem, which: Mask) -> AlignmentProblem:
     """Return the problem with some of its groups."""
-    anchor = tuple(name for name, ok in zip(b.anchor, which.tolist(), strict=True) if ok)
-    p, q, covariance, information = b.p[which], b.q[which], b.covariance[which], b.information[which]
-    scale = None if b.scale is None else b.scale[which]
-    return AlignmentProblem(
-        anchor, b.p_world[which], p, q, covariance, information, b.age_s[which], b.bias[which], scale
+    return replace(
+        b,
+        anchor=tuple(name for name, ok in zip(b.anchor, which.tolist(), strict=True) if ok),
+        p_world=b.p_world[which],
+        p=b.p[which],
+        q=b.q[which],
+        covariance=b.covariance[which],
+        information=b.information[which],
+        age_s=b.age_s[which],
+        bias=b.bias[which],
+        untested=b.untested[which],
+        scale=None if b.scale is None else b.scale[which],
     )
 
 
@@ -314,10 +333,7 @@ def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: A
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
     r = r - J @ step  # the last step was small: its linear effect is all there is
-    covariance = inverse[:6, :6]
-    if b.bias.size:  # considered, not estimated (Schmidt 1966): by how much each bias shifts the solution
-        shift = inverse[:6] @ (A.T @ b.bias.reshape(len(A), -1))
-        covariance = covariance + shift @ shift.T
+    covariance, tested = _cover_biases(b, weights, A, inverse)
     distance2 = np.add.reduce((b.information @ r[:, :, None])[:, :, 0] * r, axis=1)
     chi2 = float(weights @ distance2) + float(drift @ (diagonal[6:9] * drift)) + float(scale @ (diagonal[9:] * scale))
     freedom = 6.0 * float(weights.sum()) - 6.0
@@ -325,7 +341,25 @@ def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: A
         tilt = _tilt(q)
         chi2 += tilt_information * float(tilt @ tilt)
         freedom += 2.0
-    return AlignmentSolution(t, q, covariance, inside, chi2, freedom, drift, distance2, r[:, 3:], A, inverse, scale)
+    return AlignmentSolution(
+        t, q, covariance, inside, chi2, freedom, drift, distance2, r[:, 3:], A, inverse, scale, tested
+    )
+
+
+def _cover_biases(b: AlignmentProblem, weights: Array, A: Array, inverse: Array) -> tuple[Array, Array]:
+    """Return the covariance (6, 6) with the biases, which are considered, not estimated (Schmidt 1966): by how much
+    each shifts the solution. And how well the scale of each source is tested (U,): by looks from opposite sides or
+    several distances it is, by looks from one place not at all."""
+    covariance = inverse[:6, :6]
+    if not b.bias.size:
+        return covariance, b.tested
+    shift = inverse[:6] @ (A.T @ b.bias.reshape(len(A), -1))
+    c = b.untested.reshape(len(A), -1)
+    mixed = A.T @ c
+    tested = np.sum(c * (b.information @ b.untested * weights[:, None, None]).reshape(c.shape), axis=0)
+    tested = np.maximum(tested - np.sum(mixed * (inverse @ mixed), axis=0), b.tested)
+    more = inverse[:6] @ (mixed / np.sqrt(1.0 + tested))
+    return covariance + shift @ shift.T + more @ more.T, tested
 
 
 def _tilt(q: Array) -> Array:

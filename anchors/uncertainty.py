@@ -117,8 +117,9 @@ class NoiseModel:
 class SourceBias:
     """Errors that all looks of one headset share, standard deviations: more looks do not reduce them.
 
-    `scale`: share of the distance, along the view (size of a print, focal length). `direction_rad`: of the line of
-    sight, along either axis of the picture. `position_m`, `turn_rad`: per axis of the anchor (how a maker defines the
+    `scale`: share of the distance, along the view (size of a print, focal length); `untested_scale`: as much more,
+    until looks from several places have tested it. `direction_rad`: of the line of sight, along either axis of the
+    picture. `position_m`, `turn_rad`: per axis of the anchor (how a maker defines the
     pose of a controller, corners that a detector puts too far out).
     """
 
@@ -126,6 +127,7 @@ class SourceBias:
     direction_rad: float = 0.0
     position_m: float = 0.0
     turn_rad: float = 0.0
+    untested_scale: float = 0.0
 
     def compute_shifts(self, p_head: Array | None, p_anchor: Array, q_anchor: Array) -> Array:
         """Return by how much one standard deviation of each bias shifts an observed pose, tracking axes: (6, 9).
@@ -155,8 +157,14 @@ _UNKNOWN_DISTANCE_M: Final = 0.7
 #: By source of observations; docs/anchors.md, "Biases", says where the figures come from.
 SOURCE_BIASES: Final[Mapping[str, SourceBias]] = MappingProxyType(
     {
-        "qr_camera": SourceBias(scale=0.005, direction_rad=0.001, turn_rad=math.radians(0.4)),
-        "qr_system": SourceBias(scale=0.006, direction_rad=0.002, position_m=0.002, turn_rad=math.radians(0.4)),
+        "qr_camera": SourceBias(scale=0.005, direction_rad=0.001, turn_rad=math.radians(0.4), untested_scale=0.012),
+        "qr_system": SourceBias(
+            scale=0.006,
+            direction_rad=0.002,
+            position_m=0.002,
+            turn_rad=math.radians(0.4),
+            untested_scale=0.012,
+        ),
         "holder": SourceBias(position_m=0.002, turn_rad=math.radians(0.6)),
     }
 )

@@ -23,7 +23,7 @@ from iris_session.alignment.touches import MAX_TIPS, TouchEstimator
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import AlignmentProposal, AnchorLooks
-from iris_session.protocol.names import AlarmKind, AlignmentKind, AnchorKind, ObservationSource
+from iris_session.protocol.names import AlignmentKind, AnchorKind, ObservationSource
 from iris_session.protocol.status import AlignmentReport, AnchorSeen
 
 #: Errors that linear algebra raises for extreme input of a client.
@@ -111,7 +111,7 @@ class ConnectionEstimator:
         """
         beside: tuple[str, ...] | None
         try:
-            beside = self._estimator.weigh_alarm(alarm.anchor_id, alarm.since_ns, alarm.kind != AlarmKind.JUMP)
+            beside = self._estimator.weigh_alarm(alarm.anchor_id, alarm.since_ns)
         except NUMERICAL_ERRORS:
             beside = ()
             self._estimator.reset()

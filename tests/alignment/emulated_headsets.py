@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from anchors.lie import to_vec3
 from anchors.pose import PoseTuple, Vec3, compose, inverse, quat_from_yaw
 from iris_session.alignment.service import AlignmentService
 from iris_session.protocol.client_messages import Observation, Sample
@@ -33,7 +34,10 @@ class FakeConnection:
 
 
 class Wearer:
-    """One headset. `frame` is the true `T_world_tracking`, which a test may change without a new epoch."""
+    """One headset. `frame` is the true `T_world_tracking`, which a test may change without a new epoch. Its camera sees
+    everything too far away by the share `too_far`."""
+
+    too_far = 0.0
 
     def __init__(self, lab: Lab, number: int, seed: int) -> None:
         self.lab = lab
@@ -57,6 +61,8 @@ class Wearer:
         if head:
             self.report_head(head_in_tracking(self.frame, view))
         p, q = view.observe(self.frame, self.lab.world.get(anchor))
+        head_p = np.array(view.head_pose(self.frame))
+        p = to_vec3(head_p + (1.0 + self.too_far) * (np.array(p) - head_p))
         self.observe(Observation(anchor, kind, Pose(p, q), self.lab.now_ns, self.epoch, self.viewpoint, source=source))
 
     def observe(self, observation: Observation) -> None:

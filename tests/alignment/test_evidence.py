@@ -135,6 +135,22 @@ def test_a_sheet_that_is_known_to_be_moved_vouches_for_no_frame() -> None:
     assert [(a.anchor_id, a.beside) for a in ann.alarms()[known:]][:1] == [("a", ())]
 
 
+@pytest.mark.parametrize(("too_far", "seed"), [(0.05, 1), (-0.05, 2), (0.05, 3), (-0.05, 4)])
+def test_a_wrong_focal_length_is_told_from_a_jump(too_far: float, seed: int) -> None:
+    """Seen from near by, then from the other side: all is explained by the camera, and nothing is forgotten."""
+    lab = Lab({"a": SHEETS["a"]})
+    ann = lab.wearer(seed=seed)
+    ann.too_far = too_far
+    for head in ((0.3, 0.1, 1.1), (-0.6, 0.2, 1.5), (0.1, -0.5, 1.5)):
+        ann.report_observations(ann.place("a", p_head_world=head), 20, "a")
+        newest = ann.accept()
+        assert error_at_anchor(ann, newest, "a") < 3.0 * newest.error_at_anchor_m
+    assert error_at_anchor(ann, newest, "a") < 0.012
+    assert newest.n_viewpoints == 3
+    assert "camera" in newest.advice
+    assert ann.alarms() == []
+
+
 @pytest.mark.parametrize("source", ["my_detector", "touch", "holder"])
 def test_a_source_that_does_not_fit_states_the_largest_error(source: str) -> None:
     def measure(name: str) -> float:

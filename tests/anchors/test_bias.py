@@ -63,6 +63,24 @@ def test_neither_observations_nor_places_reduce_a_bias() -> None:
     assert turn >= bias.turn_rad
 
 
+def test_scale_is_uncertain_until_looks_from_two_sides_have_tested_it() -> None:
+    rng = np.random.default_rng(3)
+    frame, estimator = tracking_frame(rng), AlignmentEstimator({"a": SHEET})
+    along = []
+    for place, (x, epoch) in enumerate(((0.5, 0), (-0.9, 0), (0.5, 1))):
+        view = Viewpoint(rng, SHEET, (SHEET[0][0] + x, SHEET[0][1], SHEET[0][2] + 0.3))
+        for k in range(8):
+            pose, head = view.observe(frame), view.head_pose(frame)
+            estimator.add(
+                "a", pose, (30 * place + k) * 100_000_000, epoch, place, 1.0, 0.0, (), head, None, "qr_camera"
+            )
+        along.append(math.sqrt(estimator.estimate().covariance[0]))
+    once, twice, in_another_frame = along
+    assert once > 0.5 * SOURCE_BIASES["qr_camera"].untested_scale
+    assert twice < 0.6 * once
+    assert in_another_frame < 0.8 * once, "the camera is the same"
+
+
 @pytest.mark.parametrize("source", ["", "another"])
 def test_unknown_source_has_no_bias(source: str) -> None:
     of_none = look(np.random.default_rng(5), SourceBias(), "")[1]
