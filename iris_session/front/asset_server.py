@@ -39,6 +39,8 @@ ROUND: Final = 64
 CHUNKS: Final = 2
 #: While the front's loop is late, one chunk is sent per so long: the slowest headset still gets its scene.
 YIELD_MS: Final = 5
+#: Refusals that do not count against a gateway, which requests for many: it limits each of them by itself.
+_OF_OTHERS: Final = frozenset({AssetRefusal.UNKNOWN, AssetRefusal.TOO_MANY, AssetRefusal.RATE, AssetRefusal.BUSY})
 #: Pause after a fault of the server: a repeated fault must not use a whole processor.
 FAULT_S: Final = 0.25
 #: As plain integers: operations on the enumerations take longer than the calls that use them.
@@ -57,11 +59,13 @@ class AssetAccess(NamedTuple):
         clients: Connections that may request, with the key of their TCP connection (empty without encryption).
         allowed_keys: Fingerprints of the keys that may connect.
         folders: Assets that are served.
+        gateways: Connections that request for others.
     """
 
     clients: Mapping[int, str] = {}
     allowed_keys: frozenset[str] = frozenset()
     folders: tuple[AssetFolder, ...] = ()
+    gateways: frozenset[int] = frozenset()
 
 
 class AssetSockets:
@@ -232,9 +236,9 @@ class AssetServer:
             self._count_reasons([self._guard.record_message(descriptor, lengths, int(refused))])
 
     def _handle_request(self, route: bytes, descriptor: int, user: str, frame: zmq.Frame, *, single: bool) -> bool:
-        """Handle one message. Return whether it was refused."""
+        """Handle one message. Return whether it was refused in a way that counts against its connection."""
         now_ns = self._now_ns()
-        request_id, address = 0, ""
+        request_id, address, is_gateway = 0, "", False
         self.requests += 1
         try:
             request = decode_asset_request(frame.buffer if single else b"")
@@ -244,10 +248,11 @@ class AssetServer:
             reason = AssetRefusal.MALFORMED
         else:
             request_id, address = request.request_id, request.address
+            is_gateway = request.connection_epoch in self._applied.gateways
             reason = self._scheduler.request(route, descriptor, user, request, now_ns)
         if reason:
             self._queue_refusal(route, request_id, address, reason)
-        return bool(reason)
+        return bool(reason) and not (is_gateway and reason in _OF_OTHERS)
 
     def _queue_refusal(self, route: bytes, request_id: int, address: str, reason: str) -> None:
         """Refuse a request, at once or after the reader's pending chunks."""

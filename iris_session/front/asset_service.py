@@ -8,6 +8,7 @@ from typing import Final
 from iris_session.front.asset_server import AssetAccess, AssetFolder, AssetServer
 from iris_session.front.context import FrontContext
 from iris_session.link.config import MILLISECOND, SceneInfo
+from iris_session.protocol.names import Role
 from iris_session.protocol.status import AssetsReport
 
 PERIOD_NS: Final = 250 * MILLISECOND
@@ -111,7 +112,9 @@ class AssetService:
         keys: frozenset[str] = frozenset()
         if keyring.key is not None:
             keys = frozenset(key for key in keyring.fingerprints if not self._context.tokens.is_revoked(key))
-        access = AssetAccess(listeners, keys, self._folders)
+        connections = self._context.connections.by_number
+        gateways = frozenset(n for n in listeners if connections[n].hello.role == Role.GATEWAY)
+        access = AssetAccess(listeners, keys, self._folders, gateways)
         if access != self._published:
             self._published = access
             self._server.set_access(access)

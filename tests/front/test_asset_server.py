@@ -89,15 +89,15 @@ class Shop:
         self.fetchers: list[Fetcher] = []
         self.allow({1: ""})
 
-    def allow(self, clients: dict[int, str], *keys: KeyPair) -> None:
+    def allow(self, clients: dict[int, str], *keys: KeyPair, gateways: frozenset[int] = frozenset()) -> None:
         marks = frozenset(pair.fingerprint for pair in keys)
-        self.server.set_access(AssetAccess(clients, marks, ((str(self.root), tuple(self.addresses)),)))
+        self.server.set_access(AssetAccess(clients, marks, ((str(self.root), tuple(self.addresses)),), gateways))
 
-    def receive(self, fetcher: Fetcher, n: int) -> None:
+    def receive(self, fetcher: Fetcher, n: int, address: str = "") -> None:
         """Send so many requests for 5 bytes, and process them."""
         wanted = self.server.requests + n
         for _ in range(n):
-            fetcher.ask(self.addresses[1], 0, 5)
+            fetcher.ask(address or self.addresses[1], 0, 5)
         while self.server.requests < wanted and self.sockets.socket.poll(30_000):
             self.server._receive_requests()
         assert self.server.requests == wanted
@@ -243,3 +243,16 @@ def test_only_refused_requests_count_as_a_flood(still: Shop) -> None:
         still.server._send_chunks()
         assert still.server.sent_bytes == 5 * n
     assert still.server.drops.by_reason == {}
+
+
+def test_what_those_behind_a_gateway_cause_does_not_count_against_it(still: Shop) -> None:
+    still.allow({1: "", 2: ""}, gateways=frozenset({2}))
+    ann, gateway, n = Fetcher(still), Fetcher(still, epoch=2), TcpBounds().counted_messages // 8
+    for _ in range(10):
+        still.now_ns += 1_000_000_000  # slower than any rate
+        still.receive(gateway, n, "0" * 64)
+    assert still.server.drops.by_reason["assets_unknown_asset"] == 10 * n
+    assert "assets_flood" not in still.server.drops.by_reason
+    still.now_ns += 1_000_000_000
+    still.receive(ann, 8 * n + 1, "0" * 64)
+    assert still.server.drops.by_reason["assets_flood"] == 1

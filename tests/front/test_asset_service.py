@@ -52,9 +52,9 @@ class AssetServiceRig:
         self.clients, self.tokens = front.connections, front.tokens
         self.service = AssetService(front, self.server)  # type: ignore[arg-type]
 
-    def join(self, number: int, key: str, gateway: int = 0) -> None:
+    def join(self, number: int, key: str, gateway: int = 0, role: str = "observer") -> None:
         route, peer = Route(b"%d" % number), Peer(number, key)
-        connection = FrontConnection(number, route, peer, ("127.0.0.1", 1), key, Hello("observer", "Ann"), gateway)
+        connection = FrontConnection(number, route, peer, ("127.0.0.1", 1), key, Hello(role, "Ann"), gateway)
         connection.admitted = True
         self.clients.add(connection)
 
@@ -99,12 +99,13 @@ def test_access_is_by_own_key_or_gateway_key_and_never_by_revoked_keys() -> None
     listed = {mark: AllowedKey(mark, "") for mark in ("ann", "gate", "eve")}
     rig = AssetServiceRig(Keyring(KeyPair.generate(), read=lambda: listed))
     rig.join(1, "ann")
-    rig.join(2, "gate")
+    rig.join(2, "gate", role="gateway")
     rig.join(3, "bob", gateway=2)
     rig.tokens.revoke_key("eve")
     rig.service.tick(0)
     assert rig.server.table.allowed_keys == {"ann", "gate"}
     assert rig.server.table.clients == {1: "ann", 2: "gate", 3: "gate"}
+    assert rig.server.table.gateways == {2}
     rig.tokens.revoke_key("ann")
     rig.service.tick(PERIOD_NS)
     assert rig.server.table.allowed_keys == {"gate"}
