@@ -558,7 +558,7 @@ def check_web(data: bytes) -> None:
     else:
         wire.peek_server_message(frames[0])
         spliced = wire.splice_name(frames[0], WEB_NAME)
-        wire.peek_client_type(frames[0])
+        wire.peek_client_message(frames[0])
         assert codec.decode_client(spliced).on_behalf_of == WEB_NAME
 
 

@@ -34,6 +34,7 @@ WEB_EXPLANATIONS: Final[Mapping[str, str]] = {
     "web_handshake": "web gateway: connections without a handshake of TLS: a certificate that is not trusted",
     "web_body": "web gateway: requests with a body, which no request of the page has",
     "web_host": "web gateway: requests under a name that is not this machine's: use its address",
+    "web_identity": "web gateway: clients that said hello with another secret on the same WebSocket",
     "web_idle": "web gateway: connections that sent no request",
     "web_malformed": "web gateway: messages that are none",
     "web_no_hello": "web gateway: clients that did not join in time",

@@ -7,6 +7,7 @@ WebSockets, `gateway` the sockets of the session. A browser here is anything tha
 from __future__ import annotations
 
 import base64
+import hashlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
@@ -26,11 +27,12 @@ from iris_session.web.wire import (
     CLOSE_VERSION,
     CONTROL,
     STATE,
+    ClientHead,
     Ticket,
     decode_frames,
     encode_frames,
     encode_gateway_message,
-    peek_client_type,
+    peek_client_message,
     peek_server_message,
     splice_name,
 )
@@ -51,10 +53,11 @@ _HELLO: Final = "hello"
 _PAIR: Final = "pair"
 #: Networks whose pairing attempts and messages without a `welcome` are counted.
 MAX_NETWORKS: Final = 1024
+#: Identities that the session has welcomed, and whose messages without a `welcome` count for themselves.
+MAX_IDENTITIES: Final = 256
 #: Answers to malformed messages of one browser.
 _FAULTS_PER_S, _FAULT_BURST = 2.0, 5
-#: Requests of one browser for assets that the session does not serve: it closes a connection of the gateway, which all
-#: share, after 1,024 of them.
+#: Requests of one identity for assets that the session does not serve: each costs the session an answer.
 _UNKNOWN_PER_S, _UNKNOWN_BURST = 0.5, 32
 #: Media sockets that one browser opens: each is a handshake of the gateway's key, and the session allows 8 a second.
 _MEDIA_PER_S, _MEDIA_BURST = 0.5, 8
@@ -69,8 +72,8 @@ class HubLimits(msgspec.Struct, frozen=True):
         messages_per_s, message_burst: Messages of one browser.
         bytes_per_s, byte_burst: Their bytes.
         pair_per_s, pair_burst: Pairing attempts of one network; the session counts wrong ones against the gateway.
-        early_per_s, early_burst: Messages without a `welcome`, and hellos, of one network: the session counts those
-            against the gateway.
+        early_per_s, early_burst: Messages without a `welcome`, and hellos, of one network, and of one identity that
+            the session has welcomed before: the session counts those against the gateway.
         early_shared_per_s, early_shared_burst: More of them, which all networks share.
         queued_messages, queued_bytes: Control messages that wait for one browser; a snapshot has at most 32 MB.
         total_bytes: Control messages that wait for all browsers together.
@@ -111,6 +114,7 @@ class Browser:
     Attributes:
         name: What the gateway calls it in `on_behalf_of`.
         address: Of its peer; of IPv6 its network.
+        identity: SHA-256 of the secret in its hello, empty before.
         epoch: Connection epoch of its present `welcome`, 0 without one: then it gets no state, media and assets.
         has_budget: The session has sent its delivery budget, so that it may subscribe to media.
         outgoing: Control messages that wait, oldest first.
@@ -123,6 +127,7 @@ class Browser:
     def __init__(self, name: str, address: str, limits: HubLimits, now_ns: int) -> None:
         self.name = name
         self.address = find_network(address)
+        self.identity = b""
         self.epoch = 0
         self.has_budget = False
         self.outgoing: deque[bytes] = deque()
@@ -139,7 +144,6 @@ class Browser:
         self.messages = TokenBucket(limits.messages_per_s, limits.message_burst, now_ns)
         self.bytes = TokenBucket(limits.bytes_per_s, limits.byte_burst, now_ns)
         self.faults = TokenBucket(_FAULTS_PER_S, _FAULT_BURST, now_ns)
-        self.unknown_assets = TokenBucket(_UNKNOWN_PER_S, _UNKNOWN_BURST, now_ns)
         self.media_opens = TokenBucket(_MEDIA_PER_S, _MEDIA_BURST, now_ns)
 
     @property
@@ -171,6 +175,8 @@ class Hub:
         self._pairs = KeyedBuckets(self.limits.pair_per_s, self.limits.pair_burst, MAX_NETWORKS)
         self._early = KeyedBuckets(self.limits.early_per_s, self.limits.early_burst, MAX_NETWORKS)
         self._early_shared = TokenBucket(self.limits.early_shared_per_s, self.limits.early_shared_burst)
+        self._welcomed: dict[bytes, TokenBucket] = {}  # by identity; the one that was welcomed last comes last
+        self._unknown_assets = KeyedBuckets(_UNKNOWN_PER_S, _UNKNOWN_BURST, MAX_IDENTITIES)
         self._tickets: dict[bytes, tuple[Browser, int]] = {}  # with the time at which each expires
 
     def __len__(self) -> int:
@@ -241,7 +247,7 @@ class Hub:
 
     def note_unknown_asset(self, browser: Browser, now_ns: int) -> None:
         """Note that a browser asked for an asset that the session does not serve; too many close its WebSocket."""
-        if not browser.unknown_assets.take(now_ns):
+        if not self._unknown_assets.take(browser.identity, now_ns):
             self._reject(browser, CLOSE_LIMIT, "web_flood", "too many requests for assets that are not served")
 
     def allow_media(self, browser: Browser, now_ns: int) -> bool:
@@ -264,8 +270,6 @@ class Hub:
         if not browser.messages.take(now_ns) or not browser.bytes.take(now_ns, len(data)):
             self._reject(browser, CLOSE_LIMIT, "web_flood", "more messages than a client may send: send less")
             return None
-        if not browser.epoch and not self._take_early(browser, now_ns):
-            return None
         try:
             channel, frames = decode_frames(data)
             if channel != CONTROL or len(frames) != 1:
@@ -282,27 +286,45 @@ class Hub:
         return envelope if self._check_message(browser, frames[0], now_ns) else None
 
     def _take_early(self, browser: Browser, now_ns: int) -> bool:
-        """Return whether a message that the session may count against the gateway is within the limits of its network.
-        What is above closes the browser's WebSocket."""
+        """Return whether a message that the session may count against the gateway is within the limits of its identity,
+        if that was welcomed before, or of its network. What is above closes the browser's WebSocket."""
+        own = self._welcomed.get(browser.identity)
+        if own is not None and own.take(now_ns):
+            return True  # whatever others behind the same address send
         if self._early.take(browser.address, now_ns) or self._early_shared.take(now_ns):
             return True
         self._reject(browser, CLOSE_LIMIT, "web_flood", "too many messages before the welcome: come again")
         return False
+
+    def _identify(self, browser: Browser, secret: bytes) -> bool:
+        """Note the identity of a browser, which is that of its first hello: what it is allowed depends on that."""
+        identity = hashlib.sha256(secret).digest()
+        if browser.identity and browser.identity != identity:
+            self._reject(browser, CLOSE_NOT_ALLOWED, "web_identity", "a WebSocket has one identity: open another one")
+            return False
+        browser.identity = identity
+        return True
 
     def _check_message(self, browser: Browser, envelope: memoryview, now_ns: int) -> bool:
         """Return whether a message is for the session. What is not MessagePack is answered as the session would.
 
         Note a hello, after which the session has a connection to lose, and a bye, after which it has none.
         """
+        malformed, head = None, ClientHead()
         try:
-            kind = peek_client_type(envelope)
+            head = peek_client_message(envelope)
         except MalformedError as error:
+            malformed = error
+        kind = head.type
+        if kind == _HELLO and not self._identify(browser, head.secret):
+            return False
+        if (kind == _HELLO or not browser.epoch) and not self._take_early(browser, now_ns):
+            return False
+        if malformed is not None:
             self.drops.count("web_malformed")
             if browser.faults.take(now_ns):
-                fault = ServerEnvelope(PROTOCOL_VERSION, browser.epoch, ProtocolFault(error.code, str(error)))
+                fault = ServerEnvelope(PROTOCOL_VERSION, browser.epoch, ProtocolFault(malformed.code, str(malformed)))
                 self._queue(browser, encode_frames(CONTROL, (encode_server(fault),)))
-            return False
-        if kind == _HELLO and browser.epoch and not self._take_early(browser, now_ns):
             return False
         if kind == _PAIR and not self._pairs.take(browser.address, now_ns):
             text = "too many pairing attempts from this address: wait a minute"
@@ -339,6 +361,7 @@ class Hub:
             self._leave(browser)
             browser.said_hello = True
             browser.epoch = head.connection_epoch
+            self._note_welcomed(browser.identity, now_ns)
         elif head.type == _BUDGET:
             browser.has_budget = True
             browser.wake()
@@ -347,6 +370,13 @@ class Hub:
             browser.opened_ns = now_ns  # it has time to say hello again
         elif head.type == _REFUSED and not browser.epoch:
             browser.said_hello = False
+
+    def _note_welcomed(self, identity: bytes, now_ns: int) -> None:
+        limits = self.limits
+        bucket = self._welcomed.pop(identity, None)
+        self._welcomed[identity] = bucket or TokenBucket(limits.early_per_s, limits.early_burst, now_ns)
+        if len(self._welcomed) > MAX_IDENTITIES:
+            del self._welcomed[next(iter(self._welcomed))]
 
     def _queue(self, browser: Browser, message: bytes) -> None:
         """Queue a control message. A browser for which too much waits does not read: its WebSocket is closed. When too

@@ -27,7 +27,8 @@ from iris_session.web.wire import CLOSE_LIMIT, make_close_frame
 
 #: Connections of one browser that are established. It has two WebSockets, and 16 assets at once.
 MAX_PER_BROWSER: Final = 24
-#: Of one address: handshakes of TLS, which cost a millisecond each, and requests. The page has some ten files.
+#: Of one address: handshakes of TLS, which cost a millisecond each, and requests, those of a browser counted for
+#: itself. The page has some ten files.
 HANDSHAKES_PER_S, HANDSHAKE_BURST = 20.0, 120
 REQUESTS_PER_S, REQUEST_BURST = 200.0, 1000
 MAX_ADDRESSES: Final = 1024
@@ -208,9 +209,9 @@ class Listener:
         self._drops.count("web_handshake_rate")
         return False
 
-    def allow_request(self, address: str) -> bool:
-        """Return whether an address may make one more request now."""
-        if self._requests.take(find_network(address), time.monotonic_ns()):
+    def allow_request(self, owner: str) -> bool:
+        """Return whether the owner of a connection, a network or a browser, may make one more request now."""
+        if self._requests.take(owner, time.monotonic_ns()):
             return True
         self._drops.count("web_request_rate")
         return False

@@ -63,8 +63,8 @@ _CHECK_S: Final = 0.5
 _CLOSE_S: Final = 1.0
 _SMALL_MESSAGE: Final = 32_768
 TICKET_S: Final = 5.0
-#: Requests for assets at once: of one participant, and of all.
-ASSETS_PER_BROWSER: Final = 16
+#: Requests for assets at once: of one identity, and of all.
+ASSETS_PER_IDENTITY: Final = 16
 ASSETS_IN_ALL: Final = 128
 #: Bytes of an asset that are written at a time, in between state is sent.
 ASSET_PIECE: Final = 65_536
@@ -75,6 +75,7 @@ ASSET_BYTES_PER_S: Final = 48e6
 _SUBSCRIPTIONS_PER_S, _SUBSCRIPTIONS_BURST = 5.0, 20
 _RANGE: Final = re.compile(r"bytes=(\d{0,15})-(\d{0,15})")
 _TICKET_HEADER: Final = "X-Iris-Ticket"
+_COME_AGAIN: Final = {"Retry-After": "1"}
 _MAX_REASON: Final = 120
 _FAULT_LOG_S: Final = 10.0
 
@@ -237,7 +238,7 @@ class WebServer:
         self._page = page
         self._listener: Listener | None = None
         self._media: dict[str, SocketWriter] = {}
-        self._loads: dict[str, int] = {}
+        self._loads: dict[bytes, int] = {}  # requests for assets under way, by identity
         self._asset_rate = ByteRate(ASSET_BYTES_PER_S)
         self._fault_logged = 0.0
         application = web.Application(middlewares=[self._guard], client_max_size=4096)
@@ -287,10 +288,11 @@ class WebServer:
         """Check where a request comes from, and turn every error into an answer."""
         connection = None if self._listener is None else self._listener.find(request.transport)
         if connection is not None:
-            if self._listener is not None and not self._listener.allow_request(connection.address[0]):
-                if request.transport is not None:
-                    request.transport.abort()
-                raise ConnectionResetError
+            if self._listener is not None and not self._listener.allow_request(connection.owner):
+                response = web.Response(status=TOO_MANY, text="too many requests\n", headers=_COME_AGAIN)
+                response.headers.update(make_security_headers(""))
+                response.force_close()
+                return response
             connection.requests += 1
         try:
             return await self._answer(request, handler)
@@ -317,7 +319,7 @@ class WebServer:
             else:
                 response = await handler(request)
         except web.HTTPException as error:
-            response = web.Response(status=error.status, text=f"{error.reason}\n", headers=_pick_allow(error))
+            response = web.Response(status=error.status, text=f"{error.reason}\n", headers=_pick_headers(error))
         except (ConnectionError, asyncio.CancelledError):
             raise
         except Exception as error:  # a fault of ours must not end the connection of anyone else
@@ -387,18 +389,19 @@ class WebServer:
             raise web.HTTPUnauthorized(reason="no valid ticket")
         if not is_address(address):
             raise web.HTTPNotFound
-        n = self._loads.get(browser.name, 0)
-        if n >= ASSETS_PER_BROWSER or sum(self._loads.values()) >= ASSETS_IN_ALL:
+        identity = browser.identity
+        n = self._loads.get(identity, 0)
+        if n >= ASSETS_PER_IDENTITY or sum(self._loads.values()) >= ASSETS_IN_ALL:
             self._drops.count("web_assets_at_once")
-            raise web.HTTPTooManyRequests(reason="too many assets at once")
+            raise web.HTTPTooManyRequests(reason="too many assets at once", headers=_COME_AGAIN)
         self._establish(request, browser)
-        self._loads[browser.name] = n + 1
+        self._loads[identity] = n + 1
         try:
             return await self._send_asset(request, address, browser)
         finally:
-            left = self._loads.pop(browser.name, 1) - 1
+            left = self._loads.pop(identity, 1) - 1
             if left > 0:
-                self._loads[browser.name] = left
+                self._loads[identity] = left
 
     async def _send_asset(self, request: web.Request, address: str, browser: Browser) -> web.StreamResponse:
         try:
@@ -406,7 +409,7 @@ class WebServer:
         except AssetUnavailableError as error:
             if error.status == UNKNOWN:
                 self._hub.note_unknown_asset(browser, time.monotonic_ns())
-            headers = {"Retry-After": "1"} if error.status in (TOO_MANY, 503) else {}
+            headers = _COME_AGAIN if error.status in (TOO_MANY, 503) else {}
             return web.Response(status=error.status, text=f"{error}\n", headers=headers)
         total = len(view)
         part = _parse_range(request.headers.get("Range", ""), total)
@@ -639,9 +642,8 @@ class WebServer:
             await writer.close(Closing(CLOSE_NOT_ALLOWED, "the session has no connection for this participant now"))
 
 
-def _pick_allow(error: web.HTTPException) -> dict[str, str]:
-    allow = error.headers.get("Allow")
-    return {} if allow is None else {"Allow": allow}
+def _pick_headers(error: web.HTTPException) -> dict[str, str]:
+    return {name: error.headers[name] for name in ("Allow", "Retry-After") if name in error.headers}
 
 
 def _parse_range(text: str, total: int) -> tuple[int, int, bool] | None:

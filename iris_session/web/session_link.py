@@ -38,7 +38,7 @@ from iris_session.web.config import GatewayConfig
 from iris_session.web.hub import Browser, Hub
 from iris_session.web.sockets import SocketReader
 from iris_session.web.uplink import BrowserUplink
-from iris_session.web.wire import CLOSE_ENDED, CLOSE_RESTART, peek_client_type
+from iris_session.web.wire import CLOSE_ENDED, CLOSE_RESTART, peek_client_message
 
 #: Time for the gateway to be admitted by the session, before a WebSocket is closed with "come again".
 READY_S: Final = 5.0
@@ -180,7 +180,7 @@ class SessionLink:
         control = self._control
         if not len(self._uplink) and control is not None and control.send([envelope]):
             return None
-        kind = peek_client_type(envelope)
+        kind = peek_client_message(envelope).type
         excess = self._uplink.push(browser.name, kind, envelope, admitted=browser.is_admitted)
         return self._hub.find(excess) if excess else None
 

@@ -97,6 +97,13 @@ class ServerHead(NamedTuple):
     code: str
 
 
+class ClientHead(msgspec.Struct):
+    """Beginning of a client message: `type`, and the `secret` of a hello."""
+
+    type: str = ""
+    secret: bytes = b""
+
+
 class _Type(msgspec.Struct):
     type: str = ""
     code: str = ""
@@ -112,7 +119,7 @@ class _ClientEnvelope(msgspec.Struct, array_like=True):
     version: int
     connection_epoch: int
     on_behalf_of: str
-    message: _Type
+    message: ClientHead
 
 
 _server: Final = msgspec.msgpack.Decoder(_ServerEnvelope)
@@ -230,13 +237,13 @@ def splice_name(envelope: Bytes, name: str) -> bytes:
     return b"".join((data[:begin], _encoder.encode(name), data[end:]))
 
 
-def peek_client_type(envelope: Bytes) -> str:
-    """Return the type of a client message, empty for one without. Raises `MalformedError` for what is not MessagePack.
+def peek_client_message(envelope: Bytes) -> ClientHead:
+    """Return the head of a client message. Raises `MalformedError` for what is not MessagePack.
 
     The session checks the rest: it may know types that a gateway does not.
     """
     try:
-        return _client.decode(envelope).message.type
+        return _client.decode(envelope).message
     except BAD_BYTES as error:
         raise MalformedError(f"no envelope: {error}") from None
 

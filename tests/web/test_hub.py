@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.protocol.client_messages import Bye, Disconnected, Heartbeat, Hello, Pair, wrap_message
+from iris_session.protocol.client_messages import Bye, Disconnected, EStop, Heartbeat, Hello, Pair, wrap_message
 from iris_session.protocol.codec import decode_client, decode_server, encode_client, encode_server
 from iris_session.protocol.common import Message
 from iris_session.protocol.server_messages import Endpoints, ProtocolFault, ServerEnvelope, Welcome
 from iris_session.web import wire
-from iris_session.web.hub import SECOND, TICKET_BYTES, Browser, Hub, HubLimits
+from iris_session.web.hub import MAX_IDENTITIES, SECOND, TICKET_BYTES, Browser, Hub, HubLimits
 
-HELLO = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(Hello("observer", "ann", secret=bytes(32))))])
+
+def make_hello(secret: int) -> bytes:
+    hello = Hello("observer", "ann", secret=secret.to_bytes(32, "big"))
+    return wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(hello))])
+
+
+HELLO = make_hello(0)
+ESTOP = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(EStop(), 0))])
 PAIR = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(Pair("ann", bytes(32), identity=bytes(32))))])
 HEARTBEAT = wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(Heartbeat(), 5))])
 
@@ -31,8 +38,8 @@ def answer(hub: Hub, browser: Browser, message: Message, epoch: int = 5, *bulk: 
     assert hub.deliver([envelope, *bulk, browser.name.encode()], now_ns)
 
 
-def welcome(hub: Hub, browser: Browser, epoch: int = 5, now_ns: int = 0) -> None:
-    hub.receive(browser, HELLO, now_ns)
+def welcome(hub: Hub, browser: Browser, epoch: int = 5, now_ns: int = 0, secret: int = 0) -> None:
+    hub.receive(browser, make_hello(secret), now_ns)
     message = Welcome("s", "name", "live", "p1", epoch, "observer", b"t" * 16, False, 0, 1, 1, 1, Endpoints())
     answer(hub, browser, message, epoch, now_ns=now_ns)
 
@@ -105,7 +112,9 @@ def test_a_browser_without_a_welcome_may_say_little() -> None:
     assert browser.closing is not None
     welcome(hub, joined)
     assert all(hub.receive(joined, HEARTBEAT, 0) for _ in range(100))
-    assert [hub.receive(joined, HELLO, 0) is not None for _ in range(2)] == [True, False], "nor many hellos later"
+    assert [hub.receive(joined, HELLO, 0) is not None for _ in range(4)] == [True] * 3 + [False], (
+        "nor many hellos later"
+    )
 
 
 def test_many_sockets_of_a_network_say_no_more_before_the_welcome_than_one() -> None:
@@ -316,12 +325,12 @@ def test_a_full_hub_makes_room_only_by_those_that_have_not_joined() -> None:
     assert hub.drops.by_reason == {"web_evicted": 3, "web_full": 1}
 
 
-def test_unknown_assets_and_media_sockets_are_limited_by_browser() -> None:
+def test_unknown_assets_are_limited_by_identity_and_media_sockets_by_browser() -> None:
     hub = Hub()
     ann, bob = open_browser(hub, 1), open_browser(hub, 2)
-    for browser in (ann, bob):
-        welcome(hub, browser)
-        hub.issue_ticket(browser, bytes((browser is ann,)) * TICKET_BYTES, 0)
+    for secret, browser in enumerate((ann, bob)):
+        welcome(hub, browser, secret=secret)
+        hub.issue_ticket(browser, bytes((secret,)) * TICKET_BYTES, 0)
     for n in range(10):
         hub.note_unknown_asset(bob, n * SECOND)
     for _ in range(100):
@@ -329,7 +338,47 @@ def test_unknown_assets_and_media_sockets_are_limited_by_browser() -> None:
     assert ann.closing is not None
     assert ann.closing.code == wire.CLOSE_LIMIT
     assert hub.find_ticket(ann.ticket.decode(), 0) is None
+    again = open_browser(hub, 3)
+    welcome(hub, again)
+    hub.note_unknown_asset(again, 0)
+    assert again.closing is not None, "the same identity"
     assert bob.closing is None
     n_media = sum(hub.allow_media(bob, 10 * SECOND) for _ in range(100))
     assert 1 < n_media < 20
     assert hub.allow_media(bob, 20 * SECOND)
+
+
+def test_a_stop_of_one_that_was_welcomed_before_arrives_whatever_its_neighbours_say() -> None:
+    hub = Hub()
+    ann = open_browser(hub, 1)
+    welcome(hub, ann)
+    hub.close_browser(ann)
+    neighbours = [open_browser(hub, n) for n in range(2, 50)]
+    for n in range(20):
+        for secret, browser in enumerate(neighbours, 1):
+            hub.receive(browser, ESTOP if n else make_hello(secret), 0)
+    assert {browser.closing is None for browser in neighbours} == {False}
+    again, stranger = open_browser(hub, 50), open_browser(hub, 51)
+    assert hub.receive(stranger, make_hello(51), 0) is None
+    assert hub.receive(again, HELLO, 0) is not None
+    assert all(hub.receive(again, ESTOP, 0) is not None for _ in range(10))
+
+
+def test_identities_that_were_welcomed_are_bounded() -> None:
+    hub = Hub()
+    for n in range(MAX_IDENTITIES + 2):
+        browser = open_browser(hub, n)
+        welcome(hub, browser, now_ns=n * SECOND, secret=n)
+        assert browser.epoch
+        hub.close_browser(browser)
+    assert len(hub._welcomed) == MAX_IDENTITIES
+
+
+def test_a_websocket_has_one_identity() -> None:
+    hub = Hub()
+    browser = open_browser(hub)
+    assert all(hub.receive(browser, HELLO, 0) is not None for _ in range(2))
+    assert hub.receive(browser, make_hello(1), 0) is None
+    assert browser.closing is not None
+    assert browser.closing.code == wire.CLOSE_NOT_ALLOWED
+    assert hub.drops.by_reason == {"web_identity": 1}

@@ -13,7 +13,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
-from aiohttp import ClientError, ClientSession, WSMessage, WSMsgType, WSServerHandshakeError, web
+from aiohttp import ClientError, ClientSession, TCPConnector, WSMessage, WSMsgType, WSServerHandshakeError, web
 
 from iris_session.web import server, wire
 from iris_session.web.assets import ByteRate
@@ -141,22 +141,84 @@ def test_a_download_ends_with_the_admission(monkeypatch: pytest.MonkeyPatch) -> 
             return memoryview(bytes(total))
 
     async def download() -> int:
-        browser = hub.open_browser(bytes(range(6)), "127.0.0.1", time.monotonic_ns())
-        assert browser is not None
-        browser.epoch = 5
-        hub.issue_ticket(browser, bytes(32), time.monotonic_ns())
+        headers = open_with_ticket(hub, 0, b"ann")
+        (browser,) = hub
         assets: Any = Assets()
-        async with serve(hub, assets) as (page, _), ClientSession() as session:
-            headers = {"X-Iris-Ticket": browser.ticket.decode()}
-            async with session.get(f"{page}v1/asset/{address}", headers=headers) as response:
-                n = len(await response.content.readany())
-                browser.epoch = 0  # revoked: the WebSocket may still be open
-                with contextlib.suppress(ClientError):
-                    while more := await response.content.readany():
-                        n += len(more)
+        async with (
+            serve(hub, assets) as (page, _),
+            ClientSession() as session,
+            session.get(f"{page}v1/asset/{address}", headers=headers) as response,
+        ):
+            n = len(await response.content.readany())
+            browser.epoch = 0  # revoked: the WebSocket may still be open
+            with contextlib.suppress(ClientError):
+                while more := await response.content.readany():
+                    n += len(more)
         return n
 
     assert 0 < asyncio.run(download()) < total
+
+
+def open_with_ticket(hub: Hub, n: int, identity: bytes) -> dict[str, str]:
+    """Open a browser that the session has welcomed. Return the header of its requests for assets."""
+    browser = hub.open_browser(n.to_bytes(6, "big"), "127.0.0.1", time.monotonic_ns())
+    assert browser is not None
+    browser.epoch, browser.identity = 5, identity
+    hub.issue_ticket(browser, bytes((n,)) * 32, time.monotonic_ns())
+    return {"X-Iris-Ticket": browser.ticket.decode()}
+
+
+def test_one_identity_cannot_have_all_assets_at_once() -> None:
+    hub = Hub()
+
+    class Assets:
+        def __init__(self) -> None:
+            self.waiting = 0
+            self.may_answer = asyncio.Event()
+
+        async def find(self, _address: str) -> memoryview:
+            self.waiting += 1
+            await self.may_answer.wait()
+            return memoryview(b"")
+
+    async def request() -> list[tuple[int, str]]:
+        first, second, other = (open_with_ticket(hub, n, b"ann" if n < 2 else b"bob") for n in range(3))
+        assets = Assets()
+        connector = TCPConnector(limit=0)
+        async with serve(hub, assets) as (page, _), ClientSession(connector=connector) as session:
+
+            async def get(headers: dict[str, str]) -> tuple[int, str]:
+                async with session.get(f"{page}v1/asset/{'ab' * 32}", headers=headers) as response:
+                    return response.status, response.headers.get("Retry-After", "")
+
+            tasks = [asyncio.create_task(get((first, second)[n % 2])) for n in range(server.ASSETS_PER_IDENTITY)]
+            while assets.waiting < len(tasks):
+                await asyncio.sleep(0)
+            tasks += [asyncio.create_task(get(headers)) for headers in (second, other)]
+            while assets.waiting + tasks[-2].done() < len(tasks):
+                await asyncio.sleep(0)
+            assets.may_answer.set()
+            return [await task for task in (*tasks[-2:], asyncio.create_task(get(second)))]
+
+    assert asyncio.run(request()) == [(429, "1"), (200, ""), (200, "")]
+
+
+def test_too_many_requests_are_answered() -> None:
+    class Listening:
+        def find(self, _transport: object) -> Mock:
+            return Mock(owner="10.0.0.1", requests=0)
+
+        def allow_request(self, owner: str) -> bool:
+            return owner != "10.0.0.1"
+
+    async def request() -> tuple[int, str, str]:
+        async with serve(Hub()) as (page, serving), ClientSession() as session:
+            listening: Any = Listening()
+            serving.attach(listening)
+            async with session.get(page) as response:
+                return response.status, response.headers["Retry-After"], response.headers["Connection"]
+
+    assert asyncio.run(request()) == (429, "1", "close")
 
 
 @pytest.mark.parametrize(

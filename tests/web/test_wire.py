@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iris_session.protocol.client_messages import Bye, Heartbeat, wrap_message
+from iris_session.protocol.client_messages import Bye, Heartbeat, Hello, wrap_message
 from iris_session.protocol.codec import decode_client, encode_client, encode_server
 from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError, TooLargeError
 from iris_session.protocol.limits import MAX_CLIENT_BYTES, MAX_CONTROL_BYTES
@@ -86,7 +86,7 @@ def test_arbitrary_bytes_raise_protocol_errors_only(data: bytes) -> None:
         wire.decode_gateway_message,
         wire.decode_subscriptions,
         lambda data: wire.splice_name(data, "web-00112233aabb"),
-        wire.peek_client_type,
+        wire.peek_client_message,
         wire.peek_server_message,
     ):
         try:
@@ -155,7 +155,9 @@ def test_subscriptions_are_bounded_names() -> None:
 
 
 def test_types_are_read_without_the_message() -> None:
-    assert wire.peek_client_type(encode_client(wrap_message(Bye(), 3, "x"))) == "bye"
+    assert wire.peek_client_message(encode_client(wrap_message(Bye(), 3, "x"))) == wire.ClientHead("bye")
+    hello = encode_client(wrap_message(Hello("observer", "ann", secret=b"s"), 0))
+    assert wire.peek_client_message(hello) == wire.ClientHead("hello", b"s")
     pong = encode_server(ServerEnvelope(1, 9, ClockPong(1, 2, 3)))
     assert wire.peek_server_message(pong) == (9, "clock_pong", "")
     fault = encode_server(ServerEnvelope(1, 9, ProtocolFault("revoked", "text")))
