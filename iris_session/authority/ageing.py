@@ -71,6 +71,14 @@ def doubt_age(ctx: Context, p: Participant) -> None:
     alignment.doubt_alignment(ctx, p, AlignmentDoubt.AGED, f"{text}; until then the next clutch moves nothing")
 
 
+def doubt_all(ctx: Context) -> None:
+    """Make all measured alignments unconfirmed: it is not known for how long the session was down."""
+    for p in ctx.state.participants.values():
+        if p.needs_alignment and p.alignment is not None and p.alignment.kind != AlignmentKind.PLACED:
+            text = "the session was down, and it is not known for how long: glance at a sheet, or touch three marks"
+            alignment.doubt_alignment(ctx, p, AlignmentDoubt.AGED, f"{text}; until then the next clutch moves nothing")
+
+
 def describe_age(ctx: Context, p: Participant) -> str:
     """Return how old an alignment is, in words."""
     minutes = (ctx.now_ns - p.confirmed_ns) / _MINUTE_NS

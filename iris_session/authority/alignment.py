@@ -38,7 +38,7 @@ from anchors.pose import (
 )
 from iris_session.authority import engagement
 from iris_session.authority.config import KEY_PREFIX
-from iris_session.authority.context import Context, build_absent_denial
+from iris_session.authority.context import Context, build_absent_denial, join_names
 from iris_session.authority.state import Correction, Participant, Placement, WarningState
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
@@ -66,6 +66,8 @@ SAME_ERROR: Final = 1.25
 _NO_LOOK: Final = -1
 #: Walking since a look that is not older than this is neglected.
 _FRESH_NS: Final = 2_000_000_000
+#: Looks at other anchors speak against a single one that contradicts them, as long as the estimator remembers them.
+_REMEMBERED_NS: Final = 600_000_000_000
 #: Reasons of a hold that a better alignment ends.
 _OF_ALIGNMENT: Final = (HoldReason.UNALIGNED, HoldReason.VIEW_ONLY, HoldReason.UNCONFIRMED)
 ADVICE: Final = "step closer to the sheet, look at it from a second place, or add a sheet near the robot"
@@ -109,6 +111,11 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
     warn_wearer(ctx, p, "tilt", tilt if tilted else "", same="tilted")
     advice = f"alignment of {p.name}: {m.advice}" if m.advice and not tilted else ""
     warn_wearer(ctx, p, "advice", advice, same=m.advice)
+    against = _list_contradicted(ctx, p, m)
+    if against:
+        known = join_names(against)
+        text = f"sheet '{m.looks[0].anchor_id}' is not where {known} say it is, and it alone was looked at since"
+        return _notify_refusal(ctx, p, text, f"look at {known} again")
     looked_ns, walked_m = _find_look(ctx, p, m)
     if p.placed or (looked_ns is None and not _is_after_move(ctx, p, m)):
         return None
@@ -126,6 +133,19 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
         if error <= SAME_ERROR * max(known, now.error_at_robot_m):
             confirm_alignment(ctx, p, looked_ns, walked_m)
     return None
+
+
+def _list_contradicted(ctx: Context, p: Participant, m: AlignmentProposal) -> tuple[str, ...]:
+    """Return the anchors that still speak against a proposal: it rests on nothing but the anchor of the alarm, while
+    what is in force rests on these too. The front weighs that itself; after a new connection or process it has
+    forgotten what it saw.
+    """
+    if p.alignment is None or p.alarm is None or p.alarm.beside or not p.alarm.anchor_id:
+        return ()
+    if {one.anchor_id for one in m.looks} != {p.alarm.anchor_id}:
+        return ()
+    since_ns = ctx.now_ns - _REMEMBERED_NS
+    return tuple(n for n, one in sorted(p.looks.items()) if n != p.alarm.anchor_id and one.last_ns >= since_ns)
 
 
 def _find_look(ctx: Context, p: Participant, m: AlignmentProposal) -> tuple[int | None, float]:

@@ -140,9 +140,10 @@ def _check_numbers(ctx: Context, s: Sample) -> str:
 
 def is_measuring(ctx: Context, p: Participant, device: str) -> bool:
     """Return true for a device whose poses are measured: no two are the same, and they never jump. Agents compute
-    theirs.
+    theirs, unless they wear a headset.
     """
-    return ctx.config.speed_limits[device].linear_acceleration > 0.0 and p.role != Role.AGENT
+    computes = p.role == Role.AGENT and not p.needs_alignment
+    return ctx.config.speed_limits[device].linear_acceleration > 0.0 and not computes
 
 
 def is_measured(ctx: Context, p: Participant, s: Sample) -> bool:

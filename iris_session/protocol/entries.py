@@ -195,11 +195,13 @@ class Audit(Message, frozen=True, tag="audit"):
 
 class SessionResumed(Message, frozen=True, tag="session_resumed"):
     """The session continues from a keyframe of an earlier recording, after `gap_ns` (host only). `anchors`: all of
-    them, when they were given anew; empty: as they were.
+    them, when they were given anew; empty: as they were. `is_gap_known`: false after a reboot of the host, when session
+    time continues as if there had been no gap.
     """
 
     gap_ns: Nanoseconds
     anchors: dict[Name, Pose] = msgspec.field(default_factory=dict)
+    is_gap_known: bool = True
 
 
 class SceneLoaded(Message, frozen=True, tag="scene_loaded"):

@@ -258,7 +258,7 @@ class SessionProcesses:
             chain = header_root(header)
         keyframe_ns = round(self._config.keyframe_s * 1e9)
         past = self._past
-        after = None if past is None else ResumedFrom(past.step, past.now_ns, past.anchors)
+        after = None if past is None else ResumedFrom(past.step, past.now_ns, past.anchors, past.is_gap_known)
         front, feed = self.front.link, self.feed
         stepper = Stepper(core, front, feed, clock, self.state_period_ns, keyframe_ns, chain, after)
         stepper.on_scene.append(self._follow_scene)

@@ -95,6 +95,7 @@ class PastSession:
         core: In the state after `step`, at session time `now_ns`.
         recording: The file to continue in.
         origin_ns: `time.monotonic_ns()` at session time 0.
+        is_gap_known: The host was not rebooted, so that session time went on.
         notes: Messages for people, one line each.
         anchors: New poses of anchors, when `merge_config` was given other ones.
 
@@ -247,10 +248,8 @@ class PastSession:
             self.handback = encode_handback(last)
         now_ns = time.monotonic_ns()
         same_boot = bool(header.boot_id) and header.boot_id == read_boot_id()
-        origin_ns = header.origin_ns if same_boot else now_ns
-        if now_ns - origin_ns <= self.now_ns:
-            origin_ns = now_ns - self.now_ns - MARGIN_NS
-        self.origin_ns = origin_ns
+        self.is_gap_known = same_boot and now_ns - header.origin_ns > self.now_ns
+        self.origin_ns = header.origin_ns if self.is_gap_known else now_ns - self.now_ns - MARGIN_NS
 
 
 def prepare_session(

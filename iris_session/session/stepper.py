@@ -96,11 +96,14 @@ class OwnerRequest(msgspec.Struct, frozen=True):
 
 
 class ResumedFrom(NamedTuple):
-    """Newest step and session time of the recording that is resumed. `anchors`: new poses; empty: as they were."""
+    """Newest step and session time of the recording that is resumed. `anchors`: new poses; empty: as they were.
+    `is_gap_known`: session time went on while the session was down.
+    """
 
     step: int
     now_ns: int
     anchors: Mapping[str, Pose] = MappingProxyType({})
+    is_gap_known: bool = True
 
 
 class Stepper:
@@ -286,7 +289,7 @@ class Stepper:
         if self.last is None and self._resumed_from is not None:
             # The view is empty: it gets the participants by a snapshot, as a client does.
             past = self._resumed_from
-            begin = (SessionResumed(now_ns - past.now_ns, dict(past.anchors)), GetSnapshot())
+            begin = (SessionResumed(now_ns - past.now_ns, dict(past.anchors), past.is_gap_known), GetSnapshot())
             host += [Entry(HOST, HOST, now_ns, message) for message in begin]
         if self._scenes:
             host += [Entry(HOST, HOST, now_ns, message) for message in self._announce_scene()]

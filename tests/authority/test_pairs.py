@@ -8,8 +8,8 @@ import pytest
 from iris_session.authority import AuthorityConfig
 from iris_session.protocol.client_messages import Align, PlaceAlignment
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.protocol.entries import AlignmentAlarm, AnchorLooks, Join, Lost, SessionResumed
-from iris_session.protocol.names import AlarmKind, AlignmentDoubt, HoldReason, RejectReason
+from iris_session.protocol.entries import AlignmentAlarm, AnchorLooks, FrontRestarted, Join, Lost, SessionResumed
+from iris_session.protocol.names import AlarmKind, AlignmentDoubt, DenialReason, HoldReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentAlarmed, Notice, SamplesRejected
 
 from .table import SECOND, Person, Table, proposal
@@ -291,3 +291,46 @@ def test_bad_numbers_of_a_front_change_nothing() -> None:
     t.wait(10 * SECOND)
     eve = aligned(t, "eve")
     assert (doubt(t, bob), doubt(t, eve)) == (AlignmentDoubt.UNVERIFIED, ""), "a look is never in the future"
+
+
+# --- what a front has forgotten ---------------------------------------------------------------------------------------
+
+
+def test_one_sheet_that_contradicts_others_takes_over_only_with_one_of_them() -> None:
+    t = Table(CONFIG)
+    ann = aligned(t, "ann", by=("a", "b"), capabilities=("run:1",))
+    t.step(ann.says(AlignmentAlarm(AlarmKind.DIFFERS, 0, "a", 0.05)))
+    t.step(t.host(FrontRestarted()))
+    ann = reconnect(t, ann, "run:1")
+    version = t.authority.build_alignment_reports()[ann.id].version
+    see(t, ann, "a", x=1.05)
+    t.wait(3 * SECOND)
+    assert t.authority.build_alignment_reports()[ann.id].version == version
+    assert doubt(t, ann) == AlignmentDoubt.CONTRADICTED
+    assert t.last(Notice).reason == DenialReason.ALIGNMENT_REFUSED
+    see(t, ann, "a", "b", x=1.05)
+    t.wait(3 * SECOND)
+    assert t.authority.build_alignment_reports()[ann.id].version > version
+    assert doubt(t, ann) == ""
+
+
+def test_one_sheet_that_contradicts_looks_of_long_ago_replaces_them() -> None:
+    t = Table(CONFIG)
+    ann = aligned(t, "ann", "left", by=("a", "b"))
+    t.wait(601 * SECOND)
+    version = t.authority.build_alignment_reports()[ann.id].version
+    t.step(ann.says(AlignmentAlarm(AlarmKind.DIFFERS, 0, "a", 0.05)))
+    see(t, ann, "a", x=1.05)
+    t.wait(3 * SECOND)
+    assert t.authority.build_alignment_reports()[ann.id].version > version
+
+
+@pytest.mark.parametrize("is_gap_known", [True, False])
+def test_after_a_reboot_of_the_host_alignments_wait_for_a_glance(is_gap_known: bool) -> None:
+    t = Table(CONFIG)
+    ann = aligned(t, "ann", capabilities=("run:1",))
+    t.step(t.host(SessionResumed(0, {}, is_gap_known)))
+    ann = reconnect(t, ann, "run:1")
+    assert doubt(t, ann) == ("" if is_gap_known else AlignmentDoubt.AGED)
+    see(t, ann, "a")
+    assert doubt(t, ann) == ""

@@ -168,14 +168,20 @@ def test_a_device_that_freezes_holds_after_half_a_second(frozen: str) -> None:
     assert t.command().kind == "pose"
 
 
-def test_what_an_agent_computes_may_stand_still_and_be_zero() -> None:
+@pytest.mark.parametrize(("alignment", "hold"), [("not_needed", ""), ("measured", "frozen")])
+def test_what_an_agent_computes_may_stand_still_unless_it_wears_a_headset(alignment: str, hold: str) -> None:
     t = Table(frozen_ns=500 * MS)
-    agent = t.join("agent", alignment="not_needed", devices=("hand/left",))
+    agent = t.join("agent", alignment=alignment, devices=("hand/left",))
     agent.acquire("left")
-    agent.engage("left", device="hand/left", p=(0.0, 0.0, 0.0))
-    for _ in range(60):
-        move(t, agent, 1, device="hand/left", p=(0.0, 0.0, 0.0))
+    if hold:
+        t.step(agent.says(proposal()))
+        agent.alignment_version = t.authority.build_alignment_reports()[agent.id].version
+    p = (0.1, 0.0, 0.0) if hold else (0.0, 0.0, 0.0)  # zero of what measures is none
+    agent.engage("left", device="hand/left", p=p)
     assert t.command().kind == "pose"
+    for _ in range(60):
+        move(t, agent, 1, device="hand/left", p=p)
+    assert t.hold() == hold
 
 
 def test_a_surprise_that_waits_is_in_the_snapshot() -> None:

@@ -266,7 +266,7 @@ def test_anchors_are_those_of_the_recording_by_default(tmp_path: Path, given: di
     assert (config.anchor_poses(), past.anchors) == (now or {"table": moved}, now)
     stepper = Stepper(
         past.core, Front(STEPS), None, lambda: LAST_NS + 10**9, 10**9, 10**10, b"",
-        ResumedFrom(past.step, past.now_ns, past.anchors),
+        ResumedFrom(past.step, past.now_ns, past.anchors, past.is_gap_known),
     )  # fmt: skip
     stepper.step(1)
     assert past.core.authority.anchors == (now or {"table": moved})
@@ -321,6 +321,7 @@ def test_untrusted_note_is_ignored(session: Path, fault: str) -> None:
 def test_session_time_continues_within_a_boot(session: Path) -> None:
     past = PastSession(session)
     assert past.origin_ns == past.header.origin_ns
+    assert past.is_gap_known
 
 
 @pytest.mark.parametrize("header", [{"boot_id": "another"}, {"boot_id": ""}, {"origin_ns": 2**62}])
@@ -328,6 +329,7 @@ def test_session_time_after_a_reboot_continues_above_recorded_times(tmp_path: Pa
     past = PastSession(recorded(tmp_path / "session.rrd", **header))  # type: ignore[arg-type]
     now_ns = time.monotonic_ns() - past.origin_ns
     assert LAST_NS + MARGIN_NS <= now_ns < LAST_NS + 2 * MARGIN_NS
+    assert not past.is_gap_known
 
 
 # --- the first steps --------------------------------------------------------------------------------------------------
