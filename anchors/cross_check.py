@@ -2,7 +2,7 @@
 
 Every stated error rests on a noise model; this measurement does not. A target is a sheet, which stands still, so the
 medians of both headsets' observations within `max_age_ns` are compared; or it moves, such as a controller, and is
-compared at the same instants. Pure: times are passed in.
+compared at the same instants; or it is a point that both wearers touch. Pure: times are passed in.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate
 from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_to_matrix, to_vec3
-from anchors.pose import PoseTuple, Vec3, compose, is_rigid, is_valid_point
+from anchors.pose import PoseTuple, Vec3, apply, compose, distance, is_rigid, is_valid_point
 from anchors.uncertainty import NoiseModel, isotropic_covariance, length_p95
 
 
@@ -50,6 +50,7 @@ class CrossCheckConfig:
     min_observations: int = 5
     max_observations: int = 100
     max_targets: int = 64
+    max_points: int = 4  # touched, per headset
 
 
 class _TargetObservation(NamedTuple):
@@ -57,6 +58,12 @@ class _TargetObservation(NamedTuple):
     pose: PoseTuple  # T_tracking_target
     p_head: Vec3 | None
     viewpoint_id: int
+
+
+class _TouchedPoint(NamedTuple):
+    touched_ns: int
+    p_tracking: Vec3
+    sigma_m: float
 
 
 @dataclass
@@ -70,6 +77,7 @@ class CrossCheck:
     config: CrossCheckConfig = field(default_factory=CrossCheckConfig)
     unknown_viewpoint_sigma_m: float = 0.005
     _observations: dict[tuple[str, str], deque[_TargetObservation]] = field(default_factory=dict)
+    _points: dict[tuple[str, str], _TouchedPoint] = field(default_factory=dict)
     _epochs: dict[str, int] = field(default_factory=dict)
 
     def add_observation(
@@ -109,6 +117,31 @@ class CrossCheck:
         looks.append(_TargetObservation(capture_ns, T_tracking_target, p_tracking_head, viewpoint_id))
         return True
 
+    def add_point(
+        self, headset: str, name: str, p_tracking_point: Vec3, sigma_m: float, touched_ns: int, tracking_epoch: int
+    ) -> bool:
+        """Add a touch of a point that others touch too; only the newest of each name counts.
+
+        Args:
+            headset: Name of the headset whose wearer touches it.
+            name: Name of the point.
+            p_tracking_point: Where the tip was.
+            sigma_m: Noise of the touch, per axis.
+            touched_ns: Session time.
+            tracking_epoch: As of `add_observation`.
+
+        Returns:
+            False if it is not used: not finite, or of an older tracking frame.
+        """
+        if not is_valid_point(p_tracking_point) or not self.begin_epoch(headset, tracking_epoch):
+            return False
+        self._points.pop((headset, name), None)
+        self._points[headset, name] = _TouchedPoint(touched_ns, p_tracking_point, sigma_m)
+        own = [key for key in self._points if key[0] == headset]
+        if len(own) > self.config.max_points:
+            del self._points[own[0]]
+        return True
+
     def begin_epoch(self, headset: str, tracking_epoch: int) -> bool:
         """Discard what a headset observed in an older tracking frame; return false if `tracking_epoch` is older."""
         epoch = self._epochs.get(headset, tracking_epoch)
@@ -130,8 +163,9 @@ class CrossCheck:
 
     def discard_headset(self, headset: str) -> None:
         """Discard the observations of a headset that left or whose tracking frame changed."""
-        for key in [key for key in self._observations if key[0] == headset]:
-            del self._observations[key]
+        for kept in (self._observations, self._points):
+            for key in [key for key in kept if key[0] == headset]:
+                del kept[key]
         self._epochs.pop(headset, None)
 
     def discard_target(self, thing: str) -> None:
@@ -143,9 +177,10 @@ class CrossCheck:
         """Return a copy with the observations of these headsets, to be compared while others are added here."""
         observations = {key: looks.copy() for key, looks in self._observations.items() if key[0] in headsets}
         epochs = {headset: epoch for headset, epoch in self._epochs.items() if headset in headsets}
-        return CrossCheck(
-            self.noise, self.config, self.unknown_viewpoint_sigma_m, _observations=observations, _epochs=epochs
-        )
+        points = {key: touch for key, touch in self._points.items() if key[0] in headsets}
+        copy = CrossCheck(self.noise, self.config, self.unknown_viewpoint_sigma_m)
+        copy._observations, copy._points, copy._epochs = observations, points, epochs
+        return copy
 
     def compare(
         self, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: Set[str] = frozenset()
@@ -162,6 +197,28 @@ class CrossCheck:
                     out.append(
                         self._compare_pair((a, b, thing), (alignments[a], alignments[b]), (looks_a, looks_b), pairs)
                     )
+        return out
+
+    def compare_points(
+        self, alignments: Mapping[str, AlignmentEstimate], now_ns: int, since_ns: int = -1
+    ) -> list[Disagreement]:
+        """Compare the points that both of two aligned headsets have touched, one of them after `since_ns`."""
+        out = []
+        headsets = sorted(h for h, e in alignments.items() if not e.refused and e.tracking_epoch == self._epochs.get(h))
+        for (a, name), touch in self._points.items():
+            for b in headsets:
+                other = self._points.get((b, name))
+                if a not in headsets or a >= b or other is None:
+                    continue
+                first_ns, last_ns = sorted((touch.touched_ns, other.touched_ns))
+                if now_ns - first_ns > self.config.max_age_ns or last_ns <= since_ns:
+                    continue
+                p_a = apply(alignments[a].T_world_tracking, touch.p_tracking)
+                p_b = apply(alignments[b].T_world_tracking, other.p_tracking)
+                at = to_vec3(np.add(p_a, p_b) / 2.0)
+                S = alignments[a].covariance_at(at) + alignments[b].covariance_at(at)
+                S = S + np.eye(3) * (touch.sigma_m**2 + other.sigma_m**2)
+                out.append(Disagreement(a, b, name, distance(p_a, p_b), 0.0, length_p95(S), at, 1))
         return out
 
     def _select_recent(self, headset: str, thing: str, now_ns: int) -> list[_TargetObservation]:

@@ -74,6 +74,14 @@ class CrossCheckScheduler:
         self._n_observations[connection] = self._n_observations.get(connection, 0) + used
         return used
 
+    def add_point(
+        self, connection: int, name: str, p_tracking_point: Vec3, sigma_m: float, touched_ns: int, tracking_epoch: int
+    ) -> bool:
+        """Add a touch of a point that others touch too; return false if it is dropped (`CrossCheck.add_point`)."""
+        used = self._check.add_point(str(connection), name, p_tracking_point, sigma_m, touched_ns, tracking_epoch)
+        self._n_observations[connection] = self._n_observations.get(connection, 0) + used
+        return used
+
     def _list_moving(self, connection: int) -> set[str]:
         return self._check.list_targets(str(connection)) - self._anchors
 
@@ -115,17 +123,21 @@ class CrossCheckScheduler:
         check = self._check.copy_headsets((str(a), str(b)))
         alignments = {str(a): in_force[a], str(b): in_force[b]}
         moving = self._list_moving(a) & self._list_moving(b)
+        since_ns = self._reported.get((a, b), (-1, (0, 0)))[0]
         counts, discards = self._count_observations((a, b)), self._discards
 
         def compare() -> Callable[[], None]:
             worst = _find_worst(check, alignments, now_ns, moving)
-            return lambda: finish(worst)
+            touched = check.compare_points(alignments, now_ns, since_ns)
+            return lambda: finish(worst, touched)
 
-        def finish(worst: Disagreement | None) -> None:
-            if worst is not None and discards == self._discards:
+        def finish(worst: Disagreement | None, touched: list[Disagreement]) -> None:
+            if discards != self._discards:
+                return
+            for one in (*([] if worst is None else [worst]), *touched):
                 self._reported[a, b] = (now_ns, counts)
-                off = (worst.error_m, worst.error_rad, worst.expected_p95_m)
-                offer(Entry(a, a, now_ns, CrossChecked(b, worst.target, *off, worst.p_world, worst.n)))
+                off, is_touched = (one.error_m, one.error_rad, one.expected_p95_m), one is not worst
+                offer(Entry(a, a, now_ns, CrossChecked(b, one.target, *off, one.p_world, one.n, is_touched)))
 
         return compare
 

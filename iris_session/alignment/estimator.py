@@ -175,6 +175,10 @@ class ConnectionEstimator:
             self._unusable += 1
         return used
 
+    def find_touch_sigma(self, observation: Observation) -> float | None:
+        """Return the noise of a touch per axis [m], `None` if its covariance is invalid."""
+        return self._touches.find_sigma(observation)
+
     def _note_wrong(self, wrong: tuple[int, str], is_touch: bool) -> None:
         """Note an observation to be reported as refused; unknown sheets do not displace a touch."""
         if wrong == self._reported_wrong or (self._wrong is not None and self._is_wrong_touch and not is_touch):

@@ -252,14 +252,17 @@ class AlignmentMonitor:
         difference_m = distance(apply(in_force.T_world_tracking, p_tracking), newest.pivot_world)
         return in_force if difference_m <= _PENDING_CORRECTION_M else newest
 
-    def to_message(self, alarm: Alarm, now_ns: int) -> AlignmentAlarm | None:
-        """Return the message to the authority, `None` if it would repeat a jump or exceed the alarm rate."""
-        if alarm.kind == AlarmKind.JUMP:
-            if self._jump_ns is not None and now_ns - self._jump_ns < MIN_JUMP_INTERVAL_NS:
-                return None
+    def is_too_frequent(self, alarm: Alarm, now_ns: int) -> bool:
+        """Return whether an alarm would repeat a jump or exceed the alarm rate; else it counts."""
+        if alarm.kind != AlarmKind.JUMP:
+            return not self._bucket.take(now_ns)
+        is_repeat = self._jump_ns is not None and now_ns - self._jump_ns < MIN_JUMP_INTERVAL_NS
+        if not is_repeat:
             self._jump_ns = now_ns
-        elif not self._bucket.take(now_ns):
-            return None
+        return is_repeat
+
+    def to_message(self, alarm: Alarm) -> AlignmentAlarm:
+        """Return the message to the authority."""
         epoch, beside = self._monitor.tracking_epoch, alarm.beside[:_MAX_BESIDE]
         return AlignmentAlarm(alarm.kind, epoch, alarm.anchor_id, alarm.size_m, alarm.capture_ns, beside)
 

@@ -259,6 +259,10 @@ class AlignmentService:
             state.estimator.count_fault(look, observation.tracking_epoch, known)
             self._drops.count("observation_unusable", number)
             return
+        if observation.kind == AnchorKind.POINT:
+            if not self._add_point(number, state, observation, now_ns):
+                self._drops.count("observation_unusable", number)
+            return
         if known and seen and not tracked and self._has_two_prints(number, state, observation, now_ns):
             state.estimator.count_fault(TWO_PRINTS, observation.tracking_epoch, known)
             self._drops.count("observation_unusable", number)
@@ -301,6 +305,11 @@ class AlignmentService:
             now_ns,
         )
 
+    def _add_point(self, number: int, state: _HeadsetState, observation: Observation, now_ns: int) -> bool:
+        sigma_m, p = state.estimator.find_touch_sigma(observation), observation.T_tracking_anchor.p
+        name, epoch = observation.anchor_id, observation.tracking_epoch
+        return sigma_m is not None and self._cross_check.add_point(number, name, p, sigma_m, now_ns, epoch)
+
     def _add_connection(self, connection: HeadsetConnection) -> _HeadsetState:
         estimator = ConnectionEstimator(self.anchors, self._proposal_period_ns, self._sizes, self._marks)
         for device, covariance in self._tips.get(connection.participant_id, {}).items():
@@ -314,7 +323,11 @@ class AlignmentService:
     def _process_alarm(self, number: int, state: _HeadsetState, alarm: Alarm, tracking_epoch: int, now_ns: int) -> None:
         """Report an alarm. The estimator is asked first: a sheet that others outvote is no evidence against the
         headset."""
-        in_force = state.monitor.in_force
+        in_force, is_dropped = state.monitor.in_force, state.monitor.is_too_frequent(alarm, now_ns)
+        if is_dropped:
+            self._drops.count("alarms_repeated", number)
+            if alarm.kind in (AlarmKind.CHANGED, AlarmKind.DIFFERS) and not alarm.beside:
+                return  # the next looks raise it again
         if alarm.anchor_id and not alarm.beside and alarm.kind != AlarmKind.TWO_PLACES:
             outvoting = state.estimator.weigh_alarm(alarm)
             if outvoting is None:
@@ -326,15 +339,13 @@ class AlignmentService:
             state.estimator.leave_out(alarm)
         if alarm.kind == AlarmKind.JUMP:
             state.last_jump = (tracking_epoch, min(alarm.capture_ns, now_ns))
-        message = state.monitor.to_message(alarm, now_ns)
-        if message is not None and in_force is not None and alarm.p is not None and not alarm.beside:
+        message = state.monitor.to_message(alarm)
+        if in_force is not None and alarm.p is not None and not alarm.beside:
             x, y, z = apply(in_force.T_world_tracking, alarm.p)
             x0, y0, z0 = self.anchors[alarm.anchor_id][0]
             is_known = in_force.tracking_epoch == tracking_epoch
             message = msgspec.structs.replace(message, shift_m=(x - x0, y - y0, z - z0) if is_known else ())
-        if message is None:
-            self._drops.count("alarms_repeated", number)
-        else:
+        if not is_dropped:
             state.alarm_ns = max(now_ns, state.proposal_ns)  # no proposal made before is later
             self._offer(Entry(number, number, state.alarm_ns, message))
         if alarm.beside:

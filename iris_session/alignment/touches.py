@@ -128,14 +128,14 @@ class TouchEstimator:
 
     def is_covariance_valid(self, observation: Observation) -> bool:
         """Return whether a touch states no covariance, or one whose position is usable."""
-        return self._find_sigma(observation) is not None
+        return self.find_sigma(observation) is not None
 
     def add_touch(self, observation: Observation, now_ns: int) -> bool:
         """Add one touch of a known anchor; return false if it is of an older tracking frame, no mark of it, or not a
         finite point, or its covariance is invalid."""
         pose = observation.T_tracking_anchor
         point = _Point(observation.anchor_id, observation.mark)
-        sigma = self._find_sigma(observation)
+        sigma = self.find_sigma(observation)
         if not self.has_mark(*point) or not is_valid_point(pose.p) or sigma is None:
             return False
         if not self._begin_epoch(observation.tracking_epoch):
@@ -158,7 +158,7 @@ class TouchEstimator:
         self.pending, self.looked_ns = self._suffice(), now_ns
         return True
 
-    def _find_sigma(self, observation: Observation) -> float | None:
+    def find_sigma(self, observation: Observation) -> float | None:
         """Return the noise of a touch per axis, `None` if its covariance is invalid."""
         is_finger = observation.device.startswith("hand/")
         if not observation.covariance:

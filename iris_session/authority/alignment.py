@@ -113,9 +113,9 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
     warn_wearer(ctx, p, "advice", advice, same=m.advice)
     against = _list_contradicted(ctx, p, m)
     if against:
-        known = join_names(against)
-        text = f"sheet '{m.looks[0].anchor_id}' is not where {known} say it is, and it alone was looked at since"
-        return _notify_refusal(ctx, p, text, f"look at {known} again")
+        others = join_names(against)
+        text = f"sheet '{m.looks[0].anchor_id}' is not where {others} say it is, and it alone was looked at since"
+        return _notify_refusal(ctx, p, text, f"look at {others} again")
     looked_ns, walked_m = _find_look(ctx, p, m)
     if p.placed or (looked_ns is None and not _is_after_move(ctx, p, m)):
         return None

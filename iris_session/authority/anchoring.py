@@ -205,9 +205,9 @@ def record_cross_check(ctx: Context, p: Participant, m: CrossChecked) -> None:
     sizes = (float(m.error_m), float(m.error_rad), float(m.expected_p95_m))
     if not all(math.isfinite(v) for v in (*sizes, x, y, z)) or min(sizes) < 0.0:
         return
-    key = " ".join(sorted((p.id, other.id)))
-    ctx.state.cross_checks[key] = CrossCheckState(p.id, other.id, m.anchor_id, *sizes, m.n, ctx.now_ns)
-    ctx.emit(HeadsetsCompared(p.id, other.id, m.anchor_id, *sizes, (float(x), float(y), float(z)), m.n))
+    key = " ".join(sorted((p.id, other.id))) + " touched" * m.touched
+    ctx.state.cross_checks[key] = CrossCheckState(p.id, other.id, m.anchor_id, *sizes, m.n, ctx.now_ns, m.touched)
+    ctx.emit(HeadsetsCompared(p.id, other.id, m.anchor_id, *sizes, (float(x), float(y), float(z)), m.n, m.touched))
 
 
 def remove_cross_checks(ctx: Context, p: Participant) -> None:
@@ -238,11 +238,11 @@ def build_alignment_report(ctx: Context, p: Participant) -> AlignmentReport:
 
 
 def build_cross_check_reports(ctx: Context) -> tuple[CrossCheckReport, ...]:
-    """Return the newest cross-check of every pair, newest first."""
+    """Return the newest cross-checks of every pair, by looks and by touch, newest first."""
     newest = sorted(ctx.state.cross_checks.values(), key=lambda c: -c.compared_ns)[:MAX_REPORTED]
     return tuple(
         CrossCheckReport(
-            c.a, c.b, c.anchor_id, c.error_m, c.error_rad, c.expected_p95_m, ctx.now_ns - c.compared_ns, c.n
+            c.a, c.b, c.anchor_id, c.error_m, c.error_rad, c.expected_p95_m, ctx.now_ns - c.compared_ns, c.n, c.touched
         )
         for c in newest
     )

@@ -301,6 +301,7 @@ class CrossCheckState(msgspec.Struct):
     expected_p95_m: float
     n: int
     compared_ns: int
+    touched: bool = False
 
 
 class StopState(msgspec.Struct, array_like=True):
@@ -317,11 +318,11 @@ class AuthorityState(msgspec.Struct):
     """The authority's whole memory. `name_owners`: assigned name -> key that has it (policy `config`).
 
     `scene`: None while it is the one that the session began with. `patches`: all of its patches, merged. `anchors`:
-    `T_world_anchor` by id, as they are since `anchors_ns`. `cross_checks`: by both participants, "a b". `handovers`:
-    objects on their way between people; `regrasps`: between two robots, of one person too. `stop_seq` counts the
-    e-stops, `stops` are those in force, oldest first. `diverged`: why physics stands still until a reset, which
-    also ends the pause that came of it (`paused_by_divergence`). `owner_listens`: the owner of a user loop takes
-    requests. `rerecording`: the episode that begins when that owner has reset the scene.
+    `T_world_anchor` by id, as they are since `anchors_ns`. `cross_checks`: by both participants, "a b", and "a b
+    touched". `handovers`: objects on their way between people; `regrasps`: between two robots, of one person too.
+    `stop_seq` counts the e-stops, `stops` are those in force, oldest first. `diverged`: why physics stands still
+    until a reset, which also ends the pause that came of it (`paused_by_divergence`). `owner_listens`: the owner of
+    a user loop takes requests. `rerecording`: the episode that begins when that owner has reset the scene.
     """
 
     robots: dict[str, LeaseState]

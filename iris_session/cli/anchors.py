@@ -244,8 +244,8 @@ def run_print(arguments: argparse.Namespace) -> int:
     mm = f"{1e3 * sheet.edge_m:g} mm"
     lines = [
         f"{out}: anchor {sheet.anchor_id!r}, code {mm}, for {arguments.paper}",
-        f"print at 100 % (not 'fit to page'), then measure the code with a ruler: {mm} from edge to edge; what you "
-        "measure: `anchors print --measured LENGTH`, or `size_m` in the anchors file",
+        f"print at 100 % (not 'fit to page'). UNVERIFIED until you measure the code with a ruler: {mm} from edge to "
+        "edge; what you measure: `anchors print --measured LENGTH`, or `size_m` in the anchors file",
         "tape the sheet down and draw its corners; a second sheet, 1 m away or more, shows when one has moved",
     ]
     if sheet.has_marks:
@@ -496,10 +496,11 @@ def format_pending_correction(r: AlignmentReport) -> str:
 def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
     a, b = (f"{names[one]} ({one})" if one in names else one for one in (check.a, check.b))
     verdict = "" if is_consistent(check) else "  TOO FAR APART"
+    turn = "" if check.touched else f", {degrees(check.error_rad):.2f} deg"
+    how = "touched by both" if check.touched else f"{check.n} observations"
     return (
-        f"{a} - {b}: {check.error_m * 1e3:.1f} mm, {degrees(check.error_rad):.2f} deg apart at '{check.anchor_id}', "
-        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {check.n} observations, "
-        f"{format_duration(check.age_ns)} ago{verdict}"
+        f"{a} - {b}: {check.error_m * 1e3:.1f} mm{turn} apart at '{check.anchor_id}', "
+        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {how}, {format_duration(check.age_ns)} ago{verdict}"
     )
 
 

@@ -119,20 +119,21 @@ class ClientAlignment:
         """Report the observation of an anchor, in the tracking frame.
 
         Args:
-            anchor_id: Id of the anchor.
+            anchor_id: Id of the anchor; of kind `point`, a name for what others touch too.
             T_tracking_anchor: Its pose in the tracking frame, `((x, y, z) [m], (w, x, y, z))`.
             kind: An `AnchorKind`.
             capture_ns: Session time of the observation [ns], default now.
             viewpoint_id: The same number for observations from one place.
             size_m: Measured edge length [m], 0 when not measured.
             quality: 0 to 1.
-            device: The device that observed it; of kind `touch`, what touched. Without a covariance, all but a
-                controller whose tip was calibrated counts as a fingertip.
+            device: The device that observed it; of kinds `touch` and `point`, what touched. Without a covariance, all
+                but a controller whose tip was calibrated counts as a fingertip.
             covariance: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), tracking axes; without it the
                 session assumes that of a headset's camera, or of a touch with `device`. Of kind `touch` only the
                 position counts; of kind `persistent` the axes are those of the anchor
                 (`anchors.persistent.covariance_at_anchor`).
-            mark: Of kind `touch`, the touched mark; the position is that of the tip, the rotation that of the grip.
+            mark: Of kind `touch`, the touched mark. Of both kinds the position is that of the tip, the rotation that of
+                the grip.
             tracking_epoch: Epoch of the tracking frame, default the present one.
 
         Raises:

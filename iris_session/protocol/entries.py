@@ -151,6 +151,7 @@ class CrossChecked(Message, frozen=True, tag="cross_checked"):
     expected_p95_m: float
     p_world: Vec3
     n: Count
+    touched: bool = False
 
 
 class ExternalReset(Message, frozen=True, tag="external_reset"):

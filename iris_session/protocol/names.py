@@ -152,7 +152,8 @@ class AnchorKind:
     """Kind of an observation: the form of the anchor, or the way in which it was found.
 
     `touch`: a tip or a fingertip on a mark. `tip`: a controller turned while its tip stayed in a hole. `persistent`: a
-    place that the device kept since an earlier alignment.
+    place that the device kept since an earlier alignment. `point`: a tip or a fingertip on any point that others touch
+    too, to measure how far apart their worlds are.
     """
 
     QR: Final = "qr"
@@ -161,8 +162,9 @@ class AnchorKind:
     TOUCH: Final = "touch"
     TIP: Final = "tip"
     PERSISTENT: Final = "persistent"
-    NOT_SEEN: Final = frozenset({"touch", "tip", "persistent"})
-    ALL: Final = frozenset({"qr", "board", "controller", "touch", "tip", "persistent"})
+    POINT: Final = "point"
+    NOT_SEEN: Final = frozenset({"touch", "tip", "persistent", "point"})
+    ALL: Final = frozenset({"qr", "board", "controller", "touch", "tip", "persistent", "point"})
 
 
 class ObservationSource:

@@ -328,6 +328,7 @@ class HeadsetsCompared(EventBody, frozen=True, tag="headsets_compared"):
     apart.
 
     `expected_p95_m`: 95 % of such pairs stay below it by their stated errors and the noise of these `n` observations.
+    `touched`: `anchor_id` is the name of a point that both have touched.
     """
 
     a: Name
@@ -338,6 +339,7 @@ class HeadsetsCompared(EventBody, frozen=True, tag="headsets_compared"):
     expected_p95_m: float
     p_world: Vec3
     n: Count
+    touched: bool = False
 
 
 class SceneChanged(EventBody, frozen=True, tag="scene_changed"):

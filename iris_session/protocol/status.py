@@ -125,6 +125,7 @@ class CrossCheckReport(msgspec.Struct, frozen=True):
     expected_p95_m: float
     age_ns: Nanoseconds
     n: Count = 0
+    touched: bool = False
 
 
 class UnverifiedReport(msgspec.Struct, frozen=True):

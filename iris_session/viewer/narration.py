@@ -338,12 +338,15 @@ class EventNarration:
                 if refused:
                     return LogLine(WARN, f"{tip} is not calibrated: {advice}")
                 return LogLine(INFO, f"{tip} is calibrated to {error_m * 1e3:.1f} mm")
-            case HeadsetsCompared(a=a, b=b, anchor_id=anchor, error_m=error_m, expected_p95_m=expected_m):
+            case HeadsetsCompared(a, b, anchor, error_m, expected_p95_m=expected_m, touched=touched):
                 pair, agree = (min(a, b), max(a, b)), error_m <= MAX_ERROR_RATIO * expected_m
-                level = DEBUG if self._agreed.get(pair) is agree else INFO  # every five seconds for every pair
+                is_news = touched or self._agreed.get(pair) is not agree  # every five seconds for every pair
                 self._agreed[pair] = agree
-                text = f"{self._name(a)} and {self._name(b)} see {anchor} {error_m * 1e3:.1f} mm apart"
-                return LogLine(level, f"{text}, 95 % of such pairs are below {expected_m * 1e3:.1f} mm")
+                verb = "touch" if touched else "see"
+                text = f"{self._name(a)} and {self._name(b)} {verb} {anchor} {error_m * 1e3:.1f} mm apart"
+                return LogLine(
+                    INFO if is_news else DEBUG, f"{text}, 95 % of such pairs are below {expected_m * 1e3:.1f} mm"
+                )
             case SamplesRejected(participant=who, device=device, reason=reason, count=count):
                 rejected = self._rejected.setdefault(who, Counter())
                 rejected[device, reason] = count

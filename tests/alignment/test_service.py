@@ -301,6 +301,29 @@ def test_shared_controller_is_compared_at_equal_times() -> None:
     )
 
 
+def test_a_point_that_both_wearers_touch_measures_their_pair_once_per_touch() -> None:
+    lab = Lab()
+    ann, bob = _pair(lab, 0.02)
+    lab.entries.clear()
+    for one, device in ((ann, "hand/right"), (bob, "controller/right")):
+        p = apply(inverse(one.frame), (1.2, 0.1, 0.7))
+        one.observe(Observation("cross", "point", Pose(p, IDENTITY.q), lab.now_ns, 1, device=device))
+        lab.now_ns += SECOND
+    view = ann.place(d=0.5), bob.place(d=0.5)
+    for _ in range(20):
+        lab.now_ns += SECOND
+        for one, at in zip((ann, bob), view, strict=True):
+            one.report_observation(at)
+        lab.poll(20)
+    found = [m for m in (entry.message for entry in lab.cross_checks()) if isinstance(m, CrossChecked)]
+    assert len(found) > 2, "looks at the sheet are compared meanwhile"
+    (message,) = [one for one in found if one.touched]
+    assert (message.anchor_id, message.n) == ("cross", 1)
+    assert message.error_m == pytest.approx(0.02, abs=0.012)
+    assert message.expected_p95_m > 0.02, "two fingertips"
+    assert lab.drops.by_reason.get("observation_unusable", 0) == 0
+
+
 def test_restarted_front_restores_alignment_in_force_from_a_snapshot() -> None:
     lab = Lab()
     ann = lab.wearer()

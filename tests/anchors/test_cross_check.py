@@ -9,7 +9,8 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimator
 from anchors.cross_check import CrossCheck, CrossCheckConfig
-from anchors.pose import PoseTuple, compose, inverse, quat_from_yaw
+from anchors.pose import PoseTuple, apply, compose, inverse, quat_from_yaw
+from anchors.uncertainty import length_p95
 from tests.anchors.worlds import Viewpoint, align_to_sheet, tracking_frame, viewpoint_around
 
 SHEET: PoseTuple = ((0.2, -0.4, 0.75), quat_from_yaw(0.5))
@@ -91,3 +92,29 @@ def test_anchors_out_of_sight_are_removed() -> None:
     used = [check.add_observation("h", thing, SHEET, (0.0, 0.0, 1.0), i, 0) for i, thing in enumerate("abcd")]
     assert used == [True, True, False, False]
     assert check.add_observation("h", "c", SHEET, (0.0, 0.0, 1.0), 20 * PERIOD, 0)
+
+
+def test_a_point_that_both_touch_measures_how_far_apart_their_worlds_are() -> None:
+    rng = np.random.default_rng(0)
+    check, alignments = CrossCheck(config=CrossCheckConfig(max_points=2)), {}
+    point = (1.2, 0.1, 0.7)
+    for i, name in enumerate("ab"):
+        T = tracking_frame(rng)
+        p, q = inverse(T)
+        alignments[name] = replace(align_to_sheet(rng, SHEET, T), T_world_tracking=((p[0] + 0.02 * i, p[1], p[2]), q))
+        assert check.add_point(name, "cross", apply(T, point), 0.0015, PERIOD, 0)
+        assert not check.add_point(name, "cross", (math.nan, 0.0, 0.0), 0.0015, 2 * PERIOD, 0)
+    (got,) = check.compare_points(alignments, 2 * PERIOD)
+    assert (got.a, got.b, got.target) == ("a", "b", "cross")
+    assert abs(got.error_m - 0.02) < 1e-9
+    assert math.dist(got.p_world, (1.21, 0.1, 0.7)) < 1e-9
+    own = [alignments[name].covariance_at(got.p_world) for name in "ab"]
+    assert got.expected_p95_m > length_p95(own[0] + own[1])
+    assert check.copy_headsets("ab").compare_points(alignments, 2 * PERIOD) == [got]
+    assert check.compare_points(alignments, 62 * 10**9) == [], "too long ago"
+    assert check.compare_points(alignments, 2 * PERIOD, since_ns=PERIOD) == [], "no news"
+    for name in ("x", "y"):
+        check.add_point("a", name, point, 0.0015, 2 * PERIOD, 0)
+    assert check.compare_points(alignments, 2 * PERIOD) == [], "the oldest point is forgotten"
+    check.add_point("b", "x", point, 0.0015, 3 * PERIOD, 1)
+    assert check.compare_points(alignments, 3 * PERIOD) == [], "its alignment is of another tracking frame"

@@ -272,13 +272,15 @@ def test_two_headsets_are_compared_and_the_newest_is_kept_per_pair() -> None:
     )
     t.step(bert.says(compared(anna.connection, error_m=0.02)), dt_ns=SECOND)
     t.step(dt_ns=100 * MS)
-    newest, older = t.authority.build_cross_check_reports()
+    t.step(bert.says(compared(anna.connection, error_m=0.008, touched=True)), dt_ns=0)
+    touched, newest, older = t.authority.build_cross_check_reports()
+    assert (touched.touched, touched.error_m) == (True, 0.008)
     assert ({newest.a, newest.b}, newest.error_m, newest.age_ns) == ({anna.id, bert.id}, 0.02, 100 * MS)
     assert ({older.a, older.b}, older.error_m) == ({bert.id, carl.id}, 0.1)
     t.step(anna.says(Lost()))
-    assert len(t.authority.build_cross_check_reports()) == 2
+    assert len(t.authority.build_cross_check_reports()) == 3
     carl.does(Bye())
-    assert [{c.a, c.b} for c in t.authority.build_cross_check_reports()] == [{anna.id, bert.id}]
+    assert [{c.a, c.b} for c in t.authority.build_cross_check_reports()] == [{anna.id, bert.id}] * 2
 
 
 @pytest.mark.parametrize(

@@ -153,7 +153,8 @@ namespace IrisSession.Protocol
     /// Kind of an observation: the form of the anchor, or the way in which it was found.
     ///
     /// touch: a tip or a fingertip on a mark. tip: a controller turned while its tip stayed in a hole. persistent: a
-    /// place that the device kept since an earlier alignment.
+    /// place that the device kept since an earlier alignment. point: a tip or a fingertip on any point that others touch
+    /// too, to measure how far apart their worlds are.
     /// </summary>
     public static class AnchorKind
     {
@@ -163,6 +164,7 @@ namespace IrisSession.Protocol
         public const string Touch = "touch";
         public const string Tip = "tip";
         public const string Persistent = "persistent";
+        public const string Point = "point";
     }
 
     /// <summary>
@@ -2119,6 +2121,7 @@ namespace IrisSession.Protocol
         public double ExpectedP95M = 0.0;
         public long AgeNs = 0;
         public long N = 0;
+        public bool Touched = false;
 
         public static CrossCheckReport Read(WireReader reader)
         {
@@ -2136,6 +2139,7 @@ namespace IrisSession.Protocol
                     case "expected_p95_m": value.ExpectedP95M = reader.ReadDouble(); seen |= 32u; break;
                     case "age_ns": value.AgeNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 64u; break;
                     case "n": value.N = reader.ReadLong(0, long.MaxValue); break;
+                    case "touched": value.Touched = reader.ReadBool(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -2145,7 +2149,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(8);
+            writer.WriteMapHeader(9);
             writer.Write("a");
             writer.Write(A);
             writer.Write("b");
@@ -2162,6 +2166,8 @@ namespace IrisSession.Protocol
             writer.Write(AgeNs);
             writer.Write("n");
             writer.Write(N);
+            writer.Write("touched");
+            writer.Write(Touched);
         }
     }
 
@@ -5605,6 +5611,7 @@ namespace IrisSession.Protocol
     /// apart.
     ///
     /// expected_p95_m: 95 % of such pairs stay below it by their stated errors and the noise of these n observations.
+    /// touched: anchor_id is the name of a point that both have touched.
     /// </summary>
     public sealed class HeadsetsCompared : EventKind
     {
@@ -5618,6 +5625,7 @@ namespace IrisSession.Protocol
         public double ExpectedP95M = 0.0;
         public double[] PWorld = new double[3];
         public long N = 0;
+        public bool Touched = false;
 
         public static HeadsetsCompared Read(WireReader reader)
         {
@@ -5635,6 +5643,7 @@ namespace IrisSession.Protocol
                     case "expected_p95_m": value.ExpectedP95M = reader.ReadDouble(); seen |= 32u; break;
                     case "p_world": value.PWorld = reader.ReadDoubles(3, 0); seen |= 64u; break;
                     case "n": value.N = reader.ReadLong(0, long.MaxValue); seen |= 128u; break;
+                    case "touched": value.Touched = reader.ReadBool(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -5644,7 +5653,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(9);
+            writer.WriteMapHeader(10);
             writer.Write("event");
             writer.Write(TagName);
             writer.Write("a");
@@ -5663,6 +5672,8 @@ namespace IrisSession.Protocol
             writer.Write(PWorld);
             writer.Write("n");
             writer.Write(N);
+            writer.Write("touched");
+            writer.Write(Touched);
         }
     }
 

@@ -134,7 +134,8 @@ export type AlignmentDoubt = (typeof AlignmentDoubt)[keyof typeof AlignmentDoubt
  * Kind of an observation: the form of the anchor, or the way in which it was found.
  *
  * `touch`: a tip or a fingertip on a mark. `tip`: a controller turned while its tip stayed in a hole. `persistent`: a
- * place that the device kept since an earlier alignment.
+ * place that the device kept since an earlier alignment. `point`: a tip or a fingertip on any point that others touch
+ * too, to measure how far apart their worlds are.
  */
 export const AnchorKind = {
   QR: "qr",
@@ -143,6 +144,7 @@ export const AnchorKind = {
   TOUCH: "touch",
   TIP: "tip",
   PERSISTENT: "persistent",
+  POINT: "point",
 } as const;
 export type AnchorKind = (typeof AnchorKind)[keyof typeof AnchorKind] | (string & {});
 
@@ -753,6 +755,7 @@ export interface CrossCheckReport {
   expected_p95_m: number;
   age_ns: number;
   n?: number;
+  touched?: boolean;
 }
 
 /**
@@ -1584,6 +1587,7 @@ export interface TipCalibrated {
  * apart.
  *
  * `expected_p95_m`: 95 % of such pairs stay below it by their stated errors and the noise of these `n` observations.
+ * `touched`: `anchor_id` is the name of a point that both have touched.
  */
 export interface HeadsetsCompared {
   event: "headsets_compared";
@@ -1595,6 +1599,7 @@ export interface HeadsetsCompared {
   expected_p95_m: number;
   p_world: [number, number, number];
   n: number;
+  touched?: boolean;
 }
 
 /**
@@ -2362,7 +2367,7 @@ export const DEFAULTS = {
   alignment_alarmed: { beside: [], witnesses: [] },
   anchor_moved: { by: "" },
   tip_calibrated: { p_grip_tip: [0.0, 0.0, 0.0], covariance: [], error_m: 0.0, residual_m: 0.0, n_poses: 0, refused: false, advice: "" },
-  headsets_compared: {},
+  headsets_compared: { touched: false },
   scene_changed: { scene_hash: "", tick_period_ns: 0 },
   estop_changed: { reason: "", stop_seq: 0 },
   pause_changed: { participant: "", reason: "" },
@@ -2470,6 +2475,7 @@ export const VALUE_DEFAULTS = {
   },
   CrossCheckReport: {
     n: 0,
+    touched: false,
   },
   AnchorReport: {
     size_m: 0.0,

@@ -266,6 +266,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["expected_p95_m", ["float"], []],
       ["age_ns", ["int", null, null], []],
       ["n", ["int", 0, null], [0]],
+      ["touched", ["bool"], [false]],
     ],
   },
   UnverifiedReport: {
@@ -1013,6 +1014,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["expected_p95_m", ["float"], []],
       ["p_world", ["array", ["float"], 3, 0], []],
       ["n", ["int", 0, null], []],
+      ["touched", ["bool"], [false]],
     ],
   },
   SceneChanged: {

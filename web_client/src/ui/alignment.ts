@@ -29,7 +29,7 @@ export function makeAlignmentPanel(state: PageState, actions: Actions): Panel {
       section.setCount(headsets.length > 0 ? String(headsets.length) : "");
       const found = (state.status?.cross_checks ?? []).map(
         (check) =>
-          `${state.nameOf(check.a)} and ${state.nameOf(check.b)} see ${check.anchor_id} ${formatMillimetres(check.error_m)} ` +
+          `${state.nameOf(check.a)} and ${state.nameOf(check.b)} ${check.touched ? "touch" : "see"} ${check.anchor_id} ${formatMillimetres(check.error_m)} ` +
           `apart (expected up to ${formatMillimetres(check.expected_p95_m)}), ${formatAge(check.age_ns)} ago`,
       );
       const unverified = (state.status?.unverified ?? []).map(

@@ -236,13 +236,14 @@ export function eventWords(
       );
     case "anchor_moved":
       return info(`${body.by ? nameOf(body.by) : "a director"} moved the anchor ${body.anchor_id}`);
-    case "headsets_compared":
-      return body.error_m > body.expected_p95_m
-        ? warning(
-            `${nameOf(body.a)} and ${nameOf(body.b)} see ${body.anchor_id} ${formatMillimetres(body.error_m)} apart, ` +
-              `expected at most ${formatMillimetres(body.expected_p95_m)}`,
-          )
-        : null;
+    case "headsets_compared": {
+      const verb = body.touched ? "touch" : "see";
+      const words =
+        `${nameOf(body.a)} and ${nameOf(body.b)} ${verb} ${body.anchor_id} ${formatMillimetres(body.error_m)} apart, ` +
+        `expected at most ${formatMillimetres(body.expected_p95_m)}`;
+      if (body.error_m > body.expected_p95_m) return warning(words);
+      return body.touched ? info(words) : null;
+    }
     case "scene_changed":
       return info({ reset: "scene reset", new_scene: "another scene", patch: "scene changed" }[body.cause] ?? "time of the scene went back");
     case "estop_changed":

@@ -92,6 +92,7 @@ export class Marks {
     for (const message of messages) {
       if (message.type !== "event") continue;
       const { body } = message;
+      if (body.event === "headsets_compared") this.takeComparison(body);
       if (!("participant" in body) || body.participant !== this.state.selfId) continue;
       if (body.event === "tip_calibrated") this.takeTip(body);
       else if (body.event === "notice" && body.reason === "alignment_refused") this.touching.onRefused(body.text);
@@ -154,6 +155,12 @@ export class Marks {
   private takeTip(answer: Parameters<Touching["onTip"]>[0]): void {
     this.touching.onTip(answer);
     if (!answer.refused && this.store) keepTips(this.store, this.owner, this.touching.tips);
+  }
+
+  private takeComparison(compared: Parameters<Touching["onCompared"]>[1]): void {
+    const { a, b, touched } = compared;
+    const { selfId } = this.state;
+    if (touched && (a === selfId || b === selfId)) this.touching.onCompared(this.state.nameOf(a === selfId ? b : a), compared);
   }
 
   private get owner(): string {

@@ -48,11 +48,18 @@ type Stage =
   | { name: "turn"; side: Side; device: wire.Device; poses: wire.Pose[] }
   | { name: "solve"; device: wire.Device; since_ms: number }
   | { name: "touch" }
-  | { name: "rest"; pressing: Side; touching: Side; device: wire.Device; points: Vec3[]; since_ms: number }
+  /** `isCheck`: of a point that others touch too, while the squeeze is held; else of a mark. */
+  | { name: "rest"; pressing: Side; touching: Side; device: wire.Device; points: Vec3[]; since_ms: number; isCheck: boolean }
   | { name: "wait"; since_ms: number }
   | { name: "done"; since_ms: number };
 
-/** A trigger is pressed from the first on, and until it falls below the second. */
+interface Presses {
+  triggers: Side[];
+  squeezes: Side[];
+  buttons: number;
+}
+
+/** A trigger or a squeeze is pressed from the first on, and until it falls below the second. */
 const PRESS = 0.6;
 const LET_GO = 0.4;
 /** A trigger held this long at nothing begins a new alignment [ms]. */
@@ -65,6 +72,8 @@ const MIN_TIP_POSES = 20;
 /** A touch is the mean over this time [ms], in which a tip and a fingertip move less than this [m]. */
 export const REST_MS = 350;
 const STILL_M = { controller: 0.004, hand: 0.012 } as const;
+/** Name of the point that wearers touch to compare their worlds. */
+const POINT = "point";
 /** Noise of a touch per axis [m] and [rad], as docs/protocol.md (section 5) has it. */
 const TOUCH_SIGMA_M = 0.0015;
 const TOUCH_SIGMA_RAD = 0.01;
@@ -87,7 +96,7 @@ export class Touching {
   private readonly touched = new Map<string, Vec3>();
   /** Marks that the session asked for once more. */
   private readonly repeated = new Set<string>();
-  private readonly pressed = new Map<Side, { trigger: boolean; buttons: number; since_ms: number | null }>();
+  private readonly pressed = new Map<Side, { trigger: boolean; squeeze: boolean; buttons: number; since_ms: number | null }>();
   /** Words about what happened last. */
   private advice = "";
   private wasAsked = false;
@@ -174,6 +183,12 @@ export class Touching {
     if (this.stage.name === "wait") this.stage = { name: "touch" };
   }
 
+  /** Take how far apart two worlds are at the point that was touched. `other`: the other one's name. */
+  onCompared(other: string, { error_m, expected_p95_m }: Filled<wire.HeadsetsCompared>): void {
+    const verdict = error_m > 2 * expected_p95_m ? "too much" : `expected at most ${formatMillimetres(expected_p95_m)}`;
+    this.advice = `You and ${other} are ${formatMillimetres(error_m)} apart at the touched point: ${verdict}.`;
+  }
+
   /** Return where the next mark is expected, with the axes of its sheet, in the tracking frame; null: not known, or none is. */
   findExpected({ alignment }: Pick<Facts, "alignment">): { mark: string; pose: wire.Pose } | null {
     const { anchor } = this;
@@ -205,13 +220,13 @@ export class Touching {
       case "solve":
         return ["The session computes where the tip is"];
       case "rest":
-        return [`Mark ${this.queue[0]}: hold still`, drawBar((now_ms - stage.since_ms) / REST_MS)];
+        return [`${stage.isCheck ? "Your common point" : `Mark ${this.queue[0]}`}: hold still`, drawBar((now_ms - stage.since_ms) / REST_MS)];
       case "wait":
         return ["The session computes the alignment"];
       case "done":
         return [capitalize(describeAlignment(alignment)), ...(memory === "" ? [] : wrap(memory))];
       default:
-        return [...this.describeNext(alignment), ...advice, ...this.describeHow(sheet)];
+        return [...this.describeNext(alignment), ...advice, ...this.describeHow(sheet), ...this.describeCheck(alignment)];
     }
   }
 
@@ -227,11 +242,16 @@ export class Touching {
     return wrap(`Put a fingertip on cross ${this.queue[0]} of the ${sheet}, and pinch with the other hand. A finger is good enough to look; to drive, take a controller.`);
   }
 
+  private describeCheck(alignment: Facts["alignment"]): string[] {
+    return this.isBare || !isPlaced(alignment) ? [] : wrap("Squeeze: compare, with the tip on a point that another one touches too");
+  }
+
   // --- frames ---------------------------------------------------------------------------------------------------------
 
   /** Find the triggers and buttons that are pressed at this frame; those that are held when a hand appears are not. */
-  private readPresses({ inputs, capture_ms }: FrameReading, facts: Facts, outcomes: Outcome[]): { triggers: Side[]; buttons: number } {
+  private readPresses({ inputs, capture_ms }: FrameReading, facts: Facts, outcomes: Outcome[]): Presses {
     const triggers: Side[] = [];
+    const squeezes: Side[] = [];
     let buttons = 0;
     for (const side of this.pressed.keys()) if (!inputs.some((input) => input.side === side)) this.pressed.delete(side);
     for (const input of inputs) {
@@ -239,17 +259,19 @@ export class Touching {
       const trigger = before?.trigger ? input.trigger > LET_GO : input.trigger >= PRESS;
       const isPress = before !== undefined && trigger && !before.trigger && input.tracked;
       if (isPress && !facts.busy.includes(input.side)) triggers.push(input.side);
+      const squeeze = before?.squeeze ? input.squeeze > LET_GO : input.squeeze >= PRESS;
+      if (before && squeeze && !before.squeeze && input.tracked && input.kind === "controller") squeezes.push(input.side);
       if (before) buttons |= input.buttons & ~before.buttons;
       const mayBegin = trigger && input.kind === "controller" && !this.isActive && !facts.busy.includes(input.side) && input.squeeze < LET_GO;
       const since_ms = mayBegin ? (isPress ? capture_ms : (before?.since_ms ?? null)) : null;
       const isHeld = since_ms !== null && capture_ms - since_ms >= BEGIN_MS;
       if (isHeld && this.anchor && facts.isReady) outcomes.push({ type: "restart" });
-      this.pressed.set(input.side, { trigger, buttons: input.buttons, since_ms: isHeld ? null : since_ms });
+      this.pressed.set(input.side, { trigger, squeeze, buttons: input.buttons, since_ms: isHeld ? null : since_ms });
     }
-    return { triggers, buttons };
+    return { triggers, squeezes, buttons };
   }
 
-  private step(reading: FrameReading, facts: Facts, { triggers, buttons }: { triggers: Side[]; buttons: number }, outcomes: Outcome[]): void {
+  private step(reading: FrameReading, facts: Facts, { triggers, squeezes, buttons }: Presses, outcomes: Outcome[]): void {
     const { alignment } = facts;
     const now_ms = reading.capture_ms;
     const isNeeded = !isPlaced(alignment) || alignment?.kind === "persistent";
@@ -280,7 +302,8 @@ export class Touching {
         if (this.isConfirming && alignment?.kind === "measured") return this.finish(alignment, now_ms, outcomes);
         if (buttons & BUTTON.lower) this.wantsTip = true;
         this.stage = { name: !this.wantsTip && this.canTouch(reading) ? "touch" : "tip" };
-        for (const side of triggers) this.press(side, reading);
+        for (const side of triggers) this.press(side, reading, false);
+        if (isPlaced(alignment)) for (const side of squeezes) this.press(side, reading, true);
     }
   }
 
@@ -289,12 +312,12 @@ export class Touching {
     return inputs.some(({ kind, side }) => kind === "hand" || this.tips.has(`${kind}/${side}`));
   }
 
-  private press(side: Side, reading: FrameReading): void {
+  private press(side: Side, reading: FrameReading, isCheck: boolean): void {
     const pressing = reading.inputs.find((input) => input.side === side)!;
     const device: wire.Device = `${pressing.kind}/${side}`;
     const since_ms = reading.capture_ms;
     if (this.stage.name === "tip") {
-      if (pressing.kind !== "controller") return;
+      if (pressing.kind !== "controller" || isCheck) return;
       this.advice = "";
       this.stage = { name: "turn", side, device, poses: [] };
       return;
@@ -305,7 +328,7 @@ export class Touching {
       this.advice = pressing.kind === "hand" ? "The finger of the other hand is not seen." : `The tip of the ${side} controller is not calibrated: A or X begins that.`;
       return;
     }
-    this.stage = { name: "rest", pressing: side, touching: touching.side, device: `${touching.kind}/${touching.side}`, points: [], since_ms };
+    this.stage = { name: "rest", pressing: side, touching: touching.side, device: `${touching.kind}/${touching.side}`, points: [], since_ms, isCheck };
   }
 
   private stepTurn(stage: Extract<Stage, { name: "turn" }>, reading: FrameReading, triggers: Side[], outcomes: Outcome[]): void {
@@ -332,9 +355,9 @@ export class Touching {
     const now_ms = reading.capture_ms;
     const touching = reading.inputs.find((input) => input.side === stage.touching && `${input.kind}/${input.side}` === device);
     const p = touching?.tracked ? this.findTip(touching) : null;
-    const isHeld = this.pressed.get(stage.pressing)?.trigger ?? false;
+    const isHeld = this.pressed.get(stage.pressing)?.[stage.isCheck ? "squeeze" : "trigger"] ?? false;
     if (!touching || p === null || !isHeld) {
-      this.advice = "Keep the trigger pressed for a moment, and hold still.";
+      this.advice = `Keep the ${stage.isCheck ? "squeeze" : "trigger"} pressed for a moment, and hold still.`;
       this.stage = { name: "touch" };
       return;
     }
@@ -343,24 +366,29 @@ export class Touching {
       return;
     }
     points.push(p);
-    if (now_ms - stage.since_ms >= REST_MS) this.report(touching, device, points, facts, now_ms, outcomes);
+    if (now_ms - stage.since_ms >= REST_MS) this.report(stage, touching, facts, now_ms, outcomes);
   }
 
-  private report(touching: InputReading, device: wire.Device, points: Vec3[], { alignment }: Facts, capture_ms: number, outcomes: Outcome[]): void {
-    const { anchor } = this;
-    const mark = this.queue.shift();
-    if (!anchor || mark === undefined) return;
+  private report({ device, points, isCheck }: Extract<Stage, { name: "rest" }>, touching: InputReading, { alignment }: Facts, capture_ms: number, outcomes: Outcome[]): void {
     const sum = points.reduce((a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]]);
     const p: [number, number, number] = [sum[0] / points.length, sum[1] / points.length, sum[2] / points.length];
     const tip = this.tips.get(device);
+    const T_tracking_anchor: wire.Pose = [p, [...(touching.pose?.[1] ?? IDENTITY[1])]];
+    const covariance = tip ? makeTouchCovariance(tip) : [];
+    outcomes.push({ type: "pulse", side: touching.side });
+    if (isCheck) {
+      outcomes.push({ type: "observe", observation: { anchor_id: POINT, kind: "point", device, T_tracking_anchor, covariance, capture_ms } });
+      [this.stage, this.advice] = [{ name: "touch" }, "Touched. It is compared when another one touches the same point within a minute."];
+      return;
+    }
+    const { anchor } = this;
+    const mark = this.queue.shift();
+    if (!anchor || mark === undefined) return;
     this.isConfirming = this.touched.size === 0 ? alignment?.kind === "persistent" && tip !== undefined : this.isConfirming;
     if (this.touched.size === 0) this.version = alignment?.version;
     this.touched.set(mark, p);
     this.advice = "";
-    const q = touching.pose?.[1] ?? IDENTITY[1];
-    const covariance = tip ? makeTouchCovariance(tip) : [];
-    const observation: ObservationInput = { anchor_id: anchor.anchor_id, kind: "touch", mark, device, T_tracking_anchor: [p, [...q]], covariance, capture_ms };
-    outcomes.push({ type: "observe", observation }, { type: "pulse", side: touching.side });
+    outcomes.push({ type: "observe", observation: { anchor_id: anchor.anchor_id, kind: "touch", mark, device, T_tracking_anchor, covariance, capture_ms } });
     this.stage = this.queue.length > 0 ? { name: "touch" } : { name: "wait", since_ms: capture_ms };
   }
 

@@ -102,6 +102,30 @@ describe("the tip", () => {
   });
 });
 
+describe("comparison", () => {
+  test("an aligned headset reports a point under a squeeze, and hears how far apart two worlds are", () => {
+    knowTip();
+    const squeeze = (p: Vec3): ObservationInput[] => {
+      step(controller());
+      const found: ObservationInput[] = [];
+      for (let i = 0; i <= REST_MS / 20 + 2 && found.length === 0; i++) found.push(...observed(step(controller({ pose: tipAt(p), squeeze: 1 }))));
+      return found;
+    };
+    touching.begin();
+    expect(squeeze([1, 0, 0])).toEqual([]); // not aligned: there is nothing to compare
+    facts.alignment = alignment;
+    step(controller());
+    expect(says()).toMatch(/Squeeze: compare/);
+    const [point] = squeeze([1, 0.2, 0.3]);
+    expect(point).toMatchObject({ kind: "point", anchor_id: "point", device: "controller/right" });
+    point!.T_tracking_anchor[0].forEach((value, i) => expect(value).toBeCloseTo([1, 0.2, 0.3][i]!, 9));
+    expect(point!.covariance).toHaveLength(36);
+    touching.onCompared("Bob", { event: "headsets_compared", a: "p1", b: "p2", anchor_id: "point", error_m: 0.0062, error_rad: 0, expected_p95_m: 0.014, p_world: [0, 0, 0], n: 1, touched: true });
+    expect(says()).toMatch(/You and Bob are 6.2 mm apart at the touched point: expected at most 14/);
+    expect(touch(at("1"))[0]).toMatchObject({ kind: "touch", mark: "1" }); // marks go on
+  });
+});
+
 describe("touches", () => {
   test("each mark in turn, as the mean of a moment of rest, with the error of the tip", () => {
     knowTip();
