@@ -78,6 +78,8 @@ def make_stages() -> tuple[Stage, ...]:
     return (
         Stage("lint", (str(BIN / "ruff"), "check", "."), takes_one_core=True),
         Stage("format", (str(BIN / "ruff"), "format", "--check", "."), takes_one_core=True),
+        # They wait for frames and for each other: beside another stage they take no longer.
+        make_pytest("browsers", "e2e and not long and browser", "-p", "no:xdist", "tests/e2e", takes_one_core=True),
         make_pytest(
             "core",
             "not e2e and not long",
@@ -100,7 +102,6 @@ def make_stages() -> tuple[Stage, ...]:
             "e2e and not long and not browser",
             *("-n", str(PROCESS_JOBS), "--dist", "loadfile", "--no-loadscope-reorder", "tests"),
         ),
-        make_pytest("browsers", "e2e and not long and browser", "-p", "no:xdist", "tests/e2e"),
     )
 
 
