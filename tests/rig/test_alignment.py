@@ -218,6 +218,15 @@ def test_four_headsets_show_the_hammer_at_one_place() -> None:
             assert report is not None
             assert report.observations > 0
             assert 0.0 < report.error_at_anchor_m < report.error_at_robot_m + 1e-9
+        for one in operators[:2]:  # both put a fingertip on one point of the table
+            T_tracking_finger = one.headset.track((hammer[0], (1.0, 0.0, 0.0, 0.0)), rig.simulation.now_ns)
+            one.client.alignment.observe("cross", T_tracking_finger, kind="point", device="hand/right")
+        rig.run(12.0)
+        touched = [c for _, c in rig.list_events("watcher", HeadsetsCompared) if c.touched]
+        assert len(touched) == 1, "the sheet is compared every five seconds, the touches once"
+        assert {touched[0].a, touched[0].b} == {one.client.participant_id for one in operators[:2]}
+        assert touched[0].error_m <= CHANCE_FACTOR * touched[0].expected_p95_m
+        assert [c.error_m for c in watcher.status().cross_checks if c.touched] == [touched[0].error_m]
 
 
 def test_bump_raises_an_alarm_and_the_robot_holds_until_aligned_again() -> None:
