@@ -22,7 +22,7 @@ from iris_session.link.sockets import open_listeners
 from iris_session.link.tcp_guard import TcpBounds, TcpConnection, TcpGuard, TcpReasons
 from iris_session.protocol.limits import Drops, KeyedBuckets, TokenBucket, find_network
 from iris_session.web.frames import NETWORK_EXTRA_BURST, NETWORK_EXTRA_PER_S, FrameMeter
-from iris_session.web.sockets import limit_unsent
+from iris_session.web.sockets import MeteredSocket, count_acknowledged, count_unacknowledged, limit_unsent
 from iris_session.web.wire import CLOSE_LIMIT, make_close_frame
 
 #: Connections of one browser that are established. It has two WebSockets, and 16 assets at once.
@@ -33,12 +33,19 @@ HANDSHAKES_PER_S, HANDSHAKE_BURST = 20.0, 120
 REQUESTS_PER_S, REQUEST_BURST = 200.0, 1000
 MAX_ADDRESSES: Final = 1024
 #: Bytes from one connection: of an established one what its browser may send in messages (`HubLimits`) with their
-#: frames, of another a request, a hello and pairing. All that a peer can send counts, whatever aiohttp does with it:
-#: empty fragments of WebSockets for example never become a message.
+#: frames, of another a request, a hello and pairing. All that a peer can send counts, whatever TLS and aiohttp do with
+#: it: handshake messages and empty fragments of WebSockets for example never become a message.
 ESTABLISHED_BYTES_PER_S, ESTABLISHED_BYTES_BURST = 5e6, 10_000_000
 OTHER_BYTES_PER_S, OTHER_BYTES_BURST = 20e3, 200_000
 #: The same of all connections of a network that are not established.
 NETWORK_BYTES_PER_S, NETWORK_BYTES_BURST = 200e3, 2_000_000
+#: Bytes of one owner that are none of its data: 29 of each record of TLS, of which a browser sends 1,500 a second, and
+#: those of handshakes. A ClientHello after the handshake has 33, costs 8 us, and leaves 31 of an answer in memory; so
+#: a connection that is not established has few of them in all.
+OVERHEAD_PER_S, OVERHEAD_BURST, OTHER_OVERHEAD = 60e3, 200_000, 16_384
+#: Of these bytes of one connection none count for its network: a request and a hello come through whatever others of
+#: the network send.
+FREE_BYTES, FREE_OVERHEAD = 16_384, 4096
 #: Time for the first byte, for the handshake of TLS, and for a request.
 FIRST_BYTE_S: Final = 5.0
 HANDSHAKE_S: Final = 8.0
@@ -53,6 +60,9 @@ BOUNDS: Final = TcpBounds(
     unread_bytes=0,
 )
 REASONS: Final = TcpReasons("web", "web_connections", "web_connections", "web_idle", "", "web_connections_per_address")
+#: Longest time in which a peer acknowledges nothing of what waits for it, also where nobody waits for it any more: a
+#: WebSocket that is being closed, small answers.
+STALLED_S: Final = 10.0
 _SWEEP_S: Final = 1.0
 _BACKLOG: Final = 256
 #: Pause when the system gives no connection, for lack of descriptors for example.
@@ -67,23 +77,20 @@ _PATH: Final = re.compile(rb"[A-Z]{3,7} (/[A-Za-z0-9._~!$&'()*+,;=:@%/?-]{0,500}
 
 
 class WatchedProtocol(asyncio.Protocol):
-    """Protocol of one connection that passes everything on to that of aiohttp, and notes the end.
-
-    `take`: returns whether so many bytes more may come; a connection with too many is cut, as is a WebSocket with too
-    many frames.
-    """
+    """Protocol of one connection that passes everything on to that of aiohttp, notes how much and the end, and cuts a
+    WebSocket with too many frames."""
 
     def __init__(
         self,
         inner: asyncio.Protocol,
         on_made: Callable[[asyncio.Transport], None],
         on_lost: Callable[[], None],
-        take: Callable[[int], bool],
+        note_data: Callable[[int], None],
     ) -> None:
         self._inner = inner
         self._on_made = on_made
         self._on_lost = on_lost
-        self._take = take
+        self._note_data = note_data
         self._transport: asyncio.Transport | None = None
         self._take_frames: Callable[[bytes], bool] | None = None
         self._is_cut = False
@@ -101,24 +108,15 @@ class WatchedProtocol(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         if self._is_cut:
             return
-        if not self._take(len(data)):
-            self._cut(b"")
-        elif self._take_frames is not None and not self._take_frames(data):
-            self._cut(_FLOOD)
-        else:
+        self._note_data(len(data))
+        if self._take_frames is None or self._take_frames(data):
             self._inner.data_received(data)
-
-    def _cut(self, farewell: bytes) -> None:
-        """Close the connection, and read nothing of it any more; `farewell` says why, to those who read."""
-        self._is_cut = True
-        if self._transport is None:
             return
-        if farewell:
-            self._transport.write(farewell)
+        self._is_cut = True
+        if self._transport is not None:  # those who read are told why
+            self._transport.write(_FLOOD)
             self._transport.close()
             asyncio.get_running_loop().call_later(_FAREWELL_S, self._transport.abort)
-        else:
-            self._transport.abort()
 
     def eof_received(self) -> bool | None:
         return self._inner.eof_received()
@@ -134,6 +132,43 @@ class WatchedProtocol(asyncio.Protocol):
             self._inner.connection_lost(exc)
         finally:
             self._on_lost()
+
+
+class ByteMeter:
+    """Counts and limits the bytes of one connection. `network_bytes`, `overhead`: buckets by network and by owner."""
+
+    def __init__(
+        self, connection: TcpConnection, network_bytes: KeyedBuckets, overhead: KeyedBuckets, now_ns: int
+    ) -> None:
+        self._connection = connection
+        self._network = find_network(connection.address[0])
+        self._network_bytes = network_bytes
+        self._overhead = overhead
+        self._other = TokenBucket(OTHER_BYTES_PER_S, OTHER_BYTES_BURST, now_ns)
+        self._established = TokenBucket(ESTABLISHED_BYTES_PER_S, ESTABLISHED_BYTES_BURST, now_ns)
+        self._received = self._data = 0
+        self._most_overhead = FREE_OVERHEAD  # bytes that were no data, when they were most
+
+    def note_data(self, n_bytes: int) -> None:
+        """Count bytes that have come out of TLS."""
+        self._data += n_bytes
+
+    def take(self, n_bytes: int, now_ns: int) -> bool:
+        """Return whether bytes that have come in are within the limits. It is known of those before what was data."""
+        overhead = self._received - self._data  # of a record that has not come whole, for a moment
+        more = max(0, overhead - self._most_overhead)
+        self._most_overhead += more
+        free = max(0, FREE_BYTES - self._received)
+        self._received += n_bytes
+        if more and not self._overhead.take(self._connection.owner, now_ns, more):
+            return False
+        if self._connection.is_established:
+            return self._established.take(now_ns, n_bytes)
+        return (
+            overhead <= OTHER_OVERHEAD
+            and self._other.take(now_ns, n_bytes)
+            and self._network_bytes.take(self._network, now_ns, max(0, n_bytes - free))
+        )
 
 
 class Listener:
@@ -154,7 +189,9 @@ class Listener:
         self._handshakes = KeyedBuckets(HANDSHAKES_PER_S, HANDSHAKE_BURST, MAX_ADDRESSES)
         self._requests = KeyedBuckets(REQUESTS_PER_S, REQUEST_BURST, MAX_ADDRESSES)
         self._bytes = KeyedBuckets(NETWORK_BYTES_PER_S, NETWORK_BYTES_BURST, MAX_ADDRESSES)
+        self._overhead = KeyedBuckets(OVERHEAD_PER_S, OVERHEAD_BURST, MAX_ADDRESSES)
         self._extra_frames = KeyedBuckets(NETWORK_EXTRA_PER_S, NETWORK_EXTRA_BURST, MAX_ADDRESSES)
+        self._progress: dict[TcpConnection, tuple[int, int]] = {}  # bytes acknowledged, and since when not more
         self._loop = asyncio.get_running_loop()
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -241,12 +278,24 @@ class Listener:
             if self._tls is not None and not self.allow_handshake(str(peer[0])):
                 sock.close()
                 continue
-            self._start(self._serve(sock))
+            self._start(self._serve(MeteredSocket(sock)))
 
     async def _sweep(self) -> None:
         while True:
             await asyncio.sleep(_SWEEP_S)
             self._count(self._guard.tick(time.monotonic_ns()))
+            self._evict_stalled(time.monotonic_ns())
+
+    def _evict_stalled(self, now_ns: int) -> None:
+        """Close connections whose peers have acknowledged nothing for `STALLED_S` although something waits."""
+        before, self._progress = self._progress, {}
+        for descriptor, connection in list(self._guard.table.items()):
+            if count_unacknowledged(descriptor):
+                acknowledged = count_acknowledged(descriptor)
+                last, since_ns = before.get(connection, (-1, now_ns))
+                self._progress[connection] = acknowledged, since_ns if acknowledged == last else now_ns
+                if now_ns - self._progress[connection][1] > STALLED_S * SECOND:
+                    self._count([self._guard.evict(descriptor, "web_too_slow")])
 
     def _count(self, reasons: Iterable[str]) -> None:
         for reason in reasons:
@@ -258,12 +307,21 @@ class Listener:
             self._closers.pop(connection)()
         return True
 
-    async def _serve(self, sock: socket.socket) -> None:
+    async def _serve(self, sock: MeteredSocket) -> None:
         """Make a connection of an accepted socket: count it, sniff TLS, shake hands."""
         task = asyncio.current_task()
         assert task is not None
         descriptor = sock.fileno()
         connection = self._guard.add(descriptor, time.monotonic_ns())
+        meter = ByteMeter(connection, self._bytes, self._overhead, time.monotonic_ns())
+
+        def take(n_bytes: int) -> bool:
+            if meter.take(n_bytes, time.monotonic_ns()):
+                return True
+            self._drops.count("web_flood")
+            return False
+
+        sock.take = take
         self._closers[connection] = task.cancel
         is_passed_on = False
         try:
@@ -282,7 +340,7 @@ class Listener:
                 self._make_protocol(),
                 on_made,
                 lambda: self._remove(descriptor, connection),
-                self._make_byte_limit(connection),
+                meter.note_data,
             )
             is_passed_on = True
             try:
@@ -299,24 +357,6 @@ class Listener:
                 self._remove(descriptor, connection)
                 with contextlib.suppress(OSError):
                     sock.close()
-
-    def _make_byte_limit(self, connection: TcpConnection) -> Callable[[int], bool]:
-        """Return the function that takes bytes of one connection from its limit."""
-        network, now_ns = find_network(connection.address[0]), time.monotonic_ns()
-        other = TokenBucket(OTHER_BYTES_PER_S, OTHER_BYTES_BURST, now_ns)
-        established = TokenBucket(ESTABLISHED_BYTES_PER_S, ESTABLISHED_BYTES_BURST, now_ns)
-
-        def take(n_bytes: int) -> bool:
-            now_ns = time.monotonic_ns()
-            if connection.is_established:
-                is_allowed = established.take(now_ns, n_bytes)
-            else:
-                is_allowed = other.take(now_ns, n_bytes) and self._bytes.take(network, now_ns, n_bytes)
-            if not is_allowed:
-                self._drops.count("web_flood")
-            return is_allowed
-
-        return take
 
     def _remove(self, descriptor: int, connection: TcpConnection) -> None:
         self._closers.pop(connection, None)

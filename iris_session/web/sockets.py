@@ -22,6 +22,8 @@ if sys.platform == "linux":
 ROUND: Final = 64
 _NOBLOCK: Final = int(zmq.NOBLOCK)
 _EVENTS, _POLLIN, _POLLOUT = int(zmq.EVENTS), int(zmq.POLLIN), int(zmq.POLLOUT)
+#: Bytes of a connection that are read before others have their turn: 4 ms of the handshake messages of TLS.
+READ_BYTES: Final = 16_384
 #: Unsent bytes that the system takes of one connection; more stays with us, where the newest value replaces the last.
 NOT_SENT_BYTES: Final = 16_384
 _TCP_NOTSENT_LOWAT: Final = 25  # linux/tcp.h
@@ -108,6 +110,36 @@ class SocketReader:
                 self._schedule()
             if events & _POLLOUT:
                 self._on_room()
+
+
+class MeteredSocket(socket.socket):
+    """A TCP connection that reports how much asyncio receives on it, before TLS and HTTP read it.
+
+    Args:
+        sock: The connection, whose descriptor is taken over.
+
+    Attributes:
+        take: Returns whether so many bytes may come; else the connection ends.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        super().__init__(sock.family, sock.type, sock.proto, sock.detach())
+        self.take: Callable[[int], bool] = bool
+
+    def recv(self, bufsize: int, flags: int = 0, /) -> bytes:
+        data = super().recv(min(bufsize, READ_BYTES), flags)
+        if not flags & socket.MSG_PEEK:
+            self._count(len(data))
+        return data
+
+    def recv_into(self, buffer: bytearray | memoryview, nbytes: int = 0, flags: int = 0, /) -> int:  # type: ignore[override]
+        n_bytes = super().recv_into(memoryview(buffer)[:READ_BYTES], nbytes, flags)
+        self._count(n_bytes)
+        return n_bytes
+
+    def _count(self, n_bytes: int) -> None:
+        if n_bytes and not self.take(n_bytes):
+            raise ConnectionAbortedError
 
 
 def limit_unsent(sock: socket.socket) -> None:

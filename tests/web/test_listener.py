@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 import ssl
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
@@ -12,13 +14,16 @@ import pytest
 
 from iris_session.link.config import SECOND
 from iris_session.link.tcp_guard import TcpConnection, TcpGuard
-from iris_session.protocol.limits import Drops
+from iris_session.protocol.limits import Drops, KeyedBuckets
+from iris_session.security import KeyHome
 from iris_session.web import listener
+from iris_session.web.certificate import load_or_make_certificate, make_tls_context
 from iris_session.web.hub import Hub
 from iris_session.web.listener import (
     BOUNDS,
     MAX_PER_BROWSER,
     REASONS,
+    ByteMeter,
     Listener,
     WatchedProtocol,
     open_listening_sockets,
@@ -26,6 +31,7 @@ from iris_session.web.listener import (
 from iris_session.web.origin import HostCheck
 from iris_session.web.page import PageFiles
 from iris_session.web.server import WebServer
+from iris_session.web.sockets import READ_BYTES, MeteredSocket
 from iris_session.web.wire import CLOSE_LIMIT, SUBPROTOCOL
 
 
@@ -106,40 +112,107 @@ def test_one_browser_has_few_connections_and_networks_have_rates() -> None:
             one.close()
 
 
+class MeterRig:
+    """Meters of connections that share the buckets of networks and owners."""
+
+    def __init__(self) -> None:
+        self.networks = KeyedBuckets(listener.NETWORK_BYTES_PER_S, listener.NETWORK_BYTES_BURST, 16)
+        self.overhead = KeyedBuckets(listener.OVERHEAD_PER_S, listener.OVERHEAD_BURST, 16)
+
+    def open(self, address: str, browser: str = "") -> ByteMeter:
+        connection = TcpConnection((address, 1), SECOND)
+        if browser:
+            connection.is_established, connection.owner = True, browser
+        return ByteMeter(connection, self.networks, self.overhead, SECOND)
+
+
+def send(meter: ByteMeter, n_records: int, n_bytes: int, n_data: int, now_ns: int = SECOND) -> int:
+    """Return how many of so many records are taken, each with `n_data` of its bytes for HTTP."""
+    for n in range(n_records):
+        if not meter.take(n_bytes, now_ns):
+            return n
+        meter.note_data(n_data)
+    return n_records
+
+
 def test_bytes_are_limited_before_anything_reads_them() -> None:
     """Empty fragments of WebSockets, for example, never become a message."""
-
-    async def send() -> None:
-        serving = Listener(asyncio.Protocol, None, drops := Drops())
-        a, b = (TcpConnection((address, 1), SECOND) for address in ("10.0.0.1", "10.0.0.2"))
-        take = serving._make_byte_limit(a)
-        assert take(listener.OTHER_BYTES_BURST - 1)
-        assert not take(listener.OTHER_BYTES_BURST)
-        a.is_established = True
-        assert take(listener.OTHER_BYTES_BURST)
-        assert not take(listener.ESTABLISHED_BYTES_BURST)
-        many = [serving._make_byte_limit(TcpConnection(b.address, SECOND))(100_000) for _ in range(60)]
-        assert 10 < many.count(True) < 40  # of one network together
-        assert drops.by_reason == {"web_flood": 2 + many.count(False)}
-
-    asyncio.run(send())
+    rig = MeterRig()
+    assert send(rig.open("a"), 300, 1000, 1000) == listener.OTHER_BYTES_BURST // 1000
+    assert send(rig.open("a", "web-1"), 20_000, 1000, 1000) == listener.ESTABLISHED_BYTES_BURST // 1000
+    n_taken = [send(rig.open("b"), 1, 100_000, 100_000) for _ in range(60)]
+    assert 10 < sum(n_taken) < 40, "of one network together"
+    assert send(rig.open("b"), 8, 1000, 1000) == 8, "the first ones do not count for the network"
 
 
-def test_a_connection_that_sends_too_much_is_cut() -> None:
-    transport, inner = Mock(spec=asyncio.Transport), Mock(spec=asyncio.Protocol)
-    protocol = WatchedProtocol(inner, lambda _: None, lambda: None, lambda n_bytes: n_bytes < 100)
-    protocol.connection_made(transport)
-    protocol.data_received(bytes(99))
-    assert not transport.abort.called
-    protocol.data_received(bytes(100))
-    assert transport.abort.called
-    inner.data_received.assert_called_once_with(bytes(99))
+def test_records_that_are_no_data_are_limited() -> None:
+    """Those after a ClientHello in TLS 1.2, or KeyUpdate in TLS 1.3, of which HTTP never hears."""
+    rig = MeterRig()
+    n_hellos = send(rig.open("a"), 10_000, 33, 0)
+    assert 33 * n_hellos < 20_000
+    browser = rig.open("a", "web-1")
+    assert 33 * send(browser, 100_000, 33, 0) < 210_000
+    assert send(rig.open("a", "web-1"), 300, 33, 0) < 300, "of one browser together"
+    neighbour = rig.open("a", "web-2")
+    for second in range(1, 60):
+        assert send(neighbour, 1500, 29 + 40, 40, second * SECOND) == 1500, "what a browser may send"
+    upload = rig.open("a", "web-3")
+    assert all(send(upload, 1, 16_384, 0) and send(upload, 1, 45, 16_384 + 16) for _ in range(500)), "records in parts"
+
+
+def test_a_socket_reports_what_it_receives_and_ends() -> None:
+    async def receive() -> tuple[list[int], Exception | None]:
+        ours, theirs = socket.socketpair()
+        metered, lost = MeteredSocket(ours), asyncio.get_running_loop().create_future()
+        metered.setblocking(False)
+        sizes: list[int] = []
+        metered.take = lambda n_bytes: sizes.append(n_bytes) is None and sum(sizes) <= 3 * READ_BYTES
+        protocol = Mock(spec=asyncio.Protocol)
+        protocol.connection_lost.side_effect = lost.set_result
+        await asyncio.get_running_loop().connect_accepted_socket(lambda: protocol, metered)
+        theirs.sendall(bytes(3 * READ_BYTES + 1))
+        reason = await lost
+        theirs.close()
+        return sizes, reason
+
+    sizes, reason = asyncio.run(receive())
+    assert sizes == [READ_BYTES] * 3 + [1]
+    assert isinstance(reason, ConnectionAbortedError)
+
+
+def test_bytes_of_tls_that_are_no_data_cut_a_connection(tmp_path: Path) -> None:
+    """Records with one byte each have the most besides that the client of Python can send."""
+    made = load_or_make_certificate(KeyHome(tmp_path), [])
+
+    async def flood() -> dict[str, int]:
+        protocol = Mock(spec=asyncio.Protocol)
+        tls = make_tls_context(made.certificate_path, made.key_path)
+        serving = Listener(lambda: protocol, tls, drops := Drops())
+        sockets = open_listening_sockets(["127.0.0.1"], 0)
+        serving.listen(sockets)
+        trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+        reader, writer = await asyncio.open_connection("127.0.0.1", sockets[0].getsockname()[1], ssl=trusting)
+        with contextlib.suppress(ConnectionError):
+            while not reader.at_eof():
+                writer.write(b"x")
+                await writer.drain()
+                await asyncio.sleep(0)
+        writer.close()
+        n_data = sum(len(one.args[0]) for one in protocol.data_received.mock_calls)
+        assert 100 < n_data < 2 * listener.OTHER_OVERHEAD // 29
+        for one in sockets:
+            one.close()
+        await serving.close()
+        return drops.by_reason
+
+    assert asyncio.run(flood()) == {"web_flood": 1}
 
 
 def test_a_websocket_with_too_many_frames_is_told_and_cut() -> None:
     async def feed() -> None:
         transport, inner = Mock(spec=asyncio.Transport), Mock(spec=asyncio.Protocol)
-        protocol = WatchedProtocol(inner, lambda _: None, lambda: None, lambda _: True)
+        protocol = WatchedProtocol(inner, lambda _: None, lambda: None, lambda _: None)
         protocol.connection_made(transport)
         protocol.count_frames(lambda data: data != b"bad")
         for data in (b"good", b"bad", b"good"):
@@ -196,6 +269,36 @@ def test_frames_that_are_no_message_end_their_websocket(path: str, frame: bytes)
     assert drops == {"web_flood": 1}
     answer, _ = asyncio.run(send(frame, b""))
     assert answer.startswith(b"HTTP/1.1 400")
+
+
+def test_a_peer_that_acknowledges_nothing_is_cut() -> None:
+    """Whatever it is sent, and also while its connection is being closed."""
+
+    class Writing(asyncio.Protocol):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            assert isinstance(transport, asyncio.Transport)
+            transport.write(bytes(8 << 20))
+            transport.close()
+
+    async def serve() -> dict[str, int]:
+        serving = Listener(Writing, None, drops := Drops())
+        sockets = open_listening_sockets(["127.0.0.1"], 0)
+        serving.listen(sockets)
+        peer = socket.create_connection(sockets[0].getsockname())
+        now_ns = 0
+        while not len(serving):
+            await asyncio.sleep(0)
+        while len(serving):  # what the system has room for is acknowledged
+            now_ns += round((listener.STALLED_S + 1) * SECOND)
+            serving._evict_stalled(now_ns)
+            await asyncio.sleep(0)
+        peer.close()
+        for one in sockets:
+            one.close()
+        await serving.close()
+        return drops.by_reason
+
+    assert asyncio.run(serve()) == {"web_too_slow": 1}
 
 
 @pytest.mark.parametrize("is_allowed", [True, False])
