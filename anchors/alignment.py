@@ -85,7 +85,8 @@ class AlignmentConfig:
     `dof`: 4, or 6 to measure the tilt without gravity. `tilt_sigma_rad`: how far a headset's
     vertical may be off; `max_tilt_rad`: beyond it a single observation is wrong; `follow_tilt_rad`: so far a tilt that
     all anchors show is followed, from `tilt_warning_rad` on (and beyond noise) with a warning. `drift_m_per_s`,
-    `walk_m_per_sqrt_s`: how the tracking frame drifts and wanders, per axis. `max_error_m`: the stated p95 at the
+    `walk_m_per_sqrt_s`: how the tracking frame drifts and wanders, per axis, `yaw_rad_per_s`, `yaw_walk_rad_per_sqrt_s`
+    about the vertical. `max_error_m`: the stated p95 at the
     anchors above which the estimate is refused. `max_observations`, `max_groups`, and of one viewpoint `max_in_group`:
     the oldest are forgotten (counted in `forgotten`), as are those older than the newest by more than `max_age_ns`
     (`outdated`). `min_agreeing`: share of one viewpoint's observations that must agree. `size_tolerance`: by what share
@@ -103,6 +104,8 @@ class AlignmentConfig:
     max_tilt_rad: float = math.radians(15.0)
     drift_m_per_s: float = 0.003 / 60.0 / math.sqrt(3.0)
     walk_m_per_sqrt_s: float = 0.001 / math.sqrt(60.0)
+    yaw_rad_per_s: float = math.radians(0.2) / 60.0
+    yaw_walk_rad_per_sqrt_s: float = math.radians(0.07) / math.sqrt(60.0)
     max_error_m: float = 0.03
     min_observations: int = 5
     max_observations: int = 600
@@ -115,7 +118,9 @@ class AlignmentConfig:
     @property
     def prior(self) -> AlignmentPrior:
         tilt = self.tilt_sigma_rad if self.dof == 4 else math.inf
-        return AlignmentPrior(tilt, self.drift_m_per_s, self.walk_m_per_sqrt_s)
+        return AlignmentPrior(
+            tilt, self.drift_m_per_s, self.walk_m_per_sqrt_s, self.yaw_rad_per_s, self.yaw_walk_rad_per_sqrt_s
+        )
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from anchors.solver import (
+    N_FRAME,
     AlignmentPrior,
     AlignmentProblem,
     AlignmentSolution,
@@ -146,7 +147,7 @@ def explain_by_scale(
     scaled, found = solve_with_scale(b, prior, start, each)
     if not _is_better(s, found):
         return None
-    sigma = np.sqrt(np.diagonal(found.inverse)[9:])
+    sigma = np.sqrt(np.diagonal(found.inverse)[N_FRAME:])
     information = 1.0 / sigma**2
     common = float(information @ found.scale / information.sum())
     spread = float(information @ (found.scale - common) ** 2)
@@ -155,13 +156,13 @@ def explain_by_scale(
         return scaled, found, (ScaleError(names[0], float(found.scale[0]), float(sigma[0]), True),)
     if spread <= chi2_quantile(len(names) - 1.0, Z999) and abs(common) > _SUSPECT / float(np.sqrt(information.sum())):
         scaled, found = solve_with_scale(b, prior, start, columns)
-        error = ScaleError("", float(found.scale[0]), float(np.sqrt(found.inverse[9, 9])), False)
+        error = ScaleError("", float(found.scale[0]), float(np.sqrt(found.inverse[N_FRAME, N_FRAME])), False)
         return (scaled, found, (error,)) if _is_better(s, found) else None
     wrong = np.abs(found.scale) > _SUSPECT * sigma
     if not wrong.any():
         return None
     scaled, found = solve_with_scale(b, prior, start, each[:, :, wrong])
-    sigma = np.sqrt(np.diagonal(found.inverse)[9:])
+    sigma = np.sqrt(np.diagonal(found.inverse)[N_FRAME:])
     errors = zip(_select(names, wrong), found.scale.tolist(), sigma.tolist(), strict=True)
     return (scaled, found, tuple(ScaleError(*one, False) for one in errors)) if _is_better(s, found) else None
 

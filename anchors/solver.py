@@ -1,7 +1,8 @@
 """Most probable `T_tracking_world` of one headset, given merged observations of anchors of known pose: the second stage
 behind `anchors.alignment`.
 
-Unknown are translation (3), rotation (3) and the velocity of the tracking frame's drift (3). Gravity is an observation
+Unknown are translation (3), rotation (3) and the drift of the tracking frame: its velocity (3) and its turn rate about
+the vertical, through the middle of what was seen (1). Gravity is an observation
 too: the tilt of the frame is zero with the stated sigma; so is the drift. Gauss-Newton on whitened residuals; where a
 group does not fit, the largest set of groups that agree with one of them is solved instead, or all but one sheet, and
 what then lies outside its 99.9 % ellipsoid is left out.
@@ -36,6 +37,7 @@ _CHI2_3_999: Final = 16.266
 _CHI2_2_999: Final = 13.816
 _ITERATIONS: Final = 6
 _STEADY_S: Final = 60.0  # for so long the drift is taken as steady, later the frame also wanders
+N_FRAME: Final = 10  # translation, rotation, drift; errors of scale follow
 _CONVERGED: Final = 2e-4  # [m], [rad]; with residuals of milliradians the step after would be below 1e-6
 _MAX_LEFT_OUT: Final = 4  # sheets that are left out in turn
 _MIN_SURE: Final = 2  # more sheets than this do not agree by chance
@@ -49,13 +51,15 @@ Mask = NDArray[np.bool_]
 class AlignmentPrior:
     """Prior of the alignment, standard deviations per axis.
 
-    `tilt_sigma_rad`: tilt against gravity, infinite to measure it. `drift_m_per_s`: velocity of the tracking frame.
-    `walk_m_per_sqrt_s`: its random walk.
+    `tilt_sigma_rad`: tilt against gravity, infinite to measure it. `drift_m_per_s`, `yaw_rad_per_s`: velocity and turn
+    rate of the tracking frame. `walk_m_per_sqrt_s`, `yaw_walk_rad_per_sqrt_s`: its random walk.
     """
 
     tilt_sigma_rad: float
     drift_m_per_s: float
     walk_m_per_sqrt_s: float
+    yaw_rad_per_s: float = 0.0
+    yaw_walk_rad_per_sqrt_s: float = 0.0
 
     @property
     def gravity(self) -> bool:
@@ -73,6 +77,7 @@ class AlignmentProblem:
     covariance: Array  # (G, 6, 6)
     information: Array  # (G, 6, 6), the inverse
     age_s: Array  # (G,)
+    yaw: Array  # (G, 6): shifts of the observed poses by a turn of the frame [1 rad]
     bias: Array  # (G, 6, K): shifts of the observed poses by one standard deviation of each of K common biases
     untested: Array  # (G, 6, U): the same, of the untested scale of each source
     sources: tuple[str, ...]  # (U,) their names
@@ -99,8 +104,8 @@ class AlignmentSolution:
     drift: Array
     distance2: Array
     turns: Array
-    weighted: Array  # (6 G, 9 + S) information times Jacobian of the groups inside
-    inverse: Array  # (9 + S, 9 + S) covariance of everything unknown
+    weighted: Array  # (6 G, 10 + S) information times Jacobian of the groups inside
+    inverse: Array  # (10 + S, 10 + S) covariance of everything unknown
     scale: Array  # (S,) errors of scale, share of the distance
     tested: Array  # (U,) how well these looks, or earlier ones, test the scale of each source
 
@@ -138,16 +143,27 @@ def build_problem(
     p = np.concatenate([m.p for m in merged]).reshape(-1, 3)
     q = quat_multiply(np.concatenate([m.q for m in merged]).reshape(-1, 4), quat_conjugate(q_world))
     covariance = np.concatenate([m.covariance for m in merged]).reshape(-1, 6, 6)
+    yaw = _compute_yaw_shifts(p)
     if float(age_s.min()) < -_STEADY_S:
-        walked = prior.walk_m_per_sqrt_s**2 * np.maximum(-age_s - _STEADY_S, 0.0)
-        covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
+        wandered_s = np.maximum(-age_s - _STEADY_S, 0.0)
+        covariance[:, [0, 1, 2], [0, 1, 2]] += prior.walk_m_per_sqrt_s**2 * wandered_s[:, None]
+        turned = prior.yaw_walk_rad_per_sqrt_s * np.sqrt(wandered_s)[:, None] * yaw
+        covariance += turned[:, :, None] * turned[:, None, :]
     information = np.linalg.inv(covariance)
     sources = tuple(sorted({m.source for m in merged} & biases.keys()))
     bias, untested = _compute_biases(merged, biases, sources)
     known = np.array([tested.get(name, 0.0) for name in sources])
     return AlignmentProblem(
-        tuple(anchor), p_world, p, q, covariance, information, age_s, bias, untested, sources, known
+        tuple(anchor), p_world, p, q, covariance, information, age_s, yaw, bias, untested, sources, known
     )
+
+
+def _compute_yaw_shifts(p: Array) -> Array:
+    """Return by how much poses at `p` (G, 3) shift when the frame turns about the vertical through their middle."""
+    arm = p - p.mean(axis=0)
+    out = np.zeros((len(p), 6))
+    out[:, 0], out[:, 1], out[:, 5] = -arm[:, 1], arm[:, 0], 1.0
+    return out
 
 
 def _compute_biases(
@@ -176,6 +192,7 @@ def select_groups(b: AlignmentProblem, which: Mask) -> AlignmentProblem:
         covariance=b.covariance[which],
         information=b.information[which],
         age_s=b.age_s[which],
+        yaw=b.yaw[which],
         bias=b.bias[which],
         untested=b.untested[which],
         scale=None if b.scale is None else b.scale[which],
@@ -297,20 +314,22 @@ def _initial_guess(b: AlignmentProblem, prior: AlignmentPrior) -> tuple[Array, A
 def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: AlignmentPrior) -> AlignmentSolution:
     """Run Gauss-Newton over (t, left rotation, drift) with the inliers; return distances of all groups too."""
     q, t = start
-    drift = np.zeros(3)
-    n = 9 if b.scale is None else 9 + b.scale.shape[2]
-    scale = np.zeros(n - 9)
+    drift = np.zeros(4)
+    n = N_FRAME if b.scale is None else N_FRAME + b.scale.shape[2]
+    scale = np.zeros(n - N_FRAME)
     J = np.zeros((b.size, 6, n))
     J[:, :, :6] = _EYE
     if b.scale is not None:
-        J[:, :, 9:] = b.scale
+        J[:, :, N_FRAME:] = b.scale
     J[:, 0, 6] = J[:, 1, 7] = J[:, 2, 8] = b.age_s
+    J[:, :, 9] = b.age_s[:, None] * b.yaw
     weights = inside.astype(np.float64)
     tilt_information = 1.0 / prior.tilt_sigma_rad**2 if prior.gravity else 0.0
     diagonal = np.zeros(n)
     diagonal[3:5] = tilt_information
-    diagonal[9:] = 1.0 / SCALE_SIGMA**2
     diagonal[6:9] = 1.0 / max(prior.drift_m_per_s, 1e-9) ** 2
+    diagonal[9] = 1.0 / max(prior.yaw_rad_per_s, 1e-9) ** 2
+    diagonal[N_FRAME:] = 1.0 / SCALE_SIGMA**2
     for _ in range(_ITERATIONS):
         r, P = _residuals(b, q, t, drift)
         if b.scale is not None:
@@ -324,18 +343,19 @@ def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: A
         H.flat[:: n + 1] += diagonal
         if prior.gravity:
             g[3:5] -= tilt_information * _tilt(q)
-        g[6:9] -= diagonal[6:9] * drift
-        g[9:] -= diagonal[9:] * scale
+        g[6:N_FRAME] -= diagonal[6:N_FRAME] * drift
+        g[N_FRAME:] -= diagonal[N_FRAME:] * scale
         inverse = np.asarray(np.linalg.inv(H), dtype=np.float64)
         step = inverse @ g
-        t, drift, scale = t + step[:3], drift + step[6:9], scale + step[9:]
+        t, drift, scale = t + step[:3], drift + step[6:N_FRAME], scale + step[N_FRAME:]
         q = quat_multiply(quat_exp(step[3:6]), q)
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
     r = r - J @ step  # the last step was small: its linear effect is all there is
     covariance, tested = _cover_biases(b, weights, A, inverse)
     distance2 = np.add.reduce((b.information @ r[:, :, None])[:, :, 0] * r, axis=1)
-    chi2 = float(weights @ distance2) + float(drift @ (diagonal[6:9] * drift)) + float(scale @ (diagonal[9:] * scale))
+    prior_d2 = np.concatenate([drift, scale]) ** 2 @ diagonal[6:]
+    chi2 = float(weights @ distance2) + float(prior_d2)
     freedom = 6.0 * float(weights.sum()) - 6.0
     if prior.gravity:
         tilt = _tilt(q)
@@ -378,8 +398,9 @@ def _residuals(b: AlignmentProblem, q: Array, t: Array, drift: Array) -> tuple[A
     """Observed minus predicted, positions then rotation vectors (G, 6); and the turned anchor positions (G, 3)."""
     P = b.p_world @ quat_to_matrix(q).T
     r = np.empty((b.size, 6))
-    r[:, :3] = b.p - P - t - b.age_s[:, None] * drift
+    r[:, :3] = b.p - P - t - b.age_s[:, None] * drift[:3]
     r[:, 3:] = quat_log(quat_multiply(b.q, quat_conjugate(q)))
+    r -= (b.age_s * drift[3])[:, None] * b.yaw
     return r, P
 
 
@@ -394,13 +415,13 @@ def _consensus(b: AlignmentProblem, prior: AlignmentPrior) -> tuple[Mask, tuple[
     tilt_var = prior.tilt_sigma_rad**2 if prior.gravity else 0.0
     lever2 = np.sum((b.p_world[None, :, :] - b.p_world[:, None, :]) ** 2, axis=2)
     C = b.covariance[:, None, :3, :3] + b.covariance[None, :, :3, :3]
-    spread = (
-        lever2 * (turn_var[:, None] + tilt_var) + (prior.drift_m_per_s * (b.age_s[:, None] - b.age_s[None, :])) ** 2
-    )
+    apart_s2 = (b.age_s[:, None] - b.age_s[None, :]) ** 2
+    yaw_var = prior.yaw_rad_per_s**2 * apart_s2
+    spread = lever2 * (turn_var[:, None] + tilt_var + yaw_var) + prior.drift_m_per_s**2 * apart_s2
     C = C + spread[:, :, None, None] * np.eye(3)
     d2 = np.einsum("hgi,hgi->hg", r, np.linalg.solve(C, r[:, :, :, None])[:, :, :, 0])
     turns = quat_log(quat_multiply(b.q[None, :, :], quat_conjugate(q)[:, None, :]))
-    turn_d2 = np.sum(turns * turns, axis=2) / (turn_var[:, None] + turn_var[None, :] + 2.0 * tilt_var)
+    turn_d2 = np.sum(turns * turns, axis=2) / (turn_var[:, None] + turn_var[None, :] + 2.0 * tilt_var + yaw_var)
     agree = (d2 <= _CHI2_3_999) & (turn_d2 <= _CHI2_3_999)
     best = max(range(b.size), key=lambda h: _votes(b, agree[h], float(np.sum(d2[h][agree[h]]))))
     return agree[best], (q[best], t[best])

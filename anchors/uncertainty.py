@@ -157,7 +157,7 @@ _UNKNOWN_DISTANCE_M: Final = 0.7
 #: By source of observations; docs/anchors.md, "Biases", says where the figures come from.
 SOURCE_BIASES: Final[Mapping[str, SourceBias]] = MappingProxyType(
     {
-        "qr_camera": SourceBias(scale=0.005, direction_rad=0.001, turn_rad=math.radians(0.4), untested_scale=0.012),
+        "qr_camera": SourceBias(scale=0.005, direction_rad=0.001, turn_rad=math.radians(0.25), untested_scale=0.012),
         "qr_system": SourceBias(
             scale=0.006,
             direction_rad=0.002,

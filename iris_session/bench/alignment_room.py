@@ -148,6 +148,7 @@ class Wearer:
                 named = [name for name in room.anchors if any(f"'{name}'" in text for text in asked)]
                 yield from self.look((named or [self._last_sheet or next(iter(room.anchors))])[0], look_s)
                 self.notices.clear()
+                yield room.now_ns + TURN_NS
         yield round(max(end_s, room.now_s) * SECOND)
 
     def walk(self, seconds: float) -> PoseTuple:

@@ -10,7 +10,18 @@ import pytest
 
 from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstimator, mirror_pose
 from anchors.lie import quat_from_matrix
-from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_from_yaw
+from anchors.pose import (
+    IDENTITY_QUAT,
+    PoseTuple,
+    Vec3,
+    apply,
+    compose,
+    distance,
+    inverse,
+    quat_angle,
+    quat_from_rotvec,
+    quat_from_yaw,
+)
 from anchors.uncertainty import length_p95, validate_covariance
 from tests.anchors.worlds import Viewpoint, axis, shifted, tracking_frame, viewpoint_around
 
@@ -211,6 +222,24 @@ def test_steady_drift_is_followed() -> None:
             far.append(_error_at(estimator.estimate(), now, (0.75, 0.4, 0.7)))
         errors[drift] = float(np.median(far))
     assert min(errors, key=errors.__getitem__) == AlignmentConfig().drift_m_per_s
+
+
+def test_glance_at_one_sheet_does_not_renew_a_yaw_that_has_drifted() -> None:
+    """0.2 degrees a minute: earlier looks at three sheets know the yaw no longer, and one glance does not measure it
+    well."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        estimator, T = AlignmentEstimator(TRIANGLE), tracking_frame(rng)
+        for viewpoint in range(6):
+            _observe(estimator, rng, T, "abc"[viewpoint % 3], viewpoint, 5.0 * viewpoint)
+        sure = estimator.estimate().error_at((0.0, 2.0, 0.7))
+        about, back = TRIANGLE["a"][0], shifted(((0.0, 0.0, 0.0), IDENTITY_QUAT), (0.0, 0.0, -0.7))
+        T = compose(compose((about, quat_from_yaw(math.radians(1.0))), back), T)
+        _observe(estimator, rng, T, "a", 6, 330.0)
+        got = estimator.estimate()
+        assert _error_at(got, T, (0.0, 2.0, 0.7)) < 1.5 * got.error_at((0.0, 2.0, 0.7))
+        assert got.error_at((0.0, 2.0, 0.7)) > 2.0 * sure
+        assert got.error_at_anchor_m < 0.012
 
 
 def test_number_of_viewpoints_is_bounded() -> None:

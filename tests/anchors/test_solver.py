@@ -11,24 +11,27 @@ from anchors.lie import Array, quat_conjugate, quat_exp, quat_multiply, quat_to_
 from anchors.solver import AlignmentPrior, AlignmentProblem, build_problem, solve_alignment
 from anchors.viewpoints import MergedObservation, fast_median, merge_poses
 
-PRIOR = AlignmentPrior(math.radians(0.2), 0.003 / 60.0, 0.0)
+PRIOR = AlignmentPrior(math.radians(0.2), 0.003 / 60.0, 0.0, yaw_rad_per_s=math.radians(1.0) / 60.0)
 P_WORLD = np.array([[0.0, 0.0, 0.7], [1.5, 0.1, 0.7], [0.6, 1.2, 0.8], [0.0, 0.0, 0.7]])
 AGES = np.array([-45.0, -30.0, -15.0, 0.0])
 
 
 def _problem(rng: np.random.Generator) -> tuple[AlignmentProblem, Array, Array]:
-    """Four observations with their own covariances in a tilted, drifting frame, and the true pose at age 0."""
+    """Four observations with their own covariances in a tilted frame that drifts and turns; the true pose at age 0."""
     tilt = quat_exp(np.append(rng.normal(0.0, PRIOR.tilt_sigma_rad, 2), 0.0))
     q = quat_multiply(tilt, quat_exp(np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)])))
     t = rng.uniform(-2.0, 2.0, 3)
-    drift = rng.normal(0.0, PRIOR.drift_m_per_s, 3)
+    drift, yaw_rate = rng.normal(0.0, PRIOR.drift_m_per_s, 3), rng.normal(0.0, PRIOR.yaw_rad_per_s)
+    middle = quat_to_matrix(q) @ P_WORLD.mean(axis=0) + t
     merged = []
     for p, age in zip(P_WORLD, AGES, strict=True):
         root = rng.normal(size=(6, 6)) * np.repeat([0.001, 0.002], 3)[:, None]
         C = root @ root.T + np.diag([1e-7] * 6)
         noise = np.linalg.cholesky(C) @ rng.normal(size=6)
-        seen = quat_to_matrix(q) @ p + t + age * drift + noise[:3]
-        merged.append(MergedObservation(seen, quat_multiply(quat_exp(noise[3:]), q), C, 20, 20))
+        turn = quat_exp(np.array([0.0, 0.0, age * yaw_rate]))
+        seen = middle + quat_to_matrix(turn) @ (quat_to_matrix(q) @ p + t - middle) + age * drift + noise[:3]
+        turned = quat_multiply(quat_exp(noise[3:]), quat_multiply(turn, q))
+        merged.append(MergedObservation(seen, turned, C, 20, 20))
     level = np.tile([1.0, 0.0, 0.0, 0.0], (4, 1))
     return build_problem("abca", P_WORLD, level, merged, AGES, PRIOR), t, q
 
