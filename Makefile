@@ -31,10 +31,11 @@ $(VENV)/.installed: pyproject.toml | $(BIN)/python
 	@$(PIP_INSTALL) -e '.[all]'
 	@touch $@
 
-# The extra `dev` has what the two others install: pip resolves everything once.
+# The extra `dev` has what the two others install: pip resolves everything once. Of 10,000 modules a fifth is imported:
+# Python compiles those when they are.
 $(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
 	@echo "installing into $(VENV) ..."
-	@$(PIP_INSTALL) -e '.[all,dev]'
+	@$(PIP_INSTALL) --no-compile -e '.[all,dev]'
 	@touch $(VENV)/.installed $(VENV)/.installed-node $@
 
 $(VENV)/.installed-node: $(VENV)/.installed

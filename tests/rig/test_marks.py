@@ -135,15 +135,15 @@ def test_fingertip_may_look_and_is_denied_to_drive_until_a_tip_is_calibrated() -
 
 
 def test_three_touches_confirm_an_alignment_that_has_grown_old() -> None:
-    """A hundred times as fast as it drifts in use."""
-    law = AgeingLaw(drift_m_per_min=0.2, yaw_rad_per_min=0.4)
+    """Four hundred times as fast as it drifts in use."""
+    law = AgeingLaw(drift_m_per_min=0.8, yaw_rad_per_min=1.6)
     config = AuthorityConfig(ageing=law, age_check_ns=10_000_000)
     with Rig(timestep=0.01, anchor_marks={"table": MARKS}, authority=config) as rig:
         ann = Toucher(rig)
         found = ann.turn_in_a_hole()
         ann.touch_marks(found.p_grip_tip, "1234")
         hand = ann.hold_robot()
-        rig.run(20.0)
+        rig.run(5.0)
         hand.clutch = True
         rig.run(0.3)
         assert ann.client.feedback["left"].hold_reason == HoldReason.UNCONFIRMED

@@ -22,7 +22,7 @@ from tests.rig.session import Hand, Rig, is_driven
 from tests.rig.simulation import SimulatedTime
 
 MS = 1_000_000
-TICK = 0.01  # [s]
+TICK = 0.02  # [s]
 
 
 def drive_left(rig: Rig) -> tuple[Client, Hand]:
@@ -204,7 +204,7 @@ def test_suspended_machine_keeps_leases() -> None:
         rig.run(0.2)
         gaps_ns = [b.now_ns - a.now_ns for a, b in itertools.pairwise(rig.journal.rows)]
         assert max(gaps_ns) == pytest.approx(4_000 * MS, abs=20 * MS)
-        assert sum(ns > 20 * MS for ns in gaps_ns) == 1
+        assert sum(ns > 40 * MS for ns in gaps_ns) == 1
         check_resumed(rig, watcher, me, version)
         hand.velocity = (0.0, 0.0, 0.0)
         rig.engage(hand)

@@ -28,9 +28,9 @@ def test_a_run_depends_on_its_seed_alone() -> None:
 def test_eight_operators_drive_eight_arms() -> None:
     with Rig(n_arms_scene(8), profile="good-wifi", timestep=0.02) as rig:
         robots = [robot.name for robot in rig.session.robots]
-        hands = [rig.drive(f"operator of {robot}", robot, (0.0, 0.01, 0.0)) for robot in robots]
+        hands = [rig.drive(f"operator of {robot}", robot, (0.0, 0.02, 0.0)) for robot in robots]
         before = [hand.tip[0][1] for hand in hands]
-        rig.run(10.0)
+        rig.run(4.0)
         assert all(hand.is_following for hand in hands)
         assert all(hand.tip[0][1] - y > 0.05 for hand, y in zip(hands, before, strict=True))
 
