@@ -243,7 +243,7 @@ def test_marks_align_and_a_touch_confirms_the_kept_place_after_a_reload(quest: M
     quest.wait(f"{PANEL}.includes('Touch mark 1 (1 of 4)')")
     quest.press("trigger", 0.0)
     quest.press("squeeze", 1.0)
-    quest.wait(f"{PANEL}.includes('Touched. It is compared')")
+    quest.wait(f"{PANEL}.includes('Touched. Now another one')")
     quest.shoot("compare")
     quest.press("b-button", 1.0)
     quest.wait(f"!{HEADSET}.marks.isActive")

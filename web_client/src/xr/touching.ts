@@ -243,7 +243,7 @@ export class Touching {
   }
 
   private describeCheck(alignment: Facts["alignment"]): string[] {
-    return this.isBare || !isPlaced(alignment) ? [] : wrap("Squeeze: compare, with the tip on a point that another one touches too");
+    return this.isBare || !isPlaced(alignment) ? [] : ["Squeeze: compare a point with another one"];
   }
 
   // --- frames ---------------------------------------------------------------------------------------------------------
@@ -378,7 +378,7 @@ export class Touching {
     outcomes.push({ type: "pulse", side: touching.side });
     if (isCheck) {
       outcomes.push({ type: "observe", observation: { anchor_id: POINT, kind: "point", device, T_tracking_anchor, covariance, capture_ms } });
-      [this.stage, this.advice] = [{ name: "touch" }, "Touched. It is compared when another one touches the same point within a minute."];
+      [this.stage, this.advice] = [{ name: "touch" }, "Touched. Now another one, within a minute."];
       return;
     }
     const { anchor } = this;
