@@ -74,6 +74,8 @@ __all__ = [
 _ERA: Final = 1 << 64
 #: Looks at other anchors vouch for the frame for so long [ns]: it may jump between looks.
 _JUST_BEFORE_NS: Final = 10_000_000_000
+#: A second pose of a flat sheet whose residual is larger by more than this is not as good as the first one.
+_ALIKE: Final = 2.0
 
 
 @dataclass(frozen=True)
@@ -222,6 +224,7 @@ class AlignmentEstimator:
         alternative: PoseTuple | None = None,
         source: str = "",
         shift: tuple[float, ...] = (),
+        residuals: tuple[float, ...] = (),
     ) -> bool:
         """Add one observation.
 
@@ -236,10 +239,11 @@ class AlignmentEstimator:
             covariance: 6x6 row-major (position [m], rotation [rad]) in tracking axes; empty: that of the noise model as
                 seen from `p_tracking_head`.
             p_tracking_head: Position of the observer.
-            alternative: The other pose that explains the same image; without it the pose mirrored along the line of
-                sight is tried, if `p_tracking_head` is known.
+            alternative: The other pose that explains the same image; it is used if it is the more upright one. Without
+                it the pose mirrored along the line of sight is tried, if `p_tracking_head` is known.
             source: Kind of the source: its biases (`AlignmentConfig.biases`) are in the stated error; empty: none.
             shift: By how much the anchor is displaced [m/s] and turned [rad/s] per second that its picture is late.
+            residuals: Of the pose and of the alternative, if known: one that fits worse by far is no alternative.
 
         Returns:
             False if it is not used: unknown anchor, older epoch, not a rigid transform, a sheet of the wrong size, or
@@ -260,7 +264,9 @@ class AlignmentEstimator:
             self.reset()
         if not self._has_expected_size(anchor_id, size_m):
             return False
-        pose = self._resolve_mirror(T_world_anchor, T_tracking_anchor, p_tracking_head, alternative)
+        if alternative is not None and not is_rigid(alternative):
+            alternative = None
+        pose = self._resolve_mirror(T_world_anchor, T_tracking_anchor, p_tracking_head, alternative, residuals)
         if pose is None:
             self.against_gravity += 1
             self._against_gravity += 1
@@ -369,18 +375,26 @@ class AlignmentEstimator:
         self._memory.split_groups(since_ns, lambda key: (key[0], key[1] % _ERA + era))
 
     def _resolve_mirror(
-        self, T_world_anchor: PoseTuple, seen: PoseTuple, p_head: Vec3 | None, alternative: PoseTuple | None
+        self,
+        T_world_anchor: PoseTuple,
+        seen: PoseTuple,
+        p_head: Vec3 | None,
+        alternative: PoseTuple | None,
+        residuals: tuple[float, ...],
     ) -> PoseTuple | None:
-        """Return the pose, or its mirrored pose if only that one agrees with gravity, `None` if neither does."""
+        """Return the pose, or its mirrored pose if only that one agrees with gravity, `None` if neither does; of two
+        that explain the image alike, the more upright one."""
         pose = (seen[0], quat_normalize(seen[1]))
-        if self.config.dof == 6 or _tilt(T_world_anchor, pose) <= self.config.max_tilt_rad:
+        tilt, bound = _tilt(T_world_anchor, pose), self.config.max_tilt_rad
+        is_open = alternative is not None and (len(residuals) != 2 or residuals[1] <= _ALIKE * residuals[0])
+        if self.config.dof == 6 or (tilt <= bound and not is_open):
             return pose
         if alternative is not None:
-            other = (alternative[0], quat_normalize(alternative[1])) if is_rigid(alternative) else None
+            other: PoseTuple | None = (alternative[0], quat_normalize(alternative[1]))
         else:
             other = mirror_pose(pose, p_head) if p_head is not None else None
-        if other is None or _tilt(T_world_anchor, other) > self.config.max_tilt_rad:
-            return None
+        if other is None or _tilt(T_world_anchor, other) > min(tilt, bound):
+            return pose if tilt <= bound else None
         self.unmirrored += 1
         return other
 

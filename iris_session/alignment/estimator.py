@@ -225,6 +225,8 @@ class ConnectionEstimator:
                 p_tracking_head=p_tracking_head,
                 source=_choose_source(observation),
                 shift=look.shift,
+                alternative=find_alternative(observation),
+                residuals=observation.residuals_px,
             )
         except NUMERICAL_ERRORS:
             return False
@@ -348,6 +350,12 @@ class ConnectionEstimator:
 def _to_refusal(tracking_epoch: int, advice: str) -> AlignmentProposal:
     p, q = IDENTITY_POSE
     return AlignmentProposal(Pose(p, q), tracking_epoch, (), p, 0.0, refused=True, advice=advice[:MAX_TEXT])
+
+
+def find_alternative(observation: Observation) -> PoseTuple | None:
+    """Return the other pose of a sheet; a controller has none."""
+    other = observation.alternative
+    return None if other is None or observation.kind == AnchorKind.CONTROLLER else (other.p, other.q)
 
 
 def _choose_source(observation: Observation) -> str:

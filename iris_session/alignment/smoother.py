@@ -31,7 +31,7 @@ from anchors.pose import (
     quat_to_rotvec,
 )
 from anchors.uncertainty import length_p95
-from iris_session.alignment.estimator import NUMERICAL_ERRORS
+from iris_session.alignment.estimator import NUMERICAL_ERRORS, find_alternative
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.names import AnchorKind
 from iris_session.recording import AlignmentHistory, RecordedObservation
@@ -228,6 +228,8 @@ def add_observation(estimator: AlignmentEstimator, look: RecordedObservation, ca
             size_m=seen.size_m,
             covariance=observed_covariance(seen),
             p_tracking_head=None if seen.kind == AnchorKind.CONTROLLER else look.p_tracking_head,
+            alternative=find_alternative(seen),
+            residuals=seen.residuals_px,
         )
     except NUMERICAL_ERRORS:
         estimator.invalid += 1

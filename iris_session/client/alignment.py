@@ -202,8 +202,8 @@ class ClientAlignment:
     ) -> list[SheetDetection]:
         """Detect sheets in an image and report them as observations.
 
-        Sheets with an ambiguous pose (both poses of a plane fit) are left out. Takes tenths of a second: not for the
-        loop that sends samples.
+        Where both poses of a plane fit, both are reported, and the session decides. Takes tenths of a second: not for
+        the loop that sends samples.
 
         Args:
             image: (height, width[, 3]) uint8.
@@ -229,12 +229,14 @@ class ClientAlignment:
         now_ns = self._session_now_ns() if capture_ns is None else capture_ns
         pose = to_pose("T_tracking_camera", T_tracking_camera)
         T: PoseTuple = (pose.p, pose.q)
-        found = [one for one in self._detect(image, camera, sheets) if not one.ambiguous]
+        found = self._detect(image, camera, sheets)
         if viewpoint_id is None:
             with self._lock:
                 viewpoint_id = self._viewpoints.number_at(epoch, T)
         for one in found:
             covariance = to_tracking_covariance(one.covariance, T, one.T_camera_sheet, camera_sigma)
+            other = one.mirrored if one.ambiguous else None  # else the picture has decided
+            px = one.reprojection_px
             self._send(
                 Observation(
                     one.anchor_id,
@@ -246,6 +248,8 @@ class ClientAlignment:
                     0.0,  # one camera cannot measure the size of a sheet, it takes it as given
                     device=device,
                     covariance=covariance,
+                    alternative=None if other is None else Pose(*compose(T, other)),
+                    residuals_px=() if other is None else (px, px * one.mirrored_ratio),
                 )
             )
         return found

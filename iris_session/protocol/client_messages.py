@@ -196,7 +196,8 @@ class Observation(Message, frozen=True, tag="observation"):
     those of the anchor, or empty. `quality`: 0 to 1.
     `source`: `ObservationSource`, empty for that of `kind`: `qr_camera`, `holder` or `touch`.
     `mark`: touched mark of the anchor (`AnchorInfo.marks`), empty for the origin of the anchor. `grip_poses`: of kind
-    `tip`, `T_tracking_grip` of `device` (section 5).
+    `tip`, `T_tracking_grip` of `device` (section 5). `alternative`: of a flat sheet, the other `T_tracking_anchor` that
+    explains the picture. `residuals_px`: rms of both, in this order, or empty.
     """
 
     anchor_id: Name
@@ -212,6 +213,8 @@ class Observation(Message, frozen=True, tag="observation"):
     mark: Name = ""
     grip_poses: TipPoses = ()
     source: Name = ""
+    alternative: Pose | None = None
+    residuals_px: Annotated[tuple[float, ...], msgspec.Meta(max_length=2)] = ()
 
 
 class PlaceAlignment(Message, frozen=True, tag="place_alignment"):

@@ -5,15 +5,20 @@ from __future__ import annotations
 import math
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anchors.pose import IDENTITY_POSE, PoseTuple
+from anchors.alignment import mirror_pose
+from anchors.lie import to_vec3
+from anchors.looks import Look
+from anchors.pose import IDENTITY_POSE, PoseTuple, apply, compose, distance, inverse, quat_angle
 from iris_session.alignment.estimator import ConnectionEstimator
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Entry, decode_entry, encode_entry
+from tests.anchors.worlds import Viewpoint, tracking_frame
 
 PERIOD = 200_000_000
 ANCHORS: dict[str, PoseTuple] = {"table": ((1.0, 2.0, 0.8), IDENTITY_POSE[1])}
@@ -37,6 +42,36 @@ def test_size_of_misprinted_sheet_is_reported_when_all_observations_are_excluded
     proposal = estimator.propose(PERIOD)
     assert proposal is not None
     assert not proposal.refused
+
+
+@pytest.mark.parametrize(("reports", "is_solved"), [("both", True), ("one", False), ("one that fits badly", False)])
+def test_of_two_poses_that_are_both_upright_the_level_one_is_used(reports: str, is_solved: bool) -> None:
+    """From nearly overhead the mirrored pose is tilted by about 10 degrees; a detector returns it first every other
+    time."""
+    rng = np.random.default_rng(7)
+    frame = tracking_frame(rng)
+    estimator = ConnectionEstimator(ANCHORS, PERIOD)
+    for place, (x, y) in enumerate(((0.05, 0.0), (-0.04, 0.04), (0.0, -0.06))):
+        p_head = to_vec3(np.add(ANCHORS["table"][0], (x, y, 0.6)))
+        view = Viewpoint(rng, ANCHORS["table"], p_head)
+        for i in range(20):
+            seen, head = view.observe(frame), view.head_pose(frame)
+            first, second = rng.permutation([0, 1])
+            poses = [Pose(*seen), Pose(*mirror_pose(seen, head))]
+            one = msgspec.structs.replace(observation(20 * place + i, pose=poses[first]), residuals_px=(0.30, 0.31))
+            if reports == "both":
+                one = msgspec.structs.replace(one, alternative=poses[second])
+            elif reports != "one":
+                one = msgspec.structs.replace(one, alternative=poses[second], residuals_px=(0.30, 0.70))
+            estimator.add_observation(one, Look(place, head))
+    proposal = estimator.propose(0)
+    assert proposal is not None
+    assert proposal.refused is not is_solved
+    if is_solved:
+        T = proposal.T_world_tracking
+        off = compose((T.p, T.q), inverse(frame))
+        assert distance(apply(off, ANCHORS["table"][0]), ANCHORS["table"][0]) < 0.005
+        assert quat_angle(off[1], IDENTITY.q) < math.radians(1.0)
 
 
 def test_too_few_observations_are_reported_once() -> None:
@@ -93,6 +128,8 @@ def test_observations_never_raise(rows: list[tuple[object, ...]]) -> None:
             viewpoint_id=viewpoint,  # type: ignore[arg-type]
             quality=quality,  # type: ignore[arg-type]
             covariance=covariance,  # type: ignore[arg-type]
+            alternative=Pose(p, q),  # type: ignore[arg-type]
+            residuals_px=(quality, quality),  # type: ignore[arg-type]
         )
         estimator.add_observation(message)
         proposal = estimator.propose(i * PERIOD)

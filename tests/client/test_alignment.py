@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,12 +90,22 @@ def test_picture_without_a_sheet_reports_nothing(ann: FakeClient, picture: Any) 
     assert ann.sent == []
 
 
-def test_ambiguous_detections_are_left_out(ann: FakeClient, picture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from anchors import detection
+def test_both_poses_are_reported_where_the_picture_does_not_decide(
+    ann: FakeClient, picture: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honest = ann.alignment._detect
+    other: PoseTuple = ((0.03, -0.02, 0.69), quat_from_rotvec((math.pi + 0.5, 0.0, 0.0)))
+    for ratio in (1.01, 9.0):
 
-    monkeypatch.setattr(detection.SheetDetection, "ambiguous", property(lambda _: True))
-    assert ann.alignment.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA) == []
-    assert ann.sent == []
+        def detect(*given: Any, ratio: float = ratio) -> Any:
+            return [replace(one, mirrored=other, mirrored_ratio=ratio) for one in honest(*given)]
+
+        monkeypatch.setattr(ann.alignment, "_detect", detect)
+        ann.alignment.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA)
+    in_doubt, decided = ann.sent
+    assert in_doubt.alternative == Pose(*compose(T_TRACKING_CAMERA, other))
+    assert in_doubt.residuals_px[1] == pytest.approx(1.01 * in_doubt.residuals_px[0])
+    assert (decided.alternative, decided.residuals_px) == (None, ())
 
 
 def test_observations_belong_to_the_tracking_frame_of_their_picture(

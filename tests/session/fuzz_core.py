@@ -163,6 +163,10 @@ class Fuzz:
             return tuple(SetVisual(rng.randrange(50), group=rng.randrange(6)) for _ in range(rng.randrange(4)))
         if name in ("T_world_tracking", "T_tracking_anchor", "T_world_anchor", "pose"):
             return self.pose()
+        if name == "alternative":
+            return rng.choice((None, self.pose()))
+        if name == "residuals_px":
+            return (number,) * rng.choice([0, 2])
         if name == "grip_poses":
             return tuple(self.pose() for _ in range(rng.randrange(4)))
         if name == "anchors":

@@ -53,7 +53,7 @@ def test_posted_messages_are_used_as_journaled() -> None:
     assert ENCODE(seen) == ENCODE(decode_entries(encode_entries(seen)))
 
 
-@pytest.mark.parametrize("seed", [12, 13])
+@pytest.mark.parametrize("seed", [11, 13])
 def test_no_entry_raises_or_jumps(seed: int) -> None:
     """Random schema-valid entries, most of them nonsense (see `fuzz_core`)."""
     fuzz = run(seed, 6000)

@@ -3441,7 +3441,8 @@ namespace IrisSession.Protocol
     /// those of the anchor, or empty. quality: 0 to 1.
     /// source: ObservationSource, empty for that of kind: qr_camera, holder or touch.
     /// mark: touched mark of the anchor (AnchorInfo.marks), empty for the origin of the anchor. grip_poses: of kind
-    /// tip, T_tracking_grip of device (section 5).
+    /// tip, T_tracking_grip of device (section 5). alternative: of a flat sheet, the other T_tracking_anchor that
+    /// explains the picture. residuals_px: rms of both, in this order, or empty.
     /// </summary>
     public sealed class Observation : ClientMessage
     {
@@ -3460,6 +3461,8 @@ namespace IrisSession.Protocol
         public string Mark = "";
         public Pose[] GripPoses = new Pose[0];
         public string Source = "";
+        public Pose Alternative = null;
+        public double[] ResidualsPx = new double[0];
 
         public static Observation Read(WireReader reader)
         {
@@ -3482,6 +3485,8 @@ namespace IrisSession.Protocol
                     case "mark": value.Mark = reader.ReadString(64); break;
                     case "grip_poses": value.GripPoses = reader.ReadArray(Protocol.Pose.Read, 100); break;
                     case "source": value.Source = reader.ReadString(64); break;
+                    case "alternative": value.Alternative = reader.TryReadNil() ? null : Pose.Read(reader); break;
+                    case "residuals_px": value.ResidualsPx = reader.ReadDoubles(0, 2); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3491,7 +3496,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(14);
+            writer.WriteMapHeader(16);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("anchor_id");
@@ -3520,6 +3525,10 @@ namespace IrisSession.Protocol
             writer.Write(GripPoses);
             writer.Write("source");
             writer.Write(Source);
+            writer.Write("alternative");
+            writer.Write(Alternative);
+            writer.Write("residuals_px");
+            writer.Write(ResidualsPx);
         }
     }
 

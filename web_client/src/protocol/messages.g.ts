@@ -1070,7 +1070,8 @@ export interface Grasp {
  * those of the anchor, or empty. `quality`: 0 to 1.
  * `source`: `ObservationSource`, empty for that of `kind`: `qr_camera`, `holder` or `touch`.
  * `mark`: touched mark of the anchor (`AnchorInfo.marks`), empty for the origin of the anchor. `grip_poses`: of kind
- * `tip`, `T_tracking_grip` of `device` (section 5).
+ * `tip`, `T_tracking_grip` of `device` (section 5). `alternative`: of a flat sheet, the other `T_tracking_anchor` that
+ * explains the picture. `residuals_px`: rms of both, in this order, or empty.
  */
 export interface Observation {
   type: "observation";
@@ -1087,6 +1088,8 @@ export interface Observation {
   mark?: string;
   grip_poses?: Pose[];
   source?: ObservationSource;
+  alternative?: Pose | null;
+  residuals_px?: number[];
 }
 
 /** Align a participant by hand, or add an offset to a measured alignment (`offset` true). Directors only. */
@@ -2326,7 +2329,7 @@ export const DEFAULTS = {
   set_mode: {},
   set_scale: { robots: [], scale: 1.0 },
   grasp: {},
-  observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [], mark: "", grip_poses: [], source: "" },
+  observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [], mark: "", grip_poses: [], source: "", alternative: null, residuals_px: [] },
   place_alignment: { offset: false },
   align: { participant: "" },
   move_anchor: { force: false },

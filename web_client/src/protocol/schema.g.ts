@@ -562,6 +562,8 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["mark", ["str", 64, ""], [""]],
       ["grip_poses", ["array", ["struct", "Pose"], 0, 100], [[]]],
       ["source", ["str", 64, ""], [""]],
+      ["alternative", ["null", ["struct", "Pose"]], [null]],
+      ["residuals_px", ["array", ["float"], 0, 2], [[]]],
     ],
   },
   PlaceAlignment: {
