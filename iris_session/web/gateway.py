@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import gc
 import logging
 import os
@@ -42,6 +43,8 @@ log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.02
 REPORT_S: Final = 1.0
+#: Period in which the C library gives free memory back: what many slow readers leave is in pieces between other blocks.
+TRIM_S: Final = 10.0
 #: Time for browsers to read why they are closed.
 FAREWELL_S: Final = 0.5
 #: Longest time for which another thread (files of assets) keeps the loop from running.
@@ -98,7 +101,7 @@ class Gateway:
     async def _work(self, link: SessionLink, assets: GatewayAssets, listener: Listener) -> None:
         """Do what is due, until the end."""
         hub = self._hub
-        epoch = 0
+        epoch, trim_at = 0, 0.0
         while not self._ending.is_set():
             link.tick()
             now_ns = time.monotonic_ns()
@@ -111,6 +114,10 @@ class Gateway:
                 self._superseded += browser.superseded
                 browser.superseded = 0
             hub.tick(now_ns)
+            if time.monotonic() >= trim_at:
+                trim_at = time.monotonic() + TRIM_S
+                with contextlib.suppress(OSError, AttributeError):  # another library than that of GNU
+                    ctypes.CDLL(None).malloc_trim(0)
             if self._parent_pid and not is_parent(self._parent_pid):
                 return
             if link.connection.phase is ConnectionPhase.REFUSED:
