@@ -60,7 +60,7 @@ BOUNDS: Final = TcpBounds(
     unread_bytes=0,
 )
 REASONS: Final = TcpReasons("web", "web_connections", "web_connections", "web_idle", "", "web_connections_per_address")
-#: Longest time in which a peer acknowledges nothing of what waits for it, also where nobody waits for it any more: a
+#: Longest time in which a peer acknowledges nothing of what waits for it, also after its request has ended: a
 #: WebSocket that is being closed, small answers.
 STALLED_S: Final = 10.0
 _SWEEP_S: Final = 1.0
@@ -113,7 +113,7 @@ class WatchedProtocol(asyncio.Protocol):
             self._inner.data_received(data)
             return
         self._is_cut = True
-        if self._transport is not None:  # those who read are told why
+        if self._transport is not None:  # a peer that reads learns why
             self._transport.write(_FLOOD)
             self._transport.close()
             asyncio.get_running_loop().call_later(_FAREWELL_S, self._transport.abort)
