@@ -306,8 +306,11 @@ class ConnectionEstimator:
         return proposal
 
     def _describe_wrong(self, observation: Observation) -> str:
-        """Return why an observation is of no anchor or mark, or states an invalid covariance; empty if it does not."""
+        """Return why an observation is of no kind, anchor or mark, or states an invalid covariance; empty if it does
+        not."""
         anchor_id, mark = observation.anchor_id, observation.mark
+        if observation.kind not in AnchorKind.ALL:
+            return f"there is no kind of observation '{observation.kind}': {', '.join(sorted(AnchorKind.ALL))}"
         if anchor_id not in self._anchors:
             return f"anchor '{anchor_id}' is not of this session; known: {', '.join(sorted(self._anchors)) or 'none'}"
         if not self._touches.has_mark(anchor_id, mark):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from anchors.pose import apply, inverse
 from iris_session.authority import alignment, pairs, shifts
 from iris_session.authority.context import (
     Context,
@@ -30,6 +31,8 @@ from iris_session.protocol.status import AlignmentReport, CrossCheckReport
 
 #: Comparisons in a report: of 64 people there are 2,016 pairs.
 MAX_REPORTED: Final = 64
+#: A comparison is outdated once an alignment has moved by so much of the expected difference.
+_OUTDATED_SHARE: Final = 0.5
 #: Names in one event.
 MAX_NAMES: Final = 32
 
@@ -206,8 +209,12 @@ def record_cross_check(ctx: Context, p: Participant, m: CrossChecked) -> None:
     if not all(math.isfinite(v) for v in (*sizes, x, y, z)) or min(sizes) < 0.0:
         return
     key = " ".join(sorted((p.id, other.id))) + " touched" * m.touched
-    ctx.state.cross_checks[key] = CrossCheckState(p.id, other.id, m.anchor_id, *sizes, m.n, ctx.now_ns, m.touched)
-    ctx.emit(HeadsetsCompared(p.id, other.id, m.anchor_id, *sizes, (float(x), float(y), float(z)), m.n, m.touched))
+    at = (float(x), float(y), float(z))
+    poses = tuple(one.alignment.T_world_tracking for one in (p, other) if one.alignment is not None)
+    aligned = poses if len(poses) == 2 else ()
+    check = CrossCheckState(p.id, other.id, m.anchor_id, *sizes, m.n, ctx.now_ns, m.touched, at, aligned)
+    ctx.state.cross_checks[key] = check
+    ctx.emit(HeadsetsCompared(p.id, other.id, m.anchor_id, *sizes, at, m.n, m.touched))
 
 
 def remove_cross_checks(ctx: Context, p: Participant) -> None:
@@ -242,7 +249,29 @@ def build_cross_check_reports(ctx: Context) -> tuple[CrossCheckReport, ...]:
     newest = sorted(ctx.state.cross_checks.values(), key=lambda c: -c.compared_ns)[:MAX_REPORTED]
     return tuple(
         CrossCheckReport(
-            c.a, c.b, c.anchor_id, c.error_m, c.error_rad, c.expected_p95_m, ctx.now_ns - c.compared_ns, c.n, c.touched
+            c.a,
+            c.b,
+            c.anchor_id,
+            c.error_m,
+            c.error_rad,
+            c.expected_p95_m,
+            ctx.now_ns - c.compared_ns,
+            c.n,
+            c.touched,
+            _is_outdated(ctx, c),
         )
         for c in newest
     )
+
+
+def _is_outdated(ctx: Context, c: CrossCheckState) -> bool:
+    """Return true when one of the two has been aligned elsewhere since, by a share of what is expected of the pair."""
+    for name, then in zip((c.a, c.b), c.T_world_trackings, strict=False):
+        p = ctx.state.participants.get(name)
+        if p is None or p.alignment is None:
+            return True
+        now = p.alignment.T_world_tracking
+        p_now = apply((now.p, now.q), apply(inverse((then.p, then.q)), c.p_world))
+        if math.dist(p_now, c.p_world) > _OUTDATED_SHARE * c.expected_p95_m:
+            return True
+    return False

@@ -291,7 +291,7 @@ class FeedbackState(msgspec.Struct):
 
 
 class CrossCheckState(msgspec.Struct):
-    """The newest cross-check of two headsets; fields as in `HeadsetsCompared`."""
+    """The newest cross-check of two headsets; fields as in `HeadsetsCompared`. `T_world_trackings`: of both, then."""
 
     a: str
     b: str
@@ -302,6 +302,8 @@ class CrossCheckState(msgspec.Struct):
     n: int
     compared_ns: int
     touched: bool = False
+    p_world: Vec3 = (0.0, 0.0, 0.0)
+    T_world_trackings: tuple[Pose, ...] = ()
 
 
 class StopState(msgspec.Struct, array_like=True):

@@ -272,7 +272,7 @@ def _print_measured(arguments: argparse.Namespace, sheet: Sheet, size_m: float) 
 
 def _list_file_lines(sheet: Sheet) -> list[str]:
     """Return the lines of the anchors file with size and marks of a sheet."""
-    lines = [f"size_m = {sheet.edge_m!r}"]
+    lines = [f"size_m = {sheet.edge_m:.6g}"]
     if sheet.has_marks:
         lines.append(f"[anchors.{json.dumps(sheet.anchor_id)}.marks_m]")
         lines += [f'"{name}" = [{", ".join(f"{c:.6g}" for c in p)}]' for name, p in sheet.marks.items()]
@@ -496,6 +496,7 @@ def format_pending_correction(r: AlignmentReport) -> str:
 def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
     a, b = (f"{names[one]} ({one})" if one in names else one for one in (check.a, check.b))
     verdict = "" if is_consistent(check) else "  TOO FAR APART"
+    verdict = "  BEFORE ONE OF THEM WAS ALIGNED ELSEWHERE" if check.outdated else verdict
     turn = "" if check.touched else f", {degrees(check.error_rad):.2f} deg"
     how = "touched by both" if check.touched else f"{check.n} observations"
     return (

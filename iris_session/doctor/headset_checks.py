@@ -108,17 +108,19 @@ def is_consistent(check: CrossCheckReport) -> bool:
 def check_agreement(people: tuple[ParticipantReport, ...], checks: tuple[CrossCheckReport, ...]) -> Finding:
     """Report pairs of headsets whose difference exceeds their stated errors."""
     names = {p.id: p.name for p in people}
-    recent = [one for one in checks if one.age_ns <= MAX_CROSS_CHECK_AGE_NS]
+    recent = [one for one in checks if one.age_ns <= MAX_CROSS_CHECK_AGE_NS and not one.outdated]
     texts = [
         f"{names.get(one.a, one.a)} and {names.get(one.b, one.b)} put '{one.anchor_id}' {one.error_m * 1e3:.0f} mm "
-        f"apart, expected is below {one.expected_p95_m * 1e3:.0f} mm"
+        f"apart, 95 % of such pairs are below {one.expected_p95_m * 1e3:.0f} mm"
         for one in recent
         if not is_consistent(one)
     ]
     fine = "no two headsets have observed the same anchor in the last ten minutes"
     if recent:
         worst_mm = 1e3 * max(one.error_m for one in recent)
-        fine = f"{len(recent)} pairs compared, at most {worst_mm:.0f} mm apart, as expected"
+        pairs = len({(one.a, one.b) for one in recent})
+        bound = f"within {MAX_ERROR_RATIO:g} times what 95 % have"
+        fine = f"{pairs} pairs compared, at most {worst_mm:.0f} mm apart, {bound}"
     why = "one of the two is aligned wrongly, or a sheet is not at the configured place"
     return report_problems("agreement", texts, fine, why, "let both headsets observe the same sheet from two sides")
 

@@ -115,7 +115,9 @@ class AlignmentReport(msgspec.Struct, frozen=True):
 
 
 class CrossCheckReport(msgspec.Struct, frozen=True):
-    """The newest comparison of two headsets, `age_ns` ago; fields as in `HeadsetsCompared`."""
+    """The newest comparison of two headsets, `age_ns` ago; fields as in `HeadsetsCompared`. `outdated`: one of them has
+    been aligned elsewhere since.
+    """
 
     a: Name
     b: Name
@@ -126,6 +128,7 @@ class CrossCheckReport(msgspec.Struct, frozen=True):
     age_ns: Nanoseconds
     n: Count = 0
     touched: bool = False
+    outdated: bool = False
 
 
 class UnverifiedReport(msgspec.Struct, frozen=True):

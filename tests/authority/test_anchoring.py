@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.protocol.client_messages import Align, Bye, Heartbeat, MoveAnchor, TrackingEpoch
+from iris_session.protocol.client_messages import Align, Bye, Heartbeat, MoveAnchor, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import AlignmentAlarm, CrossChecked, Entry, Lost, SessionResumed
 from iris_session.protocol.server_messages import (
@@ -281,6 +281,18 @@ def test_two_headsets_are_compared_and_the_newest_is_kept_per_pair() -> None:
     assert len(t.authority.build_cross_check_reports()) == 3
     carl.does(Bye())
     assert [{c.a, c.b} for c in t.authority.build_cross_check_reports()] == [{anna.id, bert.id}] * 2
+
+
+def test_a_comparison_is_outdated_once_one_of_the_two_is_aligned_elsewhere() -> None:
+    t = Table(CONFIG)
+    anna, bert = t.operator(), t.operator()
+    t.step(anna.says(compared(bert.connection, touched=True)))
+    assert [c.outdated for c in t.authority.build_cross_check_reports()] == [False]
+    now = t.last(AlignmentChanged).alignment
+    (x, y, z), q = now.T_world_tracking.p, now.T_world_tracking.q
+    for shift_m, outdated in ((0.002, False), (0.05, True)):
+        t.step(t.host(PlaceAlignment(0, bert.id, Pose((x + shift_m, y, z), q))))
+        assert [c.outdated for c in t.authority.build_cross_check_reports()] == [outdated]
 
 
 @pytest.mark.parametrize(

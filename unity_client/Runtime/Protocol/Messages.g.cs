@@ -2109,7 +2109,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// The newest comparison of two headsets, age_ns ago; fields as in HeadsetsCompared.
+    /// The newest comparison of two headsets, age_ns ago; fields as in HeadsetsCompared. outdated: one of them has
+    /// been aligned elsewhere since.
     /// </summary>
     public sealed class CrossCheckReport : WireValue
     {
@@ -2122,6 +2123,7 @@ namespace IrisSession.Protocol
         public long AgeNs = 0;
         public long N = 0;
         public bool Touched = false;
+        public bool Outdated = false;
 
         public static CrossCheckReport Read(WireReader reader)
         {
@@ -2140,6 +2142,7 @@ namespace IrisSession.Protocol
                     case "age_ns": value.AgeNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 64u; break;
                     case "n": value.N = reader.ReadLong(0, long.MaxValue); break;
                     case "touched": value.Touched = reader.ReadBool(); break;
+                    case "outdated": value.Outdated = reader.ReadBool(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -2149,7 +2152,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(9);
+            writer.WriteMapHeader(10);
             writer.Write("a");
             writer.Write(A);
             writer.Write("b");
@@ -2168,6 +2171,8 @@ namespace IrisSession.Protocol
             writer.Write(N);
             writer.Write("touched");
             writer.Write(Touched);
+            writer.Write("outdated");
+            writer.Write(Outdated);
         }
     }
 

@@ -745,7 +745,10 @@ export interface AlignmentReport {
   confirmed_ns?: number;
 }
 
-/** The newest comparison of two headsets, `age_ns` ago; fields as in `HeadsetsCompared`. */
+/**
+ * The newest comparison of two headsets, `age_ns` ago; fields as in `HeadsetsCompared`. `outdated`: one of them has
+ * been aligned elsewhere since.
+ */
 export interface CrossCheckReport {
   a: string;
   b: string;
@@ -756,6 +759,7 @@ export interface CrossCheckReport {
   age_ns: number;
   n?: number;
   touched?: boolean;
+  outdated?: boolean;
 }
 
 /**
@@ -2479,6 +2483,7 @@ export const VALUE_DEFAULTS = {
   CrossCheckReport: {
     n: 0,
     touched: false,
+    outdated: false,
   },
   AnchorReport: {
     size_m: 0.0,

@@ -267,6 +267,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["age_ns", ["int", null, null], []],
       ["n", ["int", 0, null], [0]],
       ["touched", ["bool"], [false]],
+      ["outdated", ["bool"], [false]],
     ],
   },
   UnverifiedReport: {

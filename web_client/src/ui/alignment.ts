@@ -30,7 +30,8 @@ export function makeAlignmentPanel(state: PageState, actions: Actions): Panel {
       const found = (state.status?.cross_checks ?? []).map(
         (check) =>
           `${state.nameOf(check.a)} and ${state.nameOf(check.b)} ${check.touched ? "touch" : "see"} ${check.anchor_id} ${formatMillimetres(check.error_m)} ` +
-          `apart (expected up to ${formatMillimetres(check.expected_p95_m)}), ${formatAge(check.age_ns)} ago`,
+          `apart (expected up to ${formatMillimetres(check.expected_p95_m)}), ${formatAge(check.age_ns)} ago` +
+          (check.outdated ? ", before one of them was aligned elsewhere" : ""),
       );
       const unverified = (state.status?.unverified ?? []).map(
         (pair) =>
