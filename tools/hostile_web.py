@@ -66,6 +66,7 @@ from iris_session.web import wire
 
 #: What was measured of one case, as the table shows it.
 Row = dict[str, Any]
+ROOT: Final = Path(__file__).resolve().parents[1]
 MIB: Final = 1 << 20
 START_S: Final = 90.0
 #: Longest time for an e-stop to come back, and its share of that without the attack [ms].
@@ -617,6 +618,8 @@ def main() -> int:
         victim = Victim("127.0.0.1", int(port), tls, observers)
         asyncio.run(attack(kind, victim, float(bytes_per_s)))
         return 0
+    if not (ROOT / "iris_session/web/page/index.html").is_file():
+        parser.error("there is no page, which attackers request: make web")
     figures = run(options.case or list(CASES), 3.0 if options.quick else 10.0)
     if options.json:
         print(json.dumps(figures))
