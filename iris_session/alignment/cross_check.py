@@ -127,16 +127,15 @@ class CrossCheckScheduler:
         counts, discards = self._count_observations((a, b)), self._discards
 
         def compare() -> Callable[[], None]:
-            worst = _find_worst(check, alignments, now_ns, moving)
-            touched = check.compare_points(alignments, now_ns, since_ns)
-            return lambda: finish(worst, touched)
+            found = _compare(check, alignments, now_ns, moving, since_ns)
+            return lambda: finish(found)
 
-        def finish(worst: Disagreement | None, touched: list[Disagreement]) -> None:
+        def finish(found: list[tuple[Disagreement, bool]]) -> None:
             if discards != self._discards:
                 return
-            for one in (*([] if worst is None else [worst]), *touched):
+            for one, is_touched in found:
                 self._reported[a, b] = (now_ns, counts)
-                off, is_touched = (one.error_m, one.error_rad, one.expected_p95_m), one is not worst
+                off = (one.error_m, one.error_rad, one.expected_p95_m)
                 offer(Entry(a, a, now_ns, CrossChecked(b, one.target, *off, one.p_world, one.n, is_touched)))
 
         return compare
@@ -150,13 +149,19 @@ class CrossCheckScheduler:
         return self._n_observations.get(pair[0], 0), self._n_observations.get(pair[1], 0)
 
 
-def _find_worst(
-    check: CrossCheck, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: Set[str]
-) -> Disagreement | None:
-    """Return the disagreement furthest beyond its expected error, of all targets that both observed."""
+def _compare(
+    check: CrossCheck, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: Set[str], since_ns: int
+) -> list[tuple[Disagreement, bool]]:
+    """Return the disagreement furthest beyond its expected error, of all targets that both observed, and those about
+    points that were touched after `since_ns`, with true."""
     try:
-        found = check.compare(alignments, now_ns, moving)
+        seen = check.compare(alignments, now_ns, moving)
+        touched = check.compare_points(alignments, now_ns, since_ns)
     except NUMERICAL_ERRORS:
-        return None
-    found = [one for one in found if math.isfinite(one.error_m) and one.expected_p95_m > 0.0]
-    return max(found, key=lambda one: one.error_m / one.expected_p95_m, default=None)
+        return []
+    seen = sorted(filter(_is_usable, seen), key=lambda one: one.error_m / one.expected_p95_m)
+    return [*((one, False) for one in seen[-1:]), *((one, True) for one in filter(_is_usable, touched))]
+
+
+def _is_usable(one: Disagreement) -> bool:
+    return math.isfinite(one.error_m) and one.expected_p95_m > 0.0

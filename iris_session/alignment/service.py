@@ -58,6 +58,7 @@ _MAX_WAITING: Final = 64
 TIP_PERIOD_NS: Final = 500_000_000
 #: Devices of one connection whose tips wait for their calibration.
 MAX_WAITING_TIPS: Final = 4
+UNALIGNED_POINT: Final = "points touched without an alignment that states its error"
 #: Time for a job that runs when the service is closed [s].
 CLOSE_S: Final = 1.0
 
@@ -308,6 +309,9 @@ class AlignmentService:
     def _add_point(self, number: int, state: _HeadsetState, observation: Observation, now_ns: int) -> bool:
         sigma_m, p = state.estimator.find_touch_sigma(observation), observation.T_tracking_anchor.p
         name, epoch = observation.anchor_id, observation.tracking_epoch
+        if state.monitor.in_force is None:
+            state.estimator.count_fault(UNALIGNED_POINT, epoch, False)
+            return False
         return sigma_m is not None and self._cross_check.add_point(number, name, p, sigma_m, now_ns, epoch)
 
     def _add_connection(self, connection: HeadsetConnection) -> _HeadsetState:

@@ -27,6 +27,8 @@ from iris_session.protocol.names import AlignmentDoubt, AlignmentKind
 #: Growth of the stated error that is published.
 STATED_STEP: Final = 1.2
 MIN_STATED_STEP_M: Final = 0.0005
+#: A time that is not known counts as so much, after which every alignment waits for a glance.
+UNKNOWN_NS: Final = 3_600_000_000_000
 _MINUTE_NS: Final = 60e9
 
 
@@ -71,12 +73,11 @@ def doubt_age(ctx: Context, p: Participant) -> None:
     alignment.doubt_alignment(ctx, p, AlignmentDoubt.AGED, f"{text}; until then the next clutch moves nothing")
 
 
-def doubt_all(ctx: Context) -> None:
-    """Make all measured alignments unconfirmed: it is not known for how long the session was down."""
+def add_unknown_age(ctx: Context) -> None:
+    """Let all alignments age by `UNKNOWN_NS`: it is not known for how long the session was down."""
     for p in ctx.state.participants.values():
-        if p.needs_alignment and p.alignment is not None and p.alignment.kind != AlignmentKind.PLACED:
-            text = "the session was down, and it is not known for how long: glance at a sheet, or touch three marks"
-            alignment.doubt_alignment(ctx, p, AlignmentDoubt.AGED, f"{text}; until then the next clutch moves nothing")
+        p.confirmed_ns -= UNKNOWN_NS
+        p.age_due_ns = ctx.now_ns
 
 
 def describe_age(ctx: Context, p: Participant) -> str:

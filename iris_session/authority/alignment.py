@@ -111,11 +111,12 @@ def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None
     warn_wearer(ctx, p, "tilt", tilt if tilted else "", same="tilted")
     advice = f"alignment of {p.name}: {m.advice}" if m.advice and not tilted else ""
     warn_wearer(ctx, p, "advice", advice, same=m.advice)
-    against = _list_contradicted(ctx, p, m)
-    if against:
-        others = join_names(against)
-        text = f"sheet '{m.looks[0].anchor_id}' is not where {others} say it is, and it alone was looked at since"
-        return _notify_refusal(ctx, p, text, f"look at {others} again")
+    others = join_names(_list_contradicted(ctx, p, m))
+    text = others and f"alignment of {p.name} refused: sheet '{m.looks[0].anchor_id}' alone contradicts {others}"
+    text = others and f"{text}; look at {others} again"
+    warn_wearer(ctx, p, "contradicted", text, same=others, reason=DenialReason.ALIGNMENT_REFUSED)
+    if others:
+        return None
     looked_ns, walked_m = _find_look(ctx, p, m)
     if p.placed or (looked_ns is None and not _is_after_move(ctx, p, m)):
         return None

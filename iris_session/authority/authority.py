@@ -379,7 +379,7 @@ class Authority:
             session_control.record_gap(ctx, m.gap_ns, "resumed")
             roster.restart_grace_periods(ctx)
             if not m.is_gap_known:
-                ageing.doubt_all(ctx)
+                ageing.add_unknown_age(ctx)
         elif isinstance(m, em.SceneLoaded):
             session_control.load_scene(ctx, m)
             self._commands = arbitration.CommandBuilder()

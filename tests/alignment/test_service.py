@@ -322,6 +322,10 @@ def test_a_point_that_both_wearers_touch_measures_their_pair_once_per_touch() ->
     assert message.error_m == pytest.approx(0.02, abs=0.012)
     assert message.expected_p95_m > 0.02, "two fingertips"
     assert lab.drops.by_reason.get("observation_unusable", 0) == 0
+    eve = lab.wearer(3)
+    eve.observe(Observation("cross", "point", IDENTITY, lab.now_ns, 1, device="hand/right"))
+    eve.observe(Observation("cross", "point", Pose((1.0, 0.0, 0.0), IDENTITY.q), lab.now_ns, 1, device="hand/right"))
+    assert lab.drops.by_reason["observation_unusable"] == 2, "a zero pose, and one that is not aligned"
 
 
 def test_restarted_front_restores_alignment_in_force_from_a_snapshot() -> None:

@@ -243,7 +243,7 @@ export class Touching {
   }
 
   private describeCheck(alignment: Facts["alignment"]): string[] {
-    return this.isBare || !isPlaced(alignment) ? [] : ["Squeeze: compare a point with another one"];
+    return this.isBare || !isCompared(alignment) ? [] : ["Squeeze: compare a point with another one"];
   }
 
   // --- frames ---------------------------------------------------------------------------------------------------------
@@ -303,7 +303,7 @@ export class Touching {
         if (buttons & BUTTON.lower) this.wantsTip = true;
         this.stage = { name: !this.wantsTip && this.canTouch(reading) ? "touch" : "tip" };
         for (const side of triggers) this.press(side, reading, false);
-        if (isPlaced(alignment)) for (const side of squeezes) this.press(side, reading, true);
+        if (isCompared(alignment)) for (const side of squeezes) this.press(side, reading, true);
     }
   }
 
@@ -432,6 +432,11 @@ export class Touching {
     const tip = this.tips.get(`controller/${side}`);
     return tip && pose ? transform(pose, tip.p) : null;
   }
+}
+
+/** Return whether an alignment states an error, with which it can be compared. */
+function isCompared(alignment: Facts["alignment"]): boolean {
+  return isPlaced(alignment) && alignment?.kind !== "placed";
 }
 
 /**
