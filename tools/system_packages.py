@@ -31,6 +31,13 @@ def _has_file(folder: str, pattern: str) -> Callable[[], bool]:
 
 
 OPENGL = ("libegl1", "libgl1-mesa-dri", "libopengl0")
+CSHARP = (
+    "libmono-system-io-compression4.0-cil",
+    "libmono-system-numerics4.0-cil",
+    "libnunit-framework2.6.3-cil",
+    "mono-mcs",
+)
+_MONO = "/usr/lib/mono/4.5"
 #: Name -> what needs it, and a function that tells whether it is here.
 PACKAGES: dict[str, tuple[str, Callable[[], bool]]] = {
     "chromium": (
@@ -42,9 +49,22 @@ PACKAGES: dict[str, tuple[str, Callable[[], bool]]] = {
     "libegl1": ("drawing without a display", _has_library("EGL")),
     "libgl1-mesa-dri": ("drawing without a display", _has_file("/usr/lib", "**/dri/*swrast*")),
     "libopengl0": ("drawing without a display", _has_library("OpenGL")),
+    "libmono-system-io-compression4.0-cil": (
+        "tests of the headset apps' C#",
+        _has_file(_MONO, "System.IO.Compression.dll"),
+    ),
+    "libmono-system-numerics4.0-cil": ("tests of the headset apps' C#", _has_file(_MONO, "System.Numerics.dll")),
+    "libnunit-framework2.6.3-cil": (
+        "tests of the headset apps' C#",
+        _has_file("/usr/lib/cli/nunit.framework-2.6.3", "nunit.framework.dll"),
+    ),
     "mesa-vulkan-drivers": (
         "looking at recordings in Rerun's viewer (make test-long)",
         _has_file("/usr/share/vulkan/icd.d", "*.json"),
+    ),
+    "mono-mcs": (
+        "tests of the headset apps' C#",
+        lambda: _has_command("mono")() and _has_command("mcs")(),
     ),
     "python3-venv": ("make install", lambda: importlib.util.find_spec("ensurepip") is not None),
 }

@@ -1,0 +1,61 @@
+"""Build the C# of this checkout, run its tests, or run one of its programs.
+
+python -m tools.csharp test [--runtime mono] [--filter TEXT] [--long]
+python -m tools.csharp run PROGRAM [--runtime mono] -- [ARGUMENT ...]
+python -m tools.csharp build
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+from tools.csharp.project import build, find_programs, run_tests
+from tools.csharp.toolchain import RUNTIMES, ToolchainError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line. Return the exit status: 1 when something does not compile or a test fails."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.csharp", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("build", help="compile, and print the folder")
+    test = commands.add_parser("test", help="run the NUnit tests")
+    test.add_argument("--runtime", choices=RUNTIMES, help="only on this one")
+    test.add_argument("--filter", default="", help="only tests whose full name has this text")
+    test.add_argument("--long", action="store_true", help="also those of the category Long")
+    run = commands.add_parser("run", help="run a program of tools/csharp/programs")
+    run.add_argument("program", choices=find_programs())
+    run.add_argument("--runtime", choices=RUNTIMES, default=RUNTIMES[0])
+    run.add_argument("arguments", nargs="*")
+    options = parser.parse_args(arguments)
+    try:
+        built = build()
+        if options.command == "run":
+            command = [*built.make_command(options.runtime, options.program), *options.arguments]
+            os.execvp(command[0], command)
+        if options.command == "build":
+            print(built.folder)
+            return 0
+        failed = 0
+        for runtime in (options.runtime,) if options.runtime else RUNTIMES:
+            with tempfile.TemporaryDirectory() as folder:
+                given = (*(["--long"] if options.long else []), "--filter", options.filter)
+                results = run_tests(built, runtime, Path(folder, "results"), *given)
+            failures = [one for one in results if one["failure"]]
+            for one in failures:
+                print(f"FAILED on {runtime}: {one['name']}\n{one['failure']}\n")
+            print(f"{runtime}: {len(results) - len(failures)} passed, {len(failures)} failed")
+            failed += len(failures)
+        return int(failed > 0)
+    except ToolchainError as error:
+        print(error, file=sys.stderr)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
