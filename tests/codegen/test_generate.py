@@ -109,46 +109,23 @@ def test_unsupported_types_are_rejected(kind: object) -> None:
         schema._describe_type(msgspec.inspect.type_info(kind))
 
 
-def test_every_struct_has_its_fields_and_tag_in_csharp_and_typescript() -> None:
-    cs, ts = csharp.render_csharp(), typescript.render_typescript()
+def test_every_struct_has_its_fields_in_typescript() -> None:
+    text = typescript.render_typescript()
     for struct in schema.list_all_structs():
         form = rf"type {struct.name} = \[" if struct.array_like else rf"interface {struct.name} \{{"
-        in_cs = re.search(rf"public sealed class {struct.name} : \w+\n    \{{\n(.*?)\n    \}}\n", cs, re.DOTALL)
-        in_ts = re.search(rf"export {form}\n(.*?)\n[\]}}]", ts, re.DOTALL)
-        assert in_cs, struct.name
-        assert in_ts, struct.name
-        assert (f'TagName = "{struct.tag}"' in in_cs[1]) == bool(struct.tag)
+        found = re.search(rf"export {form}\n(.*?)\n[\]}}]", text, re.DOTALL)
+        assert found, struct.name
         for field in struct.fields:
-            name = csharp.to_pascal_case(field.name, struct.name)
-            assert re.search(rf"public \S+(, long>)? {name} = ", in_cs[1]), name
-            assert re.search(rf"^  {field.name}{'' if field.required else '[?]'}: ", in_ts[1], re.MULTILINE), field.name
-    for value in (value for values in schema.list_enums().values() for value in values.values()):
-        assert f'= "{value}";' in cs
+            assert re.search(rf"^  {field.name}{'' if field.required else '[?]'}: ", found[1], re.MULTILINE), field.name
 
 
-def test_csharp_checks_the_bounds_of_the_schema() -> None:
-    text = csharp.render_csharp()
-    for line in (
-        "value.Material = reader.ReadLong(-1, 2147483647);",
-        "value.Resolution = reader.ReadLongs(2, 0, -2147483648, 2147483647);",
-        "value.GroupsShown = reader.ReadLongs(0, 256, -2147483648, 2147483647);",
-        "value.Address = reader.ReadAddress();",
-        "value.Levels = reader.ReadArray(Protocol.MeshLevel.Read, 32);",
-        "value.Group = reader.TryReadNil() ? (long?)null : reader.ReadLong(-2147483648, 2147483647);",
-        "value.Rgba = reader.TryReadNil() ? null : reader.ReadDoubles(4, 0);",
-        "value.RequestId = reader.ReadLong(0, long.MaxValue);",
-        "value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue);",
-        "value.Devices = reader.ReadStrings(32, 64);",
-        'string tag = reader.PeekTag("op");',
-    ):
-        assert line in text, line
-
-
-def test_csharp_names() -> None:
-    assert csharp.to_pascal_case("request_id", "Acquire") == "RequestId"
-    assert csharp.to_pascal_case("T_world_tracking", "Alignment") == "T_world_tracking"
-    assert csharp.to_pascal_case("tracking_epoch", "TrackingEpoch") == "TrackingEpochValue"
-    assert csharp.to_pascal_case("CONTROLLER_LEFT") == "ControllerLeft"
+def test_csharp_has_what_headset_apps_use_and_nothing_else() -> None:
+    """That classes have the fields and bounds of the schema is what their golden vectors show (tests/csharp)."""
+    generated = {struct.name for struct in csharp.list_structs()}
+    assert {struct.name for struct in schema.list_all_structs()} - generated >= csharp.LEFT_OUT
+    assert {*csharp.ROOTS, "Sample", "AlignmentChanged", "SetVisual", "TextureLevel"} <= generated
+    assert {*schema.list_enums()} >= csharp.LEFT_OUT_ENUMS
+    assert len(csharp.render_csharp().splitlines()) <= 3_500
 
 
 def test_links_of_the_document_resolve() -> None:

@@ -32,13 +32,14 @@ from tools.codegen import rigid_reference
 class Type:
     """Type of a field. `base`: bool, int, float, str, bytes, array, map, struct, union.
 
-    `item`: of an array, or the value of a map. `length`: of an array of fixed length. `max_length`: 0 for no limit.
-    `name`: of a struct or union. `optional`: may be null. `minimum`, `maximum`: of an int. `pattern`: of a str.
+    `item`: of an array, or the value of a map. `length`: of an array of fixed length. `min_length`, `max_length`: 0
+    for no limit. `name`: of a struct or union. `optional`: may be null. `minimum`, `maximum`: of an int. `pattern`: of a str.
     """
 
     base: str
     item: Type | None = None
     length: int = 0
+    min_length: int = 0
     max_length: int = 0
     name: str = ""
     optional: bool = False
@@ -327,7 +328,8 @@ def _describe_type(node: msgspec.inspect.Type) -> Type:
             if items.count(items[0]) == len(items):
                 return Type("array", item=items[0], length=len(items))
         case msgspec.inspect.VarTupleType():
-            return Type("array", item=_describe_type(node.item_type), max_length=node.max_length or 0)
+            item = _describe_type(node.item_type)
+            return Type("array", item=item, min_length=node.min_length or 0, max_length=node.max_length or 0)
         case msgspec.inspect.DictType():
             return Type("map", item=_describe_type(node.value_type))
         case msgspec.inspect.StructType():

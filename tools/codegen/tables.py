@@ -57,6 +57,7 @@ def _render_type(kind: Type) -> str:
             if kind.length:
                 return f"array of {kind.length} {item}"
             limit = f", at most {kind.max_length}" if kind.max_length else ""
+            limit = f", at least {kind.min_length}{limit}" if kind.min_length else limit
             return f"array of ({item}){limit}"
         case "map":
             return "map of string to int"

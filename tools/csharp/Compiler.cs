@@ -34,6 +34,7 @@ static class Compiler
         var arguments = CSharpCommandLineParser.Default.Parse(
             options.Where(each => !each.StartsWith(Standard)), Directory.GetCurrentDirectory(), null);
         if (arguments.Errors.Length > 0) return Report(arguments.Errors);
+        if (!arguments.MetadataReferences.All(each => File.Exists(each.Reference))) return false; // did not compile
         var trees = arguments.SourceFiles.Select(file => CSharpSyntaxTree.ParseText(
             SourceText.From(File.ReadAllText(file.Path), System.Text.Encoding.UTF8), arguments.ParseOptions, file.Path));
         var compilation = CSharpCompilation.Create(

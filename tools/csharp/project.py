@@ -21,6 +21,7 @@ from typing import Final
 from filelock import FileLock
 
 from tools.csharp.toolchain import HERE, NUNIT, RUNTIMES, Assembly, Toolchain, prepare_toolchain, run_tool
+from tools.csharp.vectors import render_message_vectors
 
 ROOT: Final = HERE.parents[1]
 PACKAGES: Final = ("unity_client",)
@@ -188,5 +189,8 @@ def run_tests(build: Build, runtime: str, results: Path, *options: str) -> list[
     Raises:
         ToolchainError: The process died; the text is what it printed.
     """
-    run_tool(build.make_test_command(runtime, results, *options), f"the tests on {runtime}")
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "messages.txt").write_text(render_message_vectors(ROOT / "docs/protocol"), encoding="utf-8")
+        data = {"IRIS_VECTORS": folder, "IRIS_REPO": str(ROOT)}
+        run_tool(build.make_test_command(runtime, results, *options), f"the tests on {runtime}", data)
     return [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]

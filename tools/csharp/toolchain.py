@@ -21,9 +21,10 @@ import sys
 import tarfile
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from filelock import FileLock
@@ -167,10 +168,10 @@ def prepare_toolchain(folder: Path | None = None) -> Toolchain:
         raise ToolchainError(f"the C# tool chain cannot be kept: {error}") from error
 
 
-def run_tool(command: Sequence[str], what: str) -> str:
+def run_tool(command: Sequence[str], what: str, variables: Mapping[str, str] = MappingProxyType({})) -> str:
     """Run a command and return what it printed. Raises `ToolchainError` with its words when it fails."""
     # No second compilation of what runs often: these processes live for seconds.
-    environment = {**os.environ, "DOTNET_TieredPGO": "0", "DOTNET_EnableDiagnostics": "0"}
+    environment = {**os.environ, "DOTNET_TieredPGO": "0", "DOTNET_EnableDiagnostics": "0", **variables}
     try:
         result = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT_S, check=False, env=environment

@@ -4,7 +4,6 @@
 // </auto-generated>
 using System;
 using System.Collections.Generic;
-using System.Text;
 
 namespace IrisSession.Protocol
 {
@@ -23,9 +22,7 @@ namespace IrisSession.Protocol
         public const string ArraysMagic = "IRA1";
     }
 
-    /// <summary>
-    /// Rights of a participant. Reserved for later message types: camera, source.
-    /// </summary>
+    /// <summary>Rights of a participant.</summary>
     public static class Role
     {
         public const string Operator = "operator";
@@ -39,9 +36,7 @@ namespace IrisSession.Protocol
         public const string Source = "source";
     }
 
-    /// <summary>
-    /// Tracked sources of input of one participant.
-    /// </summary>
+    /// <summary>Tracked sources of input of one participant.</summary>
     public static class Device
     {
         public const string Head = "head";
@@ -55,9 +50,7 @@ namespace IrisSession.Protocol
         public const string Target = "target";
     }
 
-    /// <summary>
-    /// Payload of a Sample that counts.
-    /// </summary>
+    /// <summary>Payload of a Sample that counts.</summary>
     public static class SampleKind
     {
         public const string Pose = "pose";
@@ -65,18 +58,14 @@ namespace IrisSession.Protocol
         public const string Joints = "joints";
     }
 
-    /// <summary>
-    /// Kind of a target.
-    /// </summary>
+    /// <summary>Kind of a target.</summary>
     public static class TargetKind
     {
         public const string Robot = "robot";
         public const string Object = "object";
     }
 
-    /// <summary>
-    /// Rule by which a robot's lease passes between participants.
-    /// </summary>
+    /// <summary>Rule by which a robot's lease passes between participants.</summary>
     public static class LeaseMode
     {
         public const string Exclusive = "exclusive";
@@ -86,9 +75,7 @@ namespace IrisSession.Protocol
         public const string Shared = "shared";
     }
 
-    /// <summary>
-    /// Rule that chooses a robot for a participant that names none.
-    /// </summary>
+    /// <summary>Rule that chooses a robot for a participant that names none.</summary>
     public static class AssignmentPolicy
     {
         public const string Config = "config";
@@ -97,12 +84,7 @@ namespace IrisSession.Protocol
         public const string Director = "director";
     }
 
-    /// <summary>
-    /// Origin of T_world_tracking of a participant.
-    ///
-    /// fingertip: marks touched with a fingertip, or with a tip that is not calibrated; persistent: an anchor that the
-    /// device kept, confirmed by no touch yet. Both are good enough to look, not to drive.
-    /// </summary>
+    /// <summary>Origin of T_world_tracking of a participant.</summary>
     public static class AlignmentKind
     {
         public const string None = "none";
@@ -113,23 +95,14 @@ namespace IrisSession.Protocol
         public const string Persistent = "persistent";
     }
 
-    /// <summary>
-    /// Action of align. start: measure anew, from nothing; stop: keep the alignment in force, ignore further
-    /// observations.
-    /// </summary>
+    /// <summary>Action of align.</summary>
     public static class AlignAction
     {
         public const string Start = "start";
         public const string Stop = "stop";
     }
 
-    /// <summary>
-    /// Evidence that an alignment is wrong.
-    ///
-    /// changed: an anchor is observed elsewhere than seconds ago. differs: and elsewhere than by the alignment. jump:
-    /// the tracking frame moved at once, which voids the alignment. two_places: one id is observed in two places, to and
-    /// fro: there are two prints of it.
-    /// </summary>
+    /// <summary>Evidence that an alignment is wrong.</summary>
     public static class AlarmKind
     {
         public const string Changed = "changed";
@@ -138,10 +111,7 @@ namespace IrisSession.Protocol
         public const string TwoPlaces = "two_places";
     }
 
-    /// <summary>
-    /// Reason why an alignment in force is *unconfirmed*: it begins no engagement until a look at an anchor confirms or
-    /// replaces it. Empty: none.
-    /// </summary>
+    /// <summary>Reason why an alignment in force is *unconfirmed*: it begins no engagement until a look ...</summary>
     public static class AlignmentDoubt
     {
         public const string Aged = "aged";
@@ -149,13 +119,7 @@ namespace IrisSession.Protocol
         public const string Contradicted = "contradicted";
     }
 
-    /// <summary>
-    /// Kind of an observation: the form of the anchor, or the way in which it was found.
-    ///
-    /// touch: a tip or a fingertip on a mark. tip: a controller turned while its tip stayed in a hole. persistent: a
-    /// place that the device kept since an earlier alignment. point: a tip or a fingertip on any point that others touch
-    /// too, to measure how far apart their worlds are.
-    /// </summary>
+    /// <summary>Kind of an observation: the form of the anchor, or the way in which it was found.</summary>
     public static class AnchorKind
     {
         public const string Qr = "qr";
@@ -167,12 +131,7 @@ namespace IrisSession.Protocol
         public const string Point = "point";
     }
 
-    /// <summary>
-    /// Source of an observation, whose constant errors are known by size (docs/anchors.md, "Biases").
-    ///
-    /// qr_camera: a detector of the application, on pictures of a camera. qr_system: codes that the system of the
-    /// headset tracks. holder: a tracked controller in its holder. touch: a tip on a mark.
-    /// </summary>
+    /// <summary>Source of an observation, whose constant errors are known by size (docs/anchors.md, ...</summary>
     public static class ObservationSource
     {
         public const string QrCamera = "qr_camera";
@@ -181,18 +140,14 @@ namespace IrisSession.Protocol
         public const string Touch = "touch";
     }
 
-    /// <summary>
-    /// Kind of a session.
-    /// </summary>
+    /// <summary>Kind of a session.</summary>
     public static class SessionKind
     {
         public const string Live = "live";
         public const string Replay = "replay";
     }
 
-    /// <summary>
-    /// Kind of a robot's command.
-    /// </summary>
+    /// <summary>Kind of a robot's command.</summary>
     public static class CommandKind
     {
         public const string Hold = "hold";
@@ -201,9 +156,7 @@ namespace IrisSession.Protocol
         public const string Joints = "joints";
     }
 
-    /// <summary>
-    /// Reason why a robot holds. Exactly one is given with every hold command.
-    /// </summary>
+    /// <summary>Reason why a robot holds.</summary>
     public static class HoldReason
     {
         public const string NoLease = "no_lease";
@@ -228,9 +181,7 @@ namespace IrisSession.Protocol
         public const string Unconfirmed = "unconfirmed";
     }
 
-    /// <summary>
-    /// Reason why a sample was rejected. Counted per participant, device and reason.
-    /// </summary>
+    /// <summary>Reason why a sample was rejected.</summary>
     public static class RejectReason
     {
         public const string ConnectionEpoch = "connection_epoch";
@@ -262,9 +213,7 @@ namespace IrisSession.Protocol
         public const string Unconfirmed = "unconfirmed";
     }
 
-    /// <summary>
-    /// Reason why a request was denied.
-    /// </summary>
+    /// <summary>Reason why a request was denied.</summary>
     public static class DenialReason
     {
         public const string Held = "held";
@@ -294,9 +243,7 @@ namespace IrisSession.Protocol
         public const string ViewOnly = "view_only";
     }
 
-    /// <summary>
-    /// Reason why the front refused a hello, before the authority received it.
-    /// </summary>
+    /// <summary>Reason why the front refused a hello, before the authority received it.</summary>
     public static class RefusalCode
     {
         public const string Version = "version";
@@ -311,9 +258,7 @@ namespace IrisSession.Protocol
         public const string Code = "code";
     }
 
-    /// <summary>
-    /// Reason of a ProtocolFault: a rejected message, or a change in the state of the session.
-    /// </summary>
+    /// <summary>Reason of a ProtocolFault: a rejected message, or a change in the state of the session.</summary>
     public static class FaultCode
     {
         public const string Version = "version";
@@ -328,9 +273,7 @@ namespace IrisSession.Protocol
         public const string Revoked = "revoked";
     }
 
-    /// <summary>
-    /// Action of episode.
-    /// </summary>
+    /// <summary>Action of episode.</summary>
     public static class EpisodeAction
     {
         public const string Start = "start";
@@ -341,9 +284,7 @@ namespace IrisSession.Protocol
         public const string Reset = "reset";
     }
 
-    /// <summary>
-    /// Action of control.
-    /// </summary>
+    /// <summary>Action of control.</summary>
     public static class ControlAction
     {
         public const string Pause = "pause";
@@ -352,9 +293,7 @@ namespace IrisSession.Protocol
         public const string Reset = "reset";
     }
 
-    /// <summary>
-    /// Kind of an Audited event.
-    /// </summary>
+    /// <summary>Kind of an Audited event.</summary>
     public static class AuditKind
     {
         public const string Paired = "paired";
@@ -371,9 +310,7 @@ namespace IrisSession.Protocol
         public const string Flood = "flood";
     }
 
-    /// <summary>
-    /// Share of media that a client gets, from everything to nothing. State and control are never cut.
-    /// </summary>
+    /// <summary>Share of media that a client gets, from everything to nothing.</summary>
     public static class BudgetClass
     {
         public const string Full = "full";
@@ -382,9 +319,7 @@ namespace IrisSession.Protocol
         public const string None = "none";
     }
 
-    /// <summary>
-    /// Reason why a request for an asset is refused. After the last four the same request may succeed later.
-    /// </summary>
+    /// <summary>Reason why a request for an asset is refused.</summary>
     public static class AssetRefusal
     {
         public const string Unknown = "unknown_asset";
@@ -397,9 +332,7 @@ namespace IrisSession.Protocol
         public const string Busy = "busy";
     }
 
-    /// <summary>
-    /// Encoding of the bytes of a media frame.
-    /// </summary>
+    /// <summary>Encoding of the bytes of a media frame.</summary>
     public static class MediaEncoding
     {
         public const string Bytes = "bytes";
@@ -408,18 +341,14 @@ namespace IrisSession.Protocol
         public const string Jpeg = "jpeg";
     }
 
-    /// <summary>
-    /// Audience of a media stream. Unknown values: as all.
-    /// </summary>
+    /// <summary>Audience of a media stream.</summary>
     public static class StreamAudience
     {
         public const string All = "all";
         public const string Remote = "remote";
     }
 
-    /// <summary>
-    /// Fault that the source of a media stream has found; empty without one.
-    /// </summary>
+    /// <summary>Fault that the source of a media stream has found; empty without one.</summary>
     public static class StreamFault
     {
         public const string Frozen = "frozen";
@@ -433,23 +362,7 @@ namespace IrisSession.Protocol
         public const string Source = "source";
     }
 
-    /// <summary>
-    /// Part of a late tick that took the time.
-    /// </summary>
-    public static class LateCause
-    {
-        public const string Scheduler = "scheduler";
-        public const string Physics = "physics";
-        public const string Control = "control";
-        public const string Authority = "authority";
-        public const string Output = "output";
-        public const string Supervision = "supervision";
-        public const string Owner = "owner";
-    }
-
-    /// <summary>
-    /// Shape of a visual. Sizes are those of Geometry.size.
-    /// </summary>
+    /// <summary>Shape of a visual.</summary>
     public static class GeometryKind
     {
         public const string Plane = "plane";
@@ -463,9 +376,7 @@ namespace IrisSession.Protocol
         public const string Sdf = "sdf";
     }
 
-    /// <summary>
-    /// Mapping of a texture onto a surface.
-    /// </summary>
+    /// <summary>Mapping of a texture onto a surface.</summary>
     public static class TextureKind
     {
         public const string Image = "2d";
@@ -473,9 +384,7 @@ namespace IrisSession.Protocol
         public const string Skybox = "skybox";
     }
 
-    /// <summary>
-    /// Use of a texture in a material. rgb, rgba: its colour, the only one that every client must draw.
-    /// </summary>
+    /// <summary>Use of a texture in a material.</summary>
     public static class TextureRole
     {
         public const string Rgb = "rgb";
@@ -490,9 +399,7 @@ namespace IrisSession.Protocol
         public const string User = "user";
     }
 
-    /// <summary>
-    /// Encoding of the values of a texture. auto: as they are, without conversion.
-    /// </summary>
+    /// <summary>Encoding of the values of a texture.</summary>
     public static class ColorSpace
     {
         public const string Auto = "auto";
@@ -500,9 +407,7 @@ namespace IrisSession.Protocol
         public const string Srgb = "srgb";
     }
 
-    /// <summary>
-    /// Kind of a light.
-    /// </summary>
+    /// <summary>Kind of a light.</summary>
     public static class LightKind
     {
         public const string Spot = "spot";
@@ -511,9 +416,7 @@ namespace IrisSession.Protocol
         public const string Image = "image";
     }
 
-    /// <summary>
-    /// Motion of a light or camera. Unknown values: like fixed.
-    /// </summary>
+    /// <summary>Motion of a light or camera.</summary>
     public static class Follow
     {
         public const string Fixed = "fixed";
@@ -523,9 +426,7 @@ namespace IrisSession.Protocol
         public const string TargetBodyCom = "targetbodycom";
     }
 
-    /// <summary>
-    /// Encoding of the bytes of an asset.
-    /// </summary>
+    /// <summary>Encoding of the bytes of an asset.</summary>
     public static class AssetEncoding
     {
         public const string Arrays = "arrays";
@@ -534,9 +435,7 @@ namespace IrisSession.Protocol
         public const string Opaque = "opaque";
     }
 
-    /// <summary>
-    /// Meaning of an asset of arrays.
-    /// </summary>
+    /// <summary>Meaning of an asset of arrays.</summary>
     public static class ArrayKind
     {
         public const string Mesh = "mesh";
@@ -545,9 +444,7 @@ namespace IrisSession.Protocol
         public const string Deformable = "deformable";
     }
 
-    /// <summary>
-    /// Meaning of an array of an asset; which ones a kind has is in docs/scene.md.
-    /// </summary>
+    /// <summary>Meaning of an array of an asset; which ones a kind has is in docs/scene.md.</summary>
     public static class ArrayName
     {
         public const string Index = "index";
@@ -562,9 +459,7 @@ namespace IrisSession.Protocol
         public const string Plan = "plan";
     }
 
-    /// <summary>
-    /// Transformation of an array before compression.
-    /// </summary>
+    /// <summary>Transformation of an array before compression.</summary>
     public static class ArrayFilter
     {
         public const string None = "none";
@@ -573,747 +468,217 @@ namespace IrisSession.Protocol
         public const string Up = "up";
     }
 
-    /// <summary>
-    /// Compression of an array.
-    /// </summary>
+    /// <summary>Compression of an array.</summary>
     public static class ArrayCodec
     {
         public const string None = "none";
         public const string Zstd = "zstd";
     }
 
-    /// <summary>The bytes are not MessagePack, or not a message of the schema.</summary>
-    public sealed class WireException : Exception
-    {
-        public WireException(string text) : base(text) { }
-    }
-
-    /// <summary>Reads MessagePack from a byte array. Throws WireException for all but what was asked for.</summary>
-    public sealed class WireReader
-    {
-        byte[] data = new byte[0];
-        int end;
-
-        /// <summary>Index of the next byte.</summary>
-        public int Position;
-
-        public WireReader() { }
-        public WireReader(byte[] bytes) { Reset(bytes, 0, bytes.Length); }
-
-        /// <summary>Reads from now on bytes[offset .. offset + count), without a copy.</summary>
-        public void Reset(byte[] bytes, int offset, int count)
-        {
-            if (offset < 0 || count < 0 || offset > bytes.Length - count) throw new ArgumentOutOfRangeException("count");
-            data = bytes;
-            Position = offset;
-            end = offset + count;
-        }
-
-        /// <summary>Throws unless everything was read.</summary>
-        public void ExpectEnd()
-        {
-            if (Position != end) throw new WireException((end - Position) + " bytes after the message");
-        }
-
-        byte Next()
-        {
-            if (Position >= end) throw new WireException("the message is truncated");
-            return data[Position++];
-        }
-
-        int Take(long count)
-        {
-            if (count > end - Position) throw new WireException("the message is truncated");
-            int start = Position;
-            Position += (int)count;
-            return start;
-        }
-
-        ulong Big(int bytes)
-        {
-            int start = Take(bytes);
-            ulong value = 0;
-            for (int i = 0; i < bytes; i++) value = value << 8 | data[start + i];
-            return value;
-        }
-
-        static WireException Unexpected(string wanted, byte code)
-        {
-            return new WireException("expected " + wanted + ", found MessagePack type 0x" + code.ToString("x2"));
-        }
-
-        /// <summary>Consumes a nil, if the next value is one.</summary>
-        public bool TryReadNil()
-        {
-            if (Position >= end || data[Position] != 0xc0) return false;
-            Position++;
-            return true;
-        }
-
-        public bool ReadBool()
-        {
-            byte code = Next();
-            if (code == 0xc2) return false;
-            if (code == 0xc3) return true;
-            throw Unexpected("a bool", code);
-        }
-
-        public long ReadLong()
-        {
-            byte code = Next();
-            if (code < 0x80) return code;
-            if (code >= 0xe0) return (sbyte)code;
-            switch (code)
-            {
-                case 0xcc: return (long)Big(1);
-                case 0xcd: return (long)Big(2);
-                case 0xce: return (long)Big(4);
-                case 0xcf:
-                    ulong value = Big(8);
-                    if (value > long.MaxValue) throw new WireException("an integer above int64");
-                    return (long)value;
-                case 0xd0: return (sbyte)Big(1);
-                case 0xd1: return (short)Big(2);
-                case 0xd2: return (int)Big(4);
-                case 0xd3: return (long)Big(8);
-            }
-            throw Unexpected("an integer", code);
-        }
-
-        /// <summary>An integer from low to high.</summary>
-        public long ReadLong(long low, long high)
-        {
-            long value = ReadLong();
-            if (value < low || value > high) throw new WireException(value + " is not from " + low + " to " + high);
-            return value;
-        }
-
-        public double ReadDouble()
-        {
-            byte code = Next();
-            if (code == 0xcb) return BitConverter.Int64BitsToDouble((long)Big(8));
-            if (code == 0xca)
-            {
-                byte[] single = BitConverter.GetBytes((uint)Big(4));
-                return BitConverter.ToSingle(single, 0);
-            }
-            Position--;
-            return ReadLong();
-        }
-
-        public string ReadString()
-        {
-            byte code = Next();
-            long count;
-            if ((code & 0xe0) == 0xa0) count = code & 0x1f;
-            else if (code == 0xd9) count = (long)Big(1);
-            else if (code == 0xda) count = (long)Big(2);
-            else if (code == 0xdb) count = (long)Big(4);
-            else throw Unexpected("a string", code);
-            int start = Take(count);
-            try { return Utf8.GetString(data, start, (int)count); }
-            catch (ArgumentException) { throw new WireException("a string that is not UTF-8"); }
-        }
-
-        /// <summary>A string of at most so many characters (code points); 0: of any length.</summary>
-        public string ReadString(int most)
-        {
-            string value = ReadString();
-            if (most == 0 || value.Length <= most) return value;
-            int pairs = 0;
-            foreach (char unit in value) if (char.IsLowSurrogate(unit)) pairs++;
-            if (value.Length - pairs > most) throw new WireException("a string of more than " + most + " characters");
-            return value;
-        }
-
-        /// <summary>The address of an asset: 64 digits 0-9, a-f.</summary>
-        public string ReadAddress()
-        {
-            string value = ReadString();
-            bool good = value.Length == 64;
-            foreach (char unit in value) good &= unit >= '0' && unit <= '9' || unit >= 'a' && unit <= 'f';
-            if (!good) throw new WireException("a string that is no address");
-            return value;
-        }
-
-        static readonly Encoding Utf8 = new UTF8Encoding(false, true);
-
-        /// <summary>At most so many bytes; 0: any number.</summary>
-        public byte[] ReadBytes(int most)
-        {
-            byte code = Next();
-            if (code < 0xc4 || code > 0xc6) throw Unexpected("bytes", code);
-            long count = (long)Big(1 << (code - 0xc4));
-            if (most != 0 && count > most) throw new WireException("more than " + most + " bytes");
-            int start = Take(count);
-            byte[] value = new byte[count];
-            Buffer.BlockCopy(data, start, value, 0, (int)count);
-            return value;
-        }
-
-        public int ReadArrayHeader()
-        {
-            byte code = Next();
-            if ((code & 0xf0) == 0x90) return Count(code & 0x0f, 1);
-            if (code == 0xdc) return Count((long)Big(2), 1);
-            if (code == 0xdd) return Count((long)Big(4), 1);
-            throw Unexpected("an array", code);
-        }
-
-        public int ReadMapHeader()
-        {
-            byte code = Next();
-            if ((code & 0xf0) == 0x80) return Count(code & 0x0f, 2);
-            if (code == 0xde) return Count((long)Big(2), 2);
-            if (code == 0xdf) return Count((long)Big(4), 2);
-            throw Unexpected("a map", code);
-        }
-
-        // Every element takes a byte at least: a length that cannot be true is refused before anything is allocated.
-        int Count(long count, int bytesEach)
-        {
-            if (count * bytesEach > end - Position) throw new WireException("the message is truncated");
-            return (int)count;
-        }
-
-        /// <summary>Passes over one value of any type, without recursion.</summary>
-        public void Skip()
-        {
-            for (long left = 1; left > 0; left--)
-            {
-                byte code = Next();
-                if (code < 0x80 || code >= 0xe0) continue;
-                if (code < 0x90) { left += 2 * (code & 0x0f); continue; }
-                if (code < 0xa0) { left += code & 0x0f; continue; }
-                if (code < 0xc0) { Take(code & 0x1f); continue; }
-                switch (code)
-                {
-                    case 0xc0: case 0xc2: case 0xc3: break;
-                    case 0xc4: case 0xd9: Take((long)Big(1)); break;
-                    case 0xc5: case 0xda: Take((long)Big(2)); break;
-                    case 0xc6: case 0xdb: Take((long)Big(4)); break;
-                    case 0xc7: Take((long)Big(1) + 1); break;
-                    case 0xc8: Take((long)Big(2) + 1); break;
-                    case 0xc9: Take((long)Big(4) + 1); break;
-                    case 0xcc: case 0xd0: Take(1); break;
-                    case 0xcd: case 0xd1: case 0xd4: Take(2); break;
-                    case 0xca: case 0xce: case 0xd2: Take(4); break;
-                    case 0xcb: case 0xcf: case 0xd3: Take(8); break;
-                    case 0xd5: Take(3); break;
-                    case 0xd6: Take(5); break;
-                    case 0xd7: Take(9); break;
-                    case 0xd8: Take(17); break;
-                    case 0xdc: left += (long)Big(2); break;
-                    case 0xdd: left += (long)Big(4); break;
-                    case 0xde: left += 2 * (long)Big(2); break;
-                    case 0xdf: left += 2 * (long)Big(4); break;
-                    default: throw Unexpected("a value", code);
-                }
-            }
-        }
-
-        // Of arrays: exactly length elements, and at most so many; 0: any number.
-
-        public double[] ReadDoubles(int length, int most)
-        {
-            double[] values = new double[ReadLength(length, most)];
-            for (int i = 0; i < values.Length; i++) values[i] = ReadDouble();
-            return values;
-        }
-
-        public long[] ReadLongs(int length, int most, long low, long high)
-        {
-            long[] values = new long[ReadLength(length, most)];
-            for (int i = 0; i < values.Length; i++) values[i] = ReadLong(low, high);
-            return values;
-        }
-
-        public string[] ReadStrings(int most, int characters)
-        {
-            string[] values = new string[ReadLength(0, most)];
-            for (int i = 0; i < values.Length; i++) values[i] = ReadString(characters);
-            return values;
-        }
-
-        public T[] ReadArray<T>(Func<WireReader, T> read, int most)
-        {
-            T[] values = new T[ReadLength(0, most)];
-            for (int i = 0; i < values.Length; i++) values[i] = read(this);
-            return values;
-        }
-
-        int ReadLength(int length, int most)
-        {
-            int n = ReadArrayHeader();
-            if (length != 0 && n != length) throw new WireException("expected " + length + " elements, found " + n);
-            if (most != 0 && n > most) throw new WireException("at most " + most + " elements, found " + n);
-            return n;
-        }
-
-        public Dictionary<string, long> ReadCounts()
-        {
-            Dictionary<string, long> values = new Dictionary<string, long>();
-            for (int n = ReadMapHeader(); n > 0; n--)
-            {
-                string key = ReadString();
-                values[key] = ReadLong();
-            }
-            return values;
-        }
-
-        /// <summary>Value of a key of the map that comes next, which is not consumed.</summary>
-        public string PeekTag(string key)
-        {
-            int start = Position;
-            for (int n = ReadMapHeader(); n > 0; n--)
-            {
-                if (ReadString() == key)
-                {
-                    string tag = ReadString();
-                    Position = start;
-                    return tag;
-                }
-                Skip();
-            }
-            throw new WireException("missing field " + key);
-        }
-    }
-
-    /// <summary>Writes MessagePack in its shortest form. The buffer is kept from message to message.</summary>
-    public sealed class WireWriter
-    {
-        byte[] data = new byte[256];
-
-        /// <summary>Bytes written since Clear.</summary>
-        public int Length;
-
-        /// <summary>The bytes, of which the first Length are valid until the next call.</summary>
-        public byte[] Data { get { return data; } }
-
-        public void Clear() { Length = 0; }
-
-        public byte[] ToArray()
-        {
-            byte[] copy = new byte[Length];
-            Buffer.BlockCopy(data, 0, copy, 0, Length);
-            return copy;
-        }
-
-        int Room(int count)
-        {
-            if (Length + count > data.Length) Array.Resize(ref data, Math.Max(2 * data.Length, Length + count));
-            int start = Length;
-            Length += count;
-            return start;
-        }
-
-        void Code(int code)
-        {
-            int start = Room(1);
-            data[start] = (byte)code;
-        }
-
-        void Big(int code, ulong value, int bytes)
-        {
-            int start = Room(1 + bytes);
-            data[start] = (byte)code;
-            for (int i = bytes; i > 0; i--, value >>= 8) data[start + i] = (byte)value;
-        }
-
-        public void WriteNil() { Code(0xc0); }
-
-        public void Write(bool value) { Code(value ? 0xc3 : 0xc2); }
-
-        public void Write(long value)
-        {
-            if (value >= 0)
-            {
-                if (value < 0x80) Code((int)value);
-                else if (value <= 0xff) Big(0xcc, (ulong)value, 1);
-                else if (value <= 0xffff) Big(0xcd, (ulong)value, 2);
-                else if (value <= 0xffffffff) Big(0xce, (ulong)value, 4);
-                else Big(0xcf, (ulong)value, 8);
-            }
-            else if (value >= -0x20) Code((int)(value & 0xff));
-            else if (value >= sbyte.MinValue) Big(0xd0, (ulong)value, 1);
-            else if (value >= short.MinValue) Big(0xd1, (ulong)value, 2);
-            else if (value >= int.MinValue) Big(0xd2, (ulong)value, 4);
-            else Big(0xd3, (ulong)value, 8);
-        }
-
-        public void Write(double value) { Big(0xcb, (ulong)BitConverter.DoubleToInt64Bits(value), 8); }
-
-        public void Write(string value)
-        {
-            int count = Encoding.UTF8.GetByteCount(value);
-            if (count < 0x20) Code(0xa0 | count);
-            else if (count <= 0xff) Big(0xd9, (ulong)count, 1);
-            else if (count <= 0xffff) Big(0xda, (ulong)count, 2);
-            else Big(0xdb, (ulong)count, 4);
-            int start = Room(count);
-            Encoding.UTF8.GetBytes(value, 0, value.Length, data, start);
-        }
-
-        public void Write(byte[] value)
-        {
-            if (value.Length <= 0xff) Big(0xc4, (ulong)value.Length, 1);
-            else if (value.Length <= 0xffff) Big(0xc5, (ulong)value.Length, 2);
-            else Big(0xc6, (ulong)value.Length, 4);
-            int start = Room(value.Length);
-            Buffer.BlockCopy(value, 0, data, start, value.Length);
-        }
-
-        public void WriteArrayHeader(int count)
-        {
-            if (count < 0x10) Code(0x90 | count);
-            else if (count <= 0xffff) Big(0xdc, (ulong)count, 2);
-            else Big(0xdd, (ulong)count, 4);
-        }
-
-        public void WriteMapHeader(int count)
-        {
-            if (count < 0x10) Code(0x80 | count);
-            else if (count <= 0xffff) Big(0xde, (ulong)count, 2);
-            else Big(0xdf, (ulong)count, 4);
-        }
-
-        public void Write(double[] values)
-        {
-            if (values == null) { WriteNil(); return; }
-            WriteArrayHeader(values.Length);
-            foreach (double value in values) Write(value);
-        }
-
-        public void Write(long[] values)
-        {
-            WriteArrayHeader(values.Length);
-            foreach (long value in values) Write(value);
-        }
-
-        public void Write(string[] values)
-        {
-            WriteArrayHeader(values.Length);
-            foreach (string value in values) Write(value);
-        }
-
-        public void Write(Dictionary<string, long> values)
-        {
-            WriteMapHeader(values.Count);
-            foreach (KeyValuePair<string, long> pair in values)
-            {
-                Write(pair.Key);
-                Write(pair.Value);
-            }
-        }
-
-        public void Write(WireValue value)
-        {
-            if (value == null) WriteNil();
-            else value.WriteTo(this);
-        }
-
-        public void Write(WireValue[] values)
-        {
-            WriteArrayHeader(values.Length);
-            foreach (WireValue value in values) Write(value);
-        }
-
-        public void Write(double? value)
-        {
-            if (value.HasValue) Write(value.Value);
-            else WriteNil();
-        }
-
-        public void Write(long? value)
-        {
-            if (value.HasValue) Write(value.Value);
-            else WriteNil();
-        }
-    }
-
-    /// <summary>Anything that is a MessagePack map or array of its own.</summary>
-    public abstract class WireValue
-    {
-        public abstract void WriteTo(WireWriter writer);
-
-        /// <summary>The MessagePack bytes.</summary>
-        public byte[] Encode()
-        {
-            WireWriter writer = new WireWriter();
-            WriteTo(writer);
-            return writer.ToArray();
-        }
-    }
-
-    /// <summary>One of 32 messages, distinguished by the field "type".</summary>
+    /// <summary>One of 30 messages, distinguished by the field "type".</summary>
     public abstract class ClientMessage : WireValue
     {
-        public abstract string Tag { get; }
+        internal override string TagField => "type";
 
-        public static ClientMessage ReadAny(WireReader reader)
+        public static ClientMessage ReadAny(WireReader reader) => reader.ReadUnion(null, Union);
+
+        internal static readonly UnionMaker<ClientMessage> Union = new UnionMaker<ClientMessage>("type", tag =>
         {
-            string tag = reader.PeekTag("type");
             switch (tag)
             {
-                case Hello.TagName: return Hello.Read(reader);
-                case Bye.TagName: return Bye.Read(reader);
-                case Disconnected.TagName: return Disconnected.Read(reader);
-                case Heartbeat.TagName: return Heartbeat.Read(reader);
-                case ClockPing.TagName: return ClockPing.Read(reader);
-                case GetSnapshot.TagName: return GetSnapshot.Read(reader);
-                case Sample.TagName: return Sample.Read(reader);
-                case Samples.TagName: return Samples.Read(reader);
-                case Acquire.TagName: return Acquire.Read(reader);
-                case Release.TagName: return Release.Read(reader);
-                case Withdraw.TagName: return Withdraw.Read(reader);
-                case Consent.TagName: return Consent.Read(reader);
-                case Assign.TagName: return Assign.Read(reader);
-                case SetMode.TagName: return SetMode.Read(reader);
-                case SetScale.TagName: return SetScale.Read(reader);
-                case Grasp.TagName: return Grasp.Read(reader);
-                case Observation.TagName: return Observation.Read(reader);
-                case PlaceAlignment.TagName: return PlaceAlignment.Read(reader);
-                case Align.TagName: return Align.Read(reader);
-                case MoveAnchor.TagName: return MoveAnchor.Read(reader);
-                case TrackingEpoch.TagName: return TrackingEpoch.Read(reader);
-                case Episode.TagName: return Episode.Read(reader);
-                case EStop.TagName: return EStop.Read(reader);
-                case ClearEStop.TagName: return ClearEStop.Read(reader);
-                case Control.TagName: return Control.Read(reader);
-                case Marker.TagName: return Marker.Read(reader);
-                case Pair.TagName: return Pair.Read(reader);
-                case RemoveParticipant.TagName: return RemoveParticipant.Read(reader);
-                case Rename.TagName: return Rename.Read(reader);
-                case SetRole.TagName: return SetRole.Read(reader);
-                case GetStatus.TagName: return GetStatus.Read(reader);
-                case ClientReport.TagName: return ClientReport.Read(reader);
+                case Hello.TagName: return new Hello();
+                case Bye.TagName: return new Bye();
+                case Heartbeat.TagName: return new Heartbeat();
+                case ClockPing.TagName: return new ClockPing();
+                case GetSnapshot.TagName: return new GetSnapshot();
+                case Sample.TagName: return new Sample();
+                case Samples.TagName: return new Samples();
+                case Acquire.TagName: return new Acquire();
+                case Release.TagName: return new Release();
+                case Withdraw.TagName: return new Withdraw();
+                case Consent.TagName: return new Consent();
+                case Assign.TagName: return new Assign();
+                case SetMode.TagName: return new SetMode();
+                case SetScale.TagName: return new SetScale();
+                case Grasp.TagName: return new Grasp();
+                case Observation.TagName: return new Observation();
+                case PlaceAlignment.TagName: return new PlaceAlignment();
+                case Align.TagName: return new Align();
+                case MoveAnchor.TagName: return new MoveAnchor();
+                case TrackingEpoch.TagName: return new TrackingEpoch();
+                case Episode.TagName: return new Episode();
+                case EStop.TagName: return new EStop();
+                case ClearEStop.TagName: return new ClearEStop();
+                case Control.TagName: return new Control();
+                case Marker.TagName: return new Marker();
+                case Pair.TagName: return new Pair();
+                case RemoveParticipant.TagName: return new RemoveParticipant();
+                case Rename.TagName: return new Rename();
+                case SetRole.TagName: return new SetRole();
+                case ClientReport.TagName: return new ClientReport();
             }
-            throw new WireException("unknown type " + tag);
-        }
+            return null;
+        });
     }
 
-    /// <summary>One of 11 messages, distinguished by the field "type".</summary>
+    /// <summary>One of 10 messages, distinguished by the field "type".</summary>
     public abstract class ServerMessage : WireValue
     {
-        public abstract string Tag { get; }
+        internal override string TagField => "type";
 
-        public static ServerMessage ReadAny(WireReader reader)
+        public static ServerMessage ReadAny(WireReader reader) => reader.ReadUnion(null, Union);
+
+        internal static readonly UnionMaker<ServerMessage> Union = new UnionMaker<ServerMessage>("type", tag =>
         {
-            string tag = reader.PeekTag("type");
             switch (tag)
             {
-                case Welcome.TagName: return Welcome.Read(reader);
-                case Refused.TagName: return Refused.Read(reader);
-                case ProtocolFault.TagName: return ProtocolFault.Read(reader);
-                case ClockPong.TagName: return ClockPong.Read(reader);
-                case Reply.TagName: return Reply.Read(reader);
-                case Feedback.TagName: return Feedback.Read(reader);
-                case Event.TagName: return Event.Read(reader);
-                case Snapshot.TagName: return Snapshot.Read(reader);
-                case Paired.TagName: return Paired.Read(reader);
-                case StatusReport.TagName: return StatusReport.Read(reader);
-                case DeliveryBudget.TagName: return DeliveryBudget.Read(reader);
+                case Welcome.TagName: return new Welcome();
+                case Refused.TagName: return new Refused();
+                case ProtocolFault.TagName: return new ProtocolFault();
+                case ClockPong.TagName: return new ClockPong();
+                case Reply.TagName: return new Reply();
+                case Feedback.TagName: return new Feedback();
+                case Event.TagName: return new Event();
+                case Snapshot.TagName: return new Snapshot();
+                case Paired.TagName: return new Paired();
+                case DeliveryBudget.TagName: return new DeliveryBudget();
             }
-            throw new WireException("unknown type " + tag);
-        }
+            return null;
+        });
     }
 
     /// <summary>One of 26 messages, distinguished by the field "event".</summary>
     public abstract class EventKind : WireValue
     {
-        public abstract string Tag { get; }
+        internal override string TagField => "event";
 
-        public static EventKind ReadAny(WireReader reader)
+        public static EventKind ReadAny(WireReader reader) => reader.ReadUnion(null, Union);
+
+        internal static readonly UnionMaker<EventKind> Union = new UnionMaker<EventKind>("event", tag =>
         {
-            string tag = reader.PeekTag("event");
             switch (tag)
             {
-                case ParticipantJoined.TagName: return ParticipantJoined.Read(reader);
-                case ParticipantChanged.TagName: return ParticipantChanged.Read(reader);
-                case ParticipantLeft.TagName: return ParticipantLeft.Read(reader);
-                case LeaseChanged.TagName: return LeaseChanged.Read(reader);
-                case LeasesChanged.TagName: return LeasesChanged.Read(reader);
-                case ConsentRequested.TagName: return ConsentRequested.Read(reader);
-                case Intervention.TagName: return Intervention.Read(reader);
-                case EngagementChanged.TagName: return EngagementChanged.Read(reader);
-                case ScaleChanged.TagName: return ScaleChanged.Read(reader);
-                case AlignmentChanged.TagName: return AlignmentChanged.Read(reader);
-                case AlignmentRun.TagName: return AlignmentRun.Read(reader);
-                case AlignmentAlarmed.TagName: return AlignmentAlarmed.Read(reader);
-                case AnchorMoved.TagName: return AnchorMoved.Read(reader);
-                case TipCalibrated.TagName: return TipCalibrated.Read(reader);
-                case HeadsetsCompared.TagName: return HeadsetsCompared.Read(reader);
-                case SceneChanged.TagName: return SceneChanged.Read(reader);
-                case EStopChanged.TagName: return EStopChanged.Read(reader);
-                case PauseChanged.TagName: return PauseChanged.Read(reader);
-                case EpisodeChanged.TagName: return EpisodeChanged.Read(reader);
-                case ObjectGrasped.TagName: return ObjectGrasped.Read(reader);
-                case Handover.TagName: return Handover.Read(reader);
-                case MarkerAdded.TagName: return MarkerAdded.Read(reader);
-                case SamplesRejected.TagName: return SamplesRejected.Read(reader);
-                case Gap.TagName: return Gap.Read(reader);
-                case Notice.TagName: return Notice.Read(reader);
-                case Audited.TagName: return Audited.Read(reader);
+                case ParticipantJoined.TagName: return new ParticipantJoined();
+                case ParticipantChanged.TagName: return new ParticipantChanged();
+                case ParticipantLeft.TagName: return new ParticipantLeft();
+                case LeaseChanged.TagName: return new LeaseChanged();
+                case LeasesChanged.TagName: return new LeasesChanged();
+                case ConsentRequested.TagName: return new ConsentRequested();
+                case Intervention.TagName: return new Intervention();
+                case EngagementChanged.TagName: return new EngagementChanged();
+                case ScaleChanged.TagName: return new ScaleChanged();
+                case AlignmentChanged.TagName: return new AlignmentChanged();
+                case AlignmentRun.TagName: return new AlignmentRun();
+                case AlignmentAlarmed.TagName: return new AlignmentAlarmed();
+                case AnchorMoved.TagName: return new AnchorMoved();
+                case TipCalibrated.TagName: return new TipCalibrated();
+                case HeadsetsCompared.TagName: return new HeadsetsCompared();
+                case SceneChanged.TagName: return new SceneChanged();
+                case EStopChanged.TagName: return new EStopChanged();
+                case PauseChanged.TagName: return new PauseChanged();
+                case EpisodeChanged.TagName: return new EpisodeChanged();
+                case ObjectGrasped.TagName: return new ObjectGrasped();
+                case Handover.TagName: return new Handover();
+                case MarkerAdded.TagName: return new MarkerAdded();
+                case SamplesRejected.TagName: return new SamplesRejected();
+                case Gap.TagName: return new Gap();
+                case Notice.TagName: return new Notice();
+                case Audited.TagName: return new Audited();
             }
-            throw new WireException("unknown event " + tag);
-        }
+            return null;
+        });
     }
 
     /// <summary>One of 5 messages, distinguished by the field "op".</summary>
     public abstract class PatchOp : WireValue
     {
-        public abstract string Tag { get; }
+        internal override string TagField => "op";
 
-        public static PatchOp ReadAny(WireReader reader)
+        public static PatchOp ReadAny(WireReader reader) => reader.ReadUnion(null, Union);
+
+        internal static readonly UnionMaker<PatchOp> Union = new UnionMaker<PatchOp>("op", tag =>
         {
-            string tag = reader.PeekTag("op");
             switch (tag)
             {
-                case SetVisual.TagName: return SetVisual.Read(reader);
-                case AddVisual.TagName: return AddVisual.Read(reader);
-                case RemoveVisual.TagName: return RemoveVisual.Read(reader);
-                case AddMesh.TagName: return AddMesh.Read(reader);
-                case AddMaterial.TagName: return AddMaterial.Read(reader);
+                case SetVisual.TagName: return new SetVisual();
+                case AddVisual.TagName: return new AddVisual();
+                case RemoveVisual.TagName: return new RemoveVisual();
+                case AddMesh.TagName: return new AddMesh();
+                case AddMaterial.TagName: return new AddMaterial();
             }
-            throw new WireException("unknown op " + tag);
-        }
+            return null;
+        });
     }
 
-    /// <summary>
-    /// A rigid transform T_a_b: position p [m] of frame b in a, rotation q [w, x, y, z] from b to a.
-    /// </summary>
+    /// <summary>A rigid transform T_a_b: position p [m] of frame b in a, rotation q [w, x, y, z] from b to a.</summary>
     public sealed class Pose : WireValue
     {
+        internal override bool IsArray => true;
         public double[] P = new double[3];
         public double[] Q = new double[4];
 
-        public static Pose Read(WireReader reader)
-        {
-            Pose value = new Pose();
-            int n = reader.ReadArrayHeader();
-            if (n < 2) throw new WireException("Pose of " + n + " elements, expected 2");
-            value.P = reader.ReadDoubles(3, 0);
-            value.Q = reader.ReadDoubles(4, 0);
-            for (int i = 2; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static Pose Read(WireReader reader) => reader.ReadInto(new Pose());
+        internal static readonly Func<Pose> New = () => new Pose();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(2);
-            writer.Write(P);
-            writer.Write(Q);
+            codec.Require("p", ref P, 3, 3);
+            codec.Require("q", ref Q, 4, 4);
         }
     }
 
-    /// <summary>
-    /// Target of a sample, and the lease that it is driven under. lease_version is the fencing token.
-    /// </summary>
+    /// <summary>Target of a sample, and the lease that it is driven under.</summary>
     public sealed class Target : WireValue
     {
+        internal override bool IsArray => true;
         public string Name = "";
-        public long LeaseVersion = 0;
+        public long LeaseVersion;
         public string Kind = "robot";
 
-        public static Target Read(WireReader reader)
-        {
-            Target value = new Target();
-            int n = reader.ReadArrayHeader();
-            if (n < 2) throw new WireException("Target of " + n + " elements, expected 2");
-            value.Name = reader.ReadString(64);
-            value.LeaseVersion = reader.ReadLong(0, long.MaxValue);
-            if (n > 2) value.Kind = reader.ReadString(64);
-            for (int i = 3; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static Target Read(WireReader reader) => reader.ReadInto(new Target());
+        internal static readonly Func<Target> New = () => new Target();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(3);
-            writer.Write(Name);
-            writer.Write(LeaseVersion);
-            writer.Write(Kind);
+            codec.Require("name", ref Name, 64);
+            codec.Require("lease_version", ref LeaseVersion, 0, long.MaxValue);
+            codec.Allow("kind", ref Kind, 64, "robot");
         }
     }
 
-    /// <summary>
-    /// Public state of one lease. holder is a participant id, empty when free.
-    ///
-    /// expires_ns is the session time at which the grace period of a disconnected holder ends, 0 while it is connected.
-    /// sub_holders and weights have the same length: everyone who shares the target (mode shared, objects), or an
-    /// agent and the human who stands by (mode priority; the one in charge is holder and has weight 1, the other 0). In
-    /// mode shared a token stays valid for its holder when others join and raise lease_version. scale: motion scaling
-    /// of a robot for its holder, 1 by default.
-    /// </summary>
+    /// <summary>Public state of one lease.</summary>
     public sealed class Lease : WireValue
     {
         public string Target = "";
         public string Kind = "";
         public string Mode = "";
         public string Holder = "";
-        public long LeaseVersion = 0;
-        public long ExpiresNs = 0;
-        public string[] Queue = new string[0];
-        public string[] SubHolders = new string[0];
-        public double[] Weights = new double[0];
+        public long LeaseVersion;
+        public long ExpiresNs;
+        public string[] Queue = Array.Empty<string>();
+        public string[] SubHolders = Array.Empty<string>();
+        public double[] Weights = Array.Empty<double>();
         public double Scale = 1.0;
 
-        public static Lease Read(WireReader reader)
-        {
-            Lease value = new Lease();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "target": value.Target = reader.ReadString(64); seen |= 1u; break;
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 2u; break;
-                    case "mode": value.Mode = reader.ReadString(64); seen |= 4u; break;
-                    case "holder": value.Holder = reader.ReadString(64); seen |= 8u; break;
-                    case "lease_version": value.LeaseVersion = reader.ReadLong(0, long.MaxValue); seen |= 16u; break;
-                    case "expires_ns": value.ExpiresNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    case "queue": value.Queue = reader.ReadStrings(0, 64); break;
-                    case "sub_holders": value.SubHolders = reader.ReadStrings(0, 64); break;
-                    case "weights": value.Weights = reader.ReadDoubles(0, 0); break;
-                    case "scale": value.Scale = reader.ReadDouble(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 31u) != 31u) throw new WireException("missing field of Lease");
-            return value;
-        }
+        public static Lease Read(WireReader reader) => reader.ReadInto(new Lease());
+        internal static readonly Func<Lease> New = () => new Lease();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(10);
-            writer.Write("target");
-            writer.Write(Target);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("mode");
-            writer.Write(Mode);
-            writer.Write("holder");
-            writer.Write(Holder);
-            writer.Write("lease_version");
-            writer.Write(LeaseVersion);
-            writer.Write("expires_ns");
-            writer.Write(ExpiresNs);
-            writer.Write("queue");
-            writer.Write(Queue);
-            writer.Write("sub_holders");
-            writer.Write(SubHolders);
-            writer.Write("weights");
-            writer.Write(Weights);
-            writer.Write("scale");
-            writer.Write(Scale);
+            codec.Require("target", ref Target, 64);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("mode", ref Mode, 64);
+            codec.Require("holder", ref Holder, 64);
+            codec.Require("lease_version", ref LeaseVersion, 0, long.MaxValue);
+            codec.Allow("expires_ns", ref ExpiresNs, long.MinValue, long.MaxValue, 0);
+            codec.Allow("queue", ref Queue, 0, 0, 64);
+            codec.Allow("sub_holders", ref SubHolders, 0, 0, 64);
+            codec.Allow("weights", ref Weights, 0, 0);
+            codec.Allow("scale", ref Scale, 1.0);
         }
     }
 
-    /// <summary>
-    /// A typed denial: the reason (DenialReason), the holder of the target, and advice.
-    ///
-    /// Texts that list what would have been right are cut to the length of a Text.
-    /// </summary>
+    /// <summary>A typed denial: the reason (DenialReason), the holder of the target, and advice.</summary>
     public sealed class Denial : WireValue
     {
         public string Reason = "";
@@ -1323,4857 +688,1696 @@ namespace IrisSession.Protocol
         public string Holder = "";
         public string HolderName = "";
 
-        public static Denial Read(WireReader reader)
-        {
-            Denial value = new Denial();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "reason": value.Reason = reader.ReadString(64); seen |= 1u; break;
-                    case "message": value.Message = reader.ReadString(512); seen |= 2u; break;
-                    case "advice": value.Advice = reader.ReadString(512); break;
-                    case "target": value.Target = reader.ReadString(64); break;
-                    case "holder": value.Holder = reader.ReadString(64); break;
-                    case "holder_name": value.HolderName = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Denial");
-            return value;
-        }
+        public static Denial Read(WireReader reader) => reader.ReadInto(new Denial());
+        internal static readonly Func<Denial> New = () => new Denial();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("reason");
-            writer.Write(Reason);
-            writer.Write("message");
-            writer.Write(Message);
-            writer.Write("advice");
-            writer.Write(Advice);
-            writer.Write("target");
-            writer.Write(Target);
-            writer.Write("holder");
-            writer.Write(Holder);
-            writer.Write("holder_name");
-            writer.Write(HolderName);
+            codec.Require("reason", ref Reason, 64);
+            codec.Require("message", ref Message, 512);
+            codec.Allow("advice", ref Advice, 512, "");
+            codec.Allow("target", ref Target, 64, "");
+            codec.Allow("holder", ref Holder, 64, "");
+            codec.Allow("holder_name", ref HolderName, 64, "");
         }
     }
 
-    /// <summary>
-    /// T_world_tracking of one participant, as accepted by the authority.
-    ///
-    /// covariance: 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, empty when unknown; that of the
-    /// position is stated at pivot_world.
-    /// error_at_anchor_m, error_at_robot_m: stated p95 of the position error at the anchor and at the robot.
-    /// </summary>
+    /// <summary>T_world_tracking of one participant, as accepted by the authority.</summary>
     public sealed class Alignment : WireValue
     {
-        public long Version = 0;
+        public long Version;
         public string Kind = "";
         public Pose T_world_tracking = new Pose();
-        public long TrackingEpoch = 0;
-        public double[] Covariance = new double[0];
-        public double ErrorAtAnchorM = 0.0;
-        public double ErrorAtRobotM = 0.0;
-        public bool Offset = false;
-        public double[] PivotWorld = new double[] { 0.0, 0.0, 0.0 };
+        public long TrackingEpoch;
+        public double[] Covariance = Array.Empty<double>();
+        public double ErrorAtAnchorM;
+        public double ErrorAtRobotM;
+        public bool Offset;
+        public double[] PivotWorld = new double[3];
 
-        public static Alignment Read(WireReader reader)
-        {
-            Alignment value = new Alignment();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "version": value.Version = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 2u; break;
-                    case "T_world_tracking": value.T_world_tracking = Pose.Read(reader); seen |= 4u; break;
-                    case "tracking_epoch": value.TrackingEpoch = reader.ReadLong(0, long.MaxValue); break;
-                    case "covariance": value.Covariance = reader.ReadDoubles(0, 0); break;
-                    case "error_at_anchor_m": value.ErrorAtAnchorM = reader.ReadDouble(); break;
-                    case "error_at_robot_m": value.ErrorAtRobotM = reader.ReadDouble(); break;
-                    case "offset": value.Offset = reader.ReadBool(); break;
-                    case "pivot_world": value.PivotWorld = reader.ReadDoubles(3, 0); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of Alignment");
-            return value;
-        }
+        public static Alignment Read(WireReader reader) => reader.ReadInto(new Alignment());
+        internal static readonly Func<Alignment> New = () => new Alignment();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(9);
-            writer.Write("version");
-            writer.Write(Version);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("T_world_tracking");
-            writer.Write(T_world_tracking);
-            writer.Write("tracking_epoch");
-            writer.Write(TrackingEpoch);
-            writer.Write("covariance");
-            writer.Write(Covariance);
-            writer.Write("error_at_anchor_m");
-            writer.Write(ErrorAtAnchorM);
-            writer.Write("error_at_robot_m");
-            writer.Write(ErrorAtRobotM);
-            writer.Write("offset");
-            writer.Write(Offset);
-            writer.Write("pivot_world");
-            writer.Write(PivotWorld);
+            codec.Require("version", ref Version, 0, long.MaxValue);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("T_world_tracking", ref T_world_tracking, Protocol.Pose.New);
+            codec.Allow("tracking_epoch", ref TrackingEpoch, 0, long.MaxValue, 0);
+            codec.Allow("covariance", ref Covariance, 0, 0);
+            codec.Allow("error_at_anchor_m", ref ErrorAtAnchorM, 0.0);
+            codec.Allow("error_at_robot_m", ref ErrorAtRobotM, 0.0);
+            codec.Allow("offset", ref Offset, false);
+            codec.Allow("pivot_world", ref PivotWorld, 3, 3);
         }
     }
 
-    /// <summary>
-    /// The newest sample that entered the IK target behind the ctrl in use, for one robot. All times session time.
-    /// </summary>
+    /// <summary>The newest sample that entered the IK target behind the ctrl in use, for one robot.</summary>
     public sealed class Applied : WireValue
     {
+        internal override bool IsArray => true;
         public string Robot = "";
         public string Participant = "";
         public string Device = "";
-        public long Seq = 0;
-        public long CaptureNs = 0;
-        public long ReceiveNs = 0;
-        public long StepNs = 0;
+        public long Seq;
+        public long CaptureNs;
+        public long ReceiveNs;
+        public long StepNs;
 
-        public static Applied Read(WireReader reader)
-        {
-            Applied value = new Applied();
-            int n = reader.ReadArrayHeader();
-            if (n < 7) throw new WireException("Applied of " + n + " elements, expected 7");
-            value.Robot = reader.ReadString(64);
-            value.Participant = reader.ReadString(64);
-            value.Device = reader.ReadString(64);
-            value.Seq = reader.ReadLong(0, long.MaxValue);
-            value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            value.ReceiveNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            value.StepNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            for (int i = 7; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static Applied Read(WireReader reader) => reader.ReadInto(new Applied());
+        internal static readonly Func<Applied> New = () => new Applied();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(7);
-            writer.Write(Robot);
-            writer.Write(Participant);
-            writer.Write(Device);
-            writer.Write(Seq);
-            writer.Write(CaptureNs);
-            writer.Write(ReceiveNs);
-            writer.Write(StepNs);
+            codec.Require("robot", ref Robot, 64);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("device", ref Device, 64);
+            codec.Require("seq", ref Seq, 0, long.MaxValue);
+            codec.Require("capture_ns", ref CaptureNs, long.MinValue, long.MaxValue);
+            codec.Require("receive_ns", ref ReceiveNs, long.MinValue, long.MaxValue);
+            codec.Require("step_ns", ref StepNs, long.MinValue, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// Ports of the other channels on the host of the control channel. media_ingest: for media sources.
-    /// </summary>
+    /// <summary>Ports of the other channels on the host of the control channel.</summary>
     public sealed class Endpoints : WireValue
     {
-        public long State = 0;
-        public long Media = 0;
-        public long Assets = 0;
-        public long Web = 0;
-        public long MediaIngest = 0;
+        public long State;
+        public long Media;
+        public long Assets;
+        public long Web;
+        public long MediaIngest;
 
-        public static Endpoints Read(WireReader reader)
-        {
-            Endpoints value = new Endpoints();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "state": value.State = reader.ReadLong(0, long.MaxValue); break;
-                    case "media": value.Media = reader.ReadLong(0, long.MaxValue); break;
-                    case "assets": value.Assets = reader.ReadLong(0, long.MaxValue); break;
-                    case "web": value.Web = reader.ReadLong(0, long.MaxValue); break;
-                    case "media_ingest": value.MediaIngest = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static Endpoints Read(WireReader reader) => reader.ReadInto(new Endpoints());
+        internal static readonly Func<Endpoints> New = () => new Endpoints();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("state");
-            writer.Write(State);
-            writer.Write("media");
-            writer.Write(Media);
-            writer.Write("assets");
-            writer.Write(Assets);
-            writer.Write("web");
-            writer.Write(Web);
-            writer.Write("media_ingest");
-            writer.Write(MediaIngest);
+            codec.Allow("state", ref State, 0, long.MaxValue, 0);
+            codec.Allow("media", ref Media, 0, long.MaxValue, 0);
+            codec.Allow("assets", ref Assets, 0, long.MaxValue, 0);
+            codec.Allow("web", ref Web, 0, long.MaxValue, 0);
+            codec.Allow("media_ingest", ref MediaIngest, 0, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// One row of the roster.
-    /// </summary>
+    /// <summary>One row of the roster.</summary>
     public sealed class ParticipantInfo : WireValue
     {
         public string Id = "";
         public string Name = "";
         public string Role = "";
-        public bool Connected = false;
-        public string[] Devices = new string[0];
+        public bool Connected;
+        public string[] Devices = Array.Empty<string>();
         public bool Worn = true;
-        public long TrackingEpoch = 0;
-        public Alignment Alignment = null;
+        public long TrackingEpoch;
+        public Alignment Alignment;
 
-        public static ParticipantInfo Read(WireReader reader)
-        {
-            ParticipantInfo value = new ParticipantInfo();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "id": value.Id = reader.ReadString(64); seen |= 1u; break;
-                    case "name": value.Name = reader.ReadString(64); seen |= 2u; break;
-                    case "role": value.Role = reader.ReadString(64); seen |= 4u; break;
-                    case "connected": value.Connected = reader.ReadBool(); seen |= 8u; break;
-                    case "devices": value.Devices = reader.ReadStrings(0, 64); break;
-                    case "worn": value.Worn = reader.ReadBool(); break;
-                    case "tracking_epoch": value.TrackingEpoch = reader.ReadLong(0, long.MaxValue); break;
-                    case "alignment": value.Alignment = reader.TryReadNil() ? null : Alignment.Read(reader); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of ParticipantInfo");
-            return value;
-        }
+        public static ParticipantInfo Read(WireReader reader) => reader.ReadInto(new ParticipantInfo());
+        internal static readonly Func<ParticipantInfo> New = () => new ParticipantInfo();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(8);
-            writer.Write("id");
-            writer.Write(Id);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("role");
-            writer.Write(Role);
-            writer.Write("connected");
-            writer.Write(Connected);
-            writer.Write("devices");
-            writer.Write(Devices);
-            writer.Write("worn");
-            writer.Write(Worn);
-            writer.Write("tracking_epoch");
-            writer.Write(TrackingEpoch);
-            writer.Write("alignment");
-            writer.Write(Alignment);
+            codec.Require("id", ref Id, 64);
+            codec.Require("name", ref Name, 64);
+            codec.Require("role", ref Role, 64);
+            codec.Require("connected", ref Connected);
+            codec.Allow("devices", ref Devices, 0, 0, 64);
+            codec.Allow("worn", ref Worn, true);
+            codec.Allow("tracking_epoch", ref TrackingEpoch, 0, long.MaxValue, 0);
+            codec.AllowNull("alignment", ref Alignment, Protocol.Alignment.New);
         }
     }
 
-    /// <summary>
-    /// A robot as clients need it. site_body: id of the body that carries the end-effector site; T_body_site.
-    /// </summary>
+    /// <summary>A robot as clients need it.</summary>
     public sealed class RobotInfo : WireValue
     {
         public string Name = "";
-        public string[] Joints = new string[0];
-        public long BaseBody = 0;
-        public long SiteBody = 0;
+        public string[] Joints = Array.Empty<string>();
+        public long BaseBody;
+        public long SiteBody;
         public Pose T_body_site = new Pose();
-        public bool Gripper = false;
+        public bool Gripper;
 
-        public static RobotInfo Read(WireReader reader)
-        {
-            RobotInfo value = new RobotInfo();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(64); seen |= 1u; break;
-                    case "joints": value.Joints = reader.ReadStrings(0, 64); seen |= 2u; break;
-                    case "base_body": value.BaseBody = reader.ReadLong(0, long.MaxValue); seen |= 4u; break;
-                    case "site_body": value.SiteBody = reader.ReadLong(0, long.MaxValue); seen |= 8u; break;
-                    case "T_body_site": value.T_body_site = Pose.Read(reader); seen |= 16u; break;
-                    case "gripper": value.Gripper = reader.ReadBool(); seen |= 32u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 63u) != 63u) throw new WireException("missing field of RobotInfo");
-            return value;
-        }
+        public static RobotInfo Read(WireReader reader) => reader.ReadInto(new RobotInfo());
+        internal static readonly Func<RobotInfo> New = () => new RobotInfo();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("joints");
-            writer.Write(Joints);
-            writer.Write("base_body");
-            writer.Write(BaseBody);
-            writer.Write("site_body");
-            writer.Write(SiteBody);
-            writer.Write("T_body_site");
-            writer.Write(T_body_site);
-            writer.Write("gripper");
-            writer.Write(Gripper);
+            codec.Require("name", ref Name, 64);
+            codec.Require("joints", ref Joints, 0, 0, 64);
+            codec.Require("base_body", ref BaseBody, 0, long.MaxValue);
+            codec.Require("site_body", ref SiteBody, 0, long.MaxValue);
+            codec.Require("T_body_site", ref T_body_site, Protocol.Pose.New);
+            codec.Require("gripper", ref Gripper);
         }
     }
 
-    /// <summary>
-    /// One streamed rigid body: its index in state frames is its position in Snapshot.bodies.
-    /// </summary>
+    /// <summary>One streamed rigid body: its index in state frames is its position in Snapshot.bodies.</summary>
     public sealed class BodyInfo : WireValue
     {
-        public long Id = 0;
+        internal override bool IsArray => true;
+        public long Id;
         public string Name = "";
-        public bool Moving = false;
-        public bool Object = false;
+        public bool Moving;
+        public bool Object;
 
-        public static BodyInfo Read(WireReader reader)
-        {
-            BodyInfo value = new BodyInfo();
-            int n = reader.ReadArrayHeader();
-            if (n < 3) throw new WireException("BodyInfo of " + n + " elements, expected 3");
-            value.Id = reader.ReadLong(0, long.MaxValue);
-            value.Name = reader.ReadString(64);
-            value.Moving = reader.ReadBool();
-            if (n > 3) value.Object = reader.ReadBool();
-            for (int i = 4; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static BodyInfo Read(WireReader reader) => reader.ReadInto(new BodyInfo());
+        internal static readonly Func<BodyInfo> New = () => new BodyInfo();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(4);
-            writer.Write(Id);
-            writer.Write(Name);
-            writer.Write(Moving);
-            writer.Write(Object);
+            codec.Require("id", ref Id, 0, long.MaxValue);
+            codec.Require("name", ref Name, 64);
+            codec.Require("moving", ref Moving);
+            codec.Allow("object", ref Object, false);
         }
     }
 
-    /// <summary>
-    /// A mark of an anchor that can be touched, such as a printed cross. p_anchor: its position in the anchor frame
-    /// [m].
-    /// </summary>
+    /// <summary>A mark of an anchor that can be touched, such as a printed cross.</summary>
     public sealed class AnchorMark : WireValue
     {
         public string Id = "";
         public double[] PAnchor = new double[3];
 
-        public static AnchorMark Read(WireReader reader)
-        {
-            AnchorMark value = new AnchorMark();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "id": value.Id = reader.ReadString(64); seen |= 1u; break;
-                    case "p_anchor": value.PAnchor = reader.ReadDoubles(3, 0); seen |= 2u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of AnchorMark");
-            return value;
-        }
+        public static AnchorMark Read(WireReader reader) => reader.ReadInto(new AnchorMark());
+        internal static readonly Func<AnchorMark> New = () => new AnchorMark();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("id");
-            writer.Write(Id);
-            writer.Write("p_anchor");
-            writer.Write(PAnchor);
+            codec.Require("id", ref Id, 64);
+            codec.Require("p_anchor", ref PAnchor, 3, 3);
         }
     }
 
-    /// <summary>
-    /// An anchor of the session. size_m: edge of its sheet, error_m: stated p95 of its position; 0: unknown.
-    /// marks: in the order in which they are best touched.
-    /// </summary>
+    /// <summary>An anchor of the session.</summary>
     public sealed class AnchorInfo : WireValue
     {
         public string Id = "";
         public Pose T_world_anchor = new Pose();
-        public double SizeM = 0.0;
-        public double ErrorM = 0.0;
-        public AnchorMark[] Marks = new AnchorMark[0];
+        public double SizeM;
+        public double ErrorM;
+        public AnchorMark[] Marks = Array.Empty<AnchorMark>();
 
-        public static AnchorInfo Read(WireReader reader)
-        {
-            AnchorInfo value = new AnchorInfo();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "id": value.Id = reader.ReadString(64); seen |= 1u; break;
-                    case "T_world_anchor": value.T_world_anchor = Pose.Read(reader); seen |= 2u; break;
-                    case "size_m": value.SizeM = reader.ReadDouble(); break;
-                    case "error_m": value.ErrorM = reader.ReadDouble(); break;
-                    case "marks": value.Marks = reader.ReadArray(Protocol.AnchorMark.Read, 16); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of AnchorInfo");
-            return value;
-        }
+        public static AnchorInfo Read(WireReader reader) => reader.ReadInto(new AnchorInfo());
+        internal static readonly Func<AnchorInfo> New = () => new AnchorInfo();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("id");
-            writer.Write(Id);
-            writer.Write("T_world_anchor");
-            writer.Write(T_world_anchor);
-            writer.Write("size_m");
-            writer.Write(SizeM);
-            writer.Write("error_m");
-            writer.Write(ErrorM);
-            writer.Write("marks");
-            writer.Write(Marks);
+            codec.Require("id", ref Id, 64);
+            codec.Require("T_world_anchor", ref T_world_anchor, Protocol.Pose.New);
+            codec.Allow("size_m", ref SizeM, 0.0);
+            codec.Allow("error_m", ref ErrorM, 0.0);
+            codec.Allow("marks", ref Marks, 0, 16, Protocol.AnchorMark.New);
         }
     }
 
-    /// <summary>
-    /// Median and 99th percentile [ms] over the last seconds; null where nothing was measured.
-    /// </summary>
-    public sealed class Quantiles : WireValue
-    {
-        public double P50 = 0.0;
-        public double P99 = 0.0;
-
-        public static Quantiles Read(WireReader reader)
-        {
-            Quantiles value = new Quantiles();
-            int n = reader.ReadArrayHeader();
-            if (n < 2) throw new WireException("Quantiles of " + n + " elements, expected 2");
-            value.P50 = reader.ReadDouble();
-            value.P99 = reader.ReadDouble();
-            for (int i = 2; i < n; i++) reader.Skip();
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteArrayHeader(2);
-            writer.Write(P50);
-            writer.Write(P99);
-        }
-    }
-
-    /// <summary>
-    /// Camera of a media stream: pinhole with OpenCV's distortion, and where it is.
-    ///
-    /// fx, fy, cx, cy [px]: the centre of the first pixel is at 0. distortion: 0, 4, 5 or 8 coefficients (k1, k2,
-    /// p1, p2, k3, ...). position, orientation: pose of the optical frame (x right, y down, z forward) in the frame of
-    /// body, a body of the scene; in the world if that is empty.
-    /// </summary>
+    /// <summary>Camera of a media stream: pinhole with OpenCV's distortion, and where it is.</summary>
     public sealed class StreamCamera : WireValue
     {
-        public long Width = 0;
-        public long Height = 0;
-        public double Fx = 0.0;
-        public double Fy = 0.0;
-        public double Cx = 0.0;
-        public double Cy = 0.0;
-        public double[] Distortion = new double[0];
+        public long Width;
+        public long Height;
+        public double Fx;
+        public double Fy;
+        public double Cx;
+        public double Cy;
+        public double[] Distortion = Array.Empty<double>();
         public string Body = "";
-        public double[] Position = new double[] { 0.0, 0.0, 0.0 };
-        public double[] Orientation = new double[] { 1.0, 0.0, 0.0, 0.0 };
+        public double[] Position = new double[3];
+        static readonly double[] OrientationDefault = { 1.0, 0.0, 0.0, 0.0 };
+        public double[] Orientation = (double[])OrientationDefault.Clone();
 
-        public static StreamCamera Read(WireReader reader)
-        {
-            StreamCamera value = new StreamCamera();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "width": value.Width = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "height": value.Height = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "fx": value.Fx = reader.ReadDouble(); seen |= 4u; break;
-                    case "fy": value.Fy = reader.ReadDouble(); seen |= 8u; break;
-                    case "cx": value.Cx = reader.ReadDouble(); seen |= 16u; break;
-                    case "cy": value.Cy = reader.ReadDouble(); seen |= 32u; break;
-                    case "distortion": value.Distortion = reader.ReadDoubles(0, 8); break;
-                    case "body": value.Body = reader.ReadString(64); break;
-                    case "position": value.Position = reader.ReadDoubles(3, 0); break;
-                    case "orientation": value.Orientation = reader.ReadDoubles(4, 0); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 63u) != 63u) throw new WireException("missing field of StreamCamera");
-            return value;
-        }
+        public static StreamCamera Read(WireReader reader) => reader.ReadInto(new StreamCamera());
+        internal static readonly Func<StreamCamera> New = () => new StreamCamera();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(10);
-            writer.Write("width");
-            writer.Write(Width);
-            writer.Write("height");
-            writer.Write(Height);
-            writer.Write("fx");
-            writer.Write(Fx);
-            writer.Write("fy");
-            writer.Write(Fy);
-            writer.Write("cx");
-            writer.Write(Cx);
-            writer.Write("cy");
-            writer.Write(Cy);
-            writer.Write("distortion");
-            writer.Write(Distortion);
-            writer.Write("body");
-            writer.Write(Body);
-            writer.Write("position");
-            writer.Write(Position);
-            writer.Write("orientation");
-            writer.Write(Orientation);
+            codec.Require("width", ref Width, 0, long.MaxValue);
+            codec.Require("height", ref Height, 0, long.MaxValue);
+            codec.Require("fx", ref Fx);
+            codec.Require("fy", ref Fy);
+            codec.Require("cx", ref Cx);
+            codec.Require("cy", ref Cy);
+            codec.Allow("distortion", ref Distortion, 0, 8);
+            codec.Allow("body", ref Body, 64, "");
+            codec.Allow("position", ref Position, 3, 3);
+            codec.Allow("orientation", ref Orientation, 4, 4, OrientationDefault);
         }
     }
 
-    /// <summary>
-    /// Description of a stream by its source. title: for people; empty: the stream's name. hz: frames per second
-    /// that it means to hold, 0 for a stream at rest. fault: why its frames are wrong, or do not come; detail: the same
-    /// in one line, for people. The session passes on 64 characters of the title, and 256 of the detail.
-    /// </summary>
-    public sealed class StreamInfo : WireValue
-    {
-        public string Title = "";
-        public string Audience = "all";
-        public StreamCamera Camera = null;
-        public double Hz = 0.0;
-        public string Fault = "";
-        public string Detail = "";
-
-        public static StreamInfo Read(WireReader reader)
-        {
-            StreamInfo value = new StreamInfo();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "title": value.Title = reader.ReadString(512); break;
-                    case "audience": value.Audience = reader.ReadString(64); break;
-                    case "camera": value.Camera = reader.TryReadNil() ? null : StreamCamera.Read(reader); break;
-                    case "hz": value.Hz = reader.ReadDouble(); break;
-                    case "fault": value.Fault = reader.ReadString(64); break;
-                    case "detail": value.Detail = reader.ReadString(512); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(6);
-            writer.Write("title");
-            writer.Write(Title);
-            writer.Write("audience");
-            writer.Write(Audience);
-            writer.Write("camera");
-            writer.Write(Camera);
-            writer.Write("hz");
-            writer.Write(Hz);
-            writer.Write("fault");
-            writer.Write(Fault);
-            writer.Write("detail");
-            writer.Write(Detail);
-        }
-    }
-
-    /// <summary>
-    /// One media stream, and the class that a client gets. mbit_per_s: of that class, as measured. encoding: of its
-    /// newest frame, so that a client knows what it would get before it subscribes. title, audience, camera, fault,
-    /// detail: of its newest StreamInfo. stale: no frame came for so long that the newest one shows what was.
-    /// taken_by: what this client sends under the name is refused, because the stream is of that source; else empty.
-    /// </summary>
+    /// <summary>One media stream, and the class that a client gets.</summary>
     public sealed class StreamBudget : WireValue
     {
         public string Stream = "";
         public string BudgetClass = "full";
-        public double MbitPerS = 0.0;
+        public double MbitPerS;
         public string Encoding = "bytes";
         public string Title = "";
         public string Audience = "all";
-        public StreamCamera Camera = null;
+        public StreamCamera Camera;
         public string Fault = "";
         public string Detail = "";
-        public bool Stale = false;
+        public bool Stale;
         public string TakenBy = "";
 
-        public static StreamBudget Read(WireReader reader)
-        {
-            StreamBudget value = new StreamBudget();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "stream": value.Stream = reader.ReadString(64); seen |= 1u; break;
-                    case "budget_class": value.BudgetClass = reader.ReadString(64); break;
-                    case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
-                    case "encoding": value.Encoding = reader.ReadString(64); break;
-                    case "title": value.Title = reader.ReadString(512); break;
-                    case "audience": value.Audience = reader.ReadString(64); break;
-                    case "camera": value.Camera = reader.TryReadNil() ? null : StreamCamera.Read(reader); break;
-                    case "fault": value.Fault = reader.ReadString(64); break;
-                    case "detail": value.Detail = reader.ReadString(512); break;
-                    case "stale": value.Stale = reader.ReadBool(); break;
-                    case "taken_by": value.TakenBy = reader.ReadString(512); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of StreamBudget");
-            return value;
-        }
+        public static StreamBudget Read(WireReader reader) => reader.ReadInto(new StreamBudget());
+        internal static readonly Func<StreamBudget> New = () => new StreamBudget();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(11);
-            writer.Write("stream");
-            writer.Write(Stream);
-            writer.Write("budget_class");
-            writer.Write(BudgetClass);
-            writer.Write("mbit_per_s");
-            writer.Write(MbitPerS);
-            writer.Write("encoding");
-            writer.Write(Encoding);
-            writer.Write("title");
-            writer.Write(Title);
-            writer.Write("audience");
-            writer.Write(Audience);
-            writer.Write("camera");
-            writer.Write(Camera);
-            writer.Write("fault");
-            writer.Write(Fault);
-            writer.Write("detail");
-            writer.Write(Detail);
-            writer.Write("stale");
-            writer.Write(Stale);
-            writer.Write("taken_by");
-            writer.Write(TakenBy);
+            codec.Require("stream", ref Stream, 64);
+            codec.Allow("budget_class", ref BudgetClass, 64, "full");
+            codec.Allow("mbit_per_s", ref MbitPerS, 0.0);
+            codec.Allow("encoding", ref Encoding, 64, "bytes");
+            codec.Allow("title", ref Title, 512, "");
+            codec.Allow("audience", ref Audience, 64, "all");
+            codec.AllowNull("camera", ref Camera, Protocol.StreamCamera.New);
+            codec.Allow("fault", ref Fault, 64, "");
+            codec.Allow("detail", ref Detail, 512, "");
+            codec.Allow("stale", ref Stale, false);
+            codec.Allow("taken_by", ref TakenBy, 512, "");
         }
     }
 
-    /// <summary>
-    /// Observations of one anchor by a headset: their number in this run, and the age of the newest.
-    /// </summary>
-    public sealed class AnchorSeen : WireValue
-    {
-        public string AnchorId = "";
-        public long Observations = 0;
-        public long AgeNs = 0;
-
-        public static AnchorSeen Read(WireReader reader)
-        {
-            AnchorSeen value = new AnchorSeen();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 1u; break;
-                    case "observations": value.Observations = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "age_ns": value.AgeNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of AnchorSeen");
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(3);
-            writer.Write("anchor_id");
-            writer.Write(AnchorId);
-            writer.Write("observations");
-            writer.Write(Observations);
-            writer.Write("age_ns");
-            writer.Write(AgeNs);
-        }
-    }
-
-    /// <summary>
-    /// State of the alignment of one participant, beyond AlignmentChanged.
-    ///
-    /// error_at_anchor_m, error_at_robot_m: stated p95. pending_m, pending_rad: size of a correction that waits, or
-    /// slides in. advice: why the estimator refuses, or warns. alarm: the last AlarmKind that no new alignment has
-    /// resolved yet, alarm_ns ago. unusable: observations that could not be used, since the run began. doubt: why it
-    /// is unconfirmed and begins no engagement (AlignmentDoubt), empty for not so. confirmed_ns: since the last look
-    /// that agreed with it, -1 without an alignment.
-    /// </summary>
-    public sealed class AlignmentReport : WireValue
-    {
-        public long Version = 0;
-        public bool Running = true;
-        public bool Offset = false;
-        public double ErrorAtAnchorM = 0.0;
-        public double ErrorAtRobotM = 0.0;
-        public double ResidualTiltRad = 0.0;
-        public long Observations = 0;
-        public long Viewpoints = 0;
-        public long Unusable = 0;
-        public double PendingM = 0.0;
-        public double PendingRad = 0.0;
-        public string Advice = "";
-        public string Alarm = "";
-        public double AlarmSizeM = 0.0;
-        public long AlarmNs = -1;
-        public AnchorSeen[] Seen = new AnchorSeen[0];
-        public string Doubt = "";
-        public long ConfirmedNs = -1;
-
-        public static AlignmentReport Read(WireReader reader)
-        {
-            AlignmentReport value = new AlignmentReport();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "version": value.Version = reader.ReadLong(0, long.MaxValue); break;
-                    case "running": value.Running = reader.ReadBool(); break;
-                    case "offset": value.Offset = reader.ReadBool(); break;
-                    case "error_at_anchor_m": value.ErrorAtAnchorM = reader.ReadDouble(); break;
-                    case "error_at_robot_m": value.ErrorAtRobotM = reader.ReadDouble(); break;
-                    case "residual_tilt_rad": value.ResidualTiltRad = reader.ReadDouble(); break;
-                    case "observations": value.Observations = reader.ReadLong(0, long.MaxValue); break;
-                    case "viewpoints": value.Viewpoints = reader.ReadLong(0, long.MaxValue); break;
-                    case "unusable": value.Unusable = reader.ReadLong(0, long.MaxValue); break;
-                    case "pending_m": value.PendingM = reader.ReadDouble(); break;
-                    case "pending_rad": value.PendingRad = reader.ReadDouble(); break;
-                    case "advice": value.Advice = reader.ReadString(512); break;
-                    case "alarm": value.Alarm = reader.ReadString(64); break;
-                    case "alarm_size_m": value.AlarmSizeM = reader.ReadDouble(); break;
-                    case "alarm_ns": value.AlarmNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    case "seen": value.Seen = reader.ReadArray(Protocol.AnchorSeen.Read, 0); break;
-                    case "doubt": value.Doubt = reader.ReadString(64); break;
-                    case "confirmed_ns": value.ConfirmedNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(18);
-            writer.Write("version");
-            writer.Write(Version);
-            writer.Write("running");
-            writer.Write(Running);
-            writer.Write("offset");
-            writer.Write(Offset);
-            writer.Write("error_at_anchor_m");
-            writer.Write(ErrorAtAnchorM);
-            writer.Write("error_at_robot_m");
-            writer.Write(ErrorAtRobotM);
-            writer.Write("residual_tilt_rad");
-            writer.Write(ResidualTiltRad);
-            writer.Write("observations");
-            writer.Write(Observations);
-            writer.Write("viewpoints");
-            writer.Write(Viewpoints);
-            writer.Write("unusable");
-            writer.Write(Unusable);
-            writer.Write("pending_m");
-            writer.Write(PendingM);
-            writer.Write("pending_rad");
-            writer.Write(PendingRad);
-            writer.Write("advice");
-            writer.Write(Advice);
-            writer.Write("alarm");
-            writer.Write(Alarm);
-            writer.Write("alarm_size_m");
-            writer.Write(AlarmSizeM);
-            writer.Write("alarm_ns");
-            writer.Write(AlarmNs);
-            writer.Write("seen");
-            writer.Write(Seen);
-            writer.Write("doubt");
-            writer.Write(Doubt);
-            writer.Write("confirmed_ns");
-            writer.Write(ConfirmedNs);
-        }
-    }
-
-    /// <summary>
-    /// The newest comparison of two headsets, age_ns ago; fields as in HeadsetsCompared. outdated: one of them has
-    /// been aligned elsewhere since.
-    /// </summary>
-    public sealed class CrossCheckReport : WireValue
-    {
-        public string A = "";
-        public string B = "";
-        public string AnchorId = "";
-        public double ErrorM = 0.0;
-        public double ErrorRad = 0.0;
-        public double ExpectedP95M = 0.0;
-        public long AgeNs = 0;
-        public long N = 0;
-        public bool Touched = false;
-        public bool Outdated = false;
-
-        public static CrossCheckReport Read(WireReader reader)
-        {
-            CrossCheckReport value = new CrossCheckReport();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "a": value.A = reader.ReadString(64); seen |= 1u; break;
-                    case "b": value.B = reader.ReadString(64); seen |= 2u; break;
-                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 4u; break;
-                    case "error_m": value.ErrorM = reader.ReadDouble(); seen |= 8u; break;
-                    case "error_rad": value.ErrorRad = reader.ReadDouble(); seen |= 16u; break;
-                    case "expected_p95_m": value.ExpectedP95M = reader.ReadDouble(); seen |= 32u; break;
-                    case "age_ns": value.AgeNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 64u; break;
-                    case "n": value.N = reader.ReadLong(0, long.MaxValue); break;
-                    case "touched": value.Touched = reader.ReadBool(); break;
-                    case "outdated": value.Outdated = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 127u) != 127u) throw new WireException("missing field of CrossCheckReport");
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(10);
-            writer.Write("a");
-            writer.Write(A);
-            writer.Write("b");
-            writer.Write(B);
-            writer.Write("anchor_id");
-            writer.Write(AnchorId);
-            writer.Write("error_m");
-            writer.Write(ErrorM);
-            writer.Write("error_rad");
-            writer.Write(ErrorRad);
-            writer.Write("expected_p95_m");
-            writer.Write(ExpectedP95M);
-            writer.Write("age_ns");
-            writer.Write(AgeNs);
-            writer.Write("n");
-            writer.Write(N);
-            writer.Write("touched");
-            writer.Write(Touched);
-            writer.Write("outdated");
-            writer.Write(Outdated);
-        }
-    }
-
-    /// <summary>
-    /// Two headsets that are not known to have the same world: other has aligned by an anchor since participant last
-    /// saw it, and the anchor may have been moved in between. A glance of participant at it verifies the pair.
-    /// </summary>
-    public sealed class UnverifiedReport : WireValue
-    {
-        public string Participant = "";
-        public string Other = "";
-        public string AnchorId = "";
-
-        public static UnverifiedReport Read(WireReader reader)
-        {
-            UnverifiedReport value = new UnverifiedReport();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
-                    case "other": value.Other = reader.ReadString(64); seen |= 2u; break;
-                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of UnverifiedReport");
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(3);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("other");
-            writer.Write(Other);
-            writer.Write("anchor_id");
-            writer.Write(AnchorId);
-        }
-    }
-
-    /// <summary>
-    /// One anchor of the session. size_m: edge of the printed sheet, 0 for not known.
-    /// </summary>
-    public sealed class AnchorReport : WireValue
-    {
-        public string AnchorId = "";
-        public Pose T_world_anchor = new Pose();
-        public double SizeM = 0.0;
-
-        public static AnchorReport Read(WireReader reader)
-        {
-            AnchorReport value = new AnchorReport();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 1u; break;
-                    case "T_world_anchor": value.T_world_anchor = Pose.Read(reader); seen |= 2u; break;
-                    case "size_m": value.SizeM = reader.ReadDouble(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of AnchorReport");
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(3);
-            writer.Write("anchor_id");
-            writer.Write(AnchorId);
-            writer.Write("T_world_anchor");
-            writer.Write(T_world_anchor);
-            writer.Write("size_m");
-            writer.Write(SizeM);
-        }
-    }
-
-    /// <summary>
-    /// One e-stop that is in force: its number, and who stopped the session age_ns ago, for which reason.
-    ///
-    /// participant, name: empty for a connection that had not joined.
-    /// </summary>
-    public sealed class StopReport : WireValue
-    {
-        public long StopSeq = 0;
-        public string Participant = "";
-        public string Name = "";
-        public string Reason = "";
-        public long AgeNs = 0;
-
-        public static StopReport Read(WireReader reader)
-        {
-            StopReport value = new StopReport();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "stop_seq": value.StopSeq = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
-                    case "name": value.Name = reader.ReadString(64); seen |= 4u; break;
-                    case "reason": value.Reason = reader.ReadString(512); seen |= 8u; break;
-                    case "age_ns": value.AgeNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 16u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 31u) != 31u) throw new WireException("missing field of StopReport");
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(5);
-            writer.Write("stop_seq");
-            writer.Write(StopSeq);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("reason");
-            writer.Write(Reason);
-            writer.Write("age_ns");
-            writer.Write(AgeNs);
-        }
-    }
-
-    /// <summary>
-    /// One participant, as the session sees it. Times in *_ns are durations until now, -1 for never.
-    ///
-    /// capture_to_receive: device to front. state_age: end of tick to application, as its client reports it.
-    /// alignment_void_ns: since the tracking frame jumped and voided the alignment, -1 for not so. lost: why it is
-    /// disconnected (silent, closed, slow, ...), empty while connected. rejected: samples by reason, drops:
-    /// messages dropped, both since it joined. reported: its client reports. media: the streams that it subscribed to,
-    /// budget_class the lowest of theirs, empty without one. media_bytes_per_s: sent to it, media_drops: frames that
-    /// its link did not take in time, since it joined.
-    /// </summary>
-    public sealed class ParticipantReport : WireValue
-    {
-        public string Id = "";
-        public string Name = "";
-        public string Role = "";
-        public bool Connected = false;
-        public string Address = "";
-        public string Software = "";
-        public bool Worn = true;
-        public long HeardNs = -1;
-        public string Alignment = "none";
-        public long AlignmentAgeNs = -1;
-        public long AlignmentVoidNs = -1;
-        public double AlignmentErrorM = 0.0;
-        public long TrackingEpoch = 0;
-        public string[] Holds = new string[0];
-        public string[] WaitsFor = new string[0];
-        public double SamplesPerS = 0.0;
-        public Quantiles CaptureToReceive = null;
-        public Quantiles StateAge = null;
-        public double MissedShare = 0.0;
-        public double RttMs = 0.0;
-        public double BytesPerS = 0.0;
-        public string BudgetClass = "";
-        public Dictionary<string, long> Rejected = new Dictionary<string, long>();
-        public long Drops = 0;
-        public bool Reported = false;
-        public string Lost = "";
-        public StreamBudget[] Media = new StreamBudget[0];
-        public double MediaBytesPerS = 0.0;
-        public long MediaDrops = 0;
-        public AlignmentReport AlignmentReport = null;
-
-        public static ParticipantReport Read(WireReader reader)
-        {
-            ParticipantReport value = new ParticipantReport();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "id": value.Id = reader.ReadString(64); seen |= 1u; break;
-                    case "name": value.Name = reader.ReadString(64); seen |= 2u; break;
-                    case "role": value.Role = reader.ReadString(64); seen |= 4u; break;
-                    case "connected": value.Connected = reader.ReadBool(); seen |= 8u; break;
-                    case "address": value.Address = reader.ReadString(64); break;
-                    case "software": value.Software = reader.ReadString(64); break;
-                    case "worn": value.Worn = reader.ReadBool(); break;
-                    case "heard_ns": value.HeardNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    case "alignment": value.Alignment = reader.ReadString(64); break;
-                    case "alignment_age_ns": value.AlignmentAgeNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    case "alignment_void_ns": value.AlignmentVoidNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    case "alignment_error_m": value.AlignmentErrorM = reader.ReadDouble(); break;
-                    case "tracking_epoch": value.TrackingEpoch = reader.ReadLong(0, long.MaxValue); break;
-                    case "holds": value.Holds = reader.ReadStrings(0, 64); break;
-                    case "waits_for": value.WaitsFor = reader.ReadStrings(0, 64); break;
-                    case "samples_per_s": value.SamplesPerS = reader.ReadDouble(); break;
-                    case "capture_to_receive": value.CaptureToReceive = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
-                    case "state_age": value.StateAge = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
-                    case "missed_share": value.MissedShare = reader.ReadDouble(); break;
-                    case "rtt_ms": value.RttMs = reader.ReadDouble(); break;
-                    case "bytes_per_s": value.BytesPerS = reader.ReadDouble(); break;
-                    case "budget_class": value.BudgetClass = reader.ReadString(64); break;
-                    case "rejected": value.Rejected = reader.ReadCounts(); break;
-                    case "drops": value.Drops = reader.ReadLong(0, long.MaxValue); break;
-                    case "reported": value.Reported = reader.ReadBool(); break;
-                    case "lost": value.Lost = reader.ReadString(64); break;
-                    case "media": value.Media = reader.ReadArray(Protocol.StreamBudget.Read, 0); break;
-                    case "media_bytes_per_s": value.MediaBytesPerS = reader.ReadDouble(); break;
-                    case "media_drops": value.MediaDrops = reader.ReadLong(0, long.MaxValue); break;
-                    case "alignment_report": value.AlignmentReport = reader.TryReadNil() ? null : AlignmentReport.Read(reader); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of ParticipantReport");
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(30);
-            writer.Write("id");
-            writer.Write(Id);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("role");
-            writer.Write(Role);
-            writer.Write("connected");
-            writer.Write(Connected);
-            writer.Write("address");
-            writer.Write(Address);
-            writer.Write("software");
-            writer.Write(Software);
-            writer.Write("worn");
-            writer.Write(Worn);
-            writer.Write("heard_ns");
-            writer.Write(HeardNs);
-            writer.Write("alignment");
-            writer.Write(Alignment);
-            writer.Write("alignment_age_ns");
-            writer.Write(AlignmentAgeNs);
-            writer.Write("alignment_void_ns");
-            writer.Write(AlignmentVoidNs);
-            writer.Write("alignment_error_m");
-            writer.Write(AlignmentErrorM);
-            writer.Write("tracking_epoch");
-            writer.Write(TrackingEpoch);
-            writer.Write("holds");
-            writer.Write(Holds);
-            writer.Write("waits_for");
-            writer.Write(WaitsFor);
-            writer.Write("samples_per_s");
-            writer.Write(SamplesPerS);
-            writer.Write("capture_to_receive");
-            writer.Write(CaptureToReceive);
-            writer.Write("state_age");
-            writer.Write(StateAge);
-            writer.Write("missed_share");
-            writer.Write(MissedShare);
-            writer.Write("rtt_ms");
-            writer.Write(RttMs);
-            writer.Write("bytes_per_s");
-            writer.Write(BytesPerS);
-            writer.Write("budget_class");
-            writer.Write(BudgetClass);
-            writer.Write("rejected");
-            writer.Write(Rejected);
-            writer.Write("drops");
-            writer.Write(Drops);
-            writer.Write("reported");
-            writer.Write(Reported);
-            writer.Write("lost");
-            writer.Write(Lost);
-            writer.Write("media");
-            writer.Write(Media);
-            writer.Write("media_bytes_per_s");
-            writer.Write(MediaBytesPerS);
-            writer.Write("media_drops");
-            writer.Write(MediaDrops);
-            writer.Write("alignment_report");
-            writer.Write(AlignmentReport);
-        }
-    }
-
-    /// <summary>
-    /// One robot: its holder, its state, and the reason why it holds.
-    /// </summary>
-    public sealed class RobotReport : WireValue
-    {
-        public string Name = "";
-        public string Mode = "";
-        public string Holder = "";
-        public string HolderName = "";
-        public string State = "";
-        public string HoldReason = "";
-        public Quantiles ReceiveToStep = null;
-        public string[] Queue = new string[0];
-
-        public static RobotReport Read(WireReader reader)
-        {
-            RobotReport value = new RobotReport();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(64); seen |= 1u; break;
-                    case "mode": value.Mode = reader.ReadString(64); seen |= 2u; break;
-                    case "holder": value.Holder = reader.ReadString(64); break;
-                    case "holder_name": value.HolderName = reader.ReadString(64); break;
-                    case "state": value.State = reader.ReadString(64); break;
-                    case "hold_reason": value.HoldReason = reader.ReadString(64); break;
-                    case "receive_to_step": value.ReceiveToStep = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
-                    case "queue": value.Queue = reader.ReadStrings(0, 64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of RobotReport");
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(8);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("mode");
-            writer.Write(Mode);
-            writer.Write("holder");
-            writer.Write(Holder);
-            writer.Write("holder_name");
-            writer.Write(HolderName);
-            writer.Write("state");
-            writer.Write(State);
-            writer.Write("hold_reason");
-            writer.Write(HoldReason);
-            writer.Write("receive_to_step");
-            writer.Write(ReceiveToStep);
-            writer.Write("queue");
-            writer.Write(Queue);
-        }
-    }
-
-    /// <summary>
-    /// State of the recorder: off (nothing is recorded), running, hangs (silent for 5 s), dead (being replaced),
-    /// failed (the file cannot be written) or ended (its budget is used up). disk_free_bytes 0: not known.
-    /// spilled_bytes: what waits in memory for a recorder that is behind. text: its last message, for people.
-    /// </summary>
-    public sealed class RecorderReport : WireValue
-    {
-        public string State = "off";
-        public string Path = "";
-        public long BytesWritten = 0;
-        public long DiskFreeBytes = 0;
-        public long LostRows = 0;
-        public long SpilledBytes = 0;
-        public string Text = "";
-
-        public static RecorderReport Read(WireReader reader)
-        {
-            RecorderReport value = new RecorderReport();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "state": value.State = reader.ReadString(64); break;
-                    case "path": value.Path = reader.ReadString(512); break;
-                    case "bytes_written": value.BytesWritten = reader.ReadLong(0, long.MaxValue); break;
-                    case "disk_free_bytes": value.DiskFreeBytes = reader.ReadLong(0, long.MaxValue); break;
-                    case "lost_rows": value.LostRows = reader.ReadLong(0, long.MaxValue); break;
-                    case "spilled_bytes": value.SpilledBytes = reader.ReadLong(0, long.MaxValue); break;
-                    case "text": value.Text = reader.ReadString(512); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(7);
-            writer.Write("state");
-            writer.Write(State);
-            writer.Write("path");
-            writer.Write(Path);
-            writer.Write("bytes_written");
-            writer.Write(BytesWritten);
-            writer.Write("disk_free_bytes");
-            writer.Write(DiskFreeBytes);
-            writer.Write("lost_rows");
-            writer.Write(LostRows);
-            writer.Write("spilled_bytes");
-            writer.Write(SpilledBytes);
-            writer.Write("text");
-            writer.Write(Text);
-        }
-    }
-
-    /// <summary>
-    /// One media stream, at its best class. source: its publisher's name, empty for the session's own process.
-    /// subscribers: participants that subscribed to it. encoding, age_ms: of the newest frame; its age since the
-    /// session received it. title, audience, fault, detail, stale: as in StreamBudget.
-    /// </summary>
-    public sealed class MediaStreamReport : WireValue
-    {
-        public string Stream = "";
-        public double Hz = 0.0;
-        public double MbitPerS = 0.0;
-        public string Source = "";
-        public long Subscribers = 0;
-        public string Encoding = "bytes";
-        public double AgeMs = 0.0;
-        public string Title = "";
-        public string Audience = "all";
-        public string Fault = "";
-        public string Detail = "";
-        public bool Stale = false;
-
-        public static MediaStreamReport Read(WireReader reader)
-        {
-            MediaStreamReport value = new MediaStreamReport();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "stream": value.Stream = reader.ReadString(64); seen |= 1u; break;
-                    case "hz": value.Hz = reader.ReadDouble(); break;
-                    case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
-                    case "source": value.Source = reader.ReadString(64); break;
-                    case "subscribers": value.Subscribers = reader.ReadLong(0, long.MaxValue); break;
-                    case "encoding": value.Encoding = reader.ReadString(64); break;
-                    case "age_ms": value.AgeMs = reader.ReadDouble(); break;
-                    case "title": value.Title = reader.ReadString(512); break;
-                    case "audience": value.Audience = reader.ReadString(64); break;
-                    case "fault": value.Fault = reader.ReadString(64); break;
-                    case "detail": value.Detail = reader.ReadString(512); break;
-                    case "stale": value.Stale = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of MediaStreamReport");
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(12);
-            writer.Write("stream");
-            writer.Write(Stream);
-            writer.Write("hz");
-            writer.Write(Hz);
-            writer.Write("mbit_per_s");
-            writer.Write(MbitPerS);
-            writer.Write("source");
-            writer.Write(Source);
-            writer.Write("subscribers");
-            writer.Write(Subscribers);
-            writer.Write("encoding");
-            writer.Write(Encoding);
-            writer.Write("age_ms");
-            writer.Write(AgeMs);
-            writer.Write("title");
-            writer.Write(Title);
-            writer.Write("audience");
-            writer.Write(Audience);
-            writer.Write("fault");
-            writer.Write(Fault);
-            writer.Write("detail");
-            writer.Write(Detail);
-            writer.Write("stale");
-            writer.Write(Stale);
-        }
-    }
-
-    /// <summary>
-    /// The assets channel. served: assets of the present scene. Since the front began: bytes_sent, requests, and
-    /// refusals, of requests and connections. waiting: connections with an unanswered request.
-    /// </summary>
-    public sealed class AssetsReport : WireValue
-    {
-        public long Served = 0;
-        public long BytesSent = 0;
-        public long Requests = 0;
-        public long Refusals = 0;
-        public long Waiting = 0;
-
-        public static AssetsReport Read(WireReader reader)
-        {
-            AssetsReport value = new AssetsReport();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "served": value.Served = reader.ReadLong(0, long.MaxValue); break;
-                    case "bytes_sent": value.BytesSent = reader.ReadLong(0, long.MaxValue); break;
-                    case "requests": value.Requests = reader.ReadLong(0, long.MaxValue); break;
-                    case "refusals": value.Refusals = reader.ReadLong(0, long.MaxValue); break;
-                    case "waiting": value.Waiting = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(5);
-            writer.Write("served");
-            writer.Write(Served);
-            writer.Write("bytes_sent");
-            writer.Write(BytesSent);
-            writer.Write("requests");
-            writer.Write(Requests);
-            writer.Write("refusals");
-            writer.Write(Refusals);
-            writer.Write("waiting");
-            writer.Write(Waiting);
-        }
-    }
-
-    /// <summary>
-    /// First message of a connection.
-    ///
-    /// secret: client-made 128-bit secret that stands for the key on plain loopback; behind a gateway the 32 bytes of a
-    /// web identity. resume_token: from the last Welcome, single use. alignment: measured, or not_needed for
-    /// policies, leaders, desktop and remote VR. certificate_hash: of a gateway, SHA-256 of the SubjectPublicKeyInfo of
-    /// the certificate that it shows to those behind it.
-    /// </summary>
+    /// <summary>First message of a connection.</summary>
     public sealed class Hello : ClientMessage
     {
         public const string TagName = "hello";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Role = "";
         public string Name = "";
         public string Software = "";
-        public string[] Devices = new string[0];
-        public string[] Capabilities = new string[0];
+        public string[] Devices = Array.Empty<string>();
+        public string[] Capabilities = Array.Empty<string>();
         public string Alignment = "measured";
-        public byte[] Secret = new byte[0];
-        public byte[] ResumeToken = new byte[0];
+        public byte[] Secret = Array.Empty<byte>();
+        public byte[] ResumeToken = Array.Empty<byte>();
         public string JoinCode = "";
-        public byte[] CertificateHash = new byte[0];
+        public byte[] CertificateHash = Array.Empty<byte>();
 
-        public static Hello Read(WireReader reader)
-        {
-            Hello value = new Hello();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "role": value.Role = reader.ReadString(64); seen |= 1u; break;
-                    case "name": value.Name = reader.ReadString(64); seen |= 2u; break;
-                    case "software": value.Software = reader.ReadString(64); break;
-                    case "devices": value.Devices = reader.ReadStrings(32, 64); break;
-                    case "capabilities": value.Capabilities = reader.ReadStrings(32, 64); break;
-                    case "alignment": value.Alignment = reader.ReadString(64); break;
-                    case "secret": value.Secret = reader.ReadBytes(64); break;
-                    case "resume_token": value.ResumeToken = reader.ReadBytes(64); break;
-                    case "join_code": value.JoinCode = reader.ReadString(64); break;
-                    case "certificate_hash": value.CertificateHash = reader.ReadBytes(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Hello");
-            return value;
-        }
+        public static Hello Read(WireReader reader) => reader.ReadInto(new Hello());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(11);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("role");
-            writer.Write(Role);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("software");
-            writer.Write(Software);
-            writer.Write("devices");
-            writer.Write(Devices);
-            writer.Write("capabilities");
-            writer.Write(Capabilities);
-            writer.Write("alignment");
-            writer.Write(Alignment);
-            writer.Write("secret");
-            writer.Write(Secret);
-            writer.Write("resume_token");
-            writer.Write(ResumeToken);
-            writer.Write("join_code");
-            writer.Write(JoinCode);
-            writer.Write("certificate_hash");
-            writer.Write(CertificateHash);
+            codec.Require("role", ref Role, 64);
+            codec.Require("name", ref Name, 64);
+            codec.Allow("software", ref Software, 64, "");
+            codec.Allow("devices", ref Devices, 0, 32, 64);
+            codec.Allow("capabilities", ref Capabilities, 0, 32, 64);
+            codec.Allow("alignment", ref Alignment, 64, "measured");
+            codec.Allow("secret", ref Secret, 64);
+            codec.Allow("resume_token", ref ResumeToken, 64);
+            codec.Allow("join_code", ref JoinCode, 64, "");
+            codec.Allow("certificate_hash", ref CertificateHash, 64);
         }
     }
 
-    /// <summary>
-    /// Leave the session at once: leases are released without grace.
-    /// </summary>
+    /// <summary>Leave the session at once: leases are released without grace.</summary>
     public sealed class Bye : ClientMessage
     {
         public const string TagName = "bye";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Reason = "";
 
-        public static Bye Read(WireReader reader)
-        {
-            Bye value = new Bye();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "reason": value.Reason = reader.ReadString(512); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static Bye Read(WireReader reader) => reader.ReadInto(new Bye());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("reason");
-            writer.Write(Reason);
+            codec.Allow("reason", ref Reason, 512, "");
         }
     }
 
-    /// <summary>
-    /// Report of a gateway that one behind it lost its connection: the grace period begins at once.
-    /// </summary>
-    public sealed class Disconnected : ClientMessage
-    {
-        public const string TagName = "disconnected";
-        public override string Tag { get { return TagName; } }
-        public string Reason = "closed";
-
-        public static Disconnected Read(WireReader reader)
-        {
-            Disconnected value = new Disconnected();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "reason": value.Reason = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(2);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("reason");
-            writer.Write(Reason);
-        }
-    }
-
-    /// <summary>
-    /// Sign of life, sent at least every Welcome.heartbeat_ns. worn false: the headset is not worn.
-    /// </summary>
+    /// <summary>Sign of life, sent at least every Welcome.heartbeat_ns.</summary>
     public sealed class Heartbeat : ClientMessage
     {
         public const string TagName = "heartbeat";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public bool Worn = true;
 
-        public static Heartbeat Read(WireReader reader)
-        {
-            Heartbeat value = new Heartbeat();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "worn": value.Worn = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static Heartbeat Read(WireReader reader) => reader.ReadInto(new Heartbeat());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("worn");
-            writer.Write(Worn);
+            codec.Allow("worn", ref Worn, true);
         }
     }
 
-    /// <summary>
-    /// Clock measurement. t0_ns: the client's own monotonic clock at sending. Answered by ClockPong from the
-    /// front.
-    /// </summary>
+    /// <summary>Clock measurement.</summary>
     public sealed class ClockPing : ClientMessage
     {
         public const string TagName = "clock_ping";
-        public override string Tag { get { return TagName; } }
-        public long T0Ns = 0;
+        public override string Tag => TagName;
+        public long T0Ns;
 
-        public static ClockPing Read(WireReader reader)
-        {
-            ClockPing value = new ClockPing();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "t0_ns": value.T0Ns = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 1u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of ClockPing");
-            return value;
-        }
+        public static ClockPing Read(WireReader reader) => reader.ReadInto(new ClockPing());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("t0_ns");
-            writer.Write(T0Ns);
+            codec.Require("t0_ns", ref T0Ns, long.MinValue, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// Request for a Snapshot. request_id is repeated in it.
-    /// </summary>
+    /// <summary>Request for a Snapshot.</summary>
     public sealed class GetSnapshot : ClientMessage
     {
         public const string TagName = "get_snapshot";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
 
-        public static GetSnapshot Read(WireReader reader)
-        {
-            GetSnapshot value = new GetSnapshot();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static GetSnapshot Read(WireReader reader) => reader.ReadInto(new GetSnapshot());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
+            codec.Allow("request_id", ref RequestId, 0, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// One input message of one device.
-    ///
-    /// capture_ns: when it was sampled (session time by the client's clock estimate), not when it will be displayed.
-    /// pose: T_tracking_device. twist: (vx, vy, vz [m/s], wx, wy, wz [rad/s]) in the tracking frame.
-    /// clutch: true while the person wants the target to follow. gripper: 0 open to 1 closed.
-    /// buttons: bit mask (section 6). hand_joints: up to 26 poses T_tracking_joint flattened (x, y, z, qw, qx, qy,
-    /// qz): 25 in the order of WebXR (the wrist first), 26 in that of OpenXR (the palm first); not in every sample. q,
-    /// qd: a leader's joint positions [rad or m] and velocities. emulated: the position of pose is an estimate, not
-    /// a measurement (WebXR emulatedPosition; OpenXR: valid, but not tracked): it drives nothing.
-    /// </summary>
+    /// <summary>One input message of one device.</summary>
     public sealed class Sample : ClientMessage
     {
         public const string TagName = "sample";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Device = "";
         public string Kind = "";
-        public long Seq = 0;
-        public long CaptureNs = 0;
-        public long SceneEpoch = 0;
-        public long TrackingEpoch = 0;
-        public long AlignmentVersion = 0;
-        public Target[] Targets = new Target[0];
+        public long Seq;
+        public long CaptureNs;
+        public long SceneEpoch;
+        public long TrackingEpoch;
+        public long AlignmentVersion;
+        public Target[] Targets = Array.Empty<Target>();
         public bool Tracked = true;
         public bool Worn = true;
-        public bool Clutch = false;
-        public double? Gripper = null;
-        public long Buttons = 0;
-        public Pose Pose = null;
-        public double[] Twist = null;
-        public double[] HandJoints = new double[0];
-        public double[] Q = new double[0];
-        public double[] Qd = new double[0];
-        public bool Emulated = false;
+        public bool Clutch;
+        public double? Gripper;
+        public long Buttons;
+        public Pose Pose;
+        public double[] Twist;
+        public double[] HandJoints = Array.Empty<double>();
+        public double[] Q = Array.Empty<double>();
+        public double[] Qd = Array.Empty<double>();
+        public bool Emulated;
 
-        public static Sample Read(WireReader reader)
-        {
-            Sample value = new Sample();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "device": value.Device = reader.ReadString(64); seen |= 1u; break;
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 2u; break;
-                    case "seq": value.Seq = reader.ReadLong(0, long.MaxValue); seen |= 4u; break;
-                    case "capture_ns": value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 8u; break;
-                    case "scene_epoch": value.SceneEpoch = reader.ReadLong(0, long.MaxValue); seen |= 16u; break;
-                    case "tracking_epoch": value.TrackingEpoch = reader.ReadLong(0, long.MaxValue); seen |= 32u; break;
-                    case "alignment_version": value.AlignmentVersion = reader.ReadLong(0, long.MaxValue); seen |= 64u; break;
-                    case "targets": value.Targets = reader.ReadArray(Protocol.Target.Read, 8); break;
-                    case "tracked": value.Tracked = reader.ReadBool(); break;
-                    case "worn": value.Worn = reader.ReadBool(); break;
-                    case "clutch": value.Clutch = reader.ReadBool(); break;
-                    case "gripper": value.Gripper = reader.TryReadNil() ? (double?)null : reader.ReadDouble(); break;
-                    case "buttons": value.Buttons = reader.ReadLong(0, long.MaxValue); break;
-                    case "pose": value.Pose = reader.TryReadNil() ? null : Pose.Read(reader); break;
-                    case "twist": value.Twist = reader.TryReadNil() ? null : reader.ReadDoubles(6, 0); break;
-                    case "hand_joints": value.HandJoints = reader.ReadDoubles(0, 182); break;
-                    case "q": value.Q = reader.ReadDoubles(0, 64); break;
-                    case "qd": value.Qd = reader.ReadDoubles(0, 64); break;
-                    case "emulated": value.Emulated = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 127u) != 127u) throw new WireException("missing field of Sample");
-            return value;
-        }
+        public static Sample Read(WireReader reader) => reader.ReadInto(new Sample());
+        internal static readonly Func<Sample> New = () => new Sample();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(20);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("device");
-            writer.Write(Device);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("seq");
-            writer.Write(Seq);
-            writer.Write("capture_ns");
-            writer.Write(CaptureNs);
-            writer.Write("scene_epoch");
-            writer.Write(SceneEpoch);
-            writer.Write("tracking_epoch");
-            writer.Write(TrackingEpoch);
-            writer.Write("alignment_version");
-            writer.Write(AlignmentVersion);
-            writer.Write("targets");
-            writer.Write(Targets);
-            writer.Write("tracked");
-            writer.Write(Tracked);
-            writer.Write("worn");
-            writer.Write(Worn);
-            writer.Write("clutch");
-            writer.Write(Clutch);
-            writer.Write("gripper");
-            writer.Write(Gripper);
-            writer.Write("buttons");
-            writer.Write(Buttons);
-            writer.Write("pose");
-            writer.Write(Pose);
-            writer.Write("twist");
-            writer.Write(Twist);
-            writer.Write("hand_joints");
-            writer.Write(HandJoints);
-            writer.Write("q");
-            writer.Write(Q);
-            writer.Write("qd");
-            writer.Write(Qd);
-            writer.Write("emulated");
-            writer.Write(Emulated);
+            codec.Require("device", ref Device, 64);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("seq", ref Seq, 0, long.MaxValue);
+            codec.Require("capture_ns", ref CaptureNs, long.MinValue, long.MaxValue);
+            codec.Require("scene_epoch", ref SceneEpoch, 0, long.MaxValue);
+            codec.Require("tracking_epoch", ref TrackingEpoch, 0, long.MaxValue);
+            codec.Require("alignment_version", ref AlignmentVersion, 0, long.MaxValue);
+            codec.Allow("targets", ref Targets, 0, 8, Protocol.Target.New);
+            codec.Allow("tracked", ref Tracked, true);
+            codec.Allow("worn", ref Worn, true);
+            codec.Allow("clutch", ref Clutch, false);
+            codec.Allow("gripper", ref Gripper);
+            codec.Allow("buttons", ref Buttons, 0, long.MaxValue, 0);
+            codec.AllowNull("pose", ref Pose, Protocol.Pose.New);
+            codec.AllowNull("twist", ref Twist, 6, 6);
+            codec.Allow("hand_joints", ref HandJoints, 0, 182);
+            codec.Allow("q", ref Q, 0, 64);
+            codec.Allow("qd", ref Qd, 0, 64);
+            codec.Allow("emulated", ref Emulated, false);
         }
     }
 
-    /// <summary>
-    /// Samples of several devices that were taken together, such as head and both controllers at a display frame.
-    ///
-    /// Each counts as if it had arrived alone; together they cost one message, one packet and one wake-up.
-    /// </summary>
+    /// <summary>Samples of several devices that were taken together, such as head and both controllers at ...</summary>
     public sealed class Samples : ClientMessage
     {
         public const string TagName = "samples";
-        public override string Tag { get { return TagName; } }
-        public Sample[] SamplesValue = new Sample[0];
+        public override string Tag => TagName;
+        public Sample[] SamplesValue = Array.Empty<Sample>();
 
-        public static Samples Read(WireReader reader)
-        {
-            Samples value = new Samples();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "samples": value.SamplesValue = reader.ReadArray(Protocol.Sample.Read, 8); seen |= 1u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of Samples");
-            return value;
-        }
+        public static Samples Read(WireReader reader) => reader.ReadInto(new Samples());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("samples");
-            writer.Write(SamplesValue);
+            codec.Require("samples", ref SamplesValue, 0, 8, Protocol.Sample.New);
         }
     }
 
-    /// <summary>
-    /// Request for leases, all or none. No names: the assignment policy chooses one robot. wait: queue when held.
-    /// </summary>
+    /// <summary>Request for leases, all or none.</summary>
     public sealed class Acquire : ClientMessage
     {
         public const string TagName = "acquire";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public string[] Robots = new string[0];
-        public string[] Objects = new string[0];
-        public bool Wait = false;
+        public override string Tag => TagName;
+        public long RequestId;
+        public string[] Robots = Array.Empty<string>();
+        public string[] Objects = Array.Empty<string>();
+        public bool Wait;
         public double Weight = 1.0;
 
-        public static Acquire Read(WireReader reader)
-        {
-            Acquire value = new Acquire();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "robots": value.Robots = reader.ReadStrings(32, 64); break;
-                    case "objects": value.Objects = reader.ReadStrings(32, 64); break;
-                    case "wait": value.Wait = reader.ReadBool(); break;
-                    case "weight": value.Weight = reader.ReadDouble(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of Acquire");
-            return value;
-        }
+        public static Acquire Read(WireReader reader) => reader.ReadInto(new Acquire());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("robots");
-            writer.Write(Robots);
-            writer.Write("objects");
-            writer.Write(Objects);
-            writer.Write("wait");
-            writer.Write(Wait);
-            writer.Write("weight");
-            writer.Write(Weight);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Allow("robots", ref Robots, 0, 32, 64);
+            codec.Allow("objects", ref Objects, 0, 32, 64);
+            codec.Allow("wait", ref Wait, false);
+            codec.Allow("weight", ref Weight, 1.0);
         }
     }
 
-    /// <summary>
-    /// Return leases. No targets: all of them and every place in a queue.
-    /// </summary>
+    /// <summary>Return leases.</summary>
     public sealed class Release : ClientMessage
     {
         public const string TagName = "release";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public Target[] Targets = new Target[0];
+        public override string Tag => TagName;
+        public long RequestId;
+        public Target[] Targets = Array.Empty<Target>();
 
-        public static Release Read(WireReader reader)
-        {
-            Release value = new Release();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); break;
-                    case "targets": value.Targets = reader.ReadArray(Protocol.Target.Read, 8); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static Release Read(WireReader reader) => reader.ReadInto(new Release());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(3);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("targets");
-            writer.Write(Targets);
+            codec.Allow("request_id", ref RequestId, 0, long.MaxValue, 0);
+            codec.Allow("targets", ref Targets, 0, 8, Protocol.Target.New);
         }
     }
 
-    /// <summary>
-    /// Take back the acquire with this request id. It is denied (withdrawn, with its place in the queue and the
-    /// holder); if it was granted before, what it has granted is released.
-    /// </summary>
+    /// <summary>Take back the acquire with this request id.</summary>
     public sealed class Withdraw : ClientMessage
     {
         public const string TagName = "withdraw";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public long AcquireRequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
+        public long AcquireRequestId;
 
-        public static Withdraw Read(WireReader reader)
-        {
-            Withdraw value = new Withdraw();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "acquire_request_id": value.AcquireRequestId = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Withdraw");
-            return value;
-        }
+        public static Withdraw Read(WireReader reader) => reader.ReadInto(new Withdraw());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(3);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("acquire_request_id");
-            writer.Write(AcquireRequestId);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("acquire_request_id", ref AcquireRequestId, 0, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// Answer of a holder or director to a ConsentRequested event (mode request).
-    /// </summary>
+    /// <summary>Answer of a holder or director to a ConsentRequested event (mode request).</summary>
     public sealed class Consent : ClientMessage
     {
         public const string TagName = "consent";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public long ConsentId = 0;
-        public bool Grant = false;
+        public override string Tag => TagName;
+        public long RequestId;
+        public long ConsentId;
+        public bool Grant;
 
-        public static Consent Read(WireReader reader)
-        {
-            Consent value = new Consent();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "consent_id": value.ConsentId = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "grant": value.Grant = reader.ReadBool(); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of Consent");
-            return value;
-        }
+        public static Consent Read(WireReader reader) => reader.ReadInto(new Consent());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("consent_id");
-            writer.Write(ConsentId);
-            writer.Write("grant");
-            writer.Write(Grant);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("consent_id", ref ConsentId, 0, long.MaxValue);
+            codec.Require("grant", ref Grant);
         }
     }
 
-    /// <summary>
-    /// Assign robots to a participant (empty: free them), even if another one holds them. Directors only.
-    /// </summary>
+    /// <summary>Assign robots to a participant (empty: free them), even if another one holds them.</summary>
     public sealed class Assign : ClientMessage
     {
         public const string TagName = "assign";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public string[] Robots = new string[0];
+        public override string Tag => TagName;
+        public long RequestId;
+        public string[] Robots = Array.Empty<string>();
         public string Participant = "";
 
-        public static Assign Read(WireReader reader)
-        {
-            Assign value = new Assign();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "robots": value.Robots = reader.ReadStrings(32, 64); seen |= 2u; break;
-                    case "participant": value.Participant = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Assign");
-            return value;
-        }
+        public static Assign Read(WireReader reader) => reader.ReadInto(new Assign());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("robots");
-            writer.Write(Robots);
-            writer.Write("participant");
-            writer.Write(Participant);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("robots", ref Robots, 0, 32, 64);
+            codec.Allow("participant", ref Participant, 64, "");
         }
     }
 
-    /// <summary>
-    /// Change the lease mode of a robot. Directors only. Blending weights (mode shared) come with each Acquire.
-    /// </summary>
+    /// <summary>Change the lease mode of a robot.</summary>
     public sealed class SetMode : ClientMessage
     {
         public const string TagName = "set_mode";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Robot = "";
         public string Mode = "";
 
-        public static SetMode Read(WireReader reader)
-        {
-            SetMode value = new SetMode();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "robot": value.Robot = reader.ReadString(64); seen |= 2u; break;
-                    case "mode": value.Mode = reader.ReadString(64); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of SetMode");
-            return value;
-        }
+        public static SetMode Read(WireReader reader) => reader.ReadInto(new SetMode());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("robot");
-            writer.Write(Robot);
-            writer.Write("mode");
-            writer.Write(Mode);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("robot", ref Robot, 64);
+            codec.Require("mode", ref Mode, 64);
         }
     }
 
-    /// <summary>
-    /// Set how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all robots of the sender.
-    ///
-    /// For holders and directors. Translation is scaled (that of twists too); rotation, joints and device target are not.
-    /// The scale belongs to the present holder: the next one begins at 1. Changing it while engaged moves nothing by
-    /// itself.
-    /// </summary>
+    /// <summary>Set how far robots move as the hand moves: 1 as far, 0.1 a tenth.</summary>
     public sealed class SetScale : ClientMessage
     {
         public const string TagName = "set_scale";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public string[] Robots = new string[0];
+        public override string Tag => TagName;
+        public long RequestId;
+        public string[] Robots = Array.Empty<string>();
         public double Scale = 1.0;
 
-        public static SetScale Read(WireReader reader)
-        {
-            SetScale value = new SetScale();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "robots": value.Robots = reader.ReadStrings(32, 64); break;
-                    case "scale": value.Scale = reader.ReadDouble(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of SetScale");
-            return value;
-        }
+        public static SetScale Read(WireReader reader) => reader.ReadInto(new SetScale());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("robots");
-            writer.Write(Robots);
-            writer.Write("scale");
-            writer.Write(Scale);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Allow("robots", ref Robots, 0, 32, 64);
+            codec.Allow("scale", ref Scale, 1.0);
         }
     }
 
-    /// <summary>
-    /// Take a free object with a hand, without a robot. The lease on the object comes back in the Reply.
-    /// </summary>
+    /// <summary>Take a free object with a hand, without a robot.</summary>
     public sealed class Grasp : ClientMessage
     {
         public const string TagName = "grasp";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Object = "";
         public string Device = "";
 
-        public static Grasp Read(WireReader reader)
-        {
-            Grasp value = new Grasp();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "object": value.Object = reader.ReadString(64); seen |= 2u; break;
-                    case "device": value.Device = reader.ReadString(64); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of Grasp");
-            return value;
-        }
+        public static Grasp Read(WireReader reader) => reader.ReadInto(new Grasp());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("object");
-            writer.Write(Object);
-            writer.Write("device");
-            writer.Write(Device);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("object", ref Object, 64);
+            codec.Require("device", ref Device, 64);
         }
     }
 
-    /// <summary>
-    /// Observation of an anchor by a headset or camera: T_tracking_anchor.
-    ///
-    /// kind: AnchorKind. size_m: edge of the sheet as detected. viewpoint_id: observations with the same number
-    /// share their systematic error. covariance: 6x6 row-major (position, rotation), tracking axes, of kind persistent
-    /// those of the anchor, or empty. quality: 0 to 1.
-    /// source: ObservationSource, empty for that of kind: qr_camera, holder or touch.
-    /// mark: touched mark of the anchor (AnchorInfo.marks), empty for the origin of the anchor. grip_poses: of kind
-    /// tip, T_tracking_grip of device (section 5). alternative: of a flat sheet, the other T_tracking_anchor that
-    /// explains the picture. residuals_px: rms of both, in this order, or empty.
-    /// </summary>
+    /// <summary>Observation of an anchor by a headset or camera: T_tracking_anchor.</summary>
     public sealed class Observation : ClientMessage
     {
         public const string TagName = "observation";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string AnchorId = "";
         public string Kind = "";
         public Pose T_tracking_anchor = new Pose();
-        public long CaptureNs = 0;
-        public long TrackingEpoch = 0;
-        public long ViewpointId = 0;
-        public double SizeM = 0.0;
+        public long CaptureNs;
+        public long TrackingEpoch;
+        public long ViewpointId;
+        public double SizeM;
         public double Quality = 1.0;
         public string Device = "head";
-        public double[] Covariance = new double[0];
+        public double[] Covariance = Array.Empty<double>();
         public string Mark = "";
-        public Pose[] GripPoses = new Pose[0];
+        public Pose[] GripPoses = Array.Empty<Pose>();
         public string Source = "";
-        public Pose Alternative = null;
-        public double[] ResidualsPx = new double[0];
+        public Pose Alternative;
+        public double[] ResidualsPx = Array.Empty<double>();
 
-        public static Observation Read(WireReader reader)
-        {
-            Observation value = new Observation();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 1u; break;
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 2u; break;
-                    case "T_tracking_anchor": value.T_tracking_anchor = Pose.Read(reader); seen |= 4u; break;
-                    case "capture_ns": value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 8u; break;
-                    case "tracking_epoch": value.TrackingEpoch = reader.ReadLong(0, long.MaxValue); seen |= 16u; break;
-                    case "viewpoint_id": value.ViewpointId = reader.ReadLong(0, long.MaxValue); break;
-                    case "size_m": value.SizeM = reader.ReadDouble(); break;
-                    case "quality": value.Quality = reader.ReadDouble(); break;
-                    case "device": value.Device = reader.ReadString(64); break;
-                    case "covariance": value.Covariance = reader.ReadDoubles(0, 36); break;
-                    case "mark": value.Mark = reader.ReadString(64); break;
-                    case "grip_poses": value.GripPoses = reader.ReadArray(Protocol.Pose.Read, 100); break;
-                    case "source": value.Source = reader.ReadString(64); break;
-                    case "alternative": value.Alternative = reader.TryReadNil() ? null : Pose.Read(reader); break;
-                    case "residuals_px": value.ResidualsPx = reader.ReadDoubles(0, 2); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 31u) != 31u) throw new WireException("missing field of Observation");
-            return value;
-        }
+        public static Observation Read(WireReader reader) => reader.ReadInto(new Observation());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(16);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("anchor_id");
-            writer.Write(AnchorId);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("T_tracking_anchor");
-            writer.Write(T_tracking_anchor);
-            writer.Write("capture_ns");
-            writer.Write(CaptureNs);
-            writer.Write("tracking_epoch");
-            writer.Write(TrackingEpoch);
-            writer.Write("viewpoint_id");
-            writer.Write(ViewpointId);
-            writer.Write("size_m");
-            writer.Write(SizeM);
-            writer.Write("quality");
-            writer.Write(Quality);
-            writer.Write("device");
-            writer.Write(Device);
-            writer.Write("covariance");
-            writer.Write(Covariance);
-            writer.Write("mark");
-            writer.Write(Mark);
-            writer.Write("grip_poses");
-            writer.Write(GripPoses);
-            writer.Write("source");
-            writer.Write(Source);
-            writer.Write("alternative");
-            writer.Write(Alternative);
-            writer.Write("residuals_px");
-            writer.Write(ResidualsPx);
+            codec.Require("anchor_id", ref AnchorId, 64);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("T_tracking_anchor", ref T_tracking_anchor, Protocol.Pose.New);
+            codec.Require("capture_ns", ref CaptureNs, long.MinValue, long.MaxValue);
+            codec.Require("tracking_epoch", ref TrackingEpoch, 0, long.MaxValue);
+            codec.Allow("viewpoint_id", ref ViewpointId, 0, long.MaxValue, 0);
+            codec.Allow("size_m", ref SizeM, 0.0);
+            codec.Allow("quality", ref Quality, 1.0);
+            codec.Allow("device", ref Device, 64, "head");
+            codec.Allow("covariance", ref Covariance, 0, 36);
+            codec.Allow("mark", ref Mark, 64, "");
+            codec.Allow("grip_poses", ref GripPoses, 0, 100, Protocol.Pose.New);
+            codec.Allow("source", ref Source, 64, "");
+            codec.AllowNull("alternative", ref Alternative, Protocol.Pose.New);
+            codec.Allow("residuals_px", ref ResidualsPx, 0, 2);
         }
     }
 
-    /// <summary>
-    /// Align a participant by hand, or add an offset to a measured alignment (offset true). Directors only.
-    /// </summary>
+    /// <summary>Align a participant by hand, or add an offset to a measured alignment (offset true).</summary>
     public sealed class PlaceAlignment : ClientMessage
     {
         public const string TagName = "place_alignment";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Participant = "";
         public Pose T_world_tracking = new Pose();
-        public bool Offset = false;
+        public bool Offset;
 
-        public static PlaceAlignment Read(WireReader reader)
-        {
-            PlaceAlignment value = new PlaceAlignment();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
-                    case "T_world_tracking": value.T_world_tracking = Pose.Read(reader); seen |= 4u; break;
-                    case "offset": value.Offset = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of PlaceAlignment");
-            return value;
-        }
+        public static PlaceAlignment Read(WireReader reader) => reader.ReadInto(new PlaceAlignment());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("T_world_tracking");
-            writer.Write(T_world_tracking);
-            writer.Write("offset");
-            writer.Write(Offset);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("T_world_tracking", ref T_world_tracking, Protocol.Pose.New);
+            codec.Allow("offset", ref Offset, false);
         }
     }
 
-    /// <summary>
-    /// Start or stop the alignment run of a participant (AlignAction); participant empty: the sender's own.
-    ///
-    /// A director may do so for everyone, others for themselves. The alignment in force stays until there is a better one.
-    /// </summary>
+    /// <summary>Start or stop the alignment run of a participant (AlignAction); participant empty: the ...</summary>
     public sealed class Align : ClientMessage
     {
         public const string TagName = "align";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Action = "";
         public string Participant = "";
 
-        public static Align Read(WireReader reader)
-        {
-            Align value = new Align();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "action": value.Action = reader.ReadString(64); seen |= 2u; break;
-                    case "participant": value.Participant = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Align");
-            return value;
-        }
+        public static Align Read(WireReader reader) => reader.ReadInto(new Align());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("action");
-            writer.Write(Action);
-            writer.Write("participant");
-            writer.Write(Participant);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("action", ref Action, 64);
+            codec.Allow("participant", ref Participant, 64, "");
         }
     }
 
-    /// <summary>
-    /// Set where an anchor of the session is: the shared scene moves for everyone who is aligned to it. Directors only.
-    ///
-    /// force: also when it is further than 5 m from its old place, which is more often a wrong number than intended.
-    /// </summary>
+    /// <summary>Set where an anchor of the session is: the shared scene moves for everyone who is aligned ...</summary>
     public sealed class MoveAnchor : ClientMessage
     {
         public const string TagName = "move_anchor";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string AnchorId = "";
         public Pose T_world_anchor = new Pose();
-        public bool Force = false;
+        public bool Force;
 
-        public static MoveAnchor Read(WireReader reader)
-        {
-            MoveAnchor value = new MoveAnchor();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 2u; break;
-                    case "T_world_anchor": value.T_world_anchor = Pose.Read(reader); seen |= 4u; break;
-                    case "force": value.Force = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of MoveAnchor");
-            return value;
-        }
+        public static MoveAnchor Read(WireReader reader) => reader.ReadInto(new MoveAnchor());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("anchor_id");
-            writer.Write(AnchorId);
-            writer.Write("T_world_anchor");
-            writer.Write(T_world_anchor);
-            writer.Write("force");
-            writer.Write(Force);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("anchor_id", ref AnchorId, 64);
+            codec.Require("T_world_anchor", ref T_world_anchor, Protocol.Pose.New);
+            codec.Allow("force", ref Force, false);
         }
     }
 
-    /// <summary>
-    /// Report that the tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is
-    /// void.
-    /// </summary>
+    /// <summary>Report that the tracking frame jumped (recentre, lost tracking): every earlier alignment ...</summary>
     public sealed class TrackingEpoch : ClientMessage
     {
         public const string TagName = "tracking_epoch";
-        public override string Tag { get { return TagName; } }
-        public long TrackingEpochValue = 0;
+        public override string Tag => TagName;
+        public long TrackingEpochValue;
 
-        public static TrackingEpoch Read(WireReader reader)
-        {
-            TrackingEpoch value = new TrackingEpoch();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "tracking_epoch": value.TrackingEpochValue = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of TrackingEpoch");
-            return value;
-        }
+        public static TrackingEpoch Read(WireReader reader) => reader.ReadInto(new TrackingEpoch());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("tracking_epoch");
-            writer.Write(TrackingEpochValue);
+            codec.Require("tracking_epoch", ref TrackingEpochValue, 0, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// Start or end an episode, EpisodeAction: start, success, failure, discard, rerecord, reset.
-    /// </summary>
+    /// <summary>Start or end an episode, EpisodeAction: start, success, failure, discard, rerecord, reset.</summary>
     public sealed class Episode : ClientMessage
     {
         public const string TagName = "episode";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Action = "";
         public string Label = "";
 
-        public static Episode Read(WireReader reader)
-        {
-            Episode value = new Episode();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "action": value.Action = reader.ReadString(64); seen |= 2u; break;
-                    case "label": value.Label = reader.ReadString(512); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Episode");
-            return value;
-        }
+        public static Episode Read(WireReader reader) => reader.ReadInto(new Episode());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("action");
-            writer.Write(Action);
-            writer.Write("label");
-            writer.Write(Label);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("action", ref Action, 64);
+            codec.Allow("label", ref Label, 512, "");
         }
     }
 
-    /// <summary>
-    /// Stop everything. Any participant may do so. Latched. Not a safety-rated stop.
-    /// </summary>
+    /// <summary>Stop everything.</summary>
     public sealed class EStop : ClientMessage
     {
         public const string TagName = "estop";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Reason = "";
 
-        public static EStop Read(WireReader reader)
-        {
-            EStop value = new EStop();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "reason": value.Reason = reader.ReadString(512); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static EStop Read(WireReader reader) => reader.ReadInto(new EStop());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("reason");
-            writer.Write(Reason);
+            codec.Allow("reason", ref Reason, 512, "");
         }
     }
 
-    /// <summary>
-    /// End the e-stop. Directors only. stop_seq: the newest stop that the sender has seen (EStopChanged); denied
-    /// when there is a newer one.
-    /// </summary>
+    /// <summary>End the e-stop.</summary>
     public sealed class ClearEStop : ClientMessage
     {
         public const string TagName = "clear_estop";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public long StopSeq = 0;
+        public override string Tag => TagName;
+        public long RequestId;
+        public long StopSeq;
 
-        public static ClearEStop Read(WireReader reader)
-        {
-            ClearEStop value = new ClearEStop();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "stop_seq": value.StopSeq = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of ClearEStop");
-            return value;
-        }
+        public static ClearEStop Read(WireReader reader) => reader.ReadInto(new ClearEStop());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(3);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("stop_seq");
-            writer.Write(StopSeq);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Allow("stop_seq", ref StopSeq, 0, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// Control the session, ControlAction: pause, resume, step (ticks physics ticks while paused), reset. Directors
-    /// only. When physics has diverged, both reset and resume begin anew from the initial state.
-    /// </summary>
+    /// <summary>Control the session, ControlAction: pause, resume, step (ticks physics ticks while ...</summary>
     public sealed class Control : ClientMessage
     {
         public const string TagName = "control";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Action = "";
         public long Ticks = 1;
 
-        public static Control Read(WireReader reader)
-        {
-            Control value = new Control();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "action": value.Action = reader.ReadString(64); seen |= 2u; break;
-                    case "ticks": value.Ticks = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Control");
-            return value;
-        }
+        public static Control Read(WireReader reader) => reader.ReadInto(new Control());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("action");
-            writer.Write(Action);
-            writer.Write("ticks");
-            writer.Write(Ticks);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("action", ref Action, 64);
+            codec.Allow("ticks", ref Ticks, 0, long.MaxValue, 1);
         }
     }
 
-    /// <summary>
-    /// Put a note into the recording, at the session time of its receipt.
-    /// </summary>
+    /// <summary>Put a note into the recording, at the session time of its receipt.</summary>
     public sealed class Marker : ClientMessage
     {
         public const string TagName = "marker";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Text = "";
 
-        public static Marker Read(WireReader reader)
-        {
-            Marker value = new Marker();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "text": value.Text = reader.ReadString(512); seen |= 2u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Marker");
-            return value;
-        }
+        public static Marker Read(WireReader reader) => reader.ReadInto(new Marker());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(3);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("text");
-            writer.Write(Text);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("text", ref Text, 512);
         }
     }
 
-    /// <summary>
-    /// Request to put the key of this connection on the allow-list: the only message allowed from an unknown key.
-    ///
-    /// proof: shows that the sender knows a join code, without revealing it (protocol.pairing). name: under which the
-    /// key is listed. identity: behind a gateway, the 32 bytes of the web identity that is to be listed.
-    /// </summary>
+    /// <summary>Request to put the key of this connection on the allow-list: the only message allowed ...</summary>
     public sealed class Pair : ClientMessage
     {
         public const string TagName = "pair";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Name = "";
-        public byte[] Proof = new byte[0];
+        public byte[] Proof = Array.Empty<byte>();
         public string Software = "";
-        public byte[] Identity = new byte[0];
+        public byte[] Identity = Array.Empty<byte>();
 
-        public static Pair Read(WireReader reader)
-        {
-            Pair value = new Pair();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(64); seen |= 1u; break;
-                    case "proof": value.Proof = reader.ReadBytes(64); seen |= 2u; break;
-                    case "software": value.Software = reader.ReadString(64); break;
-                    case "identity": value.Identity = reader.ReadBytes(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Pair");
-            return value;
-        }
+        public static Pair Read(WireReader reader) => reader.ReadInto(new Pair());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("proof");
-            writer.Write(Proof);
-            writer.Write("software");
-            writer.Write(Software);
-            writer.Write("identity");
-            writer.Write(Identity);
+            codec.Require("name", ref Name, 64);
+            codec.Require("proof", ref Proof, 64);
+            codec.Allow("software", ref Software, 64, "");
+            codec.Allow("identity", ref Identity, 64);
         }
     }
 
-    /// <summary>
-    /// End the participation of a participant. Directors only. revoke: its key is taken off the allow-list too.
-    /// </summary>
+    /// <summary>End the participation of a participant.</summary>
     public sealed class RemoveParticipant : ClientMessage
     {
         public const string TagName = "remove_participant";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Participant = "";
-        public bool Revoke = false;
+        public bool Revoke;
         public string Reason = "";
 
-        public static RemoveParticipant Read(WireReader reader)
-        {
-            RemoveParticipant value = new RemoveParticipant();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
-                    case "revoke": value.Revoke = reader.ReadBool(); break;
-                    case "reason": value.Reason = reader.ReadString(512); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of RemoveParticipant");
-            return value;
-        }
+        public static RemoveParticipant Read(WireReader reader) => reader.ReadInto(new RemoveParticipant());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("revoke");
-            writer.Write(Revoke);
-            writer.Write("reason");
-            writer.Write(Reason);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("participant", ref Participant, 64);
+            codec.Allow("revoke", ref Revoke, false);
+            codec.Allow("reason", ref Reason, 512, "");
         }
     }
 
-    /// <summary>
-    /// Give a participant another name. Directors only. A name that another participant has gets a number.
-    /// </summary>
+    /// <summary>Give a participant another name.</summary>
     public sealed class Rename : ClientMessage
     {
         public const string TagName = "rename";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Participant = "";
         public string Name = "";
 
-        public static Rename Read(WireReader reader)
-        {
-            Rename value = new Rename();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
-                    case "name": value.Name = reader.ReadString(64); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of Rename");
-            return value;
-        }
+        public static Rename Read(WireReader reader) => reader.ReadInto(new Rename());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("name");
-            writer.Write(Name);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("name", ref Name, 64);
         }
     }
 
-    /// <summary>
-    /// Give a participant another role, one that its key may join in. Directors only.
-    ///
-    /// It keeps what it holds when it may drive in both roles as a person, or in both as an agent.
-    /// </summary>
+    /// <summary>Give a participant another role, one that its key may join in.</summary>
     public sealed class SetRole : ClientMessage
     {
         public const string TagName = "set_role";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
+        public override string Tag => TagName;
+        public long RequestId;
         public string Participant = "";
         public string Role = "";
 
-        public static SetRole Read(WireReader reader)
-        {
-            SetRole value = new SetRole();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
-                    case "role": value.Role = reader.ReadString(64); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of SetRole");
-            return value;
-        }
+        public static SetRole Read(WireReader reader) => reader.ReadInto(new SetRole());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("role");
-            writer.Write(Role);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("role", ref Role, 64);
         }
     }
 
-    /// <summary>
-    /// Request for a StatusReport.
-    /// </summary>
-    public sealed class GetStatus : ClientMessage
-    {
-        public const string TagName = "get_status";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-
-        public static GetStatus Read(WireReader reader)
-        {
-            GetStatus value = new GetStatus();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(2);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-        }
-    }
-
-    /// <summary>
-    /// Delivery of state to the application of a client, once a second: for status, doctor and delivery budgets.
-    ///
-    /// Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
-    /// missed: frames that were sent (by state_seq) and not delivered. rtt_ms: lowest recent round trip.
-    /// media_bytes_per_s, media_age_ms (median since capture): of the media channel. display_hz: frames drawn, 0 when
-    /// none are. media_limit_mbit_per_s: upper bound of media that the client asks for, 0 for no limit of its own.
-    /// </summary>
+    /// <summary>Delivery of state to the application of a client, once a second: for status, doctor and ...</summary>
     public sealed class ClientReport : ClientMessage
     {
         public const string TagName = "client_report";
-        public override string Tag { get { return TagName; } }
-        public double AgeMsP50 = 0.0;
-        public double AgeMsP99 = 0.0;
-        public long Delivered = 0;
-        public long Missed = 0;
-        public double RttMs = 0.0;
-        public double BytesPerS = 0.0;
-        public double MediaBytesPerS = 0.0;
-        public double MediaAgeMs = 0.0;
-        public double DisplayHz = 0.0;
-        public double MediaLimitMbitPerS = 0.0;
+        public override string Tag => TagName;
+        public double AgeMsP50;
+        public double AgeMsP99;
+        public long Delivered;
+        public long Missed;
+        public double RttMs;
+        public double BytesPerS;
+        public double MediaBytesPerS;
+        public double MediaAgeMs;
+        public double DisplayHz;
+        public double MediaLimitMbitPerS;
 
-        public static ClientReport Read(WireReader reader)
-        {
-            ClientReport value = new ClientReport();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "age_ms_p50": value.AgeMsP50 = reader.ReadDouble(); seen |= 1u; break;
-                    case "age_ms_p99": value.AgeMsP99 = reader.ReadDouble(); seen |= 2u; break;
-                    case "delivered": value.Delivered = reader.ReadLong(0, long.MaxValue); seen |= 4u; break;
-                    case "missed": value.Missed = reader.ReadLong(0, long.MaxValue); break;
-                    case "rtt_ms": value.RttMs = reader.ReadDouble(); break;
-                    case "bytes_per_s": value.BytesPerS = reader.ReadDouble(); break;
-                    case "media_bytes_per_s": value.MediaBytesPerS = reader.ReadDouble(); break;
-                    case "media_age_ms": value.MediaAgeMs = reader.ReadDouble(); break;
-                    case "display_hz": value.DisplayHz = reader.ReadDouble(); break;
-                    case "media_limit_mbit_per_s": value.MediaLimitMbitPerS = reader.ReadDouble(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of ClientReport");
-            return value;
-        }
+        public static ClientReport Read(WireReader reader) => reader.ReadInto(new ClientReport());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(11);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("age_ms_p50");
-            writer.Write(AgeMsP50);
-            writer.Write("age_ms_p99");
-            writer.Write(AgeMsP99);
-            writer.Write("delivered");
-            writer.Write(Delivered);
-            writer.Write("missed");
-            writer.Write(Missed);
-            writer.Write("rtt_ms");
-            writer.Write(RttMs);
-            writer.Write("bytes_per_s");
-            writer.Write(BytesPerS);
-            writer.Write("media_bytes_per_s");
-            writer.Write(MediaBytesPerS);
-            writer.Write("media_age_ms");
-            writer.Write(MediaAgeMs);
-            writer.Write("display_hz");
-            writer.Write(DisplayHz);
-            writer.Write("media_limit_mbit_per_s");
-            writer.Write(MediaLimitMbitPerS);
+            codec.Require("age_ms_p50", ref AgeMsP50);
+            codec.Require("age_ms_p99", ref AgeMsP99);
+            codec.Require("delivered", ref Delivered, 0, long.MaxValue);
+            codec.Allow("missed", ref Missed, 0, long.MaxValue, 0);
+            codec.Allow("rtt_ms", ref RttMs, 0.0);
+            codec.Allow("bytes_per_s", ref BytesPerS, 0.0);
+            codec.Allow("media_bytes_per_s", ref MediaBytesPerS, 0.0);
+            codec.Allow("media_age_ms", ref MediaAgeMs, 0.0);
+            codec.Allow("display_hz", ref DisplayHz, 0.0);
+            codec.Allow("media_limit_mbit_per_s", ref MediaLimitMbitPerS, 0.0);
         }
     }
 
-    /// <summary>
-    /// Answer to an accepted hello. resume_token is bound to the key and may be used once.
-    ///
-    /// tick_period_ns: of the present scene; another scene may have another (SceneChanged).
-    /// </summary>
+    /// <summary>Answer to an accepted hello.</summary>
     public sealed class Welcome : ServerMessage
     {
         public const string TagName = "welcome";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string SessionId = "";
         public string SessionName = "";
         public string Kind = "";
         public string ParticipantId = "";
-        public long ConnectionEpoch = 0;
+        public long ConnectionEpoch;
         public string Role = "";
-        public byte[] ResumeToken = new byte[0];
-        public bool Resumed = false;
-        public long SessionTime = 0;
-        public long HeartbeatNs = 0;
-        public long TickPeriodNs = 0;
-        public long StatePeriodNs = 0;
+        public byte[] ResumeToken = Array.Empty<byte>();
+        public bool Resumed;
+        public long SessionTime;
+        public long HeartbeatNs;
+        public long TickPeriodNs;
+        public long StatePeriodNs;
         public Endpoints Endpoints = new Endpoints();
         public string KeyFingerprint = "";
 
-        public static Welcome Read(WireReader reader)
-        {
-            Welcome value = new Welcome();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "session_id": value.SessionId = reader.ReadString(64); seen |= 1u; break;
-                    case "session_name": value.SessionName = reader.ReadString(64); seen |= 2u; break;
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 4u; break;
-                    case "participant_id": value.ParticipantId = reader.ReadString(64); seen |= 8u; break;
-                    case "connection_epoch": value.ConnectionEpoch = reader.ReadLong(0, long.MaxValue); seen |= 16u; break;
-                    case "role": value.Role = reader.ReadString(64); seen |= 32u; break;
-                    case "resume_token": value.ResumeToken = reader.ReadBytes(0); seen |= 64u; break;
-                    case "resumed": value.Resumed = reader.ReadBool(); seen |= 128u; break;
-                    case "session_time": value.SessionTime = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 256u; break;
-                    case "heartbeat_ns": value.HeartbeatNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 512u; break;
-                    case "tick_period_ns": value.TickPeriodNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 1024u; break;
-                    case "state_period_ns": value.StatePeriodNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 2048u; break;
-                    case "endpoints": value.Endpoints = Endpoints.Read(reader); seen |= 4096u; break;
-                    case "key_fingerprint": value.KeyFingerprint = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 8191u) != 8191u) throw new WireException("missing field of Welcome");
-            return value;
-        }
+        public static Welcome Read(WireReader reader) => reader.ReadInto(new Welcome());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(15);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("session_id");
-            writer.Write(SessionId);
-            writer.Write("session_name");
-            writer.Write(SessionName);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("participant_id");
-            writer.Write(ParticipantId);
-            writer.Write("connection_epoch");
-            writer.Write(ConnectionEpoch);
-            writer.Write("role");
-            writer.Write(Role);
-            writer.Write("resume_token");
-            writer.Write(ResumeToken);
-            writer.Write("resumed");
-            writer.Write(Resumed);
-            writer.Write("session_time");
-            writer.Write(SessionTime);
-            writer.Write("heartbeat_ns");
-            writer.Write(HeartbeatNs);
-            writer.Write("tick_period_ns");
-            writer.Write(TickPeriodNs);
-            writer.Write("state_period_ns");
-            writer.Write(StatePeriodNs);
-            writer.Write("endpoints");
-            writer.Write(Endpoints);
-            writer.Write("key_fingerprint");
-            writer.Write(KeyFingerprint);
+            codec.Require("session_id", ref SessionId, 64);
+            codec.Require("session_name", ref SessionName, 64);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("participant_id", ref ParticipantId, 64);
+            codec.Require("connection_epoch", ref ConnectionEpoch, 0, long.MaxValue);
+            codec.Require("role", ref Role, 64);
+            codec.Require("resume_token", ref ResumeToken, 0);
+            codec.Require("resumed", ref Resumed);
+            codec.Require("session_time", ref SessionTime, long.MinValue, long.MaxValue);
+            codec.Require("heartbeat_ns", ref HeartbeatNs, long.MinValue, long.MaxValue);
+            codec.Require("tick_period_ns", ref TickPeriodNs, long.MinValue, long.MaxValue);
+            codec.Require("state_period_ns", ref StatePeriodNs, long.MinValue, long.MaxValue);
+            codec.Require("endpoints", ref Endpoints, Protocol.Endpoints.New);
+            codec.Allow("key_fingerprint", ref KeyFingerprint, 64, "");
         }
     }
 
-    /// <summary>
-    /// A hello that the front refused (RefusalCode), or that the authority denied (DenialReason).
-    /// </summary>
+    /// <summary>A hello that the front refused (RefusalCode), or that the authority denied (DenialReason).</summary>
     public sealed class Refused : ServerMessage
     {
         public const string TagName = "refused";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Code = "";
         public string Message = "";
         public string Advice = "";
-        public long[] SupportedVersions = new long[] { 1 };
+        static readonly long[] SupportedVersionsDefault = { 1 };
+        public long[] SupportedVersions = (long[])SupportedVersionsDefault.Clone();
 
-        public static Refused Read(WireReader reader)
-        {
-            Refused value = new Refused();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "code": value.Code = reader.ReadString(64); seen |= 1u; break;
-                    case "message": value.Message = reader.ReadString(512); seen |= 2u; break;
-                    case "advice": value.Advice = reader.ReadString(512); break;
-                    case "supported_versions": value.SupportedVersions = reader.ReadLongs(0, 0, long.MinValue, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Refused");
-            return value;
-        }
+        public static Refused Read(WireReader reader) => reader.ReadInto(new Refused());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("code");
-            writer.Write(Code);
-            writer.Write("message");
-            writer.Write(Message);
-            writer.Write("advice");
-            writer.Write(Advice);
-            writer.Write("supported_versions");
-            writer.Write(SupportedVersions);
+            codec.Require("code", ref Code, 64);
+            codec.Require("message", ref Message, 512);
+            codec.Allow("advice", ref Advice, 512, "");
+            codec.Allow("supported_versions", ref SupportedVersions, 0, 0, long.MinValue, long.MaxValue, SupportedVersionsDefault);
         }
     }
 
-    /// <summary>
-    /// A message that was rejected, or a change in the state of the session. code: FaultCode.
-    ///
-    /// reason: with dropped and revoked, why the session closed this connection: replaced (another connection
-    /// resumed this participant: joining again would take it back), removed, revoked, expired, ...
-    /// </summary>
+    /// <summary>A message that was rejected, or a change in the state of the session.</summary>
     public sealed class ProtocolFault : ServerMessage
     {
         public const string TagName = "protocol_fault";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Code = "";
         public string Message = "";
         public string Reason = "";
 
-        public static ProtocolFault Read(WireReader reader)
-        {
-            ProtocolFault value = new ProtocolFault();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "code": value.Code = reader.ReadString(64); seen |= 1u; break;
-                    case "message": value.Message = reader.ReadString(512); seen |= 2u; break;
-                    case "reason": value.Reason = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of ProtocolFault");
-            return value;
-        }
+        public static ProtocolFault Read(WireReader reader) => reader.ReadInto(new ProtocolFault());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("code");
-            writer.Write(Code);
-            writer.Write("message");
-            writer.Write(Message);
-            writer.Write("reason");
-            writer.Write(Reason);
+            codec.Require("code", ref Code, 64);
+            codec.Require("message", ref Message, 512);
+            codec.Allow("reason", ref Reason, 64, "");
         }
     }
 
-    /// <summary>
-    /// t0_ns echoed; t1_ns, t2_ns: session time of receipt and of sending.
-    /// </summary>
+    /// <summary>t0_ns echoed; t1_ns, t2_ns: session time of receipt and of sending.</summary>
     public sealed class ClockPong : ServerMessage
     {
         public const string TagName = "clock_pong";
-        public override string Tag { get { return TagName; } }
-        public long T0Ns = 0;
-        public long T1Ns = 0;
-        public long T2Ns = 0;
+        public override string Tag => TagName;
+        public long T0Ns;
+        public long T1Ns;
+        public long T2Ns;
 
-        public static ClockPong Read(WireReader reader)
-        {
-            ClockPong value = new ClockPong();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "t0_ns": value.T0Ns = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 1u; break;
-                    case "t1_ns": value.T1Ns = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 2u; break;
-                    case "t2_ns": value.T2Ns = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of ClockPong");
-            return value;
-        }
+        public static ClockPong Read(WireReader reader) => reader.ReadInto(new ClockPong());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("t0_ns");
-            writer.Write(T0Ns);
-            writer.Write("t1_ns");
-            writer.Write(T1Ns);
-            writer.Write("t2_ns");
-            writer.Write(T2Ns);
+            codec.Require("t0_ns", ref T0Ns, long.MinValue, long.MaxValue);
+            codec.Require("t1_ns", ref T1Ns, long.MinValue, long.MaxValue);
+            codec.Require("t2_ns", ref T2Ns, long.MinValue, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// Answer to a request: leases as they are now, or a denial (then nothing has changed).
-    /// </summary>
+    /// <summary>Answer to a request: leases as they are now, or a denial (then nothing has changed).</summary>
     public sealed class Reply : ServerMessage
     {
         public const string TagName = "reply";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public bool Ok = false;
-        public Denial Denial = null;
-        public Lease[] Leases = new Lease[0];
+        public override string Tag => TagName;
+        public long RequestId;
+        public bool Ok;
+        public Denial Denial;
+        public Lease[] Leases = Array.Empty<Lease>();
 
-        public static Reply Read(WireReader reader)
-        {
-            Reply value = new Reply();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "ok": value.Ok = reader.ReadBool(); seen |= 2u; break;
-                    case "denial": value.Denial = reader.TryReadNil() ? null : Denial.Read(reader); break;
-                    case "leases": value.Leases = reader.ReadArray(Protocol.Lease.Read, 0); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Reply");
-            return value;
-        }
+        public static Reply Read(WireReader reader) => reader.ReadInto(new Reply());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("ok");
-            writer.Write(Ok);
-            writer.Write("denial");
-            writer.Write(Denial);
-            writer.Write("leases");
-            writer.Write(Leases);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("ok", ref Ok);
+            codec.AllowNull("denial", ref Denial, Protocol.Denial.New);
+            codec.Allow("leases", ref Leases, 0, 0, Protocol.Lease.New);
         }
     }
 
-    /// <summary>
-    /// Feedback to the holder of a robot, for haptics and hints. Sent on change and at most at 20 Hz per robot.
-    ///
-    /// state: the command kind in force, hold_reason when it is hold. limits: joints or bounds that are active.
-    /// rejected: counts by RejectReason for this participant since it joined. contact_n: force on the gripper [N].
-    /// </summary>
+    /// <summary>Feedback to the holder of a robot, for haptics and hints.</summary>
     public sealed class Feedback : ServerMessage
     {
         public const string TagName = "feedback";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Robot = "";
         public string State = "";
         public string HoldReason = "";
-        public double ContactN = 0.0;
-        public string[] Limits = new string[0];
+        public double ContactN;
+        public string[] Limits = Array.Empty<string>();
         public Dictionary<string, long> Rejected = new Dictionary<string, long>();
 
-        public static Feedback Read(WireReader reader)
-        {
-            Feedback value = new Feedback();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "robot": value.Robot = reader.ReadString(64); seen |= 1u; break;
-                    case "state": value.State = reader.ReadString(64); seen |= 2u; break;
-                    case "hold_reason": value.HoldReason = reader.ReadString(64); break;
-                    case "contact_n": value.ContactN = reader.ReadDouble(); break;
-                    case "limits": value.Limits = reader.ReadStrings(0, 64); break;
-                    case "rejected": value.Rejected = reader.ReadCounts(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Feedback");
-            return value;
-        }
+        public static Feedback Read(WireReader reader) => reader.ReadInto(new Feedback());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(7);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("robot");
-            writer.Write(Robot);
-            writer.Write("state");
-            writer.Write(State);
-            writer.Write("hold_reason");
-            writer.Write(HoldReason);
-            writer.Write("contact_n");
-            writer.Write(ContactN);
-            writer.Write("limits");
-            writer.Write(Limits);
-            writer.Write("rejected");
-            writer.Write(Rejected);
+            codec.Require("robot", ref Robot, 64);
+            codec.Require("state", ref State, 64);
+            codec.Allow("hold_reason", ref HoldReason, 64, "");
+            codec.Allow("contact_n", ref ContactN, 0.0);
+            codec.Allow("limits", ref Limits, 0, 0, 64);
+            codec.Allow("rejected", ref Rejected);
         }
     }
 
-    /// <summary>
-    /// One entry of the shared history. A gap in event_seq: request a new snapshot.
-    /// </summary>
+    /// <summary>One entry of the shared history.</summary>
     public sealed class Event : ServerMessage
     {
         public const string TagName = "event";
-        public override string Tag { get { return TagName; } }
-        public long EventSeq = 0;
-        public long Step = 0;
-        public long SessionTime = 0;
-        public EventKind Body = null;
+        public override string Tag => TagName;
+        public long EventSeq;
+        public long Step;
+        public long SessionTime;
+        public EventKind Body;
 
-        public static Event Read(WireReader reader)
-        {
-            Event value = new Event();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "event_seq": value.EventSeq = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "step": value.Step = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "session_time": value.SessionTime = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 4u; break;
-                    case "body": value.Body = EventKind.ReadAny(reader); seen |= 8u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of Event");
-            return value;
-        }
+        public static Event Read(WireReader reader) => reader.ReadInto(new Event());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("event_seq");
-            writer.Write(EventSeq);
-            writer.Write("step");
-            writer.Write(Step);
-            writer.Write("session_time");
-            writer.Write(SessionTime);
-            writer.Write("body");
-            writer.Write(Body);
+            codec.Require("event_seq", ref EventSeq, 0, long.MaxValue);
+            codec.Require("step", ref Step, 0, long.MaxValue);
+            codec.Require("session_time", ref SessionTime, long.MinValue, long.MaxValue);
+            codec.Require("body", ref Body, Protocol.EventKind.Union);
         }
     }
 
-    /// <summary>
-    /// Everything a late joiner needs; events with event_seq at or below its own are to be discarded.
-    ///
-    /// In the step of a reset tick and sim_time are still those before it. tick_period_ns: of this scene; 0: that of
-    /// Welcome. stop_seq: of the newest stop (EStopChanged). consent_timeout_ns: time that a holder has to answer
-    /// ConsentRequested. anchors: as they are after its events. Bulk frame 1 (added by the front): float64 (n_bodies,
-    /// 7) world poses x y z qw qx qy qz of bodies at state_seq.
-    /// </summary>
+    /// <summary>Everything a late joiner needs; events with event_seq at or below its own are to be ...</summary>
     public sealed class Snapshot : ServerMessage
     {
         public const string TagName = "snapshot";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public long EventSeq = 0;
-        public long SceneEpoch = 0;
-        public long SceneRevision = 0;
+        public override string Tag => TagName;
+        public long RequestId;
+        public long EventSeq;
+        public long SceneEpoch;
+        public long SceneRevision;
         public string SceneHash = "";
-        public long Tick = 0;
-        public double SimTime = 0.0;
-        public long SessionTime = 0;
-        public ParticipantInfo[] Participants = new ParticipantInfo[0];
-        public Lease[] Leases = new Lease[0];
-        public RobotInfo[] Robots = new RobotInfo[0];
-        public BodyInfo[] Bodies = new BodyInfo[0];
-        public bool Paused = false;
-        public bool Estop = false;
-        public EpisodeChanged Episode = null;
-        public long StateSeq = 0;
-        public long TickPeriodNs = 0;
-        public long StopSeq = 0;
-        public long ConsentTimeoutNs = 0;
-        public AnchorInfo[] Anchors = new AnchorInfo[0];
+        public long Tick;
+        public double SimTime;
+        public long SessionTime;
+        public ParticipantInfo[] Participants = Array.Empty<ParticipantInfo>();
+        public Lease[] Leases = Array.Empty<Lease>();
+        public RobotInfo[] Robots = Array.Empty<RobotInfo>();
+        public BodyInfo[] Bodies = Array.Empty<BodyInfo>();
+        public bool Paused;
+        public bool Estop;
+        public EpisodeChanged Episode;
+        public long StateSeq;
+        public long TickPeriodNs;
+        public long StopSeq;
+        public long ConsentTimeoutNs;
+        public AnchorInfo[] Anchors = Array.Empty<AnchorInfo>();
 
-        public static Snapshot Read(WireReader reader)
-        {
-            Snapshot value = new Snapshot();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "event_seq": value.EventSeq = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "scene_epoch": value.SceneEpoch = reader.ReadLong(0, long.MaxValue); seen |= 4u; break;
-                    case "scene_revision": value.SceneRevision = reader.ReadLong(0, long.MaxValue); seen |= 8u; break;
-                    case "scene_hash": value.SceneHash = reader.ReadString(64); seen |= 16u; break;
-                    case "tick": value.Tick = reader.ReadLong(0, long.MaxValue); seen |= 32u; break;
-                    case "sim_time": value.SimTime = reader.ReadDouble(); seen |= 64u; break;
-                    case "session_time": value.SessionTime = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 128u; break;
-                    case "participants": value.Participants = reader.ReadArray(Protocol.ParticipantInfo.Read, 0); seen |= 256u; break;
-                    case "leases": value.Leases = reader.ReadArray(Protocol.Lease.Read, 0); seen |= 512u; break;
-                    case "robots": value.Robots = reader.ReadArray(Protocol.RobotInfo.Read, 0); break;
-                    case "bodies": value.Bodies = reader.ReadArray(Protocol.BodyInfo.Read, 0); break;
-                    case "paused": value.Paused = reader.ReadBool(); break;
-                    case "estop": value.Estop = reader.ReadBool(); break;
-                    case "episode": value.Episode = reader.TryReadNil() ? null : EpisodeChanged.Read(reader); break;
-                    case "state_seq": value.StateSeq = reader.ReadLong(0, long.MaxValue); break;
-                    case "tick_period_ns": value.TickPeriodNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    case "stop_seq": value.StopSeq = reader.ReadLong(0, long.MaxValue); break;
-                    case "consent_timeout_ns": value.ConsentTimeoutNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    case "anchors": value.Anchors = reader.ReadArray(Protocol.AnchorInfo.Read, 0); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1023u) != 1023u) throw new WireException("missing field of Snapshot");
-            return value;
-        }
+        public static Snapshot Read(WireReader reader) => reader.ReadInto(new Snapshot());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(21);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("event_seq");
-            writer.Write(EventSeq);
-            writer.Write("scene_epoch");
-            writer.Write(SceneEpoch);
-            writer.Write("scene_revision");
-            writer.Write(SceneRevision);
-            writer.Write("scene_hash");
-            writer.Write(SceneHash);
-            writer.Write("tick");
-            writer.Write(Tick);
-            writer.Write("sim_time");
-            writer.Write(SimTime);
-            writer.Write("session_time");
-            writer.Write(SessionTime);
-            writer.Write("participants");
-            writer.Write(Participants);
-            writer.Write("leases");
-            writer.Write(Leases);
-            writer.Write("robots");
-            writer.Write(Robots);
-            writer.Write("bodies");
-            writer.Write(Bodies);
-            writer.Write("paused");
-            writer.Write(Paused);
-            writer.Write("estop");
-            writer.Write(Estop);
-            writer.Write("episode");
-            writer.Write(Episode);
-            writer.Write("state_seq");
-            writer.Write(StateSeq);
-            writer.Write("tick_period_ns");
-            writer.Write(TickPeriodNs);
-            writer.Write("stop_seq");
-            writer.Write(StopSeq);
-            writer.Write("consent_timeout_ns");
-            writer.Write(ConsentTimeoutNs);
-            writer.Write("anchors");
-            writer.Write(Anchors);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("event_seq", ref EventSeq, 0, long.MaxValue);
+            codec.Require("scene_epoch", ref SceneEpoch, 0, long.MaxValue);
+            codec.Require("scene_revision", ref SceneRevision, 0, long.MaxValue);
+            codec.Require("scene_hash", ref SceneHash, 64);
+            codec.Require("tick", ref Tick, 0, long.MaxValue);
+            codec.Require("sim_time", ref SimTime);
+            codec.Require("session_time", ref SessionTime, long.MinValue, long.MaxValue);
+            codec.Require("participants", ref Participants, 0, 0, Protocol.ParticipantInfo.New);
+            codec.Require("leases", ref Leases, 0, 0, Protocol.Lease.New);
+            codec.Allow("robots", ref Robots, 0, 0, Protocol.RobotInfo.New);
+            codec.Allow("bodies", ref Bodies, 0, 0, Protocol.BodyInfo.New);
+            codec.Allow("paused", ref Paused, false);
+            codec.Allow("estop", ref Estop, false);
+            codec.AllowNull("episode", ref Episode, Protocol.EpisodeChanged.New);
+            codec.Allow("state_seq", ref StateSeq, 0, long.MaxValue, 0);
+            codec.Allow("tick_period_ns", ref TickPeriodNs, long.MinValue, long.MaxValue, 0);
+            codec.Allow("stop_seq", ref StopSeq, 0, long.MaxValue, 0);
+            codec.Allow("consent_timeout_ns", ref ConsentTimeoutNs, long.MinValue, long.MaxValue, 0);
+            codec.Allow("anchors", ref Anchors, 0, 0, Protocol.AnchorInfo.New);
         }
     }
 
-    /// <summary>
-    /// The key is on the allow-list. Connect anew to send hello: this connection stays that of an unknown key.
-    ///
-    /// proof: shows that the session knows the join code too, so it is the one that issued it. roles: those that this
-    /// key may join as; empty: any role.
-    /// </summary>
+    /// <summary>The key is on the allow-list.</summary>
     public sealed class Paired : ServerMessage
     {
         public const string TagName = "paired";
-        public override string Tag { get { return TagName; } }
-        public byte[] Proof = new byte[0];
-        public string[] Roles = new string[0];
+        public override string Tag => TagName;
+        public byte[] Proof = Array.Empty<byte>();
+        public string[] Roles = Array.Empty<string>();
 
-        public static Paired Read(WireReader reader)
-        {
-            Paired value = new Paired();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "proof": value.Proof = reader.ReadBytes(64); seen |= 1u; break;
-                    case "roles": value.Roles = reader.ReadStrings(32, 64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of Paired");
-            return value;
-        }
+        public static Paired Read(WireReader reader) => reader.ReadInto(new Paired());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(3);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("proof");
-            writer.Write(Proof);
-            writer.Write("roles");
-            writer.Write(Roles);
+            codec.Require("proof", ref Proof, 64);
+            codec.Allow("roles", ref Roles, 0, 32, 64);
         }
     }
 
-    /// <summary>
-    /// Answer to GetStatus. Shares are of the last ten seconds unless their name has total.
-    ///
-    /// late_causes: late ticks by the part that took the time (LateCause), and skipped for those left out after a
-    /// long gap. lateness: of ticks, after their deadline. step_to_publish: end of tick to the state socket, of the
-    /// last five seconds; null below 25 states in them. drops: by reason, all messages dropped anywhere. restarts: of
-    /// front and recorder. authority_silent_ns: since the authority's last message to the front; its part (ticks, roster,
-    /// robots, recorder) is as old. -1: it has sent none yet. cpu_share: of one processor, by the authority's process;
-    /// load: of the machine, over a minute. stops: the e-stops in force, newest first, the newest of each participant.
-    /// pause_reason: why physics stands still until a reset, empty otherwise. unverified: pairs of headsets.
-    /// </summary>
-    public sealed class StatusReport : ServerMessage
-    {
-        public const string TagName = "status_report";
-        public override string Tag { get { return TagName; } }
-        public long RequestId = 0;
-        public string SessionId = "";
-        public string SessionName = "";
-        public long SessionTime = 0;
-        public long Tick = 0;
-        public long TickPeriodNs = 0;
-        public bool Paused = false;
-        public bool Estop = false;
-        public bool Stalled = false;
-        public string Scheduling = "";
-        public double LateShare = 0.0;
-        public double LateShareTotal = 0.0;
-        public Quantiles Lateness = null;
-        public Dictionary<string, long> LateCauses = new Dictionary<string, long>();
-        public Quantiles StepToPublish = null;
-        public double CpuShare = 0.0;
-        public double Load = 0.0;
-        public long Cpus = 0;
-        public long MemoryBytes = 0;
-        public ParticipantReport[] Participants = new ParticipantReport[0];
-        public RobotReport[] Robots = new RobotReport[0];
-        public RecorderReport Recorder = null;
-        public Dictionary<string, long> Drops = new Dictionary<string, long>();
-        public Dictionary<string, long> Restarts = new Dictionary<string, long>();
-        public long Connections = 0;
-        public double EntriesPerS = 0.0;
-        public string[] Warnings = new string[0];
-        public long AuthoritySilentNs = -1;
-        public MediaStreamReport[] Media = new MediaStreamReport[0];
-        public AnchorReport[] Anchors = new AnchorReport[0];
-        public CrossCheckReport[] CrossChecks = new CrossCheckReport[0];
-        public AssetsReport Assets = null;
-        public StopReport[] Stops = new StopReport[0];
-        public string PauseReason = "";
-        public UnverifiedReport[] Unverified = new UnverifiedReport[0];
-
-        public static StatusReport Read(WireReader reader)
-        {
-            StatusReport value = new StatusReport();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "request_id": value.RequestId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "session_id": value.SessionId = reader.ReadString(64); seen |= 2u; break;
-                    case "session_name": value.SessionName = reader.ReadString(64); seen |= 4u; break;
-                    case "session_time": value.SessionTime = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 8u; break;
-                    case "tick": value.Tick = reader.ReadLong(0, long.MaxValue); break;
-                    case "tick_period_ns": value.TickPeriodNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    case "paused": value.Paused = reader.ReadBool(); break;
-                    case "estop": value.Estop = reader.ReadBool(); break;
-                    case "stalled": value.Stalled = reader.ReadBool(); break;
-                    case "scheduling": value.Scheduling = reader.ReadString(64); break;
-                    case "late_share": value.LateShare = reader.ReadDouble(); break;
-                    case "late_share_total": value.LateShareTotal = reader.ReadDouble(); break;
-                    case "lateness": value.Lateness = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
-                    case "late_causes": value.LateCauses = reader.ReadCounts(); break;
-                    case "step_to_publish": value.StepToPublish = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
-                    case "cpu_share": value.CpuShare = reader.ReadDouble(); break;
-                    case "load": value.Load = reader.ReadDouble(); break;
-                    case "cpus": value.Cpus = reader.ReadLong(0, long.MaxValue); break;
-                    case "memory_bytes": value.MemoryBytes = reader.ReadLong(0, long.MaxValue); break;
-                    case "participants": value.Participants = reader.ReadArray(Protocol.ParticipantReport.Read, 0); break;
-                    case "robots": value.Robots = reader.ReadArray(Protocol.RobotReport.Read, 0); break;
-                    case "recorder": value.Recorder = reader.TryReadNil() ? null : RecorderReport.Read(reader); break;
-                    case "drops": value.Drops = reader.ReadCounts(); break;
-                    case "restarts": value.Restarts = reader.ReadCounts(); break;
-                    case "connections": value.Connections = reader.ReadLong(0, long.MaxValue); break;
-                    case "entries_per_s": value.EntriesPerS = reader.ReadDouble(); break;
-                    case "warnings": value.Warnings = reader.ReadStrings(0, 512); break;
-                    case "authority_silent_ns": value.AuthoritySilentNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    case "media": value.Media = reader.ReadArray(Protocol.MediaStreamReport.Read, 0); break;
-                    case "anchors": value.Anchors = reader.ReadArray(Protocol.AnchorReport.Read, 0); break;
-                    case "cross_checks": value.CrossChecks = reader.ReadArray(Protocol.CrossCheckReport.Read, 0); break;
-                    case "assets": value.Assets = reader.TryReadNil() ? null : AssetsReport.Read(reader); break;
-                    case "stops": value.Stops = reader.ReadArray(Protocol.StopReport.Read, 0); break;
-                    case "pause_reason": value.PauseReason = reader.ReadString(512); break;
-                    case "unverified": value.Unverified = reader.ReadArray(Protocol.UnverifiedReport.Read, 0); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of StatusReport");
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteMapHeader(36);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("request_id");
-            writer.Write(RequestId);
-            writer.Write("session_id");
-            writer.Write(SessionId);
-            writer.Write("session_name");
-            writer.Write(SessionName);
-            writer.Write("session_time");
-            writer.Write(SessionTime);
-            writer.Write("tick");
-            writer.Write(Tick);
-            writer.Write("tick_period_ns");
-            writer.Write(TickPeriodNs);
-            writer.Write("paused");
-            writer.Write(Paused);
-            writer.Write("estop");
-            writer.Write(Estop);
-            writer.Write("stalled");
-            writer.Write(Stalled);
-            writer.Write("scheduling");
-            writer.Write(Scheduling);
-            writer.Write("late_share");
-            writer.Write(LateShare);
-            writer.Write("late_share_total");
-            writer.Write(LateShareTotal);
-            writer.Write("lateness");
-            writer.Write(Lateness);
-            writer.Write("late_causes");
-            writer.Write(LateCauses);
-            writer.Write("step_to_publish");
-            writer.Write(StepToPublish);
-            writer.Write("cpu_share");
-            writer.Write(CpuShare);
-            writer.Write("load");
-            writer.Write(Load);
-            writer.Write("cpus");
-            writer.Write(Cpus);
-            writer.Write("memory_bytes");
-            writer.Write(MemoryBytes);
-            writer.Write("participants");
-            writer.Write(Participants);
-            writer.Write("robots");
-            writer.Write(Robots);
-            writer.Write("recorder");
-            writer.Write(Recorder);
-            writer.Write("drops");
-            writer.Write(Drops);
-            writer.Write("restarts");
-            writer.Write(Restarts);
-            writer.Write("connections");
-            writer.Write(Connections);
-            writer.Write("entries_per_s");
-            writer.Write(EntriesPerS);
-            writer.Write("warnings");
-            writer.Write(Warnings);
-            writer.Write("authority_silent_ns");
-            writer.Write(AuthoritySilentNs);
-            writer.Write("media");
-            writer.Write(Media);
-            writer.Write("anchors");
-            writer.Write(Anchors);
-            writer.Write("cross_checks");
-            writer.Write(CrossChecks);
-            writer.Write("assets");
-            writer.Write(Assets);
-            writer.Write("stops");
-            writer.Write(Stops);
-            writer.Write("pause_reason");
-            writer.Write(PauseReason);
-            writer.Write("unverified");
-            writer.Write(Unverified);
-        }
-    }
-
-    /// <summary>
-    /// Media that this client gets from now on. Sent after Welcome, and whenever it changes.
-    ///
-    /// budget_class: the lowest class among the streams that it subscribed to. State and control are never cut.
-    /// mbit_per_s: bound of all media together, 0 for none. reason: why it is not everything. streams: every stream
-    /// of the session.
-    /// </summary>
+    /// <summary>Media that this client gets from now on.</summary>
     public sealed class DeliveryBudget : ServerMessage
     {
         public const string TagName = "delivery_budget";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string BudgetClass = "";
-        public double MbitPerS = 0.0;
+        public double MbitPerS;
         public string Reason = "";
-        public StreamBudget[] Streams = new StreamBudget[0];
+        public StreamBudget[] Streams = Array.Empty<StreamBudget>();
 
-        public static DeliveryBudget Read(WireReader reader)
-        {
-            DeliveryBudget value = new DeliveryBudget();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "budget_class": value.BudgetClass = reader.ReadString(64); seen |= 1u; break;
-                    case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
-                    case "reason": value.Reason = reader.ReadString(512); break;
-                    case "streams": value.Streams = reader.ReadArray(Protocol.StreamBudget.Read, 0); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of DeliveryBudget");
-            return value;
-        }
+        public static DeliveryBudget Read(WireReader reader) => reader.ReadInto(new DeliveryBudget());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("type");
-            writer.Write(TagName);
-            writer.Write("budget_class");
-            writer.Write(BudgetClass);
-            writer.Write("mbit_per_s");
-            writer.Write(MbitPerS);
-            writer.Write("reason");
-            writer.Write(Reason);
-            writer.Write("streams");
-            writer.Write(Streams);
+            codec.Require("budget_class", ref BudgetClass, 64);
+            codec.Allow("mbit_per_s", ref MbitPerS, 0.0);
+            codec.Allow("reason", ref Reason, 512, "");
+            codec.Allow("streams", ref Streams, 0, 0, Protocol.StreamBudget.New);
         }
     }
 
-    /// <summary>
-    /// A participant joined, or resumed after a disconnect.
-    /// </summary>
+    /// <summary>A participant joined, or resumed after a disconnect.</summary>
     public sealed class ParticipantJoined : EventKind
     {
         public const string TagName = "participant_joined";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public ParticipantInfo Participant = new ParticipantInfo();
-        public bool Resumed = false;
+        public bool Resumed;
 
-        public static ParticipantJoined Read(WireReader reader)
-        {
-            ParticipantJoined value = new ParticipantJoined();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = ParticipantInfo.Read(reader); seen |= 1u; break;
-                    case "resumed": value.Resumed = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of ParticipantJoined");
-            return value;
-        }
+        public static ParticipantJoined Read(WireReader reader) => reader.ReadInto(new ParticipantJoined());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(3);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("resumed");
-            writer.Write(Resumed);
+            codec.Require("participant", ref Participant, Protocol.ParticipantInfo.New);
+            codec.Allow("resumed", ref Resumed, false);
         }
     }
 
-    /// <summary>
-    /// The row of a participant in the roster changed.
-    /// </summary>
+    /// <summary>The row of a participant in the roster changed.</summary>
     public sealed class ParticipantChanged : EventKind
     {
         public const string TagName = "participant_changed";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public ParticipantInfo Participant = new ParticipantInfo();
 
-        public static ParticipantChanged Read(WireReader reader)
-        {
-            ParticipantChanged value = new ParticipantChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = ParticipantInfo.Read(reader); seen |= 1u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of ParticipantChanged");
-            return value;
-        }
+        public static ParticipantChanged Read(WireReader reader) => reader.ReadInto(new ParticipantChanged());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("participant");
-            writer.Write(Participant);
+            codec.Require("participant", ref Participant, Protocol.ParticipantInfo.New);
         }
     }
 
-    /// <summary>
-    /// A participant left. grace true: it is disconnected, leases are kept until Lease.expires_ns.
-    /// </summary>
+    /// <summary>A participant left.</summary>
     public sealed class ParticipantLeft : EventKind
     {
         public const string TagName = "participant_left";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Participant = "";
         public string Reason = "";
-        public bool Grace = false;
+        public bool Grace;
 
-        public static ParticipantLeft Read(WireReader reader)
-        {
-            ParticipantLeft value = new ParticipantLeft();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
-                    case "reason": value.Reason = reader.ReadString(64); seen |= 2u; break;
-                    case "grace": value.Grace = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of ParticipantLeft");
-            return value;
-        }
+        public static ParticipantLeft Read(WireReader reader) => reader.ReadInto(new ParticipantLeft());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("reason");
-            writer.Write(Reason);
-            writer.Write("grace");
-            writer.Write(Grace);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("reason", ref Reason, 64);
+            codec.Allow("grace", ref Grace, false);
         }
     }
 
-    /// <summary>
-    /// cause: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue, role (a
-    /// director gave the holder another one), scene_changed (another scene was loaded that has no such robot or object).
-    /// </summary>
+    /// <summary>cause: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, ...</summary>
     public sealed class LeaseChanged : EventKind
     {
         public const string TagName = "lease_changed";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public Lease Lease = new Lease();
         public string Cause = "";
         public string PreviousHolder = "";
 
-        public static LeaseChanged Read(WireReader reader)
-        {
-            LeaseChanged value = new LeaseChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "lease": value.Lease = Lease.Read(reader); seen |= 1u; break;
-                    case "cause": value.Cause = reader.ReadString(64); seen |= 2u; break;
-                    case "previous_holder": value.PreviousHolder = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of LeaseChanged");
-            return value;
-        }
+        public static LeaseChanged Read(WireReader reader) => reader.ReadInto(new LeaseChanged());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("lease");
-            writer.Write(Lease);
-            writer.Write("cause");
-            writer.Write(Cause);
-            writer.Write("previous_holder");
-            writer.Write(PreviousHolder);
+            codec.Require("lease", ref Lease, Protocol.Lease.New);
+            codec.Require("cause", ref Cause, 64);
+            codec.Allow("previous_holder", ref PreviousHolder, 64, "");
         }
     }
 
-    /// <summary>
-    /// Several leases changed in one step for the same cause, as LeaseChanged for each, in this order.
-    ///
-    /// previous_holders has the length of leases.
-    /// </summary>
+    /// <summary>Several leases changed in one step for the same cause, as LeaseChanged for each, in this ...</summary>
     public sealed class LeasesChanged : EventKind
     {
         public const string TagName = "leases_changed";
-        public override string Tag { get { return TagName; } }
-        public Lease[] Leases = new Lease[0];
+        public override string Tag => TagName;
+        public Lease[] Leases = Array.Empty<Lease>();
         public string Cause = "";
-        public string[] PreviousHolders = new string[0];
+        public string[] PreviousHolders = Array.Empty<string>();
 
-        public static LeasesChanged Read(WireReader reader)
-        {
-            LeasesChanged value = new LeasesChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "leases": value.Leases = reader.ReadArray(Protocol.Lease.Read, 64); seen |= 1u; break;
-                    case "cause": value.Cause = reader.ReadString(64); seen |= 2u; break;
-                    case "previous_holders": value.PreviousHolders = reader.ReadStrings(64, 64); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of LeasesChanged");
-            return value;
-        }
+        public static LeasesChanged Read(WireReader reader) => reader.ReadInto(new LeasesChanged());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("leases");
-            writer.Write(Leases);
-            writer.Write("cause");
-            writer.Write(Cause);
-            writer.Write("previous_holders");
-            writer.Write(PreviousHolders);
+            codec.Require("leases", ref Leases, 0, 64, Protocol.Lease.New);
+            codec.Require("cause", ref Cause, 64);
+            codec.Require("previous_holders", ref PreviousHolders, 0, 64, 64);
         }
     }
 
-    /// <summary>
-    /// requester asks holder for a robot (mode request); answered by Consent with this consent_id.
-    /// </summary>
+    /// <summary>requester asks holder for a robot (mode request); answered by Consent with this consent_id.</summary>
     public sealed class ConsentRequested : EventKind
     {
         public const string TagName = "consent_requested";
-        public override string Tag { get { return TagName; } }
-        public long ConsentId = 0;
+        public override string Tag => TagName;
+        public long ConsentId;
         public string Target = "";
         public string Requester = "";
         public string Holder = "";
 
-        public static ConsentRequested Read(WireReader reader)
-        {
-            ConsentRequested value = new ConsentRequested();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "consent_id": value.ConsentId = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "target": value.Target = reader.ReadString(64); seen |= 2u; break;
-                    case "requester": value.Requester = reader.ReadString(64); seen |= 4u; break;
-                    case "holder": value.Holder = reader.ReadString(64); seen |= 8u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of ConsentRequested");
-            return value;
-        }
+        public static ConsentRequested Read(WireReader reader) => reader.ReadInto(new ConsentRequested());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("consent_id");
-            writer.Write(ConsentId);
-            writer.Write("target");
-            writer.Write(Target);
-            writer.Write("requester");
-            writer.Write(Requester);
-            writer.Write("holder");
-            writer.Write(Holder);
+            codec.Require("consent_id", ref ConsentId, 0, long.MaxValue);
+            codec.Require("target", ref Target, 64);
+            codec.Require("requester", ref Requester, 64);
+            codec.Require("holder", ref Holder, 64);
         }
     }
 
-    /// <summary>
-    /// Mode priority: a human overrides an agent (active), or the agent has the robot again.
-    /// </summary>
+    /// <summary>Mode priority: a human overrides an agent (active), or the agent has the robot again.</summary>
     public sealed class Intervention : EventKind
     {
         public const string TagName = "intervention";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Robot = "";
         public string Human = "";
         public string Agent = "";
-        public bool Active = false;
+        public bool Active;
 
-        public static Intervention Read(WireReader reader)
-        {
-            Intervention value = new Intervention();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "robot": value.Robot = reader.ReadString(64); seen |= 1u; break;
-                    case "human": value.Human = reader.ReadString(64); seen |= 2u; break;
-                    case "agent": value.Agent = reader.ReadString(64); seen |= 4u; break;
-                    case "active": value.Active = reader.ReadBool(); seen |= 8u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of Intervention");
-            return value;
-        }
+        public static Intervention Read(WireReader reader) => reader.ReadInto(new Intervention());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("robot");
-            writer.Write(Robot);
-            writer.Write("human");
-            writer.Write(Human);
-            writer.Write("agent");
-            writer.Write(Agent);
-            writer.Write("active");
-            writer.Write(Active);
+            codec.Require("robot", ref Robot, 64);
+            codec.Require("human", ref Human, 64);
+            codec.Require("agent", ref Agent, 64);
+            codec.Require("active", ref Active);
         }
     }
 
-    /// <summary>
-    /// A participant's clutch engaged a robot, or the engagement ended for reason (HoldReason).
-    /// </summary>
+    /// <summary>A participant's clutch engaged a robot, or the engagement ended for reason (HoldReason).</summary>
     public sealed class EngagementChanged : EventKind
     {
         public const string TagName = "engagement_changed";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Robot = "";
         public string Participant = "";
-        public bool Engaged = false;
+        public bool Engaged;
         public string Reason = "";
 
-        public static EngagementChanged Read(WireReader reader)
-        {
-            EngagementChanged value = new EngagementChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "robot": value.Robot = reader.ReadString(64); seen |= 1u; break;
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
-                    case "engaged": value.Engaged = reader.ReadBool(); seen |= 4u; break;
-                    case "reason": value.Reason = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of EngagementChanged");
-            return value;
-        }
+        public static EngagementChanged Read(WireReader reader) => reader.ReadInto(new EngagementChanged());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("robot");
-            writer.Write(Robot);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("engaged");
-            writer.Write(Engaged);
-            writer.Write("reason");
-            writer.Write(Reason);
+            codec.Require("robot", ref Robot, 64);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("engaged", ref Engaged);
+            codec.Allow("reason", ref Reason, 64, "");
         }
     }
 
-    /// <summary>
-    /// participant set the motion scaling of a robot for its holder. When a holder leaves, LeaseChanged has the
-    /// scale.
-    /// </summary>
+    /// <summary>participant set the motion scaling of a robot for its holder.</summary>
     public sealed class ScaleChanged : EventKind
     {
         public const string TagName = "scale_changed";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Robot = "";
-        public double Scale = 0.0;
+        public double Scale;
         public string Participant = "";
 
-        public static ScaleChanged Read(WireReader reader)
-        {
-            ScaleChanged value = new ScaleChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "robot": value.Robot = reader.ReadString(64); seen |= 1u; break;
-                    case "scale": value.Scale = reader.ReadDouble(); seen |= 2u; break;
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 4u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of ScaleChanged");
-            return value;
-        }
+        public static ScaleChanged Read(WireReader reader) => reader.ReadInto(new ScaleChanged());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("robot");
-            writer.Write(Robot);
-            writer.Write("scale");
-            writer.Write(Scale);
-            writer.Write("participant");
-            writer.Write(Participant);
+            codec.Require("robot", ref Robot, 64);
+            codec.Require("scale", ref Scale);
+            codec.Require("participant", ref Participant, 64);
         }
     }
 
-    /// <summary>
-    /// Another alignment of a participant is in force.
-    /// </summary>
+    /// <summary>Another alignment of a participant is in force.</summary>
     public sealed class AlignmentChanged : EventKind
     {
         public const string TagName = "alignment_changed";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Participant = "";
         public Alignment Alignment = new Alignment();
 
-        public static AlignmentChanged Read(WireReader reader)
-        {
-            AlignmentChanged value = new AlignmentChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
-                    case "alignment": value.Alignment = Alignment.Read(reader); seen |= 2u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of AlignmentChanged");
-            return value;
-        }
+        public static AlignmentChanged Read(WireReader reader) => reader.ReadInto(new AlignmentChanged());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(3);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("alignment");
-            writer.Write(Alignment);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("alignment", ref Alignment, Protocol.Alignment.New);
         }
     }
 
-    /// <summary>
-    /// The alignment run of a participant was started (running), or stopped. run counts the starts.
-    /// </summary>
+    /// <summary>The alignment run of a participant was started (running), or stopped.</summary>
     public sealed class AlignmentRun : EventKind
     {
         public const string TagName = "alignment_run";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Participant = "";
-        public bool Running = false;
-        public long Run = 0;
+        public bool Running;
+        public long Run;
         public string By = "";
 
-        public static AlignmentRun Read(WireReader reader)
-        {
-            AlignmentRun value = new AlignmentRun();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
-                    case "running": value.Running = reader.ReadBool(); seen |= 2u; break;
-                    case "run": value.Run = reader.ReadLong(0, long.MaxValue); seen |= 4u; break;
-                    case "by": value.By = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of AlignmentRun");
-            return value;
-        }
+        public static AlignmentRun Read(WireReader reader) => reader.ReadInto(new AlignmentRun());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("running");
-            writer.Write(Running);
-            writer.Write("run");
-            writer.Write(Run);
-            writer.Write("by");
-            writer.Write(By);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("running", ref Running);
+            codec.Require("run", ref Run, 0, long.MaxValue);
+            codec.Allow("by", ref By, 64, "");
         }
     }
 
-    /// <summary>
-    /// The alignment of a participant was found wrong by size_m (AlarmKind); a jump has voided it. beside:
-    /// anchors that stayed in place meanwhile: then the anchor was moved, not the headset. witnesses: other participants
-    /// whose headsets see the same shift of the anchor: then it was moved too.
-    /// </summary>
+    /// <summary>The alignment of a participant was found wrong by size_m (AlarmKind); a jump has voided it.</summary>
     public sealed class AlignmentAlarmed : EventKind
     {
         public const string TagName = "alignment_alarmed";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Participant = "";
         public string Kind = "";
         public string AnchorId = "";
-        public double SizeM = 0.0;
-        public string[] Beside = new string[0];
-        public string[] Witnesses = new string[0];
+        public double SizeM;
+        public string[] Beside = Array.Empty<string>();
+        public string[] Witnesses = Array.Empty<string>();
 
-        public static AlignmentAlarmed Read(WireReader reader)
-        {
-            AlignmentAlarmed value = new AlignmentAlarmed();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 2u; break;
-                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 4u; break;
-                    case "size_m": value.SizeM = reader.ReadDouble(); seen |= 8u; break;
-                    case "beside": value.Beside = reader.ReadStrings(32, 64); break;
-                    case "witnesses": value.Witnesses = reader.ReadStrings(32, 64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of AlignmentAlarmed");
-            return value;
-        }
+        public static AlignmentAlarmed Read(WireReader reader) => reader.ReadInto(new AlignmentAlarmed());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(7);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("anchor_id");
-            writer.Write(AnchorId);
-            writer.Write("size_m");
-            writer.Write(SizeM);
-            writer.Write("beside");
-            writer.Write(Beside);
-            writer.Write("witnesses");
-            writer.Write(Witnesses);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("anchor_id", ref AnchorId, 64);
+            codec.Require("size_m", ref SizeM);
+            codec.Allow("beside", ref Beside, 0, 32, 64);
+            codec.Allow("witnesses", ref Witnesses, 0, 32, 64);
         }
     }
 
-    /// <summary>
-    /// A director moved an anchor: alignments to it follow.
-    /// </summary>
+    /// <summary>A director moved an anchor: alignments to it follow.</summary>
     public sealed class AnchorMoved : EventKind
     {
         public const string TagName = "anchor_moved";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string AnchorId = "";
         public Pose T_world_anchor = new Pose();
         public string By = "";
 
-        public static AnchorMoved Read(WireReader reader)
-        {
-            AnchorMoved value = new AnchorMoved();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 1u; break;
-                    case "T_world_anchor": value.T_world_anchor = Pose.Read(reader); seen |= 2u; break;
-                    case "by": value.By = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of AnchorMoved");
-            return value;
-        }
+        public static AnchorMoved Read(WireReader reader) => reader.ReadInto(new AnchorMoved());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("anchor_id");
-            writer.Write(AnchorId);
-            writer.Write("T_world_anchor");
-            writer.Write(T_world_anchor);
-            writer.Write("by");
-            writer.Write(By);
+            codec.Require("anchor_id", ref AnchorId, 64);
+            codec.Require("T_world_anchor", ref T_world_anchor, Protocol.Pose.New);
+            codec.Allow("by", ref By, 64, "");
         }
     }
 
-    /// <summary>
-    /// Answer to an observation of kind tip: the tip of a controller of a participant, or why it is unknown
-    /// (refused, advice).
-    ///
-    /// p_grip_tip: position of the tip in the grip frame of device [m]. covariance: of it, 3x3 row-major [m^2].
-    /// error_m: its stated p95. residual_m: scatter of the poses about the hole. n_poses: those that were used.
-    /// </summary>
+    /// <summary>Answer to an observation of kind tip: the tip of a controller of a participant, or why it ...</summary>
     public sealed class TipCalibrated : EventKind
     {
         public const string TagName = "tip_calibrated";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Participant = "";
         public string Device = "";
-        public double[] PGripTip = new double[] { 0.0, 0.0, 0.0 };
-        public double[] Covariance = new double[0];
-        public double ErrorM = 0.0;
-        public double ResidualM = 0.0;
-        public long NPoses = 0;
-        public bool Refused = false;
+        public double[] PGripTip = new double[3];
+        public double[] Covariance = Array.Empty<double>();
+        public double ErrorM;
+        public double ResidualM;
+        public long NPoses;
+        public bool Refused;
         public string Advice = "";
 
-        public static TipCalibrated Read(WireReader reader)
-        {
-            TipCalibrated value = new TipCalibrated();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
-                    case "device": value.Device = reader.ReadString(64); seen |= 2u; break;
-                    case "p_grip_tip": value.PGripTip = reader.ReadDoubles(3, 0); break;
-                    case "covariance": value.Covariance = reader.ReadDoubles(0, 9); break;
-                    case "error_m": value.ErrorM = reader.ReadDouble(); break;
-                    case "residual_m": value.ResidualM = reader.ReadDouble(); break;
-                    case "n_poses": value.NPoses = reader.ReadLong(0, long.MaxValue); break;
-                    case "refused": value.Refused = reader.ReadBool(); break;
-                    case "advice": value.Advice = reader.ReadString(512); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of TipCalibrated");
-            return value;
-        }
+        public static TipCalibrated Read(WireReader reader) => reader.ReadInto(new TipCalibrated());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(10);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("device");
-            writer.Write(Device);
-            writer.Write("p_grip_tip");
-            writer.Write(PGripTip);
-            writer.Write("covariance");
-            writer.Write(Covariance);
-            writer.Write("error_m");
-            writer.Write(ErrorM);
-            writer.Write("residual_m");
-            writer.Write(ResidualM);
-            writer.Write("n_poses");
-            writer.Write(NPoses);
-            writer.Write("refused");
-            writer.Write(Refused);
-            writer.Write("advice");
-            writer.Write(Advice);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("device", ref Device, 64);
+            codec.Allow("p_grip_tip", ref PGripTip, 3, 3);
+            codec.Allow("covariance", ref Covariance, 0, 9);
+            codec.Allow("error_m", ref ErrorM, 0.0);
+            codec.Allow("residual_m", ref ResidualM, 0.0);
+            codec.Allow("n_poses", ref NPoses, 0, long.MaxValue, 0);
+            codec.Allow("refused", ref Refused, false);
+            codec.Allow("advice", ref Advice, 512, "");
         }
     }
 
-    /// <summary>
-    /// Cross-check: participants a and b observe one anchor (anchor_id, at p_world) error_m and error_rad
-    /// apart.
-    ///
-    /// expected_p95_m: 95 % of such pairs stay below it by their stated errors and the noise of these n observations.
-    /// touched: anchor_id is the name of a point that both have touched.
-    /// </summary>
+    /// <summary>Cross-check: participants a and b observe one anchor (anchor_id, at p_world) error_m and ...</summary>
     public sealed class HeadsetsCompared : EventKind
     {
         public const string TagName = "headsets_compared";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string A = "";
         public string B = "";
         public string AnchorId = "";
-        public double ErrorM = 0.0;
-        public double ErrorRad = 0.0;
-        public double ExpectedP95M = 0.0;
+        public double ErrorM;
+        public double ErrorRad;
+        public double ExpectedP95M;
         public double[] PWorld = new double[3];
-        public long N = 0;
-        public bool Touched = false;
+        public long N;
+        public bool Touched;
 
-        public static HeadsetsCompared Read(WireReader reader)
-        {
-            HeadsetsCompared value = new HeadsetsCompared();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "a": value.A = reader.ReadString(64); seen |= 1u; break;
-                    case "b": value.B = reader.ReadString(64); seen |= 2u; break;
-                    case "anchor_id": value.AnchorId = reader.ReadString(64); seen |= 4u; break;
-                    case "error_m": value.ErrorM = reader.ReadDouble(); seen |= 8u; break;
-                    case "error_rad": value.ErrorRad = reader.ReadDouble(); seen |= 16u; break;
-                    case "expected_p95_m": value.ExpectedP95M = reader.ReadDouble(); seen |= 32u; break;
-                    case "p_world": value.PWorld = reader.ReadDoubles(3, 0); seen |= 64u; break;
-                    case "n": value.N = reader.ReadLong(0, long.MaxValue); seen |= 128u; break;
-                    case "touched": value.Touched = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 255u) != 255u) throw new WireException("missing field of HeadsetsCompared");
-            return value;
-        }
+        public static HeadsetsCompared Read(WireReader reader) => reader.ReadInto(new HeadsetsCompared());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(10);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("a");
-            writer.Write(A);
-            writer.Write("b");
-            writer.Write(B);
-            writer.Write("anchor_id");
-            writer.Write(AnchorId);
-            writer.Write("error_m");
-            writer.Write(ErrorM);
-            writer.Write("error_rad");
-            writer.Write(ErrorRad);
-            writer.Write("expected_p95_m");
-            writer.Write(ExpectedP95M);
-            writer.Write("p_world");
-            writer.Write(PWorld);
-            writer.Write("n");
-            writer.Write(N);
-            writer.Write("touched");
-            writer.Write(Touched);
+            codec.Require("a", ref A, 64);
+            codec.Require("b", ref B, 64);
+            codec.Require("anchor_id", ref AnchorId, 64);
+            codec.Require("error_m", ref ErrorM);
+            codec.Require("error_rad", ref ErrorRad);
+            codec.Require("expected_p95_m", ref ExpectedP95M);
+            codec.Require("p_world", ref PWorld, 3, 3);
+            codec.Require("n", ref N, 0, long.MaxValue);
+            codec.Allow("touched", ref Touched, false);
         }
     }
 
-    /// <summary>
-    /// cause: reset, new_scene, patch, external (the user's loop went back in time).
-    ///
-    /// scene_hash: after a patch, the address of the scene's specification as it is now; fetch that. Else empty.
-    /// tick_period_ns: of the new scene; 0: as it was.
-    /// </summary>
+    /// <summary>cause: reset, new_scene, patch, external (the user's loop went back in time).</summary>
     public sealed class SceneChanged : EventKind
     {
         public const string TagName = "scene_changed";
-        public override string Tag { get { return TagName; } }
-        public long SceneEpoch = 0;
-        public long SceneRevision = 0;
+        public override string Tag => TagName;
+        public long SceneEpoch;
+        public long SceneRevision;
         public string Cause = "";
         public string SceneHash = "";
-        public long TickPeriodNs = 0;
+        public long TickPeriodNs;
 
-        public static SceneChanged Read(WireReader reader)
-        {
-            SceneChanged value = new SceneChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "scene_epoch": value.SceneEpoch = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "scene_revision": value.SceneRevision = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "cause": value.Cause = reader.ReadString(64); seen |= 4u; break;
-                    case "scene_hash": value.SceneHash = reader.ReadString(64); break;
-                    case "tick_period_ns": value.TickPeriodNs = reader.ReadLong(long.MinValue, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 7u) != 7u) throw new WireException("missing field of SceneChanged");
-            return value;
-        }
+        public static SceneChanged Read(WireReader reader) => reader.ReadInto(new SceneChanged());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("scene_epoch");
-            writer.Write(SceneEpoch);
-            writer.Write("scene_revision");
-            writer.Write(SceneRevision);
-            writer.Write("cause");
-            writer.Write(Cause);
-            writer.Write("scene_hash");
-            writer.Write(SceneHash);
-            writer.Write("tick_period_ns");
-            writer.Write(TickPeriodNs);
+            codec.Require("scene_epoch", ref SceneEpoch, 0, long.MaxValue);
+            codec.Require("scene_revision", ref SceneRevision, 0, long.MaxValue);
+            codec.Require("cause", ref Cause, 64);
+            codec.Allow("scene_hash", ref SceneHash, 64, "");
+            codec.Allow("tick_period_ns", ref TickPeriodNs, long.MinValue, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// The session was stopped (active), also when it was stopped already, or the e-stop was cleared by participant.
-    ///
-    /// stop_seq counts the stops from 1; of a clear: the newest stop that it ended. participant: empty for a stop of a
-    /// connection that has not joined.
-    /// </summary>
+    /// <summary>The session was stopped (active), also when it was stopped already, or the e-stop was ...</summary>
     public sealed class EStopChanged : EventKind
     {
         public const string TagName = "estop_changed";
-        public override string Tag { get { return TagName; } }
-        public bool Active = false;
+        public override string Tag => TagName;
+        public bool Active;
         public string Participant = "";
         public string Reason = "";
-        public long StopSeq = 0;
+        public long StopSeq;
 
-        public static EStopChanged Read(WireReader reader)
-        {
-            EStopChanged value = new EStopChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "active": value.Active = reader.ReadBool(); seen |= 1u; break;
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
-                    case "reason": value.Reason = reader.ReadString(512); break;
-                    case "stop_seq": value.StopSeq = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of EStopChanged");
-            return value;
-        }
+        public static EStopChanged Read(WireReader reader) => reader.ReadInto(new EStopChanged());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("active");
-            writer.Write(Active);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("reason");
-            writer.Write(Reason);
-            writer.Write("stop_seq");
-            writer.Write(StopSeq);
+            codec.Require("active", ref Active);
+            codec.Require("participant", ref Participant, 64);
+            codec.Allow("reason", ref Reason, 512, "");
+            codec.Allow("stop_seq", ref StopSeq, 0, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// The session was paused or resumed by participant. reason: of a pause that only a reset ends (physics that
-    /// diverged).
-    /// </summary>
+    /// <summary>The session was paused or resumed by participant.</summary>
     public sealed class PauseChanged : EventKind
     {
         public const string TagName = "pause_changed";
-        public override string Tag { get { return TagName; } }
-        public bool Paused = false;
+        public override string Tag => TagName;
+        public bool Paused;
         public string Participant = "";
         public string Reason = "";
 
-        public static PauseChanged Read(WireReader reader)
-        {
-            PauseChanged value = new PauseChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "paused": value.Paused = reader.ReadBool(); seen |= 1u; break;
-                    case "participant": value.Participant = reader.ReadString(64); break;
-                    case "reason": value.Reason = reader.ReadString(512); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of PauseChanged");
-            return value;
-        }
+        public static PauseChanged Read(WireReader reader) => reader.ReadInto(new PauseChanged());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("paused");
-            writer.Write(Paused);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("reason");
-            writer.Write(Reason);
+            codec.Require("paused", ref Paused);
+            codec.Allow("participant", ref Participant, 64, "");
+            codec.Allow("reason", ref Reason, 512, "");
         }
     }
 
-    /// <summary>
-    /// state: running, success, failure, discarded. number counts episodes from 1.
-    /// </summary>
+    /// <summary>state: running, success, failure, discarded.</summary>
     public sealed class EpisodeChanged : EventKind
     {
         public const string TagName = "episode_changed";
-        public override string Tag { get { return TagName; } }
-        public long Number = 0;
+        public override string Tag => TagName;
+        public long Number;
         public string State = "";
         public string Label = "";
         public string Participant = "";
 
-        public static EpisodeChanged Read(WireReader reader)
-        {
-            EpisodeChanged value = new EpisodeChanged();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "number": value.Number = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "state": value.State = reader.ReadString(64); seen |= 2u; break;
-                    case "label": value.Label = reader.ReadString(512); break;
-                    case "participant": value.Participant = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of EpisodeChanged");
-            return value;
-        }
+        public static EpisodeChanged Read(WireReader reader) => reader.ReadInto(new EpisodeChanged());
+        internal static readonly Func<EpisodeChanged> New = () => new EpisodeChanged();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("number");
-            writer.Write(Number);
-            writer.Write("state");
-            writer.Write(State);
-            writer.Write("label");
-            writer.Write(Label);
-            writer.Write("participant");
-            writer.Write(Participant);
+            codec.Require("number", ref Number, 0, long.MaxValue);
+            codec.Require("state", ref State, 64);
+            codec.Allow("label", ref Label, 512, "");
+            codec.Allow("participant", ref Participant, 64, "");
         }
     }
 
-    /// <summary>
-    /// A hand took a free object (grasped), or released it.
-    /// </summary>
+    /// <summary>A hand took a free object (grasped), or released it.</summary>
     public sealed class ObjectGrasped : EventKind
     {
         public const string TagName = "object_grasped";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Object = "";
         public string Participant = "";
         public string Device = "";
-        public bool Grasped = false;
+        public bool Grasped;
 
-        public static ObjectGrasped Read(WireReader reader)
-        {
-            ObjectGrasped value = new ObjectGrasped();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "object": value.Object = reader.ReadString(64); seen |= 1u; break;
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 2u; break;
-                    case "device": value.Device = reader.ReadString(64); seen |= 4u; break;
-                    case "grasped": value.Grasped = reader.ReadBool(); seen |= 8u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of ObjectGrasped");
-            return value;
-        }
+        public static ObjectGrasped Read(WireReader reader) => reader.ReadInto(new ObjectGrasped());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("object");
-            writer.Write(Object);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("device");
-            writer.Write(Device);
-            writer.Write("grasped");
-            writer.Write(Grasped);
+            codec.Require("object", ref Object, 64);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("device", ref Device, 64);
+            codec.Require("grasped", ref Grasped);
         }
     }
 
-    /// <summary>
-    /// An object passed from one robot to another through contact alone. duration_ns: both grippers touched it.
-    /// </summary>
+    /// <summary>An object passed from one robot to another through contact alone.</summary>
     public sealed class Handover : EventKind
     {
         public const string TagName = "handover";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Object = "";
         public string Giver = "";
         public string Receiver = "";
         public string GiverParticipant = "";
         public string ReceiverParticipant = "";
-        public long DurationNs = 0;
+        public long DurationNs;
 
-        public static Handover Read(WireReader reader)
-        {
-            Handover value = new Handover();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "object": value.Object = reader.ReadString(64); seen |= 1u; break;
-                    case "giver": value.Giver = reader.ReadString(64); seen |= 2u; break;
-                    case "receiver": value.Receiver = reader.ReadString(64); seen |= 4u; break;
-                    case "giver_participant": value.GiverParticipant = reader.ReadString(64); seen |= 8u; break;
-                    case "receiver_participant": value.ReceiverParticipant = reader.ReadString(64); seen |= 16u; break;
-                    case "duration_ns": value.DurationNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 32u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 63u) != 63u) throw new WireException("missing field of Handover");
-            return value;
-        }
+        public static Handover Read(WireReader reader) => reader.ReadInto(new Handover());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(7);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("object");
-            writer.Write(Object);
-            writer.Write("giver");
-            writer.Write(Giver);
-            writer.Write("receiver");
-            writer.Write(Receiver);
-            writer.Write("giver_participant");
-            writer.Write(GiverParticipant);
-            writer.Write("receiver_participant");
-            writer.Write(ReceiverParticipant);
-            writer.Write("duration_ns");
-            writer.Write(DurationNs);
+            codec.Require("object", ref Object, 64);
+            codec.Require("giver", ref Giver, 64);
+            codec.Require("receiver", ref Receiver, 64);
+            codec.Require("giver_participant", ref GiverParticipant, 64);
+            codec.Require("receiver_participant", ref ReceiverParticipant, 64);
+            codec.Require("duration_ns", ref DurationNs, long.MinValue, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// A note of a participant in the recording.
-    /// </summary>
+    /// <summary>A note of a participant in the recording.</summary>
     public sealed class MarkerAdded : EventKind
     {
         public const string TagName = "marker_added";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Participant = "";
         public string Text = "";
 
-        public static MarkerAdded Read(WireReader reader)
-        {
-            MarkerAdded value = new MarkerAdded();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
-                    case "text": value.Text = reader.ReadString(512); seen |= 2u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of MarkerAdded");
-            return value;
-        }
+        public static MarkerAdded Read(WireReader reader) => reader.ReadInto(new MarkerAdded());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(3);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("text");
-            writer.Write(Text);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("text", ref Text, 512);
         }
     }
 
-    /// <summary>
-    /// First rejection of a kind, then at most one per second and (participant, device, reason).
-    /// </summary>
+    /// <summary>First rejection of a kind, then at most one per second and (participant, device, reason).</summary>
     public sealed class SamplesRejected : EventKind
     {
         public const string TagName = "samples_rejected";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Participant = "";
         public string Device = "";
         public string Reason = "";
-        public long Count = 0;
+        public long Count;
 
-        public static SamplesRejected Read(WireReader reader)
-        {
-            SamplesRejected value = new SamplesRejected();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "participant": value.Participant = reader.ReadString(64); seen |= 1u; break;
-                    case "device": value.Device = reader.ReadString(64); seen |= 2u; break;
-                    case "reason": value.Reason = reader.ReadString(64); seen |= 4u; break;
-                    case "count": value.Count = reader.ReadLong(0, long.MaxValue); seen |= 8u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of SamplesRejected");
-            return value;
-        }
+        public static SamplesRejected Read(WireReader reader) => reader.ReadInto(new SamplesRejected());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("device");
-            writer.Write(Device);
-            writer.Write("reason");
-            writer.Write(Reason);
-            writer.Write("count");
-            writer.Write(Count);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("device", ref Device, 64);
+            codec.Require("reason", ref Reason, 64);
+            codec.Require("count", ref Count, 0, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// kind: stalled (no step for so long), recording (rows are lost), resumed (from an earlier recording).
-    /// </summary>
+    /// <summary>kind: stalled (no step for so long), recording (rows are lost), resumed (from an earlier ...</summary>
     public sealed class Gap : EventKind
     {
         public const string TagName = "gap";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Kind = "";
-        public long DurationNs = 0;
-        public long Rows = 0;
+        public long DurationNs;
+        public long Rows;
 
-        public static Gap Read(WireReader reader)
-        {
-            Gap value = new Gap();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 1u; break;
-                    case "duration_ns": value.DurationNs = reader.ReadLong(long.MinValue, long.MaxValue); seen |= 2u; break;
-                    case "rows": value.Rows = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Gap");
-            return value;
-        }
+        public static Gap Read(WireReader reader) => reader.ReadInto(new Gap());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("duration_ns");
-            writer.Write(DurationNs);
-            writer.Write("rows");
-            writer.Write(Rows);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("duration_ns", ref DurationNs, long.MinValue, long.MaxValue);
+            codec.Allow("rows", ref Rows, 0, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// A text for an operator. level: info, warning, error. participant: whom it concerns. reason: the
-    /// DenialReason of a refusal that answers no request (of an alignment).
-    /// </summary>
+    /// <summary>A text for an operator.</summary>
     public sealed class Notice : EventKind
     {
         public const string TagName = "notice";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Level = "";
         public string Text = "";
         public string Participant = "";
         public string Reason = "";
 
-        public static Notice Read(WireReader reader)
-        {
-            Notice value = new Notice();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "level": value.Level = reader.ReadString(64); seen |= 1u; break;
-                    case "text": value.Text = reader.ReadString(512); seen |= 2u; break;
-                    case "participant": value.Participant = reader.ReadString(64); break;
-                    case "reason": value.Reason = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Notice");
-            return value;
-        }
+        public static Notice Read(WireReader reader) => reader.ReadInto(new Notice());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("level");
-            writer.Write(Level);
-            writer.Write("text");
-            writer.Write(Text);
-            writer.Write("participant");
-            writer.Write(Participant);
-            writer.Write("reason");
-            writer.Write(Reason);
+            codec.Require("level", ref Level, 64);
+            codec.Require("text", ref Text, 512);
+            codec.Allow("participant", ref Participant, 64, "");
+            codec.Allow("reason", ref Reason, 64, "");
         }
     }
 
-    /// <summary>
-    /// An event that concerns security. kind: AuditKind. subject: fingerprint of a key, or a participant id.
-    ///
-    /// Repeated ones (wrong codes, unknown keys) come at most once a second and address, with their count.
-    /// </summary>
+    /// <summary>An event that concerns security.</summary>
     public sealed class Audited : EventKind
     {
         public const string TagName = "audited";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public string Kind = "";
         public string Subject = "";
         public string Name = "";
@@ -6181,782 +2385,378 @@ namespace IrisSession.Protocol
         public string Detail = "";
         public long Count = 1;
 
-        public static Audited Read(WireReader reader)
-        {
-            Audited value = new Audited();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 1u; break;
-                    case "subject": value.Subject = reader.ReadString(64); break;
-                    case "name": value.Name = reader.ReadString(64); break;
-                    case "address": value.Address = reader.ReadString(64); break;
-                    case "detail": value.Detail = reader.ReadString(512); break;
-                    case "count": value.Count = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of Audited");
-            return value;
-        }
+        public static Audited Read(WireReader reader) => reader.ReadInto(new Audited());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(7);
-            writer.Write("event");
-            writer.Write(TagName);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("subject");
-            writer.Write(Subject);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("address");
-            writer.Write(Address);
-            writer.Write("detail");
-            writer.Write(Detail);
-            writer.Write("count");
-            writer.Write(Count);
+            codec.Require("kind", ref Kind, 64);
+            codec.Allow("subject", ref Subject, 64, "");
+            codec.Allow("name", ref Name, 64, "");
+            codec.Allow("address", ref Address, 64, "");
+            codec.Allow("detail", ref Detail, 512, "");
+            codec.Allow("count", ref Count, 0, long.MaxValue, 1);
         }
     }
 
-    /// <summary>
-    /// One control-channel message from a client: [version, connection_epoch, on_behalf_of, message].
-    ///
-    /// connection_epoch: from Welcome; 0 in hello. on_behalf_of: only role gateway may set it.
-    /// </summary>
+    /// <summary>One control-channel message from a client: [version, connection_epoch, on_behalf_of, ...</summary>
     public sealed class ClientEnvelope : WireValue
     {
-        public long Version = 0;
-        public long ConnectionEpoch = 0;
+        internal override bool IsArray => true;
+        public long Version;
+        public long ConnectionEpoch;
         public string OnBehalfOf = "";
-        public ClientMessage Message = null;
+        public ClientMessage Message;
 
-        public static ClientEnvelope Read(WireReader reader)
-        {
-            ClientEnvelope value = new ClientEnvelope();
-            int n = reader.ReadArrayHeader();
-            if (n < 4) throw new WireException("ClientEnvelope of " + n + " elements, expected 4");
-            value.Version = reader.ReadLong(long.MinValue, long.MaxValue);
-            value.ConnectionEpoch = reader.ReadLong(0, long.MaxValue);
-            value.OnBehalfOf = reader.ReadString(64);
-            value.Message = ClientMessage.ReadAny(reader);
-            for (int i = 4; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static ClientEnvelope Read(WireReader reader) => reader.ReadInto(new ClientEnvelope());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(4);
-            writer.Write(Version);
-            writer.Write(ConnectionEpoch);
-            writer.Write(OnBehalfOf);
-            writer.Write(Message);
+            codec.Require("version", ref Version, long.MinValue, long.MaxValue);
+            codec.Require("connection_epoch", ref ConnectionEpoch, 0, long.MaxValue);
+            codec.Require("on_behalf_of", ref OnBehalfOf, 64);
+            codec.Require("message", ref Message, Protocol.ClientMessage.Union);
         }
     }
 
-    /// <summary>
-    /// [version, connection_epoch, message]. connection_epoch is that of the connection it is meant for.
-    /// </summary>
+    /// <summary>[version, connection_epoch, message].</summary>
     public sealed class ServerEnvelope : WireValue
     {
-        public long Version = 0;
-        public long ConnectionEpoch = 0;
-        public ServerMessage Message = null;
+        internal override bool IsArray => true;
+        public long Version;
+        public long ConnectionEpoch;
+        public ServerMessage Message;
 
-        public static ServerEnvelope Read(WireReader reader)
-        {
-            ServerEnvelope value = new ServerEnvelope();
-            int n = reader.ReadArrayHeader();
-            if (n < 3) throw new WireException("ServerEnvelope of " + n + " elements, expected 3");
-            value.Version = reader.ReadLong(long.MinValue, long.MaxValue);
-            value.ConnectionEpoch = reader.ReadLong(0, long.MaxValue);
-            value.Message = ServerMessage.ReadAny(reader);
-            for (int i = 3; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static ServerEnvelope Read(WireReader reader) => reader.ReadInto(new ServerEnvelope());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(3);
-            writer.Write(Version);
-            writer.Write(ConnectionEpoch);
-            writer.Write(Message);
+            codec.Require("version", ref Version, long.MinValue, long.MaxValue);
+            codec.Require("connection_epoch", ref ConnectionEpoch, 0, long.MaxValue);
+            codec.Require("message", ref Message, Protocol.ServerMessage.Union);
         }
     }
 
-    /// <summary>
-    /// First payload frame of a rigid-state message; topic frame before it, encoded poses after it.
-    ///
-    /// session_time: end of the tick that this state belongs to. published_ns: session time when handed to the socket.
-    /// base_seq: a client that holds any frame &gt;= base_seq of this scene_epoch has every body within the bound after
-    /// this one; an older client asks for a snapshot. ticks are counted within the epoch.
-    /// </summary>
+    /// <summary>First payload frame of a rigid-state message; topic frame before it, encoded poses after it.</summary>
     public sealed class StateHeader : WireValue
     {
-        public long SceneEpoch = 0;
-        public long SceneRevision = 0;
-        public long Tick = 0;
-        public double SimTime = 0.0;
-        public long SessionTime = 0;
-        public long PublishedNs = 0;
-        public long StateSeq = 0;
-        public long BaseSeq = 0;
-        public Applied[] Applied = new Applied[0];
+        internal override bool IsArray => true;
+        public long SceneEpoch;
+        public long SceneRevision;
+        public long Tick;
+        public double SimTime;
+        public long SessionTime;
+        public long PublishedNs;
+        public long StateSeq;
+        public long BaseSeq;
+        public Applied[] Applied = Array.Empty<Applied>();
 
-        public static StateHeader Read(WireReader reader)
-        {
-            StateHeader value = new StateHeader();
-            int n = reader.ReadArrayHeader();
-            if (n < 8) throw new WireException("StateHeader of " + n + " elements, expected 8");
-            value.SceneEpoch = reader.ReadLong(0, long.MaxValue);
-            value.SceneRevision = reader.ReadLong(0, long.MaxValue);
-            value.Tick = reader.ReadLong(0, long.MaxValue);
-            value.SimTime = reader.ReadDouble();
-            value.SessionTime = reader.ReadLong(long.MinValue, long.MaxValue);
-            value.PublishedNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            value.StateSeq = reader.ReadLong(0, long.MaxValue);
-            value.BaseSeq = reader.ReadLong(0, long.MaxValue);
-            if (n > 8) value.Applied = reader.ReadArray(Protocol.Applied.Read, 0);
-            for (int i = 9; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static StateHeader Read(WireReader reader) => reader.ReadInto(new StateHeader());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(9);
-            writer.Write(SceneEpoch);
-            writer.Write(SceneRevision);
-            writer.Write(Tick);
-            writer.Write(SimTime);
-            writer.Write(SessionTime);
-            writer.Write(PublishedNs);
-            writer.Write(StateSeq);
-            writer.Write(BaseSeq);
-            writer.Write(Applied);
+            codec.Require("scene_epoch", ref SceneEpoch, 0, long.MaxValue);
+            codec.Require("scene_revision", ref SceneRevision, 0, long.MaxValue);
+            codec.Require("tick", ref Tick, 0, long.MaxValue);
+            codec.Require("sim_time", ref SimTime);
+            codec.Require("session_time", ref SessionTime, long.MinValue, long.MaxValue);
+            codec.Require("published_ns", ref PublishedNs, long.MinValue, long.MaxValue);
+            codec.Require("state_seq", ref StateSeq, 0, long.MaxValue);
+            codec.Require("base_seq", ref BaseSeq, 0, long.MaxValue);
+            codec.Allow("applied", ref Applied, 0, 0, Protocol.Applied.New);
         }
     }
 
-    /// <summary>
-    /// A device of a participant in the world. Only of participants that are aligned.
-    /// </summary>
+    /// <summary>A device of a participant in the world.</summary>
     public sealed class PresenceItem : WireValue
     {
+        internal override bool IsArray => true;
         public string Participant = "";
         public string Device = "";
         public Pose Pose = new Pose();
-        public long CaptureNs = 0;
+        public long CaptureNs;
 
-        public static PresenceItem Read(WireReader reader)
-        {
-            PresenceItem value = new PresenceItem();
-            int n = reader.ReadArrayHeader();
-            if (n < 3) throw new WireException("PresenceItem of " + n + " elements, expected 3");
-            value.Participant = reader.ReadString(64);
-            value.Device = reader.ReadString(64);
-            value.Pose = Pose.Read(reader);
-            if (n > 3) value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            for (int i = 4; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static PresenceItem Read(WireReader reader) => reader.ReadInto(new PresenceItem());
+        internal static readonly Func<PresenceItem> New = () => new PresenceItem();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(4);
-            writer.Write(Participant);
-            writer.Write(Device);
-            writer.Write(Pose);
-            writer.Write(CaptureNs);
+            codec.Require("participant", ref Participant, 64);
+            codec.Require("device", ref Device, 64);
+            codec.Require("pose", ref Pose, Protocol.Pose.New);
+            codec.Allow("capture_ns", ref CaptureNs, long.MinValue, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// Message on topic presence: heads and hands of everyone, latest value.
-    /// </summary>
+    /// <summary>Message on topic presence: heads and hands of everyone, latest value.</summary>
     public sealed class Presence : WireValue
     {
-        public long SessionTime = 0;
-        public long PublishedNs = 0;
-        public PresenceItem[] Items = new PresenceItem[0];
+        internal override bool IsArray => true;
+        public long SessionTime;
+        public long PublishedNs;
+        public PresenceItem[] Items = Array.Empty<PresenceItem>();
 
-        public static Presence Read(WireReader reader)
-        {
-            Presence value = new Presence();
-            int n = reader.ReadArrayHeader();
-            if (n < 3) throw new WireException("Presence of " + n + " elements, expected 3");
-            value.SessionTime = reader.ReadLong(long.MinValue, long.MaxValue);
-            value.PublishedNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            value.Items = reader.ReadArray(Protocol.PresenceItem.Read, 0);
-            for (int i = 3; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static Presence Read(WireReader reader) => reader.ReadInto(new Presence());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(3);
-            writer.Write(SessionTime);
-            writer.Write(PublishedNs);
-            writer.Write(Items);
+            codec.Require("session_time", ref SessionTime, long.MinValue, long.MaxValue);
+            codec.Require("published_ns", ref PublishedNs, long.MinValue, long.MaxValue);
+            codec.Require("items", ref Items, 0, 0, Protocol.PresenceItem.New);
         }
     }
 
-    /// <summary>
-    /// Second frame of a media message: topic before it, one bulk frame after it.
-    ///
-    /// seq: of the stream, as its source numbered it; at half and quarter some are left out. capture_ns: when it
-    /// was captured or computed, published_ns: when it was passed to the socket, both session time. dropped: frames of
-    /// this subscriber that its link did not take before newer ones were there, since it subscribed. sent_ns,
-    /// received_ns: when its source passed it to a socket and when the session received it, session time; 0: not known.
-    /// </summary>
+    /// <summary>Second frame of a media message: topic before it, one bulk frame after it.</summary>
     public sealed class MediaHeader : WireValue
     {
+        internal override bool IsArray => true;
         public string Stream = "";
         public string BudgetClass = "";
-        public long SceneEpoch = 0;
-        public long Seq = 0;
-        public long CaptureNs = 0;
-        public long PublishedNs = 0;
+        public long SceneEpoch;
+        public long Seq;
+        public long CaptureNs;
+        public long PublishedNs;
         public string Encoding = "bytes";
-        public long Dropped = 0;
-        public long SentNs = 0;
-        public long ReceivedNs = 0;
+        public long Dropped;
+        public long SentNs;
+        public long ReceivedNs;
 
-        public static MediaHeader Read(WireReader reader)
-        {
-            MediaHeader value = new MediaHeader();
-            int n = reader.ReadArrayHeader();
-            if (n < 6) throw new WireException("MediaHeader of " + n + " elements, expected 6");
-            value.Stream = reader.ReadString(64);
-            value.BudgetClass = reader.ReadString(64);
-            value.SceneEpoch = reader.ReadLong(0, long.MaxValue);
-            value.Seq = reader.ReadLong(0, long.MaxValue);
-            value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            value.PublishedNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            if (n > 6) value.Encoding = reader.ReadString(64);
-            if (n > 7) value.Dropped = reader.ReadLong(0, long.MaxValue);
-            if (n > 8) value.SentNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            if (n > 9) value.ReceivedNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            for (int i = 10; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static MediaHeader Read(WireReader reader) => reader.ReadInto(new MediaHeader());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(10);
-            writer.Write(Stream);
-            writer.Write(BudgetClass);
-            writer.Write(SceneEpoch);
-            writer.Write(Seq);
-            writer.Write(CaptureNs);
-            writer.Write(PublishedNs);
-            writer.Write(Encoding);
-            writer.Write(Dropped);
-            writer.Write(SentNs);
-            writer.Write(ReceivedNs);
+            codec.Require("stream", ref Stream, 64);
+            codec.Require("budget_class", ref BudgetClass, 64);
+            codec.Require("scene_epoch", ref SceneEpoch, 0, long.MaxValue);
+            codec.Require("seq", ref Seq, 0, long.MaxValue);
+            codec.Require("capture_ns", ref CaptureNs, long.MinValue, long.MaxValue);
+            codec.Require("published_ns", ref PublishedNs, long.MinValue, long.MaxValue);
+            codec.Allow("encoding", ref Encoding, 64, "bytes");
+            codec.Allow("dropped", ref Dropped, 0, long.MaxValue, 0);
+            codec.Allow("sent_ns", ref SentNs, long.MinValue, long.MaxValue, 0);
+            codec.Allow("received_ns", ref ReceivedNs, long.MinValue, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// First frame of a source's message; a bulk frame for each of classes follows, in their order.
-    ///
-    /// classes: full, and any of half and quarter that the source has in a coarser form; none in a message that has
-    /// an info and no frame. info: of the stream, with its first frames, when it changes, and once a second; null: as
-    /// before. sent_ns: when the source passed the message to its socket, session time; 0: not known. connection_epoch:
-    /// of the sender's Welcome, by which the session knows whose stream it is; 0: not known.
-    /// </summary>
-    public sealed class MediaPush : WireValue
-    {
-        public string Stream = "";
-        public long SceneEpoch = 0;
-        public long CaptureNs = 0;
-        public string[] Classes = new string[] { "full" };
-        public string Encoding = "bytes";
-        public StreamInfo Info = null;
-        public long SentNs = 0;
-        public long ConnectionEpoch = 0;
-
-        public static MediaPush Read(WireReader reader)
-        {
-            MediaPush value = new MediaPush();
-            int n = reader.ReadArrayHeader();
-            if (n < 3) throw new WireException("MediaPush of " + n + " elements, expected 3");
-            value.Stream = reader.ReadString(64);
-            value.SceneEpoch = reader.ReadLong(0, long.MaxValue);
-            value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            if (n > 3) value.Classes = reader.ReadStrings(0, 64);
-            if (n > 4) value.Encoding = reader.ReadString(64);
-            if (n > 5) value.Info = reader.TryReadNil() ? null : StreamInfo.Read(reader);
-            if (n > 6) value.SentNs = reader.ReadLong(long.MinValue, long.MaxValue);
-            if (n > 7) value.ConnectionEpoch = reader.ReadLong(0, long.MaxValue);
-            for (int i = 8; i < n; i++) reader.Skip();
-            return value;
-        }
-
-        public override void WriteTo(WireWriter writer)
-        {
-            writer.WriteArrayHeader(8);
-            writer.Write(Stream);
-            writer.Write(SceneEpoch);
-            writer.Write(CaptureNs);
-            writer.Write(Classes);
-            writer.Write(Encoding);
-            writer.Write(Info);
-            writer.Write(SentNs);
-            writer.Write(ConnectionEpoch);
-        }
-    }
-
-    /// <summary>
-    /// Request for length bytes of an asset from offset on; the answer is shorter when the asset ends before.
-    ///
-    /// connection_epoch: of the sender's Welcome. request_id: any number; repeated in the answer. address: SHA-256
-    /// of the asset, 64 hexadecimal digits.
-    /// </summary>
+    /// <summary>Request for length bytes of an asset from offset on; the answer is shorter when the asset ...</summary>
     public sealed class AssetRequest : WireValue
     {
-        public long Version = 0;
-        public long ConnectionEpoch = 0;
-        public long RequestId = 0;
+        internal override bool IsArray => true;
+        public long Version;
+        public long ConnectionEpoch;
+        public long RequestId;
         public string Address = "";
-        public long Offset = 0;
-        public long Length = 0;
+        public long Offset;
+        public long Length;
 
-        public static AssetRequest Read(WireReader reader)
-        {
-            AssetRequest value = new AssetRequest();
-            int n = reader.ReadArrayHeader();
-            if (n < 6) throw new WireException("AssetRequest of " + n + " elements, expected 6");
-            value.Version = reader.ReadLong(0, long.MaxValue);
-            value.ConnectionEpoch = reader.ReadLong(0, long.MaxValue);
-            value.RequestId = reader.ReadLong(0, long.MaxValue);
-            value.Address = reader.ReadString(64);
-            value.Offset = reader.ReadLong(0, long.MaxValue);
-            value.Length = reader.ReadLong(0, long.MaxValue);
-            for (int i = 6; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static AssetRequest Read(WireReader reader) => reader.ReadInto(new AssetRequest());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(6);
-            writer.Write(Version);
-            writer.Write(ConnectionEpoch);
-            writer.Write(RequestId);
-            writer.Write(Address);
-            writer.Write(Offset);
-            writer.Write(Length);
+            codec.Require("version", ref Version, 0, long.MaxValue);
+            codec.Require("connection_epoch", ref ConnectionEpoch, 0, long.MaxValue);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("address", ref Address, 64);
+            codec.Require("offset", ref Offset, 0, long.MaxValue);
+            codec.Require("length", ref Length, 0, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// First of two frames; the second holds bytes offset and following of an asset that has total bytes.
-    /// </summary>
+    /// <summary>First of two frames; the second holds bytes offset and following of an asset that has ...</summary>
     public sealed class AssetChunk : WireValue
     {
-        public long Version = 0;
-        public long RequestId = 0;
+        internal override bool IsArray => true;
+        public long Version;
+        public long RequestId;
         public string Address = "";
-        public long Offset = 0;
-        public long Total = 0;
+        public long Offset;
+        public long Total;
 
-        public static AssetChunk Read(WireReader reader)
-        {
-            AssetChunk value = new AssetChunk();
-            int n = reader.ReadArrayHeader();
-            if (n < 5) throw new WireException("AssetChunk of " + n + " elements, expected 5");
-            value.Version = reader.ReadLong(0, long.MaxValue);
-            value.RequestId = reader.ReadLong(0, long.MaxValue);
-            value.Address = reader.ReadString(64);
-            value.Offset = reader.ReadLong(0, long.MaxValue);
-            value.Total = reader.ReadLong(0, long.MaxValue);
-            for (int i = 5; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static AssetChunk Read(WireReader reader) => reader.ReadInto(new AssetChunk());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(5);
-            writer.Write(Version);
-            writer.Write(RequestId);
-            writer.Write(Address);
-            writer.Write(Offset);
-            writer.Write(Total);
+            codec.Require("version", ref Version, 0, long.MaxValue);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("address", ref Address, 64);
+            codec.Require("offset", ref Offset, 0, long.MaxValue);
+            codec.Require("total", ref Total, 0, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// The only frame of an answer: no bytes come for this request. request_id 0: it could not be read.
-    /// </summary>
+    /// <summary>The only frame of an answer: no bytes come for this request.</summary>
     public sealed class AssetRefused : WireValue
     {
-        public long Version = 0;
-        public long RequestId = 0;
+        internal override bool IsArray => true;
+        public long Version;
+        public long RequestId;
         public string Address = "";
         public string Reason = "";
         public string Advice = "";
 
-        public static AssetRefused Read(WireReader reader)
-        {
-            AssetRefused value = new AssetRefused();
-            int n = reader.ReadArrayHeader();
-            if (n < 4) throw new WireException("AssetRefused of " + n + " elements, expected 4");
-            value.Version = reader.ReadLong(0, long.MaxValue);
-            value.RequestId = reader.ReadLong(0, long.MaxValue);
-            value.Address = reader.ReadString(64);
-            value.Reason = reader.ReadString(64);
-            if (n > 4) value.Advice = reader.ReadString(512);
-            for (int i = 5; i < n; i++) reader.Skip();
-            return value;
-        }
+        public static AssetRefused Read(WireReader reader) => reader.ReadInto(new AssetRefused());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteArrayHeader(5);
-            writer.Write(Version);
-            writer.Write(RequestId);
-            writer.Write(Address);
-            writer.Write(Reason);
-            writer.Write(Advice);
+            codec.Require("version", ref Version, 0, long.MaxValue);
+            codec.Require("request_id", ref RequestId, 0, long.MaxValue);
+            codec.Require("address", ref Address, 64);
+            codec.Require("reason", ref Reason, 64);
+            codec.Allow("advice", ref Advice, 512, "");
         }
     }
 
-    /// <summary>
-    /// UDP discovery datagram, 5 Hz. Never needed: an address can be typed or scanned.
-    /// </summary>
+    /// <summary>UDP discovery datagram, 5 Hz.</summary>
     public sealed class Beacon : WireValue
     {
-        public long Protocol = 0;
+        public long Protocol;
         public string SessionId = "";
         public string SessionName = "";
         public string Kind = "";
         public string Host = "";
-        public long Control = 0;
-        public long State = 0;
-        public long Media = 0;
-        public long Assets = 0;
-        public long Web = 0;
+        public long Control;
+        public long State;
+        public long Media;
+        public long Assets;
+        public long Web;
         public string KeyFingerprint = "";
 
-        public static Beacon Read(WireReader reader)
-        {
-            Beacon value = new Beacon();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "protocol": value.Protocol = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "session_id": value.SessionId = reader.ReadString(64); seen |= 2u; break;
-                    case "session_name": value.SessionName = reader.ReadString(64); seen |= 4u; break;
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 8u; break;
-                    case "host": value.Host = reader.ReadString(64); seen |= 16u; break;
-                    case "control": value.Control = reader.ReadLong(0, long.MaxValue); seen |= 32u; break;
-                    case "state": value.State = reader.ReadLong(0, long.MaxValue); seen |= 64u; break;
-                    case "media": value.Media = reader.ReadLong(0, long.MaxValue); seen |= 128u; break;
-                    case "assets": value.Assets = reader.ReadLong(0, long.MaxValue); seen |= 256u; break;
-                    case "web": value.Web = reader.ReadLong(0, long.MaxValue); seen |= 512u; break;
-                    case "key_fingerprint": value.KeyFingerprint = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1023u) != 1023u) throw new WireException("missing field of Beacon");
-            return value;
-        }
+        public static Beacon Read(WireReader reader) => reader.ReadInto(new Beacon());
+        internal static readonly Func<Beacon> New = () => new Beacon();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(11);
-            writer.Write("protocol");
-            writer.Write(Protocol);
-            writer.Write("session_id");
-            writer.Write(SessionId);
-            writer.Write("session_name");
-            writer.Write(SessionName);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("host");
-            writer.Write(Host);
-            writer.Write("control");
-            writer.Write(Control);
-            writer.Write("state");
-            writer.Write(State);
-            writer.Write("media");
-            writer.Write(Media);
-            writer.Write("assets");
-            writer.Write(Assets);
-            writer.Write("web");
-            writer.Write(Web);
-            writer.Write("key_fingerprint");
-            writer.Write(KeyFingerprint);
+            codec.Require("protocol", ref Protocol, 0, long.MaxValue);
+            codec.Require("session_id", ref SessionId, 64);
+            codec.Require("session_name", ref SessionName, 64);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("host", ref Host, 64);
+            codec.Require("control", ref Control, 0, long.MaxValue);
+            codec.Require("state", ref State, 0, long.MaxValue);
+            codec.Require("media", ref Media, 0, long.MaxValue);
+            codec.Require("assets", ref Assets, 0, long.MaxValue);
+            codec.Require("web", ref Web, 0, long.MaxValue);
+            codec.Allow("key_fingerprint", ref KeyFingerprint, 64, "");
         }
     }
 
-    /// <summary>
-    /// Introduction of a session, written to a TCP connection to control port - 1, which is then closed. Nothing is
-    /// read.
-    ///
-    /// server_key: the CURVE public key, Z85 (40 characters); empty: the session is not encrypted (loopback only).
-    /// pairing: a join code can be used now. participants: how many are connected.
-    /// </summary>
+    /// <summary>Introduction of a session, written to a TCP connection to control port - 1, which is then ...</summary>
     public sealed class Introduction : WireValue
     {
         public Beacon Beacon = new Beacon();
         public string ServerKey = "";
-        public bool Pairing = false;
-        public long Participants = 0;
+        public bool Pairing;
+        public long Participants;
 
-        public static Introduction Read(WireReader reader)
-        {
-            Introduction value = new Introduction();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "beacon": value.Beacon = Beacon.Read(reader); seen |= 1u; break;
-                    case "server_key": value.ServerKey = reader.ReadString(64); break;
-                    case "pairing": value.Pairing = reader.ReadBool(); break;
-                    case "participants": value.Participants = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of Introduction");
-            return value;
-        }
+        public static Introduction Read(WireReader reader) => reader.ReadInto(new Introduction());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("beacon");
-            writer.Write(Beacon);
-            writer.Write("server_key");
-            writer.Write(ServerKey);
-            writer.Write("pairing");
-            writer.Write(Pairing);
-            writer.Write("participants");
-            writer.Write(Participants);
+            codec.Require("beacon", ref Beacon, Protocol.Beacon.New);
+            codec.Allow("server_key", ref ServerKey, 64, "");
+            codec.Allow("pairing", ref Pairing, false);
+            codec.Allow("participants", ref Participants, 0, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// A whole scene. bodies: parents before their children. source: its origin, for people.
-    ///
-    /// groups_shown: visuals, sites, tendons and deformables of other groups are hidden at first.
-    /// </summary>
+    /// <summary>A whole scene.</summary>
     public sealed class SceneSpec : WireValue
     {
         public long Version = 1;
         public string Name = "";
         public string Source = "";
-        public Body[] Bodies = new Body[0];
-        public Visual[] Visuals = new Visual[0];
-        public Material[] Materials = new Material[0];
-        public Texture[] Textures = new Texture[0];
-        public Mesh[] Meshes = new Mesh[0];
-        public HeightField[] Hfields = new HeightField[0];
-        public Light[] Lights = new Light[0];
-        public Camera[] Cameras = new Camera[0];
-        public Site[] Sites = new Site[0];
-        public Tendon[] Tendons = new Tendon[0];
-        public Deformable[] Deformables = new Deformable[0];
+        public Body[] Bodies = Array.Empty<Body>();
+        public Visual[] Visuals = Array.Empty<Visual>();
+        public Material[] Materials = Array.Empty<Material>();
+        public Texture[] Textures = Array.Empty<Texture>();
+        public Mesh[] Meshes = Array.Empty<Mesh>();
+        public HeightField[] Hfields = Array.Empty<HeightField>();
+        public Light[] Lights = Array.Empty<Light>();
+        public Camera[] Cameras = Array.Empty<Camera>();
+        public Site[] Sites = Array.Empty<Site>();
+        public Tendon[] Tendons = Array.Empty<Tendon>();
+        public Deformable[] Deformables = Array.Empty<Deformable>();
         public Environment Environment = new Environment();
-        public long[] GroupsShown = new long[] { 0, 1, 2 };
+        static readonly long[] GroupsShownDefault = { 0, 1, 2 };
+        public long[] GroupsShown = (long[])GroupsShownDefault.Clone();
         public Totals Totals = new Totals();
 
-        public static SceneSpec Read(WireReader reader)
-        {
-            SceneSpec value = new SceneSpec();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "version": value.Version = reader.ReadLong(0, long.MaxValue); break;
-                    case "name": value.Name = reader.ReadString(512); break;
-                    case "source": value.Source = reader.ReadString(512); break;
-                    case "bodies": value.Bodies = reader.ReadArray(Protocol.Body.Read, 131072); break;
-                    case "visuals": value.Visuals = reader.ReadArray(Protocol.Visual.Read, 0); break;
-                    case "materials": value.Materials = reader.ReadArray(Protocol.Material.Read, 65536); break;
-                    case "textures": value.Textures = reader.ReadArray(Protocol.Texture.Read, 65536); break;
-                    case "meshes": value.Meshes = reader.ReadArray(Protocol.Mesh.Read, 65536); break;
-                    case "hfields": value.Hfields = reader.ReadArray(Protocol.HeightField.Read, 65536); break;
-                    case "lights": value.Lights = reader.ReadArray(Protocol.Light.Read, 65536); break;
-                    case "cameras": value.Cameras = reader.ReadArray(Protocol.Camera.Read, 65536); break;
-                    case "sites": value.Sites = reader.ReadArray(Protocol.Site.Read, 65536); break;
-                    case "tendons": value.Tendons = reader.ReadArray(Protocol.Tendon.Read, 65536); break;
-                    case "deformables": value.Deformables = reader.ReadArray(Protocol.Deformable.Read, 65536); break;
-                    case "environment": value.Environment = Environment.Read(reader); break;
-                    case "groups_shown": value.GroupsShown = reader.ReadLongs(0, 256, -2147483648, 2147483647); break;
-                    case "totals": value.Totals = Totals.Read(reader); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static SceneSpec Read(WireReader reader) => reader.ReadInto(new SceneSpec());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(17);
-            writer.Write("version");
-            writer.Write(Version);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("source");
-            writer.Write(Source);
-            writer.Write("bodies");
-            writer.Write(Bodies);
-            writer.Write("visuals");
-            writer.Write(Visuals);
-            writer.Write("materials");
-            writer.Write(Materials);
-            writer.Write("textures");
-            writer.Write(Textures);
-            writer.Write("meshes");
-            writer.Write(Meshes);
-            writer.Write("hfields");
-            writer.Write(Hfields);
-            writer.Write("lights");
-            writer.Write(Lights);
-            writer.Write("cameras");
-            writer.Write(Cameras);
-            writer.Write("sites");
-            writer.Write(Sites);
-            writer.Write("tendons");
-            writer.Write(Tendons);
-            writer.Write("deformables");
-            writer.Write(Deformables);
-            writer.Write("environment");
-            writer.Write(Environment);
-            writer.Write("groups_shown");
-            writer.Write(GroupsShown);
-            writer.Write("totals");
-            writer.Write(Totals);
+            codec.Allow("version", ref Version, 0, long.MaxValue, 1);
+            codec.Allow("name", ref Name, 512, "");
+            codec.Allow("source", ref Source, 512, "");
+            codec.Allow("bodies", ref Bodies, 0, 131072, Protocol.Body.New);
+            codec.Allow("visuals", ref Visuals, 0, 0, Protocol.Visual.New);
+            codec.Allow("materials", ref Materials, 0, 65536, Protocol.Material.New);
+            codec.Allow("textures", ref Textures, 0, 65536, Protocol.Texture.New);
+            codec.Allow("meshes", ref Meshes, 0, 65536, Protocol.Mesh.New);
+            codec.Allow("hfields", ref Hfields, 0, 65536, Protocol.HeightField.New);
+            codec.Allow("lights", ref Lights, 0, 65536, Protocol.Light.New);
+            codec.Allow("cameras", ref Cameras, 0, 65536, Protocol.Camera.New);
+            codec.Allow("sites", ref Sites, 0, 65536, Protocol.Site.New);
+            codec.Allow("tendons", ref Tendons, 0, 65536, Protocol.Tendon.New);
+            codec.Allow("deformables", ref Deformables, 0, 65536, Protocol.Deformable.New);
+            codec.Allow("environment", ref Environment, Protocol.Environment.New);
+            codec.Allow("groups_shown", ref GroupsShown, 0, 256, int.MinValue, int.MaxValue, GroupsShownDefault);
+            codec.Allow("totals", ref Totals, Protocol.Totals.New);
         }
     }
 
-    /// <summary>
-    /// One rigid body. id: that of BodyInfo in the state stream; 0 is the world, which is not streamed.
-    ///
-    /// T_parent_body: rest pose in the parent's frame. T_world_body: rest pose in the world, of the initial state. A
-    /// body that is not moving stays there for good.
-    /// </summary>
+    /// <summary>One rigid body.</summary>
     public sealed class Body : WireValue
     {
-        public long Id = 0;
+        public long Id;
         public string Name = "";
-        public long Parent = 0;
+        public long Parent;
         public Pose T_parent_body = new Pose();
         public Pose T_world_body = new Pose();
-        public bool Moving = false;
+        public bool Moving;
 
-        public static Body Read(WireReader reader)
-        {
-            Body value = new Body();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "id": value.Id = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "name": value.Name = reader.ReadString(512); seen |= 2u; break;
-                    case "parent": value.Parent = reader.ReadLong(-1, 2147483647); seen |= 4u; break;
-                    case "T_parent_body": value.T_parent_body = Pose.Read(reader); seen |= 8u; break;
-                    case "T_world_body": value.T_world_body = Pose.Read(reader); seen |= 16u; break;
-                    case "moving": value.Moving = reader.ReadBool(); seen |= 32u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 63u) != 63u) throw new WireException("missing field of Body");
-            return value;
-        }
+        public static Body Read(WireReader reader) => reader.ReadInto(new Body());
+        internal static readonly Func<Body> New = () => new Body();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("id");
-            writer.Write(Id);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("parent");
-            writer.Write(Parent);
-            writer.Write("T_parent_body");
-            writer.Write(T_parent_body);
-            writer.Write("T_world_body");
-            writer.Write(T_world_body);
-            writer.Write("moving");
-            writer.Write(Moving);
+            codec.Require("id", ref Id, 0, long.MaxValue);
+            codec.Require("name", ref Name, 512);
+            codec.Require("parent", ref Parent, -1, int.MaxValue);
+            codec.Require("T_parent_body", ref T_parent_body, Protocol.Pose.New);
+            codec.Require("T_world_body", ref T_world_body, Protocol.Pose.New);
+            codec.Require("moving", ref Moving);
         }
     }
 
-    /// <summary>
-    /// A shape on a body. id: the simulator's number of it (MuJoCo geom). rgba is the colour to draw: a colour of
-    /// its own, or the material's; with alpha 0 it is not drawn. group: see SceneSpec.groups_shown.
-    /// </summary>
+    /// <summary>A shape on a body.</summary>
     public sealed class Visual : WireValue
     {
-        public long Id = 0;
-        public long Body = 0;
+        public long Id;
+        public long Body;
         public string Name = "";
         public Pose T_body_visual = new Pose();
-        public long Group = 0;
+        public long Group;
         public Geometry Geometry = new Geometry();
-        public long Material = 0;
+        public long Material;
         public double[] Rgba = new double[4];
 
-        public static Visual Read(WireReader reader)
-        {
-            Visual value = new Visual();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "id": value.Id = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "body": value.Body = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "name": value.Name = reader.ReadString(512); seen |= 4u; break;
-                    case "T_body_visual": value.T_body_visual = Pose.Read(reader); seen |= 8u; break;
-                    case "group": value.Group = reader.ReadLong(-2147483648, 2147483647); seen |= 16u; break;
-                    case "geometry": value.Geometry = Geometry.Read(reader); seen |= 32u; break;
-                    case "material": value.Material = reader.ReadLong(-1, 2147483647); seen |= 64u; break;
-                    case "rgba": value.Rgba = reader.ReadDoubles(4, 0); seen |= 128u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 255u) != 255u) throw new WireException("missing field of Visual");
-            return value;
-        }
+        public static Visual Read(WireReader reader) => reader.ReadInto(new Visual());
+        internal static readonly Func<Visual> New = () => new Visual();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(8);
-            writer.Write("id");
-            writer.Write(Id);
-            writer.Write("body");
-            writer.Write(Body);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("T_body_visual");
-            writer.Write(T_body_visual);
-            writer.Write("group");
-            writer.Write(Group);
-            writer.Write("geometry");
-            writer.Write(Geometry);
-            writer.Write("material");
-            writer.Write(Material);
-            writer.Write("rgba");
-            writer.Write(Rgba);
+            codec.Require("id", ref Id, 0, long.MaxValue);
+            codec.Require("body", ref Body, 0, long.MaxValue);
+            codec.Require("name", ref Name, 512);
+            codec.Require("T_body_visual", ref T_body_visual, Protocol.Pose.New);
+            codec.Require("group", ref Group, int.MinValue, int.MaxValue);
+            codec.Require("geometry", ref Geometry, Protocol.Geometry.New);
+            codec.Require("material", ref Material, -1, int.MaxValue);
+            codec.Require("rgba", ref Rgba, 4, 4);
         }
     }
 
-    /// <summary>
-    /// A shape, centred in its own frame. kind of GeometryKind; draw unknown kinds as a box of size.
-    ///
-    /// size [m]: half lengths along x, y, z of the extent. plane: half lengths x, y, 0 is without end; its normal is +z,
-    /// z is the spacing of grid lines. sphere: radius three times. capsule, cylinder: radius, radius, half length along z,
-    /// of a capsule without its caps. hfield: half x, half y, height of elevation 1. mesh, sdf: the scale of generated
-    /// texture coordinates (see docs/scene.md); the vertices are in metres as they are.
-    /// </summary>
+    /// <summary>A shape, centred in its own frame.</summary>
     public sealed class Geometry : WireValue
     {
         public string Kind = "";
@@ -6964,1233 +2764,573 @@ namespace IrisSession.Protocol
         public long Mesh = -1;
         public long Hfield = -1;
 
-        public static Geometry Read(WireReader reader)
-        {
-            Geometry value = new Geometry();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 1u; break;
-                    case "size": value.Size = reader.ReadDoubles(3, 0); seen |= 2u; break;
-                    case "mesh": value.Mesh = reader.ReadLong(-1, 2147483647); break;
-                    case "hfield": value.Hfield = reader.ReadLong(-1, 2147483647); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Geometry");
-            return value;
-        }
+        public static Geometry Read(WireReader reader) => reader.ReadInto(new Geometry());
+        internal static readonly Func<Geometry> New = () => new Geometry();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("size");
-            writer.Write(Size);
-            writer.Write("mesh");
-            writer.Write(Mesh);
-            writer.Write("hfield");
-            writer.Write(Hfield);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("size", ref Size, 3, 3);
+            codec.Allow("mesh", ref Mesh, -1, int.MaxValue, -1);
+            codec.Allow("hfield", ref Hfield, -1, int.MaxValue, -1);
         }
     }
 
-    /// <summary>
-    /// Surface appearance, in MuJoCo's terms. specular, shininess (times 128: exponent), reflectance: 0..1.
-    ///
-    /// emission: light of its own, times the colour. metallic, roughness: -1 where the scene does not set them. The
-    /// texture's colour multiplies that of the visual. repeat: times that a 2d texture is laid over the shape, or over
-    /// one metre when uniform (docs/scene.md, texture coordinates).
-    /// </summary>
+    /// <summary>Surface appearance, in MuJoCo's terms.</summary>
     public sealed class Material : WireValue
     {
         public string Name = "";
         public double[] Rgba = new double[4];
-        public double Emission = 0.0;
+        public double Emission;
         public double Specular = 0.5;
         public double Shininess = 0.5;
-        public double Reflectance = 0.0;
+        public double Reflectance;
         public double Metallic = -1.0;
         public double Roughness = -1.0;
-        public TextureUse[] Textures = new TextureUse[0];
-        public double[] Repeat = new double[] { 1.0, 1.0 };
-        public bool Uniform = false;
+        public TextureUse[] Textures = Array.Empty<TextureUse>();
+        static readonly double[] RepeatDefault = { 1.0, 1.0 };
+        public double[] Repeat = (double[])RepeatDefault.Clone();
+        public bool Uniform;
 
-        public static Material Read(WireReader reader)
-        {
-            Material value = new Material();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(512); seen |= 1u; break;
-                    case "rgba": value.Rgba = reader.ReadDoubles(4, 0); seen |= 2u; break;
-                    case "emission": value.Emission = reader.ReadDouble(); break;
-                    case "specular": value.Specular = reader.ReadDouble(); break;
-                    case "shininess": value.Shininess = reader.ReadDouble(); break;
-                    case "reflectance": value.Reflectance = reader.ReadDouble(); break;
-                    case "metallic": value.Metallic = reader.ReadDouble(); break;
-                    case "roughness": value.Roughness = reader.ReadDouble(); break;
-                    case "textures": value.Textures = reader.ReadArray(Protocol.TextureUse.Read, 16); break;
-                    case "repeat": value.Repeat = reader.ReadDoubles(2, 0); break;
-                    case "uniform": value.Uniform = reader.ReadBool(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of Material");
-            return value;
-        }
+        public static Material Read(WireReader reader) => reader.ReadInto(new Material());
+        internal static readonly Func<Material> New = () => new Material();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(11);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("rgba");
-            writer.Write(Rgba);
-            writer.Write("emission");
-            writer.Write(Emission);
-            writer.Write("specular");
-            writer.Write(Specular);
-            writer.Write("shininess");
-            writer.Write(Shininess);
-            writer.Write("reflectance");
-            writer.Write(Reflectance);
-            writer.Write("metallic");
-            writer.Write(Metallic);
-            writer.Write("roughness");
-            writer.Write(Roughness);
-            writer.Write("textures");
-            writer.Write(Textures);
-            writer.Write("repeat");
-            writer.Write(Repeat);
-            writer.Write("uniform");
-            writer.Write(Uniform);
+            codec.Require("name", ref Name, 512);
+            codec.Require("rgba", ref Rgba, 4, 4);
+            codec.Allow("emission", ref Emission, 0.0);
+            codec.Allow("specular", ref Specular, 0.5);
+            codec.Allow("shininess", ref Shininess, 0.5);
+            codec.Allow("reflectance", ref Reflectance, 0.0);
+            codec.Allow("metallic", ref Metallic, -1.0);
+            codec.Allow("roughness", ref Roughness, -1.0);
+            codec.Allow("textures", ref Textures, 0, 16, Protocol.TextureUse.New);
+            codec.Allow("repeat", ref Repeat, 2, 2, RepeatDefault);
+            codec.Allow("uniform", ref Uniform, false);
         }
     }
 
-    /// <summary>
-    /// A texture in one TextureRole.
-    /// </summary>
+    /// <summary>A texture in one TextureRole.</summary>
     public sealed class TextureUse : WireValue
     {
         public string Role = "";
-        public long Texture = 0;
+        public long Texture;
 
-        public static TextureUse Read(WireReader reader)
-        {
-            TextureUse value = new TextureUse();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "role": value.Role = reader.ReadString(64); seen |= 1u; break;
-                    case "texture": value.Texture = reader.ReadLong(-1, 2147483647); seen |= 2u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of TextureUse");
-            return value;
-        }
+        public static TextureUse Read(WireReader reader) => reader.ReadInto(new TextureUse());
+        internal static readonly Func<TextureUse> New = () => new TextureUse();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("role");
-            writer.Write(Role);
-            writer.Write("texture");
-            writer.Write(Texture);
+            codec.Require("role", ref Role, 64);
+            codec.Require("texture", ref Texture, -1, int.MaxValue);
         }
     }
 
-    /// <summary>
-    /// An image. height of cube and skybox is that of one face; their assets hold six, one below the other, in the
-    /// order right, left, up, down, front, back. Level 0 is the whole image, each further one has half its sides.
-    /// </summary>
+    /// <summary>An image.</summary>
     public sealed class Texture : WireValue
     {
         public string Name = "";
         public string Kind = "";
-        public long Width = 0;
-        public long Height = 0;
-        public long Channels = 0;
+        public long Width;
+        public long Height;
+        public long Channels;
         public string Colorspace = "";
-        public TextureLevel[] Levels = new TextureLevel[0];
+        public TextureLevel[] Levels = Array.Empty<TextureLevel>();
 
-        public static Texture Read(WireReader reader)
-        {
-            Texture value = new Texture();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(512); seen |= 1u; break;
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 2u; break;
-                    case "width": value.Width = reader.ReadLong(0, long.MaxValue); seen |= 4u; break;
-                    case "height": value.Height = reader.ReadLong(0, long.MaxValue); seen |= 8u; break;
-                    case "channels": value.Channels = reader.ReadLong(0, long.MaxValue); seen |= 16u; break;
-                    case "colorspace": value.Colorspace = reader.ReadString(64); seen |= 32u; break;
-                    case "levels": value.Levels = reader.ReadArray(Protocol.TextureLevel.Read, 32); seen |= 64u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 127u) != 127u) throw new WireException("missing field of Texture");
-            return value;
-        }
+        public static Texture Read(WireReader reader) => reader.ReadInto(new Texture());
+        internal static readonly Func<Texture> New = () => new Texture();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(7);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("width");
-            writer.Write(Width);
-            writer.Write("height");
-            writer.Write(Height);
-            writer.Write("channels");
-            writer.Write(Channels);
-            writer.Write("colorspace");
-            writer.Write(Colorspace);
-            writer.Write("levels");
-            writer.Write(Levels);
+            codec.Require("name", ref Name, 512);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("width", ref Width, 0, long.MaxValue);
+            codec.Require("height", ref Height, 0, long.MaxValue);
+            codec.Require("channels", ref Channels, 0, long.MaxValue);
+            codec.Require("colorspace", ref Colorspace, 64);
+            codec.Require("levels", ref Levels, 0, 32, Protocol.TextureLevel.New);
         }
     }
 
-    /// <summary>
-    /// One size of a texture. max_error: largest difference of a channel to the exact pixels of this size, 0..255.
-    /// </summary>
+    /// <summary>One size of a texture.</summary>
     public sealed class TextureLevel : WireValue
     {
         public string Address = "";
-        public long Bytes = 0;
+        public long Bytes;
         public string Encoding = "";
-        public long Width = 0;
-        public long Height = 0;
-        public long MaxError = 0;
+        public long Width;
+        public long Height;
+        public long MaxError;
 
-        public static TextureLevel Read(WireReader reader)
-        {
-            TextureLevel value = new TextureLevel();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "address": value.Address = reader.ReadAddress(); seen |= 1u; break;
-                    case "bytes": value.Bytes = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "encoding": value.Encoding = reader.ReadString(64); seen |= 4u; break;
-                    case "width": value.Width = reader.ReadLong(0, long.MaxValue); seen |= 8u; break;
-                    case "height": value.Height = reader.ReadLong(0, long.MaxValue); seen |= 16u; break;
-                    case "max_error": value.MaxError = reader.ReadLong(-2147483648, 2147483647); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 31u) != 31u) throw new WireException("missing field of TextureLevel");
-            return value;
-        }
+        public static TextureLevel Read(WireReader reader) => reader.ReadInto(new TextureLevel());
+        internal static readonly Func<TextureLevel> New = () => new TextureLevel();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("address");
-            writer.Write(Address);
-            writer.Write("bytes");
-            writer.Write(Bytes);
-            writer.Write("encoding");
-            writer.Write(Encoding);
-            writer.Write("width");
-            writer.Write(Width);
-            writer.Write("height");
-            writer.Write(Height);
-            writer.Write("max_error");
-            writer.Write(MaxError);
+            codec.RequireAddress("address", ref Address);
+            codec.Require("bytes", ref Bytes, 0, long.MaxValue);
+            codec.Require("encoding", ref Encoding, 64);
+            codec.Require("width", ref Width, 0, long.MaxValue);
+            codec.Require("height", ref Height, 0, long.MaxValue);
+            codec.Allow("max_error", ref MaxError, int.MinValue, int.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// Triangles. Level 0 is exact, each further one coarser. low, high: the box around it in its frame [m].
-    /// </summary>
+    /// <summary>Triangles.</summary>
     public sealed class Mesh : WireValue
     {
         public string Name = "";
         public double[] Low = new double[3];
         public double[] High = new double[3];
-        public bool Textured = false;
-        public MeshLevel[] Levels = new MeshLevel[0];
+        public bool Textured;
+        public MeshLevel[] Levels = Array.Empty<MeshLevel>();
 
-        public static Mesh Read(WireReader reader)
-        {
-            Mesh value = new Mesh();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(512); seen |= 1u; break;
-                    case "low": value.Low = reader.ReadDoubles(3, 0); seen |= 2u; break;
-                    case "high": value.High = reader.ReadDoubles(3, 0); seen |= 4u; break;
-                    case "textured": value.Textured = reader.ReadBool(); seen |= 8u; break;
-                    case "levels": value.Levels = reader.ReadArray(Protocol.MeshLevel.Read, 32); seen |= 16u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 31u) != 31u) throw new WireException("missing field of Mesh");
-            return value;
-        }
+        public static Mesh Read(WireReader reader) => reader.ReadInto(new Mesh());
+        internal static readonly Func<Mesh> New = () => new Mesh();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(5);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("low");
-            writer.Write(Low);
-            writer.Write("high");
-            writer.Write(High);
-            writer.Write("textured");
-            writer.Write(Textured);
-            writer.Write("levels");
-            writer.Write(Levels);
+            codec.Require("name", ref Name, 512);
+            codec.Require("low", ref Low, 3, 3);
+            codec.Require("high", ref High, 3, 3);
+            codec.Require("textured", ref Textured);
+            codec.Require("levels", ref Levels, 0, 32, Protocol.MeshLevel.New);
         }
     }
 
-    /// <summary>
-    /// One level of detail. max_error_m: how far its points lie from the exact mesh at most [m], 0: exact. Parts of
-    /// the exact mesh that are smaller than this may be missing.
-    /// </summary>
+    /// <summary>One level of detail.</summary>
     public sealed class MeshLevel : WireValue
     {
         public string Address = "";
-        public long Bytes = 0;
+        public long Bytes;
         public string Encoding = "";
-        public long Vertices = 0;
-        public long Triangles = 0;
-        public double MaxErrorM = 0.0;
+        public long Vertices;
+        public long Triangles;
+        public double MaxErrorM;
 
-        public static MeshLevel Read(WireReader reader)
-        {
-            MeshLevel value = new MeshLevel();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "address": value.Address = reader.ReadAddress(); seen |= 1u; break;
-                    case "bytes": value.Bytes = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "encoding": value.Encoding = reader.ReadString(64); seen |= 4u; break;
-                    case "vertices": value.Vertices = reader.ReadLong(0, long.MaxValue); seen |= 8u; break;
-                    case "triangles": value.Triangles = reader.ReadLong(0, long.MaxValue); seen |= 16u; break;
-                    case "max_error_m": value.MaxErrorM = reader.ReadDouble(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 31u) != 31u) throw new WireException("missing field of MeshLevel");
-            return value;
-        }
+        public static MeshLevel Read(WireReader reader) => reader.ReadInto(new MeshLevel());
+        internal static readonly Func<MeshLevel> New = () => new MeshLevel();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("address");
-            writer.Write(Address);
-            writer.Write("bytes");
-            writer.Write(Bytes);
-            writer.Write("encoding");
-            writer.Write(Encoding);
-            writer.Write("vertices");
-            writer.Write(Vertices);
-            writer.Write("triangles");
-            writer.Write(Triangles);
-            writer.Write("max_error_m");
-            writer.Write(MaxErrorM);
+            codec.RequireAddress("address", ref Address);
+            codec.Require("bytes", ref Bytes, 0, long.MaxValue);
+            codec.Require("encoding", ref Encoding, 64);
+            codec.Require("vertices", ref Vertices, 0, long.MaxValue);
+            codec.Require("triangles", ref Triangles, 0, long.MaxValue);
+            codec.Allow("max_error_m", ref MaxErrorM, 0.0);
         }
     }
 
-    /// <summary>
-    /// Elevations on a grid, rows along y, columns along x, in 0..1.
-    ///
-    /// size [m]: half length along x, along y, height of elevation 1, depth of the base below 0.
-    /// </summary>
+    /// <summary>Elevations on a grid, rows along y, columns along x, in 0..1.</summary>
     public sealed class HeightField : WireValue
     {
         public string Name = "";
-        public long Rows = 0;
-        public long Columns = 0;
+        public long Rows;
+        public long Columns;
         public double[] Size = new double[4];
         public string Address = "";
-        public long Bytes = 0;
+        public long Bytes;
         public string Encoding = "arrays";
 
-        public static HeightField Read(WireReader reader)
-        {
-            HeightField value = new HeightField();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(512); seen |= 1u; break;
-                    case "rows": value.Rows = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "columns": value.Columns = reader.ReadLong(0, long.MaxValue); seen |= 4u; break;
-                    case "size": value.Size = reader.ReadDoubles(4, 0); seen |= 8u; break;
-                    case "address": value.Address = reader.ReadAddress(); seen |= 16u; break;
-                    case "bytes": value.Bytes = reader.ReadLong(0, long.MaxValue); seen |= 32u; break;
-                    case "encoding": value.Encoding = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 63u) != 63u) throw new WireException("missing field of HeightField");
-            return value;
-        }
+        public static HeightField Read(WireReader reader) => reader.ReadInto(new HeightField());
+        internal static readonly Func<HeightField> New = () => new HeightField();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(7);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("rows");
-            writer.Write(Rows);
-            writer.Write("columns");
-            writer.Write(Columns);
-            writer.Write("size");
-            writer.Write(Size);
-            writer.Write("address");
-            writer.Write(Address);
-            writer.Write("bytes");
-            writer.Write(Bytes);
-            writer.Write("encoding");
-            writer.Write(Encoding);
+            codec.Require("name", ref Name, 512);
+            codec.Require("rows", ref Rows, 0, long.MaxValue);
+            codec.Require("columns", ref Columns, 0, long.MaxValue);
+            codec.Require("size", ref Size, 4, 4);
+            codec.RequireAddress("address", ref Address);
+            codec.Require("bytes", ref Bytes, 0, long.MaxValue);
+            codec.Allow("encoding", ref Encoding, 64, "arrays");
         }
     }
 
-    /// <summary>
-    /// A light on a body, shining along direction, a unit vector in the body's frame.
-    ///
-    /// attenuation: constant, linear [1/m], quadratic [1/m^2]. cutoff: half angle of a spot [deg], exponent: of the
-    /// cosine within it. intensity [cd]: 0 where the scene does not say. range [m]: 0 for no end.
-    /// </summary>
+    /// <summary>A light on a body, shining along direction, a unit vector in the body's frame.</summary>
     public sealed class Light : WireValue
     {
         public string Name = "";
         public string Kind = "";
-        public long Body = 0;
+        public long Body;
         public double[] PBody = new double[3];
         public double[] DirectionBody = new double[3];
         public double[] Ambient = new double[3];
         public double[] Diffuse = new double[3];
         public double[] Specular = new double[3];
-        public double[] Attenuation = new double[] { 1.0, 0.0, 0.0 };
+        static readonly double[] AttenuationDefault = { 1.0, 0.0, 0.0 };
+        public double[] Attenuation = (double[])AttenuationDefault.Clone();
         public double Cutoff = 45.0;
         public double Exponent = 10.0;
-        public double Range = 0.0;
-        public double Intensity = 0.0;
-        public double BulbRadius = 0.0;
+        public double Range;
+        public double Intensity;
+        public double BulbRadius;
         public long Texture = -1;
         public bool Castshadow = true;
         public bool Active = true;
         public string Follow = "fixed";
         public long Target = -1;
 
-        public static Light Read(WireReader reader)
-        {
-            Light value = new Light();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(512); seen |= 1u; break;
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 2u; break;
-                    case "body": value.Body = reader.ReadLong(0, long.MaxValue); seen |= 4u; break;
-                    case "p_body": value.PBody = reader.ReadDoubles(3, 0); seen |= 8u; break;
-                    case "direction_body": value.DirectionBody = reader.ReadDoubles(3, 0); seen |= 16u; break;
-                    case "ambient": value.Ambient = reader.ReadDoubles(3, 0); seen |= 32u; break;
-                    case "diffuse": value.Diffuse = reader.ReadDoubles(3, 0); seen |= 64u; break;
-                    case "specular": value.Specular = reader.ReadDoubles(3, 0); seen |= 128u; break;
-                    case "attenuation": value.Attenuation = reader.ReadDoubles(3, 0); break;
-                    case "cutoff": value.Cutoff = reader.ReadDouble(); break;
-                    case "exponent": value.Exponent = reader.ReadDouble(); break;
-                    case "range": value.Range = reader.ReadDouble(); break;
-                    case "intensity": value.Intensity = reader.ReadDouble(); break;
-                    case "bulb_radius": value.BulbRadius = reader.ReadDouble(); break;
-                    case "texture": value.Texture = reader.ReadLong(-1, 2147483647); break;
-                    case "castshadow": value.Castshadow = reader.ReadBool(); break;
-                    case "active": value.Active = reader.ReadBool(); break;
-                    case "follow": value.Follow = reader.ReadString(64); break;
-                    case "target": value.Target = reader.ReadLong(-1, 2147483647); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 255u) != 255u) throw new WireException("missing field of Light");
-            return value;
-        }
+        public static Light Read(WireReader reader) => reader.ReadInto(new Light());
+        internal static readonly Func<Light> New = () => new Light();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(19);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("body");
-            writer.Write(Body);
-            writer.Write("p_body");
-            writer.Write(PBody);
-            writer.Write("direction_body");
-            writer.Write(DirectionBody);
-            writer.Write("ambient");
-            writer.Write(Ambient);
-            writer.Write("diffuse");
-            writer.Write(Diffuse);
-            writer.Write("specular");
-            writer.Write(Specular);
-            writer.Write("attenuation");
-            writer.Write(Attenuation);
-            writer.Write("cutoff");
-            writer.Write(Cutoff);
-            writer.Write("exponent");
-            writer.Write(Exponent);
-            writer.Write("range");
-            writer.Write(Range);
-            writer.Write("intensity");
-            writer.Write(Intensity);
-            writer.Write("bulb_radius");
-            writer.Write(BulbRadius);
-            writer.Write("texture");
-            writer.Write(Texture);
-            writer.Write("castshadow");
-            writer.Write(Castshadow);
-            writer.Write("active");
-            writer.Write(Active);
-            writer.Write("follow");
-            writer.Write(Follow);
-            writer.Write("target");
-            writer.Write(Target);
+            codec.Require("name", ref Name, 512);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("body", ref Body, 0, long.MaxValue);
+            codec.Require("p_body", ref PBody, 3, 3);
+            codec.Require("direction_body", ref DirectionBody, 3, 3);
+            codec.Require("ambient", ref Ambient, 3, 3);
+            codec.Require("diffuse", ref Diffuse, 3, 3);
+            codec.Require("specular", ref Specular, 3, 3);
+            codec.Allow("attenuation", ref Attenuation, 3, 3, AttenuationDefault);
+            codec.Allow("cutoff", ref Cutoff, 45.0);
+            codec.Allow("exponent", ref Exponent, 10.0);
+            codec.Allow("range", ref Range, 0.0);
+            codec.Allow("intensity", ref Intensity, 0.0);
+            codec.Allow("bulb_radius", ref BulbRadius, 0.0);
+            codec.Allow("texture", ref Texture, -1, int.MaxValue, -1);
+            codec.Allow("castshadow", ref Castshadow, true);
+            codec.Allow("active", ref Active, true);
+            codec.Allow("follow", ref Follow, 64, "fixed");
+            codec.Allow("target", ref Target, -1, int.MaxValue, -1);
         }
     }
 
-    /// <summary>
-    /// A camera on a body: looks along -z of its own frame, y is up.
-    ///
-    /// fovy: vertical field of view [deg], of an orthographic camera the height of what it sees [m]. focal,
-    /// principal: in pixels, principal from the centre of the picture, x right, y up; 0 where only fovy counts.
-    /// resolution: pixels, 1 x 1 where the scene does not say.
-    /// </summary>
+    /// <summary>A camera on a body: looks along -z of its own frame, y is up.</summary>
     public sealed class Camera : WireValue
     {
         public string Name = "";
-        public long Body = 0;
+        public long Body;
         public Pose T_body_camera = new Pose();
-        public double Fovy = 0.0;
-        public bool Orthographic = false;
-        public double[] Focal = new double[] { 0.0, 0.0 };
-        public double[] Principal = new double[] { 0.0, 0.0 };
-        public long[] Resolution = new long[] { 1, 1 };
+        public double Fovy;
+        public bool Orthographic;
+        public double[] Focal = new double[2];
+        public double[] Principal = new double[2];
+        static readonly long[] ResolutionDefault = { 1, 1 };
+        public long[] Resolution = (long[])ResolutionDefault.Clone();
         public string Follow = "fixed";
         public long Target = -1;
 
-        public static Camera Read(WireReader reader)
-        {
-            Camera value = new Camera();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(512); seen |= 1u; break;
-                    case "body": value.Body = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "T_body_camera": value.T_body_camera = Pose.Read(reader); seen |= 4u; break;
-                    case "fovy": value.Fovy = reader.ReadDouble(); seen |= 8u; break;
-                    case "orthographic": value.Orthographic = reader.ReadBool(); break;
-                    case "focal": value.Focal = reader.ReadDoubles(2, 0); break;
-                    case "principal": value.Principal = reader.ReadDoubles(2, 0); break;
-                    case "resolution": value.Resolution = reader.ReadLongs(2, 0, -2147483648, 2147483647); break;
-                    case "follow": value.Follow = reader.ReadString(64); break;
-                    case "target": value.Target = reader.ReadLong(-1, 2147483647); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of Camera");
-            return value;
-        }
+        public static Camera Read(WireReader reader) => reader.ReadInto(new Camera());
+        internal static readonly Func<Camera> New = () => new Camera();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(10);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("body");
-            writer.Write(Body);
-            writer.Write("T_body_camera");
-            writer.Write(T_body_camera);
-            writer.Write("fovy");
-            writer.Write(Fovy);
-            writer.Write("orthographic");
-            writer.Write(Orthographic);
-            writer.Write("focal");
-            writer.Write(Focal);
-            writer.Write("principal");
-            writer.Write(Principal);
-            writer.Write("resolution");
-            writer.Write(Resolution);
-            writer.Write("follow");
-            writer.Write(Follow);
-            writer.Write("target");
-            writer.Write(Target);
+            codec.Require("name", ref Name, 512);
+            codec.Require("body", ref Body, 0, long.MaxValue);
+            codec.Require("T_body_camera", ref T_body_camera, Protocol.Pose.New);
+            codec.Require("fovy", ref Fovy);
+            codec.Allow("orthographic", ref Orthographic, false);
+            codec.Allow("focal", ref Focal, 2, 2);
+            codec.Allow("principal", ref Principal, 2, 2);
+            codec.Allow("resolution", ref Resolution, 2, 2, int.MinValue, int.MaxValue, ResolutionDefault);
+            codec.Allow("follow", ref Follow, 64, "fixed");
+            codec.Allow("target", ref Target, -1, int.MaxValue, -1);
         }
     }
 
-    /// <summary>
-    /// A marked place on a body, drawn as a shape on request.
-    /// </summary>
+    /// <summary>A marked place on a body, drawn as a shape on request.</summary>
     public sealed class Site : WireValue
     {
-        public long Id = 0;
-        public long Body = 0;
+        public long Id;
+        public long Body;
         public string Name = "";
         public Pose T_body_site = new Pose();
-        public long Group = 0;
+        public long Group;
         public Geometry Geometry = new Geometry();
-        public long Material = 0;
+        public long Material;
         public double[] Rgba = new double[4];
 
-        public static Site Read(WireReader reader)
-        {
-            Site value = new Site();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "id": value.Id = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "body": value.Body = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "name": value.Name = reader.ReadString(512); seen |= 4u; break;
-                    case "T_body_site": value.T_body_site = Pose.Read(reader); seen |= 8u; break;
-                    case "group": value.Group = reader.ReadLong(-2147483648, 2147483647); seen |= 16u; break;
-                    case "geometry": value.Geometry = Geometry.Read(reader); seen |= 32u; break;
-                    case "material": value.Material = reader.ReadLong(-1, 2147483647); seen |= 64u; break;
-                    case "rgba": value.Rgba = reader.ReadDoubles(4, 0); seen |= 128u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 255u) != 255u) throw new WireException("missing field of Site");
-            return value;
-        }
+        public static Site Read(WireReader reader) => reader.ReadInto(new Site());
+        internal static readonly Func<Site> New = () => new Site();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(8);
-            writer.Write("id");
-            writer.Write(Id);
-            writer.Write("body");
-            writer.Write(Body);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("T_body_site");
-            writer.Write(T_body_site);
-            writer.Write("group");
-            writer.Write(Group);
-            writer.Write("geometry");
-            writer.Write(Geometry);
-            writer.Write("material");
-            writer.Write(Material);
-            writer.Write("rgba");
-            writer.Write(Rgba);
+            codec.Require("id", ref Id, 0, long.MaxValue);
+            codec.Require("body", ref Body, 0, long.MaxValue);
+            codec.Require("name", ref Name, 512);
+            codec.Require("T_body_site", ref T_body_site, Protocol.Pose.New);
+            codec.Require("group", ref Group, int.MinValue, int.MaxValue);
+            codec.Require("geometry", ref Geometry, Protocol.Geometry.New);
+            codec.Require("material", ref Material, -1, int.MaxValue);
+            codec.Require("rgba", ref Rgba, 4, 4);
         }
     }
 
-    /// <summary>
-    /// A cable, drawn on request as straight pieces of radius width [m] through sites, ids; wrapping is left out.
-    /// </summary>
+    /// <summary>A cable, drawn on request as straight pieces of radius width [m] through sites, ids; ...</summary>
     public sealed class Tendon : WireValue
     {
         public string Name = "";
-        public long Group = 0;
-        public double Width = 0.0;
-        public long[] Sites = new long[0];
-        public long Material = 0;
+        public long Group;
+        public double Width;
+        public long[] Sites = Array.Empty<long>();
+        public long Material;
         public double[] Rgba = new double[4];
 
-        public static Tendon Read(WireReader reader)
-        {
-            Tendon value = new Tendon();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(512); seen |= 1u; break;
-                    case "group": value.Group = reader.ReadLong(-2147483648, 2147483647); seen |= 2u; break;
-                    case "width": value.Width = reader.ReadDouble(); seen |= 4u; break;
-                    case "sites": value.Sites = reader.ReadLongs(0, 4096, 0, long.MaxValue); seen |= 8u; break;
-                    case "material": value.Material = reader.ReadLong(-1, 2147483647); seen |= 16u; break;
-                    case "rgba": value.Rgba = reader.ReadDoubles(4, 0); seen |= 32u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 63u) != 63u) throw new WireException("missing field of Tendon");
-            return value;
-        }
+        public static Tendon Read(WireReader reader) => reader.ReadInto(new Tendon());
+        internal static readonly Func<Tendon> New = () => new Tendon();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("group");
-            writer.Write(Group);
-            writer.Write("width");
-            writer.Write(Width);
-            writer.Write("sites");
-            writer.Write(Sites);
-            writer.Write("material");
-            writer.Write(Material);
-            writer.Write("rgba");
-            writer.Write(Rgba);
+            codec.Require("name", ref Name, 512);
+            codec.Require("group", ref Group, int.MinValue, int.MaxValue);
+            codec.Require("width", ref Width);
+            codec.Require("sites", ref Sites, 0, 4096, 0, long.MaxValue);
+            codec.Require("material", ref Material, -1, int.MaxValue);
+            codec.Require("rgba", ref Rgba, 4, 4);
         }
     }
 
-    /// <summary>
-    /// A mesh whose vertices move: ropes (dim 1), cloths (2), surfaces of soft bodies (3).
-    ///
-    /// The asset has the elements (edges for dim 1, triangles else), texture coordinates, and the vertices of the initial
-    /// state, in the world. stream: of the media channel, whose frames hold the vertices in the same order. radius [m]:
-    /// half the thickness. flat: one normal per triangle.
-    /// </summary>
+    /// <summary>A mesh whose vertices move: ropes (dim 1), cloths (2), surfaces of soft bodies (3).</summary>
     public sealed class Deformable : WireValue
     {
         public string Name = "";
-        public long Dim = 0;
-        public long Group = 0;
-        public long Vertices = 0;
-        public long Elements = 0;
-        public double Radius = 0.0;
-        public bool Flat = false;
-        public long Material = 0;
+        public long Dim;
+        public long Group;
+        public long Vertices;
+        public long Elements;
+        public double Radius;
+        public bool Flat;
+        public long Material;
         public double[] Rgba = new double[4];
         public string Stream = "";
         public string Address = "";
-        public long Bytes = 0;
+        public long Bytes;
         public string Encoding = "arrays";
 
-        public static Deformable Read(WireReader reader)
-        {
-            Deformable value = new Deformable();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(512); seen |= 1u; break;
-                    case "dim": value.Dim = reader.ReadLong(0, long.MaxValue); seen |= 2u; break;
-                    case "group": value.Group = reader.ReadLong(-2147483648, 2147483647); seen |= 4u; break;
-                    case "vertices": value.Vertices = reader.ReadLong(0, long.MaxValue); seen |= 8u; break;
-                    case "elements": value.Elements = reader.ReadLong(0, long.MaxValue); seen |= 16u; break;
-                    case "radius": value.Radius = reader.ReadDouble(); seen |= 32u; break;
-                    case "flat": value.Flat = reader.ReadBool(); seen |= 64u; break;
-                    case "material": value.Material = reader.ReadLong(-1, 2147483647); seen |= 128u; break;
-                    case "rgba": value.Rgba = reader.ReadDoubles(4, 0); seen |= 256u; break;
-                    case "stream": value.Stream = reader.ReadString(64); seen |= 512u; break;
-                    case "address": value.Address = reader.ReadAddress(); seen |= 1024u; break;
-                    case "bytes": value.Bytes = reader.ReadLong(0, long.MaxValue); seen |= 2048u; break;
-                    case "encoding": value.Encoding = reader.ReadString(64); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 4095u) != 4095u) throw new WireException("missing field of Deformable");
-            return value;
-        }
+        public static Deformable Read(WireReader reader) => reader.ReadInto(new Deformable());
+        internal static readonly Func<Deformable> New = () => new Deformable();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(13);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("dim");
-            writer.Write(Dim);
-            writer.Write("group");
-            writer.Write(Group);
-            writer.Write("vertices");
-            writer.Write(Vertices);
-            writer.Write("elements");
-            writer.Write(Elements);
-            writer.Write("radius");
-            writer.Write(Radius);
-            writer.Write("flat");
-            writer.Write(Flat);
-            writer.Write("material");
-            writer.Write(Material);
-            writer.Write("rgba");
-            writer.Write(Rgba);
-            writer.Write("stream");
-            writer.Write(Stream);
-            writer.Write("address");
-            writer.Write(Address);
-            writer.Write("bytes");
-            writer.Write(Bytes);
-            writer.Write("encoding");
-            writer.Write(Encoding);
+            codec.Require("name", ref Name, 512);
+            codec.Require("dim", ref Dim, 0, long.MaxValue);
+            codec.Require("group", ref Group, int.MinValue, int.MaxValue);
+            codec.Require("vertices", ref Vertices, 0, long.MaxValue);
+            codec.Require("elements", ref Elements, 0, long.MaxValue);
+            codec.Require("radius", ref Radius);
+            codec.Require("flat", ref Flat);
+            codec.Require("material", ref Material, -1, int.MaxValue);
+            codec.Require("rgba", ref Rgba, 4, 4);
+            codec.Require("stream", ref Stream, 64);
+            codec.RequireAddress("address", ref Address);
+            codec.Require("bytes", ref Bytes, 0, long.MaxValue);
+            codec.Allow("encoding", ref Encoding, 64, "arrays");
         }
     }
 
-    /// <summary>
-    /// Surroundings of the scene. skybox: a texture. Lengths [m]. Haze blends the skybox's horizon, fog all.
-    /// </summary>
+    /// <summary>Surroundings of the scene.</summary>
     public sealed class Environment : WireValue
     {
         public Headlight Headlight = new Headlight();
         public long Skybox = -1;
-        public double[] HazeRgba = new double[] { 1.0, 1.0, 1.0, 1.0 };
+        static readonly double[] HazeRgbaDefault = { 1.0, 1.0, 1.0, 1.0 };
+        public double[] HazeRgba = (double[])HazeRgbaDefault.Clone();
         public double Haze = 0.3;
-        public double[] FogRgba = new double[] { 0.0, 0.0, 0.0, 1.0 };
-        public double FogStart = 0.0;
-        public double FogEnd = 0.0;
+        static readonly double[] FogRgbaDefault = { 0.0, 0.0, 0.0, 1.0 };
+        public double[] FogRgba = (double[])FogRgbaDefault.Clone();
+        public double FogStart;
+        public double FogEnd;
         public double Znear = 0.01;
         public double Zfar = 50.0;
         public double Extent = 1.0;
-        public double[] Center = new double[] { 0.0, 0.0, 0.0 };
+        public double[] Center = new double[3];
 
-        public static Environment Read(WireReader reader)
-        {
-            Environment value = new Environment();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "headlight": value.Headlight = Headlight.Read(reader); break;
-                    case "skybox": value.Skybox = reader.ReadLong(-1, 2147483647); break;
-                    case "haze_rgba": value.HazeRgba = reader.ReadDoubles(4, 0); break;
-                    case "haze": value.Haze = reader.ReadDouble(); break;
-                    case "fog_rgba": value.FogRgba = reader.ReadDoubles(4, 0); break;
-                    case "fog_start": value.FogStart = reader.ReadDouble(); break;
-                    case "fog_end": value.FogEnd = reader.ReadDouble(); break;
-                    case "znear": value.Znear = reader.ReadDouble(); break;
-                    case "zfar": value.Zfar = reader.ReadDouble(); break;
-                    case "extent": value.Extent = reader.ReadDouble(); break;
-                    case "center": value.Center = reader.ReadDoubles(3, 0); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static Environment Read(WireReader reader) => reader.ReadInto(new Environment());
+        internal static readonly Func<Environment> New = () => new Environment();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(11);
-            writer.Write("headlight");
-            writer.Write(Headlight);
-            writer.Write("skybox");
-            writer.Write(Skybox);
-            writer.Write("haze_rgba");
-            writer.Write(HazeRgba);
-            writer.Write("haze");
-            writer.Write(Haze);
-            writer.Write("fog_rgba");
-            writer.Write(FogRgba);
-            writer.Write("fog_start");
-            writer.Write(FogStart);
-            writer.Write("fog_end");
-            writer.Write(FogEnd);
-            writer.Write("znear");
-            writer.Write(Znear);
-            writer.Write("zfar");
-            writer.Write(Zfar);
-            writer.Write("extent");
-            writer.Write(Extent);
-            writer.Write("center");
-            writer.Write(Center);
+            codec.Allow("headlight", ref Headlight, Protocol.Headlight.New);
+            codec.Allow("skybox", ref Skybox, -1, int.MaxValue, -1);
+            codec.Allow("haze_rgba", ref HazeRgba, 4, 4, HazeRgbaDefault);
+            codec.Allow("haze", ref Haze, 0.3);
+            codec.Allow("fog_rgba", ref FogRgba, 4, 4, FogRgbaDefault);
+            codec.Allow("fog_start", ref FogStart, 0.0);
+            codec.Allow("fog_end", ref FogEnd, 0.0);
+            codec.Allow("znear", ref Znear, 0.01);
+            codec.Allow("zfar", ref Zfar, 50.0);
+            codec.Allow("extent", ref Extent, 1.0);
+            codec.Allow("center", ref Center, 3, 3);
         }
     }
 
-    /// <summary>
-    /// A light without shadow at the viewer's head that shines where it looks.
-    /// </summary>
+    /// <summary>A light without shadow at the viewer's head that shines where it looks.</summary>
     public sealed class Headlight : WireValue
     {
         public bool Active = true;
-        public double[] Ambient = new double[] { 0.1, 0.1, 0.1 };
-        public double[] Diffuse = new double[] { 0.4, 0.4, 0.4 };
-        public double[] Specular = new double[] { 0.5, 0.5, 0.5 };
+        static readonly double[] AmbientDefault = { 0.1, 0.1, 0.1 };
+        public double[] Ambient = (double[])AmbientDefault.Clone();
+        static readonly double[] DiffuseDefault = { 0.4, 0.4, 0.4 };
+        public double[] Diffuse = (double[])DiffuseDefault.Clone();
+        static readonly double[] SpecularDefault = { 0.5, 0.5, 0.5 };
+        public double[] Specular = (double[])SpecularDefault.Clone();
 
-        public static Headlight Read(WireReader reader)
-        {
-            Headlight value = new Headlight();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "active": value.Active = reader.ReadBool(); break;
-                    case "ambient": value.Ambient = reader.ReadDoubles(3, 0); break;
-                    case "diffuse": value.Diffuse = reader.ReadDoubles(3, 0); break;
-                    case "specular": value.Specular = reader.ReadDoubles(3, 0); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static Headlight Read(WireReader reader) => reader.ReadInto(new Headlight());
+        internal static readonly Func<Headlight> New = () => new Headlight();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(4);
-            writer.Write("active");
-            writer.Write(Active);
-            writer.Write("ambient");
-            writer.Write(Ambient);
-            writer.Write("diffuse");
-            writer.Write(Diffuse);
-            writer.Write("specular");
-            writer.Write(Specular);
+            codec.Allow("active", ref Active, true);
+            codec.Allow("ambient", ref Ambient, 3, 3, AmbientDefault);
+            codec.Allow("diffuse", ref Diffuse, 3, 3, DiffuseDefault);
+            codec.Allow("specular", ref Specular, 3, 3, SpecularDefault);
         }
     }
 
-    /// <summary>
-    /// Cost of the scene with everything exact: each asset once, triangles as often as they are drawn.
-    ///
-    /// objects, triangles: of the groups that are shown at first. texture_memory: bytes on a graphics card.
-    /// </summary>
+    /// <summary>Cost of the scene with everything exact: each asset once, triangles as often as they are ...</summary>
     public sealed class Totals : WireValue
     {
-        public long Objects = 0;
-        public long Triangles = 0;
-        public long MeshBytes = 0;
-        public long TextureBytes = 0;
-        public long TextureMemory = 0;
-        public long AssetBytes = 0;
+        public long Objects;
+        public long Triangles;
+        public long MeshBytes;
+        public long TextureBytes;
+        public long TextureMemory;
+        public long AssetBytes;
 
-        public static Totals Read(WireReader reader)
-        {
-            Totals value = new Totals();
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "objects": value.Objects = reader.ReadLong(0, long.MaxValue); break;
-                    case "triangles": value.Triangles = reader.ReadLong(0, long.MaxValue); break;
-                    case "mesh_bytes": value.MeshBytes = reader.ReadLong(0, long.MaxValue); break;
-                    case "texture_bytes": value.TextureBytes = reader.ReadLong(0, long.MaxValue); break;
-                    case "texture_memory": value.TextureMemory = reader.ReadLong(0, long.MaxValue); break;
-                    case "asset_bytes": value.AssetBytes = reader.ReadLong(0, long.MaxValue); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            return value;
-        }
+        public static Totals Read(WireReader reader) => reader.ReadInto(new Totals());
+        internal static readonly Func<Totals> New = () => new Totals();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("objects");
-            writer.Write(Objects);
-            writer.Write("triangles");
-            writer.Write(Triangles);
-            writer.Write("mesh_bytes");
-            writer.Write(MeshBytes);
-            writer.Write("texture_bytes");
-            writer.Write(TextureBytes);
-            writer.Write("texture_memory");
-            writer.Write(TextureMemory);
-            writer.Write("asset_bytes");
-            writer.Write(AssetBytes);
+            codec.Allow("objects", ref Objects, 0, long.MaxValue, 0);
+            codec.Allow("triangles", ref Triangles, 0, long.MaxValue, 0);
+            codec.Allow("mesh_bytes", ref MeshBytes, 0, long.MaxValue, 0);
+            codec.Allow("texture_bytes", ref TextureBytes, 0, long.MaxValue, 0);
+            codec.Allow("texture_memory", ref TextureMemory, 0, long.MaxValue, 0);
+            codec.Allow("asset_bytes", ref AssetBytes, 0, long.MaxValue, 0);
         }
     }
 
-    /// <summary>
-    /// The header of a container. kind of ArrayKind; max_error: stated bound on the values, in their unit, 0:
-    /// exact.
-    /// </summary>
+    /// <summary>The header of a container.</summary>
     public sealed class ArrayHeader : WireValue
     {
         public string Kind = "";
-        public ArrayInfo[] Arrays = new ArrayInfo[0];
-        public double MaxError = 0.0;
+        public ArrayInfo[] Arrays = Array.Empty<ArrayInfo>();
+        public double MaxError;
 
-        public static ArrayHeader Read(WireReader reader)
-        {
-            ArrayHeader value = new ArrayHeader();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "kind": value.Kind = reader.ReadString(64); seen |= 1u; break;
-                    case "arrays": value.Arrays = reader.ReadArray(Protocol.ArrayInfo.Read, 16); seen |= 2u; break;
-                    case "max_error": value.MaxError = reader.ReadDouble(); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 3u) != 3u) throw new WireException("missing field of ArrayHeader");
-            return value;
-        }
+        public static ArrayHeader Read(WireReader reader) => reader.ReadInto(new ArrayHeader());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(3);
-            writer.Write("kind");
-            writer.Write(Kind);
-            writer.Write("arrays");
-            writer.Write(Arrays);
-            writer.Write("max_error");
-            writer.Write(MaxError);
+            codec.Require("kind", ref Kind, 64);
+            codec.Require("arrays", ref Arrays, 0, 16, Protocol.ArrayInfo.New);
+            codec.Allow("max_error", ref MaxError, 0.0);
         }
     }
 
-    /// <summary>
-    /// One array. dtype: u1, i1, u2, u4, f4, little-endian. shape: C order.
-    ///
-    /// bytes: of its compressed form. Values are offset + scale * stored, per entry of the last axis, where scale
-    /// is not empty.
-    /// </summary>
+    /// <summary>One array.</summary>
     public sealed class ArrayInfo : WireValue
     {
         public string Name = "";
         public string Dtype = "";
-        public long[] Shape = new long[0];
-        public long Bytes = 0;
+        public long[] Shape = Array.Empty<long>();
+        public long Bytes;
         public string Filter = "none";
         public string Codec = "none";
-        public double[] Scale = new double[0];
-        public double[] Offset = new double[0];
+        public double[] Scale = Array.Empty<double>();
+        public double[] Offset = Array.Empty<double>();
 
-        public static ArrayInfo Read(WireReader reader)
-        {
-            ArrayInfo value = new ArrayInfo();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "name": value.Name = reader.ReadString(64); seen |= 1u; break;
-                    case "dtype": value.Dtype = reader.ReadString(64); seen |= 2u; break;
-                    case "shape": value.Shape = reader.ReadLongs(0, 4, 0, long.MaxValue); seen |= 4u; break;
-                    case "bytes": value.Bytes = reader.ReadLong(0, long.MaxValue); seen |= 8u; break;
-                    case "filter": value.Filter = reader.ReadString(64); break;
-                    case "codec": value.Codec = reader.ReadString(64); break;
-                    case "scale": value.Scale = reader.ReadDoubles(0, 4); break;
-                    case "offset": value.Offset = reader.ReadDoubles(0, 4); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 15u) != 15u) throw new WireException("missing field of ArrayInfo");
-            return value;
-        }
+        public static ArrayInfo Read(WireReader reader) => reader.ReadInto(new ArrayInfo());
+        internal static readonly Func<ArrayInfo> New = () => new ArrayInfo();
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(8);
-            writer.Write("name");
-            writer.Write(Name);
-            writer.Write("dtype");
-            writer.Write(Dtype);
-            writer.Write("shape");
-            writer.Write(Shape);
-            writer.Write("bytes");
-            writer.Write(Bytes);
-            writer.Write("filter");
-            writer.Write(Filter);
-            writer.Write("codec");
-            writer.Write(Codec);
-            writer.Write("scale");
-            writer.Write(Scale);
-            writer.Write("offset");
-            writer.Write(Offset);
+            codec.Require("name", ref Name, 64);
+            codec.Require("dtype", ref Dtype, 64);
+            codec.Require("shape", ref Shape, 1, 4, 0, long.MaxValue);
+            codec.Require("bytes", ref Bytes, 0, long.MaxValue);
+            codec.Allow("filter", ref Filter, 64, "none");
+            codec.Allow("codec", ref Codec, 64, "none");
+            codec.Allow("scale", ref Scale, 0, 4);
+            codec.Allow("offset", ref Offset, 0, 4);
         }
     }
 
-    /// <summary>
-    /// Change how a visual is drawn; fields that are null stay. rgba with alpha 0 hides it.
-    /// </summary>
+    /// <summary>Change how a visual is drawn; fields that are null stay.</summary>
     public sealed class SetVisual : PatchOp
     {
         public const string TagName = "set_visual";
-        public override string Tag { get { return TagName; } }
-        public long Visual = 0;
-        public double[] Rgba = null;
-        public long? Group = null;
-        public long? Material = null;
-        public Pose T_body_visual = null;
+        public override string Tag => TagName;
+        public long Visual;
+        public double[] Rgba;
+        public long? Group;
+        public long? Material;
+        public Pose T_body_visual;
 
-        public static SetVisual Read(WireReader reader)
-        {
-            SetVisual value = new SetVisual();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "visual": value.Visual = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    case "rgba": value.Rgba = reader.TryReadNil() ? null : reader.ReadDoubles(4, 0); break;
-                    case "group": value.Group = reader.TryReadNil() ? (long?)null : reader.ReadLong(-2147483648, 2147483647); break;
-                    case "material": value.Material = reader.TryReadNil() ? (long?)null : reader.ReadLong(-1, 2147483647); break;
-                    case "T_body_visual": value.T_body_visual = reader.TryReadNil() ? null : Pose.Read(reader); break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of SetVisual");
-            return value;
-        }
+        public static SetVisual Read(WireReader reader) => reader.ReadInto(new SetVisual());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(6);
-            writer.Write("op");
-            writer.Write(TagName);
-            writer.Write("visual");
-            writer.Write(Visual);
-            writer.Write("rgba");
-            writer.Write(Rgba);
-            writer.Write("group");
-            writer.Write(Group);
-            writer.Write("material");
-            writer.Write(Material);
-            writer.Write("T_body_visual");
-            writer.Write(T_body_visual);
+            codec.Require("visual", ref Visual, 0, long.MaxValue);
+            codec.AllowNull("rgba", ref Rgba, 4, 4);
+            codec.Allow("group", ref Group, int.MinValue, int.MaxValue);
+            codec.Allow("material", ref Material, -1, int.MaxValue);
+            codec.AllowNull("T_body_visual", ref T_body_visual, Protocol.Pose.New);
         }
     }
 
-    /// <summary>
-    /// Add decoration to a body (0: the world). Its id must be free.
-    /// </summary>
+    /// <summary>Add decoration to a body (0: the world).</summary>
     public sealed class AddVisual : PatchOp
     {
         public const string TagName = "add_visual";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public Visual Visual = new Visual();
 
-        public static AddVisual Read(WireReader reader)
-        {
-            AddVisual value = new AddVisual();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "visual": value.Visual = Visual.Read(reader); seen |= 1u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of AddVisual");
-            return value;
-        }
+        public static AddVisual Read(WireReader reader) => reader.ReadInto(new AddVisual());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("op");
-            writer.Write(TagName);
-            writer.Write("visual");
-            writer.Write(Visual);
+            codec.Require("visual", ref Visual, Protocol.Visual.New);
         }
     }
 
-    /// <summary>
-    /// Remove a visual.
-    /// </summary>
+    /// <summary>Remove a visual.</summary>
     public sealed class RemoveVisual : PatchOp
     {
         public const string TagName = "remove_visual";
-        public override string Tag { get { return TagName; } }
-        public long Visual = 0;
+        public override string Tag => TagName;
+        public long Visual;
 
-        public static RemoveVisual Read(WireReader reader)
-        {
-            RemoveVisual value = new RemoveVisual();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "visual": value.Visual = reader.ReadLong(0, long.MaxValue); seen |= 1u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of RemoveVisual");
-            return value;
-        }
+        public static RemoveVisual Read(WireReader reader) => reader.ReadInto(new RemoveVisual());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("op");
-            writer.Write(TagName);
-            writer.Write("visual");
-            writer.Write(Visual);
+            codec.Require("visual", ref Visual, 0, long.MaxValue);
         }
     }
 
-    /// <summary>
-    /// Append a mesh to the list, for visuals that come after it.
-    /// </summary>
+    /// <summary>Append a mesh to the list, for visuals that come after it.</summary>
     public sealed class AddMesh : PatchOp
     {
         public const string TagName = "add_mesh";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public Mesh Mesh = new Mesh();
 
-        public static AddMesh Read(WireReader reader)
-        {
-            AddMesh value = new AddMesh();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "mesh": value.Mesh = Mesh.Read(reader); seen |= 1u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of AddMesh");
-            return value;
-        }
+        public static AddMesh Read(WireReader reader) => reader.ReadInto(new AddMesh());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("op");
-            writer.Write(TagName);
-            writer.Write("mesh");
-            writer.Write(Mesh);
+            codec.Require("mesh", ref Mesh, Protocol.Mesh.New);
         }
     }
 
-    /// <summary>
-    /// Append a material to the list, for visuals that come after it.
-    /// </summary>
+    /// <summary>Append a material to the list, for visuals that come after it.</summary>
     public sealed class AddMaterial : PatchOp
     {
         public const string TagName = "add_material";
-        public override string Tag { get { return TagName; } }
+        public override string Tag => TagName;
         public Material Material = new Material();
 
-        public static AddMaterial Read(WireReader reader)
-        {
-            AddMaterial value = new AddMaterial();
-            uint seen = 0;
-            for (int n = reader.ReadMapHeader(); n > 0; n--)
-            {
-                switch (reader.ReadString())
-                {
-                    case "material": value.Material = Material.Read(reader); seen |= 1u; break;
-                    default: reader.Skip(); break;
-                }
-            }
-            if ((seen & 1u) != 1u) throw new WireException("missing field of AddMaterial");
-            return value;
-        }
+        public static AddMaterial Read(WireReader reader) => reader.ReadInto(new AddMaterial());
 
-        public override void WriteTo(WireWriter writer)
+        internal override void Visit(WireCodec codec)
         {
-            writer.WriteMapHeader(2);
-            writer.Write("op");
-            writer.Write(TagName);
-            writer.Write("material");
-            writer.Write(Material);
+            codec.Require("material", ref Material, Protocol.Material.New);
         }
     }
 }
