@@ -33,7 +33,8 @@ class Type:
     """Type of a field. `base`: bool, int, float, str, bytes, array, map, struct, union.
 
     `item`: of an array, or the value of a map. `length`: of an array of fixed length. `min_length`, `max_length`: 0
-    for no limit. `name`: of a struct or union. `optional`: may be null. `minimum`, `maximum`: of an int. `pattern`: of a str.
+    for no limit. `name`: of a struct or union. `optional`: may be null. `minimum`, `maximum`: of an int.
+    `pattern`: of a str.
     """
 
     base: str
