@@ -20,6 +20,7 @@ from typing import Final
 
 from filelock import FileLock
 
+from tools.csharp.deflate_vectors import render_deflate_vectors
 from tools.csharp.toolchain import HERE, NUNIT, RUNTIMES, Assembly, Toolchain, prepare_toolchain, run_tool
 from tools.csharp.vectors import render_message_vectors
 
@@ -191,6 +192,7 @@ def run_tests(build: Build, runtime: str, results: Path, *options: str) -> list[
     """
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "messages.txt").write_text(render_message_vectors(ROOT / "docs/protocol"), encoding="utf-8")
+        Path(folder, "deflate.bin").write_bytes(render_deflate_vectors())
         data = {"IRIS_VECTORS": folder, "IRIS_REPO": str(ROOT)}
         run_tool(build.make_test_command(runtime, results, *options), f"the tests on {runtime}", data)
     return [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]

@@ -43,9 +43,6 @@ namespace IrisSession.Core
                 case ProtocolFault fault:
                     ProcessFault(fault, nowNs);
                     break;
-                case StatusReport report:
-                    Status = report; // also while a session that stands still welcomes no client
-                    break;
                 default:
                     if (!IsJoined || epoch != ConnectionEpoch) Counters.OtherConnection++;
                     else Process(received, message, nowNs);

@@ -107,9 +107,7 @@ namespace IrisSession.Core
         /// <summary>True while the session has stopped stepping.</summary>
         public bool IsStalled { get; private set; }
 
-        /// <summary>Newest message of the kinds of which only the newest matters; null before the first.</summary>
-        public StatusReport Status { get; private set; }
-
+        /// <summary>What this client gets of the media streams, null before the first.</summary>
         public DeliveryBudget Budget { get; private set; }
 
         /// <summary>Whether the headset is worn: samples and heartbeats carry it. See <see cref="SetWorn"/>.</summary>
@@ -275,12 +273,6 @@ namespace IrisSession.Core
             if (message is ClearEStop) PendingEStop.Withdraw();
             Requests.AddPending();
             return requestId;
-        }
-
-        /// <summary>Queue `get_status`; the report appears in `Status`. Works while joining too. False: there is no socket by now.</summary>
-        public bool RequestStatus()
-        {
-            return (IsJoined || Phase == ConnectionPhase.Joining) && Queue(new GetStatus());
         }
 
         /// <summary>Return the next message to send, null when there is none. Valid until the next call.</summary>

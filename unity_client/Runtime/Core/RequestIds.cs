@@ -68,9 +68,6 @@ namespace IrisSession.Core
                 case SetRole one:
                     one.RequestId = requestId;
                     break;
-                case GetStatus one:
-                    one.RequestId = requestId;
-                    break;
                 default:
                     throw new InvalidMessageException(message.Tag + " is not a request: use Send");
             }
