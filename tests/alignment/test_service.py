@@ -15,12 +15,7 @@ from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import AlignmentAlarm, AlignmentProposal, CrossChecked, decode_entry, encode_entry
 from iris_session.protocol.names import AlarmKind
-from iris_session.protocol.server_messages import (
-    AlignmentRun,
-    AnchorInfo,
-    AnchorMoved,
-    ParticipantInfo,
-)
+from iris_session.protocol.server_messages import AlignmentRun, AnchorInfo, AnchorMoved, ParticipantInfo
 from iris_session.protocol.status import AlignmentReport
 from tests.alignment.emulated_headsets import ANCHORS, MS, SECOND, SHEET, Lab, Wearer, error_at_anchor, head_in_tracking
 from tests.anchors.worlds import shifted

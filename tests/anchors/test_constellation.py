@@ -7,13 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from anchors.constellation import (
-    Constellation,
-    ConstellationError,
-    SheetObservation,
-    find_moved,
-    solve_constellation,
-)
+from anchors.constellation import Constellation, ConstellationError, SheetObservation, find_moved, solve_constellation
 from anchors.pose import PoseTuple, distance, quat_angle, quat_from_rotvec, quat_from_yaw, quat_mul
 from tests.anchors.worlds import Viewpoint, shifted, tracking_frame, viewpoint_around
 

@@ -13,12 +13,7 @@ from iris_session.assets.chunk_scheduler import (
     REQUEST_BURST,
     ChunkScheduler,
 )
-from iris_session.protocol.assets import (
-    MAX_ASSET_CHUNK_BYTES,
-    MAX_ASSET_REQUESTS,
-    MAX_ASSET_WINDOW_BYTES,
-    AssetRequest,
-)
+from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, MAX_ASSET_REQUESTS, MAX_ASSET_WINDOW_BYTES, AssetRequest
 from iris_session.protocol.names import AssetRefusal
 
 SIZES = {"large": 1 << 30, "small": 100, "empty": 0}

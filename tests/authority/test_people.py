@@ -9,12 +9,7 @@ from iris_session.authority import is_same_snapshot
 from iris_session.authority.state import AGEING_FIELDS
 from iris_session.protocol.client_messages import Control, GetSnapshot, Grasp, Rename, SetRole
 from iris_session.protocol.entries import Lost
-from iris_session.protocol.server_messages import (
-    Audited,
-    LeaseChanged,
-    ParticipantChanged,
-    Snapshot,
-)
+from iris_session.protocol.server_messages import Audited, LeaseChanged, ParticipantChanged, Snapshot
 from tests.authority.table import Person, Table, robot
 from tests.authority.test_roster import refused, rejoin
 

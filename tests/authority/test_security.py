@@ -4,14 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.protocol.client_messages import (
-    Acquire,
-    Assign,
-    Control,
-    EStop,
-    RemoveParticipant,
-    SetMode,
-)
+from iris_session.protocol.client_messages import Acquire, Assign, Control, EStop, RemoveParticipant, SetMode
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.entries import Audit, Lost
 from iris_session.protocol.names import AuditKind, DenialReason

@@ -6,15 +6,7 @@ import msgspec
 import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.protocol.client_messages import (
-    Acquire,
-    ClearEStop,
-    Control,
-    Episode,
-    EStop,
-    Grasp,
-    Release,
-)
+from iris_session.protocol.client_messages import Acquire, ClearEStop, Control, Episode, EStop, Grasp, Release
 from iris_session.protocol.entries import (
     Entry,
     ExternalReset,

@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from iris_session.bench.cloud_camera import (
-    BOXES,
-    ROOM,
-    make_room_camera,
-    make_room_pose,
-    render_room,
-)
+from iris_session.bench.cloud_camera import BOXES, ROOM, make_room_camera, make_room_pose, render_room
 from iris_session.bench.cloud_stream import Interval, MovingCloud, _compare, summarize
 from iris_session.bench.report import BenchError
 from iris_session.cloud.voxels import make_rays

@@ -22,12 +22,7 @@ from iris_session.front import context as front_context
 from iris_session.link import FrontConfig, Ports, SceneInfo
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import Control
-from iris_session.protocol.codec import (
-    decode_asset_request,
-    encode_asset_header,
-    encode_media_header,
-    encode_server,
-)
+from iris_session.protocol.codec import decode_asset_request, encode_asset_header, encode_media_header, encode_server
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import HOST, Entry, SceneLoaded, ScenePatched
 from iris_session.protocol.media import MediaHeader, make_topic

@@ -88,24 +88,6 @@ def test_everything_is_fetched_once_and_then_cached(shared: Shared) -> None:
     assert shared.channel_of(again).opened == 0
 
 
-def test_killed_front_costs_no_byte_twice(shared: Shared) -> None:
-    client = shared.join()
-    killed: list[int] = []
-
-    def kill(fetch: AssetFetch) -> None:
-        if fetch.bytes_done > 2 * MIB and not killed:
-            killed.append(fetch.bytes_done)
-            shared.session.kill_front()
-
-    fetch = client.assets.fetch(shared.addresses, kill)
-    finish(client, fetch)
-    assert 0 < killed[0] < shared.bytes
-    assert client.connection.counters.reconnects == 1
-    assert shared.channel_of(client).opened == 2, "requests of the connection before are lost"
-    assert read_all(fetch) == shared.data
-    assert fetch.bytes_received == shared.bytes
-
-
 def test_lost_connection_costs_only_data_under_way(shared: Shared) -> None:
     client, cuts = shared.join(), [200, 2 * MIB, 4 * MIB, 6 * MIB]
     n_cuts = len(cuts)

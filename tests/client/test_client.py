@@ -32,17 +32,6 @@ Join = Callable[..., Client]
 HERE = ((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
 
 
-def test_client_joins_and_sees_the_session(join: Join) -> None:
-    ann = join(devices=(Device.CONTROLLER_RIGHT,))
-    bob = join("bob", role="observer")
-    assert ann.ready
-    assert ann.participant_id != bob.participant_id
-    assert ann.wait_for(lambda c: bob.participant_id in c.mirror.participants)
-    assert set(ann.mirror.robots) == {"left", "right"}
-    assert [body.name for body in ann.mirror.bodies] == list(BODIES)
-    assert ann.mirror.leases["left"].holder == ""
-
-
 def test_session_time_is_within_the_stated_error(session: ClientSession, join: Join) -> None:
     ann = join()
     assert ann.wait_for(lambda c: c.clock_error_ns() < 5_000_000)

@@ -12,12 +12,7 @@ import pytest
 from iris_session.doctor import session_checks
 from iris_session.doctor.drop_explanations import EXPLANATIONS, explain_drops
 from iris_session.doctor.findings import Finding
-from iris_session.doctor.session_checks import (
-    FULL_DISK,
-    HOLD_ADVICE,
-    LATE_CAUSES,
-    check_session_report,
-)
+from iris_session.doctor.session_checks import FULL_DISK, HOLD_ADVICE, LATE_CAUSES, check_session_report
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import HoldReason, LateCause
 from iris_session.protocol.status import (

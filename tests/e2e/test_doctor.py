@@ -15,13 +15,7 @@ import psutil
 import pytest
 
 from iris_session.security import KeyHome, KeyPair
-from tests.e2e.session_process import (
-    COMMAND,
-    SessionProcess,
-    kill_all,
-    make_serve_command,
-    skip_unless_ci,
-)
+from tests.e2e.session_process import COMMAND, SessionProcess, kill_all, make_serve_command, skip_unless_ci
 
 pytestmark = pytest.mark.e2e
 

@@ -7,12 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.session_process import (
-    DEMO_OPTIONS,
-    DEMO_S,
-    run_command,
-    skip_unless_ci,
-)
+from tests.e2e.session_process import DEMO_OPTIONS, DEMO_S, run_command, skip_unless_ci
 from tests.recording.dataframes import compare_dataframes
 from tools.look_at_recordings import MissingViewerError, look_at
 

@@ -15,14 +15,7 @@ from iris_session.protocol.entries import SessionResumed, decode_entries
 from iris_session.protocol.server_messages import Gap, Handover, ParticipantJoined
 from iris_session.recording import Recording
 from tests.e2e.scenario import Hand, Scenario
-from tests.e2e.session_process import (
-    COMMAND,
-    SessionProcess,
-    assert_all_end,
-    kill_all,
-    list_descendants,
-    run_verify,
-)
+from tests.e2e.session_process import COMMAND, SessionProcess, assert_all_end, kill_all, list_descendants, run_verify
 from tests.e2e.session_time import run_ticks, wait_until_recorded
 
 pytestmark = pytest.mark.e2e

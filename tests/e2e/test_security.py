@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from iris_session.client import Client, CurveKeys, RefusedError
-from iris_session.protocol.names import AuditKind, DenialReason, FaultCode, RefusalCode
+from iris_session.protocol.names import AuditKind, FaultCode, RefusalCode
 from iris_session.protocol.server_messages import Audited
 from iris_session.security import KeyHome, KeyPair
 from tests.e2e.scenario import Scenario
-from tests.e2e.session_process import COMMAND, DEADLINE_S, SessionProcess, wait_until
+from tests.e2e.session_process import DEADLINE_S, SessionProcess
 
 pytestmark = pytest.mark.e2e
 
@@ -68,41 +66,6 @@ def get_refusal(client: Client) -> RefusedError:
     finally:
         client.close()
     return refused.value
-
-
-def test_device_pairs_with_a_single_use_code_and_joins_in_its_role(
-    lab: EncryptedScenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lab.add(lab.make_client("watcher", lab.allow_new_key("watcher"), "observer")).start()
-    shown = tmp_path / "pair.out"
-    with shown.open("w") as out:
-        command = [*COMMAND, "pair", "--json", "--role", "observer", "--name", "tablet"]
-        process = subprocess.Popen(command, stdout=out, stderr=out, text=True)
-    wait_until(lambda: shown.read_text().endswith("\n"), "the join code")
-    offer = json.loads(shown.read_text().splitlines()[0])
-    assert offer["fingerprint"] == lab.key.fingerprint
-    assert offer["addresses"] == [lab.server.address]
-
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "tablet-home"))
-    tablet = Client(lab.server.address, role="observer", name="Tab", join_code=offer["code"].lower())
-    with tablet.connect(DEADLINE_S):
-        assert tablet.wait_for(lambda c: c.scene.state is not None, DEADLINE_S)
-    assert process.wait(DEADLINE_S) == 0
-    (entry,) = [key for key in lab.home.clients.read().values() if key.name == "tablet"]
-    assert json.loads(shown.read_text().splitlines()[-1]) == {
-        "paired": "tablet",
-        "fingerprint": entry.fingerprint,
-        "roles": ["observer"],
-    }
-    role = get_refusal(Client(lab.server.address, role="operator", name="Tab"))
-    assert role.code == DenialReason.ROLE
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "thief-home"))
-    code = get_refusal(Client(lab.server.address, name="Eve", join_code=offer["code"]))
-    assert code.code == RefusalCode.CODE
-    wait_until(lambda: lab.list_audits("watcher", AuditKind.CODE_REFUSED), "the attempt is audited")
-    assert lab.list_audits("watcher", AuditKind.PAIRED)[0].subject == entry.fingerprint
-    assert lab.list_audits("watcher", AuditKind.ROLE_REFUSED)[0].detail == "operator"
-    lab.server.finish()
 
 
 def test_revoked_key_is_out_while_another_client_goes_on(lab: EncryptedScenario) -> None:

@@ -18,12 +18,7 @@ from numpy.typing import NDArray
 
 from iris_session.bench.web_tab import WEB_CLIENT
 from iris_session.demo.named_scenes import scene_by_name
-from iris_session.protocol.server_messages import (
-    Event,
-    Gap,
-    ParticipantChanged,
-    ParticipantJoined,
-)
+from iris_session.protocol.server_messages import Event, Gap, ParticipantChanged, ParticipantJoined
 from tests.e2e.browser import Browser, Page, join_as, printed_address
 from tests.e2e.scenario import Hand, Scenario
 from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess

@@ -16,7 +16,6 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
-import aiohttp
 import psutil
 import pytest
 
@@ -24,7 +23,6 @@ from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Acquire, Bye, EStop, Hello, Pair
 from iris_session.protocol.server_messages import EStopChanged, Event, Paired, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import GetStatus, StatusReport
-from iris_session.web import wire
 from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess, run_command, wait_until
 from tests.web.browser import WebBrowser, open_http
 
@@ -143,70 +141,6 @@ def test_assets_are_fetched_with_ranges_and_a_ticket(page: str) -> None:
     run(work())
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("headers", "status"),
-    [
-        ({"Origin": "https://evil.example"}, 403),
-        ({"Origin": "null"}, 403),
-        ({"Host": "evil.example"}, 421),
-        ({"Sec-Fetch-Site": "cross-site"}, 403),
-    ],
-)
-def test_other_sites_are_refused(page: str, headers: dict[str, str], status: int) -> None:
-    async def work() -> None:
-        async with open_http() as http:
-            for path in ("v1/session", "v1/media"):
-                with pytest.raises(aiohttp.WSServerHandshakeError) as error:
-                    await http.ws_connect(page + path, protocols=[wire.SUBPROTOCOL], headers=headers)
-                assert error.value.status == status
-            async with http.get(f"{page}v1/info", headers=headers) as answer:
-                assert answer.status == status
-
-    run(work())
-
-
-def test_hostile_messages_close_their_sender_only(page: str) -> None:
-    forged = b"\x94\x01\x00\xa3bob\x81\xa4type\xa9heartbeat"
-    hostile: list[tuple[bytes | str, int]] = [
-        (b"", wire.CLOSE_NOT_ALLOWED),
-        (b"\xff" * 100, wire.CLOSE_NOT_ALLOWED),
-        (wire.encode_frames(wire.CONTROL, [forged]), wire.CLOSE_NOT_ALLOWED),
-        (wire.encode_frames(wire.STATE, [b"rigid"]), wire.CLOSE_NOT_ALLOWED),
-        (b"\x01\x01\xff\xff\xff\xff" + b"a" * 50, wire.CLOSE_NOT_ALLOWED),
-        ("text", wire.CLOSE_NOT_ALLOWED),
-        (b"\x01" * (wire.MAX_CLIENT_MESSAGE + 1), 1009),
-    ]
-
-    async def work() -> None:
-        async with browsers(page, "ann") as (ann,):
-            for data, code in hostile:
-                bad = await WebBrowser(ann.http, page, "bad").open()
-                if isinstance(data, str):
-                    await bad.socket.send_str(data)
-                else:
-                    await bad.socket.send_bytes(data)
-                assert await bad.wait_closed() == code, data[:20]
-                await bad.close()
-            bad = await WebBrowser(ann.http, page, "bad").join()
-            for envelope in (b"\x94\x01\x00\xa0\xc1", b"\x94\x01\x00\xa0\x81\xa4type\xa7unknown"):
-                n = sum(fault.code == "malformed" for fault in bad.got(ProtocolFault))
-                await bad.socket.send_bytes(wire.encode_frames(wire.CONTROL, [envelope]))
-                await bad.wait(
-                    lambda n=n: sum(f.code == "malformed" for f in bad.got(ProtocolFault)) > n, "an answer of its own"
-                )
-            with contextlib.suppress(ConnectionError):
-                for _ in range(1000):  # below the limit of frames, which cuts without a word
-                    await bad.send(Bye(), 99)
-            assert await bad.wait_closed() == wire.CLOSE_LIMIT
-            await bad.close()
-            assert ann.close_code is None
-            n = len(ann.states)
-            await ann.wait(lambda: len(ann.states) > n, "state goes on")
-
-    run(work())
-
-
 def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
     server = serve()
     page = page_of(server)
@@ -233,20 +167,6 @@ def test_killed_gateway_comes_back_and_leases_stay(serve: Serve) -> None:
 
     run(work())
     assert "web gateway ended" in server.output
-
-
-@pytest.mark.long
-def test_session_end_is_said(serve: Serve) -> None:
-    server = serve()
-    page = page_of(server)
-
-    async def work() -> None:
-        async with browsers(page, "ann") as (ann,):
-            server.process.terminate()
-            assert await ann.wait_closed() == wire.CLOSE_ENDED
-
-    run(work())
-    assert server.process.wait(DEADLINE_S) == 0
 
 
 def test_a_browser_pairs_by_the_printed_link_and_is_revoked(

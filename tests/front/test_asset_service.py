@@ -5,13 +5,7 @@ from __future__ import annotations
 import zmq
 
 from iris_session.front.asset_server import AssetAccess
-from iris_session.front.asset_service import (
-    LATE_NS,
-    LATE_TICK_NS,
-    PERIOD_NS,
-    REPLACED_NS,
-    AssetService,
-)
+from iris_session.front.asset_service import LATE_NS, LATE_TICK_NS, PERIOD_NS, REPLACED_NS, AssetService
 from iris_session.front.connections import FrontConnection, Peer, Route
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link.config import SceneInfo

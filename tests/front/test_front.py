@@ -9,55 +9,14 @@ import msgspec
 import numpy as np
 
 from iris_session.link import FrontLimits
-from iris_session.protocol.client_messages import (
-    Acquire,
-    Bye,
-    EStop,
-    Heartbeat,
-    Hello,
-    Marker,
-    Sample,
-)
+from iris_session.protocol.client_messages import Acquire, Bye, EStop, Heartbeat, Hello, Marker, Sample
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Join, Lost
-from iris_session.protocol.server_messages import (
-    Event,
-    ProtocolFault,
-    Refused,
-    Snapshot,
-    Welcome,
-)
+from iris_session.protocol.server_messages import Event, ProtocolFault, Refused, Snapshot, Welcome
 from iris_session.protocol.steps import Decision, Dropped, OutgoingMessage
 from tests.front.harness import N_BODIES, FrontSession
 
 OpenSession = Callable[..., FrontSession]
-
-
-def test_join_returns_welcome_with_ports_and_token(session: FrontSession) -> None:
-    client = session.client()
-    welcome = client.join("operator", "Ann", devices=("head",), software="test 1")
-    assert welcome.participant_id == "p1"
-    assert welcome.connection_epoch == 1
-    assert welcome.session_name == "test"
-    assert welcome.endpoints.state == session.ports.state
-    assert len(welcome.resume_token) == 16
-    assert not welcome.resumed
-    (entry,) = session.wait_entries(Join)
-    join = entry.message
-    assert isinstance(join, Join)
-    assert (join.role, join.name, join.devices, join.software) == ("operator", "Ann", ("head",), "test 1")
-    assert session.client().join(name="Bob").connection_epoch == 2
-
-
-def test_entries_hold_no_secret_or_token(session: FrontSession) -> None:
-    first = session.client()
-    token = first.join().resume_token
-    second = session.client()
-    second.secret = first.secret
-    second.join(resume_token=token)
-    blob = msgspec.msgpack.encode(session.entries) + session.process.link.handback
-    assert first.secret not in blob
-    assert token not in blob
 
 
 def test_unsupported_version_is_refused_with_advice(session: FrontSession) -> None:

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.front.media.budget import (
-    MIN_PACE,
     NONE_LEVEL,
     RAISE_NS,
     BudgetController,
@@ -110,20 +109,6 @@ def test_frames_are_paced_below_what_a_slow_link_carries() -> None:
     assert 0 < drains < later, "what fills the link drains first"
     link.capacity = 1000 * MBIT
     assert link.play(120) == BudgetGrant({"cloud": 0}), "the link has recovered"
-
-
-def test_stream_that_hardly_moves_is_not_paced_by_what_it_costs() -> None:
-    """A segment would hold back what comes after it for minutes, when the stream moves again."""
-    link, slow, moving = Link(100), {"cloth": (400.0, 200.0, 100.0, 50.0, 25.0, 12.5)}, CLOUD["cloud"]
-    link.play(5, slow)
-    link.age_ms = 300.0
-    link.play(10, slow)
-    grant = link.grants[-1][1]
-    assert 0.0 < grant.bytes_per_s < 400.0, "the machine is slow, the session takes it for the link"
-    assert grant.pace >= MIN_PACE
-    link.age_ms = 10.0
-    link.play(60, {"cloth": moving})
-    assert link.grants[-1][1] == BudgetGrant({"cloth": 0})
 
 
 def test_frames_that_wait_for_their_own_pace_are_no_congestion() -> None:

@@ -20,14 +20,7 @@ from iris_session.front.media.scheduler import (
     MediaSubscriber,
 )
 from iris_session.protocol.codec import decode_media_header
-from iris_session.protocol.media import (
-    MAX_STREAMS,
-    MediaHeader,
-    MediaPush,
-    StreamCamera,
-    StreamInfo,
-    make_topic,
-)
+from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, StreamCamera, StreamInfo, make_topic
 
 MS = 1_000_000
 ANN, BOB = 7, 8
@@ -217,29 +210,6 @@ def test_stream_belongs_to_one_connection_of_its_key() -> None:
     wire.now_ns += 4 * SECOND
     assert push(11)
     assert not push(12)
-
-
-def test_who_sends_in_vain_is_known_once_the_owner_has_sent_again() -> None:
-    wire = Wire()
-
-    def push(sender: int, source: str, connection: int, after_ns: int = MS) -> bool:
-        wire.now_ns += after_ns
-        push = MediaPush("cloud", 3, wire.now_ns, connection_epoch=sender)
-        return wire.hub.push(push, [b"x"], source, wire.now_ns, connection)
-
-    assert push(ANN, "a", 11)
-    assert not push(BOB, "b", 12)
-    assert wire.hub.list_refused(wire.now_ns) == set(), "ann may just have ended"
-    assert push(ANN, "a", 11)
-    assert wire.hub.list_refused(wire.now_ns) == {(BOB, "cloud")}
-    assert wire.hub.read_streams()["cloud"].sender == ANN
-    assert wire.hub.list_refused(wire.now_ns + 4 * SECOND) == set(), "bob has given up"
-    assert push(BOB, "b", 12, 4 * SECOND)
-    assert wire.hub.read_streams()["cloud"].sender == BOB
-    assert wire.hub.list_refused(wire.now_ns) == set()
-    assert not push(ANN, "a", 11)
-    assert push(BOB, "b", 12)
-    assert wire.hub.list_refused(wire.now_ns) == {(ANN, "cloud")}
 
 
 def test_streams_of_a_sender_that_has_left_end_and_do_not_come_back() -> None:

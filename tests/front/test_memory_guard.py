@@ -7,12 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from iris_session.front.connection_guard import SILENT_BYTES
-from iris_session.front.memory_guard import (
-    EVICTION_PAUSE_NS,
-    MEMORY_PERIOD_NS,
-    MIN_EVICT_BYTES,
-    MemoryGuard,
-)
+from iris_session.front.memory_guard import EVICTION_PAUSE_NS, MEMORY_PERIOD_NS, MIN_EVICT_BYTES, MemoryGuard
 from iris_session.link.tcp_guard import PendingConnection
 from iris_session.protocol.limits import Drops
 from tests.front.control_rig import ControlSocketRig, is_closed

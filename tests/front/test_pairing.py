@@ -91,21 +91,6 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PairingRig]
     rig.keyring.close()
 
 
-def test_slow_disk_does_not_block_the_loop(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = KeyPair.generate()
-    code, _ = rig.home.join_codes.create(rig.server)
-    rig.asks(own, rig.proof(code, own))
-    with slow_disk(monkeypatch) as disk:
-        turns(rig.turn, disk.waits.is_set)
-        for _ in range(5):
-            rig.turn()
-        assert rig.answers(own) == [], "the answer comes after the write"
-        assert rig.keyring.find_key(own.fingerprint) is None
-    assert isinstance(rig.answer(own), Paired)
-    assert rig.keyring.find_key(own.fingerprint) is not None
-    assert list(rig.home.clients.read()) == [own.fingerprint]
-
-
 def test_revocation_by_a_director_does_not_wait_for_the_disk(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
     own = KeyPair.generate()
     rig.home.clients.allow_key("ann", own.public)

@@ -156,20 +156,6 @@ def test_director_revokes_although_the_list_is_read_only(open_session: Open, tmp
     assert late.wait_for(Refused).code == RefusalCode.UNPAIRED
 
 
-def test_revoked_secret_stays_refused_on_unencrypted_loopback(session: FrontSession) -> None:
-    client = session.client()
-    client.join()
-    (entry,) = session.wait_entries(Join)
-    assert isinstance(entry.message, Join)
-    session.once(Decision((), dropped=(Dropped(1, "revoked", entry.message.key_id),)))
-    client.wait_for(ProtocolFault)
-    again = session.client()
-    again.secret = client.secret
-    again.send(Hello("operator", "Ann", secret=again.secret))
-    assert again.wait_for(Refused).code == RefusalCode.UNPAIRED
-    session.client().join()
-
-
 def test_list_may_be_edited_during_the_session(lab: Lab) -> None:
     _, ann = lab.allowed("ann")
     _, bob = lab.allowed("bob")

@@ -6,19 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from iris_session.front.status import MIN_DELAYS
 from iris_session.protocol.client_messages import Hello, Observation, Sample
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Join
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
-from iris_session.protocol.status import (
-    AlignmentReport,
-    ClientReport,
-    GetStatus,
-    ParticipantReport,
-    StatusReport,
-)
+from iris_session.protocol.status import AlignmentReport, ClientReport, GetStatus, ParticipantReport, StatusReport
 from tests.front.harness import N_BODIES, FrontSession, RawClient
 
 MS = 1_000_000
@@ -90,16 +83,6 @@ def test_both_halves_make_one_report(session: FrontSession) -> None:
     assert (ann.state_age.p50, ann.state_age.p99, ann.missed_share, ann.rtt_ms) == (1.5, 7.0, 0.25, 2.5)
     assert ann.heard_ns >= 0
     assert ann.lost == ""
-
-
-def test_few_states_have_no_percentile(session: FrontSession) -> None:
-    """A resting scene is sent four times a second: a single late state is no measure."""
-    client = session.client()
-    client.join()
-    for _ in range(MIN_DELAYS // 2):
-        session.send_state(STILL)
-        session.once()
-    assert ask(session, client).step_to_publish is None
 
 
 def test_alignment_report_has_both_halves(open_session: Callable[..., FrontSession]) -> None:

@@ -145,15 +145,6 @@ class TestIdentity:
         client = lab.client(own)
         assert lab.refused(client, Hello("operator", "bob", secret=client.secret)).code == RefusalCode.UNPAIRED
 
-    def test_one_person_has_as_many_connections_as_a_key(self, lab: Lab) -> None:
-        gateway, ada = open_gateway(lab), Person()
-        allow(lab, ada)
-        for n in range(8):
-            ada.name = f"tab{n}"
-            gateway.enter(ada)
-        ada.name = "tab9"
-        assert gateway.refused(ada).code == RefusalCode.FULL
-
 
 class TestRoles:
     @pytest.mark.parametrize(
@@ -259,33 +250,6 @@ class TestPairing:
             client.wait_for(ProtocolFault)
         assert not lab.home.clients.read().get(ada.fingerprint)
         assert lab.audits(AuditKind.GATEWAY_REFUSED)
-
-    def test_new_code_after_a_revocation(self, lab: Lab) -> None:
-        gateway, ada = open_gateway(lab), Person()
-        allow(lab, ada)
-        gateway.enter(ada)
-        lab.home.clients.revoke_key("ada")
-        lab.session.wait_entries(Lost)
-        code, _ = lab.home.join_codes.create(lab.server, web_key=CERTIFICATE)
-        gateway.ask("ada", ada.pair(code), Paired)
-        gateway.enter(ada)
-
-
-class TestRevocation:
-    def test_revoked_while_connected(self, lab: Lab) -> None:
-        gateway, ada, bob = open_gateway(lab), Person(), Person("bob")
-        allow(lab, ada)
-        allow(lab, bob)
-        welcome, _ = gateway.enter(ada)
-        theirs, _ = gateway.enter(bob)
-        lab.home.clients.revoke_key("ada")
-        (lost,) = lab.session.wait_entries(Lost)
-        assert (lost.connection, lost.message) == (welcome.connection_epoch, Lost("revoked"))
-        lab.session.pump(lambda: bool(gateway.received("ada", ProtocolFault)), "the fault")
-        assert [f.code for f in gateway.received("ada", ProtocolFault)] == [FaultCode.REVOKED]  # type: ignore[attr-defined]
-        assert gateway.refused(ada, ada.hello(resume_token=welcome.resume_token)).code == RefusalCode.UNPAIRED
-        gateway.client.send(Marker(1, "still here"), on_behalf_of="bob", epoch=theirs.connection_epoch)
-        lab.session.wait_entries(Marker, connection=theirs.connection_epoch)
 
 
 class TestOwnGateway:

@@ -11,14 +11,7 @@ import pytest
 
 from iris_session.link.config import SECOND
 from iris_session.link.sockets import close_tcp, peer_of, tcp_counts
-from iris_session.link.tcp_guard import (
-    CLOSE_FAILED,
-    TcpBounds,
-    TcpFlood,
-    TcpGuard,
-    TrafficCounter,
-    make_reasons,
-)
+from iris_session.link.tcp_guard import CLOSE_FAILED, TcpBounds, TcpFlood, TcpGuard, TrafficCounter, make_reasons
 
 FIRST = 100_000  # no descriptor of this process
 

@@ -8,15 +8,7 @@ from hypothesis import strategies as st
 
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import Hello, Sample
-from iris_session.protocol.limits import (
-    LIMITS,
-    SERVER_LIMITS,
-    Drops,
-    KeyedBuckets,
-    Limit,
-    RateLimiter,
-    find_network,
-)
+from iris_session.protocol.limits import LIMITS, SERVER_LIMITS, Drops, KeyedBuckets, Limit, RateLimiter, find_network
 
 SECOND = 1_000_000_000
 

@@ -129,17 +129,6 @@ def test_frames_that_do_not_decode_are_counted(writer: RrdWriter) -> None:
         assert list(recording.pictures()) == []
 
 
-def test_what_a_new_part_repeats_counts_once(tmp_path: Path) -> None:
-    for part, seqs in (("session.rrd", (1, 2)), ("session.part2.rrd", (2, 3))):
-        writer = RrdWriter(tmp_path / part, "id")
-        writer.write_header(SessionHeader("s", "n", "closed", 2_000_000))
-        for seq in seqs:
-            writer.add_media(message("room", make_frame(5), seq))
-        writer.close()
-    with Recording.open(tmp_path / "session.rrd") as recording:
-        assert [one.seq for one in recording.clouds("room")] == [1, 2, 3]
-
-
 def test_streams_say_what_they_are_until_they_end(writer: RrdWriter) -> None:
     camera = StreamCamera(640, 480, 585.0, 585.0, 319.5, 239.5, (0.1, -0.2, 0.0, 0.0), "hand", (0.1, 0.2, 0.3))
     room = StreamInfo("The room", "remote", camera, 30.0)

@@ -40,12 +40,7 @@ from iris_session.protocol.server_messages import (
     SceneChanged,
     TipCalibrated,
 )
-from iris_session.viewer.narration import (
-    PALETTE,
-    EventNarration,
-    LogLine,
-    find_colour,
-)
+from iris_session.viewer.narration import PALETTE, EventNarration, LogLine, find_colour
 
 POSE = Pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
 

@@ -8,12 +8,7 @@ import pytest
 
 from anchors.pose import PoseTuple, distance
 from iris_session.protocol.common import IDENTITY, Alignment
-from iris_session.protocol.server_messages import (
-    AlignmentAlarmed,
-    ParticipantChanged,
-    ParticipantInfo,
-    ParticipantLeft,
-)
+from iris_session.protocol.server_messages import AlignmentAlarmed, ParticipantChanged, ParticipantInfo, ParticipantLeft
 from iris_session.recording import AlignmentHistory, Recording, TrackingFrame, read_alignment_history
 from tests.recording.headsets import Played, S
 

@@ -17,7 +17,7 @@ from iris_session.recording import CLOSED, OPEN, Recording, verify
 from iris_session.recording import parts as recording_parts
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.paths import part_path
-from tests.recording.support import SmallCore, SmallSession, journal, loop_recorder, write
+from tests.recording.support import SmallCore, journal, write
 
 STEPS = 120
 RERUN = Path(sys.executable).parent / "rerun"
@@ -116,22 +116,3 @@ def test_parts_may_be_optimized_separately_or_merged(
         assert report.ok, report.line()
         assert (report.steps, report.keyframes, report.finished) == (STEPS, 3, True)
     assert [report.parts for report in reports] == [2, 1, 1]
-
-
-def test_copy_of_parts_of_which_one_was_killed_does_not_count_as_closed() -> None:
-    """What the killed recorder had still to write would count as damage."""
-    with loop_recorder() as one:
-        session = SmallSession(one.feed)
-        session.take(50)
-        one.pump()
-        one.kill()
-        one.begin(2)
-        one.pump()
-        session.take(50)
-        one.pump()
-        one.finish()
-        copy = optimize(one.folder / "copy.rrd", one.path, part_path(str(one.path), 2))
-        with Recording.open(one.path) as recording:
-            assert not recording.all_closed
-        with Recording.open(copy) as recording:
-            assert not recording.all_closed

@@ -21,24 +21,12 @@ from iris_session.journal.feed import BATCH_NS
 from iris_session.journal.messages import BATCH, FRAME, Batch, RecorderConfig, VertexFrame, encode_batch
 from iris_session.protocol.scene import list_assets
 from iris_session.protocol.status import ClientReport
-from iris_session.recording import (
-    RecorderError,
-    Recording,
-    RecordingLock,
-    summarise,
-    verify,
-)
+from iris_session.recording import RecorderError, Recording, summarise, verify
 from iris_session.recording import process as process_module
 from iris_session.recording.process import DRAIN_S, FLUSH_S, RecorderLoop
 from iris_session.rrd.assets import ALL, list_recorded_assets
 from iris_session.rrd.paths import part_path
-from tests.recording.support import (
-    TICK_NS,
-    LoopRecorder,
-    SmallCore,
-    SmallSession,
-    loop_recorder,
-)
+from tests.recording.support import TICK_NS, LoopRecorder, SmallCore, SmallSession, loop_recorder
 from tests.recording.test_recorded_assets import Shared
 
 
@@ -123,18 +111,6 @@ def test_reports_of_clients_are_plotted_and_no_raw_samples(one: LoopRecorder) ->
     assert (one.loop._samples, one.loop._refused) == (1, 1)
 
 
-def test_batch_beyond_a_limit_is_counted_and_its_journal_kept(one: LoopRecorder) -> None:
-    session = SmallSession(one.feed)
-    session.take(5)
-    one.feed.add_metric(4, 5 * TICK_NS, "n" * 100, 1.0)
-    session.take(100)
-    one.pump()
-    one.finish()
-    assert one.loop._refused == 1
-    report = verify(one.path, SmallCore)
-    assert (report.ok, report.steps) == (True, 105), report.line()
-
-
 def test_recording_that_is_being_written_says_so(one: LoopRecorder) -> None:
     session = SmallSession(one.feed)
     session.take(100)
@@ -182,20 +158,6 @@ def test_error_in_the_picture_leaves_out_the_picture(one: LoopRecorder) -> None:
     one.finish()
     report = verify(one.path, SmallCore)
     assert (report.ok, report.parts, report.steps, report.finished) == (True, 2, 100, True), report.line()
-
-
-def test_no_part_is_begun_while_another_session_continues_the_recording(
-    one: LoopRecorder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(process_module, "TRIED_S", 0.0)
-    SmallSession(one.feed).take(20)
-    one.pump()
-    one.kill()
-    mine = RecordingLock(one.path, shared=False)
-    with pytest.raises(RecorderError):
-        one.begin(2)
-    assert not os.path.exists(part_path(str(one.path), 2))
-    mine.release()
 
 
 def test_session_that_never_began_leaves_no_file(tmp_path: Path) -> None:

@@ -9,11 +9,7 @@ import msgspec
 import pytest
 
 from iris_session.journal.rows import FORMAT, VERIFIERS
-from iris_session.recording import (
-    NotARecordingError,
-    Recording,
-    verify,
-)
+from iris_session.recording import NotARecordingError, Recording, verify
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd import file as rrd_file
 from iris_session.rrd import paths
@@ -26,40 +22,6 @@ from tests.recording.support import SmallCore, journal, write
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return write(tmp_path / "session.rrd", *journal(200))
-
-
-@pytest.mark.parametrize(("lost_messages", "least"), [(1, 200), (4, 180), (16, 80)])
-def test_truncated_file_is_read_up_to_its_end(path: Path, lost_messages: int, least: int) -> None:
-    """As after a kill within a write: no footer, and half of a message at the end."""
-    cut = rrd_file.scan_file(path).messages[-lost_messages]
-    path.write_bytes(path.read_bytes()[: cut.offset + (16 + cut.length) // 2])
-    with Recording.open(path) as recording:
-        steps = [row.step for row in recording.rows()]
-        assert steps == list(range(len(steps)))
-        assert least <= len(steps) <= 200
-        assert recording.finished == (lost_messages == 1)
-        assert recording.damage == []
-        assert f"at byte {cut.offset}" in recording.cuts[0]
-    report = verify(path, SmallCore)
-    assert report.ok, report.line()
-    assert (report.steps, report.last_step, report.finished) == (len(steps), len(steps) - 1, lost_messages == 1)
-
-
-@pytest.mark.parametrize("window", [rrd_file.WINDOW_BYTES, 9])
-def test_damaged_length_hides_one_message(path: Path, monkeypatch: pytest.MonkeyPatch, window: int) -> None:
-    monkeypatch.setattr(rrd_file, "WINDOW_BYTES", window)
-    data = bytearray(path.read_bytes())
-    messages = [m for m in rrd_file.scan_file(path).messages if m.kind == rrd_file.KIND_ARROW]
-    victim = messages[-6]
-    data[victim.offset + 12] ^= 0x40
-    path.write_bytes(data)
-    found = rrd_file.scan_file(path)
-    assert found.holes == [(victim.offset, messages[-5].offset)]
-    assert not found.cut
-    report = verify(path, SmallCore)
-    assert not report.ok
-    assert f"bytes {victim.offset} to" in report.damage[0]
-    assert report.last_step == 199
 
 
 @pytest.mark.parametrize("indexed", [False, True])

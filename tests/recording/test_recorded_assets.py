@@ -180,19 +180,6 @@ def test_joiner_returns_an_asset_once() -> None:
     assert (list(joiner.whole.values()), joiner.changed) == ([6, 0], {})
 
 
-def test_joiner_drops_no_other_asset_for_a_broken_one() -> None:
-    broken, whole = pieces(b"x" * 10, 4), pieces(b"y" * 10, 4)
-    for lost in range(3):
-        joiner = AssetJoiner()
-        rest = [piece for i, piece in enumerate(broken) if i != lost]
-        assert [joiner.add(piece) for piece in (*rest, *whole)][-1] == b"y" * 10
-        assert [*joiner.whole] == [whole[0].address]
-        assert [joiner.add(piece) for piece in broken][-1] == b"x" * 10, "the next part has it"
-    joiner = AssetJoiner()
-    assert [joiner.add(broken[i]) for i in (0, 1, 1)] == [None] * 3
-    assert [joiner.add(broken[0]._replace(data=b"y" * 10)), [*joiner.changed]] == [None, [broken[0].address]]
-
-
 def test_pieces_with_impossible_numbers_are_refused() -> None:
     good = pieces(b"abc", 3)[0]
     assert check_piece(good) == good

@@ -30,34 +30,6 @@ def infos(model: mujoco.MjModel) -> list[BodyInfo]:
     ]
 
 
-def test_the_small_scene(tmp_path: Path) -> None:
-    model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
-    spec = parse_mujoco(model, store).spec
-    reader = scene.SceneReader(spec, store, infos(model))
-    visuals = {visual.id: visual for visual in spec.visuals if reader.is_shown(visual)}
-    assert sorted(visuals) == [0, 1, 2, 3, 4, 5], "group 3 is not visible"
-    forms = {i: reader.read_shape(visual) for i, visual in visuals.items()}
-    assert [forms[i].kind for i in sorted(forms)] == [
-        scene.MESH,
-        scene.ELLIPSOID,
-        scene.CAPSULE,
-        scene.CYLINDER,
-        scene.BOX,
-        scene.ELLIPSOID,
-    ]
-    floor = forms[0].mesh
-    assert floor is not None
-    assert np.ptp(floor.position, axis=0) == pytest.approx((0.4 + 6.0, 1.0 + 6.0, 0.0), rel=0.01), "3 m around bodies"
-    assert forms[2].size == pytest.approx((0.04, 0.04, 0.2))
-    assert scene.to_rgba8(visuals[0].rgba) == (204, 204, 204, 255)
-    assert [reader.place_visual(visuals[i])[0] for i in range(6)] == [
-        "world",
-        "ball",
-        *["arm/link 1"] * 2,
-        *["tip"] * 2,
-    ]
-
-
 def test_nested_fixed_bodies_move_with_their_root(tmp_path: Path) -> None:
     """Both are rotated, so that their order matters."""
     model = mujoco.MjModel.from_xml_string(

@@ -158,18 +158,6 @@ def test_core_that_cannot_be_built_is_reported(path: Path) -> None:
     assert report.problems[0].text.endswith("config of version 9")
 
 
-def test_open_session_uses_the_plant_of_its_rows(path: Path) -> None:
-    report = verify(write(path, *journal(120, "open")), SmallCore)
-    assert report.ok, report.line()
-    assert report.recording_class == "open"
-    header, batch = journal(120, "open")
-    plant = bytearray(batch.rows[70].plant)
-    plant[-3] ^= 1
-    batch.rows[70] = msgspec.structs.replace(batch.rows[70], plant=bytes(plant))
-    report = verify(write(path.with_name("b.rrd"), header, batch), SmallCore)
-    assert (report.problems[0].step, report.problems[0].field) == (70, "plant")
-
-
 def test_other_library_versions_are_reported(path: Path) -> None:
     header, batch = journal(50)
     header = msgspec.structs.replace(header, versions={"mujoco": "1.2.3"})

@@ -25,14 +25,7 @@ from iris_session.protocol.scene import AddVisual, Geometry, RemoveVisual, SetVi
 from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import OPEN, RecordedState, Recording
 from iris_session.replay import pictures
-from iris_session.replay.pictures import (
-    Image,
-    PictureError,
-    PictureOptions,
-    RecordingPictures,
-    Timeline,
-    open_gl,
-)
+from iris_session.replay.pictures import Image, PictureError, PictureOptions, RecordingPictures, Timeline, open_gl
 from iris_session.session.core import CoreConfig, SessionCore
 from tests.replay.support import KEYFRAME_STEPS, Played, damaged, make_drawn_core, play, scene_model, step_ns
 from tests.session.play import host

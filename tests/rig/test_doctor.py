@@ -119,14 +119,6 @@ def test_session_is_found_by_its_name(lab: Lab) -> None:
     lab.examine("--session", "nobody-here", address="", failed={"beacon"}).assert_names("beacon", "'nobody-here'")
 
 
-def test_no_listener(lab: Lab) -> None:
-    lab.rig.stop_loop(60.0)  # nobody replaces the front
-    lab.rig.kill_front()
-    found = lab.examine(failed={"tcp"})
-    found.assert_names("tcp", ADDRESS.rpartition(":")[2])
-    assert found.checks["join"]["state"] == "skipped"
-
-
 def test_listener_that_never_answers(lab: Lab) -> None:
     lab.rig.suspend_machine(60.0)
     found = lab.examine(failed={"join"})
@@ -153,20 +145,6 @@ def test_other_protocol_version(lab: Lab) -> None:
     assert found.checks["join"]["state"] == "skipped"
 
 
-def test_missing_alignment_missing_lease_and_stopped_client(lab: Lab) -> None:
-    rig = lab.rig
-    ann, carl = rig.join("ann"), rig.join("carl")
-    ann.acquire(["left"])
-    carl.acquire(["right"])
-    rig.join("bob", alignment="measured")
-    rig.hang(carl, 60.0)
-    rig.run(1.0)
-    found = lab.examine(failed={"alignment", "clients"})
-    found.assert_names("alignment", "bob")
-    found.assert_names("clients", "carl")
-    found.assert_names("leases", "bob", "left: ann", "right: carl", state="warning")
-
-
 def test_jumped_tracking_frame_and_late_samples(lab: Lab) -> None:
     """The alignment of eva is void since its tracking frame jumped; samples of fay arrive two seconds late."""
     rig = lab.rig
@@ -187,13 +165,6 @@ def test_jumped_tracking_frame_and_late_samples(lab: Lab) -> None:
     found = lab.examine(failed=set())
     found.assert_names("alignment", "eva", "lost", "tracking frame", state="warning")
     found.assert_names("age", "device -> front", "(fay)", state="warning")
-
-
-def test_emergency_stop(lab: Lab) -> None:
-    director = lab.rig.join("dora", "director")
-    director.estop("smoke")
-    lab.rig.run(0.2)
-    lab.examine(failed={"session"}).assert_names("session", "emergency stop", "dora", "smoke")
 
 
 def test_session_that_stands_still(lab: Lab) -> None:

@@ -7,7 +7,7 @@ import pytest
 from anchors.pose import distance
 from iris_session.client import Client, DeniedError, RefusedError
 from iris_session.client.identity import Identity
-from iris_session.protocol.client_messages import Assign, EStop, Hello, RemoveParticipant, Sample, SetMode
+from iris_session.protocol.client_messages import EStop, Hello, RemoveParticipant, Sample
 from iris_session.protocol.names import AuditKind, DenialReason, FaultCode, RefusalCode, RejectReason
 from iris_session.protocol.server_messages import (
     Audited,
@@ -69,24 +69,6 @@ def test_forged_and_replayed_messages_move_nothing_and_are_audited() -> None:
         assert not ann.mirror.estop
         assert hand.is_following
         assert distance(before[0], hand.tip[0]) < 1e-4
-
-
-def test_two_directors_at_once_see_one_holder() -> None:
-    with Rig(timestep=TICK, profile="good-wifi") as rig:
-        directors = [rig.join(name, "director") for name in ("one", "two")]
-        operators = [rig.join(name) for name in ("ann", "bob")]
-        asked = []
-        for i in range(20):
-            for director, operator in zip(directors, operators, strict=True):
-                asked.append((director, director.submit(Assign(0, ("left",), operator.participant_id))))
-                asked.append((director, director.submit(SetMode(0, "left", ("takeover", "exclusive")[i % 2]))))
-            rig.run(0.01)
-        rig.run(0.5)
-        assert all(director.answer(number) is not None for director, number in asked)
-        holders = {client.mirror.leases["left"].holder for client in rig.clients}
-        assert len(holders) == 1
-        assert holders <= {operator.participant_id for operator in operators}
-        assert len({client.mirror.mirror_hash() for client in rig.clients}) == 1
 
 
 def test_removed_participant_is_out_at_once_and_others_are_not() -> None:

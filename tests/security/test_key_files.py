@@ -9,15 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.security import (
-    AllowedKey,
-    KeyHome,
-    KeyPair,
-    KeysBusyError,
-    KeysError,
-    load_public,
-    load_secret,
-)
+from iris_session.security import AllowedKey, KeyHome, KeyPair, KeysBusyError, KeysError, load_public, load_secret
 
 
 @pytest.fixture

@@ -14,14 +14,7 @@ import msgspec
 import pytest
 
 from iris_session.protocol import pairing
-from iris_session.security import (
-    AllowedKey,
-    KeyHome,
-    KeyPair,
-    KeysError,
-    RegisteredSession,
-    load_secret,
-)
+from iris_session.security import AllowedKey, KeyHome, KeyPair, KeysError, RegisteredSession, load_secret
 
 
 @pytest.fixture

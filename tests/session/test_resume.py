@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,7 +24,6 @@ from iris_session.physics import encode_model, load_model
 from iris_session.protocol.client_messages import Marker, MoveAnchor
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, SessionResumed, decode_entries
-from iris_session.protocol.names import CommandKind
 from iris_session.protocol.server_messages import Gap
 from iris_session.recording import (
     CLOSED,
@@ -382,17 +380,6 @@ def test_first_entry_is_session_resumed(gone_on: tuple[Stepper, Front, Path]) ->
     assert row.n_ticks == 0
 
 
-def test_participants_keep_leases_and_robots_hold(gone_on: tuple[Stepper, Front, Path]) -> None:
-    stepper, front, _ = gone_on
-    lease = stepper.view.mirror.leases["left"]
-    assert lease.holder == "p1"
-    assert lease.expires_ns > LAST_NS + 5_000_000_000, "the grace period begins anew"
-    (ann,) = stepper.view.make_participant_reports(0)
-    assert (ann.name, ann.connected, ann.holds) == ("ann", False, ("left",))
-    assert all(command.kind == CommandKind.HOLD for decision in front.decisions for command in decision.commands)
-    assert stepper.core.world.view().tick == STEPS + 39, "the first step has no tick: it may be paused"
-
-
 def test_both_recordings_verify_and_the_second_names_the_first(gone_on: tuple[Stepper, Front, Path]) -> None:
     _, _, path = gone_on
     report = verify_recording(path)
@@ -417,21 +404,3 @@ def test_continuation_of_a_different_recording_fails(gone_on: tuple[Stepper, Fro
     report = verify_recording(path)
     assert not report.ok
     assert "does not continue" in report.problems[0].text
-
-
-def test_late_note_does_not_overwrite_that_of_the_next_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The disk hangs while the session ends."""
-    reached, works = threading.Event(), threading.Event()
-
-    def hang(_: int) -> None:
-        reached.set()
-        assert works.wait(30.0)
-
-    monkeypatch.setattr(os, "fsync", hang)
-    keeper = ResumeNoteWriter(find_note_path(tmp_path / "session.rrd"))
-    keeper.offer(ResumeNote("s1", Listening("too late")))
-    assert reached.wait(30.0)
-    keeper.close(0.0)
-    works.set()
-    keeper._thread.join(30.0)
-    assert list(tmp_path.iterdir()) == []

@@ -9,15 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iris_session import (
-    ConfigError,
-    OwnershipError,
-    PublishError,
-    SceneBuilder,
-    ScenePublisher,
-    SessionConfig,
-)
-from iris_session.protocol.scene import Environment, RemoveVisual, SetVisual
+from iris_session import ConfigError, OwnershipError, PublishError, SceneBuilder, ScenePublisher, SessionConfig
+from iris_session.protocol.scene import Environment, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from tests.rig.owned import simulate_sessions
 from tests.rig.simulation import Simulation
@@ -163,25 +156,3 @@ def test_invalid_scene_or_configuration_raises(tmp_path: Path) -> None:
             ScenePublisher(builder, config)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="scene"):
         ScenePublisher(broken, CONFIG).start()
-
-
-def test_error_that_stopped_the_session_is_raised_by_later_calls(monkeypatch: pytest.MonkeyPatch) -> None:
-    with ScenePublisher(scene(), CONFIG) as session:
-        assert session._stepper is not None
-        assert session.scene is not None
-        before, floor = session.scene, session.scene.visuals[0]
-
-        def broken(*_: object, **__: object) -> None:
-            raise KeyError("the core is broken")
-
-        monkeypatch.setattr(session._stepper.core, "step", broken)
-        with pytest.raises(KeyError, match="broken"):
-            session.run(seconds=30.0)
-        for call in (
-            session.publish,
-            lambda: session.estop("now"),
-            lambda: session.patch_scene(RemoveVisual(floor.id)),
-        ):
-            with pytest.raises(KeyError, match="broken"):
-                call()
-        assert session.scene is before

@@ -8,11 +8,7 @@ import threading
 
 import pytest
 
-from iris_session.system.priority import (
-    LOW_PRIORITY_NICE,
-    run_at_low_priority,
-    tick_priority,
-)
+from iris_session.system.priority import LOW_PRIORITY_NICE, run_at_low_priority, tick_priority
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="threads have a priority on Linux only")
 

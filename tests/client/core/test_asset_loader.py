@@ -83,25 +83,6 @@ def test_asset_above_the_maximum_is_not_requested() -> None:
     assert answer(loader, b, MAX_ASSET_BYTES) is True
 
 
-def test_requests_lost_with_a_connection_are_repeated() -> None:
-    """libzmq reconnects and sends what it had not sent: answers to those show that the others are lost."""
-    total = 6 * CHUNK_BYTES
-    loader = started("a", "b")
-    first, other = loader.next_requests(0)
-    answer(loader, first, total)
-    asks = list(loader.next_requests(0))
-    assert [ask.offset for ask in asks] == [n * CHUNK_BYTES for n in range(1, 6)]
-    assert answer(loader, asks[3], total) is None, "what is before it did not come"
-    again = list(loader.next_requests(0))
-    assert [(ask.address, ask.offset) for ask in again] == [*[("a", ask.offset) for ask in asks], ("b", 0)]
-    assert answer(loader, asks[4], total) is None
-    assert [answer(loader, ask, total) for ask in (*asks[:3], other)] == [False] * 4
-    assert [answer(loader, ask, total) for ask in again[:5]] == [True] * 5
-    assert loader.is_complete("a")
-    assert list(loader.next_requests(0)) == [], "each was made again once"
-    assert refuse(loader, again[5], AssetRefusal.UNKNOWN) != ""
-
-
 def test_number_of_small_assets_is_bounded() -> None:
     loader = AssetLoader()
     names = [f"{i}" for i in range(AT_ONCE + 10)]

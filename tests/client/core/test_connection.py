@@ -10,10 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.client.core.clock import SETTLED
-from iris_session.client.core.connection import (
-    MAX_INBOX,
-    ClientConnection,
-)
+from iris_session.client.core.connection import MAX_INBOX, ClientConnection
 from iris_session.client.core.outbox import MAX_OUTGOING, MAX_PENDING
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.errors import IdentityError, NotConnectedError

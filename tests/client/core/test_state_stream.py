@@ -12,13 +12,7 @@ from hypothesis import strategies as st
 from iris_session.client.core.state_stream import PRESENCE_WAITING, SceneState, StateStream
 from iris_session.protocol.codec import encode_presence, encode_state_header
 from iris_session.protocol.common import IDENTITY
-from iris_session.protocol.server_messages import (
-    TOPIC_PRESENCE,
-    TOPIC_RIGID,
-    Presence,
-    PresenceItem,
-    StateHeader,
-)
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, Presence, PresenceItem, StateHeader
 from iris_session.streams.rigid import WINDOW, RigidEncoder
 
 MS = 1_000_000
