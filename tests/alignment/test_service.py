@@ -69,17 +69,6 @@ def test_moved_sheet_is_reported_without_restarting_alignment() -> None:
     assert len(ann.alarms()) == 2, "without another sheet in sight it may be the headset: reported again"
 
 
-def test_change_while_out_of_sight_is_reported_once() -> None:
-    lab = Lab()
-    ann = lab.wearer()
-    ann.survey()
-    lab.now_ns += 60 * SECOND
-    ann.bump(0.03)
-    ann.report_observations(ann.place(d=0.5), 40)
-    assert [a.kind for a in ann.alarms()] == ["differs"], "the correction waits: nothing new to report"
-    assert error_at_anchor(ann, ann.proposals()[-1]) < 0.01
-
-
 @pytest.mark.parametrize("fields", [{"offset": True}, {"kind": "placed"}])
 def test_placed_alignment_is_not_contradicted_by_a_sheet(fields: dict[str, object]) -> None:
     lab = Lab()

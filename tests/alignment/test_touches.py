@@ -117,23 +117,6 @@ def test_tip_is_calibrated_with_its_error() -> None:
     assert distance(found.p_grip_tip, TIP) < found.error_m < 0.003
 
 
-@pytest.mark.parametrize(
-    ("poses", "advice"),
-    [
-        ((), "0 poses of at least 20"),
-        (_turning_poses(30, 0.05), "tilt the controller to the front and to the side"),
-        (_turning_poses(60, 0.6, 0.02), "the tip slipped"),
-    ],
-)
-def test_poses_that_do_not_determine_the_tip_are_refused_with_advice(poses: tuple[Pose, ...], advice: str) -> None:
-    _, ann = _lab()
-    _report_tip(ann, poses)
-    (found,) = _solved(ann)
-    assert found.refused
-    assert advice in found.advice
-    assert found.covariance == ()
-
-
 def test_a_flood_of_tips_is_bounded_and_counted() -> None:
     lab, ann = _lab()
     for n in range(50):
@@ -174,17 +157,6 @@ def test_nothing_that_is_reported_raises(poses: list[Pose], touches: list[tuple[
 
 
 # --- touches of marks ---
-
-
-def test_four_marks_with_a_calibrated_tip_make_an_alignment_to_drive_with() -> None:
-    _, ann = _lab()
-    _calibrate(ann)
-    for mark in "1234":
-        _touch(ann, mark)
-    got = ann.proposals()[-1]
-    assert got.kind == "measured"
-    assert _error_at(ann, got, _mark("2")) < 0.004
-    assert got.error_at_anchor_m < 0.004
 
 
 @pytest.mark.parametrize("device", ["hand/right", RIGHT, "Controller/right"])

@@ -8,7 +8,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy.spatial.transform import Rotation
 
 from anchors import lie
 from anchors.lie import Array
@@ -21,10 +20,6 @@ angles = st.one_of(
     st.floats(0.0, math.pi),
     st.sampled_from([0.0, 1e-300, 1e-12, 1e-8, 1e-7, 1e-4, math.pi - 1e-4, math.pi - 1e-8, math.pi]),
 )
-
-
-def _scipy(q: Array) -> Rotation:
-    return Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
 def _is_same_rotation(a: Array, b: Array) -> bool:

@@ -11,33 +11,16 @@ from iris_session.authority.config import SpeedLimit
 from iris_session.protocol.client_messages import (
     Acquire,
     Bye,
-    Episode,
-    EStop,
-    GetSnapshot,
-    Grasp,
     Heartbeat,
     Marker,
     Release,
-    TrackingEpoch,
 )
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, Lost
 from iris_session.protocol.server_messages import MarkerAdded, SamplesRejected, Snapshot
-from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.specs import ObjectSpec
 
 from .table import Table, make_view, proposal, robot
-
-
-def test_one_command_per_robot_in_order_even_in_an_empty_session() -> None:
-    t = Table()
-    t.step()
-    assert [(c.robot, c.kind, c.hold_reason) for c in t.decision.commands] == [
-        ("left", "hold", "no_lease"),
-        ("right", "hold", "no_lease"),
-    ]
-    t.step(n_ticks=0)
-    assert len(t.decision.commands) == 2
 
 
 def test_release_and_lost_act_in_the_step_they_arrive_in_behind_any_flood() -> None:
@@ -86,34 +69,8 @@ def test_strangers_and_wrong_envelopes_are_answered() -> None:
     assert t.decision.dropped == ()
 
 
-def test_late_joiner_sees_what_the_others_saw() -> None:
-    t = Table()
-    anna, bert = t.operator("left"), t.join()
-    anna.does(GetSnapshot(1))
-    early = SessionMirror()
-    early.apply_snapshot(snapshots(t)[0])
-    bert.does(Acquire(1, ("left",), wait=True))
-    follow(t, early)
-    for message in (EStop(), Episode(1, "start"), TrackingEpoch(4), Heartbeat(worn=False), Grasp(2, "hammer", "head")):
-        anna.does(message)
-        follow(t, early)
-    t.step(anna.says(Lost()), bert.says(GetSnapshot(1)), bert.says(GetSnapshot(2)))
-    follow(t, early)
-    assert [s.request_id for s in snapshots(t)] == [1, 2]
-    late = SessionMirror()
-    late.apply_snapshot(snapshots(t)[0])
-    assert late.mirror_hash() == early.mirror_hash()
-    assert late.estop
-    assert late.leases["left"].queue == (bert.id,)
-
-
 def snapshots(t: Table) -> list[Snapshot]:
     return [o.message for o in t.decision.outgoing if isinstance(o.message, Snapshot)]
-
-
-def follow(t: Table, mirror: SessionMirror) -> None:
-    for event in t.decision.events:
-        assert mirror.apply_event(event)
 
 
 def test_presence_is_in_the_world_and_only_of_the_aligned() -> None:

@@ -578,18 +578,6 @@ def test_director_assigns_frees_and_changes_modes() -> None:
     assert bert.denied(Acquire(1, ("left",))) == "held"
 
 
-def test_denials_fit_the_wire_in_a_scene_of_many_objects() -> None:
-    t = Table(objects=[f"a rather long name of object number {i}" for i in range(300)])
-    anna = t.join()
-    release = Release(1, (Target("nothing", 1, "object"),))
-    for message in (Acquire(1, (), ("nothing",)), release, Grasp(1, "nothing", "head")):
-        denial = anna.asks(message).denial
-        assert denial is not None
-        assert len(denial.message) <= 512
-        assert denial.advice.endswith("more")
-        assert len(denial.advice) <= 512
-
-
 def test_consent_of_one_holder_takes_nothing_from_another() -> None:
     t = with_mode("request")
     anna, bert, carl = t.operator("left"), t.join(), t.join()

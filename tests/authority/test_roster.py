@@ -39,17 +39,6 @@ def refused(t: Table) -> str:
     return message.code
 
 
-def test_join_admits_and_tells_everyone() -> None:
-    t = Table()
-    anna = t.join(devices=("head",))
-    assert t.decision.admitted == (Admitted(1, "p1", "operator", False),)
-    (event,) = t.since(ParticipantJoined)
-    assert (event.participant.id, event.participant.devices, event.participant.alignment) == ("p1", ("head",), None)
-    agent = t.join("agent", alignment="not_needed")
-    assert t.since(ParticipantJoined)[0].participant.alignment.kind == "not_needed"
-    assert (anna.id, agent.id) == ("p1", "p2")
-
-
 @pytest.mark.parametrize(
     ("fields", "code"),
     [

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from iris_session.authority import Authority, AuthorityConfig, is_same_snapshot
+from iris_session.authority import AuthorityConfig, is_same_snapshot
 from iris_session.authority.config import SPEED_LIMITS
 from iris_session.authority.tracking import JUMP, OUTLIER, STEADY, SURPRISE, Track, follow_pose
 from iris_session.protocol.common import Pose
@@ -182,17 +182,6 @@ def test_what_an_agent_computes_may_stand_still_unless_it_wears_a_headset(alignm
     for _ in range(60):
         move(t, agent, 1, device="hand/left", p=p)
     assert t.hold() == hold
-
-
-def test_a_surprise_that_waits_is_in_the_snapshot() -> None:
-    t, op = drive()
-    move(t, op, 1, x=0.04)
-    assert t.command().kind == "pose"
-    again = Authority(t.config, t.robots, t.objects)
-    again.restore(t.authority.snapshot())
-    t.authority = again
-    move(t, op, 1, x=0.04)
-    assert t.hold() == "jump"
 
 
 def test_limits_of_earlier_recordings_only_bound_the_speed() -> None:

@@ -53,17 +53,6 @@ def test_cloud_is_decoded_once_and_polled_once() -> None:
     assert cloud.colors.tolist() == [[255] * 4] * 10
 
 
-def test_frames_that_were_not_looked_at_in_time_are_counted() -> None:
-    rig = Rig()
-    rig.receive()
-    assert rig.cloud.skipped == 0
-    rig.receive()
-    rig.receive()
-    assert rig.cloud.skipped == 2
-    assert rig.cloud.poll() is not None
-    assert (rig.cloud.skipped, rig.cloud.decoded) == (2, 1)
-
-
 @pytest.mark.parametrize(
     ("data", "encoding", "fault"),
     [(FRAME[:-1], "cloud", ""), (b"", "cloud", ""), (FRAME, "jpeg", "jpeg")],

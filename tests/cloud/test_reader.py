@@ -13,7 +13,6 @@ from iris_session.cloud.reader import HEALTHY_FRAMES, REOPEN_S, SourceReader
 from iris_session.protocol.names import StreamFault
 from tests.cloud.fake_source import CAMERA, FakeSource, make_frame
 
-MS = 1_000_000
 DEADLINE_S = 60.0
 
 

@@ -126,20 +126,6 @@ def test_solves_are_at_most_100_hz_per_robot_and_two_a_tick_and_all_robots_get_t
         assert len(own) > 70
 
 
-def test_crowded_steps_solve_less_and_starve_nobody_if_all_of_them_are() -> None:
-    model, robots = panda_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(8)])
-    made = Rig(model, robots, home=PANDA_HOME)
-    solves = count_solves(made)
-    tick = made.controller.tick
-    made.controller.tick = lambda data: tick(data, crowded=True)  # type: ignore[method-assign,assignment,misc]
-    for k in range(400):
-        x = 0.1 * np.sin(0.01 * k)
-        made.step(decision(pose_command(r.name, made.source((x, 0.0, 0.0))) for r in robots))
-    assert np.bincount([t for t, _ in solves]).max() == 1
-    for i in range(8):
-        assert np.diff([t for t, robot in solves if robot == i]).max() <= 8  # 62 Hz
-
-
 @pytest.mark.parametrize(("n", "tick_s", "interval_ticks"), [(4, 0.005, 2), (12, 0.002, 5)])
 def test_long_ticks_and_many_robots_starve_nobody(n: int, tick_s: float, interval_ticks: int) -> None:
     """A robot that is solved less often than its device sends moves slower than its hand."""

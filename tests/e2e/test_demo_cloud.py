@@ -10,14 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from iris_session import Recording
 from tests.e2e.session_process import DEMO_OPTIONS, DEMO_S, run_command
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 60.0)]
-
-Floats = NDArray[np.floating]
 
 
 @pytest.mark.long

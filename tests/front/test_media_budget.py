@@ -111,23 +111,6 @@ def test_frames_are_paced_below_what_a_slow_link_carries() -> None:
     assert link.play(120) == BudgetGrant({"cloud": 0}), "the link has recovered"
 
 
-def test_frames_that_wait_for_their_own_pace_are_no_congestion() -> None:
-    controller, rates = BudgetController(), {"cloud": tuple(16 * MBIT / 2**n for n in range(6))}
-    for share in (1.0, 1.0, 1.0, 1.0, 0.5, 0.5):
-        measure = LinkMeasure(None, round(16 * share), 16, bytes_per_s=8 * MBIT * share)
-        before = controller.update(1, measure, rates, SECOND)
-    now_ns, grown = 6 * SECOND, {"cloud": tuple(2 * rate for rate in rates["cloud"])}
-    # Large segments leave rarely: none in one measure, two in the next.
-    for taken in (2.0 * before.pace, 0.0, 2.0 * before.pace, 0.0):
-        paced = controller.update(1, LinkMeasure(None, 8, 16, bytes_per_s=taken), grown, now_ns)
-        now_ns += STEP_NS
-        assert paced.bytes_per_s >= before.bytes_per_s, paced
-    for _ in range(4):
-        full = controller.update(1, LinkMeasure(None, 8, 16, bytes_per_s=0.5 * before.pace), grown, now_ns)
-        now_ns += STEP_NS
-    assert full.bytes_per_s < before.bytes_per_s
-
-
 def test_measured_rate_of_a_full_link_bounds_what_is_sent_and_tried() -> None:
     controller, rates = BudgetController(), {"cloud": tuple(192 * MBIT / 2**n for n in range(6))}
     grants = []
@@ -177,7 +160,6 @@ def test_client_may_lower_and_restore_its_level() -> None:
 
 
 MAPS = {**CLOUD, "map": (0.0, 0.0, 0.0), "plan": (0.0, 0.0, 0.0)}
-MAP_BYTES = {"map": 400_000, "plan": 400_000}
 
 
 @pytest.mark.parametrize("limit", [0.0, 2 * MBIT])
@@ -189,18 +171,6 @@ def test_stream_at_rest_is_given_on_a_full_link_within_half_a_second(limit: floa
     assert cloud > 0
     link.play(0.5, MAPS, limit)
     assert link.grants[-1][1].levels == {"cloud": cloud, "map": 0, "plan": 0}
-
-
-def test_single_frames_are_given_as_fast_as_the_budget_carries_them() -> None:
-    link = Link(8)
-    link.play(5)
-    budget = link.grants[-1][1].bytes_per_s
-    link.play(0.5, MAPS, newest=MAP_BYTES)
-    given = link.grants[-1][0]
-    assert [link.grants[-1][1].levels[stream] for stream in ("map", "plan")] == [0, NONE_LEVEL]
-    link.play(2, MAPS, newest=MAP_BYTES)
-    later = next(now for now, grant in link.grants if grant.levels.get("plan") == 0)
-    assert 0.0 <= (later - given) / SECOND - MAP_BYTES["map"] / budget <= 0.25
 
 
 def test_most_expensive_stream_is_lowered_first() -> None:

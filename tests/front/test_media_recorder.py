@@ -135,24 +135,6 @@ def test_descriptions_go_when_they_change_and_the_end_of_a_stream(rig: Rig) -> N
     assert rig.drops() == {}
 
 
-@pytest.mark.parametrize("other", ["jpeg", "bytes"])
-def test_stream_ends_in_the_encoding_that_it_changes_from(rig: Rig, other: str) -> None:
-    rig.push("room", b"cloud")
-    rig.tick()
-    for n in range(20):  # three changes in each period
-        rig.now_ns += PERIOD_NS // 3 + 1
-        rig.push("room", b"%d" % n, other if n % 2 == 0 else "cloud")
-        rig.tick()
-    ends = [header for header, info in rig.infos if info is None]
-    assert [header.budget_class for header in ends] == ["none"] * len(ends)
-    assert [header.encoding for header in ends][:2] == (["cloud", "jpeg"] if other == "jpeg" else ["cloud", "cloud"])
-    shown = [header.encoding for header, _ in rig.got]
-    assert 5 <= len(shown) <= 7, "no more than at the rate"
-    assert set(shown) == {"cloud", other} - {"bytes"}
-    assert len(ends) in (len(shown), len(shown) - 1)
-    assert rig.drops() == {}
-
-
 def test_bytes_are_bounded_and_every_stream_has_its_turn(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     """A large stream does not starve for small ones, nor they for it; what is missing is counted, and logged once."""
     seconds, sizes = 60, {"large": MAX_MEDIA_FRAME_BYTES, "small": 1000, "middle": 1_000_000}

@@ -251,23 +251,6 @@ def test_new_subscriber_gets_the_newest_frame_of_a_stream_at_rest() -> None:
     assert len(wire.got[ANN]) == 1
 
 
-def test_a_link_that_has_room_again_gets_the_newest_frame() -> None:
-    wire = Wire(ann=NONE_LEVEL)
-    wire.push()
-    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
-    wire.hub.flush(wire.send, wire.now_ns)
-    assert not wire.got[ANN]
-    wire.allow(ann=2)
-    wire.hub.flush(wire.send, wire.now_ns)
-    assert [head.budget_class for head, _ in wire.got[ANN]] == ["quarter"]
-    wire.allow(ann=0)  # it has that frame
-    wire.hub.flush(wire.send, wire.now_ns)
-    wire.allow(ann=NONE_LEVEL)
-    wire.allow(ann=0)
-    wire.hub.flush(wire.send, wire.now_ns)
-    assert len(wire.got[ANN]) == 1
-
-
 def test_subscribing_over_and_over_gets_no_frame_each_time() -> None:
     wire = Wire()
     wire.push()
@@ -362,30 +345,6 @@ def test_stream_is_stale_without_the_frames_that_it_means_to_have(hz: float, lat
     assert wire.hub.read_streams()["cloud"].is_stale(last + MS) == (late_ns is not None), "an info is no frame"
     describe(wire, None, "", b"x")
     assert not wire.hub.read_streams()["cloud"].is_stale(last + MS)
-
-
-def test_stream_at_rest_is_stale_while_its_frame_is_missing() -> None:
-    """Its source does not know that a front was restarted or had to release the frame."""
-    wire = Wire()
-
-    def is_stale() -> bool:
-        wire.now_ns += SECOND + MS
-        return wire.hub.read_streams()["cloud"].is_stale(wire.now_ns)
-
-    describe(wire, StreamInfo("Room"))
-    assert is_stale()
-    wire.push(frames={"full": b""})
-    assert not is_stale()
-    wire.hub.release_frames(wire.now_ns)
-    assert is_stale()
-    wire.push()
-    assert not is_stale()
-    wire.hub.reset()
-    assert is_stale()
-    wire.push()
-    wire.hub.subscribe(ANN, "cloud", "a", 1, wire.now_ns)
-    wire.hub.flush(wire.send, wire.now_ns)
-    assert len(wire.got[ANN]) == 1
 
 
 def test_pace_of_a_connection_is_told_once_for_each_of_its_readers() -> None:

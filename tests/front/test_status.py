@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from iris_session.protocol.client_messages import Hello, Observation, Sample
+from iris_session.protocol.client_messages import Hello, Observation
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Join
 from iris_session.protocol.names import FaultCode
@@ -53,10 +53,6 @@ def ask(
     answers: list[StatusReport] = []
     session.pump(wanted, "a status as wanted")
     return answers[-1]
-
-
-def sample(seq: int, capture_ns: int, device: str = "head") -> Sample:
-    return Sample(device, "pose", seq, capture_ns, 1, 0, 0)
 
 
 def test_both_halves_make_one_report(session: FrontSession) -> None:

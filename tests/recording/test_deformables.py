@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.journal.messages import Batch, SceneAssets, SceneModel, VertexFrame
-from iris_session.physics.load import compute_scene_hash, encode_model
-from iris_session.protocol.server_messages import BodyInfo
+from iris_session.journal.messages import Batch, SceneAssets, VertexFrame
+from iris_session.physics.load import encode_model
 from iris_session.recording import SessionHeader, pack_model
 from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
@@ -125,21 +124,6 @@ def test_ropes_are_lines_and_soft_bodies_surfaces(world: World) -> None:
     indices = np.array(told(found[SOFT], "Mesh3D:triangle_indices")[0])
     moved = np.array(told(found[SOFT], "Mesh3D:vertex_positions")[8])
     assert moved[indices] == pytest.approx(soft[world.meshes[2].elements], abs=BOUND_M)
-
-
-def test_vertices_of_the_previous_scene_are_rejected(world: World) -> None:
-    vertices = world.vertices(0)
-    world.state(0)
-    hash_ = compute_scene_hash(bytes(encode_model(world.model)))
-    scene = SceneModel(8, 16_000_007, hash_, world.packed, (BodyInfo(1, "cup", moving=True),))
-    world.writer.add(Batch(scenes=[scene], assets=[world.assets]))
-    world.publish(0, 0, vertices + 0.1)
-    world.publish(16, 0, vertices + 0.2)
-    world.state(16)
-    found = world.read()
-    assert list(told(found[CLOTH], "Mesh3D:vertex_positions")) == [0]
-    assert sorted(told(found[CLOTH.replace("/1/", "/2/")], "Mesh3D:vertex_positions")) == [8, 16]
-    assert world.writer.drawing.vertices_refused == 1
 
 
 def test_invalid_frames_are_rejected_and_counted(world: World) -> None:

@@ -40,7 +40,7 @@ from iris_session.protocol.server_messages import (
     SceneChanged,
     TipCalibrated,
 )
-from iris_session.viewer.narration import PALETTE, EventNarration, LogLine, find_colour
+from iris_session.viewer.narration import PALETTE, EventNarration, LogLine
 
 POSE = Pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
 
@@ -166,14 +166,6 @@ def test_lanes_of_a_later_part_end_what_began_before_it() -> None:
     later.add_people([ParticipantInfo("p1", "ann", "operator", True)])
     assert changes(later, free) == [("robots/left/holder", "")]
     assert changes(later, ParticipantLeft("p1", "bye")) == [("alignment/ann", "")]
-
-
-def test_colours_follow_the_order_of_joining() -> None:
-    (change,) = EventNarration().add(Event(1, 1, 1, lease("left", "p2"))).lanes
-    assert change.colours == {"p2": find_colour("p2")}
-    assert len({find_colour(f"p{i}") for i in range(1, 8)}) == 7
-    assert find_colour("p8") == find_colour("p1")
-    assert find_colour("host") == find_colour("host")
 
 
 def test_colours_are_those_of_the_page() -> None:

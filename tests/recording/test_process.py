@@ -18,7 +18,7 @@ import zmq
 
 from iris_session.journal.errors import WriteError
 from iris_session.journal.feed import BATCH_NS
-from iris_session.journal.messages import BATCH, FRAME, Batch, RecorderConfig, VertexFrame, encode_batch
+from iris_session.journal.messages import RecorderConfig
 from iris_session.protocol.scene import list_assets
 from iris_session.protocol.status import ClientReport
 from iris_session.recording import RecorderError, Recording, summarise, verify
@@ -90,17 +90,6 @@ def test_raw_samples_are_left_out_while_the_disk_is_nearly_full(
     loop._disk_free, loop._write_s = 0, 2 * process_module.SLOW_WRITE_S  # a slow disk, of unknown size
     loop._process_samples(batch)
     assert loop._samples_left_out == 6
-
-
-def test_vertices_are_left_out_while_the_disk_is_nearly_full(one: LoopRecorder) -> None:
-    SmallSession(one.feed).take(5)
-    one.pump()
-    loop = one.loop
-    loop._disk_free = process_module.JOURNAL_RESERVE_BYTES - 1
-    batch = Batch(vertices=[VertexFrame("cloth", 7, b"frame")] * 3)
-    before = loop._writer.drawing.vertices_refused
-    loop._process_message([FRAME.pack(BATCH, loop._expecting), encode_batch(batch)])
-    assert loop._writer.drawing.vertices_refused == before + 3
 
 
 def test_reports_of_clients_are_plotted_and_no_raw_samples(one: LoopRecorder) -> None:

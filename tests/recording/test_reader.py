@@ -64,18 +64,6 @@ def test_damaged_message_is_skipped(path: Path) -> None:
     assert any(p.kind == "unreadable" for p in report.problems)
 
 
-def test_empty_part_is_reported_and_skipped(tmp_path: Path, path: Path) -> None:
-    """A recorder that could not begin its file (full disk) has lost nothing by it."""
-    Path(part_path(str(path), 2)).write_bytes(b"")
-    Path(part_path(str(path), 3)).write_bytes(path.read_bytes()[:40])
-    with Recording.open(path) as recording:
-        assert len(list(recording.rows())) == 200
-        assert [note.partition(":")[0] for note in recording.notes] == ["session.part2.rrd", "session.part3.rrd"]
-    report = verify(path, SmallCore)
-    assert report.ok, report.line()
-    assert "part2" in report.line()
-
-
 def test_part_of_another_session_is_reported_and_skipped(path: Path) -> None:
     header, batch = journal(100)
     write(Path(part_path(str(path), 2)), msgspec.structs.replace(header, session_name="another"), batch)

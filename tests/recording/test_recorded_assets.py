@@ -203,13 +203,3 @@ def test_what_could_not_be_recorded_is_no_damage() -> None:
         found.add(RecordedScene(5, 6, gone, SCENE))
         assert found.list_problems(finished=True) == []
         assert found.summarise().left_out == (f"asset {gone[:12]} (specification of the scene): it cannot be read",)
-
-
-def test_missing_asset_of_a_finished_recording_is_named() -> None:
-    found = AssetCollector()
-    found.add(RecordedScene(-1, 0, "7" * 64, SCENE))
-    found.add(RecordedScene(3, 4, "8" * 64, NONE))
-    assert found.list_problems(finished=False) == []
-    assert found.list_problems(finished=True) == [
-        "asset 777777777777 (specification of the scene) is missing, or not whole"
-    ]

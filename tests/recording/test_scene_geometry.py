@@ -14,10 +14,8 @@ from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import pack_model
 from iris_session.scene import AssetMissingError, AssetStore
-from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.viewer import scene_geometry as scene
-from iris_session.viewer.scene_layer import build_components
 from tests.models import PANDA
 from tests.recording.support import XML, make_header
 from tests.scene.models import LOOKS, SHAPES, every_shape
@@ -97,23 +95,6 @@ def test_every_shape_has_its_texture(tmp_path: Path) -> None:
     assert len(looks) >= len(SHAPES) * len(LOOKS)
 
 
-def test_vertex_colours_are_drawn(tmp_path: Path) -> None:
-    """The viewer multiplies them by the colour of the mesh, as clients do."""
-    colors = np.array([[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, 128]], np.uint8)
-    builder, store = SceneBuilder(), AssetStore(tmp_path)
-    builder.add_mesh(vertices=[[0, 0, 0], [1, 0, 0], [0, 1, 0]], triangles=[[0, 1, 2]], colors=colors)
-    builder.add_mesh(vertices=[[0, 0, 0], [1, 0, 0], [0, 1, 0]], triangles=[[0, 1, 2]])
-    spec = builder.build(store).spec
-    reader = scene.SceneReader(spec, store, [])
-    drawn = [
-        build_components(reader.read_shape(visual), scene.to_rgba8(visual.rgba), reader.place_visual(visual)[1])[-1]
-        for visual in spec.visuals
-    ]
-    packed = (colors.astype(np.uint32) * [1 << 24, 1 << 16, 1 << 8, 1]).sum(axis=1)
-    assert drawn[0].vertex_colors.as_arrow_array().to_pylist() == packed.tolist()
-    assert drawn[1].vertex_colors is None
-
-
 def test_specification_is_read_or_made_from_the_model(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(XML)
     store = AssetStore(tmp_path)
@@ -141,29 +122,3 @@ def test_unreadable_specification_is_reported(
     missing = SceneAssets(0, 0, str(tmp_path), "0" * 64) if assets else SceneAssets()
     with pytest.raises(error), scene.open_scene(missing, model):
         pass
-
-
-def test_planes_end_near_the_scene_and_keep_their_texture(tmp_path: Path) -> None:
-    """One infinite, one of 40 m, both turned and far from the bodies; a small one far away stays whole."""
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><asset><texture name="t" type="2d" builtin="checker" rgb1="1 0 0" width="8" height="8"/>
-        <material name="m" texture="t" texrepeat="3 5"/></asset><worldbody>
-        <geom type="plane" size="0 0 .1" pos="20 0 0" euler="0 0 90" material="m"/>
-        <geom type="plane" size="40 40 .1" pos="20 0 0" material="m"/><geom type="plane" size="1 1 .1" pos="90 0 0"/>
-        <body pos="30 1 1"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
-    )
-    store = AssetStore(tmp_path)
-    spec = parse_mujoco(model, store).spec
-    reader = scene.SceneReader(spec, store, infos(model))
-    for visual, expected in zip(
-        spec.visuals, (((27, -2), (33, 4)), ((27, -2), (33, 4)), ((89, -1), (91, 1))), strict=False
-    ):
-        form = reader.read_shape(visual)
-        assert form.mesh is not None
-        _, T_world_plane = reader.place_visual(visual)
-        points = np.array([apply(T_world_plane, tuple(p)) for p in form.mesh.position.tolist()])
-        assert np.array([points.min(axis=0), points.max(axis=0)])[:, :2] == pytest.approx(np.array(expected), abs=1e-4)
-        if form.uv is not None:  # in the finite one, half of it per repetition
-            per_metre = np.ptp(form.uv, axis=0) / np.ptp(form.mesh.position, axis=0)[:2]
-            size = visual.geometry.size[0] or 1.0
-            assert per_metre == pytest.approx(np.array((3, 5)) / 2 / size, rel=1e-4)

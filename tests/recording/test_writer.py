@@ -435,20 +435,6 @@ def test_errors_of_alignments_and_rejected_samples_are_plotted_by_name(tmp_path:
         assert recording.damage == []
 
 
-def test_links_are_below_their_robots(tmp_path: Path) -> None:
-    """The arm of the small session as a robot; names of links and visuals are without that of the robot."""
-    path = tmp_path / "w.rrd"
-    writer = RrdWriter(path, "id")
-    header = msgspec.structs.replace(make_header(), robots=(RobotSpec("arm", (), (), "site", "arm/link 1"),))
-    writer.write_header(header)
-    writer.add(Batch(states=[frame(0, np.zeros((len(header.bodies), 7)))]))
-    writer.close()
-    moved = {entity for entity, batches in read(path).items() if select(batches, "Transform3D:translation")}
-    assert moved == {"/scene/1/robots/arm/link\\ 1", "/scene/1/robots/arm/tip", "/scene/1/bodies/ball"}
-    parents = tuple(f"{entity}/" for entity in (*moved, "/scene/1/world"))
-    assert all(entity.startswith(parents) for entity in drawn_visuals(path))
-
-
 def test_no_two_rows_of_an_entity_have_one_time(tmp_path: Path) -> None:
     """Events, denials, raw messages and changes of a lane of one step: dataframes have a row per entity and time."""
     path = tmp_path / "w.rrd"

@@ -25,7 +25,6 @@ from tests.scene.models import every_shape, flexes
 
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 SQUARE = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], np.float64)
-HALF = 0.5**0.5
 
 
 def full_scene(folder: Path) -> SceneBuilder:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from iris_session.physics import World
-from iris_session.protocol.scene import SceneSpec, decode_scene, encode_scene, list_assets
+from iris_session.protocol.scene import SceneSpec, decode_scene, encode_scene
 from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
 from iris_session.scene.mujoco_scene import ParsedScene, parse_mujoco
 from iris_session.scene.nodes import to_matrix
@@ -67,33 +67,6 @@ def test_poses_colours_and_sizes_agree_with_mujoco(tmp_path: Path, name: str) ->
         if visual.id in drawn and visual.geometry.kind not in ("mesh", "sdf", "hfield", "plane"):
             assert visual.rgba == pytest.approx(drawn[visual.id].rgba)
             assert visual.geometry.size == pytest.approx(drawn[visual.id].size)
-
-
-def test_every_shape_and_its_costs(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path)
-    parsed = parse_mujoco(every_shape(), store, name="all")
-    spec = parsed.spec
-    assert decode_scene(store.get(parsed.scene_hash)) == spec
-    assert all(address in store for address in parsed.addresses)
-    assert {visual.geometry.kind for visual in spec.visuals} == {
-        "plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf"
-    }  # fmt: skip
-    assert [texture.kind for texture in spec.textures] == ["skybox", "2d", "cube"]
-    assert spec.environment.skybox == 0
-    assert [light.kind for light in spec.lights] == ["directional", "spot", "point", "spot"]
-    seen = next(body.id for body in spec.bodies if body.name == "seen")
-    assert (spec.lights[3].follow, spec.lights[3].target) == ("targetbody", seen)
-    assert (spec.cameras[0].follow, spec.cameras[0].target) == ("targetbody", seen)
-    real = spec.cameras[3]
-    assert (real.focal, real.principal) == (pytest.approx((200, 210)), pytest.approx((9, -7)))
-    assert spec.cameras[2].orthographic
-    addresses = list_assets(spec)
-    assert all(len(store.view(address)) == size for address, size in addresses.items())
-    assert spec.totals.asset_bytes == sum(addresses.values())
-    assert spec.totals.objects == len(spec.visuals) - 2  # one is transparent, one hidden
-    grid = decode_arrays(store.get(spec.hfields[0].address), "grid")["elevation"]
-    assert grid.shape == (5, 6)
-    assert (grid.min(), grid.max()) == (0, 1)
 
 
 def test_flexes_become_deformables_without_their_bodies(tmp_path: Path) -> None:

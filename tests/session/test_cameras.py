@@ -12,8 +12,6 @@ from iris_session.session.cameras import SILENT_NS, SLOW_START_NS, SessionCamera
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import StartError
 
-SECOND = 1_000_000_000
-
 
 def write_file(folder: Path, name: str, *cameras: str, stream: str = "", picture_hz: float = 10.0) -> Path:
     """Write a camera file whose pictures do not exist: nothing opens them here."""

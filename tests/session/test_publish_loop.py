@@ -106,18 +106,6 @@ def test_newest_of_too_many_frames_is_published_and_others_are_counted(rig: Publ
     assert rig.xs() == sorted(rig.xs())
 
 
-def test_early_frame_is_published_when_it_is_due(rig: PublishLoopRig) -> None:
-    rig.publish(1.0)
-    rig.now_ns += PERIOD_NS - 2 * MS  # jitter of a source with about the rate of the state
-    rig.publish(2.0)
-    assert rig.xs()[-1] == 1.0
-    rig.loop.poll()
-    assert rig.xs()[-1] == 1.0
-    rig.advance(2 * MS)
-    assert rig.xs()[-1] == 2.0
-    assert rig.loop.superseded == 0
-
-
 def test_session_steps_while_nothing_is_published(rig: PublishLoopRig) -> None:
     rig.now_ns += 100 * MS
     rig.publish(1.0, delay_ns=40 * MS)

@@ -26,7 +26,6 @@ from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
 from tools.codegen.deformable_golden import make_cloth, make_rope, make_shell
 
-Floats = npt.NDArray[np.float64]
 HEADER = 32
 MESHES = {"cloth": make_cloth(9, 7), "shell": make_shell(4), "rope": make_rope(20)}
 

@@ -18,7 +18,6 @@ ROOT = Path(__file__).parents[2]
 #: Names of users' own scripts that child processes of a session import as modules.
 TRAPS = ("queue", "zmq", "json", "random", "select", "selectors", "anchors", "msgspec", "numpy", "rerun", "rich")
 TRAP = "raise SystemExit('a file of the working folder was taken for a module')"
-SERVE = ("serve", "handover", "--no-beacon", "--control-port", "0", "--state-port", "0", "--seconds", "0.5")
 
 
 #: Starts a child from a package that only this process can import, as in a checkout that is not installed.

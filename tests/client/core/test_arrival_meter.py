@@ -16,7 +16,6 @@ from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.identity import Identity
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.server_messages import StateHeader
-from iris_session.protocol.status import ClientReport
 from tests.client.session import ClientSession
 
 MS = 1_000_000
@@ -69,16 +68,3 @@ def test_status_of_a_session(session: ClientSession, join: Callable[..., Client]
     unopened = session.make_client()
     with pytest.raises(NotConnectedError):
         unopened.status(0.2)
-
-
-def test_one_report_per_second(connection: ClientConnection) -> None:
-    meter = ArrivalMeter()
-    assert meter.poll_report(connection, 0) is None
-    for n, seq in enumerate((1, 2, 5, 6)):
-        meter.record(frame(seq, (n + 1) * MS))
-    connection.stream.counters.bytes_received = 4000
-    assert meter.poll_report(connection, PERIOD_NS - 1) is None
-    report = meter.poll_report(connection, 2 * PERIOD_NS)
-    assert report == ClientReport(3.0, 4.0, 4, 2, 0.0, 2000.0), "the first may have been sent before"
-    assert meter.poll_report(connection, 2 * PERIOD_NS) is None
-    assert meter.poll_report(connection, 3 * PERIOD_NS) == ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0)

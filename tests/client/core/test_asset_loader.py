@@ -198,18 +198,3 @@ def test_all_assets_complete_despite_random_faults() -> None:
             if loader.idle:
                 break
         assert got == sizes
-
-
-def test_first_a_chunk_of_each_asset_then_the_rest_in_order() -> None:
-    loader = started("a", "b", "c")
-    first = list(loader.next_requests(0))
-    assert [(ask.address, ask.offset, ask.length) for ask in first] == [(name, 0, CHUNK_BYTES) for name in "abc"]
-    total = 2 * CHUNK_BYTES + 10
-    assert answer(loader, first[0], total) is True
-    assert [(ask.address, ask.offset, ask.length) for ask in loader.next_requests(0)] == [
-        ("a", CHUNK_BYTES, CHUNK_BYTES),
-        ("a", 2 * CHUNK_BYTES, 10),
-    ]
-    assert answer(loader, first[1], 7) is True
-    assert loader.is_complete("b")
-    assert not loader.is_complete("a")

@@ -134,17 +134,6 @@ def test_frame_in_hand_during_a_stall_is_not_delivered(server: Server) -> None:
     assert (stream.counters.delivered, stream.counters.queued_old) == (2, 2)
 
 
-def test_client_slow_with_every_frame_gets_all_but_the_first(server: Server) -> None:
-    stream = StateStream()
-    server.frame(0)
-    server.join(stream)
-    kept = []
-    for t in range(100 * MS, 1100 * MS, 100 * MS):
-        assert drain(stream, [server.frame(t - MS)], t) is not None
-        kept.append(stream.check_fresh(t + 80 * MS + LOCAL))
-    assert kept == [False] + [True] * 9
-
-
 def test_unread_presence_is_bounded() -> None:
     stream = StateStream()
     message = [TOPIC_PRESENCE, encode_presence(Presence(10, 11, (PresenceItem("p1", "head", IDENTITY),)))]

@@ -129,20 +129,3 @@ def test_copies_of_a_large_geometry_are_counted(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "boxes.dae").write_text(text[:end] + text[begin:end] * 20 + text[end:])
     with pytest.raises(SceneBuildError, match="triangles"):
         load_file(tmp_path / "boxes.dae")
-
-
-def test_broken_dae_is_rejected_without_library_text(tmp_path: Path) -> None:
-    """No class names, no missing attributes of `None`."""
-    text = dae("", '<node><instance_geometry url="#g"/></node>')
-    path = tmp_path / "a.dae"
-    for before, after, reason in (
-        (text[200:], "", "a.dae is cut: it ends in line 1, without </COLLADA>"),
-        ("</mesh>", "</mess>", r"a.dae, line 1: this is no XML \(mismatched tag"),
-        ('source="#p"', 'source="#q"', "is damaged, or no DAE: something in it is missing or of another kind"),
-        ('<scene><instance_visual_scene url="#s"/></scene>', "", "something in it is missing"),
-    ):
-        assert before in text
-        path.write_text(text.replace(before, after, 1))
-        with pytest.raises(SceneBuildError, match=reason) as raised:
-            load_file(path)
-        assert not any(word in str(raised.value) for word in ("Error", "NoneType", "attribute '", "<string>", "\n"))

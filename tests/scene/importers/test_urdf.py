@@ -8,7 +8,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import trimesh
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import Pose
@@ -89,18 +88,6 @@ def test_joints_bodies_and_followers(tmp_path: Path) -> None:
     assert colours["finger_left"] == (0.5, 0.5, 0.5, 1.0)
     assert len(scene.spec.meshes) == 2  # the six links use one
     assert scene.skipped == ()
-
-
-def test_meshes_in_millimetres_are_scaled(tmp_path: Path) -> None:
-    trimesh.creation.box((1000, 2000, 3000)).export(tmp_path / "box.dae")
-    text = (tmp_path / "box.dae").read_text()
-    (tmp_path / "box.dae").write_text(text.replace("<up_axis>", '<unit meter="0.001" name="millimeter"/><up_axis>'))
-    (tmp_path / "a.urdf").write_text(
-        '<robot name="r"><link name="base"><visual><geometry><mesh filename="box.dae" scale="2 2 2"/></geometry>'
-        "</visual></link></robot>"
-    )
-    (mesh,) = composed(tmp_path / "a.urdf", tmp_path).spec.meshes
-    np.testing.assert_allclose(np.subtract(mesh.high, mesh.low), (2.0, 4.0, 6.0), atol=1e-5)
 
 
 @pytest.mark.parametrize(
