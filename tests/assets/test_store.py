@@ -283,17 +283,6 @@ def test_wrong_part_of_another_session_costs_one_repeated_download(tmp_path: Pat
     assert store_part(AssetStore(tmp_path), DATA) == ADDRESS
 
 
-def test_foreign_parts_in_a_shared_folder_are_ignored(tmp_path: Path) -> None:
-    """Links of others are not followed for writing either."""
-    cache, elsewhere = AssetStore(tmp_path / "cache"), tmp_path / "elsewhere"
-    elsewhere.write_bytes(b"precious")
-    path = cache.path(ADDRESS)
-    path.parent.mkdir(parents=True)
-    path.with_name(path.name + ".part").symlink_to(elsewhere)
-    assert store_part(cache, DATA) == ADDRESS
-    assert elsewhere.read_bytes() == b"precious"
-
-
 def test_unusable_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(AssetStoreError) as caught:
@@ -317,21 +306,6 @@ def test_served_bytes_and_sizes(tmp_path: Path) -> None:
     assert bytes(files.chunk(empty, 0, 0) or b"") == b""
     assert files.size("0" * 64) is None  # named, but missing
     assert files.size("../../secret") is None
-
-
-def test_removed_file_and_directory(tmp_path: Path) -> None:
-    files = ServedAssets()
-    a, link = put(tmp_path, b"a"), "ab" + "0" * 62
-    (tmp_path / "ab").mkdir(exist_ok=True)
-    (tmp_path / "ab" / link).symlink_to("/etc/passwd")
-    folder = "cd" + "0" * 62
-    (tmp_path / "cd" / folder).mkdir(parents=True)
-    files.serve([(str(tmp_path), (a, link, folder))])
-    assert files.size(a) == 1
-    (tmp_path / a[:2] / a).unlink()
-    assert bytes(files.chunk(a, 0, 1) or b"") == b"a"  # still mapped
-    assert files.size(link) is None
-    assert files.size(folder) is None
 
 
 def test_number_of_open_files_is_bounded(tmp_path: Path) -> None:

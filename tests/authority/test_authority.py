@@ -8,13 +8,7 @@ import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.authority.config import SpeedLimit
-from iris_session.protocol.client_messages import (
-    Acquire,
-    Bye,
-    Heartbeat,
-    Marker,
-    Release,
-)
+from iris_session.protocol.client_messages import Acquire, Bye, Heartbeat, Marker, Release
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, Lost
 from iris_session.protocol.server_messages import MarkerAdded, SamplesRejected, Snapshot

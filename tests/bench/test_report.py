@@ -7,11 +7,10 @@ import math
 from functools import wraps
 from typing import Any
 
-import msgspec
 import pytest
 
 from iris_session.bench import state
-from iris_session.bench.report import NO_BARS, BenchReport, make_bar, make_link_report, measure_parallel_speed
+from iris_session.bench.report import NO_BARS, BenchReport, make_bar, make_link_report
 from iris_session.cli.main import main
 
 
@@ -66,20 +65,3 @@ def test_a_link_profile_leaves_no_bars() -> None:
     plain, linked = (make_link_report("state", {}, {"a": 1}, _report().bars, profile) for profile in ("", "lan"))
     assert (plain.params, len(plain.bars)) == ({}, 2)
     assert (linked.params, linked.bars) == ({"profile": "lan", "bars": NO_BARS}, ())
-
-
-def test_what_disturbs_the_machine_is_reported() -> None:
-    report = msgspec.structs.replace(_report(), stolen_share=0.1234567, parallel_speed=0.456)
-    for text in ("12.3%", "0.46 times"):
-        assert text in report.format()
-        assert text not in _report().format()
-    machine = report.as_dict()["machine"]
-    assert (machine["stolen_share"], machine["parallel_speed"]) == (0.1235, 0.46)
-    assert 0.0 < measure_parallel_speed() <= 1.0
-
-
-def test_infinite_values_are_null() -> None:
-    report = _report(math.inf).as_dict()
-    assert report["results"]["age_ms_p99"] is report["bars"][0]["value"] is None
-    assert report["bars"][0]["ok"] is False
-    json.dumps(report, allow_nan=False)

@@ -58,22 +58,6 @@ def test_damage_is_said_and_is_a_status(tmp_path: Path, capsys: pytest.CaptureFi
     assert f"{tmp_path / 'tables'}/events.npz" in shown.out
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        (["--robot", "lift"], "robot 'lift' does not exist in the model. Available robots: left, right."),
-        (["--object", "cup"], "object 'cup' does not exist in the model. Available objects: hammer, board."),
-    ],
-)
-def test_names_that_are_none_are_one_line(
-    options: list[str], line: str, played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "tables"
-    assert main(["recording", "export", str(played.path), "--to", "csv", "-o", str(out), *options]) == 2
-    assert capsys.readouterr().err == f"iris-session: {line}\n"
-    assert not out.exists()
-
-
 def test_assets_are_files_by_hash(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shared = Shared(tmp_path / "store")
     path = record(tmp_path / "session.rrd", shared)
@@ -97,17 +81,3 @@ def test_assets_are_files_by_hash(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().out == f"{out}: {len(wanted)} assets, {report['bytes'] / 1e6:.1f} MB, scenes: 1\n"
     assert main([*command, "--force", "--robot", "left"]) == 2
     assert "--robot choose tables: leave them out with --to assets" in capsys.readouterr().err
-
-
-def test_damaged_asset_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shared = Shared(tmp_path / "store")
-    path = record(tmp_path / "session.rrd", shared)
-    address = shared.spec.meshes[0].levels[0].address
-    data = bytearray(path.read_bytes())
-    data[data.find(shared.store.get(address)[-40:])] ^= 1
-    path.write_bytes(data)
-    out = tmp_path / "scene-files"
-    assert main(["recording", "export", str(path), "--to", "assets", "-o", str(out)]) == 1
-    assert f"asset {address[:12]} (mesh" in capsys.readouterr().err
-    assert not AssetStore(out).path(address).exists()
-    assert AssetStore(out).path(shared.scene_hash).exists()

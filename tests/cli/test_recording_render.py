@@ -130,20 +130,6 @@ def test_what_cannot_be_drawn_is_one_line(
     assert not os.listdir(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("option", "line"),
-    [
-        ("--size=big", "'big' is not a size: give WIDTHxHEIGHT"),
-        ("--fps=0", "'0' is not a rate: give a number from 0.001 to 1000"),
-        ("--from=-1", "'-1' is not a session time: give seconds from 0"),
-    ],
-)
-def test_options_that_are_none_are_refused(option: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["recording", "render", "session.rrd", "-o", "x.mp4", option])
-    assert line in capsys.readouterr().err
-
-
 def test_damage_is_said_and_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gap = play(tmp_path / "session.rrd", 45, core=make_drawn_core())
     del gap.batch.rows[30]

@@ -71,18 +71,6 @@ def test_one_camera_gives_its_newest_frame() -> None:
     assert pipeline.take_frames(70 * MS) == {}, "a frame is used once"
 
 
-def test_frames_of_two_cameras_are_joined_when_captured_together() -> None:
-    pipeline = make_pipeline("left", "right")
-    pipeline.offer("left", make_frame(100), 110 * MS)
-    pipeline.offer("right", make_frame(60, color=200), 110 * MS)
-    cloud = pipeline.make_cloud(pipeline.take_frames(110 * MS))
-    assert (cloud.cameras, cloud.capture_ns) == (("left", "right"), 60 * MS)
-    assert cloud.error_m == pytest.approx(0.02), "the larger of the two"
-    x = decode_cloud(cloud.frames["full"]).positions[:, 0]
-    assert (x < 5.0).any()
-    assert (x > 5.0).any()
-
-
 def test_a_frame_that_is_too_old_to_be_joined_is_left_out_alone_and_counted() -> None:
     pipeline = make_pipeline("left", "right")
     pipeline.offer("left", make_frame(40), 50 * MS)
@@ -199,16 +187,6 @@ def test_a_camera_on_a_body_is_placed_by_the_pose_at_its_capture() -> None:
     assert not pipeline.lacks_pose("hand")
     known[43 * MS] = known[10 * MS]
     assert pipeline.take_frames(60 * MS)["hand"].capture_ns == 43 * MS, "the later one still waited"
-
-
-def test_a_frame_whose_pose_does_not_come_is_dropped_and_counted() -> None:
-    pipeline = make_pipeline("hand", body="gripper", body_pose=lambda body, at: None)
-    pipeline.offer("hand", make_frame(10), 10 * MS)
-    assert pipeline.take_frames(200 * MS) == {}
-    assert pipeline.drops["pose"] == 0
-    assert pipeline.take_frames(211 * MS) == {}
-    assert pipeline.drops["pose"] == 1
-    assert pipeline.lacks_pose("hand")
 
 
 def test_waiting_frames_are_bounded() -> None:

@@ -202,23 +202,6 @@ def test_what_has_no_pose_is_named() -> None:
     assert lab.fault() == ("", "")
 
 
-def test_session_time_that_goes_back_opens_the_sources_anew() -> None:
-    """As of a session that is resumed after a reboot: frames would be due for as long as it ran before."""
-    lab = Lab("front", picture_hz=30.0)
-    for _ in range(3):
-        lab.step(40, "front")
-    lab.step(-40)
-    before = lab.sources["front"]
-    assert not lab.worker._readers["front"]._is_outdated, "by so much a clock is slewed"
-    lab.step(-60_000)
-    lab.open_sources()
-    assert before.closed
-    lab.sink.published.clear()
-    lab.step(40, "front")
-    assert {one[0] for one in lab.sink.published if one[1]} == {"room", "room-front"}
-    assert lab.fault() == ("", "")
-
-
 def test_the_report() -> None:
     lab = Lab("front", picture_hz=30.0, hz=30.0)
     lab.worker.make_report()

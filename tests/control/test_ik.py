@@ -209,14 +209,3 @@ def test_a_robot_that_starts_outside_its_range_is_not_thrown_back() -> None:
     made.step(decision([pose_command("panda", made.source((0.0, 0.0, 0.001)))]))
     assert np.abs(made.data.ctrl - before).max() < 2.5 * 0.002
     assert "joint4" in made.controller.get_status()[0].limits
-
-
-@pytest.mark.parametrize("timestep", [0.001, 0.005, 0.02])
-def test_other_timesteps_track_too(timestep: float) -> None:
-    made = Rig(panda_model(timestep=timestep), [panda_spec()], home=PANDA_HOME)
-    made.step(decision([pose_command("panda", made.source((0.0, 0.0, 0.0)))]))
-    start = made.target()
-    for _ in range(round(2.0 / timestep)):
-        made.step(decision([pose_command("panda", made.source((0.0, 0.1, 0.0)))]))
-    assert np.subtract(made.target()[0], start[0]) == pytest.approx((0.0, 0.1, 0.0), abs=1e-9)
-    assert apart(made.controller._ik.compute_tip(0, made.controller._states[0]), made.target())[0] < 5e-5

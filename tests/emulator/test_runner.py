@@ -153,17 +153,6 @@ def test_person_without_a_robot_reports_the_reason(session: Rig) -> None:
     assert report.phase == "failed"
 
 
-def test_person_without_a_requested_robot_drives_the_assigned_one(session: Rig) -> None:
-    specs = [HeadsetSpec(name="ann", behaviour="wander", **QUICK)]
-    reports: list[str] = []
-
-    def driving() -> bool:
-        return any(phase.startswith("work/") for phase in reports)
-
-    (report,) = run_headsets(ADDRESS, specs, 30.0, lambda r: reports.extend(r.phases), driving)
-    assert driving(), report
-
-
 def test_missing_session_is_a_failure_not_an_exception(monkeypatch: pytest.MonkeyPatch) -> None:
     with simulate_sessions() as simulation:
         monkeypatch.setattr(runner, "wait_any", wait_in(simulation))

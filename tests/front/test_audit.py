@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iris_session.front.audit import MAX_PENDING, PERIOD_NS, AuditTrail
-from iris_session.protocol.entries import HOST, Audit, Entry
+from iris_session.protocol.entries import Audit, Entry
 
 
 class Trail:
@@ -22,22 +22,6 @@ class Trail:
     def audits(self) -> list[Audit]:
         messages = [entry.message for entry in self.told]
         return [message for message in messages if isinstance(message, Audit)]
-
-
-def test_first_audit_is_sent_at_once_and_others_once_a_second() -> None:
-    t = Trail()
-    for i in range(5):
-        t.trail.record("code_refused", i, address="10.0.0.9", detail=str(i))
-    assert t.told == [Entry(HOST, HOST, 0, Audit("code_refused", "", "", "10.0.0.9", "0", 1))]
-    t.trail.tick(PERIOD_NS - 1)
-    assert len(t.told) == 1
-    t.trail.tick(PERIOD_NS)
-    assert t.audits[1] == Audit("code_refused", "", "", "10.0.0.9", "4", 4)
-    t.trail.tick(2 * PERIOD_NS)
-    t.trail.tick(3 * PERIOD_NS)
-    assert len(t.told) == 2
-    t.trail.record("code_refused", 3 * PERIOD_NS, address="10.0.0.9")
-    assert len(t.told) == 3, "after a quiet second the next is a first one again"
 
 
 @given(

@@ -15,7 +15,7 @@ from iris_session.journal.rows import CRASHED, Keyframe, make_row, seal_keyframe
 from iris_session.journal.verification import Models
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry
-from iris_session.recording import Recording, SessionHeader, verify
+from iris_session.recording import SessionHeader, verify
 from tests.recording.support import TICK_NS, SmallCore, journal, write
 
 Edit = Callable[[Batch], None]
@@ -119,19 +119,6 @@ def test_crashed_step_is_reported(path: Path, again: bool) -> None:
     assert report.steps == 201
     assert "step 200" in report.line()
     assert ("comes again: KeyError" if again else "does not come again") in report.crash
-
-
-def test_missing_first_and_last_rows_are_found(path: Path) -> None:
-    header, batch = journal(200)
-    full = write(path, header, msgspec.structs.replace(batch, rows=list(batch.rows)))
-    del batch.rows[:10]
-    report = verify(write(path.with_name("head.rrd"), header, journal(200)[1]), SmallCore)
-    assert report.ok
-    report = verify(write(path.with_name("cut.rrd"), header, batch), SmallCore)
-    assert report.gaps == [(0, 9)]
-    with Recording.open(full) as recording:
-        assert recording.end is not None
-        assert recording.end.step == 199
 
 
 def test_rewritten_journal_is_found_by_simulation(path: Path) -> None:

@@ -13,7 +13,6 @@ import pytest
 from iris_session.journal.messages import (
     Batch,
     DenialRecord,
-    HoldRecord,
     MetricRecord,
     RobotLabels,
     SceneAssets,
@@ -173,24 +172,6 @@ def test_participants_are_cleared_when_they_leave_or_have_no_pose(tmp_path: Path
     assert times(select(found["/presence/p2/head"], clear)) == [282 * ms]
     looks = [[b for b in found[f"/presence/{who}/head"] if "Boxes3D:colors" in b.schema.names] for who in ("p1", "p2")]
     assert column(looks[0], "Boxes3D:colors") != column(looks[1], "Boxes3D:colors")
-
-
-def test_states_that_last_are_lanes(tmp_path: Path) -> None:
-    writer = begin(tmp_path)
-    take = LeaseChanged(Lease("left/1", "robot", "exclusive", "p1", 1), "acquired")
-    free = LeaseChanged(Lease("left/1", "robot", "exclusive", "", 2), "released", "p1")
-    events = [joined("p1", "Ada"), Event(2, 3, 30, take), Event(3, 9, 90, free)]
-    holds = [HoldRecord(4, 40, "left/1", "clutch_open"), HoldRecord(6, 60, "left/1", "")]
-    writer.add(Batch(events=events, holds=holds))
-    found = finish(writer)
-    lane = found["/lanes/robots/left\\/1/holder"]
-    states = [batch for batch in lane if "session_time" in batch.schema.names]
-    assert column(states, "StateChange:state") == [["Ada"], [""]]
-    assert times(states) == [30, 90]
-    (look,) = [batch for batch in lane if "session_time" not in batch.schema.names]
-    assert column([look], "StateConfiguration:values") == [["Ada"]]
-    assert column([look], "StateConfiguration:colors") == [[0x3D9BE9FF]]
-    assert column(found["/lanes/robots/left\\/1/hold"], "StateChange:state") == [["clutch open"], [""]]
 
 
 def test_robots_are_labelled_by_their_holders(tmp_path: Path) -> None:

@@ -8,10 +8,8 @@ import mujoco
 import pytest
 
 from anchors.pose import distance
-from iris_session import ConfigError
 from iris_session.client import Client
 from iris_session.demo.scenes import n_arms_scene
-from iris_session.physics import ModelNotFoundError
 from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import AddVisual, Geometry, SetVisual, Visual
 from iris_session.protocol.server_messages import SceneChanged
@@ -55,17 +53,6 @@ def test_operators_go_on_in_another_scene() -> None:
         rig.run(1.0)
         assert hand.tip[0][1] - still[1] > 0.03
         assert {client.scene.tick_period_ns for client in rig.clients} == {5_000_000}
-
-
-def test_scene_that_cannot_be_used_changes_nothing() -> None:
-    with Rig(timestep=0.01) as rig:
-        ann = rig.join("ann")
-        with pytest.raises(ConfigError):
-            rig.session.load_scene(compile_scene(0.25, 2)).result(0.0)
-        with pytest.raises(ModelNotFoundError):
-            rig.session.load_scene("no/such/scene.xml").result(0.0)
-        rig.run(0.2)
-        assert ann.mirror.scene_epoch == 1
 
 
 def test_clients_of_every_kind_have_the_new_scene() -> None:

@@ -23,14 +23,12 @@ from iris_session.journal.rows import CRASHED, seal_keyframe
 from iris_session.physics import encode_model, load_model
 from iris_session.protocol.client_messages import Marker, MoveAnchor
 from iris_session.protocol.common import Pose
-from iris_session.protocol.entries import Entry, SessionResumed, decode_entries
-from iris_session.protocol.server_messages import Gap
+from iris_session.protocol.entries import Entry, decode_entries
 from iris_session.recording import (
     CLOSED,
     OPEN,
     JournalRow,
     Keyframe,
-    Recording,
     RecordingLock,
     Settings,
     header_root,
@@ -360,24 +358,6 @@ def gone_on(session: Path) -> tuple[Stepper, Front, Path]:
         stepper.step(1)
     past.close()
     return stepper, front, write(past.recording, header, Batch(rows=journal.rows, keyframes=journal.keyframes))
-
-
-def test_first_entry_is_session_resumed(gone_on: tuple[Stepper, Front, Path]) -> None:
-    stepper, front, path = gone_on
-    decision = front.decisions[0]
-    (gap,) = [event.body for event in decision.events if isinstance(event.body, Gap)]
-    assert gap.kind == "resumed"
-    assert gap.duration_ns == pytest.approx(5e9, abs=1e8)
-    before = make_core()
-    play(before, 0, STEPS)
-    assert decision.events[0].event_seq == before.authority.step(LAST_NS + 1, [], 0, before.world.view()).event_seq + 1
-    assert stepper.step_count == STEPS + 40
-    with Recording.open(path) as recording:
-        row = next(recording.rows())
-    first, *_ = decode_entries(row.entries)
-    assert first == host(row.now_ns, first.message)
-    assert isinstance(first.message, SessionResumed)
-    assert row.n_ticks == 0
 
 
 def test_both_recordings_verify_and_the_second_names_the_first(gone_on: tuple[Stepper, Front, Path]) -> None:

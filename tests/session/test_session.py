@@ -14,10 +14,9 @@ import mujoco
 import pytest
 
 from iris_session import ConfigError, OwnershipError, Session, SessionConfig
-from iris_session.authority import AuthorityConfig
-from iris_session.control import ControlConfig, ControlError
+from iris_session.control import ControlConfig
 from iris_session.demo.scenes import scene_path
-from iris_session.physics import AmbiguousModelError, load_model
+from iris_session.physics import load_model
 from iris_session.protocol.client_messages import Control
 from iris_session.protocol.scene import RemoveVisual, SetVisual, encode_scene
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, SceneChanged
@@ -195,24 +194,6 @@ def test_loaded_scene_begins_with_its_given_data(session: Session) -> None:
     other = session.load_scene(path, mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")))
     with pytest.raises(ConfigError, match="data"):
         other.result(60.0)
-
-
-def test_invalid_robots_are_refused_before_processes_start(tmp_path: Path) -> None:
-    torque = """<mujoco><worldbody><body name="arm"><joint name="j1"/><geom size=".1"/>
-    <body name="b"><joint name="j2"/><geom size=".1"/><body name="c"><joint name="j3"/><geom size=".1"/>
-    <site name="tip"/></body></body></body></worldbody><actuator><motor name="a1" joint="j1"/>
-    <motor name="a2" joint="j2"/><motor name="a3" joint="j3"/></actuator></mujoco>"""
-    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd")
-    session = Session(mujoco.MjModel.from_xml_string(torque), config=config)
-    with pytest.raises(ControlError, match="gravity_pd"):
-        session.start()
-    assert list(tmp_path.iterdir()) == []
-    ambiguous = torque.replace("motor", "position").replace('<site name="tip"/>', '<site name="x"/><site name="y"/>')
-    with pytest.raises(AmbiguousModelError):
-        Session(mujoco.MjModel.from_xml_string(ambiguous), config=config)
-    odd = SessionConfig(authority=AuthorityConfig(leader_apart="wait"), record=False)
-    with pytest.raises(ConfigError, match="'ramp'"):
-        Session(scene_path("handover"), config=odd).start()
 
 
 @pytest.mark.e2e

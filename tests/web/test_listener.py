@@ -339,15 +339,3 @@ def test_frames_of_a_connection_that_is_not_ours_are_not_counted() -> None:
         return Listener(asyncio.Protocol, None, Drops()).count_frames(None)
 
     assert not asyncio.run(count())
-
-
-def test_listening_sockets_share_one_free_port() -> None:
-    sockets = open_listening_sockets(["127.0.0.1", "localhost", "127.0.0.2"], 0)
-    try:
-        assert {one.getsockname()[1] for one in sockets} == {sockets[0].getsockname()[1]}
-        with pytest.raises(OSError, match="in use"):
-            open_listening_sockets(["127.0.0.3", "127.0.0.2"], sockets[0].getsockname()[1])
-        socket.create_connection(sockets[-1].getsockname()).close()
-    finally:
-        for one in sockets:
-            one.close()
