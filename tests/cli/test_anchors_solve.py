@@ -15,7 +15,7 @@ from anchors.pose import PoseTuple, compose, distance, inverse
 from iris_session.alignment.smoother import AlignmentSmoother, AnchorHistory, fuse_estimates
 from iris_session.cli.main import main
 from iris_session.protocol.common import IDENTITY, Alignment, Pose
-from iris_session.protocol.server_messages import AlignmentAlarmed, AnchorMoved
+from iris_session.protocol.server_messages import AnchorMoved
 from iris_session.recording import Recording, TrackingFrame, read_alignment_history
 from iris_session.session.config import load_anchors
 from tests.anchors.worlds import shifted, tracking_frame
@@ -185,23 +185,3 @@ def test_solutions_of_both_sides_are_weighted_by_their_covariance() -> None:
     assert distance(half.T_world_tracking[0], T[0]) == pytest.approx(0.002, abs=1e-4)
     apart = fuse_estimates(known(0.0, 0.002), known(0.05, 0.002))
     assert apart.error_at_anchor_m > 3.0 * half.error_at_anchor_m
-
-
-def test_observations_before_and_after_a_jump_are_not_pooled(tmp_path: Path, capsys: Capture) -> None:
-    """A headset that misses its jump reports no new epoch: each side of it is a tracking frame of its own."""
-    played, (ann, _) = Played(TRUE, {"table": 0.16}), frames()
-    jumped = shifted(ann, (0.2, 0.0, 0.0))
-    played.join(1, "p1", "ann")
-    for viewpoint, name in enumerate(("table", "door", "shelf"), 1):
-        played.look(1, name, TRUE[name], ann, viewpoint)
-    played.wait(0.5)
-    played.event(AlignmentAlarmed("p1", "jump", "", 0.2))
-    for viewpoint, name in enumerate(("table", "door"), 4):
-        played.look(1, name, TRUE[name], jumped, viewpoint)
-    played.aligned("p1", 1, jumped, 0.003)
-    result = solve(capsys, str(played.write(tmp_path / "session.rrd")))
-    before, after = result["participants"][0]["frames"]
-    assert [(one["jumps"], one["looks"]) for one in (before, after)] == [(0, 60), (1, 40)]
-    assert (before["outliers"], after["outliers"], result["constellation"]["moved"]) == ([], [], [])
-    (alignment,) = after["alignments"]
-    assert alignment["off_m"] < 0.01

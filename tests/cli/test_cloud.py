@@ -82,17 +82,6 @@ def test_a_fault_is_shown_and_is_the_exit_status(camera_file: Path, capsys: pyte
     assert "cloud room: no points came" in text
 
 
-@pytest.mark.parametrize("command", ["cloud inspect", "cloud run", "serve handover --no-record --camera"])
-def test_a_file_that_cannot_be_used_is_one_line(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*command.split(), str(tmp_path / "missing.toml")]) == 2
-    error = capsys.readouterr().err
-    assert "missing.toml" in error
-    assert "`iris-session cloud example` prints one" in error
-    assert error.count("\n") == 1
-
-
 def test_a_picture_that_cannot_be_read_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (camera_file.parent / "0.depth.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(4) + b"IHDR" + b"\xff" * 9)
     assert main(["cloud", "calibrate", str(camera_file), "--sheet", "a=100mm", "--at", "a=0,0,0,1,0,0,0"]) == 2

@@ -132,24 +132,6 @@ def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    ("content", "expected"),
-    [(None, "give a recording"), (b"", "holds no session header"), (b"x" * 99, "not a Rerun file")],
-)
-def test_what_is_no_recording_is_one_line(
-    content: bytes | None, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "x.rrd"
-    if content is not None:
-        path.write_bytes(content)
-    assert main(["recording", "inspect", str(path)]) == 2
-    out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert expected in err
-    assert str(path) in err
-    assert ": give " in err
-
-
-@pytest.mark.parametrize(
     ("command", "number"),
     [
         (("recording", "inspect"), signal.SIGTERM),

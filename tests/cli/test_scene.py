@@ -83,42 +83,6 @@ def test_inspect_prints_the_extent(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "--scale 1000" in note
 
 
-def test_millimetres_are_suspected_in_robots_and_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    trimesh.creation.box((300, 200, 100)).export(tmp_path / "box.stl")
-    mesh = '<visual><geometry><mesh filename="box.stl"/></geometry></visual>'
-    (tmp_path / "arm.urdf").write_text(f'<robot name="arm"><link name="base">{mesh}</link></robot>')
-    geom = '<asset><mesh file="box.stl"/></asset><worldbody><geom type="mesh" mesh="box"/></worldbody>'
-    (tmp_path / "model.xml").write_text(f"<mujoco>{geom}</mujoco>")
-    ground = '<geom type="box" size="30 30 .1"/>'
-    (tmp_path / "hall.xml").write_text(f"<mujoco><worldbody>{ground}</worldbody></mujoco>")
-    wanted = "300 m large: in millimetres where metres are meant?"
-    for name in ("arm.urdf", "model.xml", "hall.xml"):
-        assert run("scene", "inspect", tmp_path / name, "--assets", tmp_path / "assets") == 0
-        assert (wanted in capsys.readouterr().out) == (name != "hall.xml")
-
-
-def test_export_prints_what_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    model = tmp_path / "sky.xml"
-    texture = '<texture name="{}" type="{}" builtin="gradient" rgb1="1 0 0" rgb2="0 0 1" width="8" height="48"/>'
-    model.write_text(
-        f"<mujoco><asset>{texture.format('sky', 'skybox')}{texture.format('cube', 'cube')}"
-        '<material name="m" texture="cube"/></asset><worldbody><geom type="plane" size="0 0 1" material="m"/>'
-        "</worldbody></mujoco>"
-    )
-    out, assets = tmp_path / "out.glb", ("--assets", tmp_path / "assets")
-    assert run("scene", "export", model, out, *assets, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["file"], found["bytes"], found["skipped"]) == (str(out), out.stat().st_size, [])
-    assert [text.partition(":")[0] for text in found["simplified"]] == [
-        "the skybox",
-        "planes without end",
-    ]
-    assert run("scene", "export", model, out, *assets) == 0
-    assert "skybox" in capsys.readouterr().err
-    assert run("scene", "inspect", model, *assets) == 0
-    assert "skybox" in capsys.readouterr().out
-
-
 def test_export_does_not_overwrite_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     part = furniture(tmp_path / "part.glb")
     before = part.read_bytes()

@@ -146,20 +146,6 @@ def test_example_file_is_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert json.loads(capsys.readouterr().out) == {"toml": text}
 
 
-@pytest.mark.parametrize("text", ["nonsense", DOOR.replace("position_m", "position_mm"), None])
-def test_invalid_file_is_a_one_line_error_that_names_the_example(
-    text: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "anchors.toml"
-    if text is not None:
-        path.write_text(text)
-    assert main(["serve", "arm", "--no-record", "--anchors", str(path)]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert error.startswith("iris-session: ")
-    assert "`iris-session anchors example`" in error
-
-
 def test_resumed_session_gets_new_anchors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Effect in the session: tests/session/test_resume.py."""
     path = tmp_path / "anchors.toml"

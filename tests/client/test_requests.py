@@ -33,6 +33,8 @@ def test_director_requests_are_executed(session: ClientSession, join: Join) -> N
     ann = join("ann", alignment="measured", devices=(Device.HEAD,))
     boss.assign(["left"], ann.participant_id)
     assert ann.wait_for(lambda c: c.lease_version("left") is not None)
+    boss.set_scale(["left"], 0.5)
+    assert ann.wait_for(lambda c: c.mirror.leases["left"].scale == 0.5)
     boss.set_mode("right", LeaseMode.TAKEOVER)
     assert boss.wait_for(lambda c: c.mirror.leases["right"].mode == LeaseMode.TAKEOVER)
     boss.alignment.place(ann.participant_id, HERE)

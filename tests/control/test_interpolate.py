@@ -61,19 +61,6 @@ def test_limits_hold_for_any_goals(
     assert (joints.v == 0.0).all()
 
 
-def test_a_stop_while_standing_or_moving_away_stays_near() -> None:
-    joints = make()
-    joints.set_goal(ALL, np.array([0.5, 0.5, 0.0]), 0.014)
-    for _ in range(10):
-        joints.advance()
-    joints.set_goal(ALL, np.array([0.5, -0.5, 0.3]), 0.014)  # 0 goes on, 1 must turn round, 2 stands still
-    q, v = joints.q.copy(), joints.v.copy()
-    joints.stop(ALL)
-    assert joints.goal[2] == q[2]
-    assert q[1] < joints.goal[1] < q[1] + v[1] ** 2 / 60 + v[1] * DT
-    assert q[0] < joints.goal[0] < 0.5
-
-
 def test_speed_limits_by_name_and_by_kind() -> None:
     model, robot = panda_model(), panda_spec()
     config = ControlConfig(velocity_limits={"joint2": 0.7}, acceleration_limits={"joint7": 9.0})

@@ -30,8 +30,9 @@ from iris_session.client import Client
 from iris_session.protocol.names import HoldReason
 from iris_session.protocol.server_messages import EngagementChanged, ParticipantInfo
 from tests.e2e.browser import Page
-from tests.e2e.scenario import Scenario, assert_only_late, is_driven
+from tests.e2e.scenario import Scenario, assert_only_late
 from tests.e2e.session_process import DEADLINE_S
+from tests.rig.session import is_driven
 from tools.codegen.conversions import to_three
 
 IWER: Final = WEB_CLIENT / "node_modules" / "iwer" / "build" / "iwer.min.js"

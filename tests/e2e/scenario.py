@@ -13,6 +13,7 @@ from iris_session.client import Client
 from iris_session.protocol.names import HoldReason, RejectReason
 from iris_session.protocol.server_messages import Event, ParticipantJoined
 from tests.e2e.session_process import DEADLINE_S, SessionProcess, read_output_tails
+from tests.rig.session import is_driven
 
 
 class Hand:
@@ -156,17 +157,6 @@ class Scenario:
     def close(self) -> None:
         for client in self.clients:
             client.close()
-
-
-def is_driven(client: Client, robot: str, participant: str | None = None) -> bool:
-    """Return whether samples (of one participant) were applied to a robot in the last 100 ms of the client's state."""
-    state = client.scene.state
-    return state is not None and any(
-        a.robot == robot
-        and participant in (None, a.participant)
-        and state.header.session_time - a.step_ns < 100_000_000
-        for a in state.header.applied
-    )
 
 
 def assert_only_late(before: Mapping[str, Any], now: Mapping[str, Any], reasons: Iterable[str]) -> None:

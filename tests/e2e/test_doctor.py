@@ -9,44 +9,27 @@ import socket
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
 
 from iris_session.security import KeyHome, KeyPair
 from tests.e2e.session_process import COMMAND, SessionProcess, kill_all, make_serve_command, skip_unless_ci
+from tests.rig.test_doctor import Diagnosis
 
 pytestmark = pytest.mark.e2e
 
 
-class Diagnosis:
-    """The result of one run of the doctor."""
-
-    def __init__(self, status: int, out: str) -> None:
-        self.status = status
-        self.document: dict[str, Any] = json.loads(out)
-        self.checks = {check["check"]: check for check in self.document["checks"]}
-
-    def assert_names(self, check: str, *values: str, state: str = "failed") -> None:
-        """Check that `check` has this state, names these values, and gives a cause or advice."""
-        found = self.checks[check]
-        assert found["state"] == state, self.troubles()
-        text = f"{found['text']} {found['why']} {found['advice']}"
-        assert all(value in text for value in values), text
-        assert found["advice"] or found["why"], "a failed check needs a cause or advice"
-
-    def troubles(self) -> list[dict[str, str]]:
-        return [check for check in self.checks.values() if check["state"] in ("failed", "warning")]
+class HostDiagnosis(Diagnosis):
+    """The result of one run of the doctor on this host."""
 
     def failed(self) -> set[str]:
         """Names of the failed checks, without ticks that the scheduler made late: they say how busy this host is."""
         late = self.checks.get("ticks", {}).get("why", "").startswith("scheduler")
-        failed = {name for name, check in self.checks.items() if check["state"] == "failed"}
-        return failed - {"ticks"} if late else failed
+        return self.list_checks("failed") - ({"ticks"} if late else set())
 
 
-def run_doctor(*arguments: str, home: Path | None = None) -> Diagnosis:
+def run_doctor(*arguments: str, home: Path | None = None) -> HostDiagnosis:
     environment = {**os.environ, **({"IRIS_HOME": str(home)} if home is not None else {})}
     done = subprocess.run(
         [*COMMAND, "doctor", *arguments, "--json"],
@@ -57,10 +40,10 @@ def run_doctor(*arguments: str, home: Path | None = None) -> Diagnosis:
         env=environment,
     )
     assert done.returncode in (0, 1), done.stderr[-2000:]
-    return Diagnosis(done.returncode, done.stdout)
+    return HostDiagnosis(done.returncode, json.loads(done.stdout))
 
 
-def examine(*arguments: str, expected: set[str], home: Path | None = None) -> Diagnosis:
+def examine(*arguments: str, expected: set[str], home: Path | None = None) -> HostDiagnosis:
     """Run the doctor, which must find these checks failed and no others.
 
     It is right to find more while this machine stands still: then, at most twice, it is run anew. What it is to find is
@@ -70,7 +53,7 @@ def examine(*arguments: str, expected: set[str], home: Path | None = None) -> Di
         found = run_doctor(*arguments, home=home)
         if found.failed() == expected:
             break
-    assert found.failed() == expected, found.troubles()
+    assert found.failed() == expected, found.document
     return found
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import socket
-from pathlib import Path
 
 import pytest
 
 from tests.e2e.scenario import Scenario
-from tests.front.process_harness import ProcessSession
 
 pytestmark = pytest.mark.e2e
 
@@ -62,23 +60,3 @@ def test_silent_and_half_open_connections_are_closed_and_disturb_no_client(scena
     for one in (*silent, *others, *slow):
         one.close()
     scenario.server.finish()
-
-
-def test_garbage_in_an_encrypted_handshake_closes_the_connection(tmp_path: Path) -> None:
-    home = tmp_path / "home"
-    home.mkdir(mode=0o700)
-    front = ProcessSession(curve=True, key_home=str(home))
-    try:
-        curve = GREETING[:12] + b"CURVE".ljust(20, b"\0") + bytes(32)
-        for size in (0, 1, 199, 200, 5000):
-            for port in (front.ports.control, front.ports.state):
-                with socket.create_connection((front.host, port)) as one:
-                    command = b"\x05HELLO\x01\x00" + os.urandom(size)
-                    one.sendall(curve + b"\x06" + len(command).to_bytes(8, "big") + command)
-                    front.pump(lambda one=one: is_closed(one), "the connection to close")  # type: ignore[misc]
-        assert front.process.pid
-        with socket.create_connection((front.host, front.ports.control)) as one:
-            one.settimeout(10)
-            assert one.recv(1) == b"\xff"
-    finally:
-        front.close()

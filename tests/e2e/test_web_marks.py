@@ -21,7 +21,8 @@ from iris_session.protocol.common import Alignment
 from iris_session.protocol.names import AlignmentKind
 from tests.e2e.browser import Page, join_as
 from tests.e2e.emulated_quest import HEADSET, INSTALL, IWER, EmulatedQuest, holder
-from tests.e2e.scenario import Scenario, is_driven
+from tests.e2e.scenario import Scenario
+from tests.rig.session import is_driven
 from tools.codegen.conversions import to_three
 
 pytestmark = pytest.mark.e2e

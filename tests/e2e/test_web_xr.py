@@ -22,7 +22,8 @@ from tests.e2e.emulated_quest import (
     aim_at,
     holder,
 )
-from tests.e2e.scenario import Scenario, is_driven
+from tests.e2e.scenario import Scenario
+from tests.rig.session import is_driven
 
 pytestmark = pytest.mark.e2e
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 import zmq
 
@@ -23,7 +20,6 @@ from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, Asse
 from iris_session.protocol.codec import decode_asset_chunk, decode_asset_refused, encode_asset_request
 from iris_session.protocol.names import AssetRefusal
 from iris_session.security import KeyPair
-from iris_session.system.priority import LOW_PRIORITY_NICE
 from tests.front.fakes import put
 
 MIB = 1 << 20
@@ -200,15 +196,6 @@ def test_fault_of_the_thread_loses_pending_work_and_is_logged_once(
     ann = Fetcher(shop)
     assert ann.answer(ann.ask(shop.addresses[1])) == shop.data[1]
     assert caplog.text.count("thread of assets, which continues: ZeroDivisionError") == 1
-
-
-def test_io_threads_of_assets_have_low_priority(shop: Shop) -> None:
-    ours = os.getpriority(os.PRIO_PROCESS, 0)
-    low = min(19, ours + LOW_PRIORITY_NICE)
-    found = Counter(os.getpriority(os.PRIO_PROCESS, thread.id) for thread in psutil.Process().threads())
-    assert found[low] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
-    python = [thread.native_id for thread in threading.enumerate() if thread.native_id is not None]
-    assert {os.getpriority(os.PRIO_PROCESS, number) for number in python} == {ours}
 
 
 # --- pass by pass ----------------------------------------------------------------------------------------------------

@@ -111,21 +111,6 @@ def test_frames_are_paced_below_what_a_slow_link_carries() -> None:
     assert link.play(120) == BudgetGrant({"cloud": 0}), "the link has recovered"
 
 
-def test_measured_rate_of_a_full_link_bounds_what_is_sent_and_tried() -> None:
-    controller, rates = BudgetController(), {"cloud": tuple(192 * MBIT / 2**n for n in range(6))}
-    grants = []
-    for i in range(40):
-        share = (1.0, 0.2, 0.13)[max(0, min(2, i - 7))] if i < 10 else 1.0  # of frames: buffers take some
-        measure = LinkMeasure(None, round(15 * share), 15, bytes_per_s=18 * MBIT)
-        grants.append(controller.update(1, measure, rates, i * STEP_NS))
-    costs = [compute_cost(rates, grant.levels) / MBIT for grant in grants]
-    assert costs[:8] == [192.0] * 8
-    assert max(costs[9:30]) == 12.0, "24 Mbit/s is not tried soon: the link carried 18"
-    for i in range(40, 200):
-        controller.update(1, LinkMeasure(None, 15, 15, bytes_per_s=12 * MBIT), rates, i * STEP_NS)
-    assert controller.update(1, LinkMeasure(None, 15, 15), rates, 200 * STEP_NS).levels["cloud"] == 0, "but later"
-
-
 def test_dead_link_and_silent_client_get_nothing() -> None:
     link = Link(8)
     link.play(5)

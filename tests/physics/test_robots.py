@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import pytest
 
-from iris_session.physics import AmbiguousModelError, World, find_objects, find_robots, load_robots_toml
+from iris_session.physics import AmbiguousModelError, World, find_objects, find_robots
 from iris_session.physics.names import find_element_id, list_body_names, list_element_names
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from tests.physics.models import FINGERS, GRIPPER_TENDON, arm, model, scene
@@ -132,17 +132,6 @@ def test_ambiguous_models_are_refused_with_a_file_to_edit(kwargs: dict[str, str]
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith("robot 'a': ")
     assert 'joints = ["a/j0", "a/j1", "a/j2", "a/j3"]' in caught.value.toml
-
-
-def test_file_in_the_error_is_valid_once_completed() -> None:
-    body, actuators = arm("a", end='<site name="p1"/><site name="p2"/>')
-    m = scene(body, actuators)
-    with pytest.raises(AmbiguousModelError) as caught:
-        find_robots(m)
-    assert "one of: p1, p2" in caught.value.toml
-    (robot,) = load_robots_toml(caught.value.toml.replace('site = ""', 'site = "p2"'), m)
-    assert robot.site == "p2"
-    assert robot.base_body == "a/base"
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

@@ -116,23 +116,6 @@ def test_any_join_time_and_any_loss_give_the_same_state(kinds: list[EventKind], 
     assert lossy.mirror_hash() == truth.mirror_hash()
 
 
-def test_gap_waits_for_a_snapshot_and_continues_with_later_events() -> None:
-    mirror, truth = synced(), synced()
-    events = [event(i, EStopChanged(i % 2 == 1, f"p{i}")) for i in range(1, 6)]
-    mirror.apply_event(events[0])
-    assert not mirror.apply_event(events[2])
-    assert not mirror.synced
-    assert mirror.gaps == 1
-    mirror.apply_event(events[3])
-    for one in events[:3]:
-        truth.apply_event(one)
-    delivered = mirror.apply_snapshot(snapshot(truth))
-    assert delivered == [MissedEvents(2, 2), events[2], events[3]], "event 3 was in the snapshot, and came"
-    assert mirror.synced
-    assert mirror.event_seq == 4
-    assert mirror.discarded == 0
-
-
 @given(st.lists(st.sampled_from(["come", "lost", "twice", "snapshot"]), max_size=60), st.integers(0, 5))
 @settings(max_examples=120, deadline=None)
 def test_every_event_after_the_first_snapshot_is_delivered_or_reported_missed(fates: list[str], before: int) -> None:

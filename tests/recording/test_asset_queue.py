@@ -11,15 +11,7 @@ import pytest
 from iris_session.journal.messages import SceneAssets
 from iris_session.protocol.scene import encode_scene, list_assets
 from iris_session.rrd import assets as asset_queue
-from iris_session.rrd.assets import (
-    ALL,
-    PATCH_PERIOD_NS,
-    PIECE_BYTES,
-    SCENE,
-    AssetQueue,
-    AssetRows,
-    list_recorded_assets,
-)
+from iris_session.rrd.assets import ALL, PIECE_BYTES, SCENE, AssetQueue, AssetRows, list_recorded_assets
 from tests.recording.test_recorded_assets import Shared
 
 S = 1_000_000_000
@@ -93,22 +85,6 @@ def test_scene_that_is_no_specification_is_counted(shared: Shared) -> None:
     rows = drain(queue)
     assert len(rows.faults) == queue.left_out == 1
     assert "no scene specification" in rows.faults[0].text
-
-
-def test_of_fast_patches_the_last_is_recorded(shared: Shared) -> None:
-    queue = AssetQueue(SCENE)
-    queue.add_scene(shared.assets, is_patch=False)
-    drain(queue, S)
-    patches = [patched(shared, f"patch {i}") for i in range(4)]
-    for one in patches[:3]:
-        queue.add_scene(one, is_patch=True)
-        assert drain(queue, S + 1) == AssetRows([], [], [])
-    rows = drain(queue, S + PATCH_PERIOD_NS)
-    assert [one.hash for one in rows.scenes] == [patches[2].scene_hash]
-    assert {piece.address for piece in rows.pieces} == {patches[2].scene_hash}, "its meshes are known"
-    queue.add_scene(patches[3], is_patch=True)
-    queue.is_ending = True
-    assert [one.hash for one in drain(queue, S + PATCH_PERIOD_NS).scenes] == [patches[3].scene_hash]
 
 
 def test_what_waits_at_the_end_is_named(shared: Shared) -> None:

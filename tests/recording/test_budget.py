@@ -11,7 +11,7 @@ from iris_session.recording import Recording, summarise, verify
 from iris_session.recording import process as process_module
 from iris_session.recording.budget import END_BYTES, LOW_SHARE, MIN_BUDGET_BYTES, RecordingBudget
 from iris_session.rrd.paths import part_path
-from tests.recording.support import SmallCore, SmallSession, loop_recorder, make_header
+from tests.recording.support import SmallCore, SmallSession, loop_recorder
 
 BUDGET = 1_500_000
 
@@ -37,21 +37,6 @@ def test_earlier_parts_count(tmp_path: Path) -> None:
     assert RecordingBudget(11_000_000, path, 4).count_left(50) == 999_950
     assert RecordingBudget(10_000_000, path, 4).is_used_up(0)
     assert RecordingBudget(10_000_000, path, 3).count_left(50) == 2_999_950
-
-
-def test_raw_samples_are_left_out_first() -> None:
-    with loop_recorder(budget_bytes=MIN_BUDGET_BYTES) as one:
-        loop = one.loop
-        batch = msgspec.msgpack.encode([(1, 5, b"x")] * 3)
-        loop._process_samples(batch)
-        loop._budget = RecordingBudget(loop._writer.size_with_index + END_BYTES + 1000, "", 1)
-        assert not loop._budget.is_used_up(loop._writer.size_with_index)
-        loop._process_samples(batch)
-        assert (loop._samples_left_out, len(loop._writer._samples)) == (3, 3)
-        loop._writer.write_header(make_header())
-        one.finish()
-        with Recording.open(one.path) as recording:
-            assert recording.samples_left_out == summarise(recording).drops.samples_left_out == 3
 
 
 def test_recorder_closes_its_file_and_the_session_goes_on() -> None:

@@ -16,7 +16,7 @@ from iris_session.recording import RecordedImage, RecordedStream, Recording
 from iris_session.recording import process as process_module
 from iris_session.recording.writer import RrdWriter
 from iris_session.streams.cloud import decode_cloud, encode_cloud
-from tests.recording.support import column, loop_recorder, read
+from tests.recording.support import loop_recorder, read
 
 #: Start of image, and a start of frame of 2 x 3 pixels.
 JPEG = b"\xff\xd8\xff\xc0\x00\x11\x08\x00\x02\x00\x03 and the rest"
@@ -83,22 +83,6 @@ def test_pictures_are_read_back_exactly(writer: RrdWriter) -> None:
             RecordedImage("room-front", 1, 10, 500, JPEG + b"\x01"),
             RecordedImage("room-front", 2, 20, 500, JPEG + b"\x02"),
         ]
-
-
-def test_frames_are_drawn_at_their_capture_within_the_session(writer: RrdWriter) -> None:
-    writer.add_media(message("room", make_frame(4, voxel_m=0.02), 1, 100))
-    header = MediaHeader("room", "full", 1, 2, 2**63 - 1, 700, "cloud", received_ns=500)  # of the future
-    writer.add_media([encode_media_header(header), make_frame(4), b""])
-    writer.add_media(message("room", make_frame(4), 3, -(2**63)))
-    writer.close()
-    rows = read(Path(writer.path))["/clouds/room"]
-    times = [value.value for batch in rows for value in batch.column("session_time")]
-    assert times == [100, 500, 0]
-    assert all("sim_time" not in batch.schema.names for batch in rows)
-    assert column(rows, "Points3D:radii")[0] == pytest.approx([0.01])
-    assert column(rows, "Points3D:radii")[1][0] < 0.0, "pixels"
-    with Recording.open(writer.path) as recording:
-        assert [one.capture_ns for one in recording.clouds()] == [100, 2**63 - 1, -(2**63)]
 
 
 def test_frames_that_do_not_decode_are_counted(writer: RrdWriter) -> None:

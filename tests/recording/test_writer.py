@@ -36,11 +36,9 @@ from iris_session.protocol.server_messages import (
     AlignmentChanged,
     AnchorMoved,
     BodyInfo,
-    EpisodeChanged,
     EStopChanged,
     Event,
     EventKind,
-    Handover,
     LeaseChanged,
     ParticipantInfo,
     ParticipantJoined,
@@ -54,7 +52,7 @@ from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.paths import part_path
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco
-from tests.recording.support import XML, column, journal, make_header, read
+from tests.recording.support import XML, column, make_header, read
 from tests.scene.models import every_shape
 
 IDENTITY_Q = (1.0, 0.0, 0.0, 0.0)
@@ -480,24 +478,3 @@ def test_anchors_have_axes_and_the_worst_stated_error(tmp_path: Path) -> None:
     ]
     sizes = column(found["/anchors/sheet\\ 1/error"], "Ellipsoids3D:half_sizes")
     assert [size[0][0] for size in sizes] == pytest.approx([0.0, 0.002, 0.005, 0.002])
-
-
-def test_result_is_in_properties_and_text(tmp_path: Path) -> None:
-    header, batch = journal(3)
-    writer = begin(tmp_path, msgspec.structs.replace(header, robots=(RobotSpec("left", (), (), "site", "tip"),)))
-    passed = Handover("cup", "left", "right", "p1", "p2", 5)
-    episodes = [EpisodeChanged(1, state, "p1") for state in ("running", "success")]
-    bodies: list[EventKind] = [passed, *episodes]
-    batch.events = [
-        joined("p1", "Ada"),
-        joined("p2", "Bob"),
-        *(Event(i, 1, i, body) for i, body in enumerate(bodies, 3)),
-    ]
-    writer.add(batch)
-    found = finish(writer)
-    (result,) = found["/__properties/session"]
-    names = ("people", "robots", "handovers", "episodes", "duration_s", "verify_class")
-    values = [result.column(name)[0].as_py() for name in names]
-    assert values == [["Ada", "Bob"], ["left"], [1], [1], [pytest.approx(0.004)], ["closed"]]
-    page = column(found["/session"], "TextDocument:text")[-1][0]
-    assert "**Ada** (operator), **Bob** (operator). 0.0 s, handovers: 1" in page

@@ -125,36 +125,6 @@ def test_flood_of_a_participant_is_cut_and_reported(flood: Callable[[Peer, int],
         both.check()
 
 
-def test_flood_of_hellos_is_cut_and_reported() -> None:
-    """It comes back again and again, and is cut again."""
-    with Rig(timestep=TICK) as rig:
-        both, peer = Undisturbed(rig), Peer(rig)
-        hello = encode_client(wrap_message(Hello("observer", "Mallory", secret=bytes(16))))
-        for _ in range(150):
-            for _ in range(BURST):
-                peer.sockets.send_control(hello)
-            rig.run(BURST_S)
-        floods = both.list_floods()
-        assert floods
-        assert {audit.detail for _, audit in floods} == {"before hello"}
-        assert any(text.endswith(": before hello") for text in both.eve.status().warnings)
-        both.check()
-        rig.join("late", "observer")
-
-
-def test_many_connections_without_hello_are_closed() -> None:
-    with Rig(timestep=TICK) as rig:
-        both = Undisturbed(rig)
-        peers = [rig.connect_raw() for _ in range(400)]
-        rig.join("late", "observer")
-        assert {audit.detail for _, audit in both.list_floods()} == {"connections"}
-        rig.run(9.0)
-        assert sum(one.connection is not None for one in peers) > 300, "ten seconds for a hello"
-        rig.run(2.0)
-        assert all(one.connection is None for one in peers)
-        both.check()
-
-
 def test_garbage_disturbs_no_client() -> None:
     """It comes from a participant and from somebody who is none; a few of the messages are answered."""
     with Rig(timestep=TICK) as rig:

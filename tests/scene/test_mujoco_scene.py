@@ -186,19 +186,3 @@ def test_tracking_cameras_have_their_initial_pose(tmp_path: Path) -> None:
         T = T_world[light.body]
         np.testing.assert_allclose((T @ [*light.p_body, 1.0])[:3], data.light_xpos[k], atol=1e-9)
         np.testing.assert_allclose(T[:3, :3] @ light.direction_body, data.light_xdir[k], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("dof", "count"), [("full", "3 3 1"), ("2d", "3 3 1"), ("radial", "2 2 2"), ("trilinear", "3 3 3")]
-)
-def test_bodies_of_flex_vertices_are_not_movable(tmp_path: Path, dof: str, count: str) -> None:
-    """MuJoCo gives them one to three slides; a robot link on one slide, with a flex on it, stays a movable body."""
-    dim = 2 if count.endswith("1") else 3
-    xml = f"""<mujoco><worldbody><body name="lift" pos="0 0 1"><joint type="slide" axis="0 0 1"/>
-      <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>
-    <flexcomp name="f" type="grid" dim="{dim}" dof="{dof}" count="{count}" spacing=".1 .1 .1" radius=".01"/></worldbody>
-    <deformable><flex name="flag" dim="2" body="lift lift lift" vertex="0 0 0 .1 0 0 0 .1 0" element="0 1 2"/>
-    </deformable></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(xml)
-    assert [info.name for info in World(model, (), ()).bodies] == ["lift"]
-    assert [body.name for body in parse_mujoco(model, AssetStore(tmp_path)).spec.bodies] == ["world", "lift"]

@@ -211,21 +211,6 @@ def test_after_a_reset_a_driven_robot_is_where_its_owner_put_it(rig: Rig, how: s
     assert rig.data.qpos[joint] == pytest.approx(twin.qpos[joint], abs=1e-12)
 
 
-def test_a_reset_gives_back_what_the_owner_wrote_before(rig: Rig) -> None:
-    """The script sets `ctrl` once, and its reset only the positions."""
-    home = rig.data.ctrl.copy()
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
-    agent.drive(sideways(agent.tip(), 0.2), 1.0)
-    rig.data.time = 0.0
-    rig.data.qpos[:] = rig.model.key_qpos[0]
-    rig.data.qvel[:] = 0.0
-    rig.round()
-    assert np.array_equal(rig.data.ctrl, home)
-
-
 def test_a_real_robot_may_be_moved_by_its_owner_between_ticks(rig: Rig) -> None:
     """Measured joints are written into the data, nothing is simulated: no reset."""
     agent = Agent(rig)

@@ -24,16 +24,7 @@ from iris_session.physics import encode_model, load_model
 from iris_session.protocol.client_messages import Marker, MoveAnchor
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, decode_entries
-from iris_session.recording import (
-    CLOSED,
-    OPEN,
-    JournalRow,
-    Keyframe,
-    RecordingLock,
-    Settings,
-    header_root,
-    make_row,
-)
+from iris_session.recording import CLOSED, OPEN, JournalRow, Keyframe, RecordingLock, Settings, header_root, make_row
 from iris_session.security.resume_tokens import ResumeTokens, encode_handback
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import CoreState, SessionCore

@@ -11,8 +11,7 @@ from iris_session import Session, SessionConfig
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import Pacer, find_objects, find_robots
 from iris_session.physics.load import compute_scene_hash, decode_model, encode_model
-from iris_session.protocol.entries import SceneLoaded, decode_entries
-from iris_session.protocol.server_messages import SceneChanged
+from iris_session.protocol.entries import SceneLoaded
 from iris_session.session.core import SessionCore
 from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.scene_change import adopt_timestep, prepare_scene
@@ -83,26 +82,6 @@ def test_loop_uses_the_timestep_of_a_new_scene_at_once() -> None:
     stats = pacer.get_stats(rig.stepper.clock())
     assert (stats.finished, stats.late, stats.missing) == (1, 0, 0)
     assert not adopt_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
-
-
-def test_stepper_sends_the_scene_before_the_step() -> None:
-    rig = Rig()
-    rig.steps(60)
-    seen: list[int] = []
-    rig.stepper.on_scene.append(lambda _: seen.append(len(rig.front.decisions)))
-    scene = prepare_scene(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
-    rows = len(rig.recorder.rows)
-    rig.stepper.queue_scene(scene)
-    rig.steps(30)
-    assert rig.recorder.scenes == [(rows, scene.model_hash)]
-    assert seen == [rows]
-    first = decode_entries(rig.recorder.rows[rows].entries)[0].message
-    assert first == scene.plant.scene
-    events = [e.body for e in rig.stepper.view.recent if isinstance(e.body, SceneChanged)]
-    assert events == [SceneChanged(2, 0, "new_scene", tick_period_ns=TICK_NS)]
-    assert rig.stepper.view.mirror.synced
-    assert set(rig.stepper.view.mirror.leases) == {"left", "right", "object1", "object2", "object3"}
-    assert rig.front.n_bodies == len(scene.plant.world.bodies)
 
 
 @pytest.mark.usefixtures("simulation")

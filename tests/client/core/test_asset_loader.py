@@ -5,7 +5,6 @@ from __future__ import annotations
 from random import Random
 
 from iris_session.client.core.asset_loader import (
-    AT_ONCE,
     CHUNK_BYTES,
     FAST_NS,
     FIRST_PAUSE_NS,
@@ -81,21 +80,6 @@ def test_asset_above_the_maximum_is_not_requested() -> None:
     assert isinstance(failed, FailedAsset)
     assert failed.reason == "protocol"
     assert answer(loader, b, MAX_ASSET_BYTES) is True
-
-
-def test_number_of_small_assets_is_bounded() -> None:
-    loader = AssetLoader()
-    names = [f"{i}" for i in range(AT_ONCE + 10)]
-    for name in names:
-        loader.add(name)
-    looked = list(loader.next_lookups())
-    assert looked == names[:AT_ONCE]
-    loader.remove(looked[0])  # it was in the cache
-    assert list(loader.next_lookups()) == [names[AT_ONCE]]
-    for name in looked[1:]:
-        loader.on_missing(name, 0)
-    asks = list(loader.next_requests(0))
-    assert len(asks) == min(WINDOW_REQUESTS, WINDOW_BYTES // CHUNK_BYTES)
 
 
 def test_temporary_refusals_are_retried_with_growing_delay() -> None:

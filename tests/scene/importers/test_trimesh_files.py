@@ -6,7 +6,6 @@ import struct
 from pathlib import Path
 
 import pytest
-import trimesh
 
 from iris_session.scene import SceneBuildError
 from iris_session.scene.importers.files import load_file
@@ -117,15 +116,3 @@ def test_cyclic_nesting_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "a.dae").write_text(dae("", node))
     with pytest.raises(SceneBuildError, match="instance of itself"):
         load_file(tmp_path / "a.dae")
-
-
-def test_copies_of_a_large_geometry_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """trimesh copies a geometry for every instance in a DAE."""
-    monkeypatch.setattr("iris_session.scene.importers.xml_files.MAX_TRIANGLES", 30)
-    trimesh.creation.box().export(tmp_path / "box.dae")
-    text = (tmp_path / "box.dae").read_text()
-    load_file(tmp_path / "box.dae")
-    begin, end = text.index("<instance_geometry"), text.index("</instance_geometry>") + len("</instance_geometry>")
-    (tmp_path / "boxes.dae").write_text(text[:end] + text[begin:end] * 20 + text[end:])
-    with pytest.raises(SceneBuildError, match="triangles"):
-        load_file(tmp_path / "boxes.dae")
