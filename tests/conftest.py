@@ -21,6 +21,7 @@ import psutil
 import pytest
 from hypothesis import HealthCheck, settings
 
+from iris_session.security import KeyHome
 from tests.models import DATA, MENAGERIE
 from tools.system_packages import OPENGL, find_missing
 
@@ -120,6 +121,13 @@ def _isolate_keys_and_assets(tmp_path_factory: pytest.TempPathFactory) -> Iterat
         patch.setenv("IRIS_HOME", str(tmp_path_factory.mktemp("keys") / "home"))
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))  # shared by the tests of one run
         yield
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
+    """The home of keys of a test of its own, which the environment names."""
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    return KeyHome()
 
 
 @pytest.fixture(autouse=True)

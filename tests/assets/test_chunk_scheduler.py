@@ -13,7 +13,7 @@ from iris_session.assets.chunk_scheduler import (
     REQUEST_BURST,
     ChunkScheduler,
 )
-from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, MAX_ASSET_WINDOW_BYTES, AssetRequest
+from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, MAX_ASSET_REQUESTS, MAX_ASSET_WINDOW_BYTES, AssetRequest
 from iris_session.protocol.names import AssetRefusal
 
 SIZES = {"large": 1 << 30, "small": 100, "empty": 0}
@@ -43,6 +43,32 @@ def serve(one: ChunkScheduler, turns: int, now_ns: int = 0) -> list[int]:
         order.append(reader.number)
         one.confirm_sent(reader)
     return order
+
+
+def test_participants_are_served_in_rotation() -> None:
+    one = scheduler()
+    for _ in range(8):
+        assert request(one, 1) == ""
+    for who in (2, 3):
+        assert request(one, who) == request(one, who) == ""
+    assert Counter(serve(one, 6)) == {1: 2, 2: 2, 3: 2}
+    assert serve(one, 100) == [1] * 6
+    assert one.next_reader(0) is None
+    assert one.next_due_ns() is None
+
+
+def test_windows_of_bytes_and_requests_are_limited() -> None:
+    one = scheduler()
+    for _ in range(MAX_ASSET_WINDOW_BYTES // MIB):
+        assert request(one, 1) == ""
+    assert request(one, 1, length=1) == AssetRefusal.TOO_MANY
+    assert request(one, 2, "small") == ""
+    serve(one, 2)
+    assert request(one, 1, length=1) == ""
+    for _ in range(MAX_ASSET_REQUESTS - 1):
+        assert request(one, 3, "small") == ""
+    assert request(one, 3, "empty") == ""
+    assert request(one, 3, "empty") == AssetRefusal.TOO_MANY
 
 
 def test_refusals_have_their_reason() -> None:

@@ -1,4 +1,4 @@
-"""`bench alignment`: every key and bar, equal results for equal seeds. The benchmark itself measures accuracy."""
+"""`bench alignment`: better than naive methods, equal observations for equal seeds. The benchmark measures accuracy."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -66,3 +67,12 @@ def test_clouds_of_a_coarser_class_do_not_count_as_delivered(level: int, hz: flo
     got: Any = SimpleNamespace(logs={"a": log}, begin_ns=0, summarize=lambda *_: {})
     runs: Any = [{"captures": {str(n): n for n in frames}, "encode_ms": [1.0], "refused": 0}]
     assert summarize(got, plan, runs, cloud, 30)["delivered_hz_min"] == hz
+
+
+def test_without_recorded_frames_the_rest_is_measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from iris_session.bench.cloud import _make_cases
+
+    told: list[str] = []
+    monkeypatch.setenv("IRIS_DATA", str(tmp_path))
+    assert [case.name for case in _make_cases(40_000, 1, False, told.append)] == ["room", "room_2cm_10k"]
+    assert "IRIS_DATA" in told[0]

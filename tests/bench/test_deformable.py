@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from iris_session.bench import deformable as motion_module
-from iris_session.bench.deformable import ClothMotion, _ClothSource, _compute_max_error_m, simulate_cloth
+from iris_session.bench.deformable import (
+    ClothMotion,
+    _ClothSource,
+    _compute_max_error_m,
+    load_cloth_motion,
+    simulate_cloth,
+)
 from iris_session.bench.media_clients import MediaColumn
 from iris_session.bench.report import BenchError
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
@@ -34,6 +40,23 @@ def test_motion_depends_on_the_seed_only(home: Path) -> None:
     assert np.ptp(vertices[:, 0], axis=0).max() > 0.5, "the hands lead it"
     sides = np.linalg.norm(vertices[0, 1:6] - vertices[0, :5], axis=1)
     assert sides.sum() == pytest.approx(1.0, abs=0.05)
+
+
+def test_motion_is_cached_and_damaged_file_is_replaced(home: Path) -> None:
+    messages: list[str] = []
+    made = load_cloth_motion(5, 0, messages.append)
+    (file,) = home.iterdir()
+    assert any("simulated" in text for text in messages)
+    messages.clear()
+    kept = load_cloth_motion(5, 0, messages.append)
+    assert not messages
+    assert np.array_equal(kept.nodes, made.nodes)
+    assert (kept.scale, kept.origin.tolist()) == (made.scale, made.origin.tolist())
+    file.write_bytes(file.read_bytes()[:1000])
+    again = load_cloth_motion(5, 0, messages.append)
+    assert "simulating again" in messages[0]
+    assert np.array_equal(again.nodes, made.nodes)
+    assert np.array_equal(load_cloth_motion(5, 0, messages.append).faces, made.faces)
 
 
 def test_errors_are_relative_to_motion_and_wrong_decoding_is_detected() -> None:

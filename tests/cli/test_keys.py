@@ -26,12 +26,6 @@ Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
-    return KeyHome()
-
-
-@pytest.fixture
 def lab(home: KeyHome) -> KeyHome:
     """A home with one running session."""
     mark = home.load_server_key().fingerprint
@@ -201,17 +195,6 @@ def test_pair_shows_a_complete_uri(lab: KeyHome, tmp_path: Path, capsys: Capture
     out = capsys.readouterr().out
     assert "\u2588" in out
     assert "192.0.2.7:7721" in out
-
-
-def test_pair_selects_one_of_several_sessions(lab: KeyHome, capsys: Capture) -> None:
-    mark = lab.load_server_key().fingerprint
-    lab.sessions.add(RegisteredSession("id2", "lab-2", os.getpid(), ("10.0.0.5",), 7741, mark))
-    assert main(["pair", "--no-wait"]) == 2
-    assert "(lab-1, lab-2)" in capsys.readouterr().err
-    assert main(["pair", "--no-wait", "--session", "lab-3"]) == 2
-    assert "running: lab-1, lab-2" in capsys.readouterr().err
-    assert main(["pair", "--no-wait", "--session", "lab-2", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["addresses"] == ["10.0.0.5:7741"]
 
 
 def test_unused_code_fails_and_interrupted_code_is_void(

@@ -101,23 +101,6 @@ def test_serve_prints_json_and_its_recording_verifies(tmp_path: Path, capfd: pyt
     assert main(["verify", str(recording), str(tmp_path / "none.rrd")]) == 2
 
 
-def test_robots_prints_toml_that_serve_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from iris_session.demo.scenes import scene_path
-    from iris_session.physics import load_model, load_robots_toml
-
-    scene = str(scene_path("handover"))
-    assert main(["robots", scene]) == 0
-    text = capsys.readouterr().out
-    assert text.startswith("# 2 robots, 2 free objects: hammer, board")
-    file = tmp_path / "robots.toml"
-    file.write_text(text)
-    assert [r.name for r in load_robots_toml(file, load_model(scene))] == ["left", "right"]
-    assert main(["robots", scene, "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert [r["name"] for r in result["robots"]] == ["left", "right"]
-    assert {o["name"] for o in result["objects"]} == {"hammer", "board"}
-
-
 def test_model_without_robots_says_what_a_robot_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = tmp_path / "ball.xml"
     scene.write_text("<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>")

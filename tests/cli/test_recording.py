@@ -1,4 +1,4 @@
-"""`recording inspect`: a recording as text and JSON, a folder as lines, and files that are none."""
+"""`recording inspect`: a recording as text and JSON, a folder as lines."""
 
 from __future__ import annotations
 

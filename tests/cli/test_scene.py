@@ -83,6 +83,20 @@ def test_inspect_prints_the_extent(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "--scale 1000" in note
 
 
+def test_millimetres_are_suspected_in_robots_and_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trimesh.creation.box((300, 200, 100)).export(tmp_path / "box.stl")
+    mesh = '<visual><geometry><mesh filename="box.stl"/></geometry></visual>'
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm"><link name="base">{mesh}</link></robot>')
+    geom = '<asset><mesh file="box.stl"/></asset><worldbody><geom type="mesh" mesh="box"/></worldbody>'
+    (tmp_path / "model.xml").write_text(f"<mujoco>{geom}</mujoco>")
+    ground = '<geom type="box" size="30 30 .1"/>'
+    (tmp_path / "hall.xml").write_text(f"<mujoco><worldbody>{ground}</worldbody></mujoco>")
+    wanted = "300 m large: in millimetres where metres are meant?"
+    for name in ("arm.urdf", "model.xml", "hall.xml"):
+        assert run("scene", "inspect", tmp_path / name, "--assets", tmp_path / "assets") == 0
+        assert (wanted in capsys.readouterr().out) == (name != "hall.xml")
+
+
 def test_export_does_not_overwrite_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     part = furniture(tmp_path / "part.glb")
     before = part.read_bytes()

@@ -1,4 +1,4 @@
-"""Output of `iris-session status` and `doctor`: screens, metrics, lines. End to end: tests/e2e."""
+"""Output of `iris-session status`: screens, metrics, lines. With a session: tests/rig."""
 
 from __future__ import annotations
 
@@ -10,14 +10,11 @@ import msgspec
 import pytest
 
 from iris_session.cli.common import print_result
-from iris_session.cli.doctor import format_findings, format_verdict
 from iris_session.cli.main import main
 from iris_session.cli.metrics import format_metrics
 from iris_session.cli.status import format_status
-from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.status import (
-    NOT_PUBLISHED,
     AlignmentReport,
     AssetsReport,
     MediaStreamReport,
@@ -112,20 +109,6 @@ def test_status_shows_streams_with_subscribers_faults_and_ages(capsys: pytest.Ca
 
 
 @pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"stalled": True, "authority_silent_ns": 2_500_000_000}, "STALLED for 2.5 s"),
-        ({"authority_silent_ns": -1}, "NOT STARTED"),
-        ({"estop": True}, "E-STOP"),
-        ({}, "running"),
-        ({"warnings": ("a disk", f"{NOT_PUBLISHED} 8.5 s: the program stands still")}, "'lab'  silent for 8.5 s  tick"),
-    ],
-)
-def test_first_line_shows_state(fields: dict[str, object], words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert words in show(capsys, **fields)[0]
-
-
-@pytest.mark.parametrize(
     "changes", [{"alignment": "placed"}, {"alignment": "measured", "alignment_report": AlignmentReport(offset=True)}]
 )
 def test_placed_and_moved_alignments_have_no_stated_error(
@@ -173,21 +156,6 @@ def test_metrics_are_well_formed() -> None:
     assert 'reason="stale"} 2' in text
     lines_of_bob = [line for line in text.splitlines() if 'name="bob"' in line]
     assert not any("state_age" in line or "missed" in line for line in lines_of_bob), "not measured"
-
-
-def test_doctor_prints_findings_as_lines() -> None:
-    found = [
-        ok("tcp", "open"),
-        warning("age", "old \x1b[31m", "Wi-Fi", "nearer"),
-        failed("key", "unknown", "", "pair"),
-        Finding("join", "skipped", "not looked at"),
-    ]
-    shown = list(format_findings(found))
-    assert [line.split()[0] for line in shown] == ["ok", "WARNING", "why:", "do:", "FAILED", "do:"]
-    assert format_verdict(found) == "FAILED: key; warnings: age; 1 skipped"
-    assert len(list(format_findings(found, show_skipped=True))) == len(shown) + 1
-    assert "warnings: age" in format_verdict(found[:2])
-    assert format_verdict(found[:1]) == "all well"
 
 
 def test_invalid_address(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -116,12 +115,6 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Network:
         monkeypatch.setattr(endpoint_resolver, name, getattr(network, name))
     monkeypatch.setattr(endpoint_resolver, "time", Clock())
     return network
-
-
-@pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
-    return KeyHome()
 
 
 def resolve(address: str = "", session: str = "", code: str = "", *, force_pairing: bool = False) -> Endpoint:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from zmq.utils import z85
 
@@ -14,12 +12,6 @@ from iris_session.security import KeyHome
 
 A, B = (z85.encode(bytes([first] * 32)).decode() for first in (1, 2))
 LAB = Address("10.0.0.5", 7721)
-
-
-@pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
-    return KeyHome()
 
 
 @pytest.mark.parametrize(

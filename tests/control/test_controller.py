@@ -132,6 +132,22 @@ def test_a_twist_moves_at_its_speed_and_stops_with_hold() -> None:
     assert not rig.controller._joints.moving
 
 
+def test_a_twist_target_does_not_run_away_from_an_arm_that_cannot_follow() -> None:
+    rig = panda()
+    command = twist(rig, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    for _ in range(1500):
+        rig.step(decision([command]))
+    state = rig.controller._states[0]
+    assert state.latch is not None
+    assert apart(rig.controller._ik.compute_tip(0, state), state.latch.target)[0] <= 0.05 + 1e-9
+    # A zero twist ends it, and the opposite one works at once.
+    back = twist(rig, (-0.2, 0.0, 0.0, 0.0, 0.0, 0.0))
+    where = rig.tip()[0][0]
+    for _ in range(500):
+        rig.step(decision([back]))
+    assert rig.tip()[0][0] < where - 0.1
+
+
 def test_an_absolute_target_is_reached_at_bounded_speed_from_one_sample() -> None:
     rig = panda(ControlConfig(tip_speed=0.25))
     start = rig.target()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -36,6 +37,19 @@ def test_reachable_poses_converge_to_within_a_hair() -> None:
         distance, angle = apart(arm.forward_kinematics(q), goal)
         assert distance < 1e-4
         assert angle < 0.02
+
+
+def test_joints_in_another_order_than_the_chains_give_the_same_motion() -> None:
+    robot = panda_spec()
+    turned = msgspec.structs.replace(robot, joints=robot.joints[3:] + robot.joints[:3])
+    arm, other = ArmModel(panda_model(), robot), ArmModel(panda_model(), turned)
+    home = np.array(PANDA_HOME)
+    q, rest, goal = home + 0.1, home - 0.05, arm.forward_kinematics(home + np.linspace(-0.1, 0.2, 7))
+    lower, upper = np.linspace(-0.01, -0.07, 7), np.linspace(0.08, 0.02, 7)
+    direct = IkSolver(arm, ControlConfig()).step(q, rest, goal, lower, upper).q
+    order = [3, 4, 5, 6, 0, 1, 2]
+    mixed = IkSolver(other, ControlConfig()).step(q[order], rest[order], goal, lower[order], upper[order]).q
+    assert mixed.tobytes() == direct[order].tobytes()
 
 
 def test_a_stretched_arm_is_reported_as_singular() -> None:

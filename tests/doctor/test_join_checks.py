@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,17 +23,13 @@ from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Refused, StateHeader
 from iris_session.security import KeyHome, KeyPair, RegisteredSession
 
+pytestmark = pytest.mark.usefixtures("home")
+
 ADDRESS = Address("192.0.2.7", 7721)
 
 
 def offered_key(key: str) -> Introduction:
     return Introduction(Beacon(1, "s1", "lab", "live", "192.0.2.7", 7721, 7722, 0, 0, 0), key)
-
-
-@pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
-    return KeyHome()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Clouds and pictures from a program to a Python client that joins later, and to the page in a real Chromium."""
+"""Clouds and pictures from a program to the page in a real Chromium."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connections over real sockets that send nothing, half of a greeting, or garbage. Floods are in `tests/rig`."""
+"""Connections over real sockets that send nothing, or half of a greeting. Floods are in `tests/rig`."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ import psutil
 import pytest
 
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import Acquire, Bye, EStop, Hello, Pair
-from iris_session.protocol.server_messages import EStopChanged, Event, Paired, ProtocolFault, Refused, Reply
+from iris_session.protocol.client_messages import Acquire, Hello, Pair
+from iris_session.protocol.server_messages import Paired, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import GetStatus, StatusReport
 from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess, run_command, wait_until
 from tests.web.browser import WebBrowser, open_http
@@ -80,30 +80,6 @@ def test_page_and_information_without_a_ticket(page: str) -> None:
             for body, status in ((b"", 405), (b"x" * 100_000, 400)):
                 async with http.post(f"{page}v1/info", data=body) as answer:
                     assert answer.status == status
-
-    run(work())
-
-
-def test_an_operator_behind_the_gateway_drives_and_stops(page: str) -> None:
-    async def work() -> None:
-        async with open_http() as http:
-            ann = await WebBrowser(http, page, "ann").join("director", devices=("desktop",))
-            bob = await WebBrowser(http, page, "bob").join("operator", devices=("desktop",))
-            await ann.send(Acquire(1, ("left",)))
-            reply = await ann.wait_for(Reply)
-            assert reply.denial is None
-            await bob.send(Acquire(1, ("left",)))
-            denied = await bob.wait_for(Reply)
-            assert denied.denial is not None
-            assert "ann" in str(denied.denial)
-            await bob.send(EStop("hand in the way"))
-            await ann.wait(
-                lambda: any(isinstance(e.body, EStopChanged) and e.body.active for e in ann.got(Event)), "a stop"
-            )
-            await ann.send(Bye())
-            await bob.send(Bye())
-            await ann.close()
-            await bob.close()
 
     run(work())
 

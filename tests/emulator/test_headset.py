@@ -83,6 +83,15 @@ def test_some_detections_are_wrong_and_half_of_those_mirrored() -> None:
     assert sum(b > 0.05 for b in back) == pytest.approx(200, abs=40)
 
 
+def test_same_seed_gives_the_same_readings() -> None:
+    a, b, c = (EmulatedHeadset(HeadsetModel(), seed) for seed in (3, 3, 4))
+    for headset in (a, b, c):
+        headset.recentre_frame(SECOND)
+    readings = [[h.observe(above(0.5), SHEET, i * SECOND, 0) for i in range(5)] for h in (a, b, c)]
+    assert readings[0] == readings[1]
+    assert readings[0] != readings[2]
+
+
 @pytest.mark.parametrize(
     "head",
     [

@@ -84,6 +84,23 @@ def test_revoked_gateway_removes_connected_and_disconnected_participants(lab: La
     lab.session.wait_entries(Marker)
 
 
+def test_participants_of_a_gateway_lose_the_roles_of_its_key(lab: Lab) -> None:
+    gateway = Gateway(lab, "gateway", "operator", "observer")
+    gateway.enter("tab1", "operator")
+    gateway.enter("tab2", "observer")
+    first = gateway.ids("tab1")
+    lab.home.clients.allow_key("web", gateway.pair.public, ("gateway", "observer"))
+    assert gateway.lost(1) == {gateway.numbers["tab1"]: "role"}
+    assert gateway.removed(1) == first
+    lab.session.pump(lambda: "tab1" in gateway.faults(), "the tab is told")
+    assert gateway.faults()["tab1"].code == FaultCode.DROPPED
+    assert gateway.enter("tab1", "operator").roles == ("observer",), "the authority refuses it by that"
+    gateway.client.send(Marker(1, "still here"), on_behalf_of="tab2", epoch=gateway.numbers["tab2"])
+    (marker,) = lab.session.wait_entries(Marker)
+    assert marker.connection == gateway.numbers["tab2"]
+    assert len(gateway.lost(1)) == 1
+
+
 @pytest.mark.parametrize("who", ["behind a gateway", "without state", "with state"])
 def test_subscribers_reconnect_only_when_a_subscribed_key_is_revoked(lab: Lab, who: str) -> None:
     bob, _ = lab.allowed("bob")

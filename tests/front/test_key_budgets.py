@@ -11,13 +11,13 @@ import zmq
 
 from iris_session.front.connections import Peer
 from iris_session.front.key_budgets import FORGET_NS, HandshakeLimiter, KeyBudget
-from iris_session.link import FrontLimits
-from iris_session.protocol.client_messages import Acquire, EStop, Hello, Release, Sample
+from iris_session.link import FrontLimits, SceneInfo
+from iris_session.protocol.client_messages import Acquire, EStop, GetSnapshot, Hello, Release, Sample
 from iris_session.protocol.common import IDENTITY, Target
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.limits import Drops, KeyLimits
 from iris_session.protocol.names import DenialReason
-from iris_session.protocol.server_messages import ProtocolFault, Refused, Reply
+from iris_session.protocol.server_messages import BodyInfo, ProtocolFault, Refused, Reply
 from iris_session.security.zap import ZAP_ASSETS, ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_STATE
 from tests.front.intake_rig import HELLO, IntakeRig
 
@@ -107,6 +107,19 @@ def test_a_clutch_that_opens_always_passes(rig: IntakeRig, period: int) -> None:
             driven = drives
         assert not driven or i % period
     assert 100 <= begins <= (80 + 15 * 20) // 2 + 1
+
+
+def test_a_snapshot_of_a_scene_of_many_bodies_costs_more_than_that_of_an_empty_one(rig: IntakeRig) -> None:
+    counts = []
+    for i, n_bodies in enumerate((0, 5000)):
+        hog, kept = KeyRig(rig, 8, b"%d" % i * 16, 100 * (i + 1)), Counter[type]()
+        rig.intake._context.publisher.scene = SceneInfo("", bodies=(BodyInfo(1, "part", True),) * n_bodies)
+        for c in range(8):
+            for _ in range(8):
+                hog.send(c, GetSnapshot(1))
+        collect(rig, kept)
+        counts.append(kept[GetSnapshot])
+    assert counts == [800 // 20, 800 // (20 + 5000 // 50)]
 
 
 def test_one_key_joins_a_few_times_a_second(rig: IntakeRig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -153,3 +154,22 @@ def test_director_revokes_although_the_list_is_read_only(open_session: Open, tmp
     late = session.client(curve=curve)
     late.send(Hello("operator", "ann"))
     assert late.wait_for(Refused).code == RefusalCode.UNPAIRED
+
+
+def test_list_may_be_edited_during_the_session(lab: Lab) -> None:
+    _, ann = lab.allowed("ann")
+    _, bob = lab.allowed("bob")
+    path = lab.home.path / "clients.json"
+    lab.session.pump(lambda: any(key.last_seen for key in lab.home.clients.read().values()), "the session's own note")
+    rows = json.loads(path.read_text())
+    path.write_text(json.dumps(rows[1:]))  # in place
+    assert ann.wait_for(ProtocolFault).code == FaultCode.REVOKED
+    new = path.with_name("new")  # as editors do
+    new.write_text("[]")
+    new.chmod(0o644)
+    new.replace(path)
+    assert lab.session.wait_drops("allow_list_unreadable") >= 1
+    bob.send(Marker(1, "still here"))
+    lab.session.wait_entries(Marker)
+    path.chmod(0o600)  # as the session said
+    assert bob.wait_for(ProtocolFault).code == FaultCode.REVOKED

@@ -6,11 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.client_messages import Hello, Observation
+from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Join
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
-from iris_session.protocol.status import ClientReport, GetStatus, ParticipantReport, StatusReport
+from iris_session.protocol.status import AlignmentReport, ClientReport, GetStatus, ParticipantReport, StatusReport
 from tests.front.harness import N_BODIES, FrontSession, RawClient
 
 MS = 1_000_000
@@ -78,6 +79,27 @@ def test_both_halves_make_one_report(session: FrontSession) -> None:
     assert (ann.state_age.p50, ann.state_age.p99, ann.missed_share, ann.rtt_ms) == (1.5, 7.0, 0.25, 2.5)
     assert ann.heard_ns >= 0
     assert ann.lost == ""
+
+
+def test_alignment_report_has_both_halves(open_session: Callable[..., FrontSession]) -> None:
+    session = open_session(anchors={"table": IDENTITY})
+    ann, bob = session.client(), session.client()
+    ids = [ann.join(devices=("head",)).participant_id, bob.join(name="Bob").participant_id]
+    theirs = AlignmentReport(version=7, alarm="changed", alarm_ns=5)
+    session.process.link.send_report(half(row(ids[0], alignment_report=theirs), row(ids[1], alignment_report=theirs)))
+    for i in range(8):
+        seen = Pose((0.5, 0.0, 0.001 * i), IDENTITY.q)
+        ann.send(Observation("table", "qr", seen, session.process.link.now_ns, 1, i))
+    report = ask(
+        session,
+        bob,
+        lambda r: bool(r.participants) and getattr(r.participants[0].alignment_report, "observations", 0) == 8,
+    )
+    ours, other = (person.alignment_report for person in report.participants)
+    assert ours is not None
+    assert (ours.version, ours.alarm, ours.alarm_ns) == (7, "changed", 5)
+    assert [(s.anchor_id, s.observations) for s in ours.seen] == [("table", 8)]
+    assert other == theirs
 
 
 def test_client_can_request_status_before_admission(session: FrontSession) -> None:

@@ -1,4 +1,4 @@
-"""The front as a process: how it starts, is replaced after a crash or when it hangs, and ends with its parent.
+"""The front as a process: how it starts, ends, and is replaced after a crash or when it hangs.
 
 `test_front_supervision.py` has what decides about it.
 """
@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,7 +19,7 @@ import zmq.auth
 
 from iris_session.link import FrontConfig, FrontProcess
 from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello, wrap_message
-from iris_session.protocol.codec import decode_server, encode_client
+from iris_session.protocol.codec import encode_client
 from iris_session.protocol.entries import FrontRestarted, Join
 from iris_session.protocol.server_messages import ProtocolFault, Snapshot
 from iris_session.security import KeyHome
@@ -129,44 +127,3 @@ def test_hanging_front_is_replaced(process_session: ProcessSession) -> None:
     session.pump(has_new_front, "new front")
     assert gone(hung)
     assert client.join(resume_token=token).resumed
-
-
-PARENT = """
-import sys, time
-from iris_session.link import FrontConfig, FrontProcess
-from iris_session.protocol.steps import Admitted, Decision
-from iris_session.protocol.entries import Join
-from tests.front.process_harness import scene
-process = FrontProcess(FrontConfig(control_port=0, state_port=0), scene())
-print(process.start().control, process.pid, flush=True)
-while True:
-    joins = [e for e in process.link.poll() if isinstance(e.message, Join)]
-    admitted = tuple(Admitted(e.connection, "p1", "operator", False) for e in joins)
-    process.link.send_decision(0, Decision((), admitted=admitted))
-    time.sleep(0.002)
-"""
-
-
-def test_front_ends_with_its_parent(tmp_path: Path) -> None:
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True, env=environment)
-    assert parent.stdout is not None
-    port, pid = map(int, parent.stdout.readline().split())
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    client = context.socket(zmq.DEALER)
-    client.linger = 0
-    client.connect(f"tcp://127.0.0.1:{port}")
-    client.send(encode_client(wrap_message(Hello("operator", "Ann", secret=b"s" * 16))))
-    assert client.poll(30_000)
-    client.recv()
-    parent.kill()
-    parent.wait()
-    parent.stdout.close()
-    wait(lambda: gone(pid), "end of the front")
-    codes: list[str] = []
-    while client.poll(100 if "session_ended" in codes else 30_000):
-        message = decode_server(client.recv()).message
-        codes += [message.code] if isinstance(message, ProtocolFault) else []
-    assert codes[-1:] == ["session_ended"]
-    assert list(tmp_path.iterdir()) == [], "nobody else can remove the folder of the link"
-    context.destroy(linger=0)

@@ -1,4 +1,4 @@
-"""Point clouds and pictures in the file: read back exactly, drawn at their capture, refused if they do not decode."""
+"""Point clouds and pictures in the file: read back exactly, refused if they do not decode."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from iris_session.journal.feed import BATCH_NS
 from iris_session.journal.messages import RecorderConfig
 from iris_session.protocol.scene import list_assets
 from iris_session.protocol.status import ClientReport
-from iris_session.recording import RecorderError, Recording, summarise, verify
+from iris_session.recording import RecorderError, Recording, RecordingLock, summarise, verify
 from iris_session.recording import process as process_module
 from iris_session.recording.process import DRAIN_S, FLUSH_S, RecorderLoop
 from iris_session.rrd.assets import ALL, list_recorded_assets
@@ -147,6 +147,20 @@ def test_error_in_the_picture_leaves_out_the_picture(one: LoopRecorder) -> None:
     one.finish()
     report = verify(one.path, SmallCore)
     assert (report.ok, report.parts, report.steps, report.finished) == (True, 2, 100, True), report.line()
+
+
+def test_no_part_is_begun_while_another_session_continues_the_recording(
+    one: LoopRecorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process_module, "TRIED_S", 0.0)
+    SmallSession(one.feed).take(20)
+    one.pump()
+    one.kill()
+    mine = RecordingLock(one.path, shared=False)
+    with pytest.raises(RecorderError):
+        one.begin(2)
+    assert not os.path.exists(part_path(str(one.path), 2))
+    mine.release()
 
 
 def test_session_that_never_began_leaves_no_file(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Several operators in one session: denial, following, holding, invalid input, late joiners, e-stop, pause, scaling."""
+"""Operators in one session: following, holding, the e-stop, and what the log has of them."""
 
 from __future__ import annotations
 

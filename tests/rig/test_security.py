@@ -1,4 +1,4 @@
-"""An attacker in a session, two directors at once, and a participant that is removed. Keys are those of loopback."""
+"""An attacker in a session, and a participant that is removed. Keys are those of loopback."""
 
 from __future__ import annotations
 

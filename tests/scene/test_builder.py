@@ -96,6 +96,26 @@ def build_scenes(folder: Path, threads: int) -> list[str]:
     ]
 
 
+def test_looks(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    scene.add_sphere(radius=1, rgba=(1, 1, 0))
+    scene.add_sphere(radius=1, metallic=1.0, roughness=0.25)
+    scene.add_sphere(radius=1, metallic=1.0, roughness=0.25)
+    picture = np.zeros((2, 2, 4), np.uint8)
+    scene.add_box(half_size=(1, 1, 1), texture=picture, repeat=(2, 3), uniform=True)
+    scene.add_box(half_size=(1, 1, 1), texture=picture.copy(), rgba=(1, 0, 0))
+    spec = scene.build(store).spec
+    assert spec.visuals[0].material == -1
+    assert spec.visuals[1].material == spec.visuals[2].material
+    material = spec.materials[spec.visuals[1].material]
+    assert (material.metallic, material.roughness, material.shininess) == (1.0, 0.25, 0.75)
+    assert len(spec.textures) == 1
+    first, second = (spec.materials[visual.material] for visual in spec.visuals[3:])
+    assert (first.repeat, first.uniform, first.rgba) == ((2.0, 3.0), True, (1.0, 1.0, 1.0, 1.0))
+    assert second.find_texture("rgba") == 0
+    assert second.rgba == (1.0, 0.0, 0.0, 1.0)
+
+
 def test_meshes_given_as_arrays(store: AssetStore) -> None:
     scene = SceneBuilder()
     picture = np.zeros((2, 2, 3), np.uint8)

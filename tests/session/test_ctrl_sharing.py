@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.protocol.client_messages import ClearEStop, EStop
+from iris_session.protocol.client_messages import Assign, ClearEStop, EStop
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import MarkerAdded
@@ -139,6 +139,24 @@ def test_what_the_owner_writes_while_a_robot_is_driven_counts_when_it_is_given_b
     agent.release()
     rig.rounds(1000)
     assert rig.data.ctrl[arm[0]] == 0.2
+
+
+def test_the_clutch_open_holds_and_a_new_holder_has_to_engage(rig: Rig) -> None:
+    rig.policy = swing(rig)
+    agent, other = Agent(rig), Agent(rig, connection=2)
+    boss = Agent(rig, connection=3, role=Role.DIRECTOR)
+    rig.round()
+    agent.acquire()
+    agent.engage()
+    agent.drive(sideways(agent.tip()), 0.4)
+    here = agent.tip()
+    agent.drive(lambda t: here, 0.5, clutch=False)
+    arm = rig.actuators()
+    assert largest_step(rig.applied[-50:], arm) < 1e-9, "the holder's robot stands, whatever the policy wants"
+    boss.say(Assign(1, ("left",), "p2"))
+    rig.rounds(1000)
+    assert rig.loop.driven == (), "the new holder has not engaged"
+    assert other.version == 0
 
 
 def test_during_an_estop_nothing_is_given_back(rig: Rig) -> None:

@@ -24,9 +24,10 @@ from iris_session.session.status import (
     StatusReporter,
     collect_warnings,
     make_recorder_report,
+    make_robot_reports,
 )
 from iris_session.session.stepper import Stepper
-from tests.session.play import TICK_NS, host, make_core
+from tests.session.play import TICK_NS, entries, host, make_core
 from tests.session.test_stepper import Front
 
 BOB = 2
@@ -75,6 +76,22 @@ def test_alignment_has_an_age_and_can_be_void(session: Session) -> None:
     assert row.tracking_epoch == 1
     session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
     assert session.people()["bob"].alignment_void_ns == -1
+
+
+def test_report_lists_robots_and_holders(session: Session) -> None:
+    session.step()
+    before = {row.name: row for row in make_robot_reports(session.stepper)}
+    assert {row.mode for row in before.values()} == {"exclusive"}
+    assert {(row.state, row.hold_reason) for row in before.values()} == {("hold", "no_lease")}
+    for step in range(150):
+        session.step(*entries(step))
+    after = {row.name: row for row in make_robot_reports(session.stepper)}
+    left = after["left"]
+    assert (left.holder_name, left.state) == ("ann", "pose")
+    assert left.receive_to_step is not None
+    assert left.receive_to_step.p99 < 20.0
+    assert after["right"].receive_to_step is None
+    assert session.people()["ann"].holds == ("left",)
 
 
 def test_report_waits_for_idle_time_up_to_a_limit() -> None:

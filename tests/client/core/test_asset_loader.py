@@ -43,19 +43,6 @@ def refuse(loader: AssetLoader, ask: ChunkRequest, reason: str, now_ns: int = 0)
     return loader.process_refusal(AssetRefused(1, ask.request_id, ask.address, reason, "advice"), now_ns)
 
 
-def test_window_counts_bytes_that_are_not_stored() -> None:
-    loader = started("a")
-    (ask,) = loader.next_requests(0)
-    assert answer(loader, ask, 100 * WINDOW_BYTES) is True
-    asks = list(loader.next_requests(0))
-    assert len(asks) == WINDOW_BYTES // CHUNK_BYTES - 1
-    for ask in asks:
-        assert answer(loader, ask, 100 * WINDOW_BYTES) is True
-    assert list(loader.next_requests(0)) == []
-    loader.on_stored(CHUNK_BYTES)
-    assert len(list(loader.next_requests(0))) == 1
-
-
 def test_chunk_size_follows_the_link_rate() -> None:
     loader = started("a")
     now_ns, lengths = 0, []

@@ -119,6 +119,21 @@ def test_stall_of_link_or_client_is_detected(server: Server, polling: bool) -> N
     assert stream.counters.queued_old == 2
 
 
+def test_frame_in_hand_during_a_stall_is_not_delivered(server: Server) -> None:
+    """It was read from the socket, then the process was stopped for three seconds."""
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    assert drain(stream, [server.frame(MS)], MS) is not None
+    assert stream.check_fresh(2 * MS + LOCAL)
+    assert drain(stream, [server.frame(17 * MS)], 17 * MS) is not None
+    assert not stream.check_fresh(3000 * MS + LOCAL)
+    assert drain(stream, [server.frame(33 * MS)], 3001 * MS) is None  # nor frames queued meanwhile
+    assert drain(stream, [server.frame(3002 * MS)], 3003 * MS) is not None
+    assert stream.check_fresh(3004 * MS + LOCAL)
+    assert (stream.counters.delivered, stream.counters.queued_old) == (2, 2)
+
+
 def test_unread_presence_is_bounded() -> None:
     stream = StateStream()
     message = [TOPIC_PRESENCE, encode_presence(Presence(10, 11, (PresenceItem("p1", "head", IDENTITY),)))]

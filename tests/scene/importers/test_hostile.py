@@ -42,6 +42,17 @@ def test_large_picture_is_rejected_in_every_reader(tmp_path: Path, monkeypatch: 
         SceneBuilder().add_box(half_size=(1, 1, 1), texture=tmp_path / "picture.png")
 
 
+def test_pictures_of_all_files_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where many materials name one picture: an OBJ file opens it for each."""
+    path = write_obj(tmp_path)
+    material = "newmtl {}\nKd 1 1 1\nmap_Kd picture.png\n"
+    (tmp_path / "parts.mtl").write_text(material.format("red") + material.format("painted"))
+    load_file(path)
+    monkeypatch.setattr("iris_session.scene.images.MAX_FILE_PIXELS", 2 * 4 * 8 - 1)
+    with pytest.raises(SceneBuildError, match=r"parts\.obj .* 63 pixels"):
+        load_file(path)
+
+
 def test_accessors_without_bytes_are_bounded(tmp_path: Path) -> None:
     """As doubles they would be eight times as large."""
     document = Document()
