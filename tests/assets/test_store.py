@@ -27,18 +27,6 @@ def set_age(store: AssetStore, address: str, seconds: float) -> None:
     os.utime(path, (then, then))
 
 
-def test_put_and_get(tmp_path: Path) -> None:
-    store = AssetStore(tmp_path)
-    address = store.put(b"hello")
-    assert address == hashlib.sha256(b"hello").hexdigest()
-    assert store.path(address) == tmp_path / address[:2] / address
-    assert store.put(memoryview(b"hello")) == address
-    assert (store.get(address), address in store) == (b"hello", True)
-    assert [p for p in tmp_path.rglob("*") if p.is_file()] == [store.path(address)]
-    other = AssetStore(tmp_path)
-    assert other.get(address) == b"hello"
-
-
 def test_missing_assets(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
     missing = "0" * 64

@@ -126,17 +126,6 @@ def test_a_rate_far_below_what_is_asked_for() -> None:
     assert watch.run(3000) == ""
 
 
-@pytest.mark.parametrize("hz", [0.2, 0.45])
-def test_a_slow_camera_that_keeps_its_rate_is_not_slow(hz: float) -> None:
-    health = CameraHealth(hz)
-    health.restart(0)
-    for at_ms in range(0, 60_000, 100):
-        if at_ms % (100 * round(10 / hz)) == 0:
-            health.check_frame(make_frame(at_ms), CAMERA, at_ms * MS)
-        assert health.find_fault(at_ms * MS) is None
-    assert health.measure_hz(at_ms * MS) == pytest.approx(hz, rel=0.35)
-
-
 def test_the_rate_of_a_recording_is_enough_and_half_of_it_is_not() -> None:
     watch = Watch()
     watch.health.limit_rate(5.0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import msgspec
 import mujoco
 import numpy as np
@@ -162,17 +160,3 @@ def test_closing_is_as_fast_as_allowed_and_ends_exactly() -> None:
         grippers.tick(data)
     assert data.ctrl[left] == 0.002
     assert data.ctrl[right] == 0.037
-
-
-def test_nothing_is_asked_of_robots_without_gripper_or_by_no_number() -> None:
-    grippers, data, left, right = aloha()
-    grippers.set_goal(1, 1.0)
-    grippers.stop(1)
-    grippers.set_goal(0, None)
-    grippers.set_goal(2, math.nan)
-    grippers.tick(data)
-    assert (data.ctrl[left], data.ctrl[right]) == (0.037, 0.037)
-    grippers.set_goal(2, 7.0)
-    for _ in range(200):
-        grippers.tick(data)
-    assert data.ctrl[right] == 0.002

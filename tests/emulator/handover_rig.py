@@ -43,7 +43,6 @@ from iris_session.protocol.steps import Command, CommandSource, Decision
 NOISE = (0.001, math.radians(0.3))  # per axis: m, rad
 STATE_S = 1.0 / 60.0
 SAMPLE_S = 1.0 / 72.0
-DEVICE = "controller/right"
 
 
 def add_noise(pose: PoseTuple, rng: random.Random, noise: tuple[float, float]) -> PoseTuple:

@@ -30,18 +30,6 @@ def test_aloha_has_two_arms(aloha: mujoco.MjModel) -> None:
     )
 
 
-def test_panda_has_one_arm(panda: mujoco.MjModel) -> None:
-    assert find_robots(panda) == (
-        RobotSpec(
-            name="panda",
-            joints=tuple(f"joint{i}" for i in range(1, 8)),
-            actuators=tuple(f"actuator{i}" for i in range(1, 8)),
-            site="attachment_site",
-            base_body="link0",
-        ),
-    )
-
-
 def test_scene_without_robots() -> None:
     assert find_robots(model("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")) == ()
     assert find_robots(scene(*arm("door", joints=2))) == ()

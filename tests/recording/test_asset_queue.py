@@ -87,18 +87,6 @@ def test_scene_that_is_no_specification_is_counted(shared: Shared) -> None:
     assert "no scene specification" in rows.faults[0].text
 
 
-def test_what_waits_at_the_end_is_named(shared: Shared) -> None:
-    queue = AssetQueue(SCENE)
-    queue.add_scene(shared.assets, is_patch=False)
-    queue.read(S, 100)  # a part of the specification
-    queue.add_scene(patched(shared, "never read"), is_patch=False)
-    rows = queue.close("the session ended")
-    assert len(rows.scenes) == 1
-    assert [one.text for one in rows.faults] == ["the session ended"] * 2
-    assert queue.left_out == 2
-    assert not queue
-
-
 def test_limit_of_bytes_leaves_out_what_does_not_fit(shared: Shared) -> None:
     sizes = {address: len(shared.store.view(address)) for address in list_recorded_assets(shared.spec, SCENE)}
     room = len(shared.store.view(shared.scene_hash)) + sum(sizes.values()) - 1

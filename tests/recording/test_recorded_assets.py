@@ -105,19 +105,6 @@ def test_scene_can_be_shown_from_the_file_alone(whole: Path, shared: Shared) -> 
     assert sum(len(piece.data) for piece in _pieces(whole)) == sum(map(len, found.values())), "each once"
 
 
-@pytest.mark.parametrize(("recorded", "n"), [(NONE, 0), (ALL, None)])
-def test_other_choices(tmp_path: Path, shared: Shared, recorded: str, n: int | None) -> None:
-    path = record(tmp_path / "session.rrd", shared, recorded)
-    with Recording.open(path) as recording:
-        assert [scene.hash for scene in recording.scenes()] == [shared.scene_hash]
-        found = dict(recording.assets())
-        summary = summarise(recording).assets
-    wanted = set() if n == 0 else {shared.scene_hash, *list_assets(shared.spec)}
-    assert set(found) == wanted
-    assert (summary.recorded, summary.scenes) == (recorded, 1)
-    assert (summary.present, summary.expected) == (len(wanted), len(wanted))
-
-
 def test_finest_levels_are_what_a_client_needs(shared: Shared) -> None:
     names = list_recorded_assets(shared.spec, SCENE)
     for thing in (*shared.spec.meshes, *shared.spec.textures):

@@ -27,7 +27,7 @@ from iris_session.recording import OPEN, RecordedState, Recording
 from iris_session.replay import pictures
 from iris_session.replay.pictures import Image, PictureError, PictureOptions, RecordingPictures, Timeline, open_gl
 from iris_session.session.core import CoreConfig, SessionCore
-from tests.replay.support import KEYFRAME_STEPS, Played, damaged, make_drawn_core, play, scene_model, step_ns
+from tests.replay.support import Played, damaged, make_drawn_core, play, scene_model, step_ns
 from tests.session.play import host
 
 STEPS = 50
@@ -194,23 +194,6 @@ def test_added_visuals_are_drawn_and_those_with_meshes_of_their_own_are_noted(
     found, made = draw_times(played.path, [step_ns(29)])
     assert_same(found, [reference(with_ball, played.qpos[29])])
     assert made.notes == ["shapes that a patch brought along are not drawn: `iris-session view` shows them"]
-
-
-def test_a_late_time_begins_at_a_keyframe(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken = []
-    step = SessionCore.step
-
-    def count(self: SessionCore, now_ns: int, *arguments: Any, **options: Any) -> Any:
-        taken.append(now_ns)
-        return step(self, now_ns, *arguments, **options)
-
-    whole = draw(played.path, [0, 45])
-    monkeypatch.setattr(SessionCore, "step", count)
-    assert draw(played.path, [45])[0].tobytes() == whole[1].tobytes()
-    assert len(taken) <= KEYFRAME_STEPS
-    taken.clear()
-    draw(played.path, [KEYFRAME_STEPS - 1])  # that of the keyframe itself
-    assert len(taken) == KEYFRAME_STEPS
 
 
 def test_a_picture_shows_the_newest_step_at_its_time(played: Played) -> None:

@@ -98,22 +98,6 @@ def read_complaint(home: KeyHome, path: Path) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(
-    ("typed", "below", "wrong"),
-    [
-        ('"name": "bob"', 1, "Expecting ',' delimiter"),
-        ('"name": "bob", "king",', 0, "Expecting ':' delimiter"),
-        ('"name: "bob",', 0, "Expecting ':' delimiter"),
-    ],
-)
-def test_invalid_json_line_is_named(home: KeyHome, listed: Path, typed: str, below: int, wrong: str) -> None:
-    lines = listed.read_text().splitlines()
-    at = next(i for i, line in enumerate(lines) if '"name": "bob",' in line)
-    lines[at] = typed
-    listed.write_text("\n".join(lines))
-    assert read_complaint(home, listed) == (at + 1 + below, wrong)
-
-
-@pytest.mark.parametrize(
     ("changes", "wrong"),
     [
         ({"name": 7}, "Expected `str`, got `int`"),

@@ -12,6 +12,7 @@ import pytest
 from iris_session import ConfigError, OwnershipError, PublishError, SceneBuilder, ScenePublisher, SessionConfig
 from iris_session.protocol.scene import Environment, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
+from tests.rig.owned import simulate_sessions
 from tests.rig.simulation import Simulation
 
 CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, web=False)
@@ -24,6 +25,12 @@ def scene() -> SceneBuilder:
     builder.add_box("box", half_size=(0.1, 0.1, 0.1), movable=True, position=(1.0, 0.0, 0.0))
     builder.add_deformable("cloth", [(0, 0, 1), (0, 1, 1), (1, 0, 1)], [(0, 1, 2)])
     return builder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def simulation() -> Iterator[Simulation]:
+    with simulate_sessions() as simulation:
+        yield simulation
 
 
 @pytest.fixture(scope="module")

@@ -26,12 +26,8 @@ from iris_session.protocol.server_messages import (
     ServerEnvelope,
     Welcome,
 )
-from iris_session.security import KeysError
-from iris_session.security.allow_list import AllowList
-from iris_session.security.curve import load_public
 from iris_session.security.private_folder import PrivateFolder
 from iris_session.security.session_registry import SessionRegistry
-from iris_session.streams.rigid import RigidDecoder
 
 MS = 1_000_000
 
@@ -67,16 +63,6 @@ def test_inconsistent_row_counts_are_damage() -> None:
     assert journal.check_keyframe(msgspec.structs.replace(keyframe, step=2**64 - 1)) == "step"
 
 
-@pytest.mark.parametrize("content", [b'[{"name": "\xff"}]', b"[" * 100_000, b'[{"pid": 1'])
-def test_damaged_key_files_raise_one_error_type(tmp_path: Path, content: bytes) -> None:
-    tmp_path.chmod(0o700)
-    for name, kind in (("clients.json", AllowList), ("sessions.json", SessionRegistry)):
-        (tmp_path / name).touch(0o600)
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(KeysError):
-            kind(PrivateFolder(tmp_path)).read()
-
-
 def test_session_note_with_invalid_pid_is_ignored(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
     file = tmp_path / "sessions.json"
@@ -84,14 +70,6 @@ def test_session_note_with_invalid_pid_is_ignored(tmp_path: Path) -> None:
     note = {"session_id": "s", "name": "lab", "pid": 2**40, "hosts": [], "control": 1, "server": ""}
     file.write_bytes(msgspec.json.encode([note]))
     assert SessionRegistry(PrivateFolder(tmp_path)).read() == []
-
-
-@pytest.mark.parametrize("line", [b"public-key", b"public-key = abc", b'public-key = "\xff\xff"', b"public-key ="])
-def test_damaged_certificates_raise_one_error_type(tmp_path: Path, line: bytes) -> None:
-    path = tmp_path / "x.key"
-    path.write_bytes(b"metadata\ncurve\n    " + line + b"\n")
-    with pytest.raises(KeysError):
-        load_public(path)
 
 
 def joined_connection(heartbeat_ns: int) -> ClientConnection:
@@ -138,11 +116,3 @@ def test_faults_and_leases_of_a_client_are_bounded() -> None:
     assert len(connection.counters.faults) <= 65
     assert sum(connection.counters.faults.values()) == 6000
     assert len(connection.requests._granted) <= 4096
-
-
-def test_frames_of_unknown_bodies_change_nothing() -> None:
-    decoder = RigidDecoder(3)
-    for payload in (b"", b"\0" * 200, b"\xff" * 200):
-        with pytest.raises(ValueError):
-            decoder.apply(1, 0, payload)
-    assert decoder.state_seq == 0
