@@ -128,7 +128,7 @@ namespace IrisSession.Core
         private void Insert(int at, bool droppable, byte[] bytes, int length)
         {
             Outgoing item = free.Count > 0 ? free.Pop() : new Outgoing();
-            if (item.Bytes.Length < length) item.Bytes = new byte[Math.Max(length, 2 * item.Bytes.Length)];
+            if (item.Bytes.Length < length) item.Bytes = new byte[Math.Max(length + length / 2, 256)]; // room for numbers that grow
             Buffer.BlockCopy(bytes, 0, item.Bytes, 0, length);
             item.Count = length;
             item.IsDroppable = droppable;

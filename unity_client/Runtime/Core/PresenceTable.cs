@@ -16,6 +16,7 @@ namespace IrisSession.Core
 
         private readonly StateCounters counters;
         private readonly WireReader reader = new WireReader();
+        private readonly Presence read = new Presence();
 
         // Copies of messages that wait; buffers are used again.
         private readonly byte[][] waiting = new byte[MaxWaiting][];
@@ -33,7 +34,7 @@ namespace IrisSession.Core
         /// <summary>Session time of the newest presence [ns].</summary>
         public long SessionTimeNs { get { return presenceNs; } }
 
-        /// <summary>Return the newest item of every device of every participant, poses in the world frame.</summary>
+        /// <summary>Return the newest item of every device of every participant, poses in the world frame. The next message overwrites them.</summary>
         public IReadOnlyList<PresenceItem> ListItems()
         {
             DecodeWaiting();
@@ -89,9 +90,9 @@ namespace IrisSession.Core
                 try
                 {
                     reader.Reset(waiting[i], 0, lengths[i]);
-                    Presence presence = Protocol.Presence.Read(reader);
+                    reader.ReadInto(read);
                     reader.ExpectEnd();
-                    Take(presence);
+                    TakeItems();
                 }
                 catch (WireException)
                 {
@@ -101,21 +102,25 @@ namespace IrisSession.Core
             waitingCount = 0;
         }
 
-        private void Take(Presence presence)
+        private void TakeItems()
         {
-            if (presence.SessionTime < presenceNs)
+            if (read.SessionTime < presenceNs)
             {
                 counters.OutOfOrder++;
                 return;
             }
             counters.Presence++;
-            presenceNs = presence.SessionTime;
-            foreach (PresenceItem item in presence.Items)
+            presenceNs = read.SessionTime;
+            foreach (PresenceItem item in read.Items)
             {
                 int at = 0;
                 while (at < items.Count && !(items[at].Device == item.Device && items[at].Participant == item.Participant)) at++;
-                if (at < items.Count) items[at] = item;
-                else if (at < MaxItems) items.Add(item);
+                if (at == MaxItems) continue;
+                if (at == items.Count) items.Add(new PresenceItem { Participant = item.Participant, Device = item.Device });
+                PresenceItem kept = items[at];
+                kept.CaptureNs = item.CaptureNs;
+                Array.Copy(item.Pose.P, kept.Pose.P, 3);
+                Array.Copy(item.Pose.Q, kept.Pose.Q, 4);
             }
         }
     }

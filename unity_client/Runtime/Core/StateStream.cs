@@ -152,7 +152,7 @@ namespace IrisSession.Core
             try
             {
                 reader.Reset(message.Buffer, message.OffsetOf(1), message.LengthOf(1));
-                scratch = StateHeader.Read(reader);
+                reader.ReadInto(scratch);
                 reader.ExpectEnd();
                 return true;
             }

@@ -68,6 +68,8 @@ namespace IrisSession.Core.Tests
             for (int i = 32; i < frame.Length; i++) frame[i] = 0xff;
             Decode(decoder, frame);
             Assert.AreEqual(new[] { -2147483648f, 2147483648f, -2147483648f }, decoder.Positions);
+            BitConverter.GetBytes(float.PositiveInfinity).CopyTo(frame, 4);
+            Assert.Throws<DecodeException>(() => Decode(decoder, frame));
         }
 
         [Test]
