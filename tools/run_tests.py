@@ -120,6 +120,8 @@ def make_long_stages() -> tuple[Stage, ...]:
         ),
         make_pytest("long", "e2e and long", "-p", "no:xdist", "tests"),
         Stage("fuzz", (sys.executable, "tools/fuzz.py", "--target", "all", "--inputs", "100000", "--seed", "1")),
+        # 300,000 damaged messages, frames and assets for each decoder, on both runtimes.
+        Stage("C#", (sys.executable, "-m", "tools.csharp", "test", "--long")),
         Stage("hostile", (sys.executable, "tools/hostile.py", "--quick")),
         Stage("soak", (sys.executable, "tools/soak.py", "--seconds", "120", "--operators", "3", "--observers", "1")),
     )

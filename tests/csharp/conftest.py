@@ -16,8 +16,6 @@ from tools.csharp.project import Build, build, run_tests
 
 #: Of the user, taken before the tests get a cache of their own: the tool chain is 180 MB.
 FOLDER: Final = default_root("csharp")
-#: With it, more and longer tests (`make test-long`).
-LONG: Final = "IRIS_CSHARP_LONG"
 
 
 @pytest.fixture(scope="session")
@@ -40,7 +38,7 @@ def run_suite(built: Build, tmp_path_factory: pytest.TempPathFactory) -> Callabl
             with FileLock(f"{results}.lock"):
                 if not results.exists():
                     unfinished = Path(f"{results}.new")
-                    run_tests(built, runtime, unfinished, *(["--long"] if os.environ.get(LONG) else []))
+                    run_tests(built, runtime, unfinished)
                     unfinished.rename(results)
             known[runtime] = [json.loads(line) for line in results.read_text().splitlines()]
         return known[runtime]

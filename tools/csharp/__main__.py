@@ -49,7 +49,9 @@ def main(arguments: list[str] | None = None) -> int:
             failures = [one for one in results if one["failure"]]
             for one in failures:
                 print(f"FAILED on {runtime}: {one['name']}\n{one['failure']}\n")
-            print(f"{runtime}: {len(results) - len(failures)} passed, {len(failures)} failed")
+            skipped = sum(bool(one["skipped"]) for one in results)
+            passed = len(results) - len(failures) - skipped
+            print(f"{runtime}: {passed} passed, {len(failures)} failed, {skipped} skipped")
             failed += len(failures)
         return int(failed > 0)
     except ToolchainError as error:

@@ -27,6 +27,7 @@ from tools.csharp.vectors import render_message_vectors
 ROOT: Final = HERE.parents[1]
 PACKAGES: Final = ("unity_client",)
 RUNNER: Final = "runner"
+FUZZ_LONG: Final = 300_000
 #: Builds that are kept; the oldest are removed.
 _KEPT: Final = 8
 
@@ -181,7 +182,8 @@ def run_tests(build: Build, runtime: str, results: Path, *options: str) -> list[
         build: What `build` returned.
         runtime: `dotnet` or `mono`.
         results: File to write.
-        options: `--long`: those of the category Long too. `--filter TEXT`: those whose full name has the text.
+        options: `--long`: those of the category Long too, and `FUZZ_LONG` damaged inputs for each decoder, otherwise a
+            few thousand. `--filter TEXT`: those whose full name has the text.
 
     Returns:
         For each test `name` (`Namespace.Fixture.Test(arguments)`), `fixture`, `seconds`, and `failure`, empty if it
@@ -191,8 +193,11 @@ def run_tests(build: Build, runtime: str, results: Path, *options: str) -> list[
         ToolchainError: The process died; the text is what it printed.
     """
     with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "messages.txt").write_text(render_message_vectors(ROOT / "docs/protocol"), encoding="utf-8")
+        is_long = "--long" in options
+        vectors = render_message_vectors(ROOT / "docs/protocol", 30_000 if is_long else 3_000)
+        Path(folder, "messages.txt").write_text(vectors, encoding="utf-8")
         Path(folder, "deflate.bin").write_bytes(render_deflate_vectors())
-        data = {"IRIS_VECTORS": folder, "IRIS_REPO": str(ROOT)}
-        run_tool(build.make_test_command(runtime, results, *options), f"the tests on {runtime}", data)
+        data = {"IRIS_VECTORS": folder, "IRIS_REPO": str(ROOT), **({"IRIS_FUZZ": str(FUZZ_LONG)} if is_long else {})}
+        command = build.make_test_command(runtime, results, *options)
+        run_tool(command, f"the tests on {runtime}", data, timeout_s=3_600.0 if is_long else 300.0)
     return [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]

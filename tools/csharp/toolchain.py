@@ -48,8 +48,6 @@ _ROSLYN: Final = (
     "Microsoft.CodeAnalysis.dll", "Microsoft.CodeAnalysis.CSharp.dll",
     "System.Collections.Immutable.dll", "System.Reflection.Metadata.dll",
 )  # fmt: skip
-#: Longest time for one download, compilation or the start of a tool [s].
-_TIMEOUT_S: Final = 300.0
 
 
 class ToolchainError(RuntimeError):
@@ -168,13 +166,35 @@ def prepare_toolchain(folder: Path | None = None) -> Toolchain:
         raise ToolchainError(f"the C# tool chain cannot be kept: {error}") from error
 
 
-def run_tool(command: Sequence[str], what: str, variables: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Run a command and return what it printed. Raises `ToolchainError` with its words when it fails."""
+def run_tool(
+    command: Sequence[str],
+    what: str,
+    variables: Mapping[str, str] = MappingProxyType({}),
+    *,
+    timeout_s: float = 300.0,
+) -> str:
+    """Run a command and return what it printed.
+
+    Args:
+        command: Program and arguments.
+        what: What it does, for the error.
+        variables: Added to the environment.
+        timeout_s: When it is killed [s].
+
+    Raises:
+        ToolchainError: It failed; the text is what it printed.
+    """
     # No second compilation of what runs often: these processes live for seconds.
     environment = {**os.environ, "DOTNET_TieredPGO": "0", "DOTNET_EnableDiagnostics": "0", **variables}
     try:
         result = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT_S, check=False, env=environment
+            command,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout_s,
+            check=False,
+            env=environment,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ToolchainError(f"{what}: {error}") from error

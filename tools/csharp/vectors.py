@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from random import Random
 from typing import Any, Final
@@ -48,11 +49,12 @@ _PROBES: Final[tuple[object, ...]] = (
     b"", b"x", [], [0], [0.5], ["x"], [[]], {}, {"x": 1}, {"x": "y"},
 )  # fmt: skip
 #: Longest array that is tried [elements]; above, only the bound itself is checked, by refused vectors of docs/protocol.
-_LONGEST_PROBE: Final = 5_000
+_LONGEST_PROBE: Final = 300
 #: First bytes of MessagePack values.
 _CODES: Final = (0x00, 0x7F, 0x80, 0x8F, 0x90, 0x9F, 0xA0, 0xBF, *range(0xC0, 0x100))
 
 
+@cache
 def render_message_vectors(docs: Path, mutations: int = 3_000) -> str:
     """Return the lines.
 

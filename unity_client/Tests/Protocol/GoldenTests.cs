@@ -11,15 +11,13 @@ namespace IrisSession.Protocol.Tests
         [Test]
         public void VectorsAreReadAndWrittenByteForByte()
         {
-            foreach (Vector each in Vectors.All.Where(each => !each.IsRefused))
-                CollectionAssert.AreEqual(each.Canonical, Vectors.ReadAndWrite(each.Type, each.Bytes), each.Name);
+            foreach (Vector each in Vectors.All.Where(each => !each.IsRefused)) AssertReads(each, null);
         }
 
         [Test]
         public void RefusedVectorsThrow()
         {
-            foreach (Vector each in Vectors.All.Where(each => each.IsRefused))
-                Assert.Throws<WireException>(() => Vectors.ReadAndWrite(each.Type, each.Bytes), each.Name);
+            foreach (Vector each in Vectors.All.Where(each => each.IsRefused)) AssertRefuses(each, null);
         }
 
         [Test]
@@ -30,13 +28,26 @@ namespace IrisSession.Protocol.Tests
                 WireValue present = Vectors.Create(group.Key);
                 List<Vector> vectors = group.ToList();
                 var random = new Random(7);
-                for (int i = 0; i < 2 * vectors.Count; i++)
+                for (int i = 0; i < 60; i++)
                 {
                     Vector each = vectors[random.Next(vectors.Count)];
-                    if (each.IsRefused) Assert.Throws<WireException>(() => Vectors.ReadAndWrite(each.Type, each.Bytes, present));
-                    else CollectionAssert.AreEqual(each.Canonical, Vectors.ReadAndWrite(each.Type, each.Bytes, present), each.Name);
+                    if (each.IsRefused) AssertRefuses(each, present);
+                    else AssertReads(each, present);
                 }
             }
+        }
+
+        static void AssertReads(Vector each, WireValue into)
+        {
+            byte[] written = Vectors.ReadAndWrite(each.Type, each.Bytes, into);
+            if (!written.SequenceEqual(each.Canonical)) CollectionAssert.AreEqual(each.Canonical, written, each.Name);
+        }
+
+        static void AssertRefuses(Vector each, WireValue into)
+        {
+            try { Vectors.ReadAndWrite(each.Type, each.Bytes, into); }
+            catch (WireException) { return; }
+            Assert.Fail("{0} is read", each.Name);
         }
 
         [Test]

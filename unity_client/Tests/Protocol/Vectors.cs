@@ -12,6 +12,9 @@ namespace IrisSession.Protocol.Tests
     {
         public string Type, Name;
         public bool IsRefused;
+
+        /// <summary>Made from others by a tool.</summary>
+        public bool IsDerived;
         public byte[] Bytes, Canonical;
 
         public override string ToString() { return Name; }
@@ -31,6 +34,7 @@ namespace IrisSession.Protocol.Tests
                 return all = File.ReadLines(Path.Combine(folder, "messages.txt")).Select(line => line.Split('\t')).Select(row => new Vector
                 {
                     IsRefused = row[0] == "refuses", Type = row[1], Bytes = Parse(row[2]), Canonical = Parse(row[3]), Name = row[1] + " " + row[4],
+                    IsDerived = row[4].Contains(" = ") || row[4].Contains(", mutation") || row[4].EndsWith(" order"),
                 }).ToList();
             }
         }
