@@ -17,7 +17,10 @@ ROOT = Path(__file__).parents[2]
 
 
 # Packed bytes of arrays and deformables depend on the version of zstd: their own tests compare decoded values.
-@pytest.mark.parametrize("target", [name for name in generate.TARGETS if name not in ("arrays", "deformable")])
+@pytest.mark.parametrize(
+    "target",
+    [*(name for name in generate.TARGETS if name not in ("arrays", "deformable")), generate.UNITY_META],
+)
 def test_generated_files_are_current(target: str) -> None:
     outdated = [str(path.relative_to(ROOT)) for path, _ in generate.find_outdated(ROOT, [target])]
     assert outdated == [], f"run: python -m tools.codegen {target}"
@@ -35,12 +38,17 @@ def test_check_fails_for_a_stale_file_and_writing_repairs_it(
     root = ["--root", str(tmp_path)]
     assert generate.main(["docs", "--check", *root]) == 1
     assert generate.main(["typescript", "--check", *root]) == 0
+    stray = tmp_path / "unity_client/Runtime/Gone.cs.meta"
+    stray.write_text("guid: 0")
     assert generate.main(["all", *root]) == 0
-    assert [line.split(": ")[1] for line in capsys.readouterr().out.splitlines()] == [
+    wrote = [line.split(": ")[1] for line in capsys.readouterr().out.splitlines()]
+    assert [path for path in wrote if not path.endswith(".meta")] == [
         "docs/protocol.md",
         "docs/protocol/golden.json",
         "docs/protocol.md",
     ]
+    assert not stray.exists()
+    assert generate.main(["all", "--check", *root]) == 0
     assert generate.main(["docs", "--check", *root]) == 0
     assert text.read_text() == (ROOT / "docs/protocol.md").read_text()
 

@@ -23,10 +23,13 @@ from tools.codegen import (
     tables,
     typescript,
     typescript_schema,
+    unity_meta,
     web_golden,
 )
 
 _DOCUMENT: Final = "docs/protocol.md"
+#: The target of many files.
+UNITY_META: Final = "unity-meta"
 
 
 def update_document(text: str) -> str:
@@ -58,9 +61,15 @@ TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
 
 
 def find_outdated(root: Path, names: list[str]) -> list[tuple[Path, str]]:
-    """Return the files of the targets `names` below `root` that are not current, each with its new text."""
+    """Return the files of the targets `names` below `root` that are not current, each with its new text.
+
+    It is empty for a file that should not be there.
+    """
     found = []
     for name in names:
+        if name == UNITY_META:
+            found += unity_meta.find_outdated(root)
+            continue
         relative, make = TARGETS[name]
         path = root / relative
         present = path.read_text(encoding="utf-8") if path.exists() else ""
@@ -73,15 +82,17 @@ def find_outdated(root: Path, names: list[str]) -> list[tuple[Path, str]]:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line. Exit status 1 with `--check` when a file is not current."""
     parser = argparse.ArgumentParser(prog="python -m tools.codegen", description=__doc__)
-    parser.add_argument("what", choices=[*TARGETS, "all"])
+    parser.add_argument("what", choices=[*TARGETS, UNITY_META, "all"])
     parser.add_argument("--check", action="store_true", help="write nothing; fail when a file is not current")
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[2], help="the checkout")
     options = parser.parse_args(arguments)
     if not (options.root / _DOCUMENT).exists():
         parser.error(f"{options.root} is not a checkout: {_DOCUMENT} is missing")
-    files = find_outdated(options.root, list(TARGETS) if options.what == "all" else [options.what])
+    files = find_outdated(options.root, [*TARGETS, UNITY_META] if options.what == "all" else [options.what])
     for path, text in files:
-        if not options.check:
+        if not options.check and not text:
+            path.unlink()
+        elif not options.check:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8", newline="\n")
         print(f"{'not current' if options.check else 'wrote'}: {path.relative_to(options.root)}")

@@ -1,0 +1,53 @@
+"""The Unity package: one assembly per layer, each with its tests; what Unity reads of it is consistent."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+from tools.csharp.project import ROOT
+
+PACKAGE = ROOT / "unity_client"
+ASSEMBLIES = {path: json.loads(path.read_text()) for path in sorted(PACKAGE.rglob("*.asmdef"))}
+LAYERS = [path for path in ASSEMBLIES if path.relative_to(PACKAGE).parts[0] == "Runtime"]
+
+
+def test_manifest_has_the_version_of_the_session() -> None:
+    manifest = json.loads((PACKAGE / "package.json").read_text())
+    assert manifest["version"] == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert re.fullmatch(r"com\.[a-z0-9._-]+", manifest["name"])
+
+
+def test_each_layer_is_an_assembly_with_tests() -> None:
+    assert {"IrisSession.Protocol", "IrisSession.Core"} <= {ASSEMBLIES[path]["name"] for path in LAYERS}
+    for path, content in ASSEMBLIES.items():
+        assert path.stem == content["name"] == content["rootNamespace"]
+    for path in LAYERS:
+        tests = PACKAGE / "Tests" / path.parent.name / f"{path.stem}.Tests.asmdef"
+        assert path.stem in ASSEMBLIES[tests]["references"]
+        assert "UNITY_INCLUDE_TESTS" in ASSEMBLIES[tests]["defineConstraints"]
+
+
+def test_layers_refer_to_assemblies_that_exist() -> None:
+    names = {content["name"] for content in ASSEMBLIES.values()}
+    for content in ASSEMBLIES.values():
+        own = {name for name in content["references"] if name.startswith("IrisSession.")}
+        assert own <= names
+
+
+def test_every_asset_has_an_id_of_its_own() -> None:
+    """That each has one: tests/codegen."""
+    ids = [re.search(r"^guid: ([0-9a-f]{32})$", path.read_text(), re.MULTILINE) for path in PACKAGE.rglob("*.meta")]
+    assert all(ids)
+    assert len({found[1] for found in ids if found}) == len(ids)
+
+
+def test_sources_do_what_il2cpp_can_compile() -> None:
+    """Neither reflection nor code that is made at run time, in what apps contain."""
+    sources: list[Path] = [path for layer in LAYERS for path in layer.parent.rglob("*.cs")]
+    assert len(sources) > 3
+    for path in sources:
+        found = re.search(r"System\.Reflection|Activator\.|\bdynamic\b|Linq\.Expressions|Emit\b", path.read_text())
+        assert not found, f"{path}: {found}"
