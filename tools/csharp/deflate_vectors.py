@@ -59,6 +59,49 @@ def inflate(stream: bytes, size: int) -> bytes | None:
     return content if len(content) == size and decompressor.eof and not decompressor.unused_data else None
 
 
+def make_dynamic_block(
+    widths: dict[int, int], symbols: list[tuple[int, int]], length_count: int = 257, code: str = "01"
+) -> bytes:
+    """Return a block with codes of its own, whose content is `AAA`.
+
+    `widths`: of the codes of code lengths, by symbol. `symbols`: code lengths and repetitions with their extra bits.
+    `code`: bits of A, then of the end of the block, as many each.
+    """
+    order = (16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15)
+    codes, next_code = {}, 0
+    for width in range(1, 8):
+        for symbol in sorted(widths):
+            if widths[symbol] == width:
+                codes[symbol] = format(next_code, f"0{width}b")
+                next_code += 1
+        next_code <<= 1
+    half = len(code) // 2
+    bits = "1" + "01" + f"{length_count - 257:05b}"[::-1] + "00000" + f"{19 - 4:04b}"[::-1]
+    bits += "".join(f"{widths.get(symbol, 0):03b}"[::-1] for symbol in order)
+    extra = {16: 2, 17: 3, 18: 7}
+    for symbol, more in symbols:
+        bits += codes[symbol] + (f"{more:0{extra[symbol]}b}"[::-1] if symbol in extra else "")
+    bits += 3 * code[:half] + code[half:]
+    bits += "0" * (-len(bits) % 8)
+    return bytes(int(bits[at : at + 8][::-1], 2) for at in range(0, len(bits), 8))
+
+
+def list_headers() -> Iterator[bytes]:
+    """Yield streams with the content `AAA`: a good one, and some whose codes are not as they must be."""
+    widths = {1: 1, 18: 2, 0: 2}
+    a, b = (
+        [(18, 65 - 11), (1, 0), (18, 127), (18, 52 - 11), (1, 0)],
+        [(18, 65 - 11), (2, 0), (18, 127), (18, 52 - 11), (2, 0)],
+    )
+    yield make_dynamic_block(widths, [*a, (1, 0)])
+    yield make_dynamic_block(widths, [*a, (0, 0)])  # no distances
+    yield make_dynamic_block({1: 2, 18: 2, 0: 2}, [*a, (1, 0)])  # a sequence of bits without meaning
+    yield make_dynamic_block({2: 1, 18: 2, 0: 2}, [*b, (0, 0)], code="0001")  # the same of literals
+    yield make_dynamic_block(widths, [*a, (18, 30 - 11), (1, 0)], 287)  # too many lengths
+    yield make_dynamic_block(widths, [*a, (18, 0)])  # a repetition beyond the last one
+    yield make_dynamic_block(widths, [*a[:-1], (0, 0), (1, 0)])  # no end
+
+
 def list_streams(rng: random.Random) -> Iterator[tuple[bytes, bytes]]:
     """Yield streams and their contents."""
     contents = make_contents(rng)
@@ -77,6 +120,7 @@ def render_deflate_vectors(seed: int = 1, damaged: int = 2000) -> bytes:
     rng = random.Random(seed)
     vectors: list[tuple[bytes, bytes | None, int]] = []
     vectors += ((stream, content, len(content)) for stream, content in list_streams(rng))
+    vectors += ((stream, inflate(stream, 3), 3) for stream in list_headers())
     # Short ones with codes of their own: most of their bytes say which.
     pieces = [
         content[at : at + rng.randrange(300, 2000)] for content in make_contents(rng).values() for at in (0, 5000)

@@ -1,5 +1,6 @@
 using System;
 using System.Collections.Generic;
+using IrisSession.Protocol;
 using NUnit.Framework;
 
 namespace IrisSession.Core.Tests
@@ -75,12 +76,30 @@ namespace IrisSession.Core.Tests
             Assert.Throws<DecodeException>(() => new ArrayDecoder().Decode(bytes, 143));
         }
 
+        [TestCase("deflate")]
+        [TestCase("none")]
+        public void WhatBytesCannotHoldIsNotAllocated(string codec)
+        {
+            ArrayInfo info = new ArrayInfo { Name = "pixels", Dtype = "u1", Shape = new[] { 1L << 29 }, Bytes = 10, Codec = codec };
+            byte[] header = new ArrayHeader { Kind = "image", Arrays = new[] { info } }.Encode();
+            byte[] asset = new byte[8 + header.Length + 10];
+            System.Text.Encoding.ASCII.GetBytes("IRA1").CopyTo(asset, 0);
+            BitConverter.GetBytes(header.Length).CopyTo(asset, 4);
+            header.CopyTo(asset, 8);
+            ArrayDecoder decoder = new ArrayDecoder();
+            Assert.Throws<DecodeException>(() => decoder.Decode(asset));
+            long before = GC.GetAllocatedBytesForCurrentThread();
+            Assert.Throws<DecodeException>(() => decoder.Decode(asset));
+            long allocated = GC.GetAllocatedBytesForCurrentThread() - before;
+            Assert.LessOrEqual(allocated, 100000L);
+        }
+
         [Test]
         public void DamagedAssetsGiveOneExceptionAndAllocateNoMoreThanTheirBytesCanHold()
         {
             Random random = new Random(31);
             ArrayDecoder decoder = new ArrayDecoder();
-            int rounds = int.Parse(Environment.GetEnvironmentVariable("IRIS_FUZZ") ?? "2000");
+            int rounds = int.Parse(System.Environment.GetEnvironmentVariable("IRIS_FUZZ") ?? "2000");
             byte[][] assets = Assets.ConvertAll(asset => Golden.FromHex(asset["hex"].Text)).ToArray();
             for (int round = 0; round < rounds; round++)
             {

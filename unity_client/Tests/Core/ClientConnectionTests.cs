@@ -88,16 +88,19 @@ namespace IrisSession.Core.Tests
         {
             FakeSession session = FakeSession.Join();
             ClientConnection client = session.Client;
-            for (int i = 0; i < 300; i++) client.Send(MakeSample(client));
-            Assert.AreEqual(300 - 256, client.Counters.SamplesNotSent);
+            for (int i = 0; i < 255; i++) client.Send(MakeSample(client));
+            client.Request(new Acquire { Robots = new[] { "left" } });
+            Assert.IsFalse(client.Send(MakeSample(client)));
             Assert.Throws<NotConnectedException>(() => client.Request(new Acquire { Robots = new[] { "left" } }));
             Assert.IsTrue(client.Send(new EStop()));
             client.Request(new Release { Targets = new[] { new Target { Name = "left", LeaseVersion = 7 } } });
             List<ClientMessage> sent = session.TakeSent();
             Assert.AreEqual(256, sent.Count);
             Assert.AreEqual("estop", sent[0].Tag);
-            Assert.AreEqual("release", sent[1].Tag);
-            Assert.AreEqual(1, ((Sample)sent[2]).Seq);
+            Assert.AreEqual(253, sent.FindAll(message => message is Sample).Count);
+            Assert.AreEqual("acquire release", sent[254].Tag + " " + sent[255].Tag);
+            Assert.AreEqual(3, client.Counters.SamplesNotSent);
+            Assert.AreEqual(1, client.Counters.OutgoingDropped);
         }
 
         [Test]

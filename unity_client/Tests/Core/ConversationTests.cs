@@ -1,6 +1,7 @@
 // docs/protocol/conversations.json: the core behaves as the file states.
 using System;
 using System.Collections.Generic;
+using System.Security.Cryptography;
 using IrisSession.Protocol;
 using NUnit.Framework;
 
@@ -13,7 +14,7 @@ namespace IrisSession.Core.Tests
         {
             foreach (Json conversation in Golden.Load("conversations")["conversations"].Items)
             {
-                if (conversation["core"].Text == "connection") yield return conversation["name"].Text;
+                yield return conversation["name"].Text;
             }
         }
 
@@ -21,9 +22,16 @@ namespace IrisSession.Core.Tests
         public void Plays(string name)
         {
             Json conversation = Golden.Load("conversations")["conversations"].Items.Find(one => one["name"].Text == name);
-            ConversationPlayer player = new ConversationPlayer(conversation["secret"].Text, conversation["resume_token"].Text);
+            bool isLoader = conversation["core"].Text == "asset loader";
+            ConversationPlayer player = isLoader ? null : new ConversationPlayer(conversation["secret"].Text, conversation["resume_token"].Text);
+            AssetPlayer loader = new AssetPlayer();
             int number = 0;
-            foreach (Json step in conversation["steps"].Items) player.PlayStep(step, name + ", step " + number++ + ": " + step["do"].Text);
+            foreach (Json step in conversation["steps"].Items)
+            {
+                string where = name + ", step " + number++ + ": " + step["do"].Text;
+                if (isLoader) loader.PlayStep(step, where);
+                else player.PlayStep(step, where);
+            }
         }
     }
 
@@ -210,6 +218,71 @@ namespace IrisSession.Core.Tests
                 ["other_connection"] = connection.Counters.OtherConnection,
                 ["reconnects"] = connection.Counters.Reconnects,
             };
+        }
+    }
+
+    /// <summary>An asset loader that takes steps of a conversation, with the assets in memory.</summary>
+    internal sealed class AssetPlayer
+    {
+        private readonly AssetLoader loader = new AssetLoader();
+        private readonly Dictionary<string, List<byte>> stored = new Dictionary<string, List<byte>>();
+
+        public void PlayStep(Json step, string where)
+        {
+            long nowNs = step["at_ns"].Long;
+            string outcome = "";
+            switch (step["do"].Text)
+            {
+                case "want":
+                    loader.Add(step["address"].Text, step["size"].Long);
+                    List<string> lookups = new List<string>();
+                    loader.TakeLookups(lookups);
+                    foreach (string address in lookups)
+                    {
+                        stored[address] = new List<byte>();
+                        loader.OnMissing(address, 0);
+                    }
+                    break;
+                case "receive":
+                    byte[] head = Golden.FromHex(step["frames"].Items[0].Text);
+                    outcome = ProcessChunk(AssetChunk.Read(new WireReader(head)), Golden.FromHex(step["frames"].Items[1].Text), nowNs);
+                    break;
+                case "link_lost":
+                    loader.OnLinkLost(nowNs);
+                    break;
+            }
+            List<ChunkRequest> requests = new List<ChunkRequest>();
+            loader.TakeRequests(nowNs, requests);
+            List<object> sent = new List<object>();
+            foreach (ChunkRequest request in requests)
+            {
+                byte[] bytes = new AssetRequest { Version = 1, ConnectionEpoch = 1, RequestId = request.RequestId, Address = request.Address, Offset = request.Offset, Length = request.Length }.Encode();
+                sent.Add(Golden.ToHex(bytes, 0, bytes.Length));
+            }
+            JsonCheck.AreEqual(step["sent"], sent, where + ": sent");
+            Assert.AreEqual(step["outcome"].Text, outcome, where);
+            Assert.AreEqual((bool)step["idle"].Value, loader.IsIdle, where);
+        }
+
+        private string ProcessChunk(AssetChunk chunk, byte[] data, long nowNs)
+        {
+            AssetOutcome outcome = loader.ProcessChunk(chunk.RequestId, chunk.Address, chunk.Offset, chunk.Total, data.Length, nowNs);
+            if (outcome == AssetOutcome.Failed) return "failed: " + loader.FailureReason;
+            if (outcome != AssetOutcome.Store) return outcome.ToString().ToLowerInvariant();
+            stored[chunk.Address].AddRange(data);
+            loader.OnStored(data.Length);
+            if (!loader.IsComplete(chunk.Address)) return "stored";
+            using (SHA256 sha = SHA256.Create())
+            {
+                byte[] digest = sha.ComputeHash(stored[chunk.Address].ToArray());
+                if (Golden.ToHex(digest, 0, digest.Length) == chunk.Address)
+                {
+                    loader.Remove(chunk.Address);
+                    return "complete";
+                }
+            }
+            stored[chunk.Address].Clear();
+            return loader.RestartAsset(chunk.Address) ? "hash mismatch, again" : "failed: hash";
         }
     }
 

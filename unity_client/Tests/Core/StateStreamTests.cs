@@ -108,6 +108,36 @@ namespace IrisSession.Core.Tests
             Assert.AreEqual(0, allocated);
         }
 
+        [Test]
+        public void ReportHasAgesAndGaps()
+        {
+            StateStream stream = MakeStream();
+            ArrivalMeter meter = new ArrivalMeter();
+            Assert.IsNull(meter.Poll(stream, 0, 0));
+            for (int i = 0; i < 51; i++)
+            {
+                int seq = i < 40 ? i + 1 : i + 4; // three are lost
+                stream.Drain(new[] { Rigid(seq, 16 * i) }, (16 * i + (i == 30 ? 40 : 5)) * Ms, 16 * i * Ms);
+                meter.RecordState(stream);
+                meter.RecordDrawn();
+            }
+            stream.Drain(new[] { Rigid(60, 16 * 50) }, 1400 * Ms, 850 * Ms); // the same state again: its source is silent
+            meter.RecordState(stream);
+            meter.RecordMedia(1000, 20 * Ms);
+            Assert.IsNull(meter.Poll(stream, 0, 999 * Ms));
+            ClientReport report = meter.Poll(stream, 3 * Ms, 1000 * Ms);
+            Assert.AreEqual(5.0, report.AgeMsP50, 1e-9);
+            Assert.AreEqual(40.0, report.AgeMsP99, 1e-9);
+            Assert.AreEqual(52, report.Delivered);
+            Assert.AreEqual(3 + 5, report.Missed);
+            Assert.AreEqual(3.0, report.RttMs, 1e-9);
+            Assert.AreEqual(51.0, report.DisplayHz, 1e-9);
+            Assert.AreEqual(20.0, report.MediaAgeMs, 1e-9);
+            Assert.AreEqual((double)stream.Counters.BytesReceived, report.BytesPerS, 1e-6);
+            report = meter.Poll(stream, 0, 2000 * Ms);
+            Assert.AreEqual(0.0, report.AgeMsP99);
+        }
+
         private static StateStream MakeStream()
         {
             StateStream stream = new StateStream { SceneEpoch = 1 };
