@@ -27,7 +27,7 @@ namespace IrisSession.Core.Tests
         public void SilentSessionIsJoinedAgainWithTheToken()
         {
             FakeSession session = FakeSession.Join();
-            session.NowNs += 3 * Second;
+            session.NowNs += 5 * Second;
             session.Client.Tick(session.NowNs); // we stood still ourselves: messages may wait
             Assert.AreEqual(ConnectionPhase.Ready, session.Client.Phase);
             for (int i = 0; i < 9 && session.Client.IsJoined; i++)
