@@ -23,6 +23,7 @@ SLIVER_LINES = 80
 SLIVERS = {
     "tools.codegen.cloud_golden": "one module for each file of vectors",
     "tools.codegen.conversions": "the reference for clients that convert to engine frames",
+    "tools.codegen.unity_meta": "the only target of many files, which are no messages",
     "iris_session.doctor.drop_explanations": "a table that grows with every reason",
     "iris_session.emulator.behaviours.wander": "one behaviour per file",
     "iris_session.front.uplink": "the counterpart of downlink",
