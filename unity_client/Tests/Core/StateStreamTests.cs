@@ -46,6 +46,11 @@ namespace IrisSession.Core.Tests
             int shown = 0;
             for (int i = 0; i < 20; i++) if (stream.Drain(new[] { Rigid(2 + i, 100 + 20 * i) }, (500 + 20 * i) * Ms, (490 + 20 * i) * Ms)) shown++;
             Assert.Greater(shown, 10);
+            stream = MakeStream();
+            stream.Drain(new[] { Rigid(1, 0) }, 10 * Ms, 0);
+            shown = 0;
+            for (int i = 0; i < 10; i++) if (stream.Drain(new[] { Rigid(2 + i, 100 + 100 * i) }, (500 + 100 * i) * Ms, (490 + 100 * i) * Ms)) shown++;
+            Assert.Greater(shown, 6); // though every one comes after a silence
         }
 
         [Test]
