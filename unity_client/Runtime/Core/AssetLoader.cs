@@ -208,7 +208,7 @@ namespace IrisSession.Core
             Item item = Find(address);
             if (item == null || offset != item.Got) return AssetOutcome.Ignored;
             long expected = Math.Min(ask.Request.Length, total - offset);
-            if (total < 0 || (item.Total != -1 && item.Total != total) || size > ask.Request.Length || size > expected || (size == 0 && expected != 0))
+            if ((item.Total != -1 && item.Total != total) || size > ask.Request.Length || size > expected || (size == 0 && expected != 0))
             {
                 return Fail(address, "protocol", "the session contradicts itself about asset " + address);
             }

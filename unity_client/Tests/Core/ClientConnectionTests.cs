@@ -84,6 +84,29 @@ namespace IrisSession.Core.Tests
         }
 
         [Test]
+        public void StopIsSentAgainUntilTheSessionIsKnownToHaveIt()
+        {
+            FakeSession session = FakeSession.Join();
+            ClientConnection client = session.Client;
+            session.SendEvent(new EStopChanged { Active = true, Participant = "p2", StopSeq = 1 }); // of another: no proof
+            client.Send(new EStop { Reason = "people" });
+            session.Receive(new ClockPong { T0Ns = session.NowNs - Ms, T1Ns = 5 * Second, T2Ns = 5 * Second }); // of a ping before it
+            session.NowNs += 2 * Second;
+            client.HandleDisconnect(session.NowNs);
+            List<ClientMessage> sent = session.TakeSent();
+            Assert.AreEqual("hello estop", sent[0].Tag + " " + sent[1].Tag);
+            session.AnswerHello();
+            Assert.AreEqual(1, session.Sent.FindAll(message => message is EStop).Count);
+            // The snapshot does not say that the session is stopped, so its pongs prove nothing; its event does.
+            Assert.IsNotNull(client.PendingEStop.Message);
+            session.SendEvent(new EStopChanged { Active = true, Participant = "p1", StopSeq = 2 });
+            Assert.IsNull(client.PendingEStop.Message);
+            client.Send(new EStop());
+            for (int i = 0; i < 4; i++) session.Advance(Second / 2); // a pong of a ping after it, while stopped
+            Assert.IsNull(client.PendingEStop.Message);
+        }
+
+        [Test]
         public void FullQueueDropsSamplesAndKeepsWhatIsUrgent()
         {
             FakeSession session = FakeSession.Join();
