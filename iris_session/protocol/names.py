@@ -538,4 +538,4 @@ class ArrayCodec:
     """Compression of an array."""
 
     NONE: Final = "none"
-    ZSTD: Final = "zstd"  # one Zstandard frame (RFC 8878), without a dictionary
+    DEFLATE: Final = "deflate"  # one raw stream (RFC 1951), to the last byte

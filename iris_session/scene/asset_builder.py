@@ -1,7 +1,7 @@
 """`AssetBuilder`: encode raw content to assets in a store, with levels of detail, in threads, each content once.
 
 The key of a piece of work is the SHA-256 of its raw content, its options and `ENCODER_VERSION`; the store keeps the
-result. Hashing, Zstandard and large copies of numpy release the interpreter's lock, so threads help. Of the pieces with
+result. Hashing, deflate and large copies of numpy release the interpreter's lock, so threads help. Of the pieces with
 more than `ALONE_BYTES` of raw content only one is in memory at a time.
 """
 
@@ -44,8 +44,8 @@ class EncodeOptions(msgspec.Struct, frozen=True):
     """Options of encoding.
 
     `levels`: add coarser levels. `texture_encoding`: encoding of all levels (`AssetEncoding`): `arrays` decodes
-    fastest, `png` needs no Zstandard, `jpeg` is small and lossy, with `jpeg_quality`, and is not used for textures with
-    alpha.
+    fastest, `png` is what every library reads, `jpeg` is small and lossy, with `jpeg_quality`, and is not used for
+    textures with alpha.
     """
 
     levels: bool = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -11,7 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from iris_session.protocol.assets import MAX_ARRAY_BYTES
 from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
-from iris_session.scene.arrays import StoredArray, apply_filter, decode_arrays, encode_arrays, require_array, to_array
+from iris_session.scene.arrays import (
+    LEVEL,
+    StoredArray,
+    apply_filter,
+    decode_arrays,
+    encode_arrays,
+    require_array,
+    to_array,
+)
 from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 
 Pixels = NDArray[np.uint8]
@@ -102,12 +111,7 @@ def _choose_filter(pixels: Pixels) -> str:
     """Return the filter that makes a middle part smaller: `up` suits photographs, none suits flat colours."""
     middle = max(0, len(pixels) // 2 - _SAMPLE_ROWS // 2)
     sample = np.ascontiguousarray(pixels[middle : middle + _SAMPLE_ROWS])
-    import zstandard
-
-    sizes = {
-        kind: len(zstandard.ZstdCompressor(level=1).compress(apply_filter(sample, kind)))
-        for kind in (ArrayFilter.NONE, ArrayFilter.UP)
-    }
+    sizes = {kind: len(zlib.compress(apply_filter(sample, kind), LEVEL)) for kind in (ArrayFilter.NONE, ArrayFilter.UP)}
     return min(sizes, key=lambda kind: sizes[kind])
 
 

@@ -2,7 +2,7 @@
 
 Coordinates lie on a lattice fixed in the world, whose step is a power of two, so a vertex at rest does not flicker and
 `index * step` is exact in every language. Each index is predicted from others of the same frame in the order of the
-`DeformableTopology`; what remains is small, is split into planes of bytes, and goes through zstd. A vertex off the
+`DeformableTopology`; what remains is small, is split into planes of bytes, and is deflated. A vertex off the
 lattice (not finite, kilometres away) escapes as float32.
 
 Payload, little-endian (normative: docs/deformables.md): header, escapes, planes.
@@ -12,18 +12,18 @@ from __future__ import annotations
 
 import math
 import struct
+import zlib
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import zstandard
 
 from iris_session.protocol.names import BudgetClass
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 #: Bounds [m] of the classes are those of `full` times this.
 COARSER: Final = {BudgetClass.FULL: 1.0, BudgetClass.HALF: 2.0, BudgetClass.QUARTER: 4.0}
 MIN_BOUND_M: Final = 1e-5
@@ -34,13 +34,11 @@ REPEAT_AFTER: Final = 60
 _LATTICE_SHARE: Final = 0.9
 #: Farthest node from the world's origin: float32 has room for another bit. 4 km at a bound of 0.5 mm.
 MAX_NODE: Final = 2**23
-#: Flag: the planes are compressed.
+#: Flag: the planes are one stream of raw deflate.
 _PACKED: Final = 1
 #: format u8, flags u8, planes u8, exponent i8, bound f32 [m], vertices u32, identity u32, escaped u32, origin 3 x i32.
 _HEADER: Final = struct.Struct("<BBBbfIII3i")
 _ESCAPE: Final = np.dtype([("vertex", "<u4"), ("position", "<f4", (3,))])
-#: Of zstd, for frames of others: more than the planes of the largest mesh need.
-_WINDOW: Final = 2**23
 
 Floats = npt.NDArray[np.float64]
 Positions = npt.NDArray[np.float32]
@@ -69,22 +67,19 @@ def exponent_for(bound_m: float) -> int:
 
 
 class DeformableEncoder:
-    """Encoder of one mesh. Deterministic: the same calls give the same bytes (with one version of zstd).
+    """Encoder of one mesh. Deterministic: the same calls give the same bytes (with one version of zlib).
 
     Args:
         topology: Triangles and lines of the mesh.
         bound_m: Every vertex of every frame is at most so far from where it is (Euclidean) [m], also while nothing is
             sent.
         repeat_after: Calls after which what rests is sent again, for those who joined meanwhile.
-        level: Level of the compression.
 
     Raises:
         ValueError: A bound or interval that cannot work.
     """
 
-    def __init__(
-        self, topology: DeformableTopology, bound_m: float = 0.0005, repeat_after: int = REPEAT_AFTER, level: int = 1
-    ) -> None:
+    def __init__(self, topology: DeformableTopology, bound_m: float = 0.0005, repeat_after: int = REPEAT_AFTER) -> None:
         if not MIN_BOUND_M <= bound_m <= MAX_BOUND_M:
             raise ValueError(f"bound_m is {bound_m}: {MIN_BOUND_M:g} to {MAX_BOUND_M:g} m are possible")
         if repeat_after < 1:
@@ -94,7 +89,6 @@ class DeformableEncoder:
         #: Distance that a vertex may move before the mesh is sent again: the bound less the error of the lattice.
         self.drift_m = 0.995 * bound_m - 2.0 ** exponent_for(bound_m) * math.sqrt(3.0) / 2.0
         self._repeat_after = repeat_after
-        self._compressor = zstandard.ZstdCompressor(level=level)
         self._sent: Floats | None = None
         self._rested = 0
         self._scaled = np.empty((3, topology.n_vertices))
@@ -145,7 +139,7 @@ class DeformableEncoder:
         coded = ((residuals << 1) ^ (residuals >> 31)).view(np.uint32)  # small numbers of either sign become small
         n_planes = (int(coded.max()).bit_length() + 7) // 8
         planes = _split_planes(coded, n_planes)
-        packed = self._compressor.compress(planes) if n_planes else b""
+        packed = _deflate(planes)
         flags = _PACKED if len(packed) < len(planes) else 0
         head = _HEADER.pack(
             FORMAT,
@@ -183,7 +177,6 @@ class DeformableDecoder:
     def __init__(self, topology: DeformableTopology) -> None:
         self.topology = topology
         self.bound_m = 0.0
-        self._decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
 
     def decode(self, payload: bytes | memoryview) -> Positions:
         """Decode a frame.
@@ -228,12 +221,13 @@ class DeformableDecoder:
         size = 3 * self.topology.n_vertices * header.planes
         planes: bytes | memoryview = packed
         if header.packed:
+            inflater = zlib.decompressobj(-zlib.MAX_WBITS)
             try:
-                if zstandard.frame_content_size(packed) != size:
-                    raise StreamError(f"packed planes are not {size} bytes long")
-                planes = self._decompressor.decompress(packed, max_output_size=size, allow_extra_data=False)
-            except zstandard.ZstdError as error:
+                planes = inflater.decompress(packed, size + 1)  # room to see that there is more than was asked for
+            except zlib.error as error:
                 raise StreamError(f"packed planes are damaged: {error}") from None
+            if len(planes) != size or not inflater.eof or inflater.unused_data:
+                raise StreamError(f"packed planes are not one stream of {size} bytes")
         if len(planes) != size:
             raise StreamError(f"planes of {len(planes)} bytes, their header asks for {size}")
         coded = np.zeros((3, self.topology.n_vertices), "<u4")
@@ -302,6 +296,12 @@ def _split_planes(coded: npt.NDArray[np.uint32], n_planes: int) -> bytes:
     if n_planes == 1:
         return coded.astype(np.uint8).tobytes()
     return coded.astype("<u4", copy=False).view(np.uint8).reshape(-1, 4)[:, :n_planes].T.tobytes()
+
+
+def _deflate(planes: bytes) -> bytes:
+    """Compress planes. Residuals repeat nothing but single bytes: to look for runs alone is smaller and faster."""
+    compressor = zlib.compressobj(wbits=-zlib.MAX_WBITS, strategy=zlib.Z_RLE)
+    return compressor.compress(planes) + compressor.flush()
 
 
 def _encode_escapes(vertices: Floats, escaped: npt.NDArray[np.int64]) -> bytes:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zstandard
 
 from iris_session.streams.deformable import DeformableDecoder, read_header
 from iris_session.streams.deformable_topology import DeformableTopology
@@ -55,7 +54,7 @@ def test_vectors_cover_every_part_of_the_format() -> None:
 
 
 def test_file_is_current() -> None:
-    """With planes unpacked: another version of zstd may compress differently."""
+    """With planes unpacked: another version of zlib may compress differently."""
 
     def unpack(meshes: list[dict[str, Any]]) -> list[Any]:
         return [
@@ -69,14 +68,14 @@ def unpack_planes(frame: dict[str, Any]) -> bytes:
     payload = bytes.fromhex(frame["hex"])
     header = read_header(payload)
     at = 32 + 16 * header.n_escaped
-    return payload[:at] + (zstandard.decompress(payload[at:]) if header.packed else payload[at:])
+    return payload[:at] + (zlib.decompress(payload[at:], -15) if header.packed else payload[at:])
 
 
 # --- docs/deformables.md, in the order of its steps, one number at a time -------------------------------------------
 
 
 def read_by_the_document(topology: bytes, payload: bytes) -> list[list[float]]:
-    """Return the vertices of `payload` with struct, zlib and zstd only, as a port to another language would."""
+    """Return the vertices of `payload` with struct and zlib only, as a port to another language would."""
     _, plan, flags, n, rows, cols, _, _ = struct.unpack_from("<BBHIIIII", topology)
     words = struct.unpack(f"<{(len(topology) - 24) // 4}I", topology[24:])
     order = words[:n] if flags & 1 else range(n)
@@ -87,7 +86,7 @@ def read_by_the_document(topology: bytes, payload: bytes) -> list[list[float]]:
     )
     assert (n_of, identity) == (n, zlib.crc32(topology))
     at = 32 + 16 * n_escaped
-    data = zstandard.decompress(payload[at:]) if frame_flags & 1 and n_planes else payload[at:]
+    data = zlib.decompress(payload[at:], -15) if frame_flags & 1 and n_planes else payload[at:]
     assert len(data) == 3 * n * n_planes
 
     step = 2.0**exponent

@@ -16,7 +16,7 @@ from tools.codegen import csharp, schema, typescript
 ROOT = Path(__file__).parents[2]
 
 
-# Packed bytes of arrays and deformables depend on the version of zstd: their own tests compare decoded values.
+# Packed bytes of arrays and deformables depend on the version of zlib: their own tests compare decoded values.
 @pytest.mark.parametrize(
     "target",
     [*(name for name in generate.TARGETS if name not in ("arrays", "deformable")), generate.UNITY_META],

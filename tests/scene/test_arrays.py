@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import zlib
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -49,8 +49,8 @@ def test_random_bytes_raise_asset_errors_only(data: bytes) -> None:
 
 
 HUGE = ArrayInfo("a", "f4", (2**40, 3), 4)
-#: A frame with data after it.
-PACKED = zstandard.ZstdCompressor().compress(bytes(30)) + b"more"
+#: A stream with data after it.
+PACKED = zlib.compress(bytes(30), wbits=-15) + b"more"
 
 
 @pytest.mark.parametrize(
@@ -66,8 +66,8 @@ PACKED = zstandard.ZstdCompressor().compress(bytes(30)) + b"more"
         (asset(ArrayInfo("a", "u1", (2,), 2, scale=(1.0,), offset=(0.0,)), body=bytes(2)), "scale and offset"),
         (asset(ArrayInfo("a", "u1", (1,), 1, scale=(float("nan"),), offset=(0.0,)), body=b"a"), "not finite"),
         (asset(ArrayInfo("a", "u1", (1,), 1), body=b"a", kind="image"), "'mesh' is expected"),
-        (asset(ArrayInfo("a", "u1", (9,), 3, codec="zstd"), body=b"abc"), "Zstandard"),
-        (asset(ArrayInfo("a", "u1", (30,), len(PACKED), codec="zstd"), body=PACKED), "damaged"),
+        (asset(ArrayInfo("a", "u1", (9,), 3, codec="deflate"), body=b"\xff\xff\xff"), "damaged"),
+        (asset(ArrayInfo("a", "u1", (30,), len(PACKED), codec="deflate"), body=PACKED), "not one stream"),
     ],
 )
 def test_malformed_assets_are_rejected_with_reason(data: bytes, text: str) -> None:
@@ -75,11 +75,11 @@ def test_malformed_assets_are_rejected_with_reason(data: bytes, text: str) -> No
         decode_arrays(data, "mesh")
 
 
-def test_decompression_bomb_is_rejected_before_unpacking() -> None:
-    bomb = zstandard.ZstdCompressor().compress(bytes(50_000_000))
-    with pytest.raises(AssetDecodeError, match="another size"):
-        decode_arrays(asset(ArrayInfo("a", "u1", (100,), len(bomb), codec="zstd"), body=bomb), "mesh")
-    honest = asset(ArrayInfo("a", "u1", (50_000_000,), len(bomb), codec="zstd"), body=bomb)
+def test_decompression_bomb_is_not_unpacked() -> None:
+    bomb = zlib.compress(bytes(50_000_000), wbits=-15)
+    with pytest.raises(AssetDecodeError, match="not one stream"):
+        decode_arrays(asset(ArrayInfo("a", "u1", (100,), len(bomb), codec="deflate"), body=bomb), "mesh")
+    honest = asset(ArrayInfo("a", "u1", (50_000_000,), len(bomb), codec="deflate"), body=bomb)
     with pytest.raises(AssetDecodeError, match="at most 1000"):
         decode_arrays(honest, "mesh", max_bytes=1_000)
 
@@ -92,8 +92,8 @@ def test_empty_array_may_not_be_endless_along_an_axis() -> None:
 
 
 def test_quantised_arrays_count_with_their_decoded_size() -> None:
-    packed = zstandard.ZstdCompressor().compress(bytes(3_000))
-    info = ArrayInfo("a", "u1", (1_000, 3), len(packed), codec="zstd", scale=(1.0,) * 3, offset=(0.0,) * 3)
+    packed = zlib.compress(bytes(3_000), wbits=-15)
+    info = ArrayInfo("a", "u1", (1_000, 3), len(packed), codec="deflate", scale=(1.0,) * 3, offset=(0.0,) * 3)
     with pytest.raises(AssetDecodeError, match="12000 bytes, at most 11999"):
         decode_arrays(asset(info, body=packed), "mesh", 11_999)
     assert decode_arrays(asset(info, body=packed), "mesh", 12_000)["a"].nbytes == 12_000

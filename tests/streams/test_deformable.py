@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import struct
+import zlib
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -164,18 +164,15 @@ def _with_planes(payload: bytes, packed: bytes) -> bytes:
     return payload[:1] + b"\1\1" + payload[3:HEADER] + packed
 
 
-@pytest.mark.parametrize("more", [-1, 1, 2**34])
-def test_planes_of_wrong_length_are_rejected_before_allocation(more: int) -> None:
+@pytest.mark.parametrize("more", [-1, 1, 2**28])
+def test_planes_of_wrong_length_are_rejected(more: int) -> None:
     topology, vertices = MESHES["rope"]
     payload = encode_full(topology, vertices)
     size = 3 * topology.n_vertices
-    if more < 2**30:
-        packed = zstandard.compress(bytes(size + more))
-    else:  # a zstd frame that declares 16 GiB
-        packed = b"\x28\xb5\x2f\xfd" + bytes([0xE0]) + struct.pack("<Q", more) + zstandard.compress(bytes(size))[6:]
-    with pytest.raises(StreamError, match="not 60 bytes long"):
+    packed = zlib.compress(bytes(size + more), wbits=-15)
+    with pytest.raises(StreamError, match="60 bytes"):
         DeformableDecoder(topology).decode(_with_planes(payload, packed))
-    good = zstandard.compress(bytes(size))
+    good = zlib.compress(bytes(size), wbits=-15)
     assert DeformableDecoder(topology).decode(_with_planes(payload, good)).shape == (20, 3)
     with pytest.raises(StreamError):
         DeformableDecoder(topology).decode(_with_planes(payload, good + good))

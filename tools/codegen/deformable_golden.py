@@ -1,7 +1,7 @@
 """Golden vectors of the deformable stream, for tests of this and every other decoder.
 
 docs/protocol/deformable.json, written by `python -m tools.codegen deformable`: per mesh its topology, and frames
-with the vertices that they decode to. Packed planes are those of the zstd that is installed: another version may pack
+with the vertices that they decode to. Packed planes are those of the zlib that is installed: another may pack
 them otherwise, which decodes to the same.
 """
 

@@ -472,7 +472,7 @@ namespace IrisSession.Protocol
     public static class ArrayCodec
     {
         public const string None = "none";
-        public const string Zstd = "zstd";
+        public const string Deflate = "deflate";
     }
 
     /// <summary>One of 30 messages, distinguished by the field "type".</summary>

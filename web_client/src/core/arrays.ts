@@ -6,7 +6,7 @@ import { MAX_ARRAY_BYTES, MAX_ARRAY_HEADER_BYTES } from "../protocol/schema.g.ts
 import type { AnyArray, DecodedArray, Filled } from "./api.ts";
 import { decodeStruct } from "./codec.ts";
 import { MalformedError } from "./errors.ts";
-import { decompressFrame } from "./zstd.ts";
+import { inflate } from "./inflate.ts";
 
 type ArrayInfo = Filled<wire.ArrayInfo>;
 
@@ -89,7 +89,7 @@ function decodeArray(info: ArrayInfo, packed: Uint8Array): AnyArray {
   if (info.filter === "delta" && info.dtype === "f4") throw new MalformedError("differences of float32 are not exact");
   const size = stateBytes(info);
   let plain: Uint8Array<ArrayBuffer>;
-  if (info.codec === "zstd") plain = decompressFrame(packed, size);
+  if (info.codec === "deflate") plain = inflate(packed, size);
   else if (info.codec === "none") {
     if (packed.length !== size) throw new MalformedError(`array ${info.name} has ${packed.length} bytes, its shape and dtype need ${size}`);
     plain = packed.slice();

@@ -1,7 +1,7 @@
 // Deformable streams: topologies, and frames to vertices. docs/deformables.md is normative.
 
 import { MalformedError } from "./errors.ts";
-import { decompressFrame } from "./zstd.ts";
+import { inflate } from "./inflate.ts";
 
 const TOPOLOGY_BYTES = 24;
 const FRAME_BYTES = 32;
@@ -92,7 +92,7 @@ export class DeformableDecoder {
     const [format, flags, planes] = [view.getUint8(0), view.getUint8(1), view.getUint8(2)];
     const exponent = view.getInt8(3);
     const boundM = view.getFloat32(4, true);
-    if (format !== 1 || flags > 1 || planes > 4) throw new MalformedError(`frame of format ${format}, flags ${flags}, ${planes} planes`);
+    if (format !== 2 || flags > 1 || planes > 4) throw new MalformedError(`frame of format ${format}, flags ${flags}, ${planes} planes`);
     if (exponent < MIN_EXPONENT || exponent > MAX_EXPONENT || !(boundM > 0 && boundM < Number.POSITIVE_INFINITY)) {
       throw new MalformedError(`frame with a lattice of 2^${exponent} m and a bound of ${boundM} m`);
     }
@@ -105,7 +105,7 @@ export class DeformableDecoder {
     checkEscapes(view, escaped, vertexCount);
     const size = 3 * vertexCount * planes;
     const packed = frame.subarray(atPlanes);
-    const coded = flags === 1 ? decompressFrame(packed, size) : packed;
+    const coded = flags === 1 ? inflate(packed, size) : packed;
     if (coded.length !== size) throw new MalformedError(`planes of ${coded.length} bytes, their header asks for ${size}`);
     const positions = new Float32Array(3 * vertexCount);
     const step = 2 ** exponent;

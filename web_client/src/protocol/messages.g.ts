@@ -505,7 +505,7 @@ export type ArrayFilter = (typeof ArrayFilter)[keyof typeof ArrayFilter] | (stri
 /** Compression of an array. */
 export const ArrayCodec = {
   NONE: "none",
-  ZSTD: "zstd",
+  DEFLATE: "deflate",
 } as const;
 export type ArrayCodec = (typeof ArrayCodec)[keyof typeof ArrayCodec] | (string & {});
 
