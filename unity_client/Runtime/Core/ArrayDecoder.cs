@@ -15,7 +15,6 @@ namespace IrisSession.Core
 
         private readonly WireReader reader = new WireReader();
         private readonly Inflater inflater = new Inflater();
-        private readonly ZstdDecoder zstd = new ZstdDecoder();
 
         /// <summary>Decode an asset; quantised arrays become floats.</summary>
         /// <param name="data">The bytes of the asset.</param>
@@ -144,11 +143,6 @@ namespace IrisSession.Core
                     Inflater.CheckSize(length, size);
                     plain = new byte[size];
                     inflater.Inflate(data, at, length, plain, size);
-                    return plain;
-                case "zstd":
-                    ZstdDecoder.CheckFrame(data, at, length, size);
-                    plain = new byte[size];
-                    zstd.Decode(data, at, length, plain, size);
                     return plain;
                 default:
                     throw new DecodeException("unknown compression " + info.Codec);

@@ -18,16 +18,16 @@ namespace IrisSession.Core
 
         /// <summary>Vertices, three numbers each [m], world frame. The next frame overwrites them.</summary>
         public readonly float[] Positions;
-        private readonly ZstdDecoder zstd;
+        private readonly Inflater inflater;
         private readonly int[] nodes;
         private byte[] planeBuffer = new byte[0];
 
         /// <param name="topology">That of the present scene.</param>
-        /// <param name="zstd">May be shared by decoders of one thread.</param>
-        public DeformableDecoder(DeformableTopology topology, ZstdDecoder zstd)
+        /// <param name="inflater">May be shared by decoders of one thread.</param>
+        public DeformableDecoder(DeformableTopology topology, Inflater inflater)
         {
             Topology = topology;
-            this.zstd = zstd;
+            this.inflater = inflater;
             Positions = new float[3 * topology.VertexCount];
             nodes = new int[topology.VertexCount];
         }
@@ -46,7 +46,7 @@ namespace IrisSession.Core
             int planes = frame[offset + 2];
             int exponent = (sbyte)frame[offset + 3];
             float boundM = BitConverter.ToSingle(frame, offset + 4);
-            if (format != 1 || flags > 1 || planes > MaxPlanes) throw new DecodeException("deformable frame of format " + format + ", flags " + flags + ", " + planes + " planes");
+            if (format != 2 || flags > 1 || planes > MaxPlanes) throw new DecodeException("deformable frame of format " + format + ", flags " + flags + ", " + planes + " planes");
             if (exponent < MinExponent || exponent > MaxExponent || !(boundM > 0f) || float.IsInfinity(boundM))
             {
                 throw new DecodeException("deformable frame with a lattice of 2^" + exponent + " m and a bound of " + boundM + " m");
@@ -93,9 +93,9 @@ namespace IrisSession.Core
                 if (count != size) throw new DecodeException("deformable frame: planes of " + count + " bytes, its header asks for " + size);
                 return frame;
             }
-            ZstdDecoder.CheckFrame(frame, at, count, size);
+            Inflater.CheckSize(count, size);
             if (planeBuffer.Length < size) planeBuffer = new byte[size];
-            zstd.Decode(frame, at, count, planeBuffer, size);
+            inflater.Inflate(frame, at, count, planeBuffer, size);
             from = 0;
             return planeBuffer;
         }
