@@ -1,4 +1,4 @@
-"""What does not compile for Unity does not compile here, and why a tool chain cannot be had is said in one line."""
+"""Sources beyond C# 9 and .NET Standard 2.1 do not compile; a missing tool chain is an error of one line."""
 
 from __future__ import annotations
 
@@ -92,6 +92,7 @@ def test_runner_says_what_passed_and_why_not(built: Build, tmp_path: Path, runti
     assert [one["skipped"] for one in lines if one["skipped"]] == ["later"]
 
 
+@pytest.mark.usefixtures("built")
 def test_another_archive_than_the_pinned_one_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def download(package: Package, folder: Path) -> Path:
         archive = folder / "other.tgz"

@@ -1,4 +1,4 @@
-"""Clients that flood or send garbage: they are cut off and named, and nobody else notices."""
+"""Clients that flood or send garbage: they are cut off and named, and other clients go on undisturbed."""
 
 from __future__ import annotations
 

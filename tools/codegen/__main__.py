@@ -95,7 +95,7 @@ def main(arguments: list[str] | None = None) -> int:
         elif not options.check:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8", newline="\n")
-        print(f"{'not current' if options.check else 'wrote'}: {path.relative_to(options.root)}")
+        print(f"{'not current' if options.check else 'wrote' if text else 'removed'}: {path.relative_to(options.root)}")
     return 1 if options.check and files else 0
 
 

@@ -11,7 +11,7 @@ STRATEGIES = (zlib.Z_DEFAULT_STRATEGY, zlib.Z_FILTERED, zlib.Z_HUFFMAN_ONLY, zli
 
 
 def make_contents(rng: random.Random) -> dict[str, bytes]:
-    """Return contents whose frames use every kind of block, literals and sequences."""
+    """Return contents whose streams use every kind of block and of codes."""
     words = [bytes(rng.choices(range(97, 123), k=rng.randint(2, 9))) for _ in range(300)]
     text = b" ".join(rng.choices(words, weights=range(300, 0, -1), k=60_000))
     floats = struct.pack("<8000f", *(0.1 * i + rng.gauss(0.0, 0.01) for i in range(8000)))

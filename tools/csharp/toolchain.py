@@ -93,7 +93,7 @@ class Assembly:
 
 @dataclass(frozen=True)
 class Toolchain:
-    """What `prepare_toolchain` found. Folders: `compiler`, `runtime` (.NET), `surface` (.NET Core 3.1)."""
+    """Folders of a tool chain that is ready: `compiler`, `runtime` (.NET), `surface` (.NET Core 3.1)."""
 
     compiler: Path
     runtime: Path

@@ -109,7 +109,7 @@ def _iterate_scene(scene: dict[str, Any]) -> Iterator[tuple[str, ...]]:
 
 
 def _vary(kind: str, data: str, name: str) -> Iterator[tuple[str, ...]]:
-    """Yield a vector as it is; and with reversed entries of every map, each with one that nobody knows before it."""
+    """Yield a vector as it is, and with the entries of every map reversed, an unknown entry before each."""
     yield "reads", kind, data, data, name
     value = msgpack.unpackb(bytes.fromhex(data), raw=False)
     if (other := msgpack.packb(_reorder(value))) != bytes.fromhex(data):

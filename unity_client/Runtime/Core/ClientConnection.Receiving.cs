@@ -132,7 +132,7 @@ namespace IrisSession.Core
         /// <summary>Return whether a refusal passes: a client that was joined before keeps trying, after `rate` every client does.</summary>
         private bool IsRetryable(string code)
         {
-            return code == "rate" || (Welcome != null && (code == "full" || code == "session_full"));
+            return code == RefusalCode.Rate || (Welcome != null && (code == RefusalCode.Full || code == "session_full"));
         }
 
         private void Fail(Refused refused)
@@ -147,25 +147,25 @@ namespace IrisSession.Core
             Inbox.Add(new InboxMessage(fault));
             switch (fault.Code)
             {
-                case "stalled":
+                case FaultCode.Stalled:
                     IsStalled = true;
                     break;
-                case "recovered":
+                case FaultCode.Recovered:
                     IsStalled = false;
                     break;
-                case "revoked":
+                case FaultCode.Revoked:
                     Fail(new Refused { Code = fault.Code, Message = fault.Message, Advice = "ask the owner of the session" });
                     break;
-                case "dropped" when fault.Reason == Replaced:
+                case FaultCode.Dropped when fault.Reason == Replaced:
                     Fail(new Refused { Code = Replaced, Message = "another device took over with this identity", Advice = "give every headset an identity of its own" });
                     break;
-                case "session_ended":
+                case FaultCode.SessionEnded:
                     if (!IsJoined) break;
                     Counters.Reconnects++;
                     StartBackoff(nowNs);
                     break;
-                case "dropped":
-                case "hello":
+                case FaultCode.Dropped:
+                case FaultCode.Hello:
                     HandleDisconnect(nowNs);
                     break;
             }
@@ -186,7 +186,7 @@ namespace IrisSession.Core
 
         private void ProcessSnapshot(Snapshot snapshot, Multipart message)
         {
-            int bodyCount = Count(snapshot.Bodies);
+            int bodyCount = snapshot.Bodies.Length;
             if (message.Count < 2 || message.LengthOf(1) != 56L * bodyCount || bodyCount > ushort.MaxValue)
             {
                 Counters.Malformed++;
@@ -201,11 +201,6 @@ namespace IrisSession.Core
             Stream.Presence.Retain(Mirror);
             Stream.LoadKeyframe(snapshot.StateSeq, bodyCount, message.Buffer, message.OffsetOf(1), message.LengthOf(1));
             UpdateReady();
-        }
-
-        private static int Count(ICollection<BodyInfo> bodies)
-        {
-            return bodies.Count;
         }
 
         private void UpdateReady()
