@@ -268,7 +268,7 @@ class Admission:
         gateway = self._context.connections.by_number.get(connection.gateway)
         behind = gateway.key_id if gateway is not None else ""
         token = self._context.tokens.issue(
-            connection.key_id, admitted.participant_id, connection.hello.resume_token, behind
+            connection.key_id, admitted.participant_id, connection.hello.resume_token, behind, web=connection.web
         )
         connection.admitted = True
         self._context.keyring.record_join(connection.key_id)

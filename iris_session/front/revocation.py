@@ -22,7 +22,7 @@ from iris_session.protocol.client_messages import RemoveParticipant
 from iris_session.protocol.entries import HOST, Entry
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
-from iris_session.security import AllowList, KeysBusyError, KeysError
+from iris_session.security import WEB, AllowedKey, AllowList, KeysBusyError, KeysError
 from iris_session.security.keyring import select_gateway_roles
 from iris_session.system.file_worker import LOCK_TIMEOUT_S
 
@@ -59,6 +59,19 @@ class RevocationService:
         for mark in self._context.tokens.revoked_keys:  # the front before ended before it wrote that into the list
             if self._context.keyring.find_entry(mark) is not None:
                 self._context.keyring.pending_revocations[mark] = None
+        self._find_removed_keys()
+
+    def _find_removed_keys(self) -> None:
+        """Count keys of participants as removed that left the list while no front was running."""
+        tokens, keyring = self._context.tokens, self._context.keyring
+        if keyring.key is None:
+            return
+        removed = [AllowedKey("", mark) for mark in tokens.curve_keys if keyring.find_key(mark) is None]
+        for mark in tokens.web_keys:
+            entry = keyring.find_entry(mark)
+            if entry is None or entry.kind != WEB:
+                removed.append(AllowedKey("", mark, kind=WEB))
+        keyring.removed.update((one.key, one) for one in removed)
 
     def revoke(self, key_id: str, now_ns: int) -> None:
         """Revoke a key on request of a director: disconnect it, and take it off the list."""

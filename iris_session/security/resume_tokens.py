@@ -18,6 +18,7 @@ class _TokenRecord(msgspec.Struct, array_like=True):
     key_id: str
     participant_id: str
     behind: str = ""  # key of the gateway that connects the participant
+    web: bool = False  # `key_id` is a web identity
 
 
 class _TokenState(msgspec.Struct, array_like=True):
@@ -64,11 +65,14 @@ class ResumeTokens:
         self.changed = True
         return number
 
-    def issue(self, key_id: str, participant_id: str, previous: bytes = b"", behind: str = "") -> bytes:
+    def issue(
+        self, key_id: str, participant_id: str, previous: bytes = b"", behind: str = "", *, web: bool = False
+    ) -> bytes:
         """Return a new token for `participant_id`, which keeps at most one other: the `previous` one that it came with.
 
-        `behind`: key of the gateway that connects it. A full table drops its oldest token: that of the participant
-        that has been disconnected for longest, since those who left have none (`remove_participant`).
+        `behind`: key of the gateway that connects it. `web`: `key_id` is a web identity. A full table drops its oldest
+        token: that of the participant that has been disconnected for longest, since those who left have none
+        (`remove_participant`).
         """
         token = os.urandom(16)
         digest = _hash_token(token)
@@ -79,7 +83,7 @@ class ResumeTokens:
         while len(self._records) >= self._capacity:
             del self._records[next(iter(self._records))]
         self.changed = True
-        self._records[digest] = _TokenRecord(digest, key_id, participant_id, behind)
+        self._records[digest] = _TokenRecord(digest, key_id, participant_id, behind, web)
         return token
 
     def find_participant(self, token: bytes, key_id: str) -> str | None:
@@ -117,6 +121,16 @@ class ResumeTokens:
         """Forget that a key was revoked: it was allowed again."""
         self.changed = self.changed or key_id in self._revoked
         self._revoked.pop(key_id, None)
+
+    @property
+    def curve_keys(self) -> set[str]:
+        """CURVE keys that participants have connected with, those of their gateways included."""
+        return {one.behind or one.key_id for one in self._records.values()}
+
+    @property
+    def web_keys(self) -> set[str]:
+        """Web identities of participants."""
+        return {one.key_id for one in self._records.values() if one.web}
 
     @property
     def revoked_keys(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import pytest
 
 from iris_session.front.revocation import CHECK_PERIOD_NS
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import Disconnected, Hello, Marker, Pair
+from iris_session.protocol.client_messages import Disconnected, Hello, Marker, Pair, RemoveParticipant
 from iris_session.protocol.common import Message
 from iris_session.protocol.entries import Audit, Entry, Join, Lost
 from iris_session.protocol.names import AuditKind, FaultCode, RefusalCode, Role
@@ -274,6 +274,29 @@ class TestOwnGateway:
         gateway, eve = Gateway(lab.session, lab.curve(pair), b""), Person("eve")
         eve.secret = os.urandom(16)
         assert gateway.refused(eve, eve.hello("director")).code == RefusalCode.IDENTITY
+
+    def test_next_front_revokes_keys_that_left_the_list_while_none_ran(self, own: tuple[Lab, KeyPair]) -> None:
+        lab, pair = own
+        gateway, ada, eva = Gateway(lab.session, lab.curve(pair)), Person("ada"), Person("eva")
+        other = KeyPair.generate()
+        lab.home.clients.allow_key("other", other.public)
+        tabs, tab = Gateway(lab.session, lab.curve(other), b""), Person("tab")
+        tab.secret = os.urandom(16)  # no identity of its own: the key of its gateway counts
+        for person in (ada, eva):
+            allow(lab, person)
+        joined = {p.name: g.enter(p)[0].participant_id for g, p in ((gateway, ada), (gateway, eva), (tabs, tab))}
+        lab.home.clients.revoke_key("ada")
+        lab.session.restart()
+        (removed,) = lab.session.wait_entries(RemoveParticipant)
+        assert removed.message == RemoveParticipant(0, joined["ada"], reason="key revoked")
+        assert [one.subject for one in lab.audits(AuditKind.KEY_REVOKED)] == [ada.fingerprint]
+        lab.home.clients.revoke_key("other")
+        lab.session.restart()
+        lab.session.wait_entries(RemoveParticipant, 3)  # the gateway too
+        removals = [one.message for one in lab.session.entries if isinstance(one.message, RemoveParticipant)]
+        assert {joined["ada"], joined["tab"]} < {one.participant for one in removals}
+        assert joined["eva"] not in {one.participant for one in removals}
+        assert {one.subject for one in lab.audits(AuditKind.KEY_REVOKED, 2)} == {ada.fingerprint, other.fingerprint}
 
 
 class TestDisconnected:
