@@ -21,6 +21,7 @@ from typing import Final
 from filelock import FileLock
 
 from tools.csharp.deflate_vectors import render_deflate_vectors
+from tools.csharp.pairing_vectors import render_pairing_vectors
 from tools.csharp.toolchain import HERE, NUNIT, RUNTIMES, Assembly, Toolchain, prepare_toolchain, run_tool
 from tools.csharp.vectors import render_message_vectors
 
@@ -196,6 +197,7 @@ def run_tests(build: Build, runtime: str, results: Path, *options: str) -> list[
         is_long = "--long" in options
         vectors = render_message_vectors(ROOT / "docs/protocol", 30_000 if is_long else 3_000)
         Path(folder, "messages.txt").write_text(vectors, encoding="utf-8")
+        Path(folder, "pairing.txt").write_text(render_pairing_vectors(), encoding="utf-8")
         Path(folder, "deflate.bin").write_bytes(render_deflate_vectors())
         data = {"IRIS_VECTORS": folder, "IRIS_REPO": str(ROOT), **({"IRIS_FUZZ": str(FUZZ_LONG)} if is_long else {})}
         command = build.make_test_command(runtime, results, *options)
