@@ -186,7 +186,7 @@ def _compute_residuals(
         if not picture.sightings:
             rows.append({"file": picture.path.name, "camera": picture.camera_name, "found": False})
         for one, T in zip(picture.sightings, expected.get(picture.path, []), strict=False):
-            corners = Sheet(one.anchor_id, one.edge_m).marker_corners.reshape(-1, 3)
+            corners = Sheet(one.anchor_id, one.edge_m, layout=one.layout).marker_corners.reshape(-1, 3)
             off = picture.camera.project(corners, one.T_camera_sheet) - picture.camera.project(corners, T)
             rows.append(
                 {

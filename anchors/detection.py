@@ -22,7 +22,7 @@ from anchors.camera import CameraModel, pose_from_rvec_tvec, to_rvec_tvec
 from anchors.lie import Array, left_jacobian
 from anchors.photometric import PhotometricFit, fit_print
 from anchors.pose import PoseTuple
-from anchors.sheet import Sheet, load_dictionary
+from anchors.sheet import LAYOUTS, Sheet, load_dictionary
 
 Image = NDArray[np.uint8]
 
@@ -35,6 +35,8 @@ _CORNER_SIGMA_PX: Final = 0.6
 _CODE_CORNER_SIGMA_PX: Final = 1.2  # of a bare code, whose corners are not refined
 _ENLARGE: Final = 2
 _MIN_PERIMETER_PX: Final = 24.0  # smaller ones cannot be read
+#: Samples of a module, per axis, when it is read. OpenCV's 4 read a third fewer of the markers at the end of the range.
+_PIXELS_PER_CELL: Final = 8
 _MAX_ENLARGED_PIXELS: Final = 5_000_000
 #: A mirrored pose that fits the corners worse than by this factor is not considered any further.
 _CLEAR_RATIO: Final = 4.0
@@ -54,7 +56,7 @@ class SheetDetection:
     `covariance`: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), camera frame, at the sheet's origin.
     `mirrored`, `mirrored_ratio`: the other pose that a plane allows, and its residual over that of the result, at least
     1: near 1 the two cannot be distinguished (`ambiguous`). `reprojection_px`: rms of the
-    detected corners. `registered`: whether the whole print was used.
+    detected corners. `registered`: whether the whole print was used. `layout`: that of the print.
     """
 
     anchor_id: str
@@ -67,6 +69,7 @@ class SheetDetection:
     reprojection_px: float
     markers: int
     registered: bool
+    layout: int
 
     @property
     def ambiguous(self) -> bool:
@@ -80,13 +83,14 @@ class DetectionError(ValueError):
 
 
 class SheetDetector:
-    """Detector of known sheets in pictures of one camera."""
+    """Detector of known sheets in pictures of one camera, in every layout that was printed."""
 
     def __init__(self, sheets: Sequence[Sheet], camera: CameraModel) -> None:
         names = [sheet.anchor_id for sheet in sheets]
         if len(set(names)) != len(names):
             raise DetectionError(f"two sheets have the same id: {', '.join(sorted(names))}")
         self.sheets = tuple(sheets)
+        self._prints = [[replace(sheet, layout=number) for number in LAYOUTS] for sheet in sheets]
         self.camera = camera
         longer = max(camera.width, camera.height)
         self._detectors = {scale: _marker_detector(longer * scale) for scale in (1, _ENLARGE)}
@@ -99,11 +103,12 @@ class SheetDetector:
         """
         grey = to_grey(image, self.camera)
         found = self._find_markers(grey, 1)
-        wanted = [sheet for sheet in self.sheets if sum(k in found for k in sheet.marker_ids) < len(sheet.marker_ids)]
-        if wanted and grey.size * _ENLARGE**2 <= _MAX_ENLARGED_PIXELS:
+        if any(not _is_complete(prints, found) for prints in self._prints) and (
+            grey.size * _ENLARGE**2 <= _MAX_ENLARGED_PIXELS
+        ):
             for marker_id, corners in self._find_markers(grey, _ENLARGE).items():
                 found.setdefault(marker_id, corners)
-        sightings = [self._detect_sheet(sheet, found, grey) for sheet in self.sheets]
+        sightings = [self._detect_print(prints, found, grey) for prints in self._prints]
         return [one for one in sightings if one is not None]
 
     def _find_markers(self, grey: Image, scale: int) -> dict[int, list[Array]]:
@@ -119,6 +124,13 @@ class SheetDetector:
             found.setdefault(marker_id, []).append((four.reshape(4, 2).astype(np.float64) + 0.5) / scale - 0.5)
         return found
 
+    def _detect_print(
+        self, prints: Sequence[Sheet], found: Mapping[int, list[Array]], grey: Image
+    ) -> SheetDetection | None:
+        """Return the detection with most markers: a sheet has one layout."""
+        seen = [one for sheet in prints if (one := self._detect_sheet(sheet, found, grey)) is not None]
+        return max(seen, key=lambda one: one.markers, default=None)
+
     def _detect_sheet(self, sheet: Sheet, found: Mapping[int, list[Array]], grey: Image) -> SheetDetection | None:
         seen = {
             number: candidates[0]
@@ -130,6 +142,11 @@ class SheetDetector:
         if poses is None:
             return None
         return _refine_photometric(sheet, poses, grey, self.camera)
+
+
+def _is_complete(prints: Sequence[Sheet], found: Mapping[int, list[Array]]) -> bool:
+    """Return whether every marker of one of the layouts was found."""
+    return any(all(marker_id in found for marker_id in sheet.marker_ids) for sheet in prints)
 
 
 @dataclass(frozen=True)
@@ -186,6 +203,7 @@ def _marker_detector(longer_side_px: int) -> Any:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / longer_side_px
     parameters.relativeCornerRefinmentWinSize = 0.2
+    parameters.perspectiveRemovePixelPerCell = _PIXELS_PER_CELL
     return cv2.aruco.ArucoDetector(load_dictionary(), parameters)
 
 
@@ -315,6 +333,7 @@ def _detect_by_corners(
         reprojection_px=rms,
         markers=poses.markers,
         registered=False,
+        layout=sheet.layout,
     )
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from anchors.camera import CameraModel, apply_increment, pose_from_matrix, pose_to_matrix
 from anchors.lie import Array, skew
 from anchors.pose import PoseTuple
-from anchors.sheet import HALF_HEIGHT, HALF_WIDTH, MARKER_EDGE, Sheet
+from anchors.sheet import Sheet
 
 Picture = NDArray[np.float32]
 
@@ -91,7 +91,7 @@ def fit_print(
 def _crop(grey: NDArray[np.uint8], camera: CameraModel, sheet: Sheet, pose: PoseTuple) -> _View | None:
     import cv2
 
-    w, h = (HALF_WIDTH + _BORDER) * sheet.edge_m, (HALF_HEIGHT + _BORDER) * sheet.edge_m
+    w, h = (half * sheet.edge_m for half in _half_print(sheet))
     corners = camera.project(np.array([(-w, h, 0.0), (w, h, 0.0), (w, -h, 0.0), (-w, -h, 0.0)]), pose)
     low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 2, 0)
     high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 3, (camera.width, camera.height))
@@ -163,12 +163,13 @@ def _render(view: _View, sheet: Sheet, M: Array, blur: float) -> tuple[Array, ND
     import cv2
 
     texels_per_sample = _TEXELS / sheet.edge_m * float(np.linalg.norm(M[:3, 3])) / view.camera.fx / view.finer
-    levels = _build_pyramid(sheet.anchor_id)
+    levels = _build_pyramid(sheet.anchor_id, sheet.layout)
+    half_width, half_height = _half_print(sheet)
     level = int(np.clip(np.log2(max(texels_per_sample, 1.0)), 0, len(levels) - 1))
     per_edge = _TEXELS / 2**level
     X, Y, _ = _intersect_sheet(sheet, M, *view.fine_rays)
-    U = ((X + HALF_WIDTH + _BORDER) * per_edge - 0.5).astype(np.float32)
-    V = ((HALF_HEIGHT + _BORDER - Y) * per_edge - 0.5).astype(np.float32)
+    U = ((X + half_width) * per_edge - 0.5).astype(np.float32)
+    V = ((half_height - Y) * per_edge - 0.5).astype(np.float32)
     seen: Any = cv2.remap(levels[level], np.nan_to_num(U, nan=-1e6), np.nan_to_num(V, nan=-1e6),
                           cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, 1.0)  # fmt: skip
     seen = cv2.GaussianBlur(seen, (0, 0), blur * view.finer)
@@ -184,8 +185,8 @@ def _render(view: _View, sheet: Sheet, M: Array, blur: float) -> tuple[Array, ND
     X, Y, s = _intersect_sheet(sheet, M, x, y)
     slopes = np.stack([du * s, dv * s, dw * s, *_rotation_derivatives(du, dv, dw, x, y)], axis=2)
     ax, ay = np.abs(X), np.abs(Y)
-    inside = (ax < HALF_WIDTH + _BORDER) & (ay < HALF_HEIGHT + _BORDER)
-    written = (ay > 0.5 + 2 * _BORDER) & (ax < HALF_WIDTH - MARKER_EDGE - _BORDER)
+    inside = (ax < half_width) & (ay < half_height)
+    written = (ay > 0.5 + 2 * _BORDER) & (ax < sheet.shape.half_width - sheet.shape.marker_edge - _BORDER)
     return rendered, inside & ~written, np.nan_to_num(slopes)
 
 
@@ -204,11 +205,16 @@ def _rotation_derivatives(du: Array, dv: Array, dw: Array, x: Array, y: Array) -
     return y * dw - dv, du - x * dw, x * dv - y * du
 
 
+def _half_print(sheet: Sheet) -> tuple[float, float]:
+    """Return half width and height of the print with its border, in edges of the code."""
+    return sheet.shape.half_width + _BORDER, sheet.shape.half_height + _BORDER
+
+
 @lru_cache(maxsize=32)
-def _build_pyramid(anchor_id: str) -> tuple[Picture, ...]:
+def _build_pyramid(anchor_id: str, layout: int) -> tuple[Picture, ...]:
     """Return the print with its border, 1 for paper and 0 for ink, and an image pyramid of it."""
-    sheet = Sheet(anchor_id, 1.0)
-    w, h = HALF_WIDTH + _BORDER, HALF_HEIGHT + _BORDER
+    sheet = Sheet(anchor_id, 1.0, layout=layout)
+    w, h = _half_print(sheet)
     columns, rows = round(2 * w * _TEXELS), round(2 * h * _TEXELS)
     ink = np.zeros((rows, columns), dtype=np.float32)
     for rects in sheet.list_black_rects().values():

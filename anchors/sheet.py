@@ -13,6 +13,7 @@ PDF and SVG output: `anchors.sheet_print`.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -25,16 +26,61 @@ from anchors.pose import Vec3
 
 Array = NDArray[np.float64]
 
-#: Shares of the code's edge. At 160 mm everything fits on A4 with the 6 mm that printers leave white.
-MARKER_EDGE: Final = 0.29
-HALF_WIDTH: Final = 0.60  # from the centre to the outer edges of the markers
-HALF_HEIGHT: Final = 0.89
-#: Crosses by id, from the centre of the code: outside the frame, three in the corners. The third stands apart, so that
-#: the four look the same in no other order.
-MARKS: Final = MappingProxyType({"1": (-0.66, 0.94), "2": (0.66, 0.94), "3": (0.66, -0.40), "4": (-0.66, -0.94)})
+#: White around a code, in modules, on all four sides: ISO/IEC 18004, and Microsoft for HoloLens 2.
+QUIET_MODULES: Final = 4
+#: Modules of the smallest version of QR codes: its modules, and so its white, are the largest share of the edge.
+FEWEST_MODULES: Final = 21
+#: Headsets read codes from here on: HoloLens 2, as Microsoft states it [m]; none is stated for Quest 3.
+HEADSET_MIN_EDGE_M: Final = 0.050
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where markers and marks are, in shares of the code's edge from its centre. Layouts that were printed stay."""
+
+    number: int
+    marker_edge: float
+    half_width: float  # to the outer edges of the markers
+    half_height: float
+    marks: Mapping[str, tuple[float, float]]  # crosses by id, in an order in which the four look the same in no other
+    marked_half_width: float  # to the outer ends of the crosses
+    marked_half_height: float
+    salt: bytes  # of the hash that picks the markers: those of two layouts differ
+
+    @property
+    def white(self) -> float:
+        """White above and below the code."""
+        return self.half_height - self.marker_edge - 0.5
+
+
+#: Layout 1 left two modules of white. Since layout 2 there are four whatever the id, at 152 mm on A4: then markers, and
+#: above and below them the 6 mm that printers leave, take all of its height, and the white takes all of its width.
+LAYOUTS: Final = MappingProxyType(
+    {
+        2: Layout(
+            number=2,
+            marker_edge=0.244,
+            half_width=0.60,
+            half_height=0.935,
+            marks=MappingProxyType({"1": (-0.66, 0.94), "2": (0.15, 0.97), "3": (0.66, -0.94), "4": (-0.66, -0.94)}),
+            marked_half_width=0.69,
+            marked_half_height=1.00,
+            salt=b"iris-session sheet 2\0",
+        ),
+        1: Layout(
+            number=1,
+            marker_edge=0.29,
+            half_width=0.60,
+            half_height=0.89,
+            marks=MappingProxyType({"1": (-0.66, 0.94), "2": (0.66, 0.94), "3": (0.66, -0.40), "4": (-0.66, -0.94)}),
+            marked_half_width=0.69,
+            marked_half_height=0.97,
+            salt=b"iris-session sheet 1\0",
+        ),
+    }
+)
+NEWEST_LAYOUT: Final = 2
 MARK_ARM: Final = 0.025  # from the crossing to the end of a line
-MARKED_HALF_WIDTH: Final = 0.69  # to the outer ends of the crosses
-MARKED_HALF_HEIGHT: Final = 0.97
 #: ArUco, 4 x 4 bits inside a border of one: the largest modules for a given edge, so the longest range. The code has
 #: no error correction to speak of; a sheet is known by several markers in the right places instead.
 DICTIONARY: Final = "DICT_4X4_1000"
@@ -62,11 +108,13 @@ class Rect:
 
 @dataclass(frozen=True)
 class Sheet:
-    """One printed anchor. `edge_m`: edge of the QR code, without its quiet zone. `has_marks`: with four crosses."""
+    """One printed anchor. `edge_m`: edge of the QR code, without its quiet zone. `has_marks`: with four crosses.
+    `layout`: number of its `Layout`."""
 
     anchor_id: str
     edge_m: float
     has_marks: bool = False
+    layout: int = NEWEST_LAYOUT
 
     def __post_init__(self) -> None:
         if not (0 < len(self.anchor_id) <= MAX_ID and self.anchor_id.isascii() and self.anchor_id.isprintable()):
@@ -78,6 +126,12 @@ class Sheet:
             raise SheetError(
                 f"a code of {1e3 * self.edge_m:g} mm cannot be: {1e3 * MIN_EDGE_M:g} to {1e3 * MAX_EDGE_M:g} mm"
             )
+        if self.layout not in LAYOUTS:
+            raise SheetError(f"no layout {self.layout!r} of sheets: {', '.join(map(str, sorted(LAYOUTS)))}")
+
+    @property
+    def shape(self) -> Layout:
+        return LAYOUTS[self.layout]
 
     @cached_property
     def marker_ids(self) -> tuple[int, ...]:
@@ -85,29 +139,29 @@ class Sheet:
 
         Two sheets have all four in common once in 4e10; a single one in 1.6 % of the pairs, which geometry resolves.
         """
-        digest = hashlib.sha256(b"iris-session sheet 1\0" + self.anchor_id.encode()).digest()
+        digest = hashlib.sha256(self.shape.salt + self.anchor_id.encode()).digest()
         candidates = (int.from_bytes(digest[k : k + 2], "big") % DICTIONARY_SIZE for k in range(0, len(digest), 2))
         return tuple(dict.fromkeys(candidates))[:MARKERS]
 
     @property
     def marker_edge_m(self) -> float:
-        return MARKER_EDGE * self.edge_m
+        return self.shape.marker_edge * self.edge_m
 
     @property
     def size_m(self) -> tuple[float, float]:
         """Width and height of everything black."""
-        half = (MARKED_HALF_WIDTH, MARKED_HALF_HEIGHT) if self.has_marks else (HALF_WIDTH, HALF_HEIGHT)
-        return 2.0 * half[0] * self.edge_m, 2.0 * half[1] * self.edge_m
+        width, height = half_extent(self.shape, self.has_marks)
+        return 2.0 * width * self.edge_m, 2.0 * height * self.edge_m
 
     @property
     def marks(self) -> dict[str, Vec3]:
         """Positions of the crossings by id [m]; none on a sheet without marks."""
-        return compute_marks(self.edge_m) if self.has_marks else {}
+        return compute_marks(self.edge_m, self.layout) if self.has_marks else {}
 
     @cached_property
     def marker_corners(self) -> Array:
         """Corners of the markers, shape (4, 4, 3) [m]: marker, corner (clockwise from the upper left, as OpenCV)."""
-        w, h, m = HALF_WIDTH * self.edge_m, HALF_HEIGHT * self.edge_m, self.marker_edge_m
+        w, h, m = self.shape.half_width * self.edge_m, self.shape.half_height * self.edge_m, self.marker_edge_m
         left = ((-w, h), (w - m, h), (w - m, m - h), (-w, m - h))
         corners = [[(x, y, 0.0), (x + m, y, 0.0), (x + m, y - m, 0.0), (x, y - m, 0.0)] for x, y in left]
         return _freeze(np.array(corners))
@@ -138,9 +192,16 @@ class Sheet:
         return shapes
 
 
-def compute_marks(edge_m: float) -> dict[str, Vec3]:
+def compute_marks(edge_m: float, layout: int = NEWEST_LAYOUT) -> dict[str, Vec3]:
     """Return the positions of the marks of a sheet by id, in the sheet frame [m], to the micrometre."""
-    return {name: (round(x * edge_m, 6), round(y * edge_m, 6), 0.0) for name, (x, y) in MARKS.items()}
+    return {name: (round(x * edge_m, 6), round(y * edge_m, 6), 0.0) for name, (x, y) in LAYOUTS[layout].marks.items()}
+
+
+def half_extent(layout: Layout, has_marks: bool) -> tuple[float, float]:
+    """Return half width and half height of everything black, in edges of the code."""
+    if has_marks:
+        return layout.marked_half_width, layout.marked_half_height
+    return layout.half_width, layout.half_height
 
 
 def load_dictionary() -> Any:

@@ -11,15 +11,15 @@ from typing import Final, NamedTuple
 from xml.sax.saxutils import escape
 
 from anchors.sheet import (
-    HALF_HEIGHT,
-    HALF_WIDTH,
+    FEWEST_MODULES,
+    LAYOUTS,
     MARK_ARM,
-    MARKED_HALF_HEIGHT,
-    MARKED_HALF_WIDTH,
-    MARKER_EDGE,
+    NEWEST_LAYOUT,
+    QUIET_MODULES,
     Rect,
     Sheet,
     SheetError,
+    half_extent,
 )
 
 #: Width and height [mm], upright. ISO 216, and ANSI A for `letter`, ANSI B for `tabloid`.
@@ -55,13 +55,19 @@ class _Page(NamedTuple):
     title: str
 
 
-def largest_edge_mm(paper: str, has_marks: bool = False) -> int:
-    """Return the edge [mm] of the largest code, in whole millimetres, whose sheet fits on the paper."""
+def largest_edge_mm(paper: str, has_marks: bool = False, layout: int = NEWEST_LAYOUT) -> int:
+    """Return the edge [mm] of the largest code, in whole millimetres, whose sheet fits on the paper.
+
+    Left and right of the code the white reaches to the edge of the paper: what lies beyond it may be dark.
+    """
     if paper not in PAPERS:
         raise SheetError(f"no paper {paper!r}: {', '.join(PAPERS)}")
     width, height = PAPERS[paper]
-    half = (MARKED_HALF_WIDTH, MARKED_HALF_HEIGHT) if has_marks else (HALF_WIDTH, HALF_HEIGHT)
-    return int(min((width / 2 - MARGIN_MM) / half[0], (height / 2 - MARGIN_MM) / half[1]))
+    half = half_extent(LAYOUTS[layout], has_marks)
+    edge = min((width / 2 - MARGIN_MM) / half[0], (height / 2 - MARGIN_MM) / half[1])
+    if layout > 1:
+        edge = min(edge, width / 2 / (0.5 + QUIET_MODULES / FEWEST_MODULES))
+    return int(edge)
 
 
 def to_svg(sheet: Sheet, paper: str = "a4") -> str:
@@ -135,7 +141,7 @@ def _assemble_pdf(objects: list[bytes]) -> bytes:
 
 def _lay_out(sheet: Sheet, paper: str) -> _Page:
     edge = 1e3 * sheet.edge_m
-    largest = largest_edge_mm(paper, sheet.has_marks)
+    largest = largest_edge_mm(paper, sheet.has_marks, sheet.layout)
     width, height = PAPERS[paper]
     if edge > largest + 1e-9:
         raise SheetError(
@@ -150,7 +156,7 @@ def _lay_out(sheet: Sheet, paper: str) -> _Page:
     ruler, figures = _place_ruler(x0, y0 + 0.80 * edge, edge)
     unit = 0.03 * edge  # height of the text; everything grows with the sheet
     texts = [
-        *_place_title(x0, y0 - 0.80 * edge, edge, unit, sheet.anchor_id),
+        *_place_title(x0, y0 - 0.80 * edge, sheet, unit),
         _Text(x0, y0 - 0.70 * edge, unit, f"code {edge:g} mm  ^ up"),
         _Text(x0, y0 + 0.73 * edge, 0.8 * unit, "print at 100 %, measure the code's edge"),
         *figures,
@@ -177,9 +183,10 @@ def _place_cross(x: float, y: float, arm: float, inwards: float, name: str) -> t
     return rects, _Text(x + 0.6 * inwards * arm, y - 0.3 * arm, 0.9 * arm, name)
 
 
-def _place_title(x: float, y: float, edge: float, unit: float, text: str) -> list[_Text]:
+def _place_title(x: float, y: float, sheet: Sheet, unit: float) -> list[_Text]:
     """Return the id between the two upper markers: as large as fits, long ones in several lines."""
-    room = 2.0 * (HALF_WIDTH - MARKER_EDGE) * edge - 4.0 * unit
+    text = sheet.anchor_id
+    room = 2e3 * (sheet.shape.half_width - sheet.shape.marker_edge) * sheet.edge_m - 4.0 * unit
     n = min(len(text), max(16, int(room / (_text_width("m") * unit))))
     parts = [text[k : k + n] for k in range(0, len(text), n)]
     height = min(2.0 * unit, room / _text_width(parts[0]))

@@ -28,7 +28,7 @@ from render_sheet import Conditions, Page, photograph
 from anchors.camera import CameraModel
 from anchors.detection import SheetDetection, SheetDetector, detect_codes
 from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
-from anchors.sheet import Sheet
+from anchors.sheet import NEWEST_LAYOUT, Sheet
 from anchors.sheet_print import to_pdf
 
 #: 640 x 480 with the intrinsics of a real depth camera, and an ordinary lens; 1280 x 960 is the same, read out finer.
@@ -103,7 +103,7 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     import cv2
 
     cv2.setNumThreads(1)
-    sheet = Sheet("table", arguments.size_mm / 1000.0)
+    sheet = Sheet("table", arguments.size_mm / 1000.0, layout=arguments.layout)
     page = Page(to_pdf(sheet))
     rng = np.random.default_rng(arguments.seed)
     conditions = Conditions(blur_px=arguments.blur_px, noise=arguments.noise)
@@ -156,7 +156,8 @@ def main() -> int:
     parser.add_argument("--distances", type=float, nargs="+", default=[0.5, 1.0, 2.0, 3.0], help="[m]")
     parser.add_argument("--tilts", type=float, nargs="+", default=[0.0, 30.0, 60.0], help="from square on [deg]")
     parser.add_argument("--repeats", type=int, default=10, help="photographs per row")
-    parser.add_argument("--size-mm", type=float, default=160.0, help="edge of the code")
+    parser.add_argument("--size-mm", type=float, default=150.0, help="edge of the code")
+    parser.add_argument("--layout", type=int, default=NEWEST_LAYOUT, help="of the sheet")
     parser.add_argument("--blur-px", type=float, default=0.6, help="standard deviation of the lens [px]")
     parser.add_argument("--noise", type=float, default=1.5, help="of a pixel, grey levels")
     parser.add_argument("--seed", type=int, default=0)

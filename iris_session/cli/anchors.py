@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
 
 #: Edges of the code where none is given: with its marks it must be smaller to fit on A4.
-PLAIN_SHEET_M: Final = 0.160
+PLAIN_SHEET_M: Final = 0.150
 MARKED_SHEET_M: Final = 0.140
 #: A printed sheet that is further off its size is no print of that sheet at 100 %.
 MAX_MISPRINT: Final = 0.05
@@ -58,13 +58,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="print anchor sheets, align headsets, calibrate cameras",
         description="Print sheets that headsets and cameras detect, align headsets to them, and calibrate cameras.",
         examples="""
-            iris-session anchors print --size 160mm --id table --out table.pdf
+            iris-session anchors print --size 150mm --id table --out table.pdf
             iris-session anchors example > anchors.toml
             iris-session anchors status --watch
             iris-session anchors align start ann
             iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd --out anchors.toml
-            iris-session anchors calibrate-camera pictures --sheet table=160mm --poses poses.csv
-            iris-session anchors calibrate-camera pictures --sheet table=160mm --at table=0,-0.45,0,1,0,0,0
+            iris-session anchors calibrate-camera pictures --sheet table=150mm --poses poses.csv
+            iris-session anchors calibrate-camera pictures --sheet table=150mm --at table=0,-0.45,0,1,0,0,0
         """,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
@@ -89,22 +89,23 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         "detect from a distance, and a ruler to check the printed size. With --marks also four crosses, to be "
         "pricked and touched with a controller by devices that cannot read the code.",
         examples="""
-            iris-session anchors print --size 160mm --id table --out table.pdf
+            iris-session anchors print --size 150mm --id table --out table.pdf
             iris-session anchors print --id shelf --paper a3 --size 200mm
             iris-session anchors print --marks --out table.pdf
-            iris-session anchors print --id table --measured 159.2mm
+            iris-session anchors print --id table --measured 149.2mm
         """,
     )
     one.add_argument(
-        "--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (160mm; with --marks 140mm)"
+        "--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (150mm; with --marks 140mm)"
     )
-    one.add_argument("--marks", action="store_true", help="four crosses around the frame; a4 holds sizes up to 143mm")
+    one.add_argument("--marks", action="store_true", help="four crosses around the frame; a4 holds sizes up to 142mm")
     one.add_argument(
         "--measured",
         type=parse_length,
         metavar="LENGTH",
         help="edge of the printed code by a ruler: print the lines for the anchors file, write no sheet",
     )
+    _add_layout_option(one)
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
     one.add_argument("--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
@@ -132,7 +133,18 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
         help="name of a scene (see `iris-session serve --help`); default: one sheet, `table`",
     )
     one.add_argument("--marks", action="store_true", help="of sheets with marks, as `print --marks` writes them")
+    _add_layout_option(one)
     add_json_option(one)
+
+
+def _add_layout_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--layout",
+        type=int,
+        choices=(1, 2),
+        default=2,
+        help="2: with the white around the code that headsets ask for; 1: as printed before",
+    )
 
 
 def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -226,7 +238,7 @@ def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser])
 
 def run_print(arguments: argparse.Namespace) -> int:
     """Write the sheet, and print its size."""
-    from anchors.sheet import Sheet, SheetError
+    from anchors.sheet import HEADSET_MIN_EDGE_M, Sheet, SheetError
     from anchors.sheet_print import to_pdf, to_svg
 
     out: Path = arguments.out or Path(re.sub(r"[^\w.-]+", "_", arguments.id) + ".pdf" if arguments.id else "sheet.pdf")
@@ -234,7 +246,7 @@ def run_print(arguments: argparse.Namespace) -> int:
         raise CommandError(f"{out}: the file must end in .pdf or .svg")
     try:
         size_m = arguments.size or (MARKED_SHEET_M if arguments.marks else PLAIN_SHEET_M)
-        sheet = Sheet(arguments.id, arguments.measured or size_m, arguments.marks)
+        sheet = Sheet(arguments.id, arguments.measured or size_m, arguments.marks, arguments.layout)
         if arguments.measured:
             return _print_measured(arguments, sheet, size_m)
         drawn = to_pdf(sheet, arguments.paper) if out.suffix.lower() == ".pdf" else to_svg(sheet, arguments.paper)
@@ -248,10 +260,13 @@ def run_print(arguments: argparse.Namespace) -> int:
         "edge; what you measure: `anchors print --measured LENGTH`, or `size_m` in the anchors file",
         "tape the sheet down and draw its corners; a second sheet, 1 m away or more, shows when one has moved",
     ]
+    if sheet.edge_m < HEADSET_MIN_EDGE_M:
+        lines.append(f"for cameras: headsets read codes of {1e3 * HEADSET_MIN_EDGE_M:g} mm and more")
     if sheet.has_marks:
         lines += ["prick the crosses with a needle; the session must know them: lines for the anchors file", ""]
         lines += _list_file_lines(sheet)
     result = {"file": str(out), "id": sheet.anchor_id, "size_m": sheet.edge_m, "paper": arguments.paper}
+    result |= {"layout": sheet.layout, "for_headsets": sheet.edge_m >= HEADSET_MIN_EDGE_M}
     result |= {"markers": sheet.marker_ids, "marker_edge_m": sheet.marker_edge_m, "marks_m": sheet.marks}
     print_result(arguments, result, lines)
     return 0
@@ -289,7 +304,7 @@ def run_example(arguments: argparse.Namespace) -> int:
     if arguments.scene:
         scene = open_scene(arguments.scene)
         anchors, sizes = scene.anchors, scene.anchor_sizes
-    marks = {name: compute_marks(MARKED_SHEET_M) for name in anchors if arguments.marks}
+    marks = {name: compute_marks(MARKED_SHEET_M, arguments.layout) for name in anchors if arguments.marks}
     text = dump_anchors(anchors, sizes | dict.fromkeys(marks, MARKED_SHEET_M), marks)
     if arguments.json:
         print_json({"toml": text})

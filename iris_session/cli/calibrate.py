@@ -73,7 +73,7 @@ def _add_sheet_options(parser: argparse.ArgumentParser, *, is_required: bool, at
         required=is_required,
         default=[],
         metavar="ID=LENGTH",
-        help="id of a sheet and the printed edge of its code: table=160mm; repeatable",
+        help="id of a sheet and the printed edge of its code: table=150mm; repeatable",
     )
     pose = _make_named_type(parse_pose)
     parser.add_argument("--at", type=pose, action="append", default=[], metavar="ID=X,Y,Z,QW,QX,QY,QZ", help=at)
@@ -85,7 +85,7 @@ def _make_named_type(parse: Callable[[str], T]) -> Callable[[str], tuple[str, T]
     def parse_named(text: str) -> tuple[str, T]:
         name, _, rest = text.rpartition("=")
         if not name:
-            raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=160mm")
+            raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=150mm")
         return name, parse(rest)
 
     return parse_named
@@ -108,7 +108,7 @@ def _check_known_sheets(at: Iterable[tuple[str, PoseTuple]], sheets: list[Sheet]
     """Raise `CommandError` for a pose of a sheet whose size is not given."""
     unknown = sorted({name for name, _ in at} - {sheet.anchor_id for sheet in sheets})
     if unknown:
-        raise CommandError(f"--at {unknown[0]}: no size is given, add --sheet {unknown[0]}=160mm")
+        raise CommandError(f"--at {unknown[0]}: no size is given, add --sheet {unknown[0]}=150mm")
 
 
 def format_calibration(result: dict[str, Any]) -> list[str]:
@@ -161,8 +161,8 @@ def register_camera(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         "(--poses), or of sheets at known poses (--at). Prints residuals, and refuses pictures that do not "
         "determine the result.",
         examples="""
-            iris-session anchors calibrate-camera pictures --sheet table=160mm --poses poses.csv
-            iris-session anchors calibrate-camera pictures --sheet table=160mm --at table=0,-0.45,0,1,0,0,0
+            iris-session anchors calibrate-camera pictures --sheet table=150mm --poses poses.csv
+            iris-session anchors calibrate-camera pictures --sheet table=150mm --at table=0,-0.45,0,1,0,0,0
         """,
         notes="poses.csv, metres and unit quaternions, one line per picture:\n"
         "  image,x,y,z,qw,qx,qy,qz\n"
@@ -355,7 +355,7 @@ def register_depth_cameras(actions: argparse._SubParsersAction[argparse.Argument
         examples="""
             iris-session cloud calibrate camera.toml --out calibration.toml             sheets of the session here
             iris-session cloud calibrate camera.toml --address 192.168.1.20 --icp --out calibration.toml
-            iris-session cloud calibrate camera.toml --sheet table=160mm --at table=0,-0.45,0,1,0,0,0
+            iris-session cloud calibrate camera.toml --sheet table=150mm --at table=0,-0.45,0,1,0,0,0
             iris-session cloud calibrate camera.toml --check                            do they still fit?
         """,
     )

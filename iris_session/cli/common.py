@@ -450,5 +450,5 @@ def parse_length(text: str) -> float:
     """Parse a length with its unit [m]. The unit is required, so that 160 cannot mean 160 m."""
     match = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(mm|cm|m)", text.strip())
     if not match:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a length: give a number with its unit, for example 160mm")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length: give a number with its unit, for example 150mm")
     return float(match[1]) * _UNITS[match[2]]

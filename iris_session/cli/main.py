@@ -43,7 +43,7 @@ _EPILOG = """examples:
   iris-session sessions                      the sessions on this network
   iris-session robots scene.xml              the robots found in a model, as TOML to edit
   iris-session scene inspect scene.xml       what clients receive of a scene, and what is heavy
-  iris-session anchors print --size 160mm    a sheet for headsets and cameras, as PDF
+  iris-session anchors print --size 150mm    a sheet for headsets and cameras, as PDF
   iris-session cloud example                 a file for depth cameras; inspect it, or run it in a session
   iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
   iris-session status --watch                participants, robots, ages, late ticks, recorder of a session

@@ -12,10 +12,20 @@ import pypdfium2
 import pytest
 from numpy.typing import NDArray
 
-from anchors.sheet import MARK_ARM, Sheet, SheetError, compute_marks, load_dictionary
+from anchors.sheet import (
+    FEWEST_MODULES,
+    LAYOUTS,
+    MARK_ARM,
+    QUIET_MODULES,
+    Sheet,
+    SheetError,
+    compute_marks,
+    load_dictionary,
+)
 from anchors.sheet_print import MARGIN_MM, PAPERS, largest_edge_mm, to_pdf, to_svg
 
-TABLE = Sheet("table", 0.160)
+TABLE = Sheet("table", 0.150)
+OLD_TABLE = Sheet("table", 0.160, layout=1)
 PER_MM = 10.0  # pixels of the rasterised page
 
 
@@ -26,12 +36,39 @@ def _raster(pdf: bytes) -> NDArray[np.uint8]:
 
 def test_layout_of_printed_sheets_never_changes() -> None:
     """A change of these numbers would invalidate every printed sheet."""
-    assert TABLE.marker_ids == (929, 562, 578, 437)
-    assert Sheet("door", 0.16).marker_ids == (544, 3, 618, 419)
-    assert TABLE.marker_edge_m == pytest.approx(0.0464)
-    assert TABLE.marker_corners[0][0] == pytest.approx([-0.096, 0.1424, 0.0])
-    assert TABLE.marker_corners[2][2] == pytest.approx([0.096, -0.1424, 0.0])
-    assert TABLE.code_corners[1] == pytest.approx([0.08, 0.08, 0.0])
+    assert OLD_TABLE.marker_ids == (929, 562, 578, 437)
+    assert Sheet("door", 0.16, layout=1).marker_ids == (544, 3, 618, 419)
+    assert OLD_TABLE.marker_edge_m == pytest.approx(0.0464)
+    assert OLD_TABLE.marker_corners[0][0] == pytest.approx([-0.096, 0.1424, 0.0])
+    assert OLD_TABLE.marker_corners[2][2] == pytest.approx([0.096, -0.1424, 0.0])
+    assert OLD_TABLE.code_corners[1] == pytest.approx([0.08, 0.08, 0.0])
+    assert TABLE.marker_ids == (143, 816, 88, 64)
+    assert TABLE.marker_edge_m == pytest.approx(0.0366)
+    assert TABLE.marker_corners[0][0] == pytest.approx([-0.09, 0.14025, 0.0])
+    assert TABLE.marker_corners[2][2] == pytest.approx([0.09, -0.14025, 0.0])
+
+
+@pytest.mark.parametrize("has_marks", [False, True])
+@pytest.mark.parametrize("paper", ["a4", "a5", "letter"])
+@pytest.mark.parametrize("anchor_id", ["table", "x" * 64])
+def test_code_has_four_modules_of_white_on_all_sides(anchor_id: str, paper: str, has_marks: bool) -> None:
+    """Also where the paper ends, and between markers, words and crosses. The largest sheet is the tightest one."""
+    sheet = Sheet(anchor_id, largest_edge_mm(paper, has_marks) / 1000.0, has_marks)
+    modules = len(sheet.code)
+    assert FEWEST_MODULES <= modules <= 57, "version 10"
+    ink = 1.0 - _raster(to_pdf(sheet, paper)).astype(np.float64) / 255.0
+    per_m = 1e3 * ink.shape[1] / PAPERS[paper][0]
+    half = (0.5 + QUIET_MODULES / modules) * sheet.edge_m * per_m
+    row, column = ink.shape[0] / 2, ink.shape[1] / 2
+    assert column - half >= -1.0, "the paper is wide enough"
+    quiet = np.ones(ink.shape, dtype=bool)
+    quiet[: int(row - half) + 1] = quiet[int(row + half) :] = False
+    quiet[:, : max(int(column - half) + 1, 0)] = quiet[:, int(column + half) :] = False
+    code = int(0.5 * sheet.edge_m * per_m) + 1
+    quiet[int(row) - code : int(row) + code + 1, int(column) - code : int(column) + code + 1] = False
+    assert quiet.any()
+    assert ink[quiet].max() < 0.1
+    assert all(layout.white * modules >= QUIET_MODULES - 0.01 for layout in LAYOUTS.values() if layout.number > 1)
 
 
 def test_ids_of_sheets_differ() -> None:
@@ -71,10 +108,10 @@ def test_pdf_has_the_exact_size() -> None:
     assert abs(page.shape[0] / PER_MM - 297.0) < 0.15
     mm = 210.0 / page.shape[1]
     ink = 1.0 - page.astype(np.float64) / 255.0
-    middle = page.shape[0] // 2 - round((80.0 - 3.8) / mm)  # through the top row of modules
+    middle = page.shape[0] // 2 - round((75.0 - 3.6) / mm)  # through the top row of modules
     row = ink[middle, page.shape[1] // 2 - 900 : page.shape[1] // 2 + 900]
     black = np.flatnonzero(row > 0.5)
-    assert (black[-1] - black[0] + 1) * mm == pytest.approx(160.0, abs=0.1)
+    assert (black[-1] - black[0] + 1) * mm == pytest.approx(150.0, abs=0.1)
     for number, corners in enumerate(TABLE.marker_corners):
         (x0, y0), (x1, y1) = 1e3 * corners[0, :2], 1e3 * corners[2, :2]
         near = ink[round((147.5 - y0) / mm) : round((149.5 - y1) / mm), round((104 + x0) / mm) : round((106 + x1) / mm)]
@@ -85,17 +122,17 @@ def test_pdf_has_the_exact_size() -> None:
 
 
 def test_svg_agrees_with_the_pdf() -> None:
-    root = ElementTree.fromstring(to_svg(Sheet("<a&b>", 0.160)))
+    root = ElementTree.fromstring(to_svg(Sheet("<a&b>", 0.150)))
     assert (root.get("width"), root.get("height"), root.get("viewBox")) == ("210mm", "297mm", "0 0 210 297")
     paths = [element.get("d") or "" for element in root if element.tag.endswith("path")]
     assert len(paths) == 6  # code, four markers, ruler
-    assert "M25 68.5h" in paths[0]
-    assert paths[1].startswith("M9 6.1h46.4")
+    assert "M30 73.5h" in paths[0]
+    assert paths[1].startswith("M15 8.25h36.6")
     ticks = [float(x) for x in re.findall(r"M([\d.]+) ", paths[5])][1:]
     assert np.allclose([b - a for a, b in pairwise(ticks)], 10.0, atol=1e-3)
     texts = [element.text for element in root if element.tag.endswith("text")]
     assert "<a&b>" in texts
-    assert "80 mm between the long marks" in texts
+    assert "70 mm between the long marks" in texts
 
 
 def test_marks_are_printed_where_the_sheet_says() -> None:
@@ -131,10 +168,11 @@ def test_marks_are_printed_where_the_sheet_says() -> None:
 
 
 def test_sheets_with_marks_are_smaller_and_still_read() -> None:
-    assert (largest_edge_mm("a4", has_marks=True), largest_edge_mm("a3", has_marks=True)) == (143, 206)
-    with pytest.raises(SheetError, match="frame and marks does not fit on a4: at most 143 mm"):
-        to_pdf(Sheet("table", 0.144, has_marks=True))
-    assert compute_marks(0.14)["3"] == (0.0924, -0.056, 0.0), "this would invalidate every printed sheet"
+    assert (largest_edge_mm("a4", has_marks=True), largest_edge_mm("a3", has_marks=True)) == (142, 204)
+    with pytest.raises(SheetError, match="frame and marks does not fit on a4: at most 142 mm"):
+        to_pdf(Sheet("table", 0.143, has_marks=True))
+    assert compute_marks(0.14, layout=1)["3"] == (0.0924, -0.056, 0.0), "this would invalidate every printed sheet"
+    assert compute_marks(0.14)["2"] == (0.021, 0.1358, 0.0)
     page = _raster(to_pdf(Sheet("table", 0.140, has_marks=True)))
     page = cv2.resize(page, None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA)
     assert cv2.QRCodeDetector().detectAndDecode(page)[0] == "table"
@@ -146,5 +184,5 @@ def test_sheets_with_marks_are_smaller_and_still_read() -> None:
     "anchor_id", ["table", "lab 3: shelf, left", "lab-3/robot-cell-2/table-by-the-window/left-corner/sheet-no-0001"]
 )
 def test_code_contains_the_id(anchor_id: str) -> None:
-    page = cv2.resize(_raster(to_pdf(Sheet(anchor_id, 0.160))), None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA)
+    page = cv2.resize(_raster(to_pdf(Sheet(anchor_id, 0.150))), None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA)
     assert cv2.QRCodeDetector().detectAndDecode(page)[0] == anchor_id

@@ -162,7 +162,7 @@ def test_unusable_pictures_are_one_line(folder: Path, tmp_path: Path, capsys: Ca
         ((folder,), "give --poses CSV"),
         ((tmp_path / "no", "--poses", poses), "not a folder"),
         ((tmp_path, "--poses", poses), "no intrinsics at"),
-        ((folder, "--at", "door=0,0,0,1,0,0,0"), "add --sheet door=160mm"),
+        ((folder, "--at", "door=0,0,0,1,0,0,0"), "add --sheet door=150mm"),
         ((small, "--poses", poses, "--intrinsics", folder / "intrinsics.toml"), "64 x 48"),
     ):
         assert said in refuse(capsys, 2, *CALIBRATE, *words, *SMALL_SHEET)
@@ -199,7 +199,7 @@ POSES = {
     "left": look_at((-0.8, -1.3, 0.7), (0.1, -0.2, 0.05)),
 }
 T_WORLD_SHEET: PoseTuple = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
-SHEET = ("--sheet", "table=160mm", "--at", "table=0,-0.45,0,1,0,0,0")
+SHEET = ("--sheet", "table=150mm", "--at", "table=0,-0.45,0,1,0,0,0")
 HEAD = 'stream = "room"\nlow = [-1.5, -1.5, -0.9]\nhigh = [1.5, 1.5, 1.5]\n'
 IDENTITY = "{position_m = [0.0, 0.0, 0.0], quaternion_wxyz = [1.0, 0.0, 0.0, 0.0]}"
 DEPTH_INTRINSICS = "{width = 640, height = 480, fx = 585.0, fy = 585.0, cx = 319.5, cy = 239.5}"
@@ -233,7 +233,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)
-    page = Page(to_pdf(Sheet("table", 0.160)))
+    page = Page(to_pdf(Sheet("table", 0.150)))
     for name, T_world_camera in POSES.items():
         (folder / name).mkdir()
         T_camera_sheet = compose(inverse(pose_from_matrix(T_world_camera)), T_WORLD_SHEET)
@@ -298,7 +298,7 @@ def test_sheets_come_from_the_session(room: Room, capsys: Capture) -> None:
         control_port=0,
         state_port=0,
         anchors={"table": T_WORLD_SHEET, "door": ((0.0, 3.0, 0.0), (1.0, 0.0, 0.0, 0.0))},
-        anchor_sizes={"table": 0.160, "door": 0.160},
+        anchor_sizes={"table": 0.150, "door": 0.150},
         anchor_errors={"door": 0.5},
     )
     with ScenePublisher(scene, config) as session:
@@ -310,10 +310,10 @@ def test_sheets_come_from_the_session(room: Room, capsys: Capture) -> None:
 
 def test_unusable_input_is_a_one_line_error(room: Room, tmp_path: Path, capsys: Capture) -> None:
     file = room.write("front")
-    assert "--sheet door=160mm" in refuse(capsys, 2, "cloud", "calibrate", file, "--at", "door=0,0,0,1,0,0,0")
+    assert "--sheet door=150mm" in refuse(capsys, 2, "cloud", "calibrate", file, "--at", "door=0,0,0,1,0,0,0")
     assert "one camera" in refuse(capsys, 2, "cloud", "calibrate", file, *SHEET, "--icp")
     assert "cannot be read" in refuse(capsys, 2, "cloud", "calibrate", tmp_path / "no.toml", *SHEET)
-    door = ("--sheet", "door=160mm", "--at", "door=0,0,0,1,0,0,0")
+    door = ("--sheet", "door=150mm", "--at", "door=0,0,0,1,0,0,0")
     assert "no sheet was found in 1 picture:" in refuse(capsys, 1, "cloud", "calibrate", file, *door, "--frames", 1)
     on_hand = room.write("front", more='body = "hand"\n')
     assert "--camera-on-hand" in refuse(capsys, 2, "cloud", "calibrate", on_hand, *SHEET)

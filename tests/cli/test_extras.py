@@ -43,7 +43,7 @@ def base_install(tmp_path: Path) -> dict[str, str]:
         (("verify", "session.rrd"), "recording"),
         (("view", "session.rrd"), "recording"),
         (("demo", "handover"), "control"),
-        (("anchors", "print", "--size", "160mm", "--out", "sheet.pdf"), "anchors"),
+        (("anchors", "print", "--size", "150mm", "--out", "sheet.pdf"), "anchors"),
         (("scene", "inspect", "scene.obj"), "files"),
     ],
 )
