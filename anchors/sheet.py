@@ -36,7 +36,7 @@ HEADSET_MIN_EDGE_M: Final = 0.050
 
 @dataclass(frozen=True)
 class Layout:
-    """Where markers and marks are, in shares of the code's edge from its centre. Layouts that were printed stay."""
+    """Places of markers and marks, in shares of the code's edge from its centre. Layouts that were printed stay."""
 
     number: int
     marker_edge: float
