@@ -2,7 +2,7 @@
 // (C# 7).
 //
 // `-standard:FILE` is no option of csc: it names the netstandard.dll whose list of types a program may use of the
-// libraries that it references.
+// libraries that it references. `-members:FILE`: see Members.cs.
 using System;
 using System.Collections.Generic;
 using System.IO;
@@ -18,6 +18,7 @@ using Microsoft.CodeAnalysis.Text;
 static class Compiler
 {
     const string Standard = "-standard:";
+    const string Listed = "-members:";
     static readonly Dictionary<string, MetadataReference> References = new Dictionary<string, MetadataReference>();
 
     static int Main(string[] jobs)
@@ -29,10 +30,9 @@ static class Compiler
 
     static bool Compile(string[] options)
     {
-        string standard = options
-            .Where(each => each.StartsWith(Standard)).Select(each => each.Substring(Standard.Length)).FirstOrDefault();
+        string standard = FindOption(options, Standard), members = FindOption(options, Listed);
         var arguments = CSharpCommandLineParser.Default.Parse(
-            options.Where(each => !each.StartsWith(Standard)), Directory.GetCurrentDirectory(), null);
+            options.Where(each => !each.StartsWith(Standard) && !each.StartsWith(Listed)), Directory.GetCurrentDirectory(), null);
         if (arguments.Errors.Length > 0) return Report(arguments.Errors);
         if (!arguments.MetadataReferences.All(each => File.Exists(each.Reference))) return false; // did not compile
         var trees = arguments.SourceFiles.Select(file => CSharpSyntaxTree.ParseText(
@@ -52,7 +52,13 @@ static class Compiler
             File.WriteAllBytes(path, output.ToArray());
             File.WriteAllBytes(symbols, lines.ToArray());
         }
+        if (members != null) Members.Write(compilation, members);
         return true;
+    }
+
+    static string FindOption(string[] options, string name)
+    {
+        return options.Where(each => each.StartsWith(name)).Select(each => each.Substring(name.Length)).FirstOrDefault();
     }
 
     static MetadataReference Refer(string path)

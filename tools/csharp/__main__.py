@@ -3,6 +3,7 @@
 python -m tools.csharp test [--runtime mono] [--filter TEXT] [--long]
 python -m tools.csharp run PROGRAM [--runtime mono] -- [ARGUMENT ...]
 python -m tools.csharp build
+python -m tools.csharp unity-api          # unity_api.json again, of $IRIS_DATA/unity/api.json
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tools.csharp.project import build, find_programs, run_tests
+from tools.csharp.project import Build, build, find_programs, run_tests
 from tools.csharp.toolchain import RUNTIMES, ToolchainError
+from tools.csharp.unity_api import EXTRACT, find_problems, load_api, make_extract
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -28,6 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     test.add_argument("--runtime", choices=RUNTIMES, help="only on this one")
     test.add_argument("--filter", default="", help="only tests whose full name has this text")
     test.add_argument("--long", action="store_true", help="also those of the category Long")
+    commands.add_parser("unity-api", help="check the members of the engine that are used, and write unity_api.json")
     run = commands.add_parser("run", help="run a program of tools/csharp/programs")
     run.add_argument("program", choices=find_programs())
     run.add_argument("--runtime", choices=RUNTIMES, default=RUNTIMES[0])
@@ -41,6 +44,8 @@ def main(arguments: list[str] | None = None) -> int:
         if options.command == "build":
             print(built.folder)
             return 0
+        if options.command == "unity-api":
+            return _update_unity_api(built)
         failed = 0
         for runtime in (options.runtime,) if options.runtime else RUNTIMES:
             with tempfile.TemporaryDirectory() as folder:
@@ -57,6 +62,19 @@ def main(arguments: list[str] | None = None) -> int:
     except ToolchainError as error:
         print(error, file=sys.stderr)
         return 1
+
+
+def _update_unity_api(built: Build) -> int:
+    source = Path(os.environ.get("IRIS_DATA", ""), "unity/api.json")
+    if not source.is_file():
+        raise ToolchainError("set IRIS_DATA to the folder that has unity/api.json")
+    assemblies = built.list_engine_members()
+    EXTRACT.write_text(make_extract(source, assemblies), encoding="utf-8")
+    problems = find_problems(load_api(EXTRACT), assemblies)
+    print(
+        "\n".join(problems) if problems else f"{EXTRACT.name}: {sum(map(len, assemblies.values()))} members are right"
+    )
+    return int(bool(problems))
 
 
 if __name__ == "__main__":

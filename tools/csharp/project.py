@@ -1,7 +1,8 @@
-"""Builds the assemblies of `unity_client` that have no engine, their tests, and the programs of tools/csharp/programs.
+"""Builds the assemblies of `unity_client`, their tests, and the programs of tools/csharp/programs.
 
-An assembly is a folder with a `.asmdef`, as in Unity, that says `noEngineReferences`; a test assembly names
-`nunit.framework.dll` in it. A program is a folder of tools/csharp/programs, named like it, and may use all assemblies.
+An assembly is a folder with a `.asmdef`, as in Unity; a test assembly names `nunit.framework.dll` in it. One that does
+not say `noEngineReferences` is compiled against stand-ins of the engine, tools/csharp/standins, as are its tests in
+tests/csharp/unity. A program is a folder of tools/csharp/programs, named like it, and may use all assemblies.
 Builds are kept in the user's cache by the hash of everything that goes into them.
 """
 
@@ -23,10 +24,13 @@ from filelock import FileLock
 from tools.csharp.deflate_vectors import render_deflate_vectors
 from tools.csharp.pairing_vectors import render_pairing_vectors
 from tools.csharp.toolchain import HERE, NUNIT, RUNTIMES, Assembly, Toolchain, prepare_toolchain, run_tool
+from tools.csharp.unity_api import Member, read_members
 from tools.csharp.vectors import render_message_vectors
 
 ROOT: Final = HERE.parents[1]
-PACKAGES: Final = ("unity_client",)
+PACKAGES: Final = ("unity_client", "tools/csharp/standins", "tests/csharp/unity")
+#: The assembly that stands for the engine and its packages.
+STANDINS: Final = "UnityEngine"
 RUNNER: Final = "runner"
 FUZZ_LONG: Final = 300_000
 #: Builds that are kept; the oldest are removed.
@@ -35,12 +39,13 @@ _KEPT: Final = 8
 
 @dataclass(frozen=True)
 class Project:
-    """An assembly definition. `references`: names of other projects."""
+    """An assembly definition. `references`: names of other projects. `has_engine`: it stands for it, or uses it."""
 
     name: str
     folder: Path
     references: tuple[str, ...]
     is_test: bool
+    has_engine: bool
 
     @cached_property
     def sources(self) -> tuple[Path, ...]:
@@ -52,11 +57,12 @@ class Project:
 
 @dataclass(frozen=True)
 class Build:
-    """Compiled projects. `folder` has a folder for each runtime."""
+    """Compiled projects. `folder` has a folder for each runtime. `with_engine`: names of stand-ins and layers."""
 
     toolchain: Toolchain
     folder: Path
     tests: tuple[str, ...]
+    with_engine: tuple[str, ...] = ()
 
     def make_command(self, runtime: str, program: str) -> list[str]:
         """Return the command that runs a program of tools/csharp/programs on `dotnet` or `mono`."""
@@ -67,18 +73,22 @@ class Build:
         assemblies = [str(self.folder / runtime / f"{name}.dll") for name in self.tests]
         return [*self.make_command(runtime, RUNNER), str(results), *options, *assemblies]
 
+    def list_engine_members(self) -> dict[str, list[Member]]:
+        """Return what each assembly with the engine declares and uses of it."""
+        return {name: read_members(self.folder / RUNTIMES[0] / f"{name}.members") for name in self.with_engine}
+
 
 def find_projects(root: Path = ROOT) -> list[Project]:
-    """Return the assemblies without engine that have sources, each after those that it refers to."""
+    """Return the assemblies that have sources, each after those that it refers to."""
     found: dict[str, Project] = {}
     for package in PACKAGES:
         for path in sorted((root / package).rglob("*.asmdef")):
             text = json.loads(path.read_text(encoding="utf-8"))
-            if not text.get("noEngineReferences"):
-                continue
-            references = tuple(name for name in text.get("references", ()) if not name.startswith("Unity"))
+            has_engine = not text.get("noEngineReferences")
+            named = tuple(name for name in text.get("references", ()) if not name.startswith("Unity"))
+            references = (*named, *([STANDINS] if has_engine else []))
             is_test = NUNIT.name in text.get("precompiledReferences", ())
-            project = Project(text["name"], path.parent, references, is_test)
+            project = Project(text["name"], path.parent, references, is_test, has_engine or text["name"] == STANDINS)
             if project.sources:
                 found[project.name] = project
     ordered: dict[str, Project] = {}
@@ -129,7 +139,8 @@ def build(folder: Path | None = None) -> Build:
                 built.rename(target)
             _remove_old(builds)
         os.utime(target)
-    return Build(toolchain, target, tests)
+    with_engine = tuple(project.name for project in projects if project.has_engine and not project.is_test)
+    return Build(toolchain, target, tests, with_engine)
 
 
 def _list_assemblies(
@@ -137,7 +148,9 @@ def _list_assemblies(
 ) -> Iterator[Assembly]:
     for project in projects:
         references = [folder / f"{name}.dll" for name in _list_references(project, projects)]
-        yield Assembly(project.name, project.sources, (*references, *([NUNIT] if project.is_test else ())))
+        libraries = (*references, *([NUNIT] if project.is_test else ()))
+        listed = project.has_engine and not project.is_test
+        yield Assembly(project.name, project.sources, libraries, lists_members=listed)
     libraries = tuple(folder / f"{project.name}.dll" for project in projects if not project.is_test)
     for name, sources in programs.items():
         yield Assembly(name, sources, (*libraries, NUNIT), is_program=True)
@@ -163,8 +176,8 @@ def _hash_inputs(toolchain: Toolchain, projects: list[Project], programs: dict[s
             digest.update(f"\0{name}\0{path}\0".encode())  # paths are in the symbols
             digest.update(path.read_bytes())
     for project in projects:
-        digest.update(repr((project.name, project.references, project.is_test)).encode())
-    for path in (HERE / "project.py", HERE / "toolchain.py"):
+        digest.update(repr((project.name, project.references, project.is_test, project.has_engine)).encode())
+    for path in (HERE / "project.py", HERE / "toolchain.py", HERE / "Compiler.cs", HERE / "Members.cs"):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

