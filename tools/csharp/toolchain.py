@@ -90,8 +90,8 @@ class Assembly:
         sources: Its C# files.
         references: Paths of other assemblies than those of the surface.
         is_program: It has a `Main`.
-        lists_members: Write `name.members` beside it, for .NET: the members of the engine that it declares and uses, see
-            `Members.cs`.
+        lists_members: Write `name.members` beside it, for .NET: the members of the engine that it declares and uses
+            (`Members.cs`).
     """
 
     name: str

@@ -146,25 +146,16 @@ class Api:
         for entry in entries:
             there = set(versions)
             for tag, mask in _TAG.findall(entry):
-                if tag == "in":
-                    there &= {version for version, bit in zip(versions, mask, strict=True) if bit == "1"}
-                elif tag == "obsolete":
-                    there &= (
-                        {version for version, bit in zip(versions, mask, strict=True) if bit == "-"} if mask else set()
-                    )
-                else:
-                    there = set()
+                # Of an unknown condition, or obsolete without a mask: nowhere.
+                wanted_bit = {"in": "1", "obsolete": "-"}.get(tag)
+                there &= {version for version, bit in zip(versions, mask, strict=bool(mask)) if bit == wanted_bit}
             good |= there
         return ", ".join(version for version in wanted if version not in good)
 
     def _compare_types(self, member: Member, found: Mapping[str, Any]) -> str:
         kind, _, bases = member.signature.partition(" : ")
-        if kind.split()[-1] == "delegate" or found["kind"] == "delegate":
-            return (
-                ""
-                if kind.startswith("delegate") and "delegate" in found["kind"]
-                else f"{member}: it is a {found['kind']}"
-            )
+        if kind.startswith("delegate"):
+            kind = "delegate"
         if kind != found["kind"]:
             return f"{member}: it is a {found['kind']}"
         known = {write_plainly("types", base) for base in found.get("base", ())}
@@ -238,8 +229,8 @@ def make_extract(source: Path, assemblies: Mapping[str, list[Member]]) -> str:
     packages = {kind["pkg"] for kind in types.values()}
     return _render(
         {
-            "about": "Names and signatures of Unity's public API that unity_client uses; facts only. Made by `python -m "
-            "tools.csharp unity-api`, which says where they come from.",
+            "about": "Names and signatures of Unity's public API that unity_client uses; facts only. Made by "
+            "`python -m tools.csharp unity-api`, which says where they come from.",
             "packages": {name: content["packages"][name] for name in sorted(packages)},
             "messages": content["messages"],
             "types": {kind: types[kind] for kind in sorted(types)},
