@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from pathlib import Path
@@ -21,6 +22,7 @@ from iris_session.cli.common import (
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import DEFAULT_ROLES
 from iris_session.security.private_folder import KeysBusyError
+from iris_session.system.files import write_atomic
 
 if TYPE_CHECKING:
     from iris_session.security import JoinCode, KeyHome, KeyPair, RegisteredSession
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 ANY_ROLE: Final = "any"
 POLL_S: Final = 0.2
 MAX_MINUTES: Final = 24 * 60.0
+#: Format of the file of `--unity`, read by `unity_client/Runtime/Core/PairingFile.cs`.
+PAIRING_FILE_FORMAT: Final = 1
 #: Text by reason why no device has paired.
 FAILURE_TEXTS: Final = {
     "void": "void after five wrong attempts: create another code",
@@ -53,6 +57,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session pair --web                         a link for a browser, as a QR code
             iris-session pair --web --role observer         a browser that may look only
             iris-session pair --png code.png --no-wait      to show on another screen
+            iris-session pair --unity pairing.json --no-wait    a file to copy to one headset
             iris-session pair --address 10.0.0.5:7721       address at which others reach this machine
         """,
     )
@@ -71,6 +76,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--curve-key", default="", metavar="FILE", help="secret key of the session (default: the user's)"
     )
     parser.add_argument("--web", action="store_true", help="show a link to the page for browsers as the QR code")
+    parser.add_argument(
+        "--unity",
+        type=Path,
+        metavar="FILE",
+        help="write addresses, key of the certificate and code as JSON, which the headset apps read at start; secret "
+        "until the code is used",
+    )
     parser.add_argument(
         "--web-port",
         type=int,
@@ -138,6 +150,9 @@ def run(arguments: argparse.Namespace) -> int:
             "page": page,
             "certificate": "" if certificate is None else certificate.fingerprint,
         }
+        if arguments.unity is not None:
+            assert certificate is not None, "made or loaded for --unity"
+            _write_pairing_file(arguments.unity, certificate, [host for host, _ in places], web, invitation)
         _print_invitation(arguments, invitation)
         return 0 if arguments.no_wait else _wait_until_used(home, made, arguments)
     except BaseException:
@@ -145,17 +160,41 @@ def run(arguments: argparse.Namespace) -> int:
         raise
 
 
+def _needs_web(arguments: argparse.Namespace) -> bool:
+    return bool(arguments.web) or arguments.unity is not None
+
+
+def _write_pairing_file(
+    path: Path, certificate: Certificate, hosts: list[str], web: int, invitation: dict[str, Any]
+) -> None:
+    """Write what a headset app needs to pair by itself: only this user may read it."""
+    from iris_session.web.config import format_page_address
+
+    pairing = {
+        "format": PAIRING_FILE_FORMAT,
+        "session": invitation["session"],
+        "addresses": [format_page_address(host, web, secure=True) for host in hosts],
+        "pin": certificate.key,
+        "code": invitation["code"],
+        "expires": invitation["expires"],
+    }
+    try:
+        write_atomic(path, json.dumps(pairing, indent=2).encode() + b"\n", permissions=0o600)
+    except OSError as error:
+        raise CommandError(f"{path} cannot be written: {error.strerror}") from error
+
+
 def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[str]) -> Certificate | None:
-    """Return the certificate of the page, so that the code works there too. With `--web` it is made where needed."""
+    """Return the certificate of the page: the code works there too. Made where `--web` or `--unity` needs it."""
     from iris_session.system.extras import MissingExtraError
     from iris_session.web.certificate import find_certificate, load_certificate, load_or_make_certificate
 
     if arguments.web_cert:
         return load_certificate(arguments.web_cert)
     try:
-        return load_or_make_certificate(home, hosts) if arguments.web else find_certificate(home)
+        return load_or_make_certificate(home, hosts) if _needs_web(arguments) else find_certificate(home)
     except MissingExtraError:
-        if arguments.web:
+        if _needs_web(arguments):
             raise
         return None  # no page, no certificate
 
@@ -184,11 +223,11 @@ def _find_addresses(
 def _find_web_port(arguments: argparse.Namespace, note: RegisteredSession) -> int:
     """Return the port of the page of a session on this machine, 0 for none."""
     port = int(arguments.web_port or note.web)
-    if arguments.web and not port:
+    if _needs_web(arguments) and not port:
         raise CommandError(
             f"session {note.name!r} serves no page: pip install 'iris-session[web]' there, or leave out --no-web"
         )
-    if arguments.web and note.web and port != note.web:
+    if _needs_web(arguments) and note.web and port != note.web:
         print_error(f"session {note.name!r} serves its page at port {note.web}, not {port}")
     return port
 
@@ -200,7 +239,7 @@ def _guess_web_port(arguments: argparse.Namespace, control_port: int) -> int:
     if arguments.web_port is not None:
         return int(arguments.web_port)
     port = control_port + WEB_FROM_CONTROL
-    if arguments.web:
+    if _needs_web(arguments):
         print_error(
             f"no session with control port {control_port} runs here, so the page is assumed at port {port}: give "
             "--web-port if it has another one"

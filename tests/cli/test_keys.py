@@ -169,6 +169,33 @@ def test_pair_web_has_the_port_of_a_session_that_runs_here(home: KeyHome, capsys
     assert main(["pair", "--web", "--no-wait", "--web-port", "70000"]) != 0
 
 
+def test_pair_unity_writes_what_a_headset_reads_at_start(home: KeyHome, tmp_path: Path, capsys: Capture) -> None:
+    mark = home.load_server_key().fingerprint
+    home.sessions.add(RegisteredSession("s1", "lab-1", os.getpid(), ("10.0.0.5", "fd00::5"), 7731, mark, 8443))
+    path = tmp_path / "pairing.json"
+    assert main(["pair", "--unity", str(path), "--no-wait", "--json"]) == 0
+    shown, written = json.loads(capsys.readouterr().out), json.loads(path.read_text())
+    made = find_certificate(home)
+    assert made is not None
+    assert {"10.0.0.5", "fd00::5"} <= set(made.names), "the certificate is for the addresses in the file"
+    assert written == {
+        "format": 1,
+        "session": "lab-1",
+        "addresses": ["https://10.0.0.5:8443/", "https://[fd00::5]:8443/"],
+        "pin": made.key,
+        "code": shown["code"],
+        "expires": shown["expires"],
+    }
+    assert path.stat().st_mode & 0o077 == 0
+    (code,) = home.join_codes.read()
+    assert code.web_key == made.spki_hash, "the code is valid behind the gateway"
+    assert main(["pair", "--unity", str(tmp_path / "missing" / "pairing.json"), "--no-wait"]) == 2
+    assert not any(one.is_open(time.time()) for one in home.join_codes.read() if one.id != code.id), "void again"
+    home.sessions.add(RegisteredSession("s1", "lab-1", os.getpid(), ("10.0.0.5",), 7731, mark, 0))
+    assert main(["pair", "--unity", str(path), "--no-wait"]) == 2
+    assert "serves no page" in capsys.readouterr().err
+
+
 def test_forget_removes_stored_key(home: KeyHome) -> None:
     home.known_servers.pin("10.0.0.9:7721", "lab", KeyPair.generate().public)
     assert main(["keys", "forget", "10.0.0.9:7721"]) == 0
