@@ -23,6 +23,7 @@ from filelock import FileLock
 
 from tools.csharp.deflate_vectors import render_deflate_vectors
 from tools.csharp.pairing_vectors import render_pairing_vectors
+from tools.csharp.scene_vectors import render_scene_vectors
 from tools.csharp.toolchain import HERE, NUNIT, RUNTIMES, Assembly, Toolchain, prepare_toolchain, run_tool
 from tools.csharp.unity_api import Member, read_members
 from tools.csharp.vectors import render_message_vectors
@@ -211,6 +212,7 @@ def run_tests(build: Build, runtime: str, results: Path, *options: str) -> list[
         vectors = render_message_vectors(ROOT / "docs/protocol", 30_000 if is_long else 3_000)
         Path(folder, "messages.txt").write_text(vectors, encoding="utf-8")
         Path(folder, "pairing.txt").write_text(render_pairing_vectors(), encoding="utf-8")
+        Path(folder, "scenes.txt").write_text(render_scene_vectors(), encoding="utf-8")
         Path(folder, "deflate.bin").write_bytes(render_deflate_vectors())
         data = {"IRIS_VECTORS": folder, "IRIS_REPO": str(ROOT), **({"IRIS_FUZZ": str(FUZZ_LONG)} if is_long else {})}
         command = build.make_test_command(runtime, results, *options)
