@@ -231,6 +231,7 @@ namespace IrisSession.Core.Tests
             follower.Follow(mirror, 0);
             follower.TakeWanted(wanted, cancelled);
             Assert.AreEqual(wanted.Count - 3, cancelled.Count);
+            Assert.AreEqual(1, follower.MissingCount);
             follower.OnAsset(new string('b', 64), scene, 0, scene.Length - 1);
             Assert.AreEqual(SceneState.Unreadable, follower.State);
             Assert.AreSame(shown, follower.Plan);
