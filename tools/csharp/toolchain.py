@@ -48,6 +48,10 @@ _ROSLYN: Final = (
     "Microsoft.CodeAnalysis.dll", "Microsoft.CodeAnalysis.CSharp.dll",
     "System.Collections.Immutable.dll", "System.Reflection.Metadata.dll",
 )  # fmt: skip
+#: Of the framework, what sockets and certificates load and the program brought in a version of its own.
+_NEWER: Final = ("System.Diagnostics.DiagnosticSource.dll", "System.Formats.Asn1.dll")
+#: Of the surface, beginnings of names; `Microsoft.Win32.Primitives` has the base class of exceptions of sockets.
+_SURFACE: Final = ("System.", "netstandard", "mscorlib", "Microsoft.Win32.Primitives")
 
 
 class ToolchainError(RuntimeError):
@@ -170,8 +174,8 @@ def prepare_toolchain(folder: Path | None = None) -> Toolchain:
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / ".lock"):
             roslyn = _fetch(COMPILER, folder, lambda names: [n for n in names if Path(n).name in _ROSLYN])
-            runtime = _fetch(DOTNET, folder, lambda names: [n for n in names if "/dist/" in n], _keep_framework)
-            surface = _fetch(SURFACE, folder, _list_surface)
+            runtime = _fetch(DOTNET, folder, lambda names: [n for n in names if "/dist/" in n], _keep_framework, "-2")
+            surface = _fetch(SURFACE, folder, _list_surface, mark="-2")
             return Toolchain(_build_compiler(roslyn, surface, folder), runtime, surface)
     except OSError as error:
         raise ToolchainError(f"the C# tool chain cannot be kept: {error}") from error
@@ -221,9 +225,13 @@ def _fetch(
     folder: Path,
     select: Callable[[list[str]], list[str]],
     finish: Callable[[Path], None] = lambda _: None,
+    mark: str = "",
 ) -> Path:
-    """Return the folder of a package's selected files, without their folders; fetch it unless it is there."""
-    target = folder / f"{package.name.rpartition('/')[2]}-{package.version}-{package.sha256[:12]}"
+    """Return the folder of a package's selected files, without their folders; fetch it unless it is there.
+
+    `mark`: another one when `select` selects other files than before.
+    """
+    target = folder / f"{package.name.rpartition('/')[2]}-{package.version}-{package.sha256[:12]}{mark}"
     if target.exists():
         return target
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
@@ -270,7 +278,7 @@ def _keep_framework(folder: Path) -> None:
     described = json.loads((folder / "azmcp.deps.json").read_text())
     packs = {name: pack for target in described["targets"].values() for name, pack in target.items()}
     framework = next(pack for name, pack in packs.items() if name.startswith("runtimepack.Microsoft.NETCore.App."))
-    kept = {*framework["runtime"], *framework["native"]}
+    kept = {*framework["runtime"], *framework["native"], *_NEWER}
     for path in folder.iterdir():
         if path.name not in kept:
             path.unlink()
@@ -278,11 +286,7 @@ def _keep_framework(folder: Path) -> None:
 
 def _list_surface(names: list[str]) -> list[str]:
     """Return the libraries of .NET Core 3.1, without those of other languages and of Windows."""
-    return [
-        name
-        for name in names
-        if name.endswith(".dll") and Path(name).name.startswith(("System.", "netstandard", "mscorlib"))
-    ]
+    return [name for name in names if name.endswith(".dll") and Path(name).name.startswith(_SURFACE)]
 
 
 def _build_compiler(roslyn: Path, surface: Path, folder: Path) -> Path:

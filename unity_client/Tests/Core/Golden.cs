@@ -33,7 +33,7 @@ namespace IrisSession.Core.Tests
 
         public static string ToHex(byte[] bytes, int offset, int count)
         {
-            return BitConverter.ToString(bytes, offset, count).Replace("-", "").ToLowerInvariant();
+            return count == 0 ? "" : BitConverter.ToString(bytes, offset, count).Replace("-", "").ToLowerInvariant();
         }
 
         private static string FindCheckout([CallerFilePath] string source = "")
