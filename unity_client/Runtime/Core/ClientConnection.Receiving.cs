@@ -11,7 +11,7 @@ namespace IrisSession.Core
         private const long HeartbeatMaxNs = 10_000_000_000;
 
         /// <summary>Reason of a drop after another connection resumed this one. Joining again would only take it back in turn.</summary>
-        private const string Replaced = "replaced";
+        internal const string Replaced = "replaced";
 
         private readonly List<InboxMessage> applied = new List<InboxMessage>();
 
@@ -132,7 +132,7 @@ namespace IrisSession.Core
         /// <summary>Return whether a refusal passes: a client that was joined before keeps trying, after `rate` every client does.</summary>
         private bool IsRetryable(string code)
         {
-            return code == RefusalCode.Rate || (Welcome != null && (code == RefusalCode.Full || code == "session_full"));
+            return code == RefusalCode.Rate || (Welcome != null && (code == RefusalCode.Full || code == DenialReason.SessionFull));
         }
 
         private void Fail(Refused refused)
