@@ -180,6 +180,14 @@ namespace IrisSession.Core
             retryAt = later ? nowNs + BackoffMaxNs : Math.Min(retryAt, nowNs + UnreachableNs);
         }
 
+        /// <summary>Stop trying until <see cref="Open"/>: what is in the way is no session, such as another certificate. The token is kept.</summary>
+        public void Suspend()
+        {
+            Phase = ConnectionPhase.Idle;
+            outbox.Clear();
+            Requests.Clear();
+        }
+
         /// <summary>Do everything that depends on time: hello, back-off, clock, heartbeat, snapshot, silence.</summary>
         public void Tick(long nowNs)
         {

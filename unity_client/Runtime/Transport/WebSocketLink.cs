@@ -43,6 +43,7 @@ namespace IrisSession.Transport
         private readonly WebSocketWriter writer = new WebSocketWriter();
         private bool isOpen;
         private bool isStopping; // what waits is still written
+        private bool hasEnded;
         private bool isAsked; // we end it, not the other end
         private Thread reading;
         private volatile HttpConnection connection;
@@ -65,8 +66,11 @@ namespace IrisSession.Transport
         /// <summary>How it ended, once `HasEnded`.</summary>
         public LinkEnd End { get; private set; }
 
+        /// <summary>True from its opening until it ends or is stopped.</summary>
+        public bool IsOpen { get { lock (gate) return isOpen && !isStopping; } }
+
         /// <summary>True when nothing more comes and both threads are about to return.</summary>
-        public bool HasEnded { get; private set; }
+        public bool HasEnded { get { lock (gate) return hasEnded; } }
 
         /// <summary>Messages that came and were malformed.</summary>
         public long Malformed { get; private set; }
@@ -156,8 +160,8 @@ namespace IrisSession.Transport
             {
                 isOpen = false;
                 if (isAsked) End = default;
+                hasEnded = true;
             }
-            HasEnded = true;
             listener.OnEnd(this);
         }
 

@@ -1,0 +1,221 @@
+using System;
+using System.Collections.Generic;
+using System.Threading;
+using IrisSession.Core;
+using IrisSession.Protocol;
+
+namespace IrisSession.Transport
+{
+    // What runs on the thread of the session.
+    public sealed partial class SessionClient
+    {
+        /// <summary>Requests that wait for their reply: number on the wire and ticket of the engine.</summary>
+        private readonly List<KeyValuePair<long, long>> requests = new List<KeyValuePair<long, long>>();
+        private readonly Queue<SessionNews> ownNews = new Queue<SessionNews>(); // replies and notices that wait for room
+        private int requestGeneration;
+        private long statesReplaced;
+        private long seenSnapshots = -1;
+        private Refused seenRefusal;
+        private readonly MediaHeader mediaHeader = new MediaHeader();
+        private readonly WireReader mediaReader = new WireReader();
+
+        private void Run()
+        {
+            try
+            {
+                while (!isStopping)
+                {
+                    TakeCalls();
+                    loop.Step();
+                    Publish();
+                    transport.Wait((int)Math.Min(LongestWaitMs, (loop.NextWaitNs() + 999_999) / 1_000_000));
+                }
+            }
+            catch (Exception error)
+            {
+                crash = error.ToString(); // a defect of ours: the engine goes on without a session
+            }
+            try
+            {
+                loop.Close();
+                PublishView();
+            }
+            finally
+            {
+                transport.Dispose();
+            }
+        }
+
+        private void TakeCalls()
+        {
+            EStop pressed = Interlocked.Exchange(ref stop, null);
+            if (pressed != null) Guard(() => loop.Connection.Send(pressed));
+            while (calls.HasNews)
+            {
+                SessionCall call = calls.Oldest;
+                try
+                {
+                    Do(call);
+                }
+                catch (ClientException error)
+                {
+                    loop.Invalid++;
+                    if (call.Kind == CallKind.Request) AddNews(new SessionNews { Kind = NewsKind.Reply, Ticket = call.Ticket, Text = error.Message });
+                    else if (call.Kind == CallKind.Action) AddNews(new SessionNews { Kind = NewsKind.Notice, Text = error.Message });
+                }
+                call.Clear();
+                calls.Remove();
+            }
+        }
+
+        private void Do(SessionCall call)
+        {
+            switch (call.Kind)
+            {
+                case CallKind.Sample:
+                    loop.SendSample(call.Sample);
+                    break;
+                case CallKind.Sighting:
+                    loop.Alignment.Observe(call.Sighting);
+                    break;
+                case CallKind.Request:
+                    long number = loop.Connection.Request(call.Message);
+                    requests.Add(new KeyValuePair<long, long>(number, call.Ticket));
+                    break;
+                default:
+                    call.Action(loop);
+                    break;
+            }
+        }
+
+        private void Guard(Action action)
+        {
+            try
+            {
+                action();
+            }
+            catch (ClientException error)
+            {
+                AddNews(new SessionNews { Kind = NewsKind.Notice, Text = error.Message });
+            }
+        }
+
+        private void Publish()
+        {
+            TakeReplies();
+            while (ownNews.Count > 0 && news.HasRoom)
+            {
+                news.Next = ownNews.Dequeue();
+                news.Add();
+            }
+            Inbox inbox = loop.Connection.Inbox;
+            while (news.HasRoom && inbox.TryTake(out InboxMessage message))
+            {
+                news.Next = new SessionNews { Kind = NewsKind.Message, Message = message };
+                news.Add();
+            }
+            ClockSync clock = loop.Connection.Clock;
+            if (clock.IsSynced)
+            {
+                long nowNs = MonotonicClock.NowNs;
+                Interlocked.Exchange(ref clockOffsetNs, clock.SessionNs(nowNs) - nowNs);
+            }
+            Interlocked.Exchange(ref isClockSynced, clock.IsSettled ? 1 : 0);
+            PublishView();
+        }
+
+        private void TakeReplies()
+        {
+            PendingRequests pending = loop.Connection.Requests;
+            bool isLost = requestGeneration != loop.Connection.Generation; // those of another connection get no reply
+            requestGeneration = loop.Connection.Generation;
+            for (int i = 0; i < requests.Count;)
+            {
+                Reply reply = pending.PopReply(requests[i].Key);
+                bool waits = reply == null && pending.IsPending(requests[i].Key);
+                if (waits)
+                {
+                    i++;
+                    continue;
+                }
+                string text = reply != null ? "" : isLost ? "the connection was lost before the session answered" : "too many requests wait for an answer";
+                AddNews(new SessionNews { Kind = NewsKind.Reply, Ticket = requests[i].Value, Reply = reply, Text = text });
+                requests.RemoveAt(i);
+            }
+        }
+
+        /// <summary>Keep what is no message of the session until there is room. Beyond the bound the oldest is dropped.</summary>
+        private void AddNews(SessionNews one)
+        {
+            if (ownNews.Count == MaxRequests) ownNews.Dequeue();
+            ownNews.Enqueue(one);
+        }
+
+        private void TakeMedia(ref Multipart message)
+        {
+            try
+            {
+                if (message.Count != 3) throw new WireException("a media message of " + message.Count + " frames");
+                mediaReader.Reset(message.Buffer, message.OffsetOf(1), message.LengthOf(1));
+                mediaReader.ReadInto(mediaHeader);
+                mediaReader.ExpectEnd();
+            }
+            catch (WireException)
+            {
+                transport.Counters.Malformed++;
+                return;
+            }
+            long ageNs = loop.Connection.Clock.SessionNs(MonotonicClock.NowNs) - mediaHeader.CaptureNs;
+            loop.Meter.RecordMedia((int)message.TotalBytes, Math.Max(0, ageNs));
+            media.Put(ref message);
+        }
+
+        private void PublishView()
+        {
+            SessionView before = view;
+            ClientConnection connection = loop.Connection;
+            SessionMirror mirror = connection.Mirror;
+            bool isSame = before.Phase == connection.Phase && before.IsStalled == connection.IsStalled && before.Failure == connection.Failure
+                && before.Problem.Failure == loop.Problem.Failure && before.Endpoint == loop.Endpoints.Current && before.Welcome == connection.Welcome
+                && before.IsSynced == mirror.IsSynced && before.EventSeq == mirror.EventSeq && seenSnapshots == connection.Counters.Snapshots
+                && seenRefusal == connection.RetryableRefusal && before.Budget == connection.Budget && before.Alignment == loop.Alignment.Current;
+            if (isSame) return;
+            seenRefusal = connection.RetryableRefusal;
+            seenSnapshots = connection.Counters.Snapshots;
+            view = new SessionView(loop, before);
+        }
+
+        private sealed class Listener : ISessionListener
+        {
+            private readonly SessionClient client;
+
+            public Listener(SessionClient client)
+            {
+                this.client = client;
+            }
+
+            public void OnState(SessionLoop loop)
+            {
+                client.PublishView(); // its bodies come first
+                client.states.Back.Fill(loop.Connection.Stream, client.view.BodiesVersion);
+                if (client.states.Publish()) Interlocked.Increment(ref client.statesReplaced);
+            }
+
+            public void OnPresence(SessionLoop loop)
+            {
+                client.presence.Back.Fill(loop.Connection.Stream.Presence);
+                client.presence.Publish();
+            }
+
+            public void OnMedia(SessionLoop loop, ref Multipart message)
+            {
+                client.TakeMedia(ref message);
+            }
+
+            public void OnNotice(SessionLoop loop, string text)
+            {
+                client.AddNews(new SessionNews { Kind = NewsKind.Notice, Text = text });
+            }
+        }
+    }
+}

@@ -1,0 +1,194 @@
+// A session for an engine: connection and sockets on threads of their own, and calls that never wait for them.
+//
+//     engine's thread                                    thread of the session
+//     TrySendSample, TryPost, Request  --HandOver-->     SessionLoop.Step
+//     TakeState, TakePresence          <--TripleBuffer-- newest state, newest presence
+//     TryTakeNews                      <--HandOver--     events, replies, notices
+//     View                             <--reference--    the session, replaced when something changes
+//
+// All calls belong to one thread, the engine's. None allocates per frame; none throws what a session or a network did.
+using System;
+using System.Collections.Generic;
+using System.Threading;
+using IrisSession.Core;
+using IrisSession.Protocol;
+
+namespace IrisSession.Transport
+{
+    /// <summary>A client that an engine polls. Start it once, stop it once.</summary>
+    public sealed partial class SessionClient
+    {
+        /// <summary>Calls that wait for the thread of the session: seconds of samples, as it runs every few milliseconds.</summary>
+        private const int MaxCalls = 1024;
+
+        /// <summary>Events, replies and notices that wait for the engine. Above, messages stay in the connection's inbox, which names what is missed.</summary>
+        private const int MaxNews = 1024;
+
+        /// <summary>Requests whose reply was not taken.</summary>
+        private const int MaxRequests = 64;
+
+        /// <summary>Longest sleep of the session's thread, so that its clock estimate reaches the engine [ms].</summary>
+        private const int LongestWaitMs = 100;
+
+        /// <summary>Longest time of <see cref="Stop"/>.</summary>
+        private const int StopMs = 950;
+
+        private readonly SessionLoop loop;
+        private readonly ITransport transport;
+        private readonly Thread thread;
+        private readonly TripleBuffer<StateFrame> states = new TripleBuffer<StateFrame>(() => new StateFrame());
+        private readonly TripleBuffer<PresenceFrame> presence = new TripleBuffer<PresenceFrame>(() => new PresenceFrame());
+        private readonly HandOver<SessionCall> calls = new HandOver<SessionCall>(MaxCalls, () => new SessionCall());
+        private readonly HandOver<SessionNews> news = new HandOver<SessionNews>(MaxNews, () => default);
+        private readonly NewestMessages media = new NewestMessages(16, true);
+        private EStop stop; // handed over by itself: it never waits behind samples, and is never dropped
+        private volatile SessionView view;
+        private volatile bool isStopping;
+        private volatile string crash = "";
+        private long clockOffsetNs;
+        private long isClockSynced;
+        private long tickets;
+
+        /// <param name="hello">See <see cref="ClientConnection"/>.</param>
+        /// <param name="identity">Called on the thread of the session.</param>
+        /// <param name="endpoints">Addresses in the order of preference.</param>
+        /// <param name="transport">Disposed of by <see cref="Stop"/>.</param>
+        public SessionClient(Hello hello, IIdentityStore identity, EndpointChooser endpoints, ITransport transport)
+        {
+            this.transport = transport;
+            loop = new SessionLoop(new ClientConnection(hello, identity), transport, endpoints, new Listener(this), () => MonotonicClock.NowNs);
+            view = new SessionView(loop, null);
+            thread = new Thread(Run) { IsBackground = true, Name = "iris-session" };
+        }
+
+        /// <summary>The session as it is known now.</summary>
+        public SessionView View { get { return view; } }
+
+        /// <summary>The newest state, empty before the first. See <see cref="TakeState"/>.</summary>
+        public StateFrame State { get { return states.Front; } }
+
+        public PresenceFrame Presence { get { return presence.Front; } }
+
+        /// <summary>Calls that were dropped because too many waited.</summary>
+        public long CallsDropped { get; private set; }
+
+        /// <summary>States that a newer one replaced before the engine took them.</summary>
+        public long StatesReplaced { get { return Interlocked.Read(ref statesReplaced); } }
+
+        /// <summary>The error that ended the thread, empty while it runs as it should.</summary>
+        public string Crash { get { return crash; } }
+
+        /// <summary>True when the thread of the session has ended, or was never started.</summary>
+        public bool HasEnded { get { return !thread.IsAlive; } }
+
+        /// <summary>True when session time is known.</summary>
+        public bool HasClock { get { return Interlocked.Read(ref isClockSynced) != 0; } }
+
+        /// <summary>Return session time at a time of <see cref="MonotonicClock"/>.</summary>
+        public long ToSessionNs(long localNs)
+        {
+            return localNs + Interlocked.Read(ref clockOffsetNs);
+        }
+
+        /// <summary>Start to join the session.</summary>
+        public void Start()
+        {
+            TryPost(session => session.Open());
+            thread.Start();
+        }
+
+        /// <summary>Leave the session and end all threads. Returns within a second: whether they have ended.</summary>
+        public bool Stop()
+        {
+            isStopping = true;
+            transport.Wake();
+            return (thread.ThreadState & ThreadState.Unstarted) != 0 || thread.Join(StopMs);
+        }
+
+        /// <summary>Take the newest state as <see cref="State"/>. False: it is that already.</summary>
+        public bool TakeState()
+        {
+            return states.TryTake();
+        }
+
+        /// <summary>Take the newest presence as <see cref="Presence"/>. False: it is that already.</summary>
+        public bool TakePresence()
+        {
+            return presence.TryTake();
+        }
+
+        /// <summary>
+        /// Take the newest media frame of some stream (topic, `MediaHeader`, bytes), in exchange for `message`. False: there is none, or the other
+        /// thread hands one over at this moment. A thread of the application may call it, to decode there.
+        /// </summary>
+        public bool TryTakeMedia(ref Multipart message)
+        {
+            return media.TryTakeAtOnce(ref message);
+        }
+
+        /// <summary>Take the oldest event, reply or notice.</summary>
+        public bool TryTakeNews(out SessionNews one)
+        {
+            one = default;
+            if (!news.HasNews) return false;
+            one = news.Oldest;
+            news.Oldest = default;
+            news.Remove();
+            return true;
+        }
+
+        /// <summary>Send the input of a device, of which a copy is made. False: too many calls wait.</summary>
+        public bool TrySendSample(SampleInput input)
+        {
+            if (!HasRoom()) return false;
+            calls.Next.SetSample(input);
+            return HandCall();
+        }
+
+        /// <summary>Report a sheet, of which a copy is made. False: too many calls wait.</summary>
+        public bool TryObserve(SheetSighting sighting)
+        {
+            if (!HasRoom()) return false;
+            calls.Next.SetSighting(sighting);
+            return HandCall();
+        }
+
+        /// <summary>Do something on the thread of the session. Its `ClientException` becomes a notice. False: too many calls wait.</summary>
+        public bool TryPost(Action<SessionLoop> action)
+        {
+            if (!HasRoom()) return false;
+            calls.Next.SetAction(action);
+            return HandCall();
+        }
+
+        /// <summary>Send a request. Returns its ticket, with which the reply comes as news; 0: too many calls wait.</summary>
+        public long Request(ClientMessage message)
+        {
+            if (!HasRoom()) return 0;
+            calls.Next.SetRequest(message, ++tickets);
+            HandCall();
+            return tickets;
+        }
+
+        /// <summary>Stop all robots. Kept until the session has it, over any number of connections.</summary>
+        public void EStop(string reason)
+        {
+            Interlocked.Exchange(ref stop, new EStop { Reason = reason });
+            transport.Wake();
+        }
+
+        private bool HasRoom()
+        {
+            if (calls.HasRoom) return true;
+            CallsDropped++;
+            return false;
+        }
+
+        private bool HandCall()
+        {
+            calls.Add();
+            transport.Wake();
+            return true;
+        }
+    }
+}

@@ -1,0 +1,278 @@
+// The rounds of a client over a transport and a clock of the test: reconnects, addresses, certificates, media.
+using System.Collections.Generic;
+using System.Linq;
+using IrisSession.Core;
+using IrisSession.Protocol;
+using NUnit.Framework;
+
+namespace IrisSession.Transport.Tests
+{
+    [TestFixture]
+    public class SessionLoopTests
+    {
+        private const long Ms = LoopRig.Ms;
+        private const long Second = LoopRig.Second;
+        private static readonly WebEndpoint Cable = new WebEndpoint(false, "localhost", 7725);
+        private static readonly WebEndpoint Wifi = new WebEndpoint(true, "192.168.0.10", 7725, new byte[32]);
+
+        private static List<Hello> Hellos(LoopRig rig)
+        {
+            return rig.Transport.Sent.Select(each => each.Message).OfType<Hello>().ToList();
+        }
+
+        [Test]
+        public void JoinsAndHandsOutStates()
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Join();
+            for (int i = 0; i < 5; i++)
+            {
+                rig.SendState();
+                rig.Run(5 * Ms);
+            }
+            Assert.AreEqual(5, rig.States);
+            Assert.AreEqual(1, rig.Transport.Opened.Count);
+            rig.Run(3 * Second);
+            Assert.GreaterOrEqual(rig.Received.OfType<ClientReport>().Count(), 2);
+            Assert.GreaterOrEqual(rig.Received.OfType<Heartbeat>().Count(), 4);
+        }
+
+        [TestCase(LinkFailure.Unreachable, 0)]
+        [TestCase(LinkFailure.Closed, CloseCode.Restart)]
+        [TestCase(LinkFailure.Closed, CloseCode.TooSlow)]
+        [TestCase(LinkFailure.Overflow, 0)]
+        public void LostConnectionIsResumedAtOnceWithItsToken(LinkFailure failure, int code)
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Join();
+            rig.Run(2 * Second);
+            rig.Transport.Break(failure, code);
+            rig.Loop.Step();
+            rig.Loop.Step();
+            Assert.AreEqual(2, rig.Transport.Opened.Count);
+            CollectionAssert.AreEqual(new byte[] { 1 }, Hellos(rig)[1].ResumeToken);
+            rig.Run(200 * Ms);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            Assert.AreEqual(1, rig.Loop.Connection.Counters.Reconnects);
+        }
+
+        [Test]
+        public void SilentSessionIsJoinedAgain()
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Join();
+            rig.Run(6 * Second, false);
+            Assert.AreEqual(1, rig.Loop.Connection.Counters.Reconnects);
+            Assert.GreaterOrEqual(rig.Transport.Opened.Count, 2);
+            rig.Run(5 * Second);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+        }
+
+        [Test]
+        public void ADeadServerIsTriedAgainWithPauses()
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Loop.Open();
+            long until = rig.NowNs + 60 * Second;
+            while (rig.NowNs < until)
+            {
+                rig.Loop.Step();
+                if (rig.Transport.State == TransportState.Open) rig.Transport.Break(LinkFailure.Unreachable);
+                rig.NowNs += Ms;
+            }
+            Assert.That(rig.Transport.Opened.Count, Is.InRange(60, 200)); // a gateway that restarts is back within seconds
+            rig.Run(2 * Second);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+        }
+
+        [Test]
+        public void AfterAFloodItComesLater()
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Join();
+            rig.Run(2 * Second);
+            rig.Transport.Break(LinkFailure.Closed, CloseCode.Flood);
+            rig.Run(1900 * Ms);
+            Assert.AreEqual(1, rig.Transport.Opened.Count);
+            rig.Run(300 * Ms);
+            Assert.AreEqual(2, rig.Transport.Opened.Count);
+        }
+
+        [TestCase(CloseCode.Version)]
+        [TestCase(CloseCode.NotAllowed)]
+        public void WhatIsNotAllowedIsNotTriedAgainUntilAsked(int code)
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Join();
+            rig.Transport.Break(LinkFailure.Closed, code);
+            rig.Run(30 * Second);
+            Assert.AreEqual(1, rig.Transport.Opened.Count);
+            Assert.AreEqual(code, rig.Loop.Problem.Code);
+            rig.Loop.Open();
+            rig.Run(200 * Ms);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            Assert.AreEqual(LinkFailure.None, rig.Loop.Problem.Failure);
+        }
+
+        [Test]
+        public void AnUnknownCertificateWaitsForThePerson()
+        {
+            byte[] shown = TestCertificate.First.Hash;
+            LoopRig rig = new LoopRig(new WebEndpoint(true, "192.168.0.10", 7725));
+            rig.Loop.Open();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.UnknownCertificate, 0, shown);
+            rig.Run(30 * Second);
+            Assert.AreEqual(1, rig.Transport.Opened.Count);
+            Assert.AreEqual(LinkFailure.UnknownCertificate, rig.Loop.Problem.Failure);
+            CollectionAssert.AreEqual(shown, rig.Loop.Problem.CertificateHash);
+            rig.Loop.Trust(TestCertificate.Second.Hash);
+            Assert.AreEqual(LinkFailure.UnknownCertificate, rig.Loop.Problem.Failure);
+            rig.Loop.Trust(shown);
+            rig.Run(200 * Ms);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            CollectionAssert.AreEqual(shown, rig.Transport.Newest.Pin);
+        }
+
+        [Test]
+        public void ACableThatIsNotThereGivesWayAndIsPreferredWhenItAnswers()
+        {
+            LoopRig rig = new LoopRig(Cable, Wifi);
+            rig.Loop.Open();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(500 * Ms);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            Assert.AreSame(Wifi, rig.Transport.Newest);
+            rig.Run(3 * Second);
+            CollectionAssert.AreEqual(new[] { Cable }, rig.Transport.Probes);
+            rig.Transport.ProbeAnswers.Enqueue(new ProbeAnswer(Cable, new LinkEnd(LinkFailure.Unreachable, 0, ""), ""));
+            rig.Run(3 * Second);
+            Assert.AreEqual(2, rig.Transport.Probes.Count);
+            Assert.AreEqual(2, rig.Transport.Opened.Count);
+            rig.Transport.ProbeAnswers.Enqueue(new ProbeAnswer(Cable, default, "another session"));
+            rig.Run(3 * Second);
+            Assert.AreEqual(2, rig.Transport.Opened.Count);
+            rig.Transport.ProbeAnswers.Enqueue(new ProbeAnswer(Cable, default, "s1"));
+            byte[] token = rig.Identity.ResumeToken;
+            rig.Run(500 * Ms);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            Assert.AreSame(Cable, rig.Transport.Newest);
+            CollectionAssert.AreEqual(token, Hellos(rig)[Hellos(rig).Count - 1].ResumeToken);
+            Assert.AreEqual(1, rig.Endpoints.Moves);
+            rig.Run(2 * Second);
+            rig.Transport.Break(LinkFailure.Unreachable); // unplugged
+            rig.Loop.Step();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(500 * Ms);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            Assert.AreSame(Wifi, rig.Transport.Newest);
+        }
+
+        [Test]
+        public void AnAddressThatAnswersOnlyProbesIsLeftAloneForAWhile()
+        {
+            LoopRig rig = new LoopRig(Cable, Wifi);
+            rig.Loop.Open();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(3 * Second);
+            rig.Transport.ProbeAnswers.Enqueue(new ProbeAnswer(Cable, default, "s1"));
+            rig.Loop.Step();
+            rig.Loop.Step();
+            Assert.AreSame(Cable, rig.Transport.Newest);
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(20 * Second);
+            Assert.AreSame(Wifi, rig.Transport.Newest);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            Assert.AreEqual(1, rig.Transport.Probes.Count);
+            rig.Run(15 * Second);
+            Assert.AreEqual(2, rig.Transport.Probes.Count);
+        }
+
+        [Test]
+        public void NothingMovesWhileARobotFollows()
+        {
+            LoopRig rig = new LoopRig(Cable, Wifi);
+            rig.Loop.Open();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(500 * Ms);
+            SampleInput input = new SampleInput { Device = Device.ControllerRight, Clutch = true };
+            input.Robots.Add("left");
+            for (int i = 0; i < 500; i++)
+            {
+                rig.Loop.SendSample(input);
+                rig.Run(10 * Ms);
+            }
+            CollectionAssert.IsEmpty(rig.Transport.Probes);
+            rig.Run(2 * Second);
+            Assert.AreEqual(1, rig.Transport.Probes.Count);
+        }
+
+        [Test]
+        public void AnotherCertificateOnOneAddressDoesNotStopTheOther()
+        {
+            LoopRig rig = new LoopRig(Wifi, Cable);
+            rig.Loop.Open();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.WrongCertificate, 0, TestCertificate.First.Hash);
+            rig.Run(5 * Second);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            CollectionAssert.AreEqual(new[] { Wifi, Cable }, rig.Transport.Opened);
+            CollectionAssert.IsEmpty(rig.Transport.Probes);
+        }
+
+        [Test]
+        public void MediaAreForConnectionsWithABudget()
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Loop.SetMediaWishes(new[] { "cloud" });
+            rig.Join();
+            Assert.AreEqual(0, rig.Transport.MediaEpoch);
+            rig.Send(new DeliveryBudget { BudgetClass = "full" });
+            rig.Run(10 * Ms);
+            Assert.AreEqual(1, rig.Transport.MediaEpoch);
+            CollectionAssert.AreEqual(new[] { "cloud" }, rig.Transport.Wishes);
+            rig.Run(2 * Second);
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(300 * Ms);
+            Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            Assert.AreEqual(0, rig.Transport.MediaEpoch);
+            rig.Send(new DeliveryBudget { BudgetClass = "full" });
+            rig.Run(10 * Ms);
+            Assert.AreEqual(2, rig.Transport.MediaEpoch);
+        }
+
+        [Test]
+        public void WhileTheSocketIsFullSamplesAreDroppedAndTheRestWaits()
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Join();
+            rig.Transport.IsFull = true;
+            SampleInput input = new SampleInput { Device = Device.ControllerRight };
+            rig.Loop.SendSample(input);
+            long before = rig.Loop.Connection.Counters.SamplesNotSent;
+            rig.Loop.Step();
+            Assert.AreEqual(before + 1, rig.Loop.Connection.Counters.SamplesNotSent);
+            rig.Loop.Connection.Send(new EStop { Reason = "test" });
+            rig.Loop.Step();
+            Assert.LessOrEqual(rig.Loop.NextWaitNs(), 10 * Ms);
+            rig.Transport.IsFull = false;
+            rig.Loop.Step();
+            Assert.AreEqual(1, rig.Transport.Sent.Count(each => each.Message is EStop));
+        }
+
+        [Test]
+        public void ClosingSaysBye()
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Join();
+            rig.Loop.Close();
+            Assert.IsInstanceOf<Bye>(rig.Transport.Sent[rig.Transport.Sent.Count - 1].Message);
+            Assert.AreEqual(TransportState.Closed, rig.Transport.State);
+            CollectionAssert.IsEmpty(rig.Identity.ResumeToken);
+        }
+    }
+}
