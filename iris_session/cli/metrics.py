@@ -78,6 +78,10 @@ def _list_participant_metrics(r: StatusReport) -> Iterator[Metric]:
     yield Metric("participant_missed_share", "gauge", "State frames that did not arrive.", missed)
     rtt = [(labels, p.rtt_ms * 1e-3) for labels, p in people if p.reported]
     yield Metric("participant_rtt_seconds", "gauge", "Lowest recent round trip.", rtt)
+    charges = [(labels, p.battery) for labels, p in people if p.battery >= 0.0]
+    yield Metric("participant_battery_ratio", "gauge", "Charge of its headset, 0 to 1.", charges)
+    dropped = [(labels, float(p.dropped_frames)) for labels, p in people if p.display_hz > 0.0]
+    yield Metric("participant_dropped_frames", "gauge", "Frames not drawn in time, over the last second.", dropped)
     received = [(labels, p.bytes_per_s) for labels, p in people if p.reported]
     yield Metric("participant_state_bytes_per_second", "gauge", "State received.", received)
     drops = [(labels, float(p.drops)) for labels, p in people]

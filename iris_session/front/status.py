@@ -19,6 +19,7 @@ from iris_session.front.connections import FrontConnection
 from iris_session.front.context import FrontContext
 from iris_session.front.media.service import MediaService
 from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.names import ThermalState
 from iris_session.protocol.status import (
     ClientReport,
     GetStatus,
@@ -34,6 +35,10 @@ ROLL_NS: Final = 1_000_000_000
 #: With fewer state frames in the last seconds no 99th percentile is reported: it would be the latest frame, and in a
 #: scene at rest, whose state is sent again four times a second, one late frame would be reported for long.
 MIN_DELAYS: Final = 25
+#: Charge below which a headset is warned about: Quest 3 lasts two hours, so this is a quarter of an hour.
+LOW_BATTERY: Final = 0.15
+#: Dropped frames per frame drawn that are warned about: from here on people see it (assumed).
+DROPPED_SHARE: Final = 0.1
 #: A report is made at most this often, however many ask.
 REUSE_NS: Final = 200_000_000
 
@@ -121,15 +126,17 @@ class StatusService:
         for reason, count in self._context.drops.by_reason.items():
             drops[reason] = drops.get(reason, 0) + count
         by_participant = {c.participant_id: c for c in self._context.connections.by_number.values() if c.participant_id}
+        people = tuple(self._merge_row(row, by_participant.get(row.id), now_ns) for row in half.participants)
+        warnings = (*half.warnings, *self._context.guard.list_warnings(now_ns), *self._media.list_warnings())
         return msgspec.structs.replace(
             half,
             session_id=config.session_id,
             session_name=config.session_name,
             stalled=authority.stalled,
             step_to_publish=compute_quantiles(delays) if len(delays) >= MIN_DELAYS else None,
-            participants=tuple(self._merge_row(row, by_participant.get(row.id), now_ns) for row in half.participants),
+            participants=people,
             drops=drops,
-            warnings=(*half.warnings, *self._context.guard.list_warnings(now_ns), *self._media.list_warnings()),
+            warnings=(*warnings, *(text for person in people for text in list_device_warnings(person))),
             connections=len(self._context.connections),
             entries_per_s=self._entries_per_s,
             authority_silent_ns=now_ns - authority.heard_ns if authority.heard_ns else -1,
@@ -168,4 +175,27 @@ def _client_fields(report: ClientReport) -> dict[str, Any]:
         "missed_share": report.missed / expected if expected else 0.0,
         "rtt_ms": report.rtt_ms,
         "bytes_per_s": report.bytes_per_s,
+        "display_hz": report.display_hz,
+        "battery": report.battery,
+        "charging": report.charging,
+        "thermal": report.thermal,
+        "dropped_frames": report.dropped_frames,
     }
+
+
+def list_device_warnings(person: ParticipantReport) -> list[str]:
+    """Return what should be done about the device of a participant before it fails in an episode."""
+    if not person.connected:
+        return []
+    found = []
+    if 0.0 <= person.battery < LOW_BATTERY and not person.charging:
+        found.append(f"{person.name}: battery at {person.battery:.0%}: charge or change the headset before an episode")
+    if person.thermal == ThermalState.HOT:
+        found.append(f"{person.name}: the headset is hot and slows down: let it cool before an episode")
+    drawn = person.display_hz
+    if person.dropped_frames > DROPPED_SHARE * drawn > 0.0:
+        found.append(
+            f"{person.name}: {person.dropped_frames} frames were dropped in the last second, {drawn:.0f} drawn: the "
+            "scene or the media are too much for the headset"
+        )
+    return found

@@ -362,6 +362,14 @@ class BudgetClass:
     NONE: Final = "none"
 
 
+class ThermalState:
+    """Temperature of a headset by what it does about it. Empty where it does not say."""
+
+    NOMINAL: Final = "nominal"
+    WARM: Final = "warm"
+    HOT: Final = "hot"  # it renders less, and may turn itself off
+
+
 class AssetRefusal:
     """Reason why a request for an asset is refused. After the last four the same request may succeed later."""
 

@@ -28,6 +28,8 @@ class ClientReport(Message, frozen=True, tag="client_report"):
     `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest recent round trip.
     `media_bytes_per_s`, `media_age_ms` (median since capture): of the media channel. `display_hz`: frames drawn, 0 when
     none are. `media_limit_mbit_per_s`: upper bound of media that the client asks for, 0 for no limit of its own.
+    `battery`: charge of the device, 0 to 1, -1 where it is not known. `thermal`: a `ThermalState`. `dropped_frames`:
+    frames that were not drawn in time, over the last second.
     """
 
     age_ms_p50: float
@@ -40,6 +42,10 @@ class ClientReport(Message, frozen=True, tag="client_report"):
     media_age_ms: float = 0.0
     display_hz: float = 0.0
     media_limit_mbit_per_s: float = 0.0
+    battery: float = -1.0
+    charging: bool = False
+    thermal: Name = ""
+    dropped_frames: Count = 0
 
 
 class DeliveryBudget(Message, frozen=True, tag="delivery_budget"):
@@ -157,7 +163,8 @@ class ParticipantReport(msgspec.Struct, frozen=True):
     disconnected (`silent`, `closed`, `slow`, ...), empty while connected. `rejected`: samples by reason, `drops`:
     messages dropped, both since it joined. `reported`: its client reports. `media`: the streams that it subscribed to,
     `budget_class` the lowest of theirs, empty without one. `media_bytes_per_s`: sent to it, `media_drops`: frames that
-    its link did not take in time, since it joined.
+    its link did not take in time, since it joined. `display_hz`, `battery`, `charging`, `thermal`, `dropped_frames`: of
+    its device, as in `ClientReport`.
     """
 
     id: Name
@@ -190,6 +197,11 @@ class ParticipantReport(msgspec.Struct, frozen=True):
     media_bytes_per_s: float = 0.0
     media_drops: Count = 0
     alignment_report: AlignmentReport | None = None
+    display_hz: float = 0.0
+    battery: float = -1.0
+    charging: bool = False
+    thermal: Name = ""
+    dropped_frames: Count = 0
 
 
 class StopReport(msgspec.Struct, frozen=True):

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from msgspec.structs import replace
 
+from iris_session.front.status import list_device_warnings
 from iris_session.protocol.client_messages import Hello, Observation
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Join
@@ -79,6 +81,29 @@ def test_both_halves_make_one_report(session: FrontSession) -> None:
     assert (ann.state_age.p50, ann.state_age.p99, ann.missed_share, ann.rtt_ms) == (1.5, 7.0, 0.25, 2.5)
     assert ann.heard_ns >= 0
     assert ann.lost == ""
+
+
+def test_a_headset_that_will_fail_is_warned_about(session: FrontSession) -> None:
+    """Before it dies in an episode: by battery, heat and dropped frames, and no more once it is well."""
+    client = session.client()
+    welcome = client.join(name="Ann")
+    session.process.link.send_report(half(row(welcome.participant_id)))
+    good = ClientReport(1.0, 2.0, 60, display_hz=72.0, battery=0.8, thermal="nominal", dropped_frames=3)
+    bad = replace(good, battery=0.09, thermal="hot", dropped_frames=30)
+    for sent, count in ((bad, 3), (replace(bad, charging=True), 2), (good, 0)):
+        client.send(sent)
+        wanted = (sent.battery, sent.charging)
+
+        def shows(report: StatusReport, wanted: tuple[float, bool] = wanted) -> bool:
+            return [(p.battery, p.charging) for p in report.participants] == [wanted]
+
+        report = ask(session, client, shows)
+        (ann,) = report.participants
+        assert (ann.charging, ann.thermal, ann.dropped_frames) == (sent.charging, sent.thermal, sent.dropped_frames)
+        assert len([text for text in report.warnings if text.startswith("Ann: ")]) == count
+    gone = replace(ann, connected=False, battery=0.01)
+    assert list_device_warnings(gone) == []
+    assert list_device_warnings(replace(ann, display_hz=0.0, dropped_frames=50, battery=-1.0)) == []
 
 
 def test_alignment_report_has_both_halves(open_session: Callable[..., FrontSession]) -> None:

@@ -319,6 +319,14 @@ namespace IrisSession.Protocol
         public const string None = "none";
     }
 
+    /// <summary>Temperature of a headset by what it does about it.</summary>
+    public static class ThermalState
+    {
+        public const string Nominal = "nominal";
+        public const string Warm = "warm";
+        public const string Hot = "hot";
+    }
+
     /// <summary>Reason why a request for an asset is refused.</summary>
     public static class AssetRefusal
     {
@@ -1572,6 +1580,10 @@ namespace IrisSession.Protocol
         public double MediaAgeMs;
         public double DisplayHz;
         public double MediaLimitMbitPerS;
+        public double Battery = -1.0;
+        public bool Charging;
+        public string Thermal = "";
+        public long DroppedFrames;
 
         public static ClientReport Read(WireReader reader) => reader.ReadInto(new ClientReport());
 
@@ -1587,6 +1599,10 @@ namespace IrisSession.Protocol
             codec.Allow("media_age_ms", ref MediaAgeMs, 0.0);
             codec.Allow("display_hz", ref DisplayHz, 0.0);
             codec.Allow("media_limit_mbit_per_s", ref MediaLimitMbitPerS, 0.0);
+            codec.Allow("battery", ref Battery, -1.0);
+            codec.Allow("charging", ref Charging, false);
+            codec.Allow("thermal", ref Thermal, 64, "");
+            codec.Allow("dropped_frames", ref DroppedFrames, 0, long.MaxValue, 0);
         }
     }
 

@@ -341,6 +341,14 @@ export const BudgetClass = {
 } as const;
 export type BudgetClass = (typeof BudgetClass)[keyof typeof BudgetClass] | (string & {});
 
+/** Temperature of a headset by what it does about it. Empty where it does not say. */
+export const ThermalState = {
+  NOMINAL: "nominal",
+  WARM: "warm",
+  HOT: "hot",
+} as const;
+export type ThermalState = (typeof ThermalState)[keyof typeof ThermalState] | (string & {});
+
 /** Reason why a request for an asset is refused. After the last four the same request may succeed later. */
 export const AssetRefusal = {
   UNKNOWN: "unknown_asset",
@@ -800,7 +808,8 @@ export interface StopReport {
  * disconnected (`silent`, `closed`, `slow`, ...), empty while connected. `rejected`: samples by reason, `drops`:
  * messages dropped, both since it joined. `reported`: its client reports. `media`: the streams that it subscribed to,
  * `budget_class` the lowest of theirs, empty without one. `media_bytes_per_s`: sent to it, `media_drops`: frames that
- * its link did not take in time, since it joined.
+ * its link did not take in time, since it joined. `display_hz`, `battery`, `charging`, `thermal`, `dropped_frames`: of
+ * its device, as in `ClientReport`.
  */
 export interface ParticipantReport {
   id: string;
@@ -833,6 +842,11 @@ export interface ParticipantReport {
   media_bytes_per_s?: number;
   media_drops?: number;
   alignment_report?: AlignmentReport | null;
+  display_hz?: number;
+  battery?: number;
+  charging?: boolean;
+  thermal?: string;
+  dropped_frames?: number;
 }
 
 /** One robot: its holder, its state, and the reason why it holds. */
@@ -1237,6 +1251,8 @@ export interface GetStatus {
  * `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest recent round trip.
  * `media_bytes_per_s`, `media_age_ms` (median since capture): of the media channel. `display_hz`: frames drawn, 0 when
  * none are. `media_limit_mbit_per_s`: upper bound of media that the client asks for, 0 for no limit of its own.
+ * `battery`: charge of the device, 0 to 1, -1 where it is not known. `thermal`: a `ThermalState`. `dropped_frames`:
+ * frames that were not drawn in time, over the last second.
  */
 export interface ClientReport {
   type: "client_report";
@@ -1250,6 +1266,10 @@ export interface ClientReport {
   media_age_ms?: number;
   display_hz?: number;
   media_limit_mbit_per_s?: number;
+  battery?: number;
+  charging?: boolean;
+  thermal?: string;
+  dropped_frames?: number;
 }
 
 /**
@@ -2348,7 +2368,7 @@ export const DEFAULTS = {
   rename: {},
   set_role: {},
   get_status: { request_id: 0 },
-  client_report: { missed: 0, rtt_ms: 0.0, bytes_per_s: 0.0, media_bytes_per_s: 0.0, media_age_ms: 0.0, display_hz: 0.0, media_limit_mbit_per_s: 0.0 },
+  client_report: { missed: 0, rtt_ms: 0.0, bytes_per_s: 0.0, media_bytes_per_s: 0.0, media_age_ms: 0.0, display_hz: 0.0, media_limit_mbit_per_s: 0.0, battery: -1.0, charging: false, thermal: "", dropped_frames: 0 },
   welcome: { key_fingerprint: "" },
   refused: { advice: "", supported_versions: [1] },
   protocol_fault: { reason: "" },
@@ -2515,6 +2535,11 @@ export const VALUE_DEFAULTS = {
     media_bytes_per_s: 0.0,
     media_drops: 0,
     alignment_report: null,
+    display_hz: 0.0,
+    battery: -1.0,
+    charging: false,
+    thermal: "",
+    dropped_frames: 0,
   },
   RobotReport: {
     holder: "",

@@ -333,6 +333,11 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["media_bytes_per_s", ["float"], [0.0]],
       ["media_drops", ["int", 0, null], [0]],
       ["alignment_report", ["null", ["struct", "AlignmentReport"]], [null]],
+      ["display_hz", ["float"], [0.0]],
+      ["battery", ["float"], [-1.0]],
+      ["charging", ["bool"], [false]],
+      ["thermal", ["str", 64, ""], [""]],
+      ["dropped_frames", ["int", 0, null], [0]],
     ],
   },
   RobotReport: {
@@ -703,6 +708,10 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["media_age_ms", ["float"], [0.0]],
       ["display_hz", ["float"], [0.0]],
       ["media_limit_mbit_per_s", ["float"], [0.0]],
+      ["battery", ["float"], [-1.0]],
+      ["charging", ["bool"], [false]],
+      ["thermal", ["str", 64, ""], [""]],
+      ["dropped_frames", ["int", 0, null], [0]],
     ],
   },
   Welcome: {

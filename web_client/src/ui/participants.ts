@@ -6,7 +6,7 @@ import type { Actions } from "./actions.ts";
 import { button, h, KeyedList, type Row, setOptions, setText, setValue } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
-import { alignmentWords, formatMilliseconds, roleWords } from "./words.ts";
+import { alignmentWords, formatMilliseconds, formatShare, roleWords } from "./words.ts";
 
 const ROLES = ["operator", "observer", "director"] as const;
 
@@ -71,6 +71,7 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
         item.alignment && item.alignment.kind !== "not_needed" ? alignmentWords(item.alignment.kind) : "",
         report?.state_age ? `sees ${formatMilliseconds(report.state_age[0])} old` : "",
         report && report.rtt_ms > 0 ? `round trip ${formatMilliseconds(report.rtt_ms)}` : "",
+        report && report.battery >= 0 ? `battery ${formatShare(report.battery)}${report.charging ? ", charging" : ""}` : "",
       ];
       setText(facts, parts.filter((part) => part !== "").join(" · "));
       element.classList.toggle("away", !item.connected);
