@@ -24,7 +24,11 @@ def test_each_layer_is_an_assembly_with_tests() -> None:
     assert {"IrisSession.Protocol", "IrisSession.Core"} <= {ASSEMBLIES[path]["name"] for path in LAYERS}
     for path, content in ASSEMBLIES.items():
         assert path.stem == content["name"] == content["rootNamespace"]
+    on_standins = json.loads(next((ROOT / "tests/csharp/unity").glob("*.asmdef")).read_text())
     for path in LAYERS:
+        if not ASSEMBLIES[path]["noEngineReferences"]:
+            assert path.stem in on_standins["references"]
+            continue
         tests = PACKAGE / "Tests" / path.parent.name / f"{path.stem}.Tests.asmdef"
         assert path.stem in ASSEMBLIES[tests]["references"]
         assert "UNITY_INCLUDE_TESTS" in ASSEMBLIES[tests]["defineConstraints"]

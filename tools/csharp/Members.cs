@@ -148,13 +148,14 @@ sealed class Members
         }
         else if (symbol is IMethodSymbol method)
         {
+            bool isKnown = method.MethodKind == MethodKind.Constructor || method.MethodKind == MethodKind.Ordinary
+                || method.MethodKind == MethodKind.UserDefinedOperator || method.MethodKind == MethodKind.Conversion;
+            if (!isKnown) return; // of enums, delegates, accessors
             if (method.IsOverride && method.OverriddenMethod != null && !IsEngine(method.OverriddenMethod)) return; // of System.Object
             section = method.MethodKind == MethodKind.Constructor ? "ctors" : method.MethodKind == MethodKind.Ordinary ? "methods" : "ops";
             if (section == "methods") signature = ShowMethod(method);
             else if (section == "ops") signature = Show(method.ReturnType) + " " + ShowParameters(method.Parameters);
             else signature = (method.DeclaredAccessibility == Accessibility.Protected ? "protected " : "") + ShowParameters(method.Parameters);
-            if (method.MethodKind == MethodKind.PropertyGet || method.MethodKind == MethodKind.PropertySet) return;
-            if (method.MethodKind == MethodKind.EventAdd || method.MethodKind == MethodKind.EventRemove) return;
             name = section == "ctors" ? "" : section == "ops" ? ShowOperator(method) : name;
         }
         else if (symbol is IPropertySymbol property)

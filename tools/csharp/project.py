@@ -26,6 +26,7 @@ from tools.csharp.pairing_vectors import render_pairing_vectors
 from tools.csharp.scene_vectors import render_scene_vectors
 from tools.csharp.toolchain import HERE, NUNIT, RUNTIMES, Assembly, Toolchain, prepare_toolchain, run_tool
 from tools.csharp.unity_api import Member, read_members
+from tools.csharp.unity_scenes import write_unity_scenes
 from tools.csharp.vectors import render_message_vectors
 
 ROOT: Final = HERE.parents[1]
@@ -214,6 +215,7 @@ def run_tests(build: Build, runtime: str, results: Path, *options: str) -> list[
         Path(folder, "pairing.txt").write_text(render_pairing_vectors(), encoding="utf-8")
         Path(folder, "scenes.txt").write_text(render_scene_vectors(), encoding="utf-8")
         Path(folder, "deflate.bin").write_bytes(render_deflate_vectors())
+        write_unity_scenes(Path(folder, "unity"))
         data = {"IRIS_VECTORS": folder, "IRIS_REPO": str(ROOT), **({"IRIS_FUZZ": str(FUZZ_LONG)} if is_long else {})}
         command = build.make_test_command(runtime, results, *options)
         run_tool(command, f"the tests on {runtime}", data, timeout_s=3_600.0 if is_long else 300.0)

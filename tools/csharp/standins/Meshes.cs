@@ -117,20 +117,34 @@ namespace UnityEngine
 
         internal bool IsDynamic { get; private set; }
 
-        public Vector3[] vertices { get { return Array.ConvertAll(ReadAll(VertexAttribute.Position, 3), ToVector3); } }
+        public Vector3[] vertices { get { return ReadVectors(VertexAttribute.Position); } }
 
-        public Vector3[] normals { get { return Array.ConvertAll(ReadAll(VertexAttribute.Normal, 3), ToVector3); } }
+        public Vector3[] normals { get { return ReadVectors(VertexAttribute.Normal); } }
 
         public Color32[] colors32
         {
             get
             {
-                return Array.ConvertAll(ReadAll(VertexAttribute.Color, 4), v => new Color32(
-                    (byte)Math.Round(255 * v[0]), (byte)Math.Round(255 * v[1]), (byte)Math.Round(255 * v[2]), (byte)Math.Round(255 * v[3])));
+                float[] values = ReadAll(VertexAttribute.Color, 4);
+                Color32[] colors = new Color32[values.Length / 4];
+                for (int i = 0; i < colors.Length; i++)
+                {
+                    colors[i] = new Color32(ToByte(values[4 * i]), ToByte(values[4 * i + 1]), ToByte(values[4 * i + 2]), ToByte(values[4 * i + 3]));
+                }
+                return colors;
             }
         }
 
-        public Vector2[] uv { get { return Array.ConvertAll(ReadAll(VertexAttribute.TexCoord0, 2), v => new Vector2(v[0], v[1])); } }
+        public Vector2[] uv
+        {
+            get
+            {
+                float[] values = ReadAll(VertexAttribute.TexCoord0, 2);
+                Vector2[] places = new Vector2[values.Length / 2];
+                for (int i = 0; i < places.Length; i++) places[i] = new Vector2(values[2 * i], values[2 * i + 1]);
+                return places;
+            }
+        }
 
         public int[] triangles
         {
@@ -191,8 +205,8 @@ namespace UnityEngine
             subMesh = desc;
         }
 
-        /// <summary>Values of one attribute, as many of each vertex as `size` or it has.</summary>
-        internal float[][] ReadAll(VertexAttribute attribute, int size)
+        /// <summary>The first `size` values of one attribute of each vertex; empty when vertices have none.</summary>
+        internal float[] ReadAll(VertexAttribute attribute, int size)
         {
             int[] offsets = new int[MaxStreams];
             foreach (VertexAttributeDescriptor one in layout)
@@ -202,23 +216,27 @@ namespace UnityEngine
                     offsets[one.stream] += one.Bytes;
                     continue;
                 }
-                float[][] values = new float[count][];
-                for (int i = 0; i < count; i++)
+                float[] values = new float[size * count];
+                bool isByte = one.format == VertexAttributeFormat.UNorm8;
+                for (int i = 0; i < values.Length; i++)
                 {
-                    values[i] = new float[Math.Min(size, one.dimension)];
-                    int at = i * strides[one.stream] + offsets[one.stream];
-                    for (int k = 0; k < values[i].Length; k++)
-                    {
-                        bool isByte = one.format == VertexAttributeFormat.UNorm8;
-                        values[i][k] = isByte ? streams[one.stream][at + k] / 255f : BitConverter.ToSingle(streams[one.stream], at + 4 * k);
-                    }
+                    int at = i / size * strides[one.stream] + offsets[one.stream];
+                    values[i] = isByte ? streams[one.stream][at + i % size] / 255f : BitConverter.ToSingle(streams[one.stream], at + 4 * (i % size));
                 }
                 return values;
             }
-            return new float[0][];
+            return new float[0];
         }
 
-        private static Vector3 ToVector3(float[] values) { return new Vector3(values[0], values[1], values[2]); }
+        private Vector3[] ReadVectors(VertexAttribute attribute)
+        {
+            float[] values = ReadAll(attribute, 3);
+            Vector3[] vectors = new Vector3[values.Length / 3];
+            for (int i = 0; i < vectors.Length; i++) vectors[i] = new Vector3(values[3 * i], values[3 * i + 1], values[3 * i + 2]);
+            return vectors;
+        }
+
+        private static byte ToByte(float value) { return (byte)Math.Round(255f * value); }
 
         private int ReadIndex(int at)
         {

@@ -1,0 +1,68 @@
+// The component that draws a session: put it on the object in whose frame the headset tracks.
+using System;
+using System.Collections.Generic;
+using IrisSession.Core;
+using IrisSession.Protocol;
+using UnityEngine;
+
+namespace IrisSession.Unity
+{
+    /// <summary>What is drawn. Members are called on the engine's thread, but for `Find`.</summary>
+    public interface IWorldSource : ISceneAssets
+    {
+        /// <summary>Session time now [ns].</summary>
+        long SessionNowNs { get; }
+
+        /// <summary>Who is in the session, by id.</summary>
+        IReadOnlyDictionary<string, ParticipantInfo> Participants { get; }
+
+        /// <summary>Bring what has come since the last frame: scene, states, presence, media, alignment. Must not wait.</summary>
+        void Update(WorldView world);
+    }
+
+    /// <summary>Draws what a source brings. After the components that read devices, so that nothing is drawn a frame late.</summary>
+    [DefaultExecutionOrder(100)]
+    public sealed class IrisWorld : MonoBehaviour
+    {
+        [SerializeField] private IrisMaterials materials = new IrisMaterials();
+        private IWorldSource source;
+
+        /// <summary>What is drawn, null without a session.</summary>
+        public WorldView World { get; private set; }
+
+        /// <summary>Why nothing is drawn, for people; empty while all is well.</summary>
+        public string Problem { get; private set; } = "";
+
+        /// <summary>Materials of the package, for those who make this component in code.</summary>
+        public IrisMaterials Materials { get { return materials; } }
+
+        /// <summary>Draw a session; null: none any more.</summary>
+        public void Show(IWorldSource source)
+        {
+            World?.Dispose();
+            World = null;
+            this.source = source;
+            Problem = source != null && !materials.AreSet ? "IrisWorld has no materials: set IrisSurface and IrisPoints of the package" : "";
+            if (source != null && Problem.Length == 0) World = new WorldView(transform, materials, source, SceneBudget.Quest3);
+        }
+
+        private void LateUpdate()
+        {
+            if (World == null) return;
+            try
+            {
+                source.Update(World);
+                World.Draw(source.SessionNowNs, Time.realtimeSinceStartupAsDouble, source.Participants);
+            }
+            catch (Exception error)
+            {
+                // A defect: it is said once, and the application goes on without a world.
+                Problem = "the world cannot be drawn: " + error.Message;
+                Debug.LogException(error);
+                Show(null);
+            }
+        }
+
+        private void OnDestroy() { Show(null); }
+    }
+}
