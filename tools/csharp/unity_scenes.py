@@ -113,10 +113,9 @@ def _probe_meshes(model: mujoco.MjModel, data: mujoco.MjData, spec: SceneSpec) -
         if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH or not is_shown:
             continue
         first = model.mesh_vertadr[mesh]
-        used = np.unique(
-            model.mesh_face[model.mesh_faceadr[mesh] : model.mesh_faceadr[mesh] + model.mesh_facenum[mesh]]
-        )
-        for vertex in used[:: max(1, min(count, len(used)) // _PROBES_A_MESH)][:_PROBES_A_MESH]:
+        first_face = model.mesh_faceadr[mesh]
+        used = np.unique(model.mesh_face[first_face : first_face + model.mesh_facenum[mesh]])
+        for vertex in used[:: max(1, len(used) // _PROBES_A_MESH)][:_PROBES_A_MESH]:
             local = model.mesh_vert[first + vertex].astype(np.float64)
             yield data.geom_xpos[geom] + data.geom_xmat[geom].reshape(3, 3) @ local
 
