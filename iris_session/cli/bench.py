@@ -53,6 +53,7 @@ _BENCHMARKS: Final = {
     ),
     "stop": _Benchmark({}, _BOTH, "it uses no network"),
     "hands": _Benchmark({}, _BOTH, "it uses no network"),
+    "csharp": _Benchmark({**_BODIES, "points": (1000, 1_000_000)}, _BOTH, "it uses no network"),
     "record": _Benchmark({"kills": (1, 1000)}, _BOTH, "its bars are for loopback"),
     # A tab, one that is disturbed and one that is not; a gateway has three quarters of all connections.
     "web": _Benchmark({"clients": (3, 48), **_VERTICES}, "profile", "its bars are for loopback"),
@@ -84,6 +85,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session bench join --check
             iris-session bench stop --check
             iris-session bench hands --check
+            iris-session bench csharp --check
             iris-session bench record --check
             iris-session bench record --seconds 20 --kills 4
             iris-session bench web --clients 8 --curve --check
@@ -99,7 +101,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             "state, slow-client, deformable, cloud-stream, join, web: number of clients (default: 16; deformable, "
             "cloud-stream, join: 4; web: 8)",
         ),
-        ("bodies", int, 300, "state, slow-client: moving bodies (default: %(default)s)"),
+        ("bodies", int, 300, "state, slow-client, csharp: moving bodies (default: %(default)s)"),
         ("operators", int, 8, "input: operators (default: %(default)s)"),
         ("robots", int, 8, "input: seven-joint arms (default: %(default)s)"),
         ("observers", int, 8, "input: observers (default: %(default)s)"),
@@ -117,8 +119,8 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             "points",
             int,
             None,
-            "cloud: pixels of a cloud, shared by its cameras (default: 2000000); cloud-stream: points of a cloud "
-            "(default: 50000)",
+            "cloud: pixels of a cloud, shared by its cameras (default: 2000000); cloud-stream, csharp: points of a "
+            "cloud (default: 50000; csharp: 10000)",
         ),
         ("cameras", int, 1, "cloud: number of cameras (default: %(default)s)"),
         ("hz", int, 60, "cloud-stream: clouds per second (default: %(default)s)"),

@@ -1,0 +1,287 @@
+"""`bench csharp`: the core of the headset apps decodes frames of the real encoders, on .NET and on Mono.
+
+State of moving bodies with `applied`, presence, a cloth and a cloud come in every frame, as an app takes them. C# is
+compiled by `tools/csharp` of a source checkout, so the benchmark runs in one only.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar
+from iris_session.protocol.codec import encode_presence, encode_server, encode_state_header
+from iris_session.protocol.common import Applied, Pose
+from iris_session.protocol.names import Device, Role, SessionKind
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    Endpoints,
+    Presence,
+    PresenceItem,
+    ServerEnvelope,
+    ServerMessage,
+    Snapshot,
+    StateHeader,
+    Welcome,
+)
+from iris_session.streams.cloud import decode_cloud, encode_cloud
+from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
+from iris_session.streams.deformable_topology import DeformableTopology
+from iris_session.streams.rigid import RigidDecoder, RigidEncoder
+
+ROOT: Final = Path(__file__).parents[2]
+RUNTIMES: Final = ("dotnet", "mono")
+FRAMES: Final = 10_000
+#: Frames in which buffers grow and code is compiled.
+WARM_UP: Final = 500
+#: Every so many frames are compared with the truth.
+SAMPLE: Final = 10
+PERIOD_S: Final = 1.0 / 60.0
+#: Participants, each with three devices, and robots with an `Applied`.
+PEOPLE: Final = 8
+CLOTH_SIDE: Final = 30
+CLOTH_BOUND_M: Final = 0.0005
+CLOUDS: Final = 8
+#: Time in which a runtime decodes all frames [s].
+PATIENCE_S: Final = 300.0
+_INT: Final = struct.Struct("<i")
+Floats = NDArray[np.float64]
+
+
+def run_csharp(
+    bodies: int = 300,
+    points: int = 10_000,
+    seed: int = 0,
+    frames: int = FRAMES,
+    progress: Callable[[str], None] = lambda _: None,
+) -> BenchReport:
+    """Decode many frames after the first ones.
+
+    Args:
+        bodies: Number of moving bodies.
+        points: Points of the cloud.
+        seed: Random seed.
+        frames: Frames that count, after the first `WARM_UP`.
+        progress: Called with short texts.
+
+    Returns:
+        The report: the worse of both runtimes, and each by itself. Reference: the decoders of the Python client.
+
+    Raises:
+        BenchError: This is no source checkout, or C# cannot be compiled here.
+    """
+    if not (ROOT / "tools/csharp/__main__.py").exists():
+        raise BenchError("bench csharp compiles the C# of a source checkout: clone the repository and run it there")
+    with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
+        progress("encoding frames")
+        made = _Frames(bodies, points, frames, seed)
+        file = Path(folder, "frames")
+        file.write_bytes(made.content)
+        results: dict[str, Any] = {}
+        for runtime in RUNTIMES:
+            progress(f"decoding them on {runtime}")
+            results[runtime] = _decode(made, runtime, file, Path(folder, f"{runtime}.out"))
+    worst = {key: max(one[key] for one in results.values()) for key in results[RUNTIMES[0]]}
+    results = worst | results
+    bars = [
+        make_bar(results, "allocated_bytes_per_frame", "<=", 0.0),
+        make_bar(results, "max_error_mm", "<=", 0.1),
+        make_bar(results, "cloth_max_error_mm", "<=", CLOTH_BOUND_M * 1e3),
+    ]
+    params = {"bodies": bodies, "points": points, "vertices": CLOTH_SIDE**2, "frames": frames, "seed": seed}
+    return BenchReport("csharp", params, results, tuple(bars), made.reference)
+
+
+class _Frames:
+    """Frames of a session, and what is in them.
+
+    Attributes:
+        content: Bytes for the program (tools/csharp/programs/bench has the layout).
+        poses: Poses of every `SAMPLE`-th frame, (n, bodies, 7).
+        vertices: Vertices of these, (n, vertices, 3).
+        last_cloud: Points of the last cloud, as Python decodes them.
+        reference: Times of the Python decoders for the same frames.
+    """
+
+    def __init__(self, bodies: int, points: int, frames: int, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        motion = _Motion(rng, bodies)
+        topology = _make_cloth_topology()
+        parts = [struct.pack("<4i", bodies, frames + WARM_UP, WARM_UP, SAMPLE)]
+        first = motion.compute_poses(0.0)
+        parts += map(_pack, (_welcome(), *_make_snapshot(first), topology.to_bytes()))
+        clouds = [_make_cloud(rng, points, k) for k in range(CLOUDS)]
+        cloud_frames = [encode_cloud(*cloud)["full"] for cloud in clouds]
+        self.last_cloud = decode_cloud(cloud_frames[(frames + WARM_UP - 1) % CLOUDS]).positions
+        parts += [_INT.pack(CLOUDS), *map(_pack, cloud_frames)]
+        poses, vertices, spent = [], [], []
+        rigid, rigid_decoder = RigidEncoder(bodies), RigidDecoder(bodies)
+        cloth, cloth_decoder = DeformableEncoder(topology, CLOTH_BOUND_M), DeformableDecoder(topology)
+        for i in range(frames + WARM_UP):
+            now = motion.compute_poses(i * PERIOD_S)
+            sheet = _move_cloth(i * PERIOD_S)
+            encoded = rigid.encode(now, 1)
+            drawn = (cloth.encode(sheet) or {}).get("full", b"")
+            header = encode_state_header(_make_header(i, encoded.state_seq, encoded.base_seq))
+            parts += map(_pack, (header, encoded.payload, encode_presence(_make_presence(i)), drawn))
+            if i % SAMPLE == 0:
+                poses.append(now)
+                vertices.append(sheet)
+            began = time.perf_counter_ns()
+            rigid_decoder.apply(*encoded)
+            middle = time.perf_counter_ns()
+            if drawn:
+                cloth_decoder.decode(drawn)
+            ended = time.perf_counter_ns()
+            decode_cloud(cloud_frames[i % CLOUDS])
+            spent.append((middle - began, ended - middle, time.perf_counter_ns() - ended))
+        self.poses, self.vertices = np.array(poses), np.array(vertices)
+        times = np.array(spent[WARM_UP:]) * 1e-3
+        names = ("python_rigid_us_p50", "python_cloth_us_p50", "python_cloud_us_p50")
+        self.reference = {name: compute_percentile(times[:, k], 50) for k, name in enumerate(names)}
+        self.content = b"".join([*parts, b"rigid", b"presence"])
+
+
+class _Motion:
+    """Smooth motion of bodies around places in a room."""
+
+    def __init__(self, rng: np.random.Generator, bodies: int) -> None:
+        self._place = rng.uniform(-3.0, 3.0, (bodies, 3))
+        self._reach = rng.uniform(0.1, 0.5, (bodies, 3))
+        self._rate = rng.uniform(0.5, 4.0, (bodies, 3))
+        axis = rng.normal(size=(bodies, 3))
+        self._axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+        self._spin = rng.uniform(-3.0, 3.0, (bodies, 1))
+
+    def compute_poses(self, t: float) -> Floats:
+        """Return rows `x y z qw qx qy qz` at a time [s]."""
+        position = self._place + self._reach * np.sin(self._rate * t)
+        half = 0.5 * self._spin * t
+        return np.hstack([position, np.cos(half), np.sin(half) * self._axis])
+
+
+def _pack(data: bytes) -> bytes:
+    return _INT.pack(len(data)) + data
+
+
+def _envelope(message: ServerMessage) -> bytes:
+    return encode_server(ServerEnvelope(1, 1, message))
+
+
+def _welcome() -> bytes:
+    return _envelope(
+        Welcome(
+            "bench", "bench", SessionKind.LIVE, "p", 1, Role.OBSERVER, b"", False, 0, 1_000_000_000, 2_000_000,
+            16_666_667, Endpoints(0, 0, 0, 0),
+        )
+    )  # fmt: skip
+
+
+def _make_snapshot(poses: Floats) -> tuple[bytes, bytes]:
+    bodies = tuple(BodyInfo(k + 1, f"body {k}", True) for k in range(len(poses)))
+    return _envelope(Snapshot(1, 0, 1, 0, "", 0, 0.0, 0, (), (), bodies=bodies)), poses.tobytes()
+
+
+def _make_header(i: int, state_seq: int, base_seq: int) -> StateHeader:
+    now_ns = round((i + 1) * PERIOD_S * 1e9)
+    applied = tuple(
+        Applied(f"arm {k}", f"participant {(i // 60 + k) % PEOPLE}", Device.CONTROLLER_RIGHT, i, now_ns, now_ns, now_ns)
+        for k in range(PEOPLE)
+    )
+    return StateHeader(1, 0, i, i * PERIOD_S, now_ns, now_ns, state_seq, base_seq, applied)
+
+
+def _make_presence(i: int) -> Presence:
+    devices = (Device.HEAD, Device.HAND_LEFT, Device.HAND_RIGHT)
+    turn = math.cos(0.01 * i), 0.0, 0.0, math.sin(0.01 * i)
+    items = [
+        PresenceItem(f"participant {k}", device, Pose((0.001 * i, 0.1 * k, 1.5), turn), i)
+        for k in range(PEOPLE)
+        for device in devices
+    ]
+    return Presence(round((i + 1) * PERIOD_S * 1e9), i + 1, tuple(items))
+
+
+def _make_cloth_topology() -> DeformableTopology:
+    corner = np.arange(CLOTH_SIDE**2).reshape(CLOTH_SIDE, CLOTH_SIDE)
+    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return DeformableTopology(CLOTH_SIDE**2, faces)
+
+
+def _move_cloth(t: float) -> Floats:
+    """Return the vertices of a cloth of 1 m in waves."""
+    x, y = np.meshgrid(np.linspace(0.0, 1.0, CLOTH_SIDE), np.linspace(0.0, 1.0, CLOTH_SIDE))
+    z = 1.0 + 0.1 * np.sin(7.0 * x + 2.0 * t) * np.cos(5.0 * y - 1.3 * t)
+    return np.stack([x, y, z], axis=-1).reshape(-1, 3)
+
+
+def _make_cloud(rng: np.random.Generator, points: int, k: int) -> tuple[Floats, NDArray[np.uint8]]:
+    places = rng.uniform(-2.0, 2.0, (points, 3))
+    return places + 0.01 * k, rng.integers(0, 256, (points, 3), np.uint8)
+
+
+def _make_command(runtime: str) -> list[str]:
+    return [sys.executable, "-m", "tools.csharp", "run", "--runtime", runtime, "bench", "--"]
+
+
+def _decode(made: _Frames, runtime: str, file: Path, out: Path) -> dict[str, float]:
+    """Decode the frames in C#. Return the results."""
+    command = [*_make_command(runtime), str(file), str(out)]
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    try:
+        done = subprocess.run(
+            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise BenchError(f"{runtime} has not decoded the frames within {PATIENCE_S:g} s") from None
+    if done.returncode != 0:
+        lines = [line for line in done.stderr.splitlines() if line.strip()]
+        raise BenchError(f"the C# decoders do not run on {runtime}: {lines[0] if lines else done.returncode}")
+    got = json.loads(done.stdout)
+    position, rotation, cloth, cloud = _measure_errors(made, out.read_bytes())
+    return {
+        "decode_us_p50": got["decode_us_p50"],
+        "decode_us_p99": got["decode_us_p99"],
+        "cloth_us_p50": got["cloth_us_p50"],
+        "cloud_us_p50": got["cloud_us_p50"],
+        "allocated_bytes_per_frame": got["allocated_bytes"] / got["frames"],
+        "max_error_mm": position,
+        "max_rotation_error_deg": rotation,
+        "cloth_max_error_mm": cloth,
+        "cloud_difference_mm": cloud,
+    }
+
+
+def _measure_errors(made: _Frames, data: bytes) -> tuple[float, float, float, float]:
+    """Return the largest errors of what C# decoded: positions [mm], rotations [deg], vertices [mm]; and by how much
+    points differ from those of the Python decoder [mm]."""
+    n, bodies = made.poses.shape[:2]
+    size, drawn = 8 * n * bodies * 7, made.vertices.size * 4
+    poses = np.frombuffer(data, "<f8", count=size // 8).reshape(n, bodies, 7)
+    vertices = np.frombuffer(data, "<f4", count=made.vertices.size, offset=size).reshape(made.vertices.shape)
+    points = np.frombuffer(data, "<f8", offset=size + drawn).reshape(-1, 3)
+    position = np.linalg.norm(poses[..., :3] - made.poses[..., :3], axis=-1).max()
+    dot = np.abs(np.einsum("nbi,nbi->nb", poses[..., 3:], made.poses[..., 3:]))
+    rotation = 2.0 * np.degrees(np.arccos(np.minimum(dot.min(), 1.0)))
+    cloth = np.linalg.norm(vertices - made.vertices, axis=-1).max()
+    return (
+        round(float(position) * 1e3, 5),
+        round(float(rotation), 5),
+        round(float(cloth) * 1e3, 5),
+        round(float(np.abs(points - made.last_cloud).max()) * 1e3, 5)
+        if points.shape == made.last_cloud.shape
+        else math.inf,
+    )
