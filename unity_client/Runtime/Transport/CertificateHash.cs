@@ -3,11 +3,10 @@
 // The key is found in the DER itself: runtimes disagree on which kinds of keys their certificate classes can hand out.
 using System;
 using System.Security.Cryptography;
-using System.Text;
 
 namespace IrisSession.Transport
 {
-    /// <summary>Hashes of public keys, and how people and addresses show them.</summary>
+    /// <summary>Hashes of public keys.</summary>
     public static class CertificateHash
     {
         public const int Bytes = 32;
@@ -46,18 +45,6 @@ namespace IrisSession.Transport
             {
                 return null;
             }
-        }
-
-        /// <summary>Return a hash for people to compare: 64 hexadecimal digits in groups of four.</summary>
-        public static string ToFingerprint(byte[] hash)
-        {
-            StringBuilder text = new StringBuilder(80);
-            for (int i = 0; i < hash.Length; i++)
-            {
-                if (i > 0 && i % 2 == 0) text.Append(' ');
-                text.Append(hash[i].ToString("x2"));
-            }
-            return text.ToString();
         }
 
         /// <summary>Return whether two hashes are equal; null equals nothing.</summary>

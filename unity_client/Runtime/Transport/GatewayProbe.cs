@@ -64,7 +64,7 @@ namespace IrisSession.Transport
             {
                 using (HttpConnection connection = new HttpConnection(endpoint, interrupt)) sessionId = Ask(connection);
             }
-            catch (LinkException error)
+            catch (TransportException error)
             {
                 end = error.End;
             }
@@ -81,7 +81,7 @@ namespace IrisSession.Transport
         {
             connection.SendRequest("/v1/info", "Connection: close\r\n");
             HttpHead head = connection.ReadHead();
-            if (head.Status != 200) throw new LinkException(LinkFailure.NotAGateway, endpoint.Authority + " answers " + head.Status, head.Status);
+            if (head.Status != 200) throw new TransportException(LinkFailure.NotAGateway, endpoint.Authority + " answers " + head.Status, head.Status);
             return FindText(connection.ReadText(head, MaxText), "session_id");
         }
     }

@@ -34,7 +34,7 @@ namespace IrisSession.Transport
         }
 
         /// <summary>Read the head at the beginning of `bytes`. Returns null while it is not complete; `length`: its bytes.</summary>
-        /// <exception cref="LinkException">It is none.</exception>
+        /// <exception cref="TransportException">It is none.</exception>
         public static HttpHead TryRead(byte[] bytes, int count, out int length)
         {
             length = 0;
@@ -44,19 +44,19 @@ namespace IrisSession.Transport
             }
             if (length == 0)
             {
-                if (count >= MaxBytes) throw new LinkException(LinkFailure.NotAGateway, "an answer whose head has more than " + MaxBytes + " bytes");
+                if (count >= MaxBytes) throw new TransportException(LinkFailure.NotAGateway, "an answer whose head has more than " + MaxBytes + " bytes");
                 return null;
             }
             string[] lines = Encoding.ASCII.GetString(bytes, 0, length - 4).Split(new[] { "\r\n" }, StringSplitOptions.None);
             HttpHead head = new HttpHead();
             string first = lines[0];
             bool isAnswer = first.StartsWith("HTTP/1.1 ", StringComparison.Ordinal) && first.Length >= 12 && int.TryParse(first.Substring(9, 3), out _);
-            if (!isAnswer || lines.Length > MaxHeaders) throw new LinkException(LinkFailure.NotAGateway, "an answer that is not HTTP/1.1");
+            if (!isAnswer || lines.Length > MaxHeaders) throw new TransportException(LinkFailure.NotAGateway, "an answer that is not HTTP/1.1");
             head.Status = int.Parse(first.Substring(9, 3));
             for (int i = 1; i < lines.Length; i++)
             {
                 int colon = lines[i].IndexOf(':');
-                if (colon <= 0) throw new LinkException(LinkFailure.NotAGateway, "an answer with a header without a name");
+                if (colon <= 0) throw new TransportException(LinkFailure.NotAGateway, "an answer with a header without a name");
                 head.headers[lines[i].Substring(0, colon).Trim()] = lines[i].Substring(colon + 1).Trim();
             }
             return head;
@@ -74,6 +74,7 @@ namespace IrisSession.Transport
         private readonly Stream top;
         private readonly WebEndpoint endpoint;
         private byte[] shown; // hash of the key of the certificate
+        private string fingerprint = "";
 
         // Bytes that were received and not used yet.
         private readonly byte[] buffer = new byte[HttpHead.MaxBytes];
@@ -84,7 +85,7 @@ namespace IrisSession.Transport
         /// <param name="endpoint">With a pin, unless `takesAnyKey`.</param>
         /// <param name="interrupt">Ends all waits.</param>
         /// <param name="takesAnyKey">For pairing, which proves the key by the code: see `CertificateHash`.</param>
-        /// <exception cref="LinkException">There is no connection.</exception>
+        /// <exception cref="TransportException">There is no connection.</exception>
         public HttpConnection(WebEndpoint endpoint, Interrupt interrupt, bool takesAnyKey = false)
         {
             this.endpoint = endpoint;
@@ -132,7 +133,7 @@ namespace IrisSession.Transport
                     return head;
                 }
                 int got = top.Read(buffer, end, buffer.Length - end);
-                if (got == 0) throw new LinkException(LinkFailure.Unreachable, "the connection was closed before an answer");
+                if (got == 0) throw new TransportException(LinkFailure.Unreachable, "the connection was closed before an answer");
                 end += got;
             }
         }
@@ -144,7 +145,7 @@ namespace IrisSession.Transport
             while (at < count)
             {
                 int got = Read(target, at, count - at);
-                if (got == 0) throw new LinkException(LinkFailure.Unreachable, "the connection was closed within an answer");
+                if (got == 0) throw new TransportException(LinkFailure.Unreachable, "the connection was closed within an answer");
                 at += got;
             }
         }
@@ -153,7 +154,7 @@ namespace IrisSession.Transport
         public string ReadText(HttpHead head, int most)
         {
             long left = head.ContentLength;
-            if (left < 0 || left > 1 << 20) throw new LinkException(LinkFailure.NotAGateway, "an answer without a length");
+            if (left < 0 || left > 1 << 20) throw new TransportException(LinkFailure.NotAGateway, "an answer without a length");
             byte[] bytes = new byte[left];
             ReadBody(bytes, (int)left);
             return Encoding.UTF8.GetString(bytes, 0, (int)Math.Min(left, most)).Trim();
@@ -203,29 +204,32 @@ namespace IrisSession.Transport
         /// <summary>Return whether an exception is one of sockets, TLS or HTTP, of this runtime or another.</summary>
         public static bool IsOfConnection(Exception error)
         {
-            return error is LinkException || error is IOException || error is AuthenticationException || error is ObjectDisposedException
+            return error is TransportException || error is IOException || error is AuthenticationException || error is ObjectDisposedException
                 || error is System.Net.Sockets.SocketException || error is InvalidOperationException || error is NotSupportedException
                 || error is AggregateException || error is System.Security.Cryptography.CryptographicException;
         }
 
         /// <summary>Return what happened, in one of our words.</summary>
-        public LinkException ToLinkException(Exception error, Interrupt interrupt)
+        public TransportException ToLinkException(Exception error, Interrupt interrupt)
         {
-            if (interrupt.IsSet) return new LinkException(LinkFailure.None, "the connection was closed");
-            for (Exception inner = error; inner != null; inner = inner.InnerException) if (inner is LinkException known) return known;
+            if (interrupt.IsSet) return new TransportException(LinkFailure.None, "the connection was closed");
+            for (Exception inner = error; inner != null; inner = inner.InnerException) if (inner is TransportException known) return known;
             if (endpoint.IsSecure && shown != null && !Transport.CertificateHash.AreEqual(shown, endpoint.Pin))
             {
                 return endpoint.Pin == null
-                    ? new LinkException(LinkFailure.UnknownCertificate, "the key of " + endpoint.Authority + " is not known yet", 0, shown)
-                    : new LinkException(LinkFailure.WrongCertificate, endpoint.Authority + " has another key than before", 0, shown);
+                    ? new TransportException(LinkFailure.UnknownCertificate, "the key of " + endpoint.Authority + " is not known yet", 0, shown, fingerprint)
+                    : new TransportException(LinkFailure.WrongCertificate, endpoint.Authority + " has another key than before", 0, shown, fingerprint);
             }
-            if (endpoint.IsSecure && top == stream) return new LinkException(LinkFailure.NotAGateway, "no TLS with " + endpoint.Authority + ": " + error.Message);
-            return new LinkException(LinkFailure.Unreachable, error.Message);
+            if (endpoint.IsSecure && top == stream) return new TransportException(LinkFailure.NotAGateway, "no TLS with " + endpoint.Authority + ": " + error.Message);
+            return new TransportException(LinkFailure.Unreachable, error.Message);
         }
 
         private bool CheckKey(X509Certificate certificate, bool takesAnyKey)
         {
-            shown = certificate == null ? null : Transport.CertificateHash.Compute(certificate.GetRawCertData());
+            if (certificate == null) return false;
+            byte[] der = certificate.GetRawCertData();
+            shown = Transport.CertificateHash.Compute(der);
+            fingerprint = Core.Fingerprint.OfCertificate(der);
             return takesAnyKey ? shown != null : Transport.CertificateHash.AreEqual(shown, endpoint.Pin);
         }
     }

@@ -45,23 +45,23 @@ namespace IrisSession.Transport
         public override long Position { get { throw new NotSupportedException(); } set { throw new NotSupportedException(); } }
 
         /// <summary>Connect to the first address of a host that answers.</summary>
-        /// <exception cref="LinkException">None does, or it was interrupted.</exception>
+        /// <exception cref="TransportException">None does, or it was interrupted.</exception>
         public static InterruptibleStream Connect(string host, int port, long deadlineNs, Interrupt interrupt)
         {
             IPAddress[] addresses = Resolve(host, deadlineNs, interrupt);
-            LinkException last = null;
+            TransportException last = null;
             foreach (IPAddress address in addresses)
             {
                 try
                 {
                     return Connect(address, port, deadlineNs, interrupt);
                 }
-                catch (LinkException error)
+                catch (TransportException error)
                 {
                     last = error;
                 }
             }
-            throw last ?? new LinkException(LinkFailure.Unreachable, host + " has no address");
+            throw last ?? new TransportException(LinkFailure.Unreachable, host + " has no address");
         }
 
         public override int Read(byte[] buffer, int offset, int count)
@@ -137,7 +137,7 @@ namespace IrisSession.Transport
             }
             catch (Exception error) when (error is SocketException || error is ArgumentException)
             {
-                throw new LinkException(LinkFailure.Unreachable, host + " is not known: " + error.Message);
+                throw new TransportException(LinkFailure.Unreachable, host + " is not known: " + error.Message);
             }
         }
 
@@ -166,7 +166,7 @@ namespace IrisSession.Transport
             }
             catch (SocketException error)
             {
-                throw new LinkException(LinkFailure.Unreachable, address + ":" + port + " does not answer: " + error.Message);
+                throw new TransportException(LinkFailure.Unreachable, address + ":" + port + " does not answer: " + error.Message);
             }
             finally
             {
@@ -183,8 +183,8 @@ namespace IrisSession.Transport
 
         private static void Check(long deadlineNs, Interrupt interrupt)
         {
-            if (interrupt.IsSet) throw new LinkException(LinkFailure.None, "the connection was closed");
-            if (MonotonicClock.NowNs >= deadlineNs) throw new LinkException(LinkFailure.Unreachable, "no answer in time");
+            if (interrupt.IsSet) throw new TransportException(LinkFailure.None, "the connection was closed");
+            if (MonotonicClock.NowNs >= deadlineNs) throw new TransportException(LinkFailure.Unreachable, "no answer in time");
         }
 
         private void Wait(SelectMode mode)

@@ -1,6 +1,6 @@
 // Ends of connections to a gateway: what a person or the session loop has to know of them.
 //
-//     LinkException     a connection could not be made, or broke; never leaves the threads of the transport
+//     TransportException     a connection could not be made, or broke; never leaves the threads of the transport
 using System;
 
 namespace IrisSession.Transport
@@ -17,7 +17,7 @@ namespace IrisSession.Transport
         /// <summary>The other end closed it; `Code` says why.</summary>
         Closed,
 
-        /// <summary>The certificate is not known yet: show <see cref="LinkEnd.CertificateHash"/> to the person. Nothing was sent.</summary>
+        /// <summary>The certificate is not known yet: show <see cref="LinkEnd.Fingerprint"/> to the person. Nothing was sent.</summary>
         UnknownCertificate,
 
         /// <summary>The certificate has another key than the pinned one: another machine, or one that pretends to be it. Nothing was sent.</summary>
@@ -47,12 +47,16 @@ namespace IrisSession.Transport
         /// <summary>SHA-256 of the public key that the other end showed, null for none.</summary>
         public readonly byte[] CertificateHash;
 
-        public LinkEnd(LinkFailure failure, int code, string text, byte[] certificateHash = null)
+        /// <summary>Fingerprint of the certificate, for people to compare with that of `iris-session pair`: `3F:A2:...`; empty for none.</summary>
+        public readonly string Fingerprint;
+
+        public LinkEnd(LinkFailure failure, int code, string text, byte[] certificateHash = null, string fingerprint = "")
         {
             Failure = failure;
             Code = code;
             Text = text;
             CertificateHash = certificateHash;
+            Fingerprint = fingerprint;
         }
 
         public override string ToString()
@@ -73,13 +77,13 @@ namespace IrisSession.Transport
     }
 
     /// <summary>A connection could not be made, or broke.</summary>
-    internal sealed class LinkException : Exception
+    internal sealed class TransportException : Exception
     {
         public readonly LinkEnd End;
 
-        public LinkException(LinkFailure failure, string text, int code = 0, byte[] certificateHash = null) : base(text)
+        public TransportException(LinkFailure failure, string text, int code = 0, byte[] certificateHash = null, string fingerprint = "") : base(text)
         {
-            End = new LinkEnd(failure, code, text, certificateHash);
+            End = new LinkEnd(failure, code, text, certificateHash, fingerprint);
         }
     }
 }

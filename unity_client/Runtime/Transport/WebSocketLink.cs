@@ -148,7 +148,7 @@ namespace IrisSession.Transport
                     }
                 }
             }
-            catch (LinkException error)
+            catch (TransportException error)
             {
                 End = error.End;
             }
@@ -199,7 +199,7 @@ namespace IrisSession.Transport
             if (head.Status != 101)
             {
                 string text = head.ContentLength > 0 ? opened.ReadText(head, 256) : "";
-                throw new LinkException(LinkFailure.NotAGateway, endpoint.Authority + " answers " + head.Status + (text.Length == 0 ? "" : ": " + text), head.Status);
+                throw new TransportException(LinkFailure.NotAGateway, endpoint.Authority + " answers " + head.Status + (text.Length == 0 ? "" : ": " + text), head.Status);
             }
             string expected;
             using (SHA1 sha = SHA1.Create()) expected = Convert.ToBase64String(sha.ComputeHash(Encoding.ASCII.GetBytes(key + Guid)));
@@ -207,7 +207,7 @@ namespace IrisSession.Transport
                 && head["Sec-WebSocket-Extensions"].Length == 0
                 && string.Equals(head["Upgrade"], "websocket", StringComparison.OrdinalIgnoreCase)
                 && head["Connection"].IndexOf("upgrade", StringComparison.OrdinalIgnoreCase) >= 0;
-            if (!isOurs) throw new LinkException(LinkFailure.NotAGateway, endpoint.Authority + " does not speak " + WebMessage.Subprotocol);
+            if (!isOurs) throw new TransportException(LinkFailure.NotAGateway, endpoint.Authority + " does not speak " + WebMessage.Subprotocol);
         }
 
         private void ReadMessages(HttpConnection opened)
@@ -239,7 +239,7 @@ namespace IrisSession.Transport
                         return;
                     }
                 }
-                catch (LinkException error)
+                catch (TransportException error)
                 {
                     lock (gate) writer.AppendClose(error.End.Code);
                     throw;

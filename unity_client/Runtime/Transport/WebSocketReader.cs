@@ -80,7 +80,7 @@ namespace IrisSession.Transport
         }
 
         /// <summary>Process bytes from `at` on until something is complete; `at` is moved behind what was used.</summary>
-        /// <exception cref="LinkException">The bytes break the rules; `Code` is that of the close frame to send.</exception>
+        /// <exception cref="TransportException">The bytes break the rules; `Code` is that of the close frame to send.</exception>
         public WebSocketEvent Read(byte[] bytes, ref int at, int end)
         {
             while (true)
@@ -185,9 +185,9 @@ namespace IrisSession.Transport
             return WebSocketEvent.Close;
         }
 
-        private static LinkException Refuse(int code, string what)
+        private static TransportException Refuse(int code, string what)
         {
-            return new LinkException(LinkFailure.Protocol, "the gateway sent " + what, code);
+            return new TransportException(LinkFailure.Protocol, "the gateway sent " + what, code);
         }
     }
 }

@@ -164,6 +164,7 @@ namespace IrisSession.Transport.Tests
                 LinkEnd end = GetEnd(link, collector);
                 Assert.AreEqual(expected, end.Failure, end.ToString());
                 CollectionAssert.AreEqual(TestCertificate.Second.Hash, end.CertificateHash);
+                Assert.AreEqual(Fingerprint.OfCertificate(TestCertificate.Second.Load().GetRawCertData()), end.Fingerprint);
             }
             Assert.IsFalse(isAsked);
         }

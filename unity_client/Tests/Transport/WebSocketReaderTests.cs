@@ -92,14 +92,14 @@ namespace IrisSession.Transport.Tests
         {
             byte[] bytes = Golden.FromHex(hex.Replace(" ", ""));
             if (code == 0) CollectionAssert.IsEmpty(ReadAll(bytes, 1, 1));
-            else Assert.AreEqual(code, Assert.Throws<LinkException>(() => ReadAll(bytes, 1, 1)).End.Code);
+            else Assert.AreEqual(code, Assert.Throws<TransportException>(() => ReadAll(bytes, 1, 1)).End.Code);
         }
 
         [Test]
         public void FragmentsTogetherAreBoundedToo()
         {
             byte[] stream = Peer.Join(Peer.MakeFrame(0x02, Large), Peer.MakeFrame(0x80, new byte[4001]));
-            Assert.AreEqual(1009, Assert.Throws<LinkException>(() => ReadAll(stream, 1000, 1000)).End.Code);
+            Assert.AreEqual(1009, Assert.Throws<TransportException>(() => ReadAll(stream, 1000, 1000)).End.Code);
         }
 
         [Test]
@@ -126,7 +126,7 @@ namespace IrisSession.Transport.Tests
                         if (WebMessage.Unpack(message, reader.MessageLength) >= 0) WebMessage.TryReadGateway(message, out string _, out string _);
                     }
                 }
-                catch (LinkException)
+                catch (TransportException)
                 {
                     refused++;
                 }
@@ -202,7 +202,7 @@ namespace IrisSession.Transport.Tests
         public void WhatIsNoAnswerIsRefused(string text)
         {
             byte[] bytes = Encoding.ASCII.GetBytes(text);
-            Assert.AreEqual(LinkFailure.NotAGateway, Assert.Throws<LinkException>(() => HttpHead.TryRead(bytes, bytes.Length, out int _)).End.Failure);
+            Assert.AreEqual(LinkFailure.NotAGateway, Assert.Throws<TransportException>(() => HttpHead.TryRead(bytes, bytes.Length, out int _)).End.Failure);
         }
 
         [TestCase("Content-Length: -1")]
@@ -219,7 +219,7 @@ namespace IrisSession.Transport.Tests
         public void HeadsAreBounded()
         {
             byte[] bytes = new byte[HttpHead.MaxBytes];
-            Assert.Throws<LinkException>(() => HttpHead.TryRead(bytes, bytes.Length, out int _));
+            Assert.Throws<TransportException>(() => HttpHead.TryRead(bytes, bytes.Length, out int _));
         }
 
         private static byte[] Unmask(byte[] frame, int length)
