@@ -1,5 +1,6 @@
 // Where a gateway is, and by which key it is known.
 using System;
+using IrisSession.Core;
 
 namespace IrisSession.Transport
 {
@@ -21,7 +22,7 @@ namespace IrisSession.Transport
             if (host.Length == 0 || host.Length > 253 || port < 1 || port > 65535) throw new ArgumentException("\"" + host + ":" + port + "\" is no address");
             foreach (char unit in host) if (unit <= ' ' || unit == '/' || unit == '@' || unit > '~') throw new ArgumentException("\"" + host + "\" is no host");
             if (pin != null && pin.Length != CertificateHash.Bytes) throw new ArgumentException("a pin of " + pin.Length + " bytes");
-            if (!isSecure && !IsLoopbackHost(host)) throw new ArgumentException("http is for localhost alone: https://" + host);
+            if (!isSecure && !HostName.IsLoopback(host)) throw new ArgumentException("http is for localhost alone: https://" + host);
             IsSecure = isSecure;
             Host = host;
             Port = port;
@@ -29,7 +30,7 @@ namespace IrisSession.Transport
         }
 
         /// <summary>True for this machine: the cable of a headset (`adb reverse`), or a session beside us.</summary>
-        public bool IsLoopback { get { return IsLoopbackHost(Host); } }
+        public bool IsLoopback { get { return HostName.IsLoopback(Host); } }
 
         /// <summary>`host:port` as in addresses and in the header `Host`.</summary>
         public string Authority { get { return (Host.IndexOf(':') >= 0 ? "[" + Host + "]" : Host) + ":" + Port; } }
@@ -71,11 +72,6 @@ namespace IrisSession.Transport
         public override string ToString()
         {
             return (IsSecure ? "https://" : "http://") + Authority;
-        }
-
-        private static bool IsLoopbackHost(string host)
-        {
-            return host == "localhost" || host == "127.0.0.1" || host == "::1";
         }
     }
 }

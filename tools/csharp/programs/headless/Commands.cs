@@ -1,0 +1,316 @@
+using System;
+using System.Collections.Generic;
+using System.Collections.Concurrent;
+using System.Globalization;
+using System.Threading;
+using IrisSession.Core;
+using IrisSession.Protocol;
+using IrisSession.Transport;
+
+/// <summary>
+/// Commands of a headset: `join`, `align`, `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `measure SECONDS`, `body NAME`,
+/// `view`, `wait SECONDS`, `until TEXT` (an event of this kind), `estop`, `quit`.
+/// </summary>
+internal sealed class Commands
+{
+    private readonly Headset headset;
+    private readonly Report report;
+    private readonly Options options;
+    private int newsAt;
+
+    public Commands(Headset headset, Report report, Options options)
+    {
+        this.headset = headset;
+        this.report = report;
+        this.options = options;
+    }
+
+    /// <summary>Run commands; frames go on while none has come. Returns whether all succeeded.</summary>
+    public bool Run(IEnumerable<string> lines)
+    {
+        using (BlockingCollection<string> waiting = new BlockingCollection<string>())
+        {
+            new Thread(() =>
+            {
+                foreach (string line in lines) waiting.Add(line);
+                waiting.CompleteAdding();
+            }) { IsBackground = true }.Start();
+            bool isDone = true;
+            while (!waiting.IsCompleted)
+            {
+                if (!waiting.TryTake(out string line))
+                {
+                    headset.Frame();
+                    continue;
+                }
+                string[] words = line.Trim().Split(new[] { ' ' }, StringSplitOptions.RemoveEmptyEntries);
+                if (words.Length == 0) continue;
+                if (words[0] == "quit") break;
+                isDone &= Do(words);
+            }
+            return isDone;
+        }
+    }
+
+    private SessionClient Client { get { return headset.Client; } }
+
+    private bool Do(string[] words)
+    {
+        switch (words[0])
+        {
+            case "join": return Join();
+            case "align": return Align();
+            case "acquire": return Acquire(words[1]);
+            case "release": return Release(words[1]);
+            case "move": return Move(words[1], new Double3(Number(words[2]), Number(words[3]), Number(words[4])));
+            case "measure": return Measure(Number(words[1]));
+            case "body": return ShowBody(words[1]);
+            case "view": return ShowView();
+            case "wait": return Wait(Number(words[1]));
+            case "until": return Until(words[1]);
+            case "estop": return EStop();
+            default:
+                report.Write(words[0], false, "text", "unknown command");
+                return false;
+        }
+    }
+
+    private static double Number(string text)
+    {
+        return double.Parse(text, CultureInfo.InvariantCulture);
+    }
+
+    private bool Join()
+    {
+        bool isTrusted = false;
+        bool isJoined = headset.RunUntil(() =>
+        {
+            SessionView now = Client.View;
+            if (now.Problem.Failure == LinkFailure.UnknownCertificate && !isTrusted && options.Trust.Length > 0 && now.Problem.Fingerprint == options.Trust)
+            {
+                isTrusted = true;
+                byte[] hash = now.Problem.CertificateHash;
+                Client.TryPost(loop => loop.Trust(hash));
+            }
+            bool isOver = now.Failure != null || (now.Problem.Failure != LinkFailure.None && !isTrusted);
+            return isOver || (now.Phase == ConnectionPhase.Ready && headset.States > 0);
+        });
+        SessionView view = Client.View;
+        isJoined &= view.Phase == ConnectionPhase.Ready;
+        headset.SendsSamples = isJoined && options.RoleName != Role.Observer;
+        report.Write(
+            "join", isJoined, "phase", view.Phase.ToString(), "text", view.Text, "refusal", view.Failure == null ? "" : view.Failure.Code, "problem", view.Problem.Failure.ToString(),
+            "fingerprint", view.Problem.Fingerprint ?? "", "participant", view.ParticipantId, "resumed", view.Welcome != null && view.Welcome.Resumed,
+            "bodies", view.Bodies.Length, "robots", new List<string>(view.Robots.Keys).ToArray(), "scene", view.SceneHash, "crash", Client.Crash);
+        return isJoined;
+    }
+
+    /// <summary>Look at each sheet from several places, as a headset would, until the session has an alignment.</summary>
+    private bool Align()
+    {
+        SheetSighting sighting = new SheetSighting();
+        int looks = 0;
+        bool isAligned = headset.RunUntil(() =>
+        {
+            if (Client.View.AlignmentState == AlignmentState.Aligned && looks > 100) return true;
+            foreach (AnchorInfo anchor in Client.View.Anchors.Values)
+            {
+                RigidTransform T_world_anchor = Headset.ToTransform(anchor.T_world_anchor);
+                double angle = 0.35 * (looks / 20);
+                Double3 place = T_world_anchor.Position + new Double3(0.4 * Math.Cos(angle), 0.4 * Math.Sin(angle), 0.45);
+                headset.T_world_head = new RigidTransform(place, DoubleQuaternion.FromAxisAngle(new Double3(0, 0, 1), angle));
+                sighting.AnchorId = anchor.Id;
+                sighting.SizeM = anchor.SizeM;
+                sighting.T_tracking_anchor = headset.ToTracking(T_world_anchor);
+                sighting.T_tracking_camera = headset.ToTracking(headset.T_world_head);
+                sighting.CaptureNs = Client.ToSessionNs(MonotonicClock.NowNs);
+                if (looks % 3 == 0) Client.TryObserve(sighting);
+            }
+            looks++;
+            return false;
+        });
+        Alignment found = Client.View.Alignment;
+        double error = double.NaN;
+        if (found != null)
+        {
+            RigidTransform T_found_true = Headset.ToTransform(found.T_world_tracking).Inverse * Headset.T_world_tracking;
+            error = T_found_true.Position.Length;
+        }
+        report.Write("align", isAligned, "kind", found == null ? "" : found.Kind, "stated_m", found == null ? double.NaN : found.ErrorAtRobotM, "true_m", error, "looks", looks);
+        return isAligned;
+    }
+
+    private bool Acquire(string robot)
+    {
+        Reply reply = Ask(new Acquire { Robots = new[] { robot } }, out string text);
+        Denial denial = reply?.Denial;
+        bool isOurs = reply != null && denial == null && headset.RunUntil(() => Client.View.IsOurs(robot), 10.0);
+        report.Write(
+            "acquire", isOurs, "robot", robot, "text", denial == null ? text : denial.Message, "reason", denial == null ? "" : denial.Reason, "holder", denial == null ? "" : denial.HolderName,
+            "version", Client.View.Leases.TryGetValue(robot, out Lease lease) ? lease.LeaseVersion : -1);
+        return isOurs;
+    }
+
+    private bool Release(string robot)
+    {
+        long version = Client.View.Leases.TryGetValue(robot, out Lease lease) ? lease.LeaseVersion : 0;
+        Reply reply = Ask(new Release { Targets = new[] { new Target { Name = robot, LeaseVersion = version, Kind = TargetKind.Robot } } }, out string text);
+        bool isDone = reply != null && reply.Denial == null;
+        report.Write("release", isDone, "robot", robot, "text", text);
+        return isDone;
+    }
+
+    private Reply Ask(ClientMessage request, out string text)
+    {
+        long ticket = Client.Request(request);
+        SessionNews found = default;
+        bool isThere = headset.RunUntil(() =>
+        {
+            foreach (SessionNews one in headset.News) if (one.Kind == NewsKind.Reply && one.Ticket == ticket) found = one;
+            return found.Ticket == ticket;
+        });
+        text = isThere ? found.Text ?? "" : "no reply";
+        return found.Reply;
+    }
+
+    /// <summary>Close the clutch, move the controller within a second, and measure how far the end effector went.</summary>
+    private bool Move(string robot, Double3 by)
+    {
+        headset.Robots.Clear();
+        headset.Robots.Add(robot);
+        headset.RunUntil(() => headset.Feedbacks.ContainsKey(robot), 2.0);
+        bool hasBegun = headset.TryGetSite(robot, out RigidTransform before);
+        RigidTransform from = headset.T_world_controller;
+        bool isEngaged = Engage(robot);
+        hasBegun &= headset.TryGetSite(robot, out before);
+        long beganNs = MonotonicClock.NowNs;
+        double error = double.NaN;
+        double contact = 0;
+        bool isThere = headset.RunUntil(() =>
+        {
+            double share = Math.Min(1.0, (MonotonicClock.NowNs - beganNs) * 1e-9 / 2.0);
+            double smooth = share * share * (3.0 - 2.0 * share);
+            headset.T_world_controller = new RigidTransform(from.Position + smooth * by, from.Rotation);
+            if (headset.Feedbacks.TryGetValue(robot, out Feedback now)) contact = Math.Max(contact, now.ContactN);
+            if (share < 1.0 || !headset.TryGetSite(robot, out RigidTransform after)) return false;
+            error = (after.Position - before.Position - by).Length;
+            return error < 0.002;
+        }, 8.0);
+        string hold = headset.Feedbacks.TryGetValue(robot, out Feedback last) ? last.HoldReason : "";
+        List<string> rejected = new List<string>();
+        if (last != null) foreach (KeyValuePair<string, long> one in last.Rejected) rejected.Add(one.Key + " " + one.Value);
+        headset.Clutch = false;
+        headset.TryGetSite(robot, out RigidTransform at);
+        bool isDone = hasBegun && isEngaged && error <= 0.005;
+        report.Write(
+            "move", isDone, "robot", robot, "error_mm", 1000.0 * error, "moved_m", (at.Position - before.Position).Length, "settled", isThere, "engaged", isEngaged, "hold", hold, "contact_n", contact,
+            "rejected", rejected.ToArray());
+        return isDone;
+    }
+
+    /// <summary>Close the clutch, again after a reason for which the session wants it opened.</summary>
+    private bool Engage(string robot)
+    {
+        for (int attempt = 0; attempt < 5; attempt++)
+        {
+            headset.Clutch = true;
+            headset.Feedbacks.Remove(robot);
+            if (headset.RunUntil(() => headset.Feedbacks.TryGetValue(robot, out Feedback now) && now.HoldReason.Length == 0, 3.0)) return true;
+            headset.Clutch = false;
+            headset.RunUntil(() => false, 0.3);
+        }
+        return false;
+    }
+
+    private bool Measure(double seconds)
+    {
+        headset.Ages.Clear();
+        headset.States = headset.Frames = 0;
+        headset.LongestCallMs = 0;
+        headset.RunUntil(() => false, seconds);
+        double[] ages = headset.Ages.ToArray();
+        Array.Sort(ages);
+        double p50 = ages.Length == 0 ? double.NaN : ages[ages.Length / 2];
+        double p99 = ages.Length == 0 ? double.NaN : ages[(ages.Length - 1) * 99 / 100];
+        report.Write(
+            "measure", ages.Length > 0, "states", headset.States, "frames", headset.Frames, "age_ms_p50", p50, "age_ms_p99", p99, "longest_call_ms", headset.LongestCallMs,
+            "recovery_ms", headset.RecoveryMs, "replaced", Client.StatesReplaced, "dropped_calls", Client.CallsDropped);
+        return ages.Length > 0;
+    }
+
+    private bool ShowBody(string name)
+    {
+        SessionView view = Client.View;
+        for (int row = 0; row < view.Bodies.Length; row++)
+        {
+            if (view.Bodies[row].Name != name || Client.State.BodiesVersion != view.BodiesVersion) continue;
+            double[] pose = new double[7];
+            Array.Copy(Client.State.Poses, 7 * row, pose, 0, 7);
+            report.Write("body", true, "name", name, "pose", pose, "tick", Client.State.Tick, "state_seq", Client.State.StateSeq);
+            return true;
+        }
+        report.Write("body", false, "name", name);
+        return false;
+    }
+
+    private bool ShowView()
+    {
+        SessionView view = Client.View;
+        List<string> ours = new List<string>();
+        foreach (Lease lease in view.Leases.Values) if (view.IsOurs(lease.Target)) ours.Add(lease.Target);
+        report.Write(
+            "view", true, "phase", view.Phase.ToString(), "text", view.Text, "ours", ours.ToArray(), "alignment", view.AlignmentState.ToString(), "event_seq", view.EventSeq, "scene", view.SceneHash,
+            "stopped", view.IsStopped, "epoch", view.Welcome == null ? 0 : view.Welcome.ConnectionEpoch, "resumed", view.Welcome != null && view.Welcome.Resumed, "crash", Client.Crash);
+        return true;
+    }
+
+    private bool Wait(double seconds)
+    {
+        headset.RunUntil(() => false, seconds);
+        report.Write("wait", true);
+        return true;
+    }
+
+    /// <summary>Wait for an event of a kind, from the last one on.</summary>
+    private bool Until(string kind)
+    {
+        string what = "";
+        bool isThere = headset.RunUntil(() =>
+        {
+            for (; newsAt < headset.News.Count; newsAt++)
+            {
+                SessionNews one = headset.News[newsAt];
+                if (one.Kind != NewsKind.Message || !(one.Message.Message is Event happened) || happened.Body.Tag != kind) continue;
+                newsAt++;
+                what = Describe(happened.Body);
+                return true;
+            }
+            return false;
+        });
+        report.Write("until", isThere, "event", kind, "what", what);
+        return isThere;
+    }
+
+    private string Describe(EventKind body)
+    {
+        string NameOf(string id)
+        {
+            return Client.View.Participants.TryGetValue(id, out ParticipantInfo info) ? info.Name : id;
+        }
+
+        switch (body)
+        {
+            case LeaseChanged changed: return changed.Lease.Target + " by " + NameOf(changed.Lease.Holder);
+            case ParticipantJoined joined: return joined.Participant.Name;
+            default: return "";
+        }
+    }
+
+    private bool EStop()
+    {
+        Client.EStop("headless");
+        bool isStopped = headset.RunUntil(() => Client.View.IsStopped, 10.0);
+        report.Write("estop", isStopped);
+        return isStopped;
+    }
+}
