@@ -24,6 +24,7 @@ namespace IrisSession.Transport
 
         private readonly Interrupt interrupt;
         private readonly Socket socket;
+        private volatile bool isShutDown;
 
         private InterruptibleStream(Socket socket, Interrupt interrupt)
         {
@@ -71,6 +72,7 @@ namespace IrisSession.Transport
                 Wait(SelectMode.SelectRead);
                 int got = socket.Receive(buffer, offset, count, SocketFlags.None, out SocketError error);
                 if (error == SocketError.Success) return got;
+                if (isShutDown) return 0; // Mono says `Interrupted` then, again and again
                 if (!IsTemporary(error)) throw new IOException("the connection was lost: " + error);
             }
         }
@@ -104,6 +106,7 @@ namespace IrisSession.Transport
         /// <summary>Say to the other end that nothing more comes.</summary>
         public void Shutdown()
         {
+            isShutDown = true;
             try
             {
                 socket.Shutdown(SocketShutdown.Both);

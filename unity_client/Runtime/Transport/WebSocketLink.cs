@@ -29,8 +29,8 @@ namespace IrisSession.Transport
         private const int ReadBytes = 64 << 10;
         private const int KeptBytes = 64 << 10;
 
-        /// <summary>Time for the last messages and the close frame of a link that is stopped [ns].</summary>
-        private const long LingerNs = 300_000_000;
+        /// <summary>Time for the last messages and the close frame of a link that ends [ns].</summary>
+        private const long DefaultLingerNs = 300_000_000;
         private const string Guid = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"; // RFC 6455, section 1.3
 
         private readonly WebEndpoint endpoint;
@@ -38,6 +38,7 @@ namespace IrisSession.Transport
         private readonly int maxBytes;
         private readonly ILinkListener listener;
         private readonly bool takesAnyKey;
+        private readonly long lingerNs;
         private readonly Interrupt interrupt = new Interrupt();
         private readonly object gate = new object(); // guards what follows; never held while a socket is used
         private readonly WebSocketWriter writer = new WebSocketWriter();
@@ -54,13 +55,16 @@ namespace IrisSession.Transport
         /// <param name="maxBytes">Most bytes of a message.</param>
         /// <param name="listener">What receives.</param>
         /// <param name="takesAnyKey">See <see cref="HttpConnection"/>.</param>
-        public WebSocketLink(WebEndpoint endpoint, string path, int maxBytes, ILinkListener listener, bool takesAnyKey = false)
+        /// <param name="lingerNs">Time for the last messages and the close frame when it ends [ns].</param>
+        public WebSocketLink(
+            WebEndpoint endpoint, string path, int maxBytes, ILinkListener listener, bool takesAnyKey = false, long lingerNs = DefaultLingerNs)
         {
             this.endpoint = endpoint;
             this.path = path;
             this.maxBytes = maxBytes;
             this.listener = listener;
             this.takesAnyKey = takesAnyKey;
+            this.lingerNs = lingerNs;
         }
 
         /// <summary>How it ended, once `HasEnded`.</summary>
@@ -105,7 +109,7 @@ namespace IrisSession.Transport
                 isStopping = isAsked = true;
                 if (isOpen) writer.AppendClose(1000);
                 else interrupt.Set();
-                connection?.SetDeadline(MonotonicClock.NowNs + LingerNs);
+                connection?.SetDeadline(MonotonicClock.NowNs + lingerNs);
                 Monitor.PulseAll(gate);
             }
         }
@@ -179,7 +183,7 @@ namespace IrisSession.Transport
             }
             lock (gate)
             {
-                opened.SetDeadline(isStopping ? MonotonicClock.NowNs + LingerNs : long.MaxValue);
+                opened.SetDeadline(isStopping ? MonotonicClock.NowNs + lingerNs : long.MaxValue);
                 connection = opened;
             }
             return opened;
@@ -306,7 +310,7 @@ namespace IrisSession.Transport
             lock (gate)
             {
                 isOpen = false;
-                if (!isStopping) opened.SetDeadline(MonotonicClock.NowNs + LingerNs);
+                if (!isStopping) opened.SetDeadline(MonotonicClock.NowNs + lingerNs);
                 isStopping = true;
                 Monitor.PulseAll(gate);
             }

@@ -81,9 +81,9 @@ namespace IrisSession.Transport.Tests
     [TestFixture]
     public class WebSocketLinkTests
     {
-        private static WebSocketLink StartLink(WebEndpoint endpoint, Collector collector, int maxBytes = 1 << 20)
+        private static WebSocketLink StartLink(WebEndpoint endpoint, Collector collector, int maxBytes = 1 << 20, int lingerMs = 300)
         {
-            WebSocketLink link = new WebSocketLink(endpoint, "/v1/session", maxBytes, collector);
+            WebSocketLink link = new WebSocketLink(endpoint, "/v1/session", maxBytes, collector, false, 1_000_000L * lingerMs);
             link.Start();
             return link;
         }
@@ -214,21 +214,25 @@ namespace IrisSession.Transport.Tests
         public void AMessageAboveTheLimitEndsIt()
         {
             int closeCode = 0;
-            void Serve(Peer peer)
+            using (ManualResetEvent closed = new ManualResetEvent(false))
             {
-                peer.AcceptWebSocket();
-                peer.Send(Peer.MakeFrame(0x82, new byte[2000]));
-                byte[] close = peer.ReadFrame().Value;
-                closeCode = close[0] << 8 | close[1];
-                peer.ReadToEnd();
-            }
+                void Serve(Peer peer)
+                {
+                    peer.AcceptWebSocket();
+                    peer.Send(Peer.MakeFrame(0x82, new byte[2000]));
+                    byte[] close = peer.ReadFrame().Value;
+                    closeCode = close[0] << 8 | close[1];
+                    closed.Set();
+                }
 
-            using (FakeGateway gateway = new FakeGateway(Serve))
-            {
-                Collector collector = new Collector();
-                LinkEnd end = GetEnd(StartLink(gateway.MakeEndpoint(), collector, 1000), collector);
-                Assert.AreEqual(LinkFailure.Protocol, end.Failure);
-                Assert.AreEqual(1009, closeCode);
+                using (FakeGateway gateway = new FakeGateway(Serve))
+                {
+                    Collector collector = new Collector();
+                    LinkEnd end = GetEnd(StartLink(gateway.MakeEndpoint(), collector, 1000, Patience.Ms), collector);
+                    Assert.AreEqual(LinkFailure.Protocol, end.Failure);
+                    Assert.IsTrue(closed.WaitOne(Patience.Ms));
+                    Assert.AreEqual(1009, closeCode);
+                }
             }
         }
 
@@ -341,7 +345,7 @@ namespace IrisSession.Transport.Tests
                 using (FakeGateway gateway = new FakeGateway(Serve))
                 {
                     Collector collector = new Collector();
-                    WebSocketLink link = StartLink(gateway.MakeEndpoint(), collector);
+                    WebSocketLink link = StartLink(gateway.MakeEndpoint(), collector, lingerMs: Patience.Ms);
                     collector.WaitForOpen();
                     for (int i = 0; i < 3; i++) Assert.IsTrue(link.TrySend(1, new byte[1], 1));
                     link.Stop();
