@@ -1,7 +1,7 @@
 """Build the C# of this checkout, run its tests, or run one of its programs.
 
 python -m tools.csharp test [--runtime mono] [--filter TEXT] [--long]
-python -m tools.csharp run PROGRAM [--runtime mono] -- [ARGUMENT ...]
+python -m tools.csharp run [--runtime mono] PROGRAM [ARGUMENT ...]
 python -m tools.csharp build
 python -m tools.csharp unity-api          # unity_api.json again, of $IRIS_DATA/unity/api.json
 """
@@ -34,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     run = commands.add_parser("run", help="run a program of tools/csharp/programs")
     run.add_argument("program", choices=find_programs())
     run.add_argument("--runtime", choices=RUNTIMES, default=RUNTIMES[0])
-    run.add_argument("arguments", nargs="*")
+    run.add_argument("arguments", nargs=argparse.REMAINDER, help="of the program: they begin with its command")
     options = parser.parse_args(arguments)
     try:
         built = build()
