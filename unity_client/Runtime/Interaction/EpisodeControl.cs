@@ -160,7 +160,8 @@ namespace IrisSession.Interaction
 
         private void Begin(EpisodeStep step, long until)
         {
-            asked = Step = step;
+            asked = step;
+            Step = step == EpisodeStep.Idle && runningNumber >= 0 ? EpisodeStep.Running : step;
             untilNs = until;
         }
 

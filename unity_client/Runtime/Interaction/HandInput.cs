@@ -68,6 +68,7 @@ namespace IrisSession.Interaction
         private readonly List<string> free = new List<string>();
         private readonly List<string> guessed = new List<string>();
         private readonly SampleInput head = new SampleInput { Device = Device.Head };
+        private readonly SampleInput gaze = new SampleInput { Device = Device.Gaze };
         private readonly SampleInput[] controllers = { new SampleInput { Device = Device.ControllerLeft }, new SampleInput { Device = Device.ControllerRight } };
         private readonly SampleInput[] bare = { new SampleInput { Device = Device.HandLeft }, new SampleInput { Device = Device.HandRight } };
         private long frameNs = Never;
@@ -175,6 +176,13 @@ namespace IrisSession.Interaction
                 head.Pose = reading.Head;
                 head.Validity = isVisible ? reading.HeadValidity : PoseValidity.NotSeen;
                 samples.Add(head);
+            }
+            if (reading.HasGaze)
+            {
+                gaze.CaptureNs = captureNs;
+                gaze.Pose = reading.Gaze;
+                gaze.Validity = isVisible ? reading.GazeValidity : PoseValidity.NotSeen;
+                samples.Add(gaze);
             }
             for (int side = 0; side < Sides; side++)
             {

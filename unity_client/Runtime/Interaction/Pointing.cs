@@ -29,15 +29,17 @@ namespace IrisSession.Interaction
         private const int MaxLinks = 64;
 
         private readonly Dictionary<string, long[]> chains = new Dictionary<string, long[]>();
+        private readonly List<string> names = new List<string>();
         private readonly List<long> found = new List<long>();
 
         /// <summary>Names of the robots that have a chain.</summary>
-        public ICollection<string> Robots { get { return chains.Keys; } }
+        public List<string> Robots { get { return names; } }
 
         /// <summary>Take the robots of a scene. Call it when they, or the bodies, have changed.</summary>
         public void SetRobots(IEnumerable<RobotInfo> robots, IBodies bodies)
         {
             chains.Clear();
+            names.Clear();
             foreach (RobotInfo robot in robots)
             {
                 found.Clear();
@@ -48,6 +50,7 @@ namespace IrisSession.Interaction
                     if (parent == 0) break; // no link of the robot
                     found.Add(parent);
                 }
+                if (!chains.ContainsKey(robot.Name)) names.Add(robot.Name);
                 chains[robot.Name] = found.ToArray();
             }
         }

@@ -58,31 +58,17 @@ namespace IrisSession.Interaction
         bool IsOn { get; set; }
     }
 
+    /// <summary>Where the eyes look.</summary>
+    public interface IGaze
+    {
+        /// <summary>Return `T_tracking_gaze`, which looks along x; false while the runtime does not know it, or may not say it.</summary>
+        bool TryRead(out RigidTransform T_tracking_gaze);
+    }
+
     /// <summary>Vibration motors of controllers.</summary>
     public interface IHaptics
     {
         void Play(Side side, Pulse pulse);
-    }
-
-    /// <summary>How hot a headset says it is.</summary>
-    public enum ThermalState
-    {
-        Unknown,
-        Nominal,
-        Warm,
-        Hot,
-    }
-
-    /// <summary>Condition of the device.</summary>
-    public struct DeviceHealth
-    {
-        /// <summary>Charge, 0 to 1; -1 where it is not known.</summary>
-        public double Battery;
-        public bool IsCharging;
-        public ThermalState Thermal;
-
-        /// <summary>Frames that the compositor did not get in time, since the start; -1 where it does not say.</summary>
-        public long DroppedFrames;
     }
 
     public interface IHealthSource

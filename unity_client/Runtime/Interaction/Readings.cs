@@ -117,6 +117,11 @@ namespace IrisSession.Interaction
         public bool HasHead;
         public PoseValidity HeadValidity;
 
+        /// <summary>Where the eyes look: `T_tracking_gaze`, along x.</summary>
+        public RigidTransform Gaze;
+        public bool HasGaze;
+        public PoseValidity GazeValidity;
+
         /// <summary>Left and right, by <see cref="Side"/>.</summary>
         public readonly InputReading[] Inputs = { new InputReading(), new InputReading() };
 

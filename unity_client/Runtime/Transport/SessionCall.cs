@@ -17,6 +17,11 @@ namespace IrisSession.Transport
     /// <summary>A call of the engine on its way to the thread of the session. Made once and filled again.</summary>
     internal sealed class SessionCall
     {
+        private static readonly double[] Nothing = new double[0];
+        private double[] twist = Nothing;
+        private double[] handJoints = Nothing;
+        private double[] q = Nothing;
+        private double[] qd = Nothing;
         public readonly SampleInput Sample = new SampleInput();
         public readonly SheetSighting Sighting = new SheetSighting();
 
@@ -55,10 +60,10 @@ namespace IrisSession.Transport
             Sample.Kind = input.Kind;
             Copy(input.Robots, Sample.Robots);
             Copy(input.Objects, Sample.Objects);
-            Sample.Twist = Copy(input.Twist, Sample.Twist);
-            Sample.HandJoints = Copy(input.HandJoints, Sample.HandJoints);
-            Sample.Q = Copy(input.Q, Sample.Q);
-            Sample.Qd = Copy(input.Qd, Sample.Qd);
+            Sample.Twist = Copy(input.Twist, ref twist);
+            Sample.HandJoints = Copy(input.HandJoints, ref handJoints);
+            Sample.Q = Copy(input.Q, ref q);
+            Sample.Qd = Copy(input.Qd, ref qd);
         }
 
         public void SetSighting(SheetSighting sighting)
@@ -90,12 +95,14 @@ namespace IrisSession.Transport
             for (int i = 0; i < from.Count; i++) to.Add(from[i]);
         }
 
-        private static double[] Copy(double[] from, double[] to)
+        /// <summary>Copy into an array that is kept. Most samples have no joints: those leave it as it is.</summary>
+        private static double[] Copy(double[] from, ref double[] kept)
         {
             if (from == null) return null;
-            if (to == null || to.Length != from.Length) to = new double[from.Length];
-            Array.Copy(from, to, from.Length);
-            return to;
+            if (from.Length == 0) return Nothing;
+            if (kept.Length != from.Length) kept = new double[from.Length];
+            Array.Copy(from, kept, from.Length);
+            return kept;
         }
     }
 }

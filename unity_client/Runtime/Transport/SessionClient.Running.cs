@@ -14,6 +14,8 @@ namespace IrisSession.Transport
         private readonly Queue<SessionNews> ownNews = new Queue<SessionNews>(); // replies and notices that wait for room
         private int requestGeneration;
         private long statesReplaced;
+        private readonly List<Advice> adviceNow = new List<Advice>();
+        private long adviceAt = long.MinValue;
         private long seenSnapshots = -1;
         private Refused seenRefusal;
         private readonly MediaHeader mediaHeader = new MediaHeader();
@@ -111,6 +113,7 @@ namespace IrisSession.Transport
             Inbox inbox = loop.Connection.Inbox;
             while (news.HasRoom && inbox.TryTake(out InboxMessage message))
             {
+                loop.Note(message.Message);
                 news.Next = new SessionNews { Kind = NewsKind.Message, Message = message };
                 news.Add();
             }
@@ -122,6 +125,26 @@ namespace IrisSession.Transport
             }
             Interlocked.Exchange(ref isClockSynced, clock.IsSettled ? 1 : 0);
             PublishView();
+            PublishAdvice();
+        }
+
+        /// <summary>Publish what is wrong when it has changed, a few times a second.</summary>
+        private void PublishAdvice()
+        {
+            suspensions = loop.Headset.Suspensions;
+            isLive = loop.Headset.IsLive;
+            long nowNs = MonotonicClock.NowNs;
+            if (nowNs < adviceAt) return;
+            adviceAt = nowNs + AdvicePeriodNs;
+            loop.ListAdvice(adviceNow);
+            Advice[] before = advice;
+            bool isSame = before.Length == adviceNow.Count;
+            for (int i = 0; isSame && i < before.Length; i++)
+            {
+                Advice one = adviceNow[i];
+                isSame = one.Kind == before[i].Kind && one.Reason == before[i].Reason && one.Phrase.What == before[i].Phrase.What && one.Phrase.Remedy == before[i].Phrase.Remedy;
+            }
+            if (!isSame) advice = adviceNow.ToArray();
         }
 
         private void TakeReplies()
@@ -138,6 +161,7 @@ namespace IrisSession.Transport
                     i++;
                     continue;
                 }
+                if (reply != null) loop.Note(reply);
                 string text = reply != null ? "" : isLost ? "the connection was lost before the session answered" : "too many requests wait for an answer";
                 AddNews(new SessionNews { Kind = NewsKind.Reply, Ticket = requests[i].Value, Reply = reply, Text = text });
                 requests.RemoveAt(i);

@@ -30,6 +30,9 @@ namespace IrisSession.Transport
         /// <summary>Longest sleep of the session's thread, so that its clock estimate reaches the engine [ms].</summary>
         private const int LongestWaitMs = 100;
 
+        /// <summary>Advice is made anew so often: people read it [ns].</summary>
+        private const long AdvicePeriodNs = 200_000_000;
+
         /// <summary>Longest time of <see cref="Stop"/>.</summary>
         private const int StopMs = 950;
 
@@ -43,6 +46,9 @@ namespace IrisSession.Transport
         private readonly NewestMessages media = new NewestMessages(16, true);
         private EStop stop; // handed over by itself: it never waits behind samples, and is never dropped
         private volatile SessionView view;
+        private volatile Advice[] advice = new Advice[0];
+        private volatile int suspensions;
+        private volatile bool isLive = true;
         private volatile bool isStopping;
         private volatile string crash = "";
         private long clockOffsetNs;
@@ -63,6 +69,14 @@ namespace IrisSession.Transport
 
         /// <summary>The session as it is known now.</summary>
         public SessionView View { get { return view; } }
+
+        /// <summary>What is wrong now, the most urgent first. Never changes: another list replaces it.</summary>
+        public Advice[] Advice { get { return advice; } }
+
+        /// <summary>`HeadsetState.Suspensions` and `IsLive`, as the thread of the session last had them.</summary>
+        public int Suspensions { get { return suspensions; } }
+
+        public bool IsLive { get { return isLive; } }
 
         /// <summary>The newest state, empty before the first. See <see cref="TakeState"/>.</summary>
         public StateFrame State { get { return states.Front; } }

@@ -42,6 +42,15 @@ namespace IrisSession.Transport
         public readonly ClientAlignment Alignment;
         public readonly ArrivalMeter Meter = new ArrivalMeter();
 
+        /// <summary>What the runtime of the headset reports; it judges every sample.</summary>
+        public readonly HeadsetState Headset;
+
+        /// <summary>What is wrong, for people.</summary>
+        public readonly ClientAdvice Advice;
+
+        /// <summary>Battery, heat and dropped frames, for the report.</summary>
+        public readonly HealthMeter Health = new HealthMeter();
+
         private readonly Func<long> getNowNs;
         private readonly ISessionListener listener;
         private readonly List<string> wishes = new List<string>();
@@ -71,6 +80,8 @@ namespace IrisSession.Transport
             Endpoints = endpoints;
             Samples = new SampleBuilder(connection);
             Alignment = new ClientAlignment(connection);
+            Headset = new HeadsetState(connection);
+            Advice = new ClientAdvice(connection, Alignment) { Headset = Headset };
             this.listener = listener;
             this.getNowNs = getNowNs;
         }
@@ -126,6 +137,8 @@ namespace IrisSession.Transport
         /// <exception cref="InvalidMessageException">The session has no such robot or object.</exception>
         public bool SendSample(SampleInput input)
         {
+            if (!Headset.Judge(input)) return false;
+            if (input.Device == Device.Head) Advice.Head = input.Pose;
             if (input.Clutch && input.Robots.Count > 0) engagedAt = getNowNs();
             return Connection.Send(Samples.MakeSample(input));
         }
@@ -158,6 +171,24 @@ namespace IrisSession.Transport
             due = Math.Min(due, transportAt);
             if (isWaiting && Transport.State == TransportState.Open) due = Math.Min(due, nowNs + FullPauseNs);
             return Math.Max(0, due - nowNs);
+        }
+
+        /// <summary>Note what a message says about robots of ours, before the application takes it.</summary>
+        public void Note(ServerMessage message)
+        {
+            if (message is Feedback feedback)
+            {
+                Headset.TakeFeedback(feedback);
+                Advice.TakeFeedback(feedback);
+            }
+            else if (message is Reply reply && reply.Denial != null) Advice.TakeDenial(reply.Denial, getNowNs());
+        }
+
+        /// <summary>List what is wrong into `advice`, the most urgent first.</summary>
+        public void ListAdvice(List<Advice> advice)
+        {
+            Advice.Link = new Phrase(Problem.Failure == LinkFailure.None ? "" : Problem.Text, "");
+            Advice.List(getNowNs(), advice);
         }
 
         // --- sockets ----------------------------------------------------------------------------------------------------------------
@@ -280,7 +311,9 @@ namespace IrisSession.Transport
         {
             if (!Connection.IsJoined) return;
             ClientReport report = Meter.Poll(Connection.Stream, Connection.Clock.RttNs, nowNs);
-            if (report != null) Connection.Send(report);
+            if (report == null) return;
+            Health.Fill(report);
+            Connection.Send(report);
         }
 
         private void Flush()

@@ -118,7 +118,7 @@ namespace IrisSession.Transport.Tests
                 SessionClient client = new SessionClient(MakeHello(), new MemoryIdentity(), new EndpointChooser(new WebEndpoint(false, "localhost", 7725)), transport);
                 client.Start();
                 Assert.IsTrue(isBlocked.WaitOne(Patience.Ms));
-                SampleInput input = new SampleInput { Device = Device.ControllerRight };
+                SampleInput input = new SampleInput { Device = Device.ControllerRight, Pose = new RigidTransform(new Double3(0.1, 0.2, 1), DoubleQuaternion.Identity) };
                 int refused = 0;
                 Multipart media = new Multipart();
                 for (int frame = 0; frame < 2000; frame++)
@@ -153,7 +153,7 @@ namespace IrisSession.Transport.Tests
                 client.Start();
                 WaitUntil(() => client.View.Phase == ConnectionPhase.Ready, "not ready");
                 goesOn.Reset();
-                SampleInput input = new SampleInput { Device = Device.ControllerRight, HandJoints = new double[26 * 7] };
+                SampleInput input = new SampleInput { Device = Device.ControllerRight, Pose = new RigidTransform(new Double3(0.1, 0.2, 1), DoubleQuaternion.Identity), HandJoints = new double[26 * 7] };
                 for (int frame = 0; frame < 5000; frame++)
                 {
                     client.TakeState();
@@ -206,7 +206,7 @@ namespace IrisSession.Transport.Tests
                 SessionClient client = new SessionClient(MakeHello(), new MemoryIdentity(), new EndpointChooser(gateway.MakeEndpoint()), new WebTransport());
                 client.Start();
                 WaitUntil(() => client.View.Phase == ConnectionPhase.Ready && client.TakeState(), "no state");
-                SampleInput input = new SampleInput { Device = Device.ControllerRight, HandJoints = new double[26 * 7] };
+                SampleInput input = new SampleInput { Device = Device.ControllerRight, Pose = new RigidTransform(new Double3(0.1, 0.2, 1), DoubleQuaternion.Identity), HandJoints = new double[26 * 7] };
                 long allocated = 0;
                 for (int frame = 0; frame < 4000; frame++)
                 {

@@ -199,8 +199,10 @@ namespace IrisSession.Transport.Tests
             rig.Loop.Step();
             rig.Transport.Break(LinkFailure.Unreachable);
             rig.Run(500 * Ms);
-            SampleInput input = new SampleInput { Device = Device.ControllerRight, Clutch = true };
+            SampleInput input = new SampleInput { Device = Device.ControllerRight, Pose = new RigidTransform(new Double3(0.1, 0.2, 1), DoubleQuaternion.Identity) };
             input.Robots.Add("left");
+            rig.Loop.SendSample(input);
+            input.Clutch = true; // one that is closed from the first on is open
             for (int i = 0; i < 500; i++)
             {
                 rig.Loop.SendSample(input);
@@ -246,12 +248,35 @@ namespace IrisSession.Transport.Tests
         }
 
         [Test]
+        public void SamplesReportsAndAdviceFollowTheHeadset()
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Join();
+            SampleInput input = new SampleInput { Device = Device.ControllerRight, Pose = new RigidTransform(new Double3(0.1, 0.2, 1), DoubleQuaternion.Identity) };
+            rig.Loop.SendSample(input);
+            rig.Loop.Headset.SetFocus(AppFocus.Covered);
+            rig.Loop.Health.Newest = new DeviceHealth { Battery = 0.25, Thermal = ThermalState.Warm };
+            rig.Loop.SendSample(input);
+            rig.Run(2 * Second);
+            List<ClientMessage> sent = rig.Transport.Sent.ConvertAll(one => one.Message);
+            List<ClientMessage> samples = sent.FindAll(one => one is Sample);
+            Assert.IsTrue(((Sample)samples[0]).Tracked);
+            Assert.IsFalse(((Sample)samples[1]).Tracked);
+            Assert.AreEqual(0.25, ((ClientReport)sent.FindLast(one => one is ClientReport)).Battery);
+            rig.Loop.Note(new Reply { Denial = new Denial { Reason = DenialReason.Held } });
+            List<Advice> advice = new List<Advice>();
+            rig.Loop.ListAdvice(advice);
+            Assert.IsTrue(advice.Exists(one => one.Kind == AdviceKind.Covered));
+            Assert.IsTrue(advice.Exists(one => one.Kind == AdviceKind.Denied));
+        }
+
+        [Test]
         public void WhileTheSocketIsFullSamplesAreDroppedAndTheRestWaits()
         {
             LoopRig rig = new LoopRig(Cable);
             rig.Join();
             rig.Transport.IsFull = true;
-            SampleInput input = new SampleInput { Device = Device.ControllerRight };
+            SampleInput input = new SampleInput { Device = Device.ControllerRight, Pose = new RigidTransform(new Double3(0.1, 0.2, 1), DoubleQuaternion.Identity) };
             rig.Loop.SendSample(input);
             long before = rig.Loop.Connection.Counters.SamplesNotSent;
             rig.Loop.Step();

@@ -1,0 +1,351 @@
+// A headset, frame by frame: readings in; samples, requests and looks out. All that it decides is in the other files of this folder.
+// As web_client/src/xr/headset.ts.
+using System;
+using System.Collections.Generic;
+using IrisSession.Core;
+using IrisSession.Protocol;
+using IrisSession.Transport;
+
+namespace IrisSession.Interaction
+{
+    /// <summary>A question of another participant who asks for one's robot.</summary>
+    public sealed class ConsentQuestion
+    {
+        public long ConsentId;
+        public string Target = "";
+        public string Requester = "";
+
+        /// <summary>On the clock of readings [ns].</summary>
+        public long UntilNs;
+    }
+
+    /// <summary>Input of one headset. For the engine's thread; a frame allocates nothing after the first ones.</summary>
+    public sealed class HeadsetInput
+    {
+        /// <summary>Time to answer where the session does not state it.</summary>
+        private const long ConsentNs = 15_000_000_000;
+        private const int MaxConsents = 16;
+        private const int Sides = 2;
+
+        private struct PendingRequest
+        {
+            public long Ticket;
+            public string Robot; // of an acquire
+            public bool IsEpisode;
+        }
+
+        private readonly ISessionPort session;
+        private readonly IBodies bodies;
+        private readonly IHaptics haptics;
+        private readonly HandContext context = new HandContext();
+        private readonly List<HandIntent> intents = new List<HandIntent>();
+        private readonly List<SampleInput> samples = new List<SampleInput>();
+        private readonly List<PendingRequest> pending = new List<PendingRequest>();
+        private readonly List<ConsentQuestion> consents = new List<ConsentQuestion>();
+        private readonly FeedbackPulses pulses = new FeedbackPulses();
+        private readonly double[] hits = new double[Sides];
+        private IReadOnlyDictionary<string, RobotInfo> robotsOf;
+        private long bodiesOf = -1;
+        private int suspensions;
+
+        /// <param name="session">See <see cref="SessionClientPort"/>.</param>
+        /// <param name="bodies">Bodies as they are shown.</param>
+        /// <param name="haptics">Null: there are no motors.</param>
+        public HeadsetInput(ISessionPort session, IBodies bodies, IHaptics haptics)
+        {
+            this.session = session;
+            this.bodies = bodies;
+            this.haptics = haptics;
+        }
+
+        /// <summary>Filled by the layer before <see cref="Update"/>.</summary>
+        public readonly HeadsetReading Reading = new HeadsetReading();
+        public readonly HandInput Hands = new HandInput();
+        public readonly WristStop WristStop = new WristStop();
+        public readonly ButtonPanel Buttons = new ButtonPanel();
+        public readonly EpisodeControl Episode = new EpisodeControl();
+        public readonly Pointing Pointing = new Pointing();
+
+        /// <summary>Codes; null: none are looked for.</summary>
+        public MarkerLooks Markers { get; set; }
+
+        /// <summary>In VR nothing of the room is seen, so a director may be aligned by its own word: at this `T_world_tracking`. Null: not now.</summary>
+        public RigidTransform? OwnPlace { get; set; }
+
+        /// <summary>The question that is shown, null for none.</summary>
+        public ConsentQuestion Question { get; private set; }
+
+        /// <summary>Whom one's own request waits for: the robot, empty for none.</summary>
+        public string AwaitedRobot { get; private set; } = "";
+
+        /// <summary>A denial that the person has to see: taken by <see cref="TakeDenial"/>.</summary>
+        public Denial Denial { get; private set; }
+
+        /// <summary>Return the robot that a hand points at, empty for none.</summary>
+        public string FindPointed(Side side) { return context.Pointed[(int)side]; }
+
+        /// <summary>Return how far the ray of a hand goes until it meets something [m], 0: it meets nothing.</summary>
+        public double FindHit(Side side) { return hits[(int)side]; }
+
+        /// <summary>Return whether a request for this robot has no answer yet.</summary>
+        public bool IsRequested(string robot)
+        {
+            foreach (PendingRequest one in pending) if (one.Robot == robot) return true;
+            return false;
+        }
+
+        /// <summary>Return the newest feedback of a robot, null for none.</summary>
+        public Feedback FindFeedback(string robot) { return pulses.Find(robot); }
+
+        /// <summary>Take a frame, before the scene is drawn.</summary>
+        /// <param name="isLive">The person sees the scene, and their input reaches it.</param>
+        /// <param name="suspensionCount">`HeadsetState.Suspensions`: when it has grown, buttons count from their next press.</param>
+        /// <param name="bodiesVersion">Changes with the bodies of the scene.</param>
+        public void Update(bool isLive, int suspensionCount, long bodiesVersion)
+        {
+            long nowNs = Reading.CaptureNs;
+            if (suspensionCount != suspensions || !isLive) Suspend();
+            suspensions = suspensionCount;
+            if (isLive) TakeStops();
+            FillContext(bodiesVersion);
+            Point();
+            if (isLive)
+            {
+                intents.Clear();
+                Hands.Update(Reading, context, intents);
+                foreach (HandIntent intent in intents) Do(intent, nowNs);
+            }
+            bool canRecord = isLive && session.IsJoined;
+            Request(Episode.Update(session.Episode, canRecord, nowNs), nowNs);
+            if (Episode.IsTick) PlayBoth(Pulse.Tick);
+            Send(isLive);
+            Markers?.Update(Reading, session);
+        }
+
+        /// <summary>Take what the session said, in order.</summary>
+        public void Take(SessionNews news, long nowNs)
+        {
+            if (news.Kind == NewsKind.Reply) TakeReply(news.Ticket, news.Reply, nowNs);
+            else if (news.Kind == NewsKind.Message) Take(news.Message.Message, nowNs);
+        }
+
+        /// <summary>Take a message of the session.</summary>
+        public void Take(ServerMessage message, long nowNs)
+        {
+            switch (message)
+            {
+                case Feedback feedback:
+                    Pulse pulse = pulses.Take(feedback);
+                    if (pulse.IsFelt && Hands.TryFindDriver(feedback.Robot, out Side side)) haptics?.Play(side, pulse);
+                    break;
+                case Reply reply when reply.Denial != null:
+                    Denial = reply.Denial;
+                    break;
+                case Event one when one.Body is ConsentRequested asked && asked.Holder == session.ParticipantId:
+                    if (consents.Count == MaxConsents) consents.RemoveAt(0);
+                    consents.Add(new ConsentQuestion { ConsentId = asked.ConsentId, Target = asked.Target, Requester = asked.Requester, UntilNs = nowNs + ConsentNs });
+                    break;
+                case Event one when one.Body is LeaseChanged changed && changed.Cause != "queue":
+                    consents.RemoveAll(asked => asked.Target == changed.Lease.Target);
+                    break;
+            }
+        }
+
+        /// <summary>Take the answer to a request of ours; null: the connection was lost before it came. Others are ignored.</summary>
+        public void TakeReply(long ticket, Reply reply, long nowNs)
+        {
+            for (int i = 0; i < pending.Count; i++)
+            {
+                if (pending[i].Ticket != ticket) continue;
+                PendingRequest one = pending[i];
+                pending.RemoveAt(i);
+                bool isGranted = reply != null && reply.Ok;
+                if (one.Robot != null) Hands.Settle(one.Robot, isGranted, nowNs);
+                if (one.IsEpisode) Episode.Settle();
+                if (reply != null && reply.Denial != null) Denial = reply.Denial;
+                return;
+            }
+        }
+
+        /// <summary>Return the newest denial once, null for none.</summary>
+        public Denial TakeDenial()
+        {
+            Denial newest = Denial;
+            Denial = null;
+            return newest;
+        }
+
+        /// <summary>The wearer recentred, or the runtime located itself anew.</summary>
+        public void OnRecentred()
+        {
+            session.ReportRecentred();
+            Markers?.Reset();
+            foreach (InputReading input in Reading.Inputs) input.HasPose = false;
+            Suspend();
+        }
+
+        /// <summary>Another session: what the last one said is void.</summary>
+        public void OnWelcome()
+        {
+            pulses.Clear();
+            consents.Clear();
+        }
+
+        private void Suspend()
+        {
+            Hands.Suspend();
+            Hands.TakeStops(Reading); // one that is held when input comes back counts
+            WristStop.Suspend();
+            Episode.Cancel();
+        }
+
+        private void TakeStops()
+        {
+            if (Hands.TakeStops(Reading)) session.EStop("button of a controller");
+            if (WristStop.Update(Reading)) session.EStop("fingertip at the wrist");
+        }
+
+        private void FillContext(long bodiesVersion)
+        {
+            context.Clear();
+            IReadOnlyDictionary<string, RobotInfo> robots = session.Robots;
+            if (!ReferenceEquals(robots, robotsOf) || bodiesVersion != bodiesOf)
+            {
+                Pointing.SetRobots(robots.Values, bodies);
+                robotsOf = robots;
+                bodiesOf = bodiesVersion;
+            }
+            foreach (string robot in Pointing.Robots)
+            {
+                Feedback feedback = pulses.Find(robot);
+                if (feedback != null && feedback.HoldReason.Length == 0) context.Following.Add(robot);
+                if (feedback != null && feedback.HoldReason == HoldReason.Emulated) context.Guessed.Add(robot);
+                if (!session.Leases.TryGetValue(robot, out Lease lease) || !SessionMirror.IsHeldBy(lease, session.ParticipantId)) continue;
+                context.Held.Add(robot);
+                if (lease.SubHolders.Length == 0) context.Tenures[robot] = new Tenure(lease.LeaseVersion, session.SceneEpoch);
+            }
+            context.CanPlace = OwnPlace.HasValue && session.IsJoined && session.AlignmentState == AlignmentState.None && IsDirector();
+        }
+
+        private bool IsDirector()
+        {
+            return session.Participants.TryGetValue(session.ParticipantId, out ParticipantInfo self) && self.Role == Role.Director;
+        }
+
+        /// <summary>Find the buttons and robots that hands point at.</summary>
+        private void Point()
+        {
+            UpdateQuestion();
+            Buttons.Update(Reading, Question == null ? -1 : Question.ConsentId, AwaitedRobot.Length > 0);
+            bool isPlaced = session.TryGetAlignment(out RigidTransform T_world_tracking);
+            if (!isPlaced && OwnPlace.HasValue)
+            {
+                T_world_tracking = OwnPlace.Value;
+                isPlaced = true;
+            }
+            for (int side = 0; side < Sides; side++)
+            {
+                hits[side] = 0;
+                InputReading input = Reading.Inputs[side];
+                if (!input.IsTracked || !input.HasRay || Hands.IsSqueezing((Side)side)) continue;
+                Button button = Buttons.FindAimed(input.Ray, out double distance);
+                if (button.IsSomething)
+                {
+                    context.Aimed[side] = button;
+                    Buttons.MarkAimed(button);
+                    hits[side] = distance;
+                    continue;
+                }
+                if (!isPlaced) continue;
+                string robot = Pointing.FindPointed(input.Ray.In(T_world_tracking), bodies, out distance);
+                context.Pointed[side] = robot;
+                if (robot.Length > 0) hits[side] = distance;
+            }
+        }
+
+        private void UpdateQuestion()
+        {
+            while (consents.Count > 0 && consents[0].UntilNs <= Reading.CaptureNs) consents.RemoveAt(0);
+            Question = consents.Count > 0 ? consents[0] : null;
+            AwaitedRobot = "";
+            foreach (PendingRequest one in pending)
+            {
+                if (one.Robot == null || !session.Leases.TryGetValue(one.Robot, out Lease lease) || lease.Mode != LeaseMode.Request || lease.Holder.Length == 0) continue;
+                AwaitedRobot = one.Robot;
+                break;
+            }
+        }
+
+        private void Do(HandIntent intent, long nowNs)
+        {
+            switch (intent.Kind)
+            {
+                case IntentKind.Acquire:
+                    long ticket = session.Request(new Acquire { Robots = new[] { intent.Robot } });
+                    if (ticket == 0) Hands.Settle(intent.Robot, false, nowNs);
+                    else pending.Add(new PendingRequest { Ticket = ticket, Robot = intent.Robot });
+                    break;
+                case IntentKind.Release:
+                    if (!session.Leases.TryGetValue(intent.Robot, out Lease lease)) break;
+                    session.Request(new Release { Targets = new[] { new Target { Name = intent.Robot, LeaseVersion = lease.LeaseVersion } } });
+                    break;
+                case IntentKind.Press:
+                    Press(intent.Button);
+                    break;
+                case IntentKind.EpisodeLower:
+                    Request(Episode.PressLower(nowNs), nowNs);
+                    break;
+                case IntentKind.EpisodeUpper:
+                    Request(Episode.PressUpper(nowNs), nowNs);
+                    break;
+                case IntentKind.Place:
+                    if (!OwnPlace.HasValue) break;
+                    PlaceAlignment place = new PlaceAlignment { Participant = session.ParticipantId };
+                    place.T_world_tracking = ToPose(OwnPlace.Value);
+                    session.Request(place);
+                    break;
+            }
+        }
+
+        private void Press(Button button)
+        {
+            if (button.Id == Button.Grant || button.Id == Button.Refuse)
+            {
+                if (Question == null) return;
+                session.Request(new Consent { ConsentId = Question.ConsentId, Grant = button.Id == Button.Grant });
+                consents.Remove(Question);
+                return;
+            }
+            Buttons.FindCommand(button)?.Run();
+        }
+
+        private void Request(string episodeAction, long nowNs)
+        {
+            if (episodeAction == null) return;
+            long ticket = session.Request(new Episode { Action = episodeAction });
+            if (ticket == 0) Episode.Settle();
+            else pending.Add(new PendingRequest { Ticket = ticket, IsEpisode = true });
+        }
+
+        private void Send(bool isLive)
+        {
+            if (!session.IsJoined || !session.HasClock) return;
+            samples.Clear();
+            Hands.MakeInputs(Reading, isLive, session.ToSessionNs(Reading.CaptureNs), samples);
+            foreach (SampleInput input in samples) session.TrySendSample(input);
+        }
+
+        private void PlayBoth(Pulse pulse)
+        {
+            haptics?.Play(Side.Left, pulse);
+            haptics?.Play(Side.Right, pulse);
+        }
+
+        private static Pose ToPose(RigidTransform transform)
+        {
+            Double3 p = transform.Position;
+            DoubleQuaternion q = transform.Rotation;
+            return new Pose { P = new[] { p.X, p.Y, p.Z }, Q = new[] { q.W, q.X, q.Y, q.Z } };
+        }
+    }
+}
