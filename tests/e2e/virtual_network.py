@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -64,11 +65,11 @@ class Machine(Namespace):
         assert process.returncode == (1 if report["failed"] else 0), errors
         return report
 
-    def serve(self, *arguments: str) -> ServedSession:
+    def serve(self, *arguments: str, scene: str = "handover", command: Sequence[str] = COMMAND) -> ServedSession:
         out = self.folder / f"serve{len(self.running)}.out"
         with out.open("wb") as file:
             process = subprocess.Popen(
-                self.command("serve", "handover", "--no-record", *arguments),
+                self.wrap_command(*command, "serve", scene, "--no-record", *arguments),
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 cwd=self.folder,

@@ -13,6 +13,11 @@ using IrisSession.Transport;
 /// </summary>
 internal sealed class Commands
 {
+    /// <summary>Places from which sheets are looked at, and frames at each.</summary>
+    private const int EnoughPlaces = 3;
+    private const int MaxPlaces = 20;
+    private const int LookFrames = 40;
+
     private readonly Headset headset;
     private readonly Report report;
     private readonly Options options;
@@ -105,30 +110,16 @@ internal sealed class Commands
         return isJoined;
     }
 
-    /// <summary>Look at each sheet from several places, as a headset would, until the session has an alignment.</summary>
+    /// <summary>Look at each sheet from one place after the other, as a person would, until the session has an alignment.</summary>
     private bool Align()
     {
-        SheetSighting sighting = new SheetSighting();
-        int looks = 0;
-        bool isAligned = headset.RunUntil(() =>
+        int places = 0;
+        bool isAligned = false;
+        for (; places < MaxPlaces && !(isAligned && places >= EnoughPlaces); places++)
         {
-            if (Client.View.AlignmentState == AlignmentState.Aligned && looks > 100) return true;
-            foreach (AnchorInfo anchor in Client.View.Anchors.Values)
-            {
-                RigidTransform T_world_anchor = Headset.ToTransform(anchor.T_world_anchor);
-                double angle = 0.35 * (looks / 20);
-                Double3 place = T_world_anchor.Position + new Double3(0.4 * Math.Cos(angle), 0.4 * Math.Sin(angle), 0.45);
-                headset.T_world_head = new RigidTransform(place, DoubleQuaternion.FromAxisAngle(new Double3(0, 0, 1), angle));
-                sighting.AnchorId = anchor.Id;
-                sighting.SizeM = anchor.SizeM;
-                sighting.T_tracking_anchor = headset.ToTracking(T_world_anchor);
-                sighting.T_tracking_camera = headset.ToTracking(headset.T_world_head);
-                sighting.CaptureNs = Client.ToSessionNs(MonotonicClock.NowNs);
-                if (looks % 3 == 0) Client.TryObserve(sighting);
-            }
-            looks++;
-            return false;
-        });
+            foreach (AnchorInfo anchor in Client.View.Anchors.Values) Look(anchor, 0.35 * places);
+            isAligned = Client.View.AlignmentState == AlignmentState.Aligned;
+        }
         Alignment found = Client.View.Alignment;
         double error = double.NaN;
         if (found != null)
@@ -136,8 +127,25 @@ internal sealed class Commands
             RigidTransform T_found_true = Headset.ToTransform(found.T_world_tracking).Inverse * Headset.T_world_tracking;
             error = T_found_true.Position.Length;
         }
-        report.Write("align", isAligned, "kind", found == null ? "" : found.Kind, "stated_m", found == null ? double.NaN : found.ErrorAtRobotM, "true_m", error, "looks", looks);
+        report.Write("align", isAligned, "kind", found == null ? "" : found.Kind, "stated_m", found == null ? double.NaN : found.ErrorAtRobotM, "true_m", error, "places", places);
         return isAligned;
+    }
+
+    /// <summary>Walk to a place 0.6 m from a sheet, stand still, and report the sheet for a moment.</summary>
+    private void Look(AnchorInfo anchor, double angle)
+    {
+        RigidTransform T_world_anchor = Headset.ToTransform(anchor.T_world_anchor);
+        headset.WalkTo(T_world_anchor.Position + new Double3(0.4 * Math.Cos(angle), 0.4 * Math.Sin(angle), 0.45));
+        SheetSighting sighting = new SheetSighting { AnchorId = anchor.Id, SizeM = anchor.SizeM };
+        int frames = 0;
+        headset.RunUntil(() =>
+        {
+            sighting.T_tracking_anchor = headset.ToTracking(T_world_anchor);
+            sighting.T_tracking_camera = headset.ToTracking(headset.T_world_head);
+            sighting.CaptureNs = Client.ToSessionNs(MonotonicClock.NowNs);
+            if (frames % 3 == 0) Client.TryObserve(sighting);
+            return ++frames > LookFrames;
+        });
     }
 
     private bool Acquire(string robot)

@@ -10,6 +10,7 @@ internal sealed class Headset : IDisposable
 {
     public const int FrameMs = 14;
     private const long FreshNs = 100_000_000;
+    private const double WalkingSpeed = 0.7; // m/s
 
     /// <summary>Where the tracking frame is: nothing about it is special.</summary>
     public static readonly RigidTransform T_world_tracking = new RigidTransform(
@@ -100,6 +101,20 @@ internal sealed class Headset : IDisposable
             Frame();
         }
         return true;
+    }
+
+    /// <summary>Move the head at walking speed: one that is elsewhere from one frame to the next is a jump of the tracking.</summary>
+    public void WalkTo(Double3 place)
+    {
+        Double3 from = T_world_head.Position;
+        double durationNs = 1e9 * (0.3 + (place - from).Length / WalkingSpeed);
+        long beganNs = MonotonicClock.NowNs;
+        RunUntil(() =>
+        {
+            double share = Math.Min(1.0, (MonotonicClock.NowNs - beganNs) / durationNs);
+            T_world_head = new RigidTransform(from + share * share * (3.0 - 2.0 * share) * (place - from), T_world_head.Rotation);
+            return share >= 1.0;
+        });
     }
 
     /// <summary>Return the pose of a robot's end effector in the newest state.</summary>
