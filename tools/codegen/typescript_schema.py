@@ -83,7 +83,8 @@ def _render_type(kind: Type) -> str:
     item = _render_type(kind.item)
     if kind.base == "map":
         return f'["map", {item}]'
-    return f'["array", {item}, {kind.length}, {kind.max_length}]'
+    least = f", {kind.min_length}" if kind.min_length else ""
+    return f'["array", {item}, {kind.length}, {kind.max_length}{least}]'
 
 
 def _bound(value: int | None) -> int | None:

@@ -57,6 +57,14 @@ describe("golden vectors", () => {
     }
   });
 
+  test("arrays with a least length are read and written no shorter", () => {
+    const info = { name: "a", dtype: "u1", shape: [1], bytes: 0 };
+    expect(codec.decodeStruct("ArrayInfo", codec.encodeStruct("ArrayInfo", info))).toMatchObject(info);
+    expect(() => codec.encodeStruct("ArrayInfo", { ...info, shape: [] })).toThrow(MalformedError);
+    const bytes = toHex(codec.encodeStruct("ArrayInfo", info));
+    expect(() => codec.decodeStruct("ArrayInfo", fromHex(bytes.replace("a5736861706591" + "01", "a5736861706590")))).toThrow(MalformedError);
+  });
+
   test("what must be refused is refused, with its code", () => {
     for (const { name, hex, code } of golden.malformed) {
       let error: unknown;

@@ -68,7 +68,7 @@ class Decoders {
       case "bytes":
         return compileBytes(type[1]);
       case "array":
-        return this.compileArray(type[1], type[2], type[3]);
+        return this.compileArray(type[1], type[2], type[3], type[4] ?? 0);
       case "map":
         return this.compileDictionary(type[1]);
       case "struct":
@@ -82,12 +82,13 @@ class Decoders {
     }
   }
 
-  private compileArray(item: FieldType, length: number, longest: number): Decode {
+  private compileArray(item: FieldType, length: number, longest: number, shortest: number): Decode {
     const decode = this.compile(item);
     return (reader) => {
       const count = reader.readArrayHead();
       if (length > 0 && count !== length) throw new MalformedError(`${count} items, expected ${length}`);
       if (longest > 0 && count > longest) throw new MalformedError(`${count} items, at most ${longest} are read`);
+      if (count < shortest) throw new MalformedError(`${count} items, expected ${shortest} at least`);
       const items: unknown[] = [];
       for (let i = 0; i < count; i++) {
         try {
@@ -313,7 +314,7 @@ function compileEncoder(type: FieldType): Encode {
     case "bytes":
       return encodeBytes(type[1]);
     case "array":
-      return encodeArray(type[1], type[2], type[3]);
+      return encodeArray(type[1], type[2], type[3], type[4] ?? 0);
     case "map":
       return encodeDictionary(type[1]);
     case "struct":
@@ -354,12 +355,13 @@ function encodeBytes(longest: number): Encode {
   };
 }
 
-function encodeArray(item: FieldType, length: number, longest: number): Encode {
+function encodeArray(item: FieldType, length: number, longest: number, shortest: number): Encode {
   const encode = compileEncoder(item);
   return (writer, value) => {
     if (!Array.isArray(value)) throw new MalformedError(`expected an array, got ${describe(value)}`);
     if (length > 0 && value.length !== length) throw new MalformedError(`${value.length} items, expected ${length}`);
     if (longest > 0 && value.length > longest) throw new MalformedError(`${value.length} items, at most ${longest} are read`);
+    if (value.length < shortest) throw new MalformedError(`${value.length} items, expected ${shortest} at least`);
     writer.writeArrayHead(value.length);
     for (const [i, one] of value.entries()) {
       try {

@@ -2,15 +2,15 @@
 //
 // Types of fields; ["null", type] is that type or null.
 //   ["bool"], ["float"], ["int", lowest, highest] (null: no bound within int64), ["str", characters, pattern],
-//   ["bytes", bytes], ["array", item, length, longest], ["map", item], ["struct", name], ["union", name].
-// 0 or "" as a bound stands for none. `length` of an array: exactly so many items.
+//   ["bytes", bytes], ["array", item, length, longest, shortest], ["map", item], ["struct", name], ["union", name].
+// 0 or "" as a bound stands for none, as does one that is left out. `length` of an array: exactly so many items.
 
 export type FieldType =
   | readonly ["bool" | "float"]
   | readonly ["int", number | null, number | null]
   | readonly ["str", number, string]
   | readonly ["bytes", number]
-  | readonly ["array", FieldType, number, number]
+  | readonly ["array", FieldType, number, number, number?]
   | readonly ["map", FieldType]
   | readonly ["struct", string]
   | readonly ["union", string]
@@ -1569,7 +1569,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
     fields: [
       ["name", ["str", 64, ""], []],
       ["dtype", ["str", 64, ""], []],
-      ["shape", ["array", ["int", 0, null], 0, 4], []],
+      ["shape", ["array", ["int", 0, null], 0, 4, 1], []],
       ["bytes", ["int", 0, null], []],
       ["filter", ["str", 64, ""], ["none"]],
       ["codec", ["str", 64, ""], ["none"]],
