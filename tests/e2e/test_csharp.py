@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import json
+import signal
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
+import psutil
 import pytest
 
 from tests.csharp.conftest import built as built  # noqa: PLC0414  a fixture
 from tests.e2e.session_process import DEADLINE_S, PATIENT_COMMAND, wait_until
-from tests.e2e.virtual_network import Network, require_namespaces
+from tests.e2e.virtual_network import Network, ServedSession, require_namespaces
 from tools.csharp.project import Build
+from tools.csharp.toolchain import RUNTIMES
 
 pytestmark = pytest.mark.e2e
 
 #: What a hand may be away from where it should be after a move of 10 cm [mm].
 MOVE_MM: Final = 5.0
+#: A headset that stood still has a fresh state within it [ms].
+FRESH_MS: Final = 100.0
+STILL_S: Final = 3.0
 
 
 class Headset:
@@ -65,6 +71,11 @@ class Headset:
 
     def _count(self, name: str) -> int:
         return sum(one["command"] == name for one in self.results)
+
+    def wait_for_view(self, condition: Callable[[dict[str, Any]], object], what: str) -> dict[str, Any]:
+        """Ask for what it sees of the session until a condition holds."""
+        wait_until(lambda: condition(self.do("view")), what)
+        return self.results[-1]
 
     def end(self) -> int:
         """Let it leave the session, and return its exit status."""
@@ -120,8 +131,21 @@ def pair(network: Network) -> str:
     return code
 
 
+def serve(network: Network, scene: str) -> ServedSession:
+    """Serve a scene to the other machine, alone."""
+    network.server.close()
+    arguments = ("--interface", network.server.interface, "--name", scene)
+    return network.server.serve(*arguments, scene=scene, command=PATIENT_COMMAND)
+
+
+def find_process(served: ServedSession, module: str) -> psutil.Process:
+    """Return a process of a session by its module."""
+    children = psutil.Process(served.process.pid).children(recursive=True)
+    return next(one for one in children if module in " ".join(one.cmdline()))
+
+
 def test_two_headsets_find_pair_align_and_move_arms(network: Network, start: StartHeadset) -> None:
-    network.server.serve("--interface", network.server.interface, scene="aloha", command=PATIENT_COMMAND)
+    serve(network, "aloha")
     assert start("mono", "eve", "--code", "AAAA-AAAA-AAAA").process.wait(DEADLINE_S) == 2
     stranger = start("mono", "eve", "--address", "https://10.77.1.1:7725").do("join")
     assert (stranger["ok"], stranger["problem"]) == (False, "UnknownCertificate")
@@ -143,3 +167,38 @@ def test_two_headsets_find_pair_align_and_move_arms(network: Network, start: Sta
     assert ann.do("estop")["ok"]
     assert bob.do("view")["stopped"]
     assert [headset.end() for headset in (ann, bob)] == [1, 0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_what_fails_costs_neither_lease_nor_alignment(network: Network, start: StartHeadset, runtime: str) -> None:
+    """Front and gateway are killed, the headset stands still, and is killed."""
+    served = serve(network, "handover")
+    user = f"kim-{runtime}"
+    headset = start(runtime, user, "--code", pair(network))
+    assert headset.do("join")["ok"]
+    assert headset.do("align")["ok"]
+    assert headset.do("acquire left")["ok"]
+    for module in ("web.gateway", "front.main"):
+        epoch = headset.do("view")["epoch"]
+        find_process(served, module).kill()
+        back = headset.wait_for_view(lambda v, old=epoch: v["phase"] == "Ready" and v["epoch"] > old, "it is back")
+        assert (back["resumed"], back["ours"], back["alignment"]) == (True, ["left"], "Aligned")
+        assert headset.do("align")["ok"]
+        assert headset.do("move left 0 0 0.05")["error_mm"] <= MOVE_MM
+    headset.process.send_signal(signal.SIGSTOP)
+    threading.Event().wait(STILL_S)
+    headset.process.send_signal(signal.SIGCONT)
+    measured = headset.do("measure 2")
+    assert 0.0 <= measured["recovery_ms"] <= FRESH_MS, str(measured)
+    headset.process.kill()
+    headset.process.wait()
+    again = start(runtime, user, "--address", "https://10.77.1.1:7725")
+    joined = again.do("join")
+    assert (joined["ok"], joined["resumed"]) == (True, True)
+    assert again.do("view")["ours"] == ["left"]
+    assert again.do("align")["ok"]
+    assert again.do("move left 0 0 0.05")["error_mm"] <= MOVE_MM
+    assert again.end() == 0
+    served.process.send_signal(signal.SIGINT)
+    assert served.process.wait(DEADLINE_S) == 0
