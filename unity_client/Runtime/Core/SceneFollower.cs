@@ -75,14 +75,20 @@ namespace IrisSession.Core
         /// <summary>Follow the scene that the mirror names. Call it whenever the mirror may have changed.</summary>
         public void Follow(SessionMirror mirror, long nowNs)
         {
+            Follow(mirror.IsSynced, mirror.SceneHash, nowNs);
+        }
+
+        /// <summary>Follow the scene that the session names, as far as it is known.</summary>
+        public void Follow(bool isSynced, string sceneHash, long nowNs)
+        {
             if (retryAt <= nowNs && State == SceneState.Fetching && hash.Length > 0)
             {
                 retryAt = long.MaxValue;
                 Want(new SceneAsset(hash, -1, ""));
             }
-            if (!mirror.IsSynced || mirror.SceneHash == hash) return;
+            if (!isSynced || sceneHash == hash) return;
             DropAll();
-            hash = mirror.SceneHash;
+            hash = sceneHash;
             Failure = "";
             retryAt = long.MaxValue;
             if (IsAddress(hash))

@@ -54,7 +54,42 @@ namespace IrisSession.Transport
         }
     }
 
-    /// <summary>Sockets of one client. All calls but <see cref="Wake"/> belong to one thread.</summary>
+    /// <summary>Answer to a request for a chunk. Made once and filled again.</summary>
+    public sealed class AssetAnswer
+    {
+        /// <summary>The request that it answers: they are answered in order.</summary>
+        public ChunkRequest Request;
+
+        /// <summary>An `AssetRefusal`, empty for bytes; and words for people.</summary>
+        public string Reason = "";
+        public string Advice = "";
+
+        /// <summary>Place of the bytes, and size of the whole asset.</summary>
+        public long Offset;
+        public long Total;
+
+        /// <summary>The first `Count` count.</summary>
+        public byte[] Bytes = new byte[0];
+        public int Count;
+    }
+
+    /// <summary>A connection for assets. Its calls wait for sockets, so they are for a thread of their own; `Abort` is for any.</summary>
+    public interface IAssetChannel : IDisposable
+    {
+        /// <summary>False when the connection has moved to another address or ended: open another channel.</summary>
+        bool IsCurrent { get; }
+
+        /// <summary>Send a request. False: the connection is lost, with all pending ones.</summary>
+        bool TryRequest(ChunkRequest request);
+
+        /// <summary>Wait for the next answer. False: the connection is lost.</summary>
+        bool TryReceive(AssetAnswer answer);
+
+        /// <summary>End all waits.</summary>
+        void Abort();
+    }
+
+    /// <summary>Sockets of one client. Calls belong to one thread, but <see cref="Wake"/> and <see cref="OpenAssets"/>.</summary>
     public interface ITransport : IDisposable
     {
         /// <summary>State of the newest control channel.</summary>
@@ -91,6 +126,9 @@ namespace IrisSession.Transport
 
         /// <summary>Set the media streams that are wanted, of a connection that may have them (epoch 0: none may).</summary>
         void SetMedia(IReadOnlyList<string> streams, long connectionEpoch);
+
+        /// <summary>Return a connection for assets, null while there can be none. Does not wait; for any thread.</summary>
+        IAssetChannel OpenAssets();
 
         /// <summary>Try whether a gateway answers at an endpoint. One probe at a time: others are ignored meanwhile.</summary>
         void StartProbe(WebEndpoint endpoint);

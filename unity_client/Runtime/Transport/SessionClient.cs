@@ -83,6 +83,12 @@ namespace IrisSession.Transport
 
         public PresenceFrame Presence { get { return presence.Front; } }
 
+        /// <summary>See <see cref="ITransport.OpenAssets"/>.</summary>
+        internal IAssetChannel OpenAssets()
+        {
+            return transport.OpenAssets();
+        }
+
         /// <summary>Calls that were dropped because too many waited.</summary>
         public long CallsDropped { get; private set; }
 

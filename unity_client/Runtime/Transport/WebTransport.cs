@@ -63,7 +63,7 @@ namespace IrisSession.Transport
         public void Open(WebEndpoint endpoint)
         {
             Close();
-            this.endpoint = endpoint;
+            lock (gate) this.endpoint = endpoint;
             Counters.Opened++;
             WebSocketLink link = new WebSocketLink(endpoint, "/v1/session", MaxControlBytes, this);
             lock (gate)
@@ -134,6 +134,17 @@ namespace IrisSession.Transport
             wishes.Clear();
             for (int i = 0; i < streams.Count && i < MaxStreams; i++) wishes.Add(streams[i]);
             if (wishes.Count == 0 || (isMediaGreeted && !SendWishes())) CloseMedia();
+        }
+
+        public IAssetChannel OpenAssets()
+        {
+            lock (gate) return ticket.Length == 0 ? null : new HttpAssetChannel(this, endpoint);
+        }
+
+        /// <summary>Return the ticket of the connection to an endpoint, empty when it is not the present one.</summary>
+        internal string FindTicket(WebEndpoint of)
+        {
+            lock (gate) return of == endpoint ? ticket : "";
         }
 
         public void StartProbe(WebEndpoint endpoint)

@@ -93,6 +93,11 @@ namespace IrisSession.Transport.Tests
             MediaEpoch = connectionEpoch;
         }
 
+        public IAssetChannel OpenAssets()
+        {
+            return null;
+        }
+
         public void StartProbe(WebEndpoint endpoint)
         {
             Probes.Add(endpoint);

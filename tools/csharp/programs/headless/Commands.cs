@@ -8,7 +8,7 @@ using IrisSession.Protocol;
 using IrisSession.Transport;
 
 /// <summary>
-/// Commands of a headset: `join`, `align`, `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `measure SECONDS`, `body NAME`,
+/// Commands of a headset: `join`, `scene` (until all of it is here), `align`, `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `measure SECONDS`, `body NAME`,
 /// `view`, `wait SECONDS`, `until TEXT` (an event of this kind), `estop`, `quit`.
 /// </summary>
 internal sealed class Commands
@@ -64,6 +64,7 @@ internal sealed class Commands
         switch (words[0])
         {
             case "join": return Join();
+            case "scene": return Scene();
             case "align": return Align();
             case "acquire": return Acquire(words[1]);
             case "release": return Release(words[1]);
@@ -108,6 +109,36 @@ internal sealed class Commands
             "fingerprint", view.Problem.Fingerprint ?? "", "participant", view.ParticipantId, "resumed", view.Welcome != null && view.Welcome.Resumed,
             "bodies", view.Bodies.Length, "robots", new List<string>(view.Robots.Keys).ToArray(), "scene", view.SceneHash, "crash", Client.Crash);
         return isJoined;
+    }
+
+    /// <summary>Wait for the scene and its assets, and hash all of them once more.</summary>
+    private bool Scene()
+    {
+        SceneFetcher scene = headset.Scene;
+        ScenePlan plan = null;
+        bool isComplete = headset.RunUntil(() =>
+        {
+            plan = scene.TakeUpdate()?.Plan ?? plan;
+            return scene.Progress.IsComplete && (plan != null || scene.Progress.State != SceneState.Shown);
+        }, 120.0);
+        int right = 0;
+        long bytes = 0;
+        if (plan != null)
+        {
+            foreach (SceneAsset asset in plan.Assets)
+            {
+                byte[] found = scene.Find(asset.Address);
+                if (found == null || !AssetCache.HasAddress(found, 0, found.Length, asset.Address)) continue;
+                right++;
+                bytes += found.Length;
+            }
+        }
+        int count = plan == null ? 0 : plan.Assets.Length;
+        bool isDone = isComplete && right == count && scene.Crash.Length == 0;
+        report.Write(
+            "scene", isDone, "state", scene.Progress.State.ToString(), "assets", count, "equal", right, "bytes", bytes, "fetched", scene.FetchedCount, "fetched_bytes", scene.FetchedBytes, "failed",
+            scene.Progress.FailedCount, "parts", plan == null ? 0 : plan.Parts.Length, "text", scene.Progress.Text, "crash", scene.Crash);
+        return isDone;
     }
 
     /// <summary>Look at each sheet from one place after the other, as a person would, until the session has an alignment.</summary>

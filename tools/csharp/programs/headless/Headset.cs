@@ -1,8 +1,10 @@
 using System;
 using System.Collections.Generic;
+using System.IO;
 using System.Threading;
 using IrisSession.Core;
 using IrisSession.Protocol;
+using IrisSession.Storage;
 using IrisSession.Transport;
 
 /// <summary>A headset that is emulated: head and right controller in a tracking frame of its own, and a loop of frames at 72 Hz.</summary>
@@ -17,6 +19,7 @@ internal sealed class Headset : IDisposable
         new Double3(-0.4, 0.3, -0.75), DoubleQuaternion.FromAxisAngle(new Double3(0, 0, 1), 0.61));
 
     public readonly SessionClient Client;
+    public readonly SceneFetcher Scene;
     public readonly List<SessionNews> News = new List<SessionNews>();
     public readonly Dictionary<string, Feedback> Feedbacks = new Dictionary<string, Feedback>();
 
@@ -52,17 +55,22 @@ internal sealed class Headset : IDisposable
             Capabilities = new[] { "run:" + run },
         };
         Client = new SessionClient(hello, identity, new EndpointChooser(endpoints), new WebTransport());
+        AssetCache cache = new AssetCache(new DiskAssetFiles(Path.Combine(options.Identity, "assets")));
+        Scene = new SceneFetcher(Client, cache, SceneBudget.Quest3);
         Client.Start();
+        Scene.Start();
     }
 
+    /// <summary>Leave the session. Returns whether all threads have ended within the time that is promised.</summary>
     public bool Stop()
     {
-        return Client.Stop();
+        bool hasEnded = Scene.Stop();
+        return Client.Stop() && hasEnded;
     }
 
     public void Dispose()
     {
-        Client.Stop();
+        Stop();
     }
 
     /// <summary>One frame of an app: take what came, send samples, wait for the next one.</summary>
