@@ -21,6 +21,7 @@ namespace IrisSession.Transport.Tests
         private readonly Action<Peer> handle;
         private readonly List<Socket> open = new List<Socket>();
         private bool isClosed;
+        private volatile Exception failure;
 
         /// <param name="handle">Handles one connection; its end closes it.</param>
         /// <param name="certificate">For TLS, null for none.</param>
@@ -48,6 +49,7 @@ namespace IrisSession.Transport.Tests
                 foreach (Socket socket in open) socket.Close();
             }
             listener.Stop();
+            if (failure != null) throw new InvalidOperationException("a connection of the fake gateway failed", failure);
         }
 
         private void Accept()
@@ -94,6 +96,10 @@ namespace IrisSession.Transport.Tests
             {
                 // the client has gone, or refused the certificate
             }
+            catch (Exception error)
+            {
+                failure = error; // of an assertion: the test fails when it disposes of this
+            }
         }
     }
 
@@ -114,16 +120,23 @@ namespace IrisSession.Transport.Tests
         public string[] ReadRequest()
         {
             StringBuilder text = new StringBuilder();
-            while (!text.ToString().EndsWith("\r\n\r\n", StringComparison.Ordinal)) text.Append((char)ReadByte());
+            for (int length = 0; ;)
+            {
+                char one = (char)ReadByte();
+                text.Append(one);
+                if (one == '\n' && length == 0) break;
+                if (one == '\n') length = 0;
+                else if (one != '\r') length++;
+            }
             return text.ToString().Split(new[] { "\r\n" }, StringSplitOptions.RemoveEmptyEntries);
         }
 
         /// <summary>Answer the request for a WebSocket. Returns its path.</summary>
-        public string AcceptWebSocket(int piece = int.MaxValue)
+        public string AcceptWebSocket(int piece = int.MaxValue, string[] request = null)
         {
             string path = "";
             string key = "";
-            foreach (string line in ReadRequest())
+            foreach (string line in request ?? ReadRequest())
             {
                 if (line.StartsWith("GET ", StringComparison.Ordinal)) path = line.Split(' ')[1];
                 if (line.StartsWith("Sec-WebSocket-Key: ", StringComparison.Ordinal)) key = line.Substring(19);

@@ -14,12 +14,12 @@ namespace IrisSession.Transport.Tests
     [TestFixture]
     public class SessionClientTests
     {
-        private static Hello MakeHello()
+        internal static Hello MakeHello()
         {
             return new Hello { Role = Role.Operator, Name = "ann", Devices = new[] { Device.ControllerRight } };
         }
 
-        private static void WaitUntil(Func<bool> condition, string what)
+        internal static void WaitUntil(Func<bool> condition, string what)
         {
             Stopwatch watch = Stopwatch.StartNew();
             while (!condition())
@@ -32,7 +32,13 @@ namespace IrisSession.Transport.Tests
         /// <summary>Answer hello, ping and snapshot of one WebSocket, then send states until the client closes.</summary>
         private static void Serve(Peer peer, ManualResetEvent stalls)
         {
-            peer.AcceptWebSocket();
+            Serve(peer, stalls, null, "");
+        }
+
+        /// <summary>The same with a scene, whose assets are fetched with a ticket; `request`: that was read.</summary>
+        internal static void Serve(Peer peer, ManualResetEvent stalls, string[] request, string sceneHash)
+        {
+            peer.AcceptWebSocket(int.MaxValue, request);
             WireReader reader = new WireReader();
             while (true)
             {
@@ -45,13 +51,18 @@ namespace IrisSession.Transport.Tests
                 if (message is Hello)
                 {
                     Send(peer, new Welcome { SessionId = "s1", ParticipantId = "p1", ConnectionEpoch = 1, Role = Role.Operator, ResumeToken = new byte[] { 1 }, HeartbeatNs = 1_000_000_000 });
+                    WireWriter ticket = new WireWriter();
+                    ticket.WriteMapHeader(3);
+                    foreach (string text in new[] { "type", "ticket", "ticket", "T1", "expires_s" }) ticket.Write(text);
+                    ticket.Write(600);
+                    peer.Send(Peer.MakeFrame(0x82, Peer.MakeMessage(WebMessage.Gateway, ticket.ToArray())));
                 }
                 else if (message is ClockPing ping)
                 {
                     Send(peer, new ClockPong { T0Ns = ping.T0Ns, T1Ns = ping.T0Ns, T2Ns = ping.T0Ns });
                     SendState(peer, ping.T0Ns);
                 }
-                else if (message is GetSnapshot) Send(peer, new Snapshot { EventSeq = 10, SceneEpoch = 3, Bodies = new[] { new BodyInfo { Id = 1, Name = "a" } } }, new byte[56]);
+                else if (message is GetSnapshot) Send(peer, new Snapshot { EventSeq = 10, SceneEpoch = 3, SceneHash = sceneHash, Bodies = new[] { new BodyInfo { Id = 1, Name = "a" } } }, new byte[56]);
                 else if (message is Acquire acquire) Send(peer, new Reply { RequestId = acquire.RequestId });
             }
         }
