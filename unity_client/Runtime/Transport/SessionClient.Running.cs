@@ -14,6 +14,7 @@ namespace IrisSession.Transport
         private readonly Queue<SessionNews> ownNews = new Queue<SessionNews>(); // replies and notices that wait for room
         private int requestGeneration;
         private long statesReplaced;
+        private long newsDropped;
         private readonly List<Advice> adviceNow = new List<Advice>();
         private long adviceAt = long.MinValue;
         private long seenSnapshots = -1;
@@ -168,10 +169,14 @@ namespace IrisSession.Transport
             }
         }
 
-        /// <summary>Keep what is no message of the session until there is room. Beyond the bound the oldest is dropped.</summary>
+        /// <summary>Keep what is no message of the session until there is room. Beyond the bound the oldest is dropped, and counted.</summary>
         private void AddNews(SessionNews one)
         {
-            if (ownNews.Count == MaxRequests) ownNews.Dequeue();
+            if (ownNews.Count == MaxRequests)
+            {
+                ownNews.Dequeue();
+                Interlocked.Increment(ref newsDropped);
+            }
             ownNews.Enqueue(one);
         }
 

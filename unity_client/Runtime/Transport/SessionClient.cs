@@ -92,6 +92,9 @@ namespace IrisSession.Transport
         /// <summary>Calls that were dropped because too many waited.</summary>
         public long CallsDropped { get; private set; }
 
+        /// <summary>Replies and notices that were dropped because the engine took none.</summary>
+        public long NewsDropped { get { return Interlocked.Read(ref newsDropped); } }
+
         /// <summary>States that a newer one replaced before the engine took them.</summary>
         public long StatesReplaced { get { return Interlocked.Read(ref statesReplaced); } }
 

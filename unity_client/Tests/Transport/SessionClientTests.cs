@@ -155,6 +155,27 @@ namespace IrisSession.Transport.Tests
         }
 
         [Test]
+        public void NewsThatNothingTakesIsBoundedAndCounted()
+        {
+            const int Posted = 1200;
+            SessionClient client = new SessionClient(
+                MakeHello(), new MemoryIdentity(), new EndpointChooser(new WebEndpoint(false, "localhost", 7725)), new FakeTransport());
+            client.Start();
+            int ran = 0;
+            for (int i = 0; i < Posted;)
+            {
+                if (client.TryPost(loop => { ran++; throw new NotConnectedException("no"); })) i++;
+                else Thread.Yield();
+            }
+            WaitUntil(() => Volatile.Read(ref ran) == Posted && client.NewsDropped > 0, "nothing is dropped");
+            Assert.IsTrue(client.Stop());
+            int kept = 0;
+            while (client.TryTakeNews(out SessionNews _)) kept++;
+            Assert.LessOrEqual(kept, Posted - client.NewsDropped);
+            Assert.AreEqual("", client.Crash);
+        }
+
+        [Test]
         public void AGatewayThatReadsAndWritesNothingStopsNoFrame()
         {
             using (ManualResetEvent goesOn = new ManualResetEvent(true))
