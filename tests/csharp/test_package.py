@@ -55,3 +55,26 @@ def test_sources_do_what_il2cpp_can_compile() -> None:
     for path in sources:
         found = re.search(r"System\.Reflection|Activator\.|\bdynamic\b|Linq\.Expressions|Emit\b", path.read_text())
         assert not found, f"{path}: {found}"
+
+
+def test_shaders_and_materials_fit_the_code() -> None:
+    """What the code names is in the shaders, each draws for both eyes, and each material of the package has its shader."""
+    folder = PACKAGE / "Runtime/Unity"
+    sources = {path: path.read_text() for path in (folder / "Shaders").iterdir() if path.suffix in (".shader", ".hlsl")}
+    names = re.findall(r'PropertyToID\("(\w+)"\)', (folder / "IrisMaterials.cs").read_text())
+    assert len(names) > 20
+    assert not [name for name in names if not any(re.search(rf"\b{name}\b", text) for text in sources.values())]
+    stereo = ("UNITY_VERTEX_INPUT_INSTANCE_ID", "UNITY_SETUP_INSTANCE_ID", "UNITY_INITIALIZE_VERTEX_OUTPUT_STEREO")
+    for path, text in sources.items():
+        if path.suffix == ".hlsl":
+            continue
+        assert all(macro in text for macro in stereo), path
+        assert "UNITY_VERTEX_OUTPUT_STEREO" in text
+        identity = re.search(r"^guid: (\w+)$", Path(f"{path}.meta").read_text(), re.MULTILINE)
+        assert identity
+        material = folder / "Materials" / f"{path.stem}.mat"
+        assert f"guid: {identity[1]}," in material.read_text()
+        assert "m_EnableInstancingVariants: 1" in material.read_text()
+    limit = re.search(r"MaxLights = (\d+);", (PACKAGE / "Runtime/Core/SceneLighting.cs").read_text())
+    assert limit
+    assert f"#define IRIS_MAX_LIGHTS {limit[1]}" in sources[folder / "Shaders/IrisShared.hlsl"]

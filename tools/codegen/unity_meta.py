@@ -16,7 +16,9 @@ PACKAGES: Final = ("unity_client",)
 _IMPORTERS: Final = {
     ".asmdef": "AssemblyDefinitionImporter",
     ".cs": "MonoImporter",
+    ".hlsl": "ShaderIncludeImporter",
     ".json": "TextScriptImporter",
+    ".mat": "NativeFormatImporter",
     ".md": "TextScriptImporter",
     ".shader": "ShaderImporter",
     ".txt": "TextScriptImporter",
@@ -50,4 +52,6 @@ def _iterate_assets(root: Path, package: str) -> Iterator[tuple[Path, str]]:
             importer = "DefaultImporter"
         elif inside.as_posix() == "package.json":
             importer = "PackageManifestImporter"
-        yield path, "\n".join([*lines, f"{importer}:", "  externalObjects: {}", ""])
+        # The number of the one object in the file of a material.
+        main = ["  mainObjectFileID: 2100000"] if path.suffix == ".mat" else []
+        yield path, "\n".join([*lines, f"{importer}:", "  externalObjects: {}", *main, ""])

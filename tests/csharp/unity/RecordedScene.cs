@@ -22,11 +22,17 @@ namespace IrisSession.Unity.StandinTests
         public readonly List<double[]> Points = new List<double[]>();
         public readonly Dictionary<long, double[]> Bodies = new Dictionary<long, double[]>();
         public readonly Dictionary<string, ParticipantInfo> People = new Dictionary<string, ParticipantInfo>();
-        public readonly ScenePlan Plan;
+        public ScenePlan Plan;
         public long NewestNs;
 
         /// <summary>Assets that are here; all of them unless a test takes some away.</summary>
         public volatile HashSet<string> Hidden = new HashSet<string>();
+
+        /// <summary>Assets whose bytes are wrong.</summary>
+        public volatile HashSet<string> Damaged = new HashSet<string>();
+
+        /// <summary>Thrown by the next update.</summary>
+        public Exception Error;
         private readonly string folder;
         private readonly Queue<string[]> lines;
         private readonly RigidDecoder decoder;
@@ -38,8 +44,7 @@ namespace IrisSession.Unity.StandinTests
             string vectors = System.Environment.GetEnvironmentVariable("IRIS_VECTORS");
             if (vectors == null) Assert.Ignore("the scenes are written by python -m tools.csharp test");
             folder = Path.Combine(vectors, "unity", name);
-            byte[] spec = File.ReadAllBytes(Path.Combine(folder, "scene"));
-            Plan = new ScenePlan(SceneDecoder.Decode(spec, 0, spec.Length), WorldView.PlanBudget);
+            Plan = new ScenePlan(ReadSpec(), WorldView.PlanBudget);
             lines = new Queue<string[]>(File.ReadLines(Path.Combine(folder, "frames")).Select(line => line.Split('\t')));
             bodies = lines.Where(line => line[0] == "body").Select(line => long.Parse(line[1])).Distinct().Select(id => new BodyInfo { Id = id }).ToArray();
             decoder = new RigidDecoder(bodies.Length);
@@ -51,11 +56,13 @@ namespace IrisSession.Unity.StandinTests
 
         public byte[] Find(string address)
         {
-            return Hidden.Contains(address) ? null : File.ReadAllBytes(Path.Combine(folder, "assets", address));
+            if (Hidden.Contains(address)) return null;
+            return Damaged.Contains(address) ? new byte[100] : File.ReadAllBytes(Path.Combine(folder, "assets", address));
         }
 
         public void Update(WorldView world)
         {
+            if (Error != null) throw Error;
             if (shown == Plan) return;
             world.Scene.Apply(Plan, new SceneChanges(shown, Plan));
             shown = Plan;
@@ -65,6 +72,13 @@ namespace IrisSession.Unity.StandinTests
         public void Play(WorldView world, int states)
         {
             while (lines.Count > 0 && (lines.Peek()[0] != "state" || states-- > 0)) Bring(world, lines.Dequeue());
+        }
+
+        /// <summary>Return the specification of this scene once more, to be changed.</summary>
+        public SceneSpec ReadSpec()
+        {
+            byte[] spec = File.ReadAllBytes(Path.Combine(folder, "scene"));
+            return SceneDecoder.Decode(spec, 0, spec.Length);
         }
 
         private void Bring(WorldView world, string[] line)

@@ -105,7 +105,7 @@ namespace IrisSession.Unity.StandinTests
             Stage stage = new Stage("lab");
             stage.Load();
             UnityEngine.Material glass = Engine.Draws.Single(each => each.Material.renderQueue == 3000).Material;
-            Assert.AreEqual(0.4f, glass.GetColor(ShaderNames.BaseColor).a, 1e-6f);
+            Assert.AreEqual(0.4f, glass.GetVector(ShaderNames.BaseColor).w, 1e-6f);
             Assert.AreEqual(0f, glass.GetFloat(ShaderNames.DepthWrite));
             UnityEngine.Material box = Engine.Draws.Single(each => each.Material.GetFloat(ShaderNames.Mapping) == 1f).Material;
             Texture2D texture = (Texture2D)box.GetTexture(ShaderNames.BaseMap);

@@ -42,6 +42,7 @@ namespace Standins
         {
             thread = Thread.CurrentThread;
             foreach (GameObject one in Objects.ToArray()) one.Release();
+            for (int i = 0; i < Ended.Count; i++) Ended[i].Release();
             Objects.Clear();
             Behaviours.Clear();
             Ended.Clear();

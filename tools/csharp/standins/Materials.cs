@@ -204,6 +204,16 @@ namespace UnityEngine
             pixelBytes = textureFormat == TextureFormat.RGBA32 ? 4 : textureFormat == TextureFormat.RGB24 ? 3 : 1;
             IsLinear = linear;
             Pixels = new byte[width * height * pixelBytes];
+            Live++;
+        }
+
+        /// <summary>Textures that were made and not destroyed.</summary>
+        internal static int Live { get; private set; }
+
+        internal override void Release()
+        {
+            if (!IsDestroyed) Live--;
+            base.Release();
         }
 
         public TextureFormat format { get { return chosen; } }

@@ -104,6 +104,16 @@ namespace UnityEngine
         public Mesh()
         {
             Engine.CheckThread();
+            Live++;
+        }
+
+        /// <summary>Meshes that were made and not destroyed: the engine never does that by itself.</summary>
+        internal static int Live { get; private set; }
+
+        internal override void Release()
+        {
+            if (!IsDestroyed) Live--;
+            base.Release();
         }
 
         public IndexFormat indexFormat { get { return kind; } set { kind = value; } }

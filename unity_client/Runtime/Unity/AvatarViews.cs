@@ -59,7 +59,7 @@ namespace IrisSession.Unity
             int color = AvatarTable.FindColor(avatar.Participant);
             if (!colors.TryGetValue(color, out Material material))
             {
-                colors[color] = material = materials.Make(UnityValues.ToColor(color, 1f), false, false);
+                colors[color] = material = materials.Make(UnityValues.ToVector4(color, 1f), false, false);
                 material.SetFloat(ShaderNames.Emission, Emission);
             }
             GameObject one = new GameObject(avatar.Participant + " " + avatar.Device);

@@ -34,7 +34,7 @@ namespace IrisSession.Unity
             if (scene.Plan == null) return;
             if (scene.Plan != plan || info.Name != robot) Make(info);
             if (!IsShown) SetActive(true);
-            material.SetColor(ShaderNames.BaseColor, UnityValues.ToColor(color, Alpha));
+            material.SetVector(ShaderNames.BaseColor, UnityValues.ToVector4(color, Alpha));
             for (int i = 0; i < pieces.Length; i++)
             {
                 GhostPiece piece = shape.Pieces[i];
@@ -64,7 +64,7 @@ namespace IrisSession.Unity
             plan = scene.Plan;
             robot = info.Name;
             shape = new GhostShape(plan, info);
-            material = materials.Make(UnityValues.ToColor(0xffffff, Alpha), true, false);
+            material = materials.Make(UnityValues.ToVector4(0xffffff, Alpha), true, false);
             material.SetFloat(ShaderNames.Emission, 1f);
             pieces = new GameObject[shape.Pieces.Count];
             filters = new MeshFilter[pieces.Length];

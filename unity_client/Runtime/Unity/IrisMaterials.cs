@@ -82,7 +82,7 @@ namespace IrisSession.Unity
         /// <summary>Return the material of a part or deformable. `texture`: null while it is not here.</summary>
         public Material Make(SceneSurface surface, Texture2D texture, bool isDoubleSided)
         {
-            Material material = Make(UnityValues.ToColor(surface.Rgba), surface.IsTransparent, isDoubleSided);
+            Material material = Make(UnityValues.ToVector4(surface.Rgba), surface.IsTransparent, isDoubleSided);
             material.SetVector(ShaderNames.Highlight, new Vector4(surface.Highlight.X, surface.Highlight.Y, surface.Highlight.Z, surface.Shininess * MaxExponent));
             material.SetFloat(ShaderNames.Emission, surface.Emission);
             SetTexture(material, surface.Mapping, texture);
@@ -90,11 +90,11 @@ namespace IrisSession.Unity
         }
 
         /// <summary>Return a plain material.</summary>
-        public Material Make(Color color, bool isTransparent, bool isDoubleSided)
+        public Material Make(Vector4 color, bool isTransparent, bool isDoubleSided)
         {
             Material material = new Material(templates.Surface);
             made.Add(material);
-            material.SetColor(ShaderNames.BaseColor, color);
+            material.SetVector(ShaderNames.BaseColor, color);
             material.SetFloat(ShaderNames.Mapping, 0f);
             material.SetFloat(ShaderNames.Emission, 0f);
             material.SetVector(ShaderNames.Highlight, new Vector4(0f, 0f, 0f, 1f));

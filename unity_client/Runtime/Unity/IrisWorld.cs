@@ -57,9 +57,9 @@ namespace IrisSession.Unity
             catch (Exception error)
             {
                 // A defect: it is said once, and the application goes on without a world.
-                Problem = "the world cannot be drawn: " + error.Message;
                 Debug.LogException(error);
                 Show(null);
+                Problem = "the world cannot be drawn: " + error.Message;
             }
         }
 

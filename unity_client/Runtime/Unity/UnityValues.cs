@@ -34,13 +34,13 @@ namespace IrisSession.Unity
             return new Bounds(0.5f * (a + b), b - a);
         }
 
-        /// <summary>Return a colour of 0 to 1, which the shaders take as it is.</summary>
-        public static Color ToColor(double[] rgba) { return new Color((float)rgba[0], (float)rgba[1], (float)rgba[2], (float)rgba[3]); }
+        /// <summary>Return a colour of 0 to 1. A vector, which shaders get as it is: the engine would convert a `Color`.</summary>
+        public static Vector4 ToVector4(double[] rgba) { return new Vector4((float)rgba[0], (float)rgba[1], (float)rgba[2], (float)rgba[3]); }
 
         /// <summary>Return the colour 0xRRGGBB.</summary>
-        public static Color ToColor(int rgb, float alpha)
+        public static Vector4 ToVector4(int rgb, float alpha)
         {
-            return new Color(((rgb >> 16) & 255) / 255f, ((rgb >> 8) & 255) / 255f, (rgb & 255) / 255f, alpha);
+            return new Vector4(((rgb >> 16) & 255) / 255f, ((rgb >> 8) & 255) / 255f, (rgb & 255) / 255f, alpha);
         }
     }
 }
