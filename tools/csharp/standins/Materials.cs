@@ -1,7 +1,6 @@
 // Shaders, materials and textures of the engine: names and values, nothing is shaded.
 using System;
 using System.Collections.Generic;
-using System.Runtime.InteropServices;
 using Standins;
 
 namespace UnityEngine
@@ -111,19 +110,11 @@ namespace UnityEngine
 
         public void SetFloat(int nameID, float value) { Properties.Set(nameID, value); }
 
-        public void SetColor(int nameID, Color value) { Properties.Set(nameID, new Vector4(value.r, value.g, value.b, value.a)); }
-
         public void SetVector(int nameID, Vector4 value) { Properties.Set(nameID, value); }
 
         public void SetTexture(int nameID, Texture value) { Properties.Set(nameID, (object)value); }
 
         public float GetFloat(int nameID) { return Properties.GetFloat(nameID); }
-
-        public Color GetColor(int nameID)
-        {
-            Vector4 value = Properties.GetVector(nameID);
-            return new Color(value.x, value.y, value.z, value.w);
-        }
 
         public Vector4 GetVector(int nameID) { return Properties.GetVector(nameID); }
 
@@ -135,10 +126,6 @@ namespace UnityEngine
         internal readonly Properties Properties = new Properties();
 
         public void SetFloat(int nameID, float value) { Properties.Set(nameID, value); }
-
-        public void SetVector(int nameID, Vector4 value) { Properties.Set(nameID, value); }
-
-        public void SetColor(int nameID, Color value) { Properties.Set(nameID, new Vector4(value.r, value.g, value.b, value.a)); }
 
         public void SetMatrix(int nameID, Matrix4x4 value) { Matrices[nameID] = value; }
 

@@ -148,24 +148,6 @@ namespace UnityEngine
         public Vector3 max { get { return middle + half; } }
     }
 
-    public struct Color
-    {
-        public float r;
-        public float g;
-        public float b;
-        public float a;
-
-        public Color(float r, float g, float b, float a)
-        {
-            this.r = r;
-            this.g = g;
-            this.b = b;
-            this.a = a;
-        }
-
-        public override string ToString() { return "RGBA(" + r + ", " + g + ", " + b + ", " + a + ")"; }
-    }
-
     public struct Color32
     {
         public byte r;
