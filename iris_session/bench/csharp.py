@@ -1,4 +1,5 @@
-"""`bench csharp`: the core of the headset apps decodes frames of the real encoders, on .NET and on Mono.
+"""`bench csharp`: the headset apps without engine, on .NET and on Mono: they decode frames of the real encoders, and
+receive the state of a session behind its web gateway.
 
 State of moving bodies with `applied`, presence, a cloth and a cloud come in every frame, as an app takes them. C# is
 compiled by `tools/csharp` of a source checkout, so the benchmark runs in one only.
@@ -21,7 +22,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.bench.clients import ClientJob, Job
+from iris_session.bench.harness import BROWSERS, CLIENTS, Group, Log, measure
+from iris_session.bench.plugins import Plugin
 from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar
+from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.codec import encode_presence, encode_server, encode_state_header
 from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.names import Device, Role, SessionKind
@@ -40,9 +45,18 @@ from iris_session.streams.cloud import decode_cloud, encode_cloud
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
+from iris_session.system.extras import require_package
 
+#: In which a client ends after its input [s].
+EXIT_S: Final = 5.0
+
+
+#: Root of the checkout whose C# is compiled.
 ROOT: Final = Path(__file__).parents[2]
 RUNTIMES: Final = ("dotnet", "mono")
+CSHARP_CLIENTS: Final = "iris_session.bench.csharp:CsharpClient"
+#: Beside them: the Python client, and one over the same WebSocket.
+PYTHON, PYTHON_WEB = "python", "python_web"
 FRAMES: Final = 10_000
 #: Frames in which buffers grow and code is compiled.
 WARM_UP: Final = 500
@@ -65,19 +79,22 @@ def run_csharp(
     points: int = 10_000,
     seed: int = 0,
     frames: int = FRAMES,
+    seconds: float = 20.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """Decode many frames after the first ones.
+    """Decode many frames after the first ones; then receive the state of a session, behind its web gateway.
 
     Args:
         bodies: Number of moving bodies.
         points: Points of the cloud.
         seed: Random seed.
         frames: Frames that count, after the first `WARM_UP`.
+        seconds: Length of the window in which state is received.
         progress: Called with short texts.
 
     Returns:
-        The report: the worse of both runtimes, and each by itself. Reference: the decoders of the Python client.
+        The report: the worse of both runtimes, and each by itself. Reference: the decoders of the Python client, and
+        the age of state at it in the same session, and at one behind the gateway.
 
     Raises:
         BenchError: This is no source checkout, or C# cannot be compiled here.
@@ -93,15 +110,46 @@ def run_csharp(
         for runtime in RUNTIMES:
             progress(f"decoding them on {runtime}")
             results[runtime] = _decode(made, runtime, file, Path(folder, f"{runtime}.out"))
+    ages = _measure_ages(bodies, seconds, seed, progress)
+    for runtime in RUNTIMES:
+        results[runtime] |= ages[runtime]
+    reference = made.reference | {
+        f"{name}_{key}": value for name in (PYTHON, PYTHON_WEB) for key, value in ages[name].items()
+    }
     worst = {key: max(one[key] for one in results.values()) for key in results[RUNTIMES[0]]}
     results = worst | results
     bars = [
         make_bar(results, "allocated_bytes_per_frame", "<=", 0.0),
         make_bar(results, "max_error_mm", "<=", 0.1),
         make_bar(results, "cloth_max_error_mm", "<=", CLOTH_BOUND_M * 1e3),
+        make_bar(results, "age_ms_p99", "<=", reference[f"{PYTHON}_age_ms_p99"]),
     ]
-    params = {"bodies": bodies, "points": points, "vertices": CLOTH_SIDE**2, "frames": frames, "seed": seed}
-    return BenchReport("csharp", params, results, tuple(bars), made.reference)
+    params = {"bodies": bodies, "points": points, "vertices": CLOTH_SIDE**2, "frames": frames, "seconds": seconds}
+    params |= {"seed": seed}
+    return BenchReport("csharp", params, results, tuple(bars), reference)
+
+
+def _measure_ages(
+    bodies: int, seconds: float, seed: int, progress: Callable[[str], None]
+) -> dict[str, dict[str, float]]:
+    """Return the age of state at clients of one session, by their names."""
+    for package in ("aiohttp", "cryptography"):
+        require_package(package, "bench csharp")
+    groups: dict[str, list[Group]] = {
+        CLIENTS: [(ClientJob(PYTHON, "observer"),)],
+        BROWSERS: [(ClientJob(PYTHON_WEB, "observer"),)],
+        CSHARP_CLIENTS: [(ClientJob(runtime, "observer"),) for runtime in RUNTIMES],
+    }
+    got = measure(free_bodies_scene(bodies, seed).compile(), groups, seconds, seed=seed, progress=progress)
+    return {name: _summarize_ages(name, log) for name, log in got.logs.items()}
+
+
+def _summarize_ages(name: str, log: Log) -> dict[str, float]:
+    """Return percentiles of the age of state when an application could have it [ms]."""
+    if not len(log["ticks"]):
+        raise BenchError(f"the client {name} received no state: increase --seconds")
+    ages = (log["handed_ns"] - log["state_ns"]) * 1e-6
+    return {f"age_ms_p{q}": compute_percentile(ages, q) for q in (50, 99)}
 
 
 class _Frames:
@@ -233,17 +281,12 @@ def _make_cloud(rng: np.random.Generator, points: int, k: int) -> tuple[Floats, 
     return places + 0.01 * k, rng.integers(0, 256, (points, 3), np.uint8)
 
 
-def _make_command(runtime: str) -> list[str]:
-    return [sys.executable, "-m", "tools.csharp", "run", "--runtime", runtime, "bench", "--"]
-
-
 def _decode(made: _Frames, runtime: str, file: Path, out: Path) -> dict[str, float]:
     """Decode the frames in C#. Return the results."""
-    command = [*_make_command(runtime), str(file), str(out)]
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    command = [*make_command(runtime), "decode", str(file), str(out)]
     try:
         done = subprocess.run(
-            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            command, cwd=ROOT, env=make_environment(), capture_output=True, text=True, timeout=PATIENCE_S, check=False
         )
     except subprocess.TimeoutExpired:
         raise BenchError(f"{runtime} has not decoded the frames within {PATIENCE_S:g} s") from None
@@ -285,3 +328,57 @@ def _measure_errors(made: _Frames, data: bytes) -> tuple[float, float, float, fl
         if points.shape == made.last_cloud.shape
         else math.inf,
     )
+
+
+# --- C# programs ---
+
+
+def make_command(runtime: str) -> list[str]:
+    """Return the command that runs the program `bench` of tools/csharp on a runtime, in `ROOT`."""
+    return [sys.executable, "-m", "tools.csharp", "run", "--runtime", runtime, "bench"]
+
+
+def make_environment() -> dict[str, str]:
+    """Return the environment in which `make_command` finds the tools of the checkout."""
+    return {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+
+
+class CsharpClient(Plugin):
+    """One C# client on the runtime that its name is."""
+
+    job_type = Job
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(job)
+        (spec,) = job.clients
+        command = [*make_command(spec.name), "live", job.page, spec.name, str(job.origin_ns)]
+        self._name = spec.name
+        self._process = subprocess.Popen(
+            command, cwd=ROOT, env=make_environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self._expect("ready")
+
+    def measure(self, begin_ns: int, end_ns: int) -> None:
+        """Let the client log a window of session time [ns], and write its log."""
+        assert self._process.stdin is not None
+        with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
+            file = Path(folder, "log")
+            self._process.stdin.write(f"measure {begin_ns} {end_ns} {file}\n")
+            self._process.stdin.flush()
+            self._expect("done")
+            rows = np.loadtxt(file, np.int64, ndmin=2).reshape(-1, 3)
+        self.job.write_log({self._name: dict(zip(("ticks", "handed_ns", "state_ns"), rows.T, strict=True))})
+
+    def close(self) -> None:
+        """Let the client leave the session."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(EXIT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+
+    def _expect(self, line: str) -> None:
+        assert self._process.stdout is not None
+        if (got := self._process.stdout.readline().strip()) != line:
+            raise BenchError(f"the C# client {self._name} said {got!r} instead of {line!r}")

@@ -17,10 +17,14 @@ pytestmark = pytest.mark.e2e
 def test_frames_are_decoded_without_allocations_and_within_the_bound(
     built: Build, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(csharp, "_make_command", lambda runtime: built.make_command(runtime, "bench"))
+    monkeypatch.setattr(csharp, "make_command", lambda runtime: built.make_command(runtime, "bench"))
+    ages = {name: {"age_ms_p50": 1.0, "age_ms_p99": 2.0} for name in ("dotnet", "mono", "python", "python_web")}
+    monkeypatch.setattr(csharp, "_measure_ages", lambda *_: ages)
     report = csharp.run_csharp(bodies=50, points=500, frames=100)
     assert report.ok
-    assert {bar.key for bar in report.bars} >= {"allocated_bytes_per_frame", "max_error_mm"}
+    assert {bar.key for bar in report.bars} >= {"allocated_bytes_per_frame", "max_error_mm", "age_ms_p99"}
+    ages["mono"]["age_ms_p99"] = 2.1
+    assert [bar.key for bar in csharp.run_csharp(bodies=5, points=50, frames=10).bars if not bar.ok] == ["age_ms_p99"]
     assert report.results["max_error_mm"] > 0.0
     assert report.results["cloud_difference_mm"] == 0.0
 

@@ -1,6 +1,8 @@
-// Decodes the frames of `iris-session bench csharp` as an app does, and says how long that takes and what it allocates.
+// What `iris-session bench csharp` measures.
 //
-//     bench FRAMES OUT    prints one line of JSON; writes decoded poses, vertices and points of every n-th frame to OUT
+//     bench decode FRAMES OUT            decodes frames as an app does, and says how long that takes and what it allocates: one line of
+//                                        JSON; decoded poses, vertices and points of every n-th frame are written to OUT
+//     bench live ADDRESS NAME ORIGIN_NS  joins a session: see Live.cs
 //
 // FRAMES, little-endian: int32 bodies, frames, warm-up frames, n; int32 lengths with their bytes: welcome, snapshot and its keyframe,
 // topology of the cloth; int32 number of clouds, each as its length and bytes: frame i has cloud i modulo that number. Then for each
@@ -18,13 +20,21 @@ static class Bench
 {
     static int Main(string[] arguments)
     {
-        var player = new FramePlayer(File.ReadAllBytes(arguments[0]));
+        if (arguments.Length == 3 && arguments[0] == "decode") return Decode(arguments[1], arguments[2]);
+        if (arguments.Length == 4 && arguments[0] == "live") return Live.Run(arguments[1], arguments[2], long.Parse(arguments[3], CultureInfo.InvariantCulture));
+        Console.Error.WriteLine("bench decode FRAMES OUT | bench live ADDRESS NAME ORIGIN_NS");
+        return 2;
+    }
+
+    static int Decode(string frames, string output)
+    {
+        var player = new FramePlayer(File.ReadAllBytes(frames));
         for (int i = 0; i < player.WarmUp; i++) player.Play(i);
         GC.Collect();
         long before = GC.GetAllocatedBytesForCurrentThread();
         for (int i = player.WarmUp; i < player.Frames; i++) player.Play(i);
         long allocated = GC.GetAllocatedBytesForCurrentThread() - before;
-        using (var file = File.Create(arguments[1])) player.WriteDecoded(file);
+        using (var file = File.Create(output)) player.WriteDecoded(file);
         var line = new StringBuilder("{");
         foreach (string name in new[] { "decode", "cloth", "cloud" })
         {
