@@ -33,7 +33,7 @@ from iris_session.protocol.status import DeliveryBudget
 from iris_session.protocol.steps import FixedView
 from tests.rig import front as rig_front
 from tests.rig.front import RigFrontProcess, install_front
-from tests.rig.network import Network, RigClientSockets
+from tests.rig.network import Network, RigClientSockets, refuse_introduction
 from tests.rig.simulation import SECOND, Simulation, simulate_modules
 
 ADDRESS: Final = "127.0.0.1:7721"
@@ -270,7 +270,7 @@ class ClientSession:
         patch.setattr(front_context, "FrontSockets", _FrontSockets)
         patch.setattr(client_module, "ClientSockets", self._make_sockets)
         patch.setattr(assets, "AssetWorkers", InlineWorkers)
-        patch.setattr(endpoint_resolver, "request_introduction", _refuse_introduction)
+        patch.setattr(endpoint_resolver, "request_introduction", refuse_introduction)
         self.front = RigFrontProcess(self._config, self.scene, self.simulation)
         self.front.start()
         self._step()
@@ -403,9 +403,3 @@ class ClientSession:
         for client in self.clients:
             topic = make_topic(client.connection.connection_epoch, stream) + b"full"
             self.sockets_of(client).push_media(topic, [head, data])
-
-
-def _refuse_introduction(*_: object) -> Any:
-    """Answer as a port without an introduction does: clients of loopback then connect without encryption."""
-    raise ConnectionRefusedError
-    yield

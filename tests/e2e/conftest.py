@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -88,6 +89,17 @@ def marked_scenario(serve: Callable[..., SessionProcess], tmp_path: Path) -> Ite
     scenario = Scenario(serve("handover", "--anchors", str(path)))
     yield scenario
     scenario.close()
+
+
+@pytest.fixture
+def script_scenario(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Scenario]:
+    """The session of the script `SCRIPT` of the test's module."""
+    (tmp_path / "script.py").write_text(request.module.SCRIPT)
+    server = SessionProcess(tmp_path, tmp_path / "session.rrd", [sys.executable, str(tmp_path / "script.py")])
+    scenario = Scenario(server)
+    yield scenario
+    scenario.close()
+    kill_all([server])
 
 
 @pytest.fixture

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,7 @@ from iris_session.protocol.server_messages import SceneChanged
 from iris_session.session.deformables import BOUND_M
 from iris_session.streams.rigid import MAX_POSITION_ERROR_M
 from tests.e2e.scenario import Scenario
-from tests.e2e.session_process import SessionProcess, assert_all_end, kill_all, list_descendants, run_command
+from tests.e2e.session_process import assert_all_end, list_descendants, run_command
 
 pytestmark = pytest.mark.e2e
 
@@ -50,17 +48,10 @@ with ScenePublisher(scene, config) as session, session.signals():
 """
 
 
-@pytest.fixture
-def scenario(tmp_path: Path) -> Iterator[Scenario]:
-    (tmp_path / "script.py").write_text(SCRIPT)
-    server = SessionProcess(tmp_path, tmp_path / "session.rrd", [sys.executable, str(tmp_path / "script.py")])
-    scenario = Scenario(server)
-    yield scenario
-    scenario.close()
-    kill_all([server])
-
-
-def test_observers_receive_poses_and_vertices_of_a_world_without_mujoco(scenario: Scenario, tmp_path: Path) -> None:
+def test_observers_receive_poses_and_vertices_of_a_world_without_mujoco(
+    script_scenario: Scenario, tmp_path: Path
+) -> None:
+    scenario = script_scenario
     ann, late = scenario.join("ann", role="observer"), scenario.join("late", role="observer")
     shapes = Deformables(late)
     heights: set[float] = set()

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.e2e.scenario import Scenario
-from tests.e2e.session_process import SessionProcess, assert_all_end, kill_all, list_descendants, run_verify
+from tests.e2e.session_process import assert_all_end, list_descendants, run_verify
 
 pytestmark = pytest.mark.e2e
 
@@ -34,17 +32,8 @@ print("ended in order", flush=True)
 """
 
 
-@pytest.fixture
-def scenario(tmp_path: Path) -> Iterator[Scenario]:
-    (tmp_path / "script.py").write_text(SCRIPT)
-    server = SessionProcess(tmp_path, tmp_path / "session.rrd", [sys.executable, str(tmp_path / "script.py")])
-    scenario = Scenario(server)
-    yield scenario
-    scenario.close()
-    kill_all([server])
-
-
-def test_attached_script_without_close_ends_in_order(scenario: Scenario, tmp_path: Path) -> None:
+def test_attached_script_without_close_ends_in_order(script_scenario: Scenario, tmp_path: Path) -> None:
+    scenario = script_scenario
     hand = scenario.drive("ann", "left")
     before = hand.tip
     hand.velocity = (0.0, 0.1, 0.0)

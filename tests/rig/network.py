@@ -380,3 +380,9 @@ class RigClientSockets:
 
     def drain_assets(self) -> list[list[memoryview]]:
         return []
+
+
+def refuse_introduction(*_: object) -> Any:
+    """Answer as a port without an introduction does: clients of loopback then connect without encryption."""
+    raise ConnectionRefusedError
+    yield

@@ -29,7 +29,7 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.session import PAUSED_STEP_S, Session
 from tests.rig.front import RigFrontProcess, install_front
 from tests.rig.journal import Journal
-from tests.rig.network import Link, Network, RigClientSockets
+from tests.rig.network import Link, Network, RigClientSockets, refuse_introduction
 from tests.rig.simulation import SECOND, Simulation, simulate_modules
 
 ADDRESS: Final = "127.0.0.1:7721"
@@ -143,7 +143,7 @@ class Rig:
         install_front(self._network, patch)
         patch.setattr(processes, "FrontProcess", self._make_front)
         patch.setattr(client_module, "ClientSockets", self._make_sockets)
-        patch.setattr(endpoint_resolver, "request_introduction", _refuse_introduction)
+        patch.setattr(endpoint_resolver, "request_introduction", refuse_introduction)
         patch.setattr(socket, "create_connection", self._network.try_port)
         try:
             self.session = self._make_session()
@@ -415,12 +415,6 @@ def _sockets_of(client: Client) -> RigClientSockets:
     sockets = client._sockets
     assert isinstance(sockets, RigClientSockets)
     return sockets
-
-
-def _refuse_introduction(*_: object) -> Any:
-    """Answer as a port without an introduction does: clients of loopback then connect without encryption."""
-    raise ConnectionRefusedError
-    yield
 
 
 def see_tip(client: Client, robot: str) -> PoseTuple:
