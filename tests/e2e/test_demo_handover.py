@@ -23,8 +23,9 @@ from tests.e2e.session_process import (
     run_verify,
     wait_until,
 )
+from tests.e2e.test_demo_scenes import assert_looks_right
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 60.0)]
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 120.0)]
 
 
 #: Processes of a demo: front, recorder, display and two emulated headsets.
@@ -45,6 +46,7 @@ def test_hammer_is_handed_over_and_the_recording_verifies(tmp_path: Path) -> Non
     assert (handover["object"], handover["giver"], handover["receiver"]) == ("hammer", "left", "right")
     report = run_verify(tmp_path / result["recording"])
     assert (report["recording_class"], report["finished"]) == ("closed", True)
+    assert_looks_right(tmp_path / result["recording"])
 
 
 @pytest.mark.long

@@ -1,4 +1,7 @@
-"""The demos beside the handover, each by its command: real robots' models and deformables, recorded and verified."""
+"""The demos beside the handover, each by its command: real robots' models and deformables, recorded and verified.
+
+Their recordings are looked at in Rerun's viewer by `tools/look_at_recordings.py`, and read as its dataframes.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,24 @@ from typing import Any
 
 import pytest
 
-from tests.e2e.session_process import DEMO_OPTIONS, DEMO_S, run_command
+from tests.e2e.session_process import DEMO_OPTIONS, DEMO_S, run_command, skip_unless_ci
+from tests.recording.dataframes import compare_dataframes
+from tools.look_at_recordings import MissingViewerError, look_at
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 60.0)]
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(DEMO_S + 120.0)]
+
+
+def assert_looks_right(path: Path) -> None:
+    """Look at a recording; skip the test, or fail in CI, without a driver."""
+    n, problems = compare_dataframes(path)
+    assert not problems
+    assert n > 10_000
+    try:
+        look = look_at(path)
+    except MissingViewerError as error:
+        skip_unless_ci(str(error))
+        raise
+    assert not look.problems, look
 
 
 def run_demo(folder: Path, *arguments: str, max_attempts: int = 2) -> dict[str, Any]:
@@ -35,21 +53,26 @@ def test_aloha_operators_exchange_boards(tmp_path: Path) -> None:
     }
     for error in result["alignment_mm"].values():
         assert 0.0 < error["at_sheet"] < 2.0 * error["stated_p95"]
+    assert_looks_right(tmp_path / result["recording"])
 
 
 @pytest.mark.long
 def test_panda_operators_hand_over_a_hammer(tmp_path: Path) -> None:
     result = run_demo(tmp_path, "panda")
     assert [(h["object"], h["giver"], h["receiver"]) for h in result["handovers"]] == [("object1", "left", "right")]
+    assert_looks_right(tmp_path / result["recording"])
 
 
 @pytest.mark.long
 def test_two_operators_stow_two_soft_bodies(tmp_path: Path) -> None:
-    goals = run_demo(tmp_path, "soft")["goals"]
-    assert sorted((goal["deformable"], goal["goal"]) for goal in goals) == [("mint", "stowed"), ("rose", "stowed")]
+    result = run_demo(tmp_path, "soft")
+    found = sorted((goal["deformable"], goal["goal"]) for goal in result["goals"])
+    assert found == [("mint", "stowed"), ("rose", "stowed")]
+    assert_looks_right(tmp_path / result["recording"])
 
 
 @pytest.mark.long
 def test_two_operators_fold_a_cloth(tmp_path: Path) -> None:
-    goals = run_demo(tmp_path, "cloth", max_attempts=3)["goals"]  # on a busy machine, one fold in some ten fails
-    assert [(goal["deformable"], goal["goal"]) for goal in goals] == [("cloth", "folded")]
+    result = run_demo(tmp_path, "cloth", max_attempts=3)  # on a busy machine, one fold in some ten fails
+    assert [(goal["deformable"], goal["goal"]) for goal in result["goals"]] == [("cloth", "folded")]
+    assert_looks_right(tmp_path / result["recording"])

@@ -249,6 +249,3 @@ def test_assets_follow_the_journal_and_each_part_has_them(tmp_path: Path) -> Non
 def test_killed_recorder_loses_at_most_a_quarter_second() -> None:
     """Delays of batch, transfer and write add up."""
     assert BATCH_NS * 1e-9 + DRAIN_S + FLUSH_S + DRAIN_S <= 0.25
-
-
-# --- processes --------------------------------------------------------------------------------------------------------

@@ -27,24 +27,6 @@ def assert_equals(played: Played, steps: list[int], positions: list[bytes]) -> N
     assert positions == [played.qpos[step].tobytes() for step in steps]
 
 
-def test_steps_are_taken_again_bit_for_bit(tmp_path: Path) -> None:
-    played = play(tmp_path / "session.rrd", 100)
-    steps, positions, taken = replay(played.write())
-    assert steps == list(range(100))
-    assert_equals(played, steps, positions)
-    assert len(set(positions)) == 100, "something moves"
-    assert not taken.left_out
-
-
-def test_open_sessions_have_the_plants_of_their_rows(tmp_path: Path) -> None:
-    played = play(tmp_path / "session.rrd", 80, recording_class=OPEN)
-    path = played.write()
-    for with_control in (False, True):
-        steps, positions, _ = replay(path, with_control=with_control)
-        assert steps == list(range(80))
-        assert_equals(played, steps, positions)
-
-
 def test_open_sessions_need_no_control(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = play(tmp_path / "session.rrd", 5, recording_class=OPEN).write()
 
