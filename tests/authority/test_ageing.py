@@ -6,7 +6,7 @@ import pytest
 
 from anchors.ageing import AgeingLaw
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Align, Heartbeat, MoveAnchor, PlaceAlignment
+from iris_session.protocol.client_messages import Heartbeat, MoveAnchor, PlaceAlignment
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Join, Lost
 from iris_session.protocol.names import AlignmentDoubt, HoldReason, RejectReason
@@ -15,7 +15,6 @@ from iris_session.protocol.status import AlignmentReport
 
 from .table import SECOND, Person, Table, proposal
 
-MINUTE = 60 * SECOND
 #: A step may be a minute long.
 LONG = {"gap_ns": 3600 * SECOND, "heartbeat_timeout_ns": 36_000 * SECOND}
 CONFIG = AuthorityConfig(anchors={"table": Pose((0.0, -0.5, 0.0), IDENTITY.q)}, **LONG)  # type: ignore[arg-type]
@@ -95,18 +94,6 @@ def test_what_is_engaged_when_it_becomes_old_goes_on() -> None:
     assert t.command().kind == "pose"
 
 
-def test_an_agreeing_look_begins_the_age_again_and_says_so() -> None:
-    t = Table(CONFIG)
-    anna = t.operator("left")
-    pass_minutes(t, 1)
-    assert t.last(AlignmentChanged).alignment.error_at_robot_m > 0.003
-    assert report(t, anna).doubt == ""
-    t.step(anna.says(proposal()))
-    t.step(dt_ns=2 * SECOND)
-    assert report(t, anna).error_at_robot_m < 0.001
-    assert t.last(AlignmentChanged).alignment.error_at_robot_m < 0.001
-
-
 def test_a_look_that_says_less_than_what_is_known_confirms_nothing() -> None:
     t = Table(CONFIG)
     anna = t.operator("left")
@@ -156,14 +143,6 @@ def test_an_offset_ages_as_the_measurement_below_it() -> None:
     assert report(t, anna).doubt == ""
 
 
-def test_a_stopped_run_is_to_be_started_before_a_glance() -> None:
-    t = Table(CONFIG)
-    anna = t.operator("left")
-    anna.asks(Align(1, "stop"))
-    pass_minutes(t, 20)
-    assert "start" in warnings(t, anna)[0]
-
-
 def test_without_the_law_nothing_ages() -> None:
     t = Table(AuthorityConfig(ageing=None, **LONG))  # type: ignore[arg-type]
     anna = t.operator("left")
@@ -200,12 +179,3 @@ def test_an_estimate_without_a_new_look_ends_neither_age_nor_doubt(moved: bool) 
     t.wait(5 * SECOND)
     assert report(t, anna).doubt == ""
     assert 0 <= report(t, anna).confirmed_ns <= 6 * SECOND
-
-
-def test_an_estimate_is_as_old_as_its_newest_look() -> None:
-    t = Table(CONFIG)
-    anna = t.operator("left")
-    pass_minutes(t, 10)
-    t.step(anna.says(proposal(looked_ns=t.now_ns - 4 * MINUTE)))
-    t.wait(SECOND)
-    assert report(t, anna).confirmed_ns >= 4 * MINUTE

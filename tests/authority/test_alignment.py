@@ -11,7 +11,7 @@ import pytest
 
 from anchors.pose import quat_from_rotvec, quat_from_yaw, quat_rotate
 from iris_session.authority.alignment import compute_position_p95, widen_covariance
-from iris_session.protocol.client_messages import Grasp, Heartbeat, PlaceAlignment, TrackingEpoch
+from iris_session.protocol.client_messages import Heartbeat, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, Alignment, Pose
 from iris_session.protocol.server_messages import AlignmentChanged, Notice, ParticipantChanged, SamplesRejected
 from iris_session.protocol.status import AlignmentReport
@@ -378,16 +378,6 @@ def test_while_engaged_a_correction_waits_and_is_told_once() -> None:
     assert report(t, anna).pending_m == pytest.approx(0.054)
     anna.sends("left")
     assert [e.alignment.T_world_tracking.p[0] for e in t.since(AlignmentChanged)] == [1.054]
-
-
-def test_a_hand_on_an_object_is_a_use_too() -> None:
-    t = Table()
-    anna = t.operator()
-    anna.asks(Grasp(1, "hammer", "controller/right"))
-    anna.engage("hammer")
-    t.step(anna.says(at(1.005)))
-    rest_of_it = [t.step(anna.says(anna.sample("hammer", clutch=True)), dt_ns=20 * MS) for _ in range(40)]
-    assert not any(isinstance(e.body, AlignmentChanged) for d in rest_of_it for e in d.events)
 
 
 def test_a_directors_word_waits_for_the_clutch() -> None:

@@ -77,17 +77,6 @@ def test_a_new_run_keeps_what_is_in_force_and_lets_the_next_in_at_once() -> None
     assert [e.alignment.T_world_tracking.p[0] for e in t.since(AlignmentChanged)] == [1.5]
 
 
-def test_a_stopped_run_keeps_what_is_in_force_whatever_is_seen() -> None:
-    t = Table(CONFIG)
-    anna = t.operator()
-    t.wait(100 * MS)
-    anna.asks(Align(1, "stop"))
-    t.step(anna.says(shifted(1.5)))
-    t.step(anna.says(proposal(refused=True, advice="closer")))
-    assert t.since(AlignmentChanged) == t.since(Notice) == []
-    assert not report(t, anna).running
-
-
 # --- anchors ----------------------------------------------------------------------------------------------------------
 
 
@@ -249,15 +238,6 @@ def test_odd_sizes_are_bounded(size_m: float) -> None:
     t.step(anna.says(AlignmentAlarm("jump", 1, "", size_m)))
     assert 0.0 <= t.since(AlignmentAlarmed)[0].size_m <= CONFIG.reach_m
     assert report(t, anna).version == 0
-
-
-def test_a_flood_of_its_own_does_not_push_out_what_the_front_says() -> None:
-    t = Table(AuthorityConfig(quota=4))
-    anna = t.operator("left")
-    anna.engage("left")
-    t.step(*(anna.says(Heartbeat()) for _ in range(20)), anna.says(AlignmentAlarm("jump", 0)))
-    assert t.hold() == "rearm"
-    assert len(t.since(AlignmentAlarmed)) == 1
 
 
 # --- comparisons ------------------------------------------------------------------------------------------------------

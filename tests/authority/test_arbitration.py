@@ -209,13 +209,6 @@ def test_the_second_hand_takes_over_without_a_jump() -> None:
     assert t.decision.objects == ()
 
 
-def test_a_hand_without_samples_lets_go() -> None:
-    t, _ = holding()
-    t.step(dt_ns=149 * MS)
-    t.step()
-    assert t.decision.objects == ()
-
-
 def test_acquired_objects_take_any_hand_and_a_reset_drops_them() -> None:
     t = Table(AuthorityConfig(max_sub_holders=1))
     anna, bert, boss = t.operator(), t.operator(), t.join("director")
@@ -226,20 +219,6 @@ def test_acquired_objects_take_any_hand_and_a_reset_drops_them() -> None:
     assert [c.object for c in t.decision.objects] == ["hammer", "board"]
     boss.does(Control(1, "reset"))
     assert t.decision.objects == ()
-
-
-def test_nothing_is_taken_hold_of_in_the_step_of_a_reset() -> None:
-    """What is seen of the world in that step is gone a moment later."""
-    t, anna = holding()
-    boss = t.join("director")
-    anna.does(anna.sample("hammer", **LEFT))
-    anna.scene_epoch = 2
-    opens, closes = (anna.says(anna.sample("hammer", clutch=c, **LEFT)) for c in (False, True))
-    t.step(boss.says(Control(1, "reset")), opens, closes)
-    assert t.decision.reset
-    assert t.decision.objects == ()
-    anna.engage("hammer", **LEFT)
-    assert t.decision.objects != ()
 
 
 @pytest.mark.parametrize(

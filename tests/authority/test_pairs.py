@@ -89,30 +89,6 @@ def test_whoever_saw_the_sheet_last_before_is_asked_once_and_holds_until_a_glanc
     assert (len(prompts(t, ann)), prompts(t, bob)) == (1, [])
 
 
-def test_what_is_engaged_goes_on() -> None:
-    t = Table(CONFIG)
-    ann = aligned(t, "ann", "left")
-    t.wait(10 * SECOND)
-    ann.engage("left")
-    aligned(t, "bob")
-    ann.sends("left", clutch=True)
-    assert doubt(t, ann) == AlignmentDoubt.UNVERIFIED
-    assert t.command().kind == "pose"
-
-
-def test_looks_at_the_same_time_and_looks_that_agree_cost_nothing() -> None:
-    t = Table(CONFIG)
-    ann = aligned(t, "ann")
-    t.wait(SECOND)
-    bob = aligned(t, "bob")
-    assert (doubt(t, ann), doubt(t, bob)) == ("", ""), "bob began to look while ann did"
-    for person, other in ((ann, bob), (bob, ann)):
-        t.wait(10 * SECOND)
-        see(t, person, "a", x=1.001)
-        assert (doubt(t, person), doubt(t, other)) == ("", "")
-    assert pairs(t) == []
-
-
 def test_a_look_that_disagrees_makes_everybody_glance() -> None:
     """Bob looks again and finds the sheet elsewhere: nobody knows whether it was bumped before ann's look or after."""
     t, ann, bob = two()
@@ -269,16 +245,6 @@ def test_two_prints_of_one_id_hold_everybody_who_knows_no_other_sheet() -> None:
     t.step(ann.says(AlignmentAlarm(AlarmKind.TWO_PLACES, 0, "a", 0.8)))
     assert (doubt(t, ann), doubt(t, bob)) == (AlignmentDoubt.CONTRADICTED, "")
     assert [e.participant for e in t.events if isinstance(e, Notice) and e.level == "warning"] == [""]
-
-
-def test_a_sheet_that_the_resumed_session_does_not_have_is_not_looked_at() -> None:
-    t = Table(CONFIG)
-    ann = aligned(t, "ann", capabilities=("run:1",))
-    t.step(t.host(SessionResumed(SECOND, {"b": SHEETS["b"]})))
-    back = reconnect(t, ann, "run:1")
-    assert t.authority.build_alignment_reports()[back.id].error_at_robot_m > 0.0, "its alignment is kept"
-    t.step(back.says(shift()))
-    assert t.last(AlignmentAlarmed).witnesses == ()
 
 
 def test_bad_numbers_of_a_front_change_nothing() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from iris_session.authority import is_same_snapshot
 from iris_session.authority.state import AGEING_FIELDS
-from iris_session.protocol.client_messages import Control, GetSnapshot, Grasp, Rename, SetRole
+from iris_session.protocol.client_messages import Control, GetSnapshot, Rename, SetRole
 from iris_session.protocol.entries import Lost
 from iris_session.protocol.server_messages import Audited, LeaseChanged, ParticipantChanged, Snapshot
 from tests.authority.table import Person, Table, robot
@@ -70,23 +70,6 @@ class TestSetRole:
         ann.engage("left")
         assert t.hold() == ""
         assert ann.asks(Control(2, "pause")).ok
-
-    def test_observer_holds_nothing(self) -> None:
-        t, dora, ann = meet()
-        ann.acquire("left")
-        ann.asks(Grasp(2, "hammer", "hand/right"))
-        ann.engage("left")
-        assert dora.asks(SetRole(1, ann.id, "observer")).ok
-        changes = t.since(LeaseChanged)
-        assert {(c.lease.target, c.lease.holder, c.cause, c.previous_holder) for c in changes} == {
-            ("left", "", "role", ann.id),
-            ("hammer", "", "role", ann.id),
-        }
-        assert t.hold()
-        ann.sends("left", clutch=True)
-        assert t.hold()
-        assert dora.asks(SetRole(2, ann.id, "operator")).ok
-        assert ann.acquire("left").ok
 
     def test_person_who_becomes_an_agent_lets_go(self) -> None:
         """Modes `priority` and `takeover` treat agents otherwise than people."""

@@ -45,29 +45,6 @@ def with_mode(mode: str, **config: int) -> Table:
 # --- exclusive and the queue ---
 
 
-def test_exclusive_denial_names_the_holder_and_what_to_do() -> None:
-    t = Table()
-    anna, bert = t.operator("left"), t.join()
-    denial = bert.acquire("left").denial
-    assert denial is not None
-    assert (denial.reason, denial.holder, denial.holder_name, denial.target) == ("held", anna.id, anna.name, "left")
-    assert "wait" in denial.advice
-    assert t.since(LeaseChanged) == []
-
-
-def test_acquire_is_all_or_none() -> None:
-    t = Table()
-    anna, bert = t.operator("right"), t.join()
-    assert bert.denied(Acquire(1, ("left", "right"))) == "held"
-    assert t.hold("left") == "no_lease"
-    anna.does(Release())
-    reply = bert.acquire("left", "right")
-    assert reply.ok
-    assert {lease.target: lease.holder for lease in reply.leases} == {"left": bert.id, "right": bert.id}
-    again = bert.acquire("left", "left")
-    assert again.leases[0].lease_version == reply.leases[0].lease_version
-
-
 def test_queue_is_first_come_first_served_and_answers_when_granted() -> None:
     t = Table()
     anna, bert, carl = t.operator("left"), t.join(), t.join()
@@ -81,16 +58,6 @@ def test_queue_is_first_come_first_served_and_answers_when_granted() -> None:
     assert carl.replies() == []
     bert.does(Release(targets=(Target("left", reply.leases[0].lease_version),)))
     assert carl.replies()[0].ok
-
-
-def test_a_waiting_pair_takes_nothing_and_is_not_overtaken() -> None:
-    t = Table()
-    anna, bert, carl = t.operator("left"), t.join(), t.join()
-    bert.does(Acquire(1, ("left", "right"), wait=True))
-    assert t.hold("right") == "no_lease"
-    assert carl.denied(Acquire(1, ("right",))) == "held"
-    anna.does(Release())
-    assert [lease.target for lease in bert.replies()[0].leases] == ["left", "right"]
 
 
 def test_queue_is_bounded_and_one_place_each() -> None:
@@ -179,17 +146,6 @@ def test_a_request_that_was_granted_meanwhile_is_given_back() -> None:
     assert anna.asks(Withdraw(7, 5)).leases == ()
 
 
-def test_a_withdrawal_is_of_one_connection() -> None:
-    """Another program that resumes the participant counts its requests from one again."""
-    t = Table()
-    anna = t.operator()
-    assert anna.asks(Acquire(1, ("left",))).ok
-    t.step(anna.says(Lost()))
-    back = t.join(key_id=f"key{anna.connection}", name=anna.name, resume_of=anna.id)
-    assert back.asks(Withdraw(2, 1)).leases == ()
-    assert t.last(LeaseChanged).lease.holder == anna.id
-
-
 # --- request ---
 
 
@@ -261,23 +217,6 @@ def test_an_agent_takes_no_robot_out_of_an_engaged_hand() -> None:
     assert agent.denied(Acquire(1, ("right", "left"))) == "held"
     assert t.command().sources[0].participant == anna.id
     assert t.operator().acquire("left").ok, "people take from people"
-
-
-@pytest.mark.parametrize("why", ["untracked", "stale", "estop", "disconnected"])
-def test_an_agent_takes_no_robot_from_a_human_who_cannot_drive_for_a_moment(why: str) -> None:
-    t = with_mode("takeover")
-    anna, agent, boss = t.operator("left"), t.join("agent", alignment="not_needed"), t.join("director")
-    anna.engage("left")
-    if why == "untracked":
-        anna.sends("left", tracked=False)
-    elif why == "estop":
-        boss.does(EStop())
-    elif why == "disconnected":
-        t.step(anna.says(Lost()))
-    for _ in range(250):
-        t.step(*(p.says(Heartbeat()) for p in (anna, boss)), agent.says(Heartbeat()), dt_ns=20 * MS)
-    assert t.hold() == why
-    assert agent.denied(Acquire(1, ("left",))) == "held"
 
 
 def test_an_agent_takes_a_robot_whose_holder_stands_by_or_never_drove() -> None:
@@ -541,18 +480,6 @@ def test_shared_robot_blends_by_normalised_weights() -> None:
     assert [s.participant for s in t.command().sources] == [anna.id], "changing the kind ends one's own engagement"
     anna.sends("left", clutch=True)
     assert t.command().kind == "pose", "who drives alone may change it"
-
-
-def test_joining_does_not_fence_the_first_sharer() -> None:
-    t = with_mode("shared")
-    anna = t.operator("left")
-    anna.engage("left")
-    t.operator("left")
-    anna.sends("left", clutch=True)
-    assert t.command().sources[0].new
-    anna.versions["left"] += 1  # what the event told
-    anna.sends("left", clutch=True)
-    assert t.command().sources[0].new
 
 
 # --- directors ---

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, Bye, GetSnapshot, Heartbeat, Release
+from iris_session.protocol.client_messages import Acquire, Bye, Heartbeat, Release
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.entries import Entry, FrontRestarted, Join, Lost, SessionResumed
 from iris_session.protocol.server_messages import (
@@ -16,9 +16,8 @@ from iris_session.protocol.server_messages import (
     ParticipantJoined,
     ParticipantLeft,
     Refused,
-    Snapshot,
 )
-from iris_session.protocol.steps import Admitted, Dropped
+from iris_session.protocol.steps import Dropped
 
 from .table import MS, SECOND, Person, Table
 
@@ -88,22 +87,6 @@ def test_session_full_forgets_lost_people_without_leases_first() -> None:
     assert t.last(ParticipantLeft).participant == bert.id
     t.join()
     assert refused(t) == "session_full"
-
-
-def test_lost_holder_holds_disconnected_and_keeps_the_lease_for_the_grace_period() -> None:
-    t = Table()
-    anna = t.operator("left")
-    anna.engage("left")
-    t.step(anna.says(Lost("closed")))
-    assert t.hold() == "disconnected"
-    assert t.since(ParticipantLeft) == [ParticipantLeft(anna.id, "closed", True)]
-    lease = t.last(LeaseChanged).lease
-    assert (lease.holder, lease.expires_ns) == (anna.id, t.now_ns + 30 * SECOND)
-    t.step(anna.says(Lost()))
-    t.wait(30 * SECOND)
-    assert t.hold() == "no_lease"
-    assert t.last(LeaseChanged).cause == "expired"
-    assert t.last(ParticipantLeft) == ParticipantLeft(anna.id, "expired", False)
 
 
 def test_grace_begins_anew_when_the_session_was_down_also_for_who_was_lost_before() -> None:
@@ -182,14 +165,6 @@ def test_resume_needs_the_same_key_and_role() -> None:
         assert refused(t) == "resume_token"
 
 
-def test_resume_of_a_forgotten_participant_joins_anew() -> None:
-    t = Table()
-    anna = t.join()
-    anna.does(Bye())
-    rejoin(t, anna)
-    assert t.decision.admitted == (Admitted(2, "p2", "operator", False),)
-
-
 def test_bye_releases_at_once() -> None:
     t = Table()
     anna = t.operator("left")
@@ -214,18 +189,6 @@ def test_three_silent_seconds_are_a_lost_connection() -> None:
     assert t.hold() == "disconnected"
     assert dropped == [Dropped(anna.connection, "heartbeat")]
     assert t.last(ParticipantLeft) == ParticipantLeft(anna.id, "heartbeat", True)
-
-
-def test_front_restart_loses_everyone_but_the_host() -> None:
-    t = Table()
-    anna = t.operator("left")
-    t.step(t.host(FrontRestarted()))
-    assert t.hold() == "disconnected"
-    assert t.last(ParticipantLeft).reason == "front_restarted"
-    t.step(t.host(GetSnapshot(1)))
-    (snapshot,) = [o.message for o in t.decision.outgoing]
-    assert isinstance(snapshot, Snapshot)
-    assert [(p.id, p.connected) for p in snapshot.participants] == [(anna.id, False)]
 
 
 def test_host_cannot_be_lost_say_bye_or_be_resumed() -> None:

@@ -46,18 +46,6 @@ def test_whoever_says_that_it_needs_no_alignment_moves_nothing_with_a_headset(ro
     assert t.hold() == "unaligned"
 
 
-@pytest.mark.parametrize(
-    ("role", "device"),
-    [("operator", "desktop"), ("operator", "target"), ("director", "desktop"), ("agent", "hand/left")],
-)
-def test_desks_and_policies_need_no_alignment(role: str, device: str) -> None:
-    t = Table()
-    anna = t.join(role, alignment="not_needed", devices=(device, "head"))
-    anna.acquire("left")
-    anna.engage("left", device=device)
-    assert t.command().kind == "pose"
-
-
 @pytest.mark.parametrize("entry", ["operator", "controller/right", "key:key1"])
 def test_the_configuration_decides_who_may_be_unaligned(entry: str) -> None:
     t = Table(AuthorityConfig(unaligned=(entry,)))
@@ -138,25 +126,6 @@ def test_old_or_future_receive_time() -> None:
         s = op.sample("left", clutch=True)
         t.step(Entry(op.connection, op.connection, t.now_ns + shift, s))
         assert t.since(SamplesRejected)[0].reason == reason
-
-
-def test_capture_after_receipt_is_from_the_future() -> None:
-    t, op = engaged()
-    t.step(dt_ns=20 * MS)
-    s = op.sample("left", clutch=True)
-    t.step(Entry(op.connection, op.connection, t.now_ns - 6 * MS, s))
-    assert t.since(SamplesRejected)[0].reason == "future"
-
-
-def test_foreign_target_is_not_holder_and_leaves_the_holder_engaged() -> None:
-    t, op = engaged()
-    thief = t.operator("right")
-    thief.versions["left"] = op.versions["left"]
-    thief.engage("left")
-    assert t.since(SamplesRejected) == []  # the second one of a kind is not reported again within a second
-    assert t.last(SamplesRejected).reason == "not_holder"
-    assert t.command().sources[0].participant == op.id
-    assert t.command().kind == "pose"
 
 
 def test_another_connection_cannot_speak_for_a_participant() -> None:
@@ -273,24 +242,6 @@ def test_capture_times_that_go_back_and_forth_make_no_time_for_a_jump() -> None:
     assert t.command().kind == "pose"
     anna.sends("left", clutch=True, p=(0.9, 0.0, 1.0))
     assert t.hold() == "jump"
-
-
-@pytest.mark.parametrize(
-    "between",
-    [
-        {"kind": "twist", "pose": None, "twist": (0.0,) * 6},
-        {"tracked": False},
-        {"worn": False},
-        {"tracked": False, "pose": None},
-    ],
-)
-def test_nothing_sent_in_between_makes_a_jump_possible(between: dict[str, Any]) -> None:
-    t, op = engaged()
-    op.sends(**between)
-    op.sends("left", clutch=True, p=(0.9, 0.0, 1.0))
-    assert t.command().kind == "hold"
-    op.engage("left")
-    assert t.command().kind == "pose"
 
 
 def test_a_hand_that_was_not_tracked_for_a_while_may_be_elsewhere() -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.protocol.client_messages import Acquire, Assign, Control, EStop, RemoveParticipant, SetMode
+from iris_session.protocol.client_messages import Acquire, EStop, RemoveParticipant
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.entries import Audit, Lost
 from iris_session.protocol.names import AuditKind, DenialReason
-from iris_session.protocol.server_messages import Audited, LeaseChanged, ParticipantLeft, Refused
+from iris_session.protocol.server_messages import Audited, ParticipantLeft, Refused
 from iris_session.protocol.steps import Dropped
 
 from .table import Table
@@ -97,26 +97,3 @@ def test_audits_of_the_front_become_events_and_those_of_others_nothing() -> None
     assert t.since(Audited) == [Audited(audit.kind, "mark", "Eve", "10.0.0.9", "x" * MAX_TEXT, 12)]
     t.step(ann.says(audit))
     assert t.since(Audited) == []
-
-
-def test_two_directors_at_once_both_act_and_the_last_word_wins() -> None:
-    t = Table()
-    one, two = t.join("director"), t.join("director")
-    ann, bob = t.operator("left"), t.operator()
-    t.step(
-        one.says(Assign(1, ("left",), bob.id)),
-        two.says(Assign(2, ("left",), ann.id)),
-        one.says(SetMode(3, "left", "takeover")),
-        two.says(SetMode(4, "left", "exclusive")),
-        one.says(Control(5, "pause")),
-        two.says(Control(6, "resume")),
-    )
-    replies = {o.message.request_id: o.message for o in t.decision.outgoing if hasattr(o.message, "request_id")}
-    assert sorted(replies) == [1, 2, 3, 4, 5, 6]
-    assert all(reply.ok for reply in replies.values()), replies
-    assert not t.decision.paused
-    assert t.last(LeaseChanged).lease.holder == ann.id
-    t.step(one.says(RemoveParticipant(7, two.id)), two.says(RemoveParticipant(8, one.id)))
-    assert [d.connection for d in t.decision.dropped] == [two.connection], "who was removed first removes nobody"
-    (denied,) = two.replies()
-    assert denied.denial.reason == DenialReason.NOT_JOINED

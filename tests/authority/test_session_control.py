@@ -10,7 +10,6 @@ from iris_session.protocol.client_messages import Acquire, ClearEStop, Control, 
 from iris_session.protocol.entries import (
     Entry,
     ExternalReset,
-    Join,
     Lost,
     OwnerListens,
     PhysicsDiverged,
@@ -121,20 +120,6 @@ def test_a_clear_lifts_no_stop_that_its_sender_has_not_seen() -> None:
     assert t.authority.build_stop_reports() == ()
     op.does(EStop("again"))
     assert t.since(EStopChanged) == [EStopChanged(True, op.id, "again", 3)], "numbers go on"
-
-
-def test_the_stops_on_the_list_are_bounded_and_each_sender_is_there_once() -> None:
-    t, op, boss = playing()
-    crowd = [t.join("observer") for _ in range(20)]
-    for i in range(50):
-        t.step(*(p.says(EStop(f"stop {i}")) for p in crowd))
-    op.does(EStop("the last"))
-    stops = t.authority.build_stop_reports()
-    assert len(stops) == 16
-    assert len({s.participant for s in stops}) == 16
-    assert stops[0].reason == "the last"
-    assert t.authority.stop_seq == 1001
-    assert boss.asks(ClearEStop(1, 1001)).ok
 
 
 def test_pause_and_resume_rearm() -> None:
@@ -325,28 +310,6 @@ def test_release_acts_before_an_acquire_that_was_sent_earlier() -> None:
     assert [(r.request_id, r.ok) for r in other.replies()] == [(2, True), (1, False)]
     t.step(other.says(Release(3)), other.says(Acquire(4, ("right",))))
     assert [(r.request_id, r.ok) for r in other.replies()] == [(3, True), (4, True)]
-
-
-def test_one_who_was_just_given_up_still_stops_everything() -> None:
-    t, _, _ = playing()
-    lost = t.join()
-    t.step(Entry(lost.connection, lost.connection, t.now_ns, Lost("net")))
-    lost.does(EStop("from afar"))
-    assert t.hold() == "estop"
-    assert t.since(EStopChanged) == [EStopChanged(True, "", "from afar", 1)]
-    assert t.authority.build_stop_reports()[0].participant == ""
-
-
-def test_a_stop_that_comes_with_its_senders_hello_or_before_it_stops() -> None:
-    t = Table()
-    t.step(Entry(7, 0, t.now_ns, EStop()), Entry(7, 7, t.now_ns, Join("key", "operator", "anna")))
-    assert [a.connection for a in t.decision.admitted] == [7]
-    assert t.decision.estop
-    t = Table()
-    t.step(Entry(7, 0, t.now_ns, EStop()))
-    t.step(Entry(7, 7, t.now_ns, Join("key", "operator", "anna")))
-    assert t.decision.estop
-    assert [a.connection for a in t.decision.admitted] == [7]
 
 
 # --- another scene in a running session ---

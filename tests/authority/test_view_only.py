@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from iris_session.protocol.client_messages import Align, Grasp, TrackingEpoch
+from iris_session.protocol.client_messages import Align, TrackingEpoch
 from iris_session.protocol.entries import TipSolved
 from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentChanged, Notice, SamplesRejected, TipCalibrated
@@ -45,32 +45,6 @@ def test_it_shows_the_scene_and_drives_nothing(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_objects_are_denied_with_advice(kind: str) -> None:
-    t = Table()
-    anna = t.join(name="anna")
-    t.step(anna.says(view_only(kind)))
-    denial = anna.asks(Grasp(2, "hammer", "hand/left")).denial
-    assert denial is not None
-    assert denial.reason == DenialReason.VIEW_ONLY
-    assert "calibrated tip" in denial.advice or "calibrate the tip" in denial.advice
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_measurement_replaces_it_at_once_and_drives(kind: str) -> None:
-    t = Table()
-    anna = t.join(name="anna")
-    t.step(anna.says(view_only(kind)))
-    rest(t, anna, seconds=20.0)  # long enough for a correction to be announced
-    t.step(anna.says(proposal(T_world_tracking=yawed(0.1, 1.1))))
-    got = t.last(AlignmentChanged).alignment
-    assert got.kind == "measured"
-    anna.alignment_version = got.version
-    anna.acquire("left")
-    anna.engage("left")
-    assert t.command().sources
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_it_never_replaces_an_alignment_to_drive_with(kind: str) -> None:
     t = Table()
     anna, boss = t.operator("left", name="anna"), t.join("director")
@@ -84,14 +58,6 @@ def test_it_never_replaces_an_alignment_to_drive_with(kind: str) -> None:
     t.step(anna.says(view_only(kind, tracking_epoch=1)))
     assert t.last(AlignmentChanged).alignment.kind == kind, "of another frame nothing else is known"
     assert t.hold() == HoldReason.REARM
-
-
-def test_errors_are_bounded_too() -> None:
-    t = Table()
-    anna = t.join(name="anna")
-    t.step(anna.says(view_only("fingertip", covariance=covariance(0.05, 0.1))))
-    assert t.since(AlignmentChanged) == []
-    assert "at most 200 mm is allowed" in t.last(Notice).text
 
 
 def test_kinds_that_are_not_known_are_no_measurement() -> None:
