@@ -71,6 +71,38 @@ namespace IrisSession.Core
         public bool IsUrgent { get { return Kind <= AdviceKind.Unconfirmed; } }
     }
 
+    /// <summary>What of a scene and its cache a person may have to know. Never changes: another one replaces it.</summary>
+    public sealed class SceneFacts
+    {
+        public readonly SceneState State;
+
+        /// <summary>Why the specification cannot be had, for people; else empty.</summary>
+        public readonly string Failure;
+
+        /// <summary>Assets that could not be had.</summary>
+        public readonly int FailedCount;
+
+        /// <summary>Visuals that are left out because there would be too many draw calls.</summary>
+        public readonly int HiddenCount;
+
+        /// <summary>False when the scene exceeds the budget of the headset.</summary>
+        public readonly bool Fits;
+
+        /// <summary>`Kept`, or why the newest asset was not.</summary>
+        public readonly CacheResult Cache;
+
+        public SceneFacts(SceneFollower follower, CacheResult cache)
+        {
+            State = follower.State;
+            Failure = follower.Failure;
+            FailedCount = follower.FailedCount;
+            ScenePlan plan = follower.State == SceneState.Shown ? follower.Plan : null;
+            HiddenCount = plan == null ? 0 : plan.HiddenCount;
+            Fits = plan == null || plan.Fits;
+            Cache = cache;
+        }
+    }
+
     /// <summary>Collects what is wrong. Made once; for the thread of the connection.</summary>
     public sealed class ClientAdvice
     {
@@ -86,6 +118,7 @@ namespace IrisSession.Core
         private readonly ClientConnection connection;
         private readonly ClientAlignment alignment;
         private readonly Dictionary<string, string> holds = new Dictionary<string, string>();
+        private volatile SceneFacts scene;
         private long waitsSince = -1;
         private Denial denial;
         private long denialUntil;
@@ -99,11 +132,12 @@ namespace IrisSession.Core
         /// <summary>What the headset reports; null: nothing.</summary>
         public HeadsetState Headset { get; set; }
 
-        /// <summary>The scene; null: none is shown.</summary>
-        public SceneFollower Scene { get; set; }
-
-        /// <summary>The cache; null: there is none.</summary>
-        public AssetCache Cache { get; set; }
+        /// <summary>The scene; null: none is shown. May be set by any thread.</summary>
+        public SceneFacts Scene
+        {
+            get { return scene; }
+            set { scene = value; }
+        }
 
         /// <summary>Why the transport has no link, in words, as it says them; empty while it has one.</summary>
         public Phrase Link { get; set; } = new Phrase("", "");
@@ -244,16 +278,16 @@ namespace IrisSession.Core
 
         private void ListScene(List<Advice> advice)
         {
-            if (Scene != null && Scene.State == SceneState.Unreadable) Add(advice, AdviceKind.SceneUnreadable, new Phrase("the scene cannot be shown: " + Scene.Failure, "update the older of app and session"));
-            if (Scene != null && Scene.FailedCount > 0) Add(advice, AdviceKind.SceneIncomplete, new Phrase(Scene.FailedCount + " parts of the scene did not come", "join again to fetch them"));
-            if (Scene?.Plan != null && Scene.State == SceneState.Shown && !Scene.Plan.Fits)
+            SceneFacts now = scene;
+            if (now == null) return;
+            if (now.State == SceneState.Unreadable) Add(advice, AdviceKind.SceneUnreadable, new Phrase("the scene cannot be shown: " + now.Failure, "update the older of app and session"));
+            if (now.FailedCount > 0) Add(advice, AdviceKind.SceneIncomplete, new Phrase(now.FailedCount + " parts of the scene did not come", "join again to fetch them"));
+            if (!now.Fits)
             {
-                int hidden = Scene.Plan.HiddenCount;
-                Add(advice, AdviceKind.OverBudget, new Phrase(hidden > 0 ? hidden + " small things are not shown: the scene is too large for this headset" : "the scene is larger than this headset draws smoothly", "show fewer groups, or a simpler scene"));
+                Add(advice, AdviceKind.OverBudget, new Phrase(now.HiddenCount > 0 ? now.HiddenCount + " small things are not shown: the scene is too large for this headset" : "the scene is larger than this headset draws smoothly", "show fewer groups, or a simpler scene"));
             }
-            if (Cache == null) return;
-            if (Cache.State == CacheResult.Full) Add(advice, AdviceKind.CacheFull, new Phrase("the scene does not fit into the cache: it is fetched again at every start", "raise the limit of the cache in the settings of this app"));
-            if (Cache.State == CacheResult.Unwritable) Add(advice, AdviceKind.CacheUnwritable, new Phrase("the scene cannot be kept on this headset", "make room on it"));
+            if (now.Cache == CacheResult.Full) Add(advice, AdviceKind.CacheFull, new Phrase("the scene does not fit into the cache: it is fetched again at every start", "raise the limit of the cache in the settings of this app"));
+            if (now.Cache == CacheResult.Unwritable) Add(advice, AdviceKind.CacheUnwritable, new Phrase("the scene cannot be kept on this headset", "make room on it"));
         }
 
         private bool IsHeldFor(string reason)

@@ -313,7 +313,11 @@ namespace IrisSession.Transport
         private void Publish()
         {
             SceneProgress now = new SceneProgress(follower, loader, cache);
-            if (!now.IsSame(progress)) progress = now;
+            if (!now.IsSame(progress))
+            {
+                progress = now;
+                client.NoteScene(new SceneFacts(follower, cache.State));
+            }
             if (Volatile.Read(ref update) != null) return;
             SceneChanges next = follower.TakeChanges();
             if (next != null) Volatile.Write(ref update, new SceneUpdate(follower.Plan, next));

@@ -200,6 +200,12 @@ namespace IrisSession.Transport
             transport.Wake();
         }
 
+        /// <summary>Say how the scene is, so that advice has it. From any thread.</summary>
+        internal void NoteScene(SceneFacts facts)
+        {
+            loop.Advice.Scene = facts;
+        }
+
         private bool HasRoom()
         {
             if (calls.HasRoom) return true;

@@ -161,13 +161,14 @@ namespace IrisSession.Core.Tests
             scene.Follow(session.Client.Mirror, 0);
             byte[] bytes = Golden.FromHex(Golden.Load("scene")["scenes"].Items[0]["hex"].Text);
             scene.OnAsset(new string('a', 64), bytes, 0, bytes.Length);
-            ClientAdvice panel = new ClientAdvice(session.Client, new ClientAlignment(session.Client)) { Scene = scene };
+            ClientAdvice panel = new ClientAdvice(session.Client, new ClientAlignment(session.Client)) { Scene = new SceneFacts(scene, CacheResult.Full) };
             List<Advice> list = new List<Advice>();
             panel.List(session.NowNs, list);
-            Assert.AreEqual(new[] { AdviceKind.OverBudget }, list.Select(one => one.Kind));
+            Assert.AreEqual(new[] { AdviceKind.OverBudget, AdviceKind.CacheFull }, list.Select(one => one.Kind));
             session.SendEvent(new SceneChanged { SceneEpoch = 4, SceneHash = new string('b', 64), Cause = "patch" });
             scene.Follow(session.Client.Mirror, 0);
             scene.OnAsset(new string('b', 64), bytes, 0, 5);
+            panel.Scene = new SceneFacts(scene, CacheResult.Kept);
             panel.List(session.NowNs, list);
             Assert.AreEqual(new[] { AdviceKind.SceneUnreadable }, list.Select(one => one.Kind));
         }
