@@ -27,6 +27,10 @@ MOVE_MM: Final = 5.0
 #: A headset that stood still has a fresh state within it [ms].
 FRESH_MS: Final = 100.0
 STILL_S: Final = 3.0
+#: Draw calls of a frame that a Quest 3 can do.
+DRAW_CALLS: Final = 200
+#: What a body is drawn away from where the newest state has it, while the arms stand still [mm].
+DRAWN_MM: Final = 1.0
 
 
 class Headset:
@@ -156,6 +160,11 @@ def test_two_headsets_find_pair_align_and_move_arms(network: Network, start: Sta
     for headset in (ann, bob, ann):  # those who saw a sheet before are asked to glance at it once more
         aligned = headset.do("align")
         assert aligned["true_m"] <= aligned["stated_m"]
+    drawn = ann.do("draw")  # by the Unity layer on stand-ins of the engine
+    assert drawn["ok"], str(drawn)
+    assert 0 < drawn["draws"] <= DRAW_CALLS
+    assert drawn["error_mm"] <= DRAWN_MM, str(drawn)
+    assert drawn["people"] > 0
     assert bob.do("acquire south/left")["ok"]
     assert ann.do("until lease_changed")["what"] == "south/left by bob"
     denied = ann.do("acquire south/left")
@@ -166,6 +175,8 @@ def test_two_headsets_find_pair_align_and_move_arms(network: Network, start: Sta
         assert moved["error_mm"] <= MOVE_MM, str(moved)
     assert ann.do("estop")["ok"]
     assert bob.do("view")["stopped"]
+    network.server.close()
+    assert ann.do("draw dimmed")["dimmed"]
     assert [headset.end() for headset in (ann, bob)] == [1, 0]
 
 

@@ -1,3 +1,4 @@
 using System.Runtime.CompilerServices;
 
 [assembly: InternalsVisibleTo("IrisSession.Unity.StandinTests")]
+[assembly: InternalsVisibleTo("headless")]

@@ -8,7 +8,7 @@ using IrisSession.Protocol;
 using IrisSession.Transport;
 
 /// <summary>
-/// Commands of a headset: `join`, `scene` (until all of it is here), `align`, `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `measure SECONDS`, `body NAME`,
+/// Commands of a headset: `join`, `scene` (until all of it is here), `draw` (all of it by the Unity layer; instead of `scene`), `draw dimmed` (until the world is grey), `align`, `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `measure SECONDS`, `body NAME`,
 /// `view`, `wait SECONDS`, `until TEXT` (an event of this kind), `estop`, `quit`.
 /// </summary>
 internal sealed class Commands
@@ -22,6 +22,7 @@ internal sealed class Commands
     private readonly Report report;
     private readonly Options options;
     private int newsAt;
+    private Drawing drawing;
 
     public Commands(Headset headset, Report report, Options options)
     {
@@ -65,6 +66,7 @@ internal sealed class Commands
         {
             case "join": return Join();
             case "scene": return Scene();
+            case "draw": return Draw(words.Length > 1 ? words[1] : "");
             case "align": return Align();
             case "acquire": return Acquire(words[1]);
             case "release": return Release(words[1]);
@@ -139,6 +141,13 @@ internal sealed class Commands
             "scene", isDone, "state", scene.Progress.State.ToString(), "assets", count, "equal", right, "bytes", bytes, "fetched", scene.FetchedCount, "fetched_bytes", scene.FetchedBytes, "failed",
             scene.Progress.FailedCount, "parts", plan == null ? 0 : plan.Parts.Length, "text", scene.Progress.Text, "crash", scene.Crash);
         return isDone;
+    }
+
+    private bool Draw(string what)
+    {
+        drawing = drawing ?? new Drawing(headset);
+        bool wantsDimmed = what == "dimmed";
+        return drawing.Write(report, drawing.Run(() => drawing.IsDimmed == wantsDimmed));
     }
 
     /// <summary>Look at each sheet from one place after the other, as a person would, until the session has an alignment.</summary>
