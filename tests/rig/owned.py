@@ -13,8 +13,7 @@ from iris_session.session import processes
 from iris_session.session.stepper import Stepper
 from tests.rig.front import RigFrontProcess, install_front
 from tests.rig.journal import Journal
-from tests.rig.network import Network, RigClientSockets
-from tests.rig.session import _refuse_introduction as refuse_introduction
+from tests.rig.network import Network, RigClientSockets, refuse_introduction
 from tests.rig.simulation import Simulation, simulate_modules
 
 
