@@ -42,6 +42,9 @@ namespace IrisSession.Core
 
         /// <summary>A permission is missing; `Reason` is its name.</summary>
         Permission,
+
+        /// <summary>The headset finds no sheets by itself.</summary>
+        NoMarkers,
         SceneUnreadable,
         SceneIncomplete,
         OverBudget,
@@ -247,7 +250,8 @@ namespace IrisSession.Core
             if (Headset == null) return;
             if (!Headset.IsTracking) Add(advice, AdviceKind.TrackingLost, new Phrase("this headset does not know where it is", "look around slowly, with light on"));
             if (Headset.Focus == AppFocus.Covered) Add(advice, AdviceKind.Covered, new Phrase("a menu of the headset is open: robots hold", "close it, then open and close the clutch"));
-            if (!Headset.CanSeeSheets) Add(advice, AdviceKind.Permission, new Phrase("this app may not see sheets", "allow the camera and the room in the settings of the headset, or touch the marks of a sheet"), "sheets");
+            if (!Headset.HasMarkerSupport) Add(advice, AdviceKind.NoMarkers, new Phrase("this headset cannot find sheets by itself", "touch the marks of a sheet, or ask a director to place it"));
+            else if (!Headset.CanSeeSheets) Add(advice, AdviceKind.Permission, new Phrase("this app may not see sheets", "allow the camera and the room in the settings of the headset, or touch the marks of a sheet"), "sheets");
             if (Headset[HeadsetPermission.Hands] == PermissionState.Denied) Add(advice, AdviceKind.Permission, new Phrase("this app may not see hands", "use controllers, or allow it in the settings of the headset"), "hands");
         }
 

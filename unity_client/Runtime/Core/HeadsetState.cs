@@ -118,6 +118,9 @@ namespace IrisSession.Core
 
         public PermissionState this[HeadsetPermission permission] { get { return permissions[(int)permission]; } }
 
+        /// <summary>False on a headset that finds no sheets by itself, as its system says.</summary>
+        public bool HasMarkerSupport { get; set; } = true;
+
         /// <summary>True unless the wearer has refused every way in which sheets are found.</summary>
         public bool CanSeeSheets
         {

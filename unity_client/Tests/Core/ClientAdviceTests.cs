@@ -145,9 +145,11 @@ namespace IrisSession.Core.Tests
                 list.Select(one => one.Kind));
             Assert.AreEqual(HoldReason.Frozen, list[3].Reason);
             Assert.IsTrue(ClientAdvice.Wrap(list, 9).All(line => line.Length <= 44 && line.Trim() == line));
+            headset.HasMarkerSupport = false;
             panel.TakeFeedback(new Feedback { Robot = "left", HoldReason = HoldReason.Unconfirmed });
             panel.List(session.NowNs + 6 * FakeSession.Second, list);
-            Assert.IsTrue(list.Any(one => one.Kind == AdviceKind.Unconfirmed));
+            Assert.IsTrue(list.Any(one => one.Kind == AdviceKind.Unconfirmed) && list.Any(one => one.Kind == AdviceKind.NoMarkers));
+            Assert.AreEqual(1, list.Count(one => one.Kind == AdviceKind.Permission), "hands; which sheets it may see does not matter");
             Assert.IsFalse(list.Any(one => one.Kind == AdviceKind.Holding || one.Kind == AdviceKind.Denied));
         }
 
