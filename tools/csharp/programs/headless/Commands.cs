@@ -8,7 +8,9 @@ using IrisSession.Protocol;
 using IrisSession.Transport;
 
 /// <summary>
-/// Commands of a headset: `join`, `scene` (until all of it is here), `draw` (all of it by the Unity layer; instead of `scene`), `draw dimmed` (until the world is grey), `align`, `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `measure SECONDS`, `body NAME`,
+/// Commands of a headset: `join`, `scene` (until all of it is here), `draw` (all of it by the Unity layer; instead of `scene`), `draw dimmed`
+/// (until the world is grey), `align`, `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `media STREAM SECONDS` (counts
+/// frames of a cloud, cloth or picture, and decodes them), `measure SECONDS`, `body NAME`,
 /// `view`, `wait SECONDS`, `until TEXT` (an event of this kind), `estop`, `quit`.
 /// </summary>
 internal sealed class Commands
@@ -23,6 +25,7 @@ internal sealed class Commands
     private readonly Options options;
     private int newsAt;
     private Drawing drawing;
+    private ScenePlan scenePlan;
 
     public Commands(Headset headset, Report report, Options options)
     {
@@ -71,6 +74,7 @@ internal sealed class Commands
             case "acquire": return Acquire(words[1]);
             case "release": return Release(words[1]);
             case "move": return Move(words[1], new Double3(Number(words[2]), Number(words[3]), Number(words[4])));
+            case "media": return Media(words[1], Number(words[2]));
             case "measure": return Measure(Number(words[1]));
             case "body": return ShowBody(words[1]);
             case "view": return ShowView();
@@ -117,12 +121,12 @@ internal sealed class Commands
     private bool Scene()
     {
         SceneFetcher scene = headset.Scene;
-        ScenePlan plan = null;
         bool isComplete = headset.RunUntil(() =>
         {
-            plan = scene.TakeUpdate()?.Plan ?? plan;
-            return scene.Progress.IsComplete && (plan != null || scene.Progress.State != SceneState.Shown);
+            scenePlan = scene.TakeUpdate()?.Plan ?? scenePlan;
+            return scene.Progress.IsComplete && (scenePlan != null || scene.Progress.State != SceneState.Shown);
         }, 120.0);
+        ScenePlan plan = scenePlan;
         int right = 0;
         long bytes = 0;
         if (plan != null)
@@ -286,6 +290,55 @@ internal sealed class Commands
         return ages.Length > 0;
     }
 
+    /// <summary>Receive a stream, and decode what the core decodes.</summary>
+    private bool Media(string stream, double seconds)
+    {
+        Client.TryPost(loop => loop.SetMediaWishes(new[] { stream }));
+        MediaHeader header = new MediaHeader();
+        WireReader reader = new WireReader();
+        Multipart frame = new Multipart();
+        Cloud cloud = new Cloud();
+        DeformableDecoder cloth = MakeDeformableDecoder(stream);
+        int frames = 0;
+        int decoded = 0;
+        long points = 0;
+        string encoding = "";
+        long beganNs = 0;
+        bool isThere = headset.RunUntil(() =>
+        {
+            while (Client.TryTakeMedia(ref frame))
+            {
+                if (frames == 0) beganNs = MonotonicClock.NowNs;
+                frames++;
+                reader.Reset(frame.Buffer, frame.OffsetOf(1), frame.LengthOf(1));
+                reader.ReadInto(header);
+                encoding = header.Encoding;
+                if (encoding == MediaEncoding.Cloud) cloud.Decode(frame.Buffer, frame.OffsetOf(2), frame.LengthOf(2));
+                else if (encoding == MediaEncoding.Deformable && cloth != null) cloth.Decode(frame.Buffer, frame.OffsetOf(2), frame.LengthOf(2));
+                else continue;
+                decoded++;
+                points = encoding == MediaEncoding.Cloud ? cloud.Count : cloth.Topology.VertexCount;
+            }
+            return frames > 0 && MonotonicClock.NowNs - beganNs > seconds * 1e9;
+        });
+        Client.TryPost(loop => loop.SetMediaWishes(new string[0]));
+        report.Write("media", isThere, "stream", stream, "encoding", encoding, "frames", frames, "hz", frames / Math.Max(seconds, 1e-3), "decoded", decoded, "points", points, "class", header.BudgetClass);
+        return isThere;
+    }
+
+    private DeformableDecoder MakeDeformableDecoder(string stream)
+    {
+        if (scenePlan == null) return null;
+        foreach (Deformable deformable in scenePlan.Deformables)
+        {
+            byte[] bytes = deformable.Stream == stream ? headset.Scene.Find(deformable.Address) : null;
+            if (bytes == null) continue;
+            byte[] plan = new ArrayDecoder().Decode(bytes).RequireBytes(ArrayName.Plan, ArrayAsset.Any);
+            return new DeformableDecoder(new DeformableTopology(plan, 0, plan.Length), new Inflater());
+        }
+        return null;
+    }
+
     private bool ShowBody(string name)
     {
         SessionView view = Client.View;
@@ -305,10 +358,12 @@ internal sealed class Commands
     {
         SessionView view = Client.View;
         List<string> ours = new List<string>();
+        List<string> streams = new List<string>();
+        if (view.Budget != null) foreach (StreamBudget one in view.Budget.Streams) streams.Add(one.Stream + " " + one.BudgetClass);
         foreach (Lease lease in view.Leases.Values) if (view.IsOurs(lease.Target)) ours.Add(lease.Target);
         report.Write(
             "view", true, "phase", view.Phase.ToString(), "text", view.Text, "ours", ours.ToArray(), "alignment", view.AlignmentState.ToString(), "event_seq", view.EventSeq, "scene", view.SceneHash,
-            "stopped", view.IsStopped, "epoch", view.Welcome == null ? 0 : view.Welcome.ConnectionEpoch, "resumed", view.Welcome != null && view.Welcome.Resumed, "crash", Client.Crash);
+            "streams", streams.ToArray(), "stopped", view.IsStopped, "epoch", view.Welcome == null ? 0 : view.Welcome.ConnectionEpoch, "resumed", view.Welcome != null && view.Welcome.Resumed, "crash", Client.Crash);
         return true;
     }
 

@@ -23,23 +23,33 @@ internal static class Finder
         }
         else
         {
-            PairingLink link;
-            try
-            {
-                link = PairingLink.Parse(options.Address);
-            }
-            catch (ClientException error)
-            {
-                report.Write("find", false, "text", error.Message);
-                return null;
-            }
-            endpoint = new WebEndpoint(link.IsEncrypted, link.Host, link.WebPort);
-            if (code.Length == 0) code = link.Code;
+            endpoint = FindByAddress(options.Address, report, ref code);
+            if (endpoint == null) return null;
         }
         byte[] pin = endpoint.IsSecure ? identity.FindPin(endpoint.Authority) : null;
         if (pin != null) endpoint = endpoint.WithPin(pin);
         if (code.Length > 0) endpoint = Pair(endpoint, code, options, identity, report);
         return endpoint == null ? null : new[] { endpoint };
+    }
+
+    private static WebEndpoint FindByAddress(string address, Report report, ref string code)
+    {
+        PairingLink link;
+        try
+        {
+            link = PairingLink.Parse(address);
+        }
+        catch (ClientException error)
+        {
+            report.Write("find", false, "text", error.Message);
+            return null;
+        }
+        if (code.Length == 0) code = link.Code;
+        GatewayFinder finder = new GatewayFinder(link);
+        finder.Start();
+        while (!finder.IsDone) Thread.Sleep(5);
+        if (finder.Endpoint == null) report.Write("find", false, "text", finder.End.Text);
+        return finder.Endpoint;
     }
 
     private static WebEndpoint FindByBeacon(Report report)
