@@ -145,6 +145,9 @@ namespace IrisSession.Core
         /// <summary>Why the transport has no link, in words, as it says them; empty while it has one.</summary>
         public Phrase Link { get; set; } = new Phrase("", "");
 
+        /// <summary>True when there is no link because the other end speaks another version.</summary>
+        public bool IsLinkOfOtherVersion { get; set; }
+
         /// <summary>`T_tracking_head`, for the distance to a sheet; null: not known.</summary>
         public RigidTransform? Head { get; set; }
 
@@ -235,7 +238,7 @@ namespace IrisSession.Core
                 Add(advice, isVersion ? AdviceKind.OtherVersion : AdviceKind.Refused, Words.OfRefusal(failure), failure.Code);
                 return;
             }
-            if (Link.What.Length > 0) Add(advice, AdviceKind.Link, Link);
+            if (Link.What.Length > 0) Add(advice, IsLinkOfOtherVersion ? AdviceKind.OtherVersion : AdviceKind.Link, Link);
             else if (!connection.IsJoined)
             {
                 Refused passing = connection.RetryableRefusal;

@@ -2,6 +2,7 @@
 // that every reason of the protocol has words.
 using System.Collections.Generic;
 using System.Globalization;
+using System.Text;
 using IrisSession.Protocol;
 
 namespace IrisSession.Core
@@ -172,6 +173,22 @@ namespace IrisSession.Core
 
         /// <summary>What is wrong with a media stream: a `StreamFault`.</summary>
         public static Phrase OfStream(string fault) { return Find(Streams, fault); }
+
+        /// <summary>Return a text of others on one line, cut to so many characters.</summary>
+        public static string ToLine(string text, int most = 160)
+        {
+            StringBuilder line = new StringBuilder();
+            foreach (char c in text)
+            {
+                if (line.Length == most)
+                {
+                    line.Append("...");
+                    break;
+                }
+                line.Append(char.IsControl(c) || c == '\u2028' || c == '\u2029' ? ' ' : c);
+            }
+            return line.ToString();
+        }
 
         /// <summary>Return a length such as `7.5 mm`, `12 cm`, `1.4 m`.</summary>
         public static string FormatLength(double metres)

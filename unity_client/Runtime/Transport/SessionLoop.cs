@@ -187,7 +187,10 @@ namespace IrisSession.Transport
         /// <summary>List what is wrong into `advice`, the most urgent first.</summary>
         public void ListAdvice(List<Advice> advice)
         {
-            Advice.Link = new Phrase(Problem.Failure == LinkFailure.None ? "" : Problem.Text, "");
+            bool showsLast = Problem.Failure == LinkFailure.None && !Connection.IsJoined && Connection.RetryableRefusal == null;
+            LinkEnd shown = showsLast ? LastEnd : Problem;
+            Advice.Link = LinkWords.OfEnd(shown);
+            Advice.IsLinkOfOtherVersion = shown.Failure == LinkFailure.Closed && shown.Code == CloseCode.Version;
             Advice.List(getNowNs(), advice);
         }
 

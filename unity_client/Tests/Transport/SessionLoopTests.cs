@@ -81,8 +81,10 @@ namespace IrisSession.Transport.Tests
                 rig.NowNs += Ms;
             }
             Assert.That(rig.Transport.Opened.Count, Is.InRange(60, 200)); // a gateway that restarts is back within seconds
+            Assert.AreEqual(AdviceKind.Link, FirstAdvice(rig));
             rig.Run(2 * Second);
             Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
+            Assert.AreNotEqual(AdviceKind.Link, FirstAdvice(rig));
         }
 
         [Test]
@@ -108,6 +110,7 @@ namespace IrisSession.Transport.Tests
             rig.Run(30 * Second);
             Assert.AreEqual(1, rig.Transport.Opened.Count);
             Assert.AreEqual(code, rig.Loop.Problem.Code);
+            Assert.AreEqual(code == CloseCode.Version ? AdviceKind.OtherVersion : AdviceKind.Link, FirstAdvice(rig));
             rig.Loop.Open();
             rig.Run(200 * Ms);
             Assert.AreEqual(ConnectionPhase.Ready, rig.Phase);
@@ -287,6 +290,13 @@ namespace IrisSession.Transport.Tests
             rig.Transport.IsFull = false;
             rig.Loop.Step();
             Assert.AreEqual(1, rig.Transport.Sent.Count(each => each.Message is EStop));
+        }
+
+        private static AdviceKind FirstAdvice(LoopRig rig)
+        {
+            List<Advice> advice = new List<Advice>();
+            rig.Loop.ListAdvice(advice);
+            return advice[0].Kind;
         }
 
         [Test]
