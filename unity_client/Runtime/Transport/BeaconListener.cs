@@ -66,7 +66,7 @@ namespace IrisSession.Transport
                     while (!interrupt.IsSet) if (socket.Poll(1000 * LookMs, SelectMode.SelectRead)) Receive(socket, bytes);
                 }
             }
-            catch (Exception error) when (error is SocketException || error is ObjectDisposedException)
+            catch (Exception error)
             {
                 problem = error.Message;
             }

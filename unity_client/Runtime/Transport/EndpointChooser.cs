@@ -138,7 +138,7 @@ namespace IrisSession.Transport
 
         /// <summary>Process the answer to a probe. Returns whether the connection is to be moved there.</summary>
         /// <param name="answer">Of the address that <see cref="TakeProbe"/> returned.</param>
-        /// <param name="sessionId">The session that we are in.</param>
+        /// <param name="sessionId">The session that we are in; empty: in none now, so nothing moves.</param>
         /// <param name="nowNs">A monotonic clock.</param>
         public bool OnProbe(ProbeAnswer answer, string sessionId, long nowNs)
         {
@@ -148,7 +148,7 @@ namespace IrisSession.Transport
             candidates[probed].ProbeAt = nowNs + ProbeNs;
             LinkFailure failure = answer.End.Failure;
             if (failure == LinkFailure.UnknownCertificate || failure == LinkFailure.WrongCertificate) candidates[probed].Blocked = answer.End;
-            if (failure != LinkFailure.None || answer.SessionId != sessionId) return false;
+            if (failure != LinkFailure.None || sessionId.Length == 0 || answer.SessionId != sessionId) return false;
             at = probed;
             candidates[at].IsMovedTo = true;
             Moves++;

@@ -52,7 +52,7 @@ namespace IrisSession.Transport
             {
                 if (link.ControlPort > 1) Introduction = ReadIntroduction();
             }
-            catch (Exception error) when (HttpConnection.IsOfConnection(error) || error is DecodeException)
+            catch (Exception)
             {
                 // not there, or of an older session: its gateway may be where gateways usually are
             }

@@ -68,7 +68,7 @@ namespace IrisSession.Transport
             {
                 end = error.End;
             }
-            catch (Exception error) when (HttpConnection.IsOfConnection(error))
+            catch (Exception error) // of whatever kind: see WebSocketLink
             {
                 end = new LinkEnd(LinkFailure.Unreachable, 0, error.Message);
             }

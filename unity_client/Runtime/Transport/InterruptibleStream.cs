@@ -25,6 +25,7 @@ namespace IrisSession.Transport
         private readonly Interrupt interrupt;
         private readonly Socket socket;
         private volatile bool isShutDown;
+        private long deadlineNs = long.MaxValue;
 
         private InterruptibleStream(Socket socket, Interrupt interrupt)
         {
@@ -33,7 +34,11 @@ namespace IrisSession.Transport
         }
 
         /// <summary>Time at which reads and writes fail [ns of the monotonic clock]; `long.MaxValue` for never.</summary>
-        public long DeadlineNs { get; set; } = long.MaxValue;
+        public long DeadlineNs
+        {
+            get { return Interlocked.Read(ref deadlineNs); }
+            set { Interlocked.Exchange(ref deadlineNs, value); }
+        }
 
         public override bool CanRead { get { return true; } }
 

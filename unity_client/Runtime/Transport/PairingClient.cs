@@ -144,13 +144,25 @@ namespace IrisSession.Transport
             PairingResult found = null;
             for (int attempt = 1; found == null; attempt++)
             {
-                found = Attempt();
+                found = TryAttempt();
                 bool isRate = found.Outcome == PairingOutcome.Refused && found.Refusal.Code == RefusalCode.Rate;
                 if (!isRate || attempt == Attempts) break;
                 lock (gate) if (!isStopping) Monitor.Wait(gate, RatePauseMs);
                 if (!isStopping) found = null;
             }
             result = found;
+        }
+
+        private PairingResult TryAttempt()
+        {
+            try
+            {
+                return Attempt();
+            }
+            catch (Exception error) // a defect of ours, or what the runtime lacks: the app goes on
+            {
+                return new PairingResult(PairingOutcome.NoAnswer, end: new LinkEnd(LinkFailure.Protocol, 0, error.Message));
+            }
         }
 
         private PairingResult Attempt()

@@ -43,16 +43,17 @@ namespace IrisSession.Transport
                 loop.Close();
                 PublishView();
             }
-            finally
+            catch (Exception error)
             {
-                transport.Dispose();
+                crash += error;
             }
+            transport.Dispose();
         }
 
         private void TakeCalls()
         {
             EStop pressed = Interlocked.Exchange(ref stop, null);
-            if (pressed != null) Guard(() => loop.Connection.Send(pressed));
+            if (pressed != null) Press(pressed);
             while (calls.HasNews)
             {
                 SessionCall call = calls.Oldest;
@@ -91,11 +92,11 @@ namespace IrisSession.Transport
             }
         }
 
-        private void Guard(Action action)
+        private void Press(EStop pressed)
         {
             try
             {
-                action();
+                loop.Connection.Send(pressed);
             }
             catch (ClientException error)
             {

@@ -125,7 +125,9 @@ namespace IrisSession.Transport
         {
             isStopping = true;
             transport.Wake();
-            return (thread.ThreadState & ThreadState.Unstarted) != 0 || thread.Join(StopMs);
+            if ((thread.ThreadState & ThreadState.Unstarted) == 0) return thread.Join(StopMs);
+            transport.Dispose();
+            return true;
         }
 
         /// <summary>Take the newest state as <see cref="State"/>. False: it is that already.</summary>

@@ -253,8 +253,8 @@ namespace IrisSession.Transport
             long nowNs = getNowNs();
             if (Transport.TryTakeProbe(out ProbeAnswer answer))
             {
-                bool moves = Connection.IsJoined && Endpoints.OnProbe(answer, Connection.Welcome.SessionId, nowNs);
-                if (moves)
+                bool isBetter = Endpoints.OnProbe(answer, Connection.IsJoined ? Connection.Welcome.SessionId : "", nowNs);
+                if (isBetter)
                 {
                     keepsAddress = true;
                     Connection.HandleDisconnect(nowNs);

@@ -27,7 +27,9 @@ namespace IrisSession.Transport
         public const int MaxWaitingBytes = 64 << 10;
 
         private const int ReadBytes = 64 << 10;
-        private const int KeptBytes = 64 << 10;
+
+        /// <summary>Buffers of messages above this size are not used again: state of 65,535 bodies and most media frames have less.</summary>
+        private const int KeptBytes = 2 << 20;
 
         /// <summary>Time for the last messages and the close frame of a link that ends [ns].</summary>
         private const long DefaultLingerNs = 300_000_000;
@@ -156,7 +158,7 @@ namespace IrisSession.Transport
             {
                 End = error.End;
             }
-            catch (Exception error) when (HttpConnection.IsOfConnection(error))
+            catch (Exception error) // whatever a runtime's TLS throws when it is ended: it must not end the app
             {
                 End = new LinkEnd(LinkFailure.Unreachable, 0, error.Message);
             }
@@ -292,9 +294,9 @@ namespace IrisSession.Transport
                     spare = bytes.Length <= 2 * MaxWaitingBytes ? bytes : new byte[4096];
                 }
             }
-            catch (Exception error) when (HttpConnection.IsOfConnection(error))
+            catch (Exception)
             {
-                // the thread that reads finds the same
+                // the thread that reads finds the same, and says so
             }
             lock (gate)
             {

@@ -195,6 +195,26 @@ namespace IrisSession.Transport.Tests
         }
 
         [Test]
+        public void AnAnswerThatComesBetweenConnectionsMovesNothingAndProbesGoOn()
+        {
+            LoopRig rig = new LoopRig(Cable, Wifi);
+            rig.Loop.Open();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(3 * Second);
+            Assert.AreEqual(1, rig.Transport.Probes.Count);
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Transport.ProbeAnswers.Enqueue(new ProbeAnswer(Cable, default, "s1"));
+            rig.Loop.Step(); // lost, and an answer at the same time
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(5 * Second);
+            Assert.AreSame(Wifi, rig.Transport.Newest);
+            Assert.AreEqual(2, rig.Transport.Probes.Count);
+            Assert.AreEqual(0, rig.Endpoints.Moves);
+        }
+
+        [Test]
         public void NothingMovesWhileARobotFollows()
         {
             LoopRig rig = new LoopRig(Cable, Wifi);

@@ -363,7 +363,7 @@ internal sealed class Commands
         foreach (Lease lease in view.Leases.Values) if (view.IsOurs(lease.Target)) ours.Add(lease.Target);
         report.Write(
             "view", true, "phase", view.Phase.ToString(), "text", view.Text, "ours", ours.ToArray(), "alignment", view.AlignmentState.ToString(), "event_seq", view.EventSeq, "scene", view.SceneHash,
-            "streams", streams.ToArray(), "stopped", view.IsStopped, "epoch", view.Welcome == null ? 0 : view.Welcome.ConnectionEpoch, "resumed", view.Welcome != null && view.Welcome.Resumed, "crash", Client.Crash);
+            "endpoint", view.Endpoint == null ? "" : view.Endpoint.ToString(), "streams", streams.ToArray(), "stopped", view.IsStopped, "epoch", view.Welcome == null ? 0 : view.Welcome.ConnectionEpoch, "resumed", view.Welcome != null && view.Welcome.Resumed, "crash", Client.Crash);
         return true;
     }
 

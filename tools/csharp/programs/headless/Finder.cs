@@ -14,22 +14,19 @@ internal static class Finder
     /// <summary>Return where the session is, null when it is nowhere or does not let us in.</summary>
     public static WebEndpoint[] Find(Options options, FileIdentityStore identity, Report report)
     {
-        WebEndpoint endpoint;
-        string code = options.Code;
-        if (options.Address.Length == 0)
+        List<WebEndpoint> endpoints = new List<WebEndpoint>();
+        foreach (string address in options.Address.Split(','))
         {
-            endpoint = FindByBeacon(report);
+            string code = options.Code;
+            WebEndpoint endpoint = address.Length == 0 ? FindByBeacon(report) : FindByAddress(address, report, ref code);
             if (endpoint == null) return null;
-        }
-        else
-        {
-            endpoint = FindByAddress(options.Address, report, ref code);
+            byte[] pin = endpoint.IsSecure ? identity.FindPin(endpoint.Authority) : null;
+            if (pin != null) endpoint = endpoint.WithPin(pin);
+            if (code.Length > 0 && endpoint.IsSecure) endpoint = Pair(endpoint, code, options, identity, report);
             if (endpoint == null) return null;
+            endpoints.Add(endpoint);
         }
-        byte[] pin = endpoint.IsSecure ? identity.FindPin(endpoint.Authority) : null;
-        if (pin != null) endpoint = endpoint.WithPin(pin);
-        if (code.Length > 0) endpoint = Pair(endpoint, code, options, identity, report);
-        return endpoint == null ? null : new[] { endpoint };
+        return endpoints.ToArray();
     }
 
     private static WebEndpoint FindByAddress(string address, Report report, ref string code)

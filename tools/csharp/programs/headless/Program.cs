@@ -1,6 +1,6 @@
 // A client without engine and screen: joins a session over the web wire as a headset app does, and does what it is asked to.
 //
-//     headless run [--address ADDRESS] [--code CODE] [--identity FOLDER] [--name NAME] [--role ROLE] [--trust FINGERPRINT]
+//     headless run [--address ADDRESS[,ADDRESS]] [--code CODE] [--identity FOLDER] [--name NAME] [--role ROLE] [--trust FINGERPRINT]
 //                  [--json] [--do "COMMAND; COMMAND"]
 //
 // Without --do, commands are lines of its input; see Commands.cs. Exit status: 0 when all of them succeeded, 1 when one failed, 2 when
