@@ -9,11 +9,12 @@ import pytest
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.authority.config import SpeedLimit
 from iris_session.protocol.client_messages import Acquire, Bye, Heartbeat, Marker, Release
+from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, Lost
 from iris_session.protocol.server_messages import MarkerAdded, SamplesRejected, Snapshot
 from iris_session.protocol.specs import ObjectSpec
 
-from .table import Table, make_view, robot
+from .table import Table, make_view, proposal, robot
 
 
 def test_release_and_lost_act_in_the_step_they_arrive_in_behind_any_flood() -> None:
@@ -64,6 +65,24 @@ def test_strangers_and_wrong_envelopes_are_answered() -> None:
 
 def snapshots(t: Table) -> list[Snapshot]:
     return [o.message for o in t.decision.outgoing if isinstance(o.message, Snapshot)]
+
+
+def test_presence_is_in_the_world_and_only_of_the_aligned() -> None:
+    t = Table()
+    anna, watcher = t.operator("left"), t.join("observer")
+    watcher.sends(device="head")
+    assert t.decision.presence == ()
+    t.step(watcher.says(proposal()))
+    t.step(
+        watcher.says(watcher.sample(device="head")),
+        watcher.says(watcher.sample(device="head", p=(0.01, 0.0, 1.0))),
+        anna.says(anna.sample("left")),
+    )
+    shown = {(i.participant, i.device): i.pose for i in t.decision.presence}
+    assert shown[(watcher.id, "head")] == Pose((1.01, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+    assert shown.keys() == {(watcher.id, "head"), (anna.id, "controller/right")}
+    t.step()
+    assert t.decision.presence == ()
 
 
 @pytest.mark.parametrize(

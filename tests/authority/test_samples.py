@@ -128,6 +128,14 @@ def test_old_or_future_receive_time() -> None:
         assert t.since(SamplesRejected)[0].reason == reason
 
 
+def test_capture_after_receipt_is_from_the_future() -> None:
+    t, op = engaged()
+    t.step(dt_ns=20 * MS)
+    s = op.sample("left", clutch=True)
+    t.step(Entry(op.connection, op.connection, t.now_ns - 6 * MS, s))
+    assert t.since(SamplesRejected)[0].reason == "future"
+
+
 def test_another_connection_cannot_speak_for_a_participant() -> None:
     t, op = engaged()
     s = op.sample("left", scene_epoch=9)
@@ -242,6 +250,24 @@ def test_capture_times_that_go_back_and_forth_make_no_time_for_a_jump() -> None:
     assert t.command().kind == "pose"
     anna.sends("left", clutch=True, p=(0.9, 0.0, 1.0))
     assert t.hold() == "jump"
+
+
+@pytest.mark.parametrize(
+    "between",
+    [
+        {"kind": "twist", "pose": None, "twist": (0.0,) * 6},
+        {"tracked": False},
+        {"worn": False},
+        {"tracked": False, "pose": None},
+    ],
+)
+def test_nothing_sent_in_between_makes_a_jump_possible(between: dict[str, Any]) -> None:
+    t, op = engaged()
+    op.sends(**between)
+    op.sends("left", clutch=True, p=(0.9, 0.0, 1.0))
+    assert t.command().kind == "hold"
+    op.engage("left")
+    assert t.command().kind == "pose"
 
 
 def test_a_hand_that_was_not_tracked_for_a_while_may_be_elsewhere() -> None:

@@ -10,6 +10,7 @@ from iris_session.protocol.client_messages import Acquire, ClearEStop, Control, 
 from iris_session.protocol.entries import (
     Entry,
     ExternalReset,
+    Join,
     Lost,
     OwnerListens,
     PhysicsDiverged,
@@ -310,6 +311,18 @@ def test_release_acts_before_an_acquire_that_was_sent_earlier() -> None:
     assert [(r.request_id, r.ok) for r in other.replies()] == [(2, True), (1, False)]
     t.step(other.says(Release(3)), other.says(Acquire(4, ("right",))))
     assert [(r.request_id, r.ok) for r in other.replies()] == [(3, True), (4, True)]
+
+
+def test_a_stop_that_comes_with_its_senders_hello_or_before_it_stops() -> None:
+    t = Table()
+    t.step(Entry(7, 0, t.now_ns, EStop()), Entry(7, 7, t.now_ns, Join("key", "operator", "anna")))
+    assert [a.connection for a in t.decision.admitted] == [7]
+    assert t.decision.estop
+    t = Table()
+    t.step(Entry(7, 0, t.now_ns, EStop()))
+    t.step(Entry(7, 7, t.now_ns, Join("key", "operator", "anna")))
+    assert t.decision.estop
+    assert [a.connection for a in t.decision.admitted] == [7]
 
 
 # --- another scene in a running session ---

@@ -138,6 +138,13 @@ def test_a_surprise_does_not_engage_and_an_open_clutch_counts_at_once() -> None:
     assert t.hold() == "clutch_open"
 
 
+def test_a_jump_in_a_sample_that_names_no_robot_ends_the_engagement_too() -> None:
+    t, op = drive()
+    t.step(dt_ns=SECOND // 72)
+    op.sends(p=(0.5, 0.0, 1.0), clutch=True)
+    assert t.hold() == "jump"
+
+
 @pytest.mark.parametrize("frozen", ["controller/right", "head"])
 def test_a_device_that_freezes_holds_after_half_a_second(frozen: str) -> None:
     t, op = drive()

@@ -45,6 +45,21 @@ def test_it_shows_the_scene_and_drives_nothing(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_measurement_replaces_it_at_once_and_drives(kind: str) -> None:
+    t = Table()
+    anna = t.join(name="anna")
+    t.step(anna.says(view_only(kind)))
+    rest(t, anna, seconds=20.0)  # long enough for a correction to be announced
+    t.step(anna.says(proposal(T_world_tracking=yawed(0.1, 1.1))))
+    got = t.last(AlignmentChanged).alignment
+    assert got.kind == "measured"
+    anna.alignment_version = got.version
+    anna.acquire("left")
+    anna.engage("left")
+    assert t.command().sources
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_it_never_replaces_an_alignment_to_drive_with(kind: str) -> None:
     t = Table()
     anna, boss = t.operator("left", name="anna"), t.join("director")
