@@ -24,7 +24,8 @@ MANUAL: Final = HERE / "unity_manual.json"
 #: Layer -> package -> versions in which a member must be there; of packages that are not listed, the primary one.
 TARGETS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "unity": {"engine": ("6000.0.78f1", "6000.3.19f1")},
-    "hololens": {"engine": ("2022.3.76f1",)},
+    "unity.input": {"engine": ("2022.3.76f1", "6000.0.78f1", "6000.3.19f1")},
+    "hololens": {"engine": ("2022.3.76f1",), "com.unity.xr.arfoundation": ("5.1.6",)},
 }
 _ALIASES: Final = {
     "Boolean": "bool", "Byte": "byte", "SByte": "sbyte", "Int16": "short", "UInt16": "ushort", "Int32": "int",
@@ -101,7 +102,7 @@ class Api:
             return
         entries = found.get(section, ()) if section == "ctors" else found.get(section, {}).get(name, ())
         if section == "ctors" and "ctors" not in found and "class" in found["kind"] and "static" not in found["kind"]:
-            entries = ["()"]  # the compiler makes it
+            entries = ["protected ()" if "abstract" in found["kind"] else "()"]  # the compiler makes it
         yield from ((kind, str(entry)) for entry in ([entries] if isinstance(entries, str | int) else entries))
         if section not in ("ctors", "values"):
             for base in found.get("base", ()):
@@ -156,10 +157,12 @@ class Api:
         kind, _, bases = member.signature.partition(" : ")
         if kind.startswith("delegate"):
             kind = "delegate"
-        if kind != found["kind"]:
+        if kind != found["kind"].removeprefix("readonly "):
             return f"{member}: it is a {found['kind']}"
         known = {write_plainly("types", base) for base in found.get("base", ())}
-        others = [base for base in bases.split(", ") if base and write_plainly("types", base) not in known]
+        others = [
+            base for base in re.split(r", (?![^<]*>)", bases) if base and write_plainly("types", base) not in known
+        ]
         return f"{member}: it is no {', '.join(others)}" if others else ""
 
 
@@ -190,8 +193,9 @@ def find_problems(api: Api, assemblies: Mapping[str, list[Member]]) -> list[str]
         for member in members:
             targets = [target for target in TARGETS if f".{target}" in name.lower()] or list(TARGETS)
             problems = [api.find_problem(member, target) for target in targets]
-            if all(problems):  # stand-ins are for any layer
-                found.append(problems[0])
+            named = any(f".{target}" in name.lower() for target in TARGETS)
+            if (any if named else all)(problems):  # stand-ins are for any layer
+                found.append(next(filter(None, problems)))
     return found
 
 

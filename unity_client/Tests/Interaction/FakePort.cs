@@ -5,7 +5,7 @@ using IrisSession.Protocol;
 
 namespace IrisSession.Interaction.Tests
 {
-    internal sealed class FakePort : ISessionPort
+    public sealed class FakePort : ISessionPort
     {
         public const long SessionOffset = 5_000_000_000;
         public readonly List<ClientMessage> Requests = new List<ClientMessage>();
@@ -98,7 +98,7 @@ namespace IrisSession.Interaction.Tests
     }
 
     /// <summary>Two arms of three links, each 0.3 m long and upright: left at y = 0.3, right at y = -0.3, one metre ahead.</summary>
-    internal sealed class FakeBodies : IBodies
+    public sealed class FakeBodies : IBodies
     {
         public long FindParent(long body) { return body % 10 > 1 ? body - 1 : 0; }
 
@@ -109,14 +109,14 @@ namespace IrisSession.Interaction.Tests
         }
     }
 
-    internal sealed class FakeHaptics : IHaptics
+    public sealed class FakeHaptics : IHaptics
     {
         public readonly List<KeyValuePair<Side, Pulse>> Played = new List<KeyValuePair<Side, Pulse>>();
 
         public void Play(Side side, Pulse pulse) { Played.Add(new KeyValuePair<Side, Pulse>(side, pulse)); }
     }
 
-    internal sealed class FakeMarkers : IMarkerSource
+    public sealed class FakeMarkers : IMarkerSource
     {
         public readonly List<MarkerReport> Now = new List<MarkerReport>();
         public bool IsActive;
@@ -136,7 +136,7 @@ namespace IrisSession.Interaction.Tests
     }
 
     /// <summary>A headset whose wearer holds two controllers and points at the robots with them.</summary>
-    internal sealed class Wearer
+    public sealed class Wearer
     {
         public const long FrameNs = 14_000_000;
         public readonly FakePort Session = new FakePort();

@@ -1,0 +1,258 @@
+// The input layer on stand-ins: devices are read in the axes of the wire, and panels stand where the core says.
+using System.Collections.Generic;
+using IrisSession.Core;
+using IrisSession.Interaction;
+using IrisSession.Interaction.Tests;
+using IrisSession.Protocol;
+using IrisSession.Transport;
+using IrisSession.Unity.ArFoundation;
+using IrisSession.Unity.Input;
+using NUnit.Framework;
+using Standins;
+using Unity.XR.CoreUtils;
+using UnityEngine;
+using UnityEngine.XR;
+using UnityEngine.XR.ARFoundation;
+using UnityEngine.XR.ARSubsystems;
+using UnityEngine.XR.Hands;
+using EnginePose = UnityEngine.Pose;
+
+namespace IrisSession.Unity.StandinTests
+{
+    [TestFixture]
+    public sealed class InputTests
+    {
+        [SetUp]
+        public void Begin()
+        {
+            Engine.Reset();
+            Controls.Clear();
+            Subsystems.Running.Clear();
+            SystemInfo.Battery = -1f;
+            SystemInfo.Status = BatteryStatus.Unknown;
+        }
+
+        [Test]
+        public void ControllersAreReadInTheAxesOfTheWire()
+        {
+            SetPose("<XRHMD>/", "centerEyePosition", "centerEyeRotation", new Vector3(0.1f, 1.6f, 0.2f), Quaternion.AngleAxis(90f, Vector3.up));
+            SetPose("<XRController>{RightHand}/", "devicePosition", "deviceRotation", new Vector3(0.3f, 1.2f, 0.5f), Quaternion.AngleAxis(40f, Vector3.right));
+            Controls.Set("<XRController>{RightHand}/pointerPosition", new Vector3(0.3f, 1.25f, 0.55f));
+            Controls.Set("<XRController>{RightHand}/pointerRotation", Quaternion.AngleAxis(90f, Vector3.up)); // points to the right
+            Controls.Set("<XRController>{RightHand}/trigger", 0.75f);
+            Controls.Set("<XRController>{RightHand}/grip", 0.25f);
+            Controls.Set("<XRController>{RightHand}/thumbstickClicked", 1f);
+            using (ControlReader reader = new ControlReader(ControlNames.Controllers))
+            {
+                HeadsetReading reading = new HeadsetReading();
+                reader.Read(reading);
+                AssertNear(new Double3(0.2, -0.1, 1.6), reading.Head.Position);
+                AssertNear(new Double3(0, -1, 0), reading.Head.Rotation.Rotate(new Double3(1, 0, 0))); // looks to the right
+                InputReading right = reading[Side.Right];
+                Assert.AreEqual(InputKind.Controller, right.Kind);
+                AssertNear(new Double3(0.5, -0.3, 1.2), right.Pose.Position);
+                AssertNear(new Double3(0.55, -0.3, 1.25), right.Ray.Origin);
+                AssertNear(new Double3(0, -1, 0), right.Ray.Direction);
+                AssertNear(right.Ray.Direction, right.Pose.Rotation.Rotate(new Double3(1, 0, 0)));
+                Assert.AreEqual(0.75, right.Trigger);
+                Assert.AreEqual(0.25, right.Squeeze);
+                Assert.AreEqual(ButtonBits.Thumbstick | ButtonBits.Trigger, right.Buttons);
+                Assert.IsTrue(right.IsTracked);
+                Assert.IsFalse(reading[Side.Left].IsPresent);
+                Assert.IsFalse(reading.HasGaze);
+
+                Controls.Set("<XRController>{RightHand}/isTracked", 0f); // valid, not tracked: an estimate
+                reader.Read(reading);
+                Assert.AreEqual(PoseValidity.Emulated, right.Validity);
+                Controls.Set("<XRController>{RightHand}/trackingState", 0);
+                Controls.Set("<XRController>{RightHand}/devicePosition", Vector3.zero);
+                reader.Read(reading);
+                Assert.AreEqual(PoseValidity.NotSeen, right.Validity);
+                AssertNear(new Double3(0.5, -0.3, 1.2), right.Pose.Position); // where it was
+                Assert.AreEqual(0, right.Trigger);
+                Assert.AreEqual(ButtonBits.Thumbstick, right.Buttons & ButtonBits.Stop, "one that is lost stops too");
+            }
+        }
+
+        [Test]
+        public void WornIsBelievedOnceTheRuntimeHasSaidSo()
+        {
+            using (ControlReader reader = new ControlReader(ControlNames.Controllers))
+            {
+                Assert.IsTrue(reader.IsOnHead, "this runtime does not know");
+                Controls.Set("<XRHMD>/userPresence", 1f);
+                Assert.IsTrue(reader.IsOnHead);
+                Controls.Set("<XRHMD>/userPresence", 0f);
+                Assert.IsFalse(reader.IsOnHead);
+            }
+        }
+
+        [Test]
+        public void BareHandsPinchAndHaveJoints()
+        {
+            XRHandSubsystem subsystem = new XRHandSubsystem();
+            XrHands hands = new XrHands();
+            Assert.IsFalse(hands.IsSupported);
+            Subsystems.Running.Add(subsystem);
+            Assert.IsTrue(hands.IsSupported);
+            InputReading reading = new InputReading();
+            Assert.IsFalse(hands.TryRead(Side.Left, true, reading));
+            Dictionary<XRHandJointID, EnginePose> joints = new Dictionary<XRHandJointID, EnginePose>();
+            for (XRHandJointID id = XRHandJointID.Wrist; id < XRHandJointID.EndMarker; id++) joints[id] = At(0.01f * (int)id, 1f, 0.3f);
+            joints[XRHandJointID.ThumbTip] = joints[XRHandJointID.IndexTip] = At(0.2f, 1.1f, 0.4f);
+            subsystem.leftHand = new XRHand { isTracked = true, Joints = joints };
+            subsystem.leftHandCommonGestures.Aim = At(0.1f, 1f, 0.3f);
+            Assert.IsTrue(hands.TryRead(Side.Left, true, reading));
+            Assert.AreEqual(InputKind.Hand, reading.Kind);
+            Assert.AreEqual(1, reading.Trigger, "thumb and index finger touch");
+            AssertNear(new Double3(0.4, -0.2, 1.1), reading.Tip);
+            AssertNear(new Double3(0.3, -0.01, 1), reading.Pose.Position); // of the wrist
+            AssertNear(new Double3(0.3, -0.1, 1), reading.Ray.Origin);
+            Assert.AreEqual(26 * 7, reading.Joints.Length);
+            Assert.AreEqual(-0.02, reading.Joints[1], 1e-6, "the palm first");
+            Assert.AreEqual(-0.01, reading.Joints[8], 1e-6);
+            Assert.AreEqual(-0.26, reading.Joints[25 * 7 + 1], 1e-6);
+            joints.Remove(XRHandJointID.MiddleTip);
+            hands.TryRead(Side.Left, true, reading);
+            Assert.AreEqual(PoseValidity.NotSeen, reading.Validity);
+        }
+
+        [Test]
+        public void CodesAreReportedInTheTrackingFrame()
+        {
+            Transform offset = new GameObject("offset").transform;
+            offset.SetPositionAndRotation(new Vector3(3f, 1f, -2f), Quaternion.AngleAxis(30f, Vector3.up));
+            XROrigin origin = new GameObject("origin").AddComponent<XROrigin>();
+            origin.Trackables = new GameObject("trackables").transform;
+            Behaviour manager = new GameObject("manager").AddComponent<XROrigin>(); // any component stands for the manager
+            ArMarkers source = new ArMarkers(origin, manager, offset);
+            ARMarker marker = new GameObject("marker").AddComponent<ARMarker>();
+            marker.transform.SetParent(origin.Trackables, false);
+            // Upright on a wall 1 m ahead, 0.2 m to the right: its normal, local Y, points back to the person.
+            Vector3 position = new Vector3(0.2f, 1.1f, 1f);
+            Quaternion rotation = Quaternion.AngleAxis(-90f, Vector3.right);
+            marker.transform.SetPositionAndRotation(offset.TransformPoint(position), offset.rotation * rotation);
+            marker.size = new Vector2(0.15f, 0.15f);
+            List<MarkerReport> reports = new List<MarkerReport>();
+            Assert.AreEqual(1, source.Read(reports));
+            Assert.AreEqual("", reports[0].Text, "not decoded yet");
+            marker.Data = "table";
+            for (int i = 0; i < 100; i++) source.Read(reports);
+            Assert.AreEqual("table", reports[0].Text);
+            Assert.LessOrEqual(marker.Reads, 3, "the text is asked for rarely, and never again");
+            RigidTransform sheet = reports[0].Pose.T_tracking_anchor;
+            AssertNear(new Double3(1, -0.2, 1.1), sheet.Position);
+            AssertNear(new Double3(-1, 0, 0), sheet.Rotation.Rotate(new Double3(0, 0, 1)));
+            AssertNear(new Double3(0, 0, 1), sheet.Rotation.Rotate(new Double3(0, 1, 0)));
+            Assert.AreEqual(0.15, reports[0].Pose.SizeM, 1e-6);
+            marker.trackingState = TrackingState.Limited;
+            source.Read(reports);
+            Assert.IsFalse(reports[0].IsTracked);
+            source.SetActive(false);
+            Assert.IsFalse(manager.enabled);
+            source.IsAllowed = false;
+            source.SetActive(true);
+            Assert.IsFalse(manager.enabled, "it stays off until the person has allowed it");
+            Assert.AreEqual(MarkerSupport.NotAllowed, source.Support);
+            Assert.AreEqual(MarkerSupport.Missing, new ArMarkers(origin, null, offset).Support);
+        }
+
+        [Test]
+        public void PanelsStandWhereTheyBelongAndFaceTheEyes()
+        {
+            Wearer wearer = new Wearer();
+            HeadsetPanels panels = new HeadsetPanels(wearer.Input, wearer.Session, wearer.Bodies);
+            Transform frame = new GameObject("frame").transform;
+            PanelViews views = new PanelViews(panels, frame, null);
+            wearer.Run();
+            panels.Update(new Advice[0], "");
+            views.Update(wearer.Input.Reading.Head.Position);
+            TextMesh robot = FindText(frame, "left: free");
+            Assert.IsNotNull(robot);
+            Vector3 expected = EnginePoses.ToEngine(new Double3(1.0, 0.3, 1.4 + 0.18));
+            StandinTests.AssertNear(expected, robot.transform.localPosition);
+            Vector3 head = EnginePoses.ToEngine(wearer.Input.Reading.Head.Position);
+            Vector3 away = robot.transform.localRotation * Vector3.forward;
+            Assert.Greater(Vector3.Dot(away, expected - head) / (expected - head).magnitude, 0.999f, "it is read from the eyes");
+            StringAssert.Contains("press the trigger to take it", robot.text);
+            Assert.IsNull(FindText(frame, "STOP"));
+            wearer.Session.Give("left", "p1");
+            wearer.PointUp(Side.Left);
+            wearer.Run(10);
+            panels.Update(new Advice[0], "well done");
+            views.Update(wearer.Input.Reading.Head.Position);
+            Assert.AreEqual("left: you", robot.text);
+            Assert.IsNotNull(FindText(frame, "well done"));
+        }
+
+        [Test]
+        public void ComponentReadsAHeadsetWithoutASessionAndSaysSo()
+        {
+            SetPose("<XRHMD>/", "centerEyePosition", "centerEyeRotation", new Vector3(0f, 1.6f, 0f), Quaternion.identity);
+            IrisHeadset headset = new GameObject("offset").AddComponent<IrisHeadset>();
+            SessionClient client = new SessionClient(new Hello { Role = Role.Operator }, new NoIdentity(), new EndpointChooser(new[] { new WebEndpoint(false, "localhost", 1) }), new WebTransport());
+            try
+            {
+                XRInputSubsystem subsystem = new XRInputSubsystem();
+                Subsystems.Running.Add(subsystem);
+                SystemInfo.Battery = 0.4f;
+                headset.Connect(client, new FakeBodies());
+                for (int i = 0; i < 100; i++) Engine.Step();
+                Assert.AreEqual(0.4f, headset.Condition.Read().Battery, 1e-6);
+                subsystem.Recentre();
+                Engine.Pause(true);
+                Engine.Focus(false);
+                for (int i = 0; i < 10; i++) Engine.Step();
+                Assert.IsEmpty(Engine.Errors);
+                Assert.AreEqual("", headset.Problem);
+                Assert.AreEqual(0, client.CallsDropped);
+            }
+            finally
+            {
+                client.Stop();
+            }
+        }
+
+        [Test]
+        public void PulsesAreFeltByTheHandThatDrives()
+        {
+            using (ControllerHaptics haptics = new ControllerHaptics()) haptics.Play(Side.Right, new Pulse(0.5f, 0.25f));
+            Assert.AreEqual(1, Controls.Pulses.Count);
+            StringAssert.StartsWith("<XRController>{RightHand}/haptic", Controls.Pulses[0]);
+        }
+
+        private sealed class NoIdentity : IIdentityStore
+        {
+            public byte[] Secret { get; } = new byte[32];
+
+            public byte[] ResumeToken { get; private set; } = new byte[0];
+
+            public void Remember(byte[] token) { ResumeToken = token; }
+        }
+
+        private static void SetPose(string device, string position, string rotation, Vector3 at, Quaternion turn)
+        {
+            Controls.Set(device + position, at);
+            Controls.Set(device + rotation, turn);
+            Controls.Set(device + "isTracked", 1f);
+            Controls.Set(device + "trackingState", 3);
+        }
+
+        private static EnginePose At(float x, float y, float z) { return new EnginePose(new Vector3(x, y, z), Quaternion.identity); }
+
+        private static TextMesh FindText(Transform parent, string text)
+        {
+            for (int i = 0; i < parent.childCount; i++)
+            {
+                TextMesh one = parent.GetChild(i).GetComponent<TextMesh>();
+                if (one != null && one.gameObject.activeSelf && one.text.Contains(text)) return one;
+            }
+            return null;
+        }
+
+        private static void AssertNear(Double3 expected, Double3 actual)
+        {
+            Assert.LessOrEqual((expected - actual).Length, 1e-5, expected + " is not " + actual);
+        }
+    }
+}

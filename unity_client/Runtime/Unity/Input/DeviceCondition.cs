@@ -1,0 +1,63 @@
+// What the engine knows of the headset beside poses: battery, dropped frames, recentring.
+using System;
+using System.Collections.Generic;
+using IrisSession.Core;
+using IrisSession.Interaction;
+using UnityEngine;
+using UnityEngine.XR;
+
+namespace IrisSession.Unity.Input
+{
+    /// <summary>Battery and frames, and when the tracking frame moves.</summary>
+    public sealed class DeviceCondition : IHealthSource, IDisposable
+    {
+        private readonly List<XRDisplaySubsystem> displays = new List<XRDisplaySubsystem>();
+        private readonly List<XRInputSubsystem> inputs = new List<XRInputSubsystem>();
+        private readonly List<XRInputSubsystem> listened = new List<XRInputSubsystem>();
+        private readonly Action<XRInputSubsystem> moved;
+
+        /// <summary>`ThermalState` by something of the application that knows it, null: nothing does.</summary>
+        public Func<string> Thermal { get; set; }
+
+        public DeviceCondition()
+        {
+            moved = _ => HasMoved = true;
+        }
+
+        /// <summary>The tracking frame has moved since this was last cleared: it may be reported several times at once.</summary>
+        public bool HasMoved { get; set; }
+
+        /// <summary>Listen to subsystems, which come and go with the loader. Once a second.</summary>
+        public void Refresh()
+        {
+            SubsystemManager.GetSubsystems(displays);
+            SubsystemManager.GetSubsystems(inputs);
+            foreach (XRInputSubsystem one in inputs)
+            {
+                if (listened.Contains(one)) continue;
+                one.trackingOriginUpdated += moved;
+                listened.Add(one);
+            }
+        }
+
+        public DeviceHealth Read()
+        {
+            DeviceHealth health = DeviceHealth.Unknown;
+            health.Battery = SystemInfo.batteryLevel;
+            BatteryStatus status = SystemInfo.batteryStatus;
+            health.IsCharging = status == BatteryStatus.Charging || status == BatteryStatus.Full;
+            health.Thermal = Thermal == null ? "" : Thermal();
+            foreach (XRDisplaySubsystem display in displays)
+            {
+                if (display.running && display.TryGetDroppedFrameCount(out int dropped)) health.DroppedFrames = dropped;
+            }
+            return health;
+        }
+
+        public void Dispose()
+        {
+            foreach (XRInputSubsystem one in listened) one.trackingOriginUpdated -= moved;
+            listened.Clear();
+        }
+    }
+}
