@@ -1,4 +1,5 @@
 // What reports of the headset do to worn, tracking epoch, clutches and samples.
+using System;
 using System.Collections.Generic;
 using System.Linq;
 using IrisSession.Protocol;
@@ -138,6 +139,24 @@ namespace IrisSession.Core.Tests
             for (int i = 0; i < 100; i++) headset.SetPermission(HeadsetPermission.Scene, i % 2 == 0);
             Assert.AreEqual(32, TakeEvents().Count);
             Assert.Greater(headset.DroppedEvents, 50);
+        }
+
+        [Test]
+        public void JudgingAllocatesNothing()
+        {
+            SampleInput input = Make(Here, PoseValidity.Measured);
+            headset.TakeFeedback(new Feedback { Robot = "left", HoldReason = HoldReason.Emulated });
+            long before = 0;
+            for (int i = -100; i < 10_000; i++)
+            {
+                if (i == 0) before = GC.GetAllocatedBytesForCurrentThread();
+                if (input.Robots.Count == 0) input.Robots.Add("left");
+                input.Pose = new RigidTransform(new Double3(i, 1.0, 2.0), DoubleQuaternion.Identity);
+                input.Validity = (PoseValidity)((i + 100) % 3);
+                input.Clutch = i % 7 < 4;
+                headset.Judge(input);
+            }
+            Assert.AreEqual(0, GC.GetAllocatedBytesForCurrentThread() - before);
         }
 
         private SampleInput Guess()
