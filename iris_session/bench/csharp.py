@@ -12,7 +12,6 @@ import math
 import os
 import struct
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -46,13 +45,10 @@ from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
 from iris_session.system.extras import require_package
+from iris_session.system.process import ROOT, module_command
 
 #: In which a client ends after its input [s].
 EXIT_S: Final = 5.0
-
-
-#: Root of the checkout whose C# is compiled.
-ROOT: Final = Path(__file__).parents[2]
 RUNTIMES: Final = ("dotnet", "mono")
 CSHARP_CLIENTS: Final = "iris_session.bench.csharp:CsharpClient"
 #: Beside them: the Python client, and one over the same WebSocket.
@@ -335,7 +331,7 @@ def _measure_errors(made: _Frames, data: bytes) -> tuple[float, float, float, fl
 
 def make_command(runtime: str) -> list[str]:
     """Return the command that runs the program `bench` of tools/csharp on a runtime, in `ROOT`."""
-    return [sys.executable, "-m", "tools.csharp", "run", "--runtime", runtime, "bench"]
+    return module_command("tools.csharp", "run", "--runtime", runtime, "bench")
 
 
 def make_environment() -> dict[str, str]:
