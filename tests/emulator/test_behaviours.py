@@ -7,7 +7,7 @@ import math
 import pytest
 
 from iris_session.emulator.behaviours import Giver, Idle, Receiver
-from tests.emulator.handover_rig import Rig, handover
+from tools.handover_rig import Rig, handover
 
 pytestmark = pytest.mark.usefixtures("untraced")
 

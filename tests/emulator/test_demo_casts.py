@@ -9,8 +9,8 @@ import pytest
 from iris_session.demo.demos import make_demo
 from iris_session.emulator.behaviours import CombinedBehaviour, Folder, HandInput, OperatorView, Stower, make_behaviour
 from iris_session.emulator.behaviours.phases import SEARCH_S
-from tests.emulator.deformable_rig import SoftRig, soft_demo
-from tests.emulator.handover_rig import LateView
+from tools.deformable_rig import SoftRig, soft_demo
+from tools.handover_rig import LateView
 
 
 class ScriptedHand:

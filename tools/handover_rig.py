@@ -2,7 +2,7 @@
 
 Replaces network, headset and authority only: states reach the operators 30 to 60 ms old with 1 mm and 0.3 deg of
 noise and stalls, their samples reach the session 8 to 25 ms later with the same noise on the hand. `Referee` judges the
-handover from contacts alone. `python -m tests.emulator.handover_rig 50 panda` counts successes over 50 seeds of a demo
+handover from contacts alone. `python -m tools.handover_rig 50 panda` counts successes over 50 seeds of a demo
 (`handover`, `panda`, `aloha`; a third argument is the number of operators), or of `board`.
 """
 

@@ -1,6 +1,6 @@
 """Demos with deformables without a network: real physics and control, operators with delayed and noisy views.
 
-`python -m tests.emulator.deformable_rig 10 cloth` runs many seeds and prints the share of successes.
+`python -m tools.deformable_rig 10 cloth` runs many seeds and prints the share of successes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from iris_session.demo.demos import Demo, make_demo
 from iris_session.demo.goals import GoalMonitor
 from iris_session.emulator.behaviours import make_behaviour
 from iris_session.emulator.behaviours.deformables import list_observed_vertices
-from tests.emulator.handover_rig import Rig
+from tools.handover_rig import Rig
 
 #: Deformables start up to so far from their places, rotated by up to so much.
 MOVED_M, TURNED_RAD = 0.015, math.radians(8.0)
