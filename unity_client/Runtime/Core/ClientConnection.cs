@@ -52,6 +52,9 @@ namespace IrisSession.Core
         private const long SteadyNs = 1_000_000_000;
         private const long SnapshotRetryNs = 500_000_000;
 
+        /// <summary>Characters of the reason of an e-stop (docs/protocol.md).</summary>
+        private const int MaxReason = 512;
+
         /// <summary>Heartbeat periods without a message from the session: the connection is lost.</summary>
         private const int SilentHeartbeats = 4;
 
@@ -261,8 +264,8 @@ namespace IrisSession.Core
         {
             if (message is EStop stop && (IsJoined || Phase == ConnectionPhase.Joining || Phase == ConnectionPhase.Waiting))
             {
-                PendingEStop.Begin(stop);
-                return Phase != ConnectionPhase.Waiting && Queue(message);
+                PendingEStop.Begin(Fit(stop));
+                return Phase != ConnectionPhase.Waiting && Queue(PendingEStop.Message);
             }
             if (IsJoined) return Queue(message);
             if (!(message is Sample) && !(message is Samples)) throw new NotConnectedException(Describe());
@@ -353,6 +356,14 @@ namespace IrisSession.Core
             Requests.Clear();
             Queue(MessageCodec.WithIdentity(hello, Identity.Secret, Identity.ResumeToken), 0);
             if (PendingEStop.Message != null) Queue(PendingEStop.Message, 0); // every client may stop, however early
+        }
+
+        /// <summary>Return an e-stop that a session accepts: one with a reason that is too long, or without one, must not be refused for that.</summary>
+        private static EStop Fit(EStop stop)
+        {
+            string reason = stop.Reason ?? "";
+            if (reason.Length > MaxReason) reason = reason.Substring(0, MaxReason);
+            return new EStop { Reason = reason };
         }
 
         private void StartBackoff(long nowNs)

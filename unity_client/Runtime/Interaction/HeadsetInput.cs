@@ -106,7 +106,7 @@ namespace IrisSession.Interaction
             long nowNs = Reading.CaptureNs;
             if (suspensionCount != suspensions || !isLive) Suspend();
             suspensions = suspensionCount;
-            if (isLive) TakeStops();
+            TakeStops(isLive);
             FillContext(bodiesVersion);
             Point();
             if (isLive)
@@ -194,15 +194,15 @@ namespace IrisSession.Interaction
         private void Suspend()
         {
             Hands.Suspend();
-            Hands.TakeStops(Reading); // one that is held when input comes back counts
             WristStop.Suspend();
             Episode.Cancel();
         }
 
-        private void TakeStops()
+        /// <summary>A button of the e-stop counts whenever the runtime reports it: also without tracking, and in the frame of a recentring.</summary>
+        private void TakeStops(bool isLive)
         {
             if (Hands.TakeStops(Reading)) session.EStop("button of a controller");
-            if (WristStop.Update(Reading)) session.EStop("fingertip at the wrist");
+            if (isLive && WristStop.Update(Reading)) session.EStop("fingertip at the wrist");
         }
 
         private void FillContext(long bodiesVersion)

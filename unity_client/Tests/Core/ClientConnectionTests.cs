@@ -106,6 +106,16 @@ namespace IrisSession.Core.Tests
             Assert.IsNull(client.PendingEStop.Message);
         }
 
+        [TestCase(false)]
+        [TestCase(true)]
+        public void StopWithAReasonThatDoesNotFitIsNotRefusedForIt(bool isLong)
+        {
+            FakeSession session = FakeSession.Join();
+            Assert.IsTrue(session.Client.Send(new EStop { Reason = isLong ? new string('x', 600) : null }));
+            EStop stop = (EStop)session.TakeSent()[0]; // read by the rules of the wire
+            Assert.AreEqual(isLong ? 512 : 0, stop.Reason.Length);
+        }
+
         [Test]
         public void FullQueueDropsSamplesAndKeepsWhatIsUrgent()
         {

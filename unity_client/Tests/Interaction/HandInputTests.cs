@@ -195,6 +195,23 @@ namespace IrisSession.Interaction.Tests
             Assert.AreEqual(2, wearer.Session.Stops.Count);
         }
 
+        [TestCase(0)]
+        [TestCase(1)]
+        [TestCase(2)]
+        public void ButtonOfTheEStopCountsWhateverElseDoesNot(int way)
+        {
+            Wearer wearer = new Wearer();
+            wearer.Run();
+            if (way == 0) wearer.IsLive = false; // tracking is lost: the wearer has all the more reason
+            else if (way == 1) wearer.Suspensions++; // recentred in this frame
+            else wearer.Input.OnRecentred();
+            wearer[Side.Right].Buttons = ButtonBits.Thumbstick;
+            wearer.Run();
+            wearer.IsLive = true;
+            wearer.Run(5);
+            Assert.AreEqual(1, wearer.Session.Stops.Count);
+        }
+
         [Test]
         public void PinchAndFistAreTriggerAndSqueeze()
         {
