@@ -117,7 +117,7 @@ namespace IrisSession.Interaction
 
         public void ReportRecentred()
         {
-            client.TryPost(loop => loop.Headset.OnRecentred());
+            client.Post(loop => loop.Headset.OnRecentred());
         }
     }
 }

@@ -138,7 +138,7 @@ namespace IrisSession.Transport
 
         /// <summary>Process the answer to a probe. Returns whether the connection is to be moved there.</summary>
         /// <param name="answer">Of the address that <see cref="TakeProbe"/> returned.</param>
-        /// <param name="sessionId">The session that we are in; empty: in none now, so nothing moves.</param>
+        /// <param name="sessionId">The session that we are in; empty: nothing moves now, as we are in none, or a robot follows.</param>
         /// <param name="nowNs">A monotonic clock.</param>
         public bool OnProbe(ProbeAnswer answer, string sessionId, long nowNs)
         {

@@ -31,6 +31,9 @@ namespace IrisSession.Transport
 
         /// <summary>We do not read fast enough: the queue of control messages is full.</summary>
         Overflow,
+
+        /// <summary>A defect of this program has ended the session: it has to be started again.</summary>
+        Defect,
     }
 
     /// <summary>How a connection ended.</summary>

@@ -23,6 +23,7 @@ namespace IrisSession.Transport
                     return new Phrase(Or(text, "the session has another key than before") + ": " + end.Fingerprint, "another machine may pretend to be it: pair again only if its owner has made new keys");
                 case LinkFailure.NotAGateway: return new Phrase(Or(text, "this is not the page of a session"), "check the address: `iris-session pair --web` shows it");
                 case LinkFailure.Protocol: return new Phrase(Or(text, "the session sends what this app does not understand"), Update);
+                case LinkFailure.Defect: return new Phrase(Or(text, "a defect of this app has ended the session"), "start the app again");
                 case LinkFailure.Overflow: return new Phrase("more came than this app could read", ByItself);
                 default: return new Phrase(Or(text, "the connection has ended"), ByItself);
             }

@@ -38,22 +38,36 @@ namespace IrisSession.Transport
             {
                 crash = error.ToString(); // a defect of ours: the engine goes on without a session
             }
+            Guard(Leave);
+            if (crash.Length > 0) loop.NoteDefect();
+            adviceAt = long.MinValue;
+            Guard(PublishView);
+            Guard(PublishAdvice);
+            transport.Dispose();
+        }
+
+        /// <summary>Send an e-stop that was pressed last, and leave.</summary>
+        private void Leave()
+        {
+            TakeStop();
+            loop.Close();
+        }
+
+        private void Guard(Action action)
+        {
             try
             {
-                loop.Close();
-                PublishView();
+                action();
             }
             catch (Exception error)
             {
                 crash += error;
             }
-            transport.Dispose();
         }
 
         private void TakeCalls()
         {
-            EStop pressed = Interlocked.Exchange(ref stop, null);
-            if (pressed != null) Press(pressed);
+            TakeStop();
             while (calls.HasNews)
             {
                 SessionCall call = calls.Oldest;
@@ -61,14 +75,39 @@ namespace IrisSession.Transport
                 {
                     Do(call);
                 }
-                catch (ClientException error)
+                catch (Exception error)
                 {
+                    // Actions and messages of the application may throw anything. The session goes on: the next call may be an e-stop.
                     loop.Invalid++;
                     if (call.Kind == CallKind.Request) AddNews(new SessionNews { Kind = NewsKind.Reply, Ticket = call.Ticket, Text = error.Message });
                     else if (call.Kind == CallKind.Action) AddNews(new SessionNews { Kind = NewsKind.Notice, Text = error.Message });
                 }
                 call.Clear();
                 calls.Remove();
+            }
+            TakeOwed();
+        }
+
+        /// <summary>Do what <see cref="Post"/> has kept, now that all calls before it are done.</summary>
+        private void TakeOwed()
+        {
+            while (true)
+            {
+                Action<SessionLoop> action;
+                lock (owed)
+                {
+                    if (owed.Count == 0) return;
+                    action = owed.Dequeue();
+                }
+                try
+                {
+                    action(loop);
+                }
+                catch (Exception error)
+                {
+                    loop.Invalid++;
+                    AddNews(new SessionNews { Kind = NewsKind.Notice, Text = error.Message });
+                }
             }
         }
 
@@ -92,8 +131,10 @@ namespace IrisSession.Transport
             }
         }
 
-        private void Press(EStop pressed)
+        private void TakeStop()
         {
+            EStop pressed = Interlocked.Exchange(ref stop, null);
+            if (pressed == null) return;
             try
             {
                 loop.Connection.Send(pressed);

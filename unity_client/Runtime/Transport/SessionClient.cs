@@ -27,6 +27,9 @@ namespace IrisSession.Transport
         /// <summary>Requests whose reply was not taken.</summary>
         private const int MaxRequests = 64;
 
+        /// <summary>Calls that must not be lost and wait behind those: reports of a headset, a few each minute.</summary>
+        private const int MaxOwed = 256;
+
         /// <summary>Longest sleep of the session's thread, so that its clock estimate reaches the engine [ms].</summary>
         private const int LongestWaitMs = 100;
 
@@ -42,6 +45,7 @@ namespace IrisSession.Transport
         private readonly TripleBuffer<StateFrame> states = new TripleBuffer<StateFrame>(() => new StateFrame());
         private readonly TripleBuffer<PresenceFrame> presence = new TripleBuffer<PresenceFrame>(() => new PresenceFrame());
         private readonly HandOver<SessionCall> calls = new HandOver<SessionCall>(MaxCalls, () => new SessionCall());
+        private readonly Queue<Action<SessionLoop>> owed = new Queue<Action<SessionLoop>>(); // guarded by itself; after all that is in `calls`
         private readonly HandOver<SessionNews> news = new HandOver<SessionNews>(MaxNews, () => default);
         private readonly NewestMessages media = new NewestMessages(16, true);
         private EStop stop; // handed over by itself: it never waits behind samples, and is never dropped
@@ -178,7 +182,27 @@ namespace IrisSession.Transport
             return HandCall();
         }
 
-        /// <summary>Do something on the thread of the session. Its `ClientException` becomes a notice. False: too many calls wait.</summary>
+        /// <summary>
+        /// Do something on the thread of the session that must not be lost, such as a report of what the wearer or the system did. While too
+        /// many calls wait it is kept, and later calls are refused, so that nothing is done out of order.
+        /// </summary>
+        public void Post(Action<SessionLoop> action)
+        {
+            if (HasRoomNow())
+            {
+                calls.Next.SetAction(action);
+                HandCall();
+                return;
+            }
+            lock (owed)
+            {
+                if (owed.Count < MaxOwed) owed.Enqueue(action);
+                else CallsDropped++;
+            }
+            transport.Wake();
+        }
+
+        /// <summary>Do something on the thread of the session. What it throws becomes a notice. False: too many calls wait.</summary>
         public bool TryPost(Action<SessionLoop> action)
         {
             if (!HasRoom()) return false;
@@ -196,10 +220,12 @@ namespace IrisSession.Transport
         }
 
         /// <summary>Stop all robots. Kept until the session has it, over any number of connections.</summary>
-        public void EStop(string reason)
+        /// <returns>False when the thread of the session has ended: nothing can be stopped from here any more.</returns>
+        public bool EStop(string reason)
         {
             Interlocked.Exchange(ref stop, new EStop { Reason = reason });
             transport.Wake();
+            return !HasEnded;
         }
 
         /// <summary>Say how the scene is, so that advice has it. From any thread.</summary>
@@ -210,9 +236,15 @@ namespace IrisSession.Transport
 
         private bool HasRoom()
         {
-            if (calls.HasRoom) return true;
+            if (HasRoomNow()) return true;
             CallsDropped++;
             return false;
+        }
+
+        private bool HasRoomNow()
+        {
+            if (!calls.HasRoom) return false;
+            lock (owed) return owed.Count == 0; // held for moments
         }
 
         private bool HandCall()

@@ -119,6 +119,12 @@ namespace IrisSession.Transport
             DropSocket();
         }
 
+        /// <summary>Say that a defect of this program ends the session.</summary>
+        internal void NoteDefect()
+        {
+            Problem = new LinkEnd(LinkFailure.Defect, 0, "a defect of this app has ended the session");
+        }
+
         /// <summary>Become a participant with another hello, such as one with other devices. See <see cref="ClientConnection.Rejoin"/>.</summary>
         public void Rejoin(Hello hello)
         {
@@ -251,16 +257,14 @@ namespace IrisSession.Transport
         private void CheckProbe()
         {
             long nowNs = getNowNs();
-            if (Transport.TryTakeProbe(out ProbeAnswer answer))
+            bool canMove = Connection.IsJoined && nowNs - engagedAt >= EngagedNs;
+            if (Transport.TryTakeProbe(out ProbeAnswer answer) && Endpoints.OnProbe(answer, canMove ? Connection.Welcome.SessionId : "", nowNs))
             {
-                bool isBetter = Endpoints.OnProbe(answer, Connection.IsJoined ? Connection.Welcome.SessionId : "", nowNs);
-                if (isBetter)
-                {
-                    keepsAddress = true;
-                    Connection.HandleDisconnect(nowNs);
-                }
+                keepsAddress = true;
+                Connection.HandleDisconnect(nowNs);
+                return;
             }
-            if (!Connection.IsJoined || nowNs - engagedAt < EngagedNs) return;
+            if (!canMove) return;
             WebEndpoint better = Endpoints.TakeProbe(nowNs);
             if (better != null) Transport.StartProbe(better);
         }

@@ -19,6 +19,7 @@ namespace IrisSession.Transport.Tests
         public List<string> Wishes = new List<string>();
         public long MediaEpoch;
         public bool IsFull;
+        public int Wakes;
         public bool IsDisposed;
 
         /// <summary>Called within every send: a test may block there.</summary>
@@ -123,6 +124,7 @@ namespace IrisSession.Transport.Tests
 
         public void Wake()
         {
+            Interlocked.Increment(ref Wakes);
             news.Set();
         }
 

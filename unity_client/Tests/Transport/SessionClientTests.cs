@@ -175,6 +175,89 @@ namespace IrisSession.Transport.Tests
             Assert.AreEqual("", client.Crash);
         }
 
+        private static SessionClient Start(FakeTransport transport)
+        {
+            SessionClient client = new SessionClient(MakeHello(), new MemoryIdentity(), new EndpointChooser(new WebEndpoint(false, "localhost", 7725)), transport);
+            client.Start();
+            WaitUntil(() => CountSent<Hello>(transport) > 0, "no hello");
+            return client;
+        }
+
+        private static int CountSent<T>(FakeTransport transport)
+        {
+            lock (transport.Sent) return transport.Sent.FindAll(each => each.Message is T).Count;
+        }
+
+        [Test]
+        public void MistakesOfTheApplicationDoNotEndTheSession()
+        {
+            FakeTransport transport = new FakeTransport();
+            SessionClient client = Start(transport);
+            client.TryPost(loop => throw new InvalidOperationException("of the application"));
+            client.Post(loop => throw new InvalidOperationException("of the application"));
+            client.TrySendSample(new SampleInput { Device = null });
+            client.EStop(null);
+            WaitUntil(() => CountSent<EStop>(transport) > 0, "no e-stop: " + client.Crash);
+            SessionNews news = default;
+            WaitUntil(() => client.TryTakeNews(out news), "no notice");
+            Assert.AreEqual("of the application", news.Text);
+            Assert.IsTrue(client.Stop());
+            Assert.AreEqual("", client.Crash);
+        }
+
+        [Test]
+        public void AnEStopJustBeforeTheEndIsSent()
+        {
+            FakeTransport transport = new FakeTransport();
+            SessionClient client = Start(transport);
+            Thread stopper = new Thread(() => client.Stop());
+            client.TryPost(loop =>
+            {
+                client.EStop("the last");
+                int before = transport.Wakes;
+                stopper.Start();
+                WaitUntil(() => Volatile.Read(ref transport.Wakes) > before, "not stopped");
+            });
+            WaitUntil(() => client.HasEnded, "not ended");
+            stopper.Join();
+            Assert.AreEqual(1, CountSent<EStop>(transport));
+        }
+
+        [Test]
+        public void AReportThatMustNotBeLostIsKeptInOrderWhileTooMuchWaits()
+        {
+            FakeTransport transport = new FakeTransport();
+            using (ManualResetEvent isReleased = new ManualResetEvent(false))
+            {
+                SessionClient client = Start(transport);
+                string order = "";
+                client.TryPost(loop => isReleased.WaitOne());
+                while (client.TryPost(loop => order = "before "))
+                {
+                }
+                client.Post(loop => order += "report ");
+                isReleased.Set();
+                WaitUntil(() => client.TryPost(loop => order += "after"), "no room");
+                client.Stop();
+                Assert.AreEqual("before report after", order);
+            }
+        }
+
+        [Test]
+        public void ADefectEndsTheSessionInWords()
+        {
+            FakeTransport transport = new FakeTransport();
+            SessionClient client = Start(transport);
+            transport.OnSend = () => throw new InvalidOperationException("a defect");
+            client.EStop("now");
+            WaitUntil(() => client.HasEnded, "still runs");
+            StringAssert.Contains("a defect", client.Crash);
+            Assert.IsTrue(transport.IsDisposed);
+            Assert.AreEqual(LinkFailure.Defect, client.View.Problem.Failure);
+            Assert.AreEqual(AdviceKind.Link, client.Advice[0].Kind);
+            Assert.IsFalse(client.EStop("nothing is left that could stop"));
+        }
+
         [Test]
         public void AGatewayThatReadsAndWritesNothingStopsNoFrame()
         {

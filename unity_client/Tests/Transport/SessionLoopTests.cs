@@ -237,6 +237,46 @@ namespace IrisSession.Transport.Tests
         }
 
         [Test]
+        public void AProbeThatIsAnsweredDuringAReconnectIsNotTheLast()
+        {
+            LoopRig rig = new LoopRig(Cable, Wifi);
+            rig.Loop.Open();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(3 * Second);
+            Assert.AreEqual(1, rig.Transport.Probes.Count);
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Loop.Step();
+            rig.Transport.ProbeAnswers.Enqueue(new ProbeAnswer(Cable, new LinkEnd(LinkFailure.Unreachable, 0, ""), ""));
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(5 * Second);
+            Assert.AreSame(Wifi, rig.Transport.Newest);
+            Assert.Greater(rig.Transport.Probes.Count, 1);
+        }
+
+        [Test]
+        public void AProbeThatIsAnsweredWhileARobotFollowsMovesNothing()
+        {
+            LoopRig rig = new LoopRig(Cable, Wifi);
+            rig.Loop.Open();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.Unreachable);
+            rig.Run(3 * Second);
+            Assert.AreEqual(1, rig.Transport.Probes.Count);
+            SampleInput input = new SampleInput { Device = Device.ControllerRight, Pose = new RigidTransform(new Double3(0.1, 0.2, 1), DoubleQuaternion.Identity) };
+            input.Robots.Add("left");
+            rig.Loop.SendSample(input);
+            input.Clutch = true;
+            rig.Loop.SendSample(input);
+            rig.Transport.ProbeAnswers.Enqueue(new ProbeAnswer(Cable, default, "s1"));
+            rig.Run(500 * Ms);
+            Assert.AreSame(Wifi, rig.Transport.Newest);
+            rig.Run(4 * Second);
+            Assert.AreEqual(2, rig.Transport.Probes.Count, "it is tried again later");
+        }
+
+        [Test]
         public void AnotherCertificateOnOneAddressDoesNotStopTheOther()
         {
             LoopRig rig = new LoopRig(Wifi, Cable);
