@@ -96,6 +96,8 @@ namespace IrisSession.Transport
             {
                 tls = new SslStream(stream, true, (sender, certificate, chain, errors) => CheckKey(certificate, takesAnyKey));
                 tls.AuthenticateAsClient(endpoint.Host, null, SslProtocols.Tls12, false);
+                // A runtime that does not ask `CheckKey` must not be a way around the pin.
+                if (!IsRightKey(takesAnyKey)) throw new AuthenticationException("the key of the other end was not checked");
                 top = tls;
             }
             catch (Exception error) when (IsOfConnection(error))
@@ -230,6 +232,11 @@ namespace IrisSession.Transport
             byte[] der = certificate.GetRawCertData();
             shown = Transport.CertificateHash.Compute(der);
             fingerprint = Core.Fingerprint.OfCertificate(der);
+            return IsRightKey(takesAnyKey);
+        }
+
+        private bool IsRightKey(bool takesAnyKey)
+        {
             return takesAnyKey ? shown != null : Transport.CertificateHash.AreEqual(shown, endpoint.Pin);
         }
     }

@@ -124,7 +124,7 @@ namespace IrisSession.Transport
         /// <summary>Take words of the gateway for the person, null for none.</summary>
         string TakeNotice();
 
-        /// <summary>Set the media streams that are wanted, of a connection that may have them (epoch 0: none may).</summary>
+        /// <summary>Set the media streams that are wanted, the first 16, of a connection that may have them (epoch 0: none may).</summary>
         void SetMedia(IReadOnlyList<string> streams, long connectionEpoch);
 
         /// <summary>Return a connection for assets, null while there can be none. Does not wait; for any thread.</summary>

@@ -128,11 +128,12 @@ namespace IrisSession.Transport
         {
             if (connectionEpoch != mediaEpoch) CloseMedia(); // it belongs to the connection before
             mediaEpoch = connectionEpoch;
-            bool isSame = streams.Count == wishes.Count;
-            for (int i = 0; i < streams.Count && isSame; i++) isSame = streams[i] == wishes[i];
+            int count = Math.Min(streams.Count, MaxStreams);
+            bool isSame = count == wishes.Count;
+            for (int i = 0; i < count && isSame; i++) isSame = streams[i] == wishes[i];
             if (isSame) return;
             wishes.Clear();
-            for (int i = 0; i < streams.Count && i < MaxStreams; i++) wishes.Add(streams[i]);
+            for (int i = 0; i < count; i++) wishes.Add(streams[i]);
             if (wishes.Count == 0 || (isMediaGreeted && !SendWishes())) CloseMedia();
         }
 
