@@ -286,6 +286,13 @@ def test_revoked_key_pairs_again_once(network: Network, home: KeyHome, form: str
     assert joining.connection.phase is ConnectionPhase.REFUSED
 
 
+def test_refusal_without_a_code_is_final(network: Network, home: KeyHome) -> None:
+    joining = Joining(ADDRESS)
+    joining.refuse(RefusalCode.UNPAIRED)
+    assert isinstance(joining.connection.failure, RefusedError)
+    assert not joining.joiner.is_resolving
+
+
 # --- pairing over a socket --------------------------------------------------------------------------------------------
 
 

@@ -95,6 +95,13 @@ def test_invalid_stream_names_are_rejected(session: ClientSession) -> None:
         ann.media.publish("cloud", {"half": b""})
 
 
+def test_source_publishes_frames(session: ClientSession, join: Join) -> None:
+    camera = join("cam", role="camera")
+    assert camera.media.publish("depth", {"full": b"all", "half": b"less"}, capture_ns=5)
+    ((stream, frames),) = session.sockets_of(camera).published
+    assert (stream, frames[1:]) == ("depth", [b"all", b"less"])
+
+
 def test_frames_of_an_unsubscribed_stream_are_late_and_not_malformed(session: ClientSession, join: Join) -> None:
     ann = join()
     ann.media.subscribe("cloud")

@@ -179,8 +179,13 @@ def test_keys_drive_the_robot_while_the_dead_man_is_pressed(scenario: Scenario, 
 
 @pytest.mark.long
 def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
-    """By the speed of the keys, along their axis; it rests as soon as they are let go."""
     tip = Tip(scenario)
+    begin = tip.place
+    driver.hold("w")  # without the dead-man nothing moves
+    tip.watch_for(0.5)
+    assert np.linalg.norm(tip.place - begin) < REST_M
+    assert words(driver).startswith("Held. Hold left Shift")
+    driver.let_go("w")
     begin = drive_forward(driver, tip, 0.095)
     driver.wait("document.querySelector('.drive.engaged')")
     assert words(driver) == "The robot follows you."
@@ -194,6 +199,9 @@ def test_keys_move_the_end_effector(scenario: Scenario, driver: Page) -> None:
     assert moved[1] > 0.09
     assert np.linalg.norm(moved[[0, 2]]) < 0.005
     assert stopped_s < STOP_S
+    driver.let_go("Shift")
+    driver.wait("document.querySelector('.drive .why').textContent.startsWith('Held. Hold left Shift')")
+    assert driver.errors == []
 
 
 @pytest.mark.long

@@ -66,6 +66,11 @@ class Link:
         return [b[0] for a, b in pairs if any(b[1].levels[s] < a[1].levels.get(s, NONE_LEVEL) for s in b[1].levels)]
 
 
+def test_sufficient_link_keeps_full_level() -> None:
+    grant = Link(100).play(60, BOTH)
+    assert grant == BudgetGrant({"cloud": 0, "cloth": 0})
+
+
 def test_narrow_link_gets_a_lower_level_within_two_seconds() -> None:
     link = Link(8)
     link.play(1.75)

@@ -76,6 +76,15 @@ def test_subscribers_get_frames_of_their_level() -> None:
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [8, 6]
 
 
+def test_coarser_class_is_sent_at_full_rate() -> None:
+    wire = Wire(ann=1, bob=2)
+    wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)
+    wire.hub.subscribe(BOB, "cloud", "b", 2, SECOND)
+    wire.push(4, frames={"full": b"full", "half": b"half"})
+    assert [frame for _, frame in wire.got[ANN]] == [b"half"] * 4
+    assert [frame for _, frame in wire.got[BOB]] == [b"half"] * 2, "every second of the next better one"
+
+
 def test_full_connection_gets_the_newest_frame_later_and_delays_no_other() -> None:
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1, SECOND)

@@ -164,6 +164,18 @@ class TestRoles:
         allow(lab, ada, *own)
         assert gateway.enter(ada, "observer")[1].roles == left
 
+    def test_role_taken_from_the_person(self, lab: Lab) -> None:
+        gateway, ada, bob = open_gateway(lab), Person(), Person("bob")
+        allow(lab, ada, "operator")
+        allow(lab, bob, "operator")
+        welcome, _ = gateway.enter(ada)
+        gateway.enter(bob)
+        allow(lab, ada, "observer")
+        (lost,) = lab.session.wait_entries(Lost)
+        assert (lost.connection, lost.message) == (welcome.connection_epoch, Lost("role"))
+        lab.session.pump(lambda: bool(gateway.received("ada", ProtocolFault)), "the fault")
+        assert not gateway.received("bob", ProtocolFault)
+
     def test_director_gives_a_role_that_the_key_has_lost(self, lab: Lab) -> None:
         """The authority knows the roles of a key as they were when it joined; the front as they are."""
         gateway, ada = open_gateway(lab), Person()

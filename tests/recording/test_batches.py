@@ -30,6 +30,11 @@ def values(batches: list[Any]) -> dict[str, list[Any]]:
     return {name: [v for b in batches for v in b.column(name).to_pylist()] for name in (ROW_ID, "step", *COLUMNS)}
 
 
+def test_rows_as_they_were_written_stay_as_they_are() -> None:
+    written = [table(0, 5), table(5, 1), table(6, 3)]
+    assert [join_pieces(pieces) for pieces in group_spans(written)] == written
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_columns_cut_at_any_place_are_joined(seed: int) -> None:
     rng = random.Random(seed)
@@ -56,6 +61,19 @@ def test_pending_rows_are_bounded_by_interleaving() -> None:
     for n, pieces in enumerate(group_spans(thick_and_thin())):
         assert join_pieces(pieces).num_rows == 10
         assert taken <= n + 2
+
+
+def test_rows_without_a_column_have_null_in_it() -> None:
+    first, second = table(0, 4), table(4, 2, ("b", "c"))
+    batch = join_pieces([first, second])
+    assert batch.column("a").to_pylist() == [[b"a0"], [b"a1"], [b"a2"], [b"a3"], None, None]
+    assert batch.column("b").null_count == 0
+
+
+def test_rows_out_of_order_within_a_batch_are_sorted() -> None:
+    mixed = table(0, 6, ("a", "c")).take(pa.array([3, 1, 0, 5, 4, 2]))
+    found = list(group_spans([mixed, table(0, 3, ("b",)), table(3, 3, ("b",))]))
+    assert values(list(map(join_pieces, found))) == values([table(0, 6)])
 
 
 def test_two_values_of_one_row_are_an_error() -> None:

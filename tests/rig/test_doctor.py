@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Callable, Generator, Iterator
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import pytest
 
@@ -14,7 +14,6 @@ from iris_session.link.discovery import FoundSession
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import ProtocolVersionError
 from iris_session.protocol.names import PROTOCOL_VERSION
-from tests.doctor.test_network_checks import Listener as FixedListener
 from tests.rig.network import RigClientSockets
 from tests.rig.session import ADDRESS, Rig
 from tests.rig.simulation import SECOND
@@ -79,13 +78,21 @@ class Lab:
         return found
 
 
-class Listener(FixedListener):
+class Listener:
     """Hears the beacon of the session."""
 
-    sessions_heard = (FoundSession(NAME, ADDRESS, "s1", "live", "", ("127.0.0.1",)),)
+    ignored: ClassVar[dict[str, int]] = {}
+
+    def __enter__(self) -> Listener:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
 
     def wait(self, timeout_s: float) -> None:
         network_checks.time.sleep(timeout_s)
+
+    def poll_sessions(self) -> list[FoundSession]:
+        return [FoundSession(NAME, ADDRESS, "s1", "live", "", ("127.0.0.1",))]
 
 
 @pytest.fixture

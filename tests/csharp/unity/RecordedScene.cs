@@ -31,6 +31,9 @@ namespace IrisSession.Unity.StandinTests
         /// <summary>Assets whose bytes are wrong.</summary>
         public volatile HashSet<string> Damaged = new HashSet<string>();
 
+        /// <summary>Assets that make those throw who want them.</summary>
+        public volatile HashSet<string> Broken = new HashSet<string>();
+
         /// <summary>Thrown by the next update.</summary>
         public Exception Error;
         private readonly string folder;
@@ -57,6 +60,7 @@ namespace IrisSession.Unity.StandinTests
         public byte[] Find(string address)
         {
             if (Hidden.Contains(address)) return null;
+            if (Broken.Contains(address)) throw new InvalidOperationException("broken");
             return Damaged.Contains(address) ? new byte[100] : File.ReadAllBytes(Path.Combine(folder, "assets", address));
         }
 

@@ -235,6 +235,30 @@ namespace IrisSession.Unity.StandinTests
         }
 
         [Test]
+        public void WhatIsMissingComesLaterAlsoWhenTheSceneIsPatchedMeanwhile()
+        {
+            Stage stage = new Stage("lab");
+            stage.Source.Hidden = new HashSet<string> { stage.Source.Plan.Deformables[0].Address };
+            stage.Load();
+            int few = Engine.Draws.Count;
+            stage.Source.Plan = new ScenePlan(stage.Source.ReadSpec(), WorldView.PlanBudget);
+            stage.Source.Hidden = new HashSet<string>();
+            stage.Load();
+            Assert.AreEqual(few + 1, Engine.Draws.Count);
+        }
+
+        [Test]
+        public void AThingThatCannotBeMadeCostsNoOther()
+        {
+            Stage stage = new Stage("lab");
+            stage.Source.Broken = new HashSet<string> { stage.Source.Plan.Deformables[0].Address };
+            Engine.Step();
+            while (!stage.World.Scene.IsSettled) Engine.Step();
+            Assert.AreEqual(1, stage.World.Scene.Problems.Count);
+            Assert.Greater(Engine.Draws.Count, 3);
+        }
+
+        [Test]
         public void FramesAllocateNothing()
         {
             Stage stage = new Stage("lab");

@@ -78,6 +78,7 @@ namespace IrisSession.Transport
         private readonly Thread thread;
         private readonly AutoResetEvent wake = new AutoResetEvent(false);
         private volatile bool isStopping;
+        private volatile bool isReleasing;
         private volatile IAssetChannel channel;
         private volatile SceneProgress progress;
         private volatile string crash = "";
@@ -141,10 +142,22 @@ namespace IrisSession.Transport
             }
         }
 
-        /// <summary>Let go of the bytes of an asset that was built: <see cref="Find"/> reads them again from the cache.</summary>
-        public void Release(string address)
+        /// <summary>Let go of the bytes that the cache has too, once all is built: <see cref="Find"/> reads them again from there. Waits for nothing.</summary>
+        public void ReleaseBytes()
         {
-            lock (ready) ready.Remove(address);
+            isReleasing = true;
+            wake.Set();
+        }
+
+        /// <summary>Bytes of assets that are held in memory. May wait for a file.</summary>
+        internal long HeldBytes
+        {
+            get
+            {
+                long sum = 0;
+                lock (ready) foreach (byte[] bytes in ready.Values) sum += bytes.Length;
+                return sum;
+            }
         }
 
         private void Run()
@@ -153,6 +166,7 @@ namespace IrisSession.Transport
             {
                 while (!isStopping)
                 {
+                    if (isReleasing) ReleaseKept();
                     Follow();
                     LookUp();
                     SendRequests();
@@ -307,6 +321,15 @@ namespace IrisSession.Transport
                     ready.Clear();
                 }
                 else ready[address] = bytes;
+            }
+        }
+
+        private void ReleaseKept()
+        {
+            isReleasing = false;
+            lock (ready)
+            {
+                foreach (string address in new List<string>(ready.Keys)) if (cache.Contains(address)) ready.Remove(address);
             }
         }
 

@@ -142,6 +142,10 @@ namespace IrisSession.Unity
                 {
                     thing.Problem = "there is not enough memory for it";
                 }
+                catch (Exception error)
+                {
+                    thing.Problem = error.Message; // a defect of ours costs one thing, not the thread and the scene
+                }
                 lock (requests) if (thing.Plan == plan) ready.Enqueue(thing);
             }
         }

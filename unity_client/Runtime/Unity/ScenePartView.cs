@@ -48,11 +48,15 @@ namespace IrisSession.Unity
         /// <summary>What is drawn, null while it is not here.</summary>
         public Mesh Mesh { get; private set; }
 
+        /// <summary>True when the finest mesh is drawn.</summary>
+        public bool IsFine { get; private set; }
+
         /// <summary>Show another mesh; the one before is destroyed.</summary>
-        public void Show(Mesh mesh)
+        public void Show(Mesh mesh, bool isFine)
         {
             if (!(Mesh is null)) Object.Destroy(Mesh);
             Mesh = mesh;
+            IsFine = isFine;
             if (filter != null) filter.sharedMesh = mesh;
         }
 
@@ -69,7 +73,7 @@ namespace IrisSession.Unity
         /// <summary>Remove it. Its material belongs to those who made it.</summary>
         public void Destroy()
         {
-            Show(null);
+            Show(null, false);
             if (single != null) Object.Destroy(single);
         }
     }

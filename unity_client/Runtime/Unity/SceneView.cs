@@ -77,12 +77,12 @@ namespace IrisSession.Unity
             {
                 if (changes.Kept[i] >= 0) parts[i] = before[changes.Kept[i]];
                 else parts[i] = MakePart(plan.Parts[i]);
-                if (parts[i].Mesh == null) loader.Request(LoadKind.Part, i);
+                if (!parts[i].IsFine) loader.Request(LoadKind.Part, i);
                 RequestTexture(plan.Parts[i].Look.Texture);
             }
             for (int i = 0; i < plan.Deformables.Length; i++)
             {
-                if (changes.AddedDeformables.Contains(plan.Deformables[i].Stream)) loader.Request(LoadKind.Deformable, i);
+                if (changes.AddedDeformables.Contains(plan.Deformables[i].Stream) || !IsShown(plan.Deformables[i].Stream)) loader.Request(LoadKind.Deformable, i);
                 RequestTexture(SceneSurface.FromDeformable(plan, plan.Deformables[i]).Texture);
             }
             if (changes.IsLightingChanged || Lighting == null || changes.ChangedBodies.Count + changes.RemovedBodies.Count > 0) Lighting = new SceneLighting(plan);
@@ -144,7 +144,7 @@ namespace IrisSession.Unity
         {
             if (thing.IsCoarse) missing.Add((thing.Kind, thing.Index));
             if (thing.IsCoarse && parts[thing.Index].Mesh != null) return 0;
-            parts[thing.Index].Show(MeshUpload.Make(thing.Mesh, "iris-session"));
+            parts[thing.Index].Show(MeshUpload.Make(thing.Mesh, "iris-session"), !thing.IsCoarse);
             return thing.Mesh.Positions.Length / 3;
         }
 
@@ -223,6 +223,12 @@ namespace IrisSession.Unity
         {
             UnityEngine.Object.Destroy(textures[key]);
             textures.Remove(key);
+        }
+
+        private bool IsShown(string stream)
+        {
+            foreach (DeformableView one in deformables) if (one.Stream == stream) return true;
+            return false;
         }
 
         private void ReleaseDeformable(string stream)

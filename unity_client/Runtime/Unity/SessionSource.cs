@@ -18,6 +18,7 @@ namespace IrisSession.Unity
         private long seenStateNs = long.MinValue;
         private long seenPresenceNs = long.MinValue;
         private int seenMissing = -1;
+        private bool isReleased;
 
         /// <param name="client">The session.</param>
         /// <param name="scene">Its scene, planned within `WorldView.PlanBudget`. Nothing else may take its updates.</param>
@@ -49,8 +50,17 @@ namespace IrisSession.Unity
         private void TakeScene(WorldView world)
         {
             SceneUpdate update = scene.TakeUpdate();
-            if (update != null) world.Scene.Apply(update.Plan, update.Changes);
+            if (update != null)
+            {
+                world.Scene.Apply(update.Plan, update.Changes);
+                isReleased = false;
+            }
             int missing = scene.Progress.MissingCount;
+            if (!isReleased && missing == seenMissing && scene.Progress.IsComplete && world.Scene.IsComplete)
+            {
+                isReleased = true; // all is built
+                scene.ReleaseBytes();
+            }
             if (missing == seenMissing) return;
             seenMissing = missing;
             world.Scene.OnAssets();
@@ -91,7 +101,7 @@ namespace IrisSession.Unity
                 {
                     if (one.Encoding == MediaEncoding.Deformable || one.Encoding == MediaEncoding.Cloud) wishes.Add(one.Stream);
                 }
-                client.TryPost(session => session.SetMediaWishes(wishes));
+                client.Post(session => session.SetMediaWishes(wishes));
             }
             for (int i = 0; i < MediaStreams.MaxStreams && client.TryTakeMedia(ref media); i++) world.Media.Process(media);
         }

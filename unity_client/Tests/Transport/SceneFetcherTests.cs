@@ -134,6 +134,20 @@ namespace IrisSession.Transport.Tests
         }
 
         [Test]
+        public void BytesThatTheCacheHasAreNotHeldOnceTheyAreBuilt()
+        {
+            bool IsReleased(SceneFetcher one)
+            {
+                if (!IsUnreadable(one)) return false;
+                one.ReleaseBytes();
+                return one.HeldBytes == 0;
+            }
+
+            SceneFetcher scene = Fetch((peer, request, i) => SendPart(peer, request, Asset), new MemoryFiles(), IsReleased);
+            CollectionAssert.AreEqual(Asset, scene.Find(Address));
+        }
+
+        [Test]
         public void ShortPartsAndEndsOfConnectionsAreContinued()
         {
             void Answer(Peer peer, string[] request, int i)
