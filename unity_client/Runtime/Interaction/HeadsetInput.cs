@@ -81,6 +81,9 @@ namespace IrisSession.Interaction
         /// <summary>A denial that the person has to see: taken by <see cref="TakeDenial"/>.</summary>
         public Denial Denial { get; private set; }
 
+        /// <summary>What a command of the application threw, for a log; null: nothing. Clear it once it is said.</summary>
+        public Exception CommandError { get; set; }
+
         /// <summary>Return the robot that a hand points at, empty for none.</summary>
         public string FindPointed(Side side) { return context.Pointed[(int)side]; }
 
@@ -316,7 +319,14 @@ namespace IrisSession.Interaction
                 consents.Remove(Question);
                 return;
             }
-            Buttons.FindCommand(button)?.Run();
+            try
+            {
+                Buttons.FindCommand(button)?.Run();
+            }
+            catch (Exception error)
+            {
+                CommandError = error; // of the application: samples and the e-stop go on
+            }
         }
 
         private void Request(string episodeAction, long nowNs)

@@ -98,7 +98,11 @@ namespace IrisSession.Interaction.Tests
         {
             Wearer wearer = new Wearer();
             int runs = 0;
-            Command command = new Command("Next object", () => runs++);
+            Command command = new Command("Next object", () =>
+            {
+                runs++;
+                throw new InvalidOperationException("of the application");
+            });
             wearer.Input.Buttons.AddCommand(command);
             wearer[Side.Left].Pose = new RigidTransform(new Double3(0.1, 0.05, 1.3), DoubleQuaternion.FromAxisAngle(new Double3(1, 0, 0), 1.5));
             wearer.Run();
@@ -112,6 +116,7 @@ namespace IrisSession.Interaction.Tests
             Assert.IsTrue(wearer.Input.Buttons.Shown[0].IsAimed);
             wearer.Tap(Side.Right);
             Assert.AreEqual(1, runs);
+            Assert.IsInstanceOf<InvalidOperationException>(wearer.Input.CommandError);
             Assert.AreEqual(0, wearer.Session.Requests.Count, "no robot behind it is taken");
             for (int i = 1; i < ButtonPanel.MaxCommands; i++) wearer.Input.Buttons.AddCommand(command);
             Assert.Throws<InvalidOperationException>(() => wearer.Input.Buttons.AddCommand(command));
