@@ -1,5 +1,8 @@
 // The input layer on stand-ins: devices are read in the axes of the wire, and panels stand where the core says.
+using System;
 using System.Collections.Generic;
+using System.Diagnostics;
+using System.Threading;
 using IrisSession.Core;
 using IrisSession.Interaction;
 using IrisSession.Interaction.Tests;
@@ -190,7 +193,7 @@ namespace IrisSession.Unity.StandinTests
         {
             SetPose("<XRHMD>/", "centerEyePosition", "centerEyeRotation", new Vector3(0f, 1.6f, 0f), Quaternion.identity);
             IrisHeadset headset = new GameObject("offset").AddComponent<IrisHeadset>();
-            SessionClient client = new SessionClient(new Hello { Role = Role.Operator }, new NoIdentity(), new EndpointChooser(new[] { new WebEndpoint(false, "localhost", 1) }), new WebTransport());
+            SessionClient client = MakeClient();
             try
             {
                 XRInputSubsystem subsystem = new XRInputSubsystem();
@@ -206,6 +209,68 @@ namespace IrisSession.Unity.StandinTests
                 Assert.IsEmpty(Engine.Errors);
                 Assert.AreEqual("", headset.Problem);
                 Assert.AreEqual(0, client.CallsDropped);
+            }
+            finally
+            {
+                client.Stop();
+            }
+        }
+
+        private static SessionClient MakeClient()
+        {
+            return new SessionClient(new Hello { Role = Role.Operator }, new NoIdentity(), new EndpointChooser(new[] { new WebEndpoint(false, "localhost", 1) }), new WebTransport());
+        }
+
+        private static void StepUntil(Func<bool> condition)
+        {
+            Stopwatch watch = Stopwatch.StartNew();
+            while (!condition())
+            {
+                Assert.Less(watch.Elapsed.TotalSeconds, 30.0);
+                Engine.Step();
+                Thread.Yield();
+            }
+        }
+
+        [TestCase(true)]
+        [TestCase(false)]
+        public void AnotherSessionHearsThatTheHeadsetIsOffOrCovered(bool isOff)
+        {
+            Controls.Set("<XRHMD>/userPresence", 1f);
+            IrisHeadset headset = new GameObject("offset").AddComponent<IrisHeadset>();
+            SessionClient first = MakeClient(), second = MakeClient();
+            headset.Connect(first, new FakeBodies());
+            Engine.Step();
+            if (isOff) Controls.Set("<XRHMD>/userPresence", 0f);
+            else Engine.Focus(false);
+            Engine.Step();
+            headset.Connect(second, new FakeBodies());
+            second.Start();
+            try
+            {
+                StepUntil(() => !second.IsLive);
+            }
+            finally
+            {
+                first.Stop();
+                second.Stop();
+            }
+        }
+
+        [Test]
+        public void MistakesOfTheApplicationDoNotEndTheInput()
+        {
+            IrisHeadset headset = new GameObject("offset").AddComponent<IrisHeadset>();
+            SessionClient client = MakeClient();
+            headset.News += news => throw new InvalidOperationException("of the application");
+            headset.Connect(client, new FakeBodies());
+            client.TryPost(loop => throw new InvalidOperationException("which is news"));
+            client.Start();
+            try
+            {
+                StepUntil(() => Engine.Errors.Count > 0);
+                Assert.IsNotNull(headset.Input);
+                Assert.AreEqual("", headset.Problem);
             }
             finally
             {

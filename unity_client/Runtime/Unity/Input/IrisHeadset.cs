@@ -62,6 +62,8 @@ namespace IrisSession.Unity.Input
             Problem = "";
             Input = null;
             if (client == null) return;
+            wasOnHead = wasTracking = true; // as a new client takes it; the next frame reports what differs
+            if (focus != AppFocus.Focused) ReportFocus(focus);
             if (reader == null) reader = new ControlReader(Controls, ControlsKind);
             if (haptics == null) haptics = new ControllerHaptics();
             reader.BareHands = BareHands;
@@ -95,11 +97,42 @@ namespace IrisSession.Unity.Input
             while (client.TryTakeNews(out SessionNews news))
             {
                 Input.Take(news, reading.CaptureNs);
-                News?.Invoke(news);
+                Pass(news);
             }
             Input.Update(client.IsLive && focus == AppFocus.Focused, client.Suspensions, client.View.BodiesVersion);
-            Panels.Update(client.Advice, Notice);
-            views.Update(reading.Head.Position);
+            if (Input.CommandError != null) Debug.LogException(Input.CommandError);
+            Input.CommandError = null;
+            ShowPanels(reading);
+        }
+
+        /// <summary>Hand news to the application. What it throws is its own: samples and the e-stop go on.</summary>
+        private void Pass(SessionNews news)
+        {
+            try
+            {
+                News?.Invoke(news);
+            }
+            catch (Exception error)
+            {
+                Debug.LogException(error);
+            }
+        }
+
+        private void ShowPanels(HeadsetReading reading)
+        {
+            if (views == null) return;
+            try
+            {
+                Panels.Update(client.Advice, Notice);
+                views.Update(reading.Head.Position);
+            }
+            catch (Exception error)
+            {
+                // A defect: it is said once, and without panels samples and the e-stop go on.
+                Debug.LogException(error);
+                views = null;
+                Problem = "panels cannot be drawn: " + error.Message;
+            }
         }
 
         private void ReportCondition(HeadsetReading reading)
@@ -110,15 +143,36 @@ namespace IrisSession.Unity.Input
                 Input.OnRecentred();
             }
             bool isOnHead = reader.IsOnHead;
-            if (isOnHead != wasOnHead) client.TryPost(loop => loop.Headset.SetOnHead(isOnHead));
-            wasOnHead = isOnHead;
+            if (isOnHead != wasOnHead) ReportOnHead(isOnHead);
             bool isTracking = reading.HeadValidity != PoseValidity.NotSeen || !reading.HasHead;
-            if (isTracking != wasTracking) client.TryPost(loop => loop.Headset.SetTracking(isTracking));
-            wasTracking = isTracking;
+            if (isTracking != wasTracking) ReportTracking(isTracking);
             if (Time.realtimeSinceStartupAsDouble < conditionAt) return;
             conditionAt = Time.realtimeSinceStartupAsDouble + ConditionS;
             condition.Refresh();
-            DeviceHealth health = condition.Read();
+            ReportHealth(condition.Read());
+        }
+
+        // Each in a method of its own: what a lambda captures is allocated where it is declared, and other frames allocate nothing.
+
+        private void ReportOnHead(bool isOnHead)
+        {
+            wasOnHead = isOnHead;
+            client.Post(loop => loop.Headset.SetOnHead(isOnHead));
+        }
+
+        private void ReportTracking(bool isTracking)
+        {
+            wasTracking = isTracking;
+            client.Post(loop => loop.Headset.SetTracking(isTracking));
+        }
+
+        private void ReportFocus(AppFocus now)
+        {
+            client.Post(loop => loop.Headset.SetFocus(now));
+        }
+
+        private void ReportHealth(DeviceHealth health)
+        {
             client.TryPost(loop => loop.Health.Newest = health);
         }
 
@@ -139,7 +193,7 @@ namespace IrisSession.Unity.Input
             AppFocus now = isPaused ? AppFocus.Background : hasFocus ? AppFocus.Focused : AppFocus.Covered;
             if (now == focus) return;
             focus = now;
-            client?.TryPost(loop => loop.Headset.SetFocus(now));
+            if (client != null) ReportFocus(now);
         }
 
         private void OnDestroy()
