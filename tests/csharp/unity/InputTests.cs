@@ -178,6 +178,7 @@ namespace IrisSession.Unity.StandinTests
             Vector3 away = robot.transform.localRotation * Vector3.forward;
             Assert.Greater(Vector3.Dot(away, expected - head) / (expected - head).magnitude, 0.999f, "it is read from the eyes");
             StringAssert.Contains("press the trigger to take it", robot.text);
+            Assert.IsFalse(robot.richText, "a name is no markup");
             Assert.IsNull(FindText(frame, "STOP"));
             wearer.Session.Give("left", "p1");
             wearer.PointUp(Side.Left);
@@ -209,6 +210,10 @@ namespace IrisSession.Unity.StandinTests
                 Assert.IsEmpty(Engine.Errors);
                 Assert.AreEqual("", headset.Problem);
                 Assert.AreEqual(0, client.CallsDropped);
+                Assert.Greater(headset.transform.childCount, 0);
+                headset.Connect(null, null);
+                Engine.Step();
+                Assert.AreEqual(0, headset.transform.childCount, "panels of a session that is left are not shown");
             }
             finally
             {

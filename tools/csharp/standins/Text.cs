@@ -35,6 +35,8 @@ namespace UnityEngine
     {
         public string text { get; set; } = "";
 
+        public bool richText { get; set; } = true;
+
         public int fontSize { get; set; }
 
         public float characterSize { get; set; } = 1f;

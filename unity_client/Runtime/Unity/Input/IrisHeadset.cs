@@ -61,6 +61,7 @@ namespace IrisSession.Unity.Input
             this.client = client;
             Problem = "";
             Input = null;
+            RemovePanels();
             if (client == null) return;
             wasOnHead = wasTracking = true; // as a new client takes it; the next frame reports what differs
             if (focus != AppFocus.Focused) ReportFocus(focus);
@@ -130,9 +131,15 @@ namespace IrisSession.Unity.Input
             {
                 // A defect: it is said once, and without panels samples and the e-stop go on.
                 Debug.LogException(error);
-                views = null;
+                RemovePanels();
                 Problem = "panels cannot be drawn: " + error.Message;
             }
+        }
+
+        private void RemovePanels()
+        {
+            views?.Destroy();
+            views = null;
         }
 
         private void ReportCondition(HeadsetReading reading)

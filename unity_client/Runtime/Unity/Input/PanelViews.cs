@@ -59,6 +59,13 @@ namespace IrisSession.Unity.Input
             for (int side = 0; side < 2; side++) UpdateRay(rays[side], panels.Rays[side]);
         }
 
+        /// <summary>Remove all of it: what it says is not true any more.</summary>
+        public void Destroy()
+        {
+            foreach (TextMesh text in texts) Object.Destroy(text.gameObject);
+            foreach (LineRenderer ray in rays) if (ray != null) Object.Destroy(ray.gameObject);
+        }
+
         private static void UpdateRay(LineRenderer line, PanelRay ray)
         {
             if (line == null) return;
@@ -74,6 +81,7 @@ namespace IrisSession.Unity.Input
             GameObject one = new GameObject("iris-session panel " + panel.Style);
             one.transform.SetParent(parent, false);
             TextMesh text = one.AddComponent<TextMesh>();
+            text.richText = false; // names of others are in it
             text.fontSize = FontSize;
             text.anchor = TextAnchor.LowerCenter;
             text.alignment = TextAlignment.Center;
