@@ -238,8 +238,8 @@ namespace IrisSession.Transport.Tests
                 client.Post(loop => order += "report ");
                 isReleased.Set();
                 WaitUntil(() => client.TryPost(loop => order += "after"), "no room");
+                WaitUntil(() => Volatile.Read(ref order) == "before report after", "another order");
                 client.Stop();
-                Assert.AreEqual("before report after", order);
             }
         }
 
