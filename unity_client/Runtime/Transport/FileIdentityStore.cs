@@ -65,6 +65,16 @@ namespace IrisSession.Transport
             return ReadPins().TryGetValue(authority, out byte[] pin) ? pin : null;
         }
 
+        /// <summary>
+        /// Return an address with the key that it was known by. One that was known by a key is never plain http again: another program of
+        /// this device may listen at the port of the cable, and our secret goes to what listens there.
+        /// </summary>
+        public WebEndpoint WithKnownPin(WebEndpoint endpoint)
+        {
+            byte[] pin = FindPin(endpoint.Authority);
+            return pin == null ? endpoint : new WebEndpoint(true, endpoint.Host, endpoint.Port, pin);
+        }
+
         /// <summary>Keep the key of a gateway, which was paired, or which the person has compared.</summary>
         public void KeepPin(string authority, byte[] pin)
         {

@@ -116,6 +116,11 @@ namespace IrisSession.Transport.Tests
                 CollectionAssert.AreEqual(new byte[] { 1, 2, 3 }, second.ResumeToken);
                 CollectionAssert.AreEqual(TestCertificate.Second.Hash, second.FindPin("host69:1"));
                 Assert.IsNull(second.FindPin("host0:1"));
+                WebEndpoint cable = new WebEndpoint(false, "localhost", 7725);
+                Assert.AreSame(cable, second.WithKnownPin(cable));
+                second.KeepPin(cable.Authority, TestCertificate.First.Hash);
+                Assert.IsTrue(second.WithKnownPin(cable).IsSecure);
+                CollectionAssert.AreEqual(TestCertificate.First.Hash, second.WithKnownPin(cable).Pin);
                 Assert.IsNotNull(second.FindPin("host10:1"));
                 Assert.AreEqual("", first.Problem + second.Problem);
                 CollectionAssert.AreNotEqual(first.Secret, new FileIdentityStore(folder + "/other").Secret);

@@ -20,8 +20,7 @@ internal static class Finder
             string code = options.Code;
             WebEndpoint endpoint = address.Length == 0 ? FindByBeacon(report) : FindByAddress(address, report, ref code);
             if (endpoint == null) return null;
-            byte[] pin = endpoint.IsSecure ? identity.FindPin(endpoint.Authority) : null;
-            if (pin != null) endpoint = endpoint.WithPin(pin);
+            endpoint = identity.WithKnownPin(endpoint);
             if (code.Length > 0 && endpoint.IsSecure) endpoint = Pair(endpoint, code, options, identity, report);
             if (endpoint == null) return null;
             endpoints.Add(endpoint);
