@@ -199,11 +199,13 @@ namespace IrisSession.Transport.Tests
         [TestCase("Content-Range: bytes 0-9/5")]
         [TestCase("Content-Range: x")]
         [TestCase("X: y")]
-        public void AnswersThatContradictThemselvesAreNoBytes(string header)
+        public void AnswersThatContradictThemselvesEndTheConnection(string header)
         {
             int answers = 0;
+            HashSet<Peer> seen = new HashSet<Peer>();
             void Answer(Peer peer, string[] request, int i)
             {
+                lock (seen) Assert.IsTrue(seen.Add(peer), "another request on the same connection");
                 Interlocked.Exchange(ref answers, i + 1);
                 peer.SendText("HTTP/1.1 206 Partial Content\r\nContent-Length: 11\r\n" + header + "\r\n\r\n");
                 peer.Send(new byte[11]);

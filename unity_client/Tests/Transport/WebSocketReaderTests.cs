@@ -76,7 +76,7 @@ namespace IrisSession.Transport.Tests
         }
 
         [TestCase("c201 00", 1002, TestName = "reserved bit")]
-        [TestCase("8281 0000000000", 1002, TestName = "masked")]
+        [TestCase("8281 05", 1002, TestName = "masked")]
         [TestCase("8100", 1003, TestName = "text")]
         [TestCase("8300", 1002, TestName = "unknown data frame")]
         [TestCase("8b00", 1002, TestName = "unknown control frame")]
