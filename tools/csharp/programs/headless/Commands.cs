@@ -279,6 +279,7 @@ internal sealed class Commands
         headset.Ages.Clear();
         headset.States = headset.Frames = 0;
         headset.LongestCallMs = 0;
+        int collections = GC.CollectionCount(0);
         headset.RunUntil(() => false, seconds);
         double[] ages = headset.Ages.ToArray();
         Array.Sort(ages);
@@ -286,7 +287,7 @@ internal sealed class Commands
         double p99 = ages.Length == 0 ? double.NaN : ages[(ages.Length - 1) * 99 / 100];
         report.Write(
             "measure", ages.Length > 0, "states", headset.States, "frames", headset.Frames, "age_ms_p50", p50, "age_ms_p99", p99, "longest_call_ms", headset.LongestCallMs,
-            "recovery_ms", headset.RecoveryMs, "replaced", Client.StatesReplaced, "dropped_calls", Client.CallsDropped);
+            "recovery_ms", headset.RecoveryMs, "collections", GC.CollectionCount(0) - collections, "replaced", Client.StatesReplaced, "dropped_calls", Client.CallsDropped);
         return ages.Length > 0;
     }
 
