@@ -34,6 +34,21 @@ def test_each_layer_is_an_assembly_with_tests() -> None:
         assert "UNITY_INCLUDE_TESTS" in ASSEMBLIES[tests]["defineConstraints"]
 
 
+def test_layers_with_an_engine_stay_thin() -> None:
+    """A layer that runs on stand-ins only must be short enough to be read."""
+    sources = {path: len(path.read_text().splitlines()) for path in (PACKAGE / "Runtime/Unity").rglob("*.cs")}
+    hololens = {path: len(path.read_text().splitlines()) for path in (ROOT / "hololens_client").rglob("*.cs")}
+    assert hololens
+    assert max({**sources, **hololens}.values()) < 400
+    assert sum(hololens.values()) < 1000
+
+
+def test_hololens_needs_this_core() -> None:
+    manifest = json.loads((ROOT / "hololens_client/package.json").read_text())
+    core = json.loads((PACKAGE / "package.json").read_text())
+    assert manifest["dependencies"][core["name"]] == core["version"] == manifest["version"]
+
+
 def test_layers_refer_to_assemblies_that_exist() -> None:
     names = {content["name"] for content in ASSEMBLIES.values()}
     for content in ASSEMBLIES.values():

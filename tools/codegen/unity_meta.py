@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-PACKAGES: Final = ("unity_client",)
+PACKAGES: Final = ("unity_client", "hololens_client")
 #: What reads a file, by its suffix; `DefaultImporter` for all others.
 _IMPORTERS: Final = {
     ".asmdef": "AssemblyDefinitionImporter",

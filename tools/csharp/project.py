@@ -30,7 +30,7 @@ from tools.csharp.unity_scenes import write_unity_scenes
 from tools.csharp.vectors import render_message_vectors
 
 ROOT: Final = HERE.parents[1]
-PACKAGES: Final = ("unity_client", "tools/csharp/standins", "tests/csharp/unity")
+PACKAGES: Final = ("unity_client", "hololens_client", "tools/csharp/standins", "tests/csharp/unity")
 #: The assembly that stands for the engine and its packages.
 STANDINS: Final = "UnityEngine"
 RUNNER: Final = "runner"
@@ -87,7 +87,7 @@ def find_projects(root: Path = ROOT) -> list[Project]:
         for path in sorted((root / package).rglob("*.asmdef")):
             text = json.loads(path.read_text(encoding="utf-8"))
             has_engine = not text.get("noEngineReferences")
-            named = tuple(name for name in text.get("references", ()) if not name.startswith("Unity"))
+            named = tuple(name for name in text.get("references", ()) if not name.startswith(("Unity", "Microsoft")))
             references = (*named, *([STANDINS] if has_engine else []))
             is_test = NUNIT.name in text.get("precompiledReferences", ())
             project = Project(text["name"], path.parent, references, is_test, has_engine or text["name"] == STANDINS)

@@ -4,6 +4,7 @@ using System.Collections.Generic;
 using System.Diagnostics;
 using System.Threading;
 using IrisSession.Core;
+using IrisSession.HoloLens;
 using IrisSession.Interaction;
 using IrisSession.Interaction.Tests;
 using IrisSession.Protocol;
@@ -19,6 +20,7 @@ using UnityEngine.XR.ARFoundation;
 using UnityEngine.XR.ARSubsystems;
 using UnityEngine.XR.Hands;
 using EnginePose = UnityEngine.Pose;
+using MicrosoftMarker = Microsoft.MixedReality.OpenXR.ARMarker;
 
 namespace IrisSession.Unity.StandinTests
 {
@@ -276,6 +278,74 @@ namespace IrisSession.Unity.StandinTests
                 StepUntil(() => Engine.Errors.Count > 0);
                 Assert.IsNotNull(headset.Input);
                 Assert.AreEqual("", headset.Problem);
+            }
+            finally
+            {
+                client.Stop();
+            }
+        }
+
+        [Test]
+        public void CodesThatAHoloLensRemembersAreNoLooks()
+        {
+            Transform offset = new GameObject("offset").transform;
+            XROrigin origin = new GameObject("origin").AddComponent<XROrigin>();
+            origin.Trackables = new GameObject("trackables").transform;
+            HoloLensMarkers source = new HoloLensMarkers(origin, new GameObject("manager").AddComponent<XROrigin>(), offset);
+            MicrosoftMarker marker = new GameObject("marker").AddComponent<MicrosoftMarker>();
+            marker.transform.SetParent(origin.Trackables, false);
+            // Upright on a wall 1 m ahead: local X right, Y down, Z back to the person.
+            marker.transform.SetPositionAndRotation(new Vector3(0.1f, 1.4f, 1f), Quaternion.AngleAxis(180f, Vector3.right));
+            marker.Data = "table";
+            marker.size = new Vector2(0.15f, 0.15f);
+            Wearer wearer = new Wearer();
+            wearer.Session.T_world_tracking = null;
+            wearer.Input.Markers = new MarkerLooks(source);
+            for (int i = 0; i < 60; i++)
+            {
+                Engine.Step();
+                marker.transform.SetPositionAndRotation(new Vector3(0.1f + 1e-5f * i, 1.4f, 1f), Quaternion.AngleAxis(180f, Vector3.right));
+                wearer.Input.Reading.CaptureNs = MonotonicClock.NowNs + i * Wearer.FrameNs; // the engine's clock is that of the steps
+                marker.lastSeenTime = -100f; // of another app, before this one was started
+                wearer.Input.Update(true, 0, 1);
+            }
+            Assert.AreEqual(0, wearer.Session.Looks.Count);
+            Assert.AreEqual(60, wearer.Input.Markers.Filter.Count(MarkerVerdict.Remembered));
+            List<MarkerReport> reports = new List<MarkerReport>();
+            marker.lastSeenTime = (float)Time.realtimeSinceStartupAsDouble;
+            source.Read(reports);
+            Assert.LessOrEqual(System.Math.Abs(MonotonicClock.NowNs - reports[0].SeenNs), 10_000_000_000, "now, on our clock");
+            AssertNear(new Double3(1, -0.1, 1.4), new Double3(reports[0].Pose.T_tracking_anchor.Position.X, -0.1, reports[0].Pose.T_tracking_anchor.Position.Z));
+            AssertNear(new Double3(-1, 0, 0), reports[0].Pose.T_tracking_anchor.Rotation.Rotate(new Double3(0, 0, 1)));
+            AssertNear(new Double3(0, 0, 1), reports[0].Pose.T_tracking_anchor.Rotation.Rotate(new Double3(0, 1, 0)));
+            Assert.AreEqual(Microsoft.MixedReality.OpenXR.TransformMode.Center, marker.transformMode);
+        }
+
+        [Test]
+        public void HoloLensIsAHeadsetWithCommandsAndFewDrawCalls()
+        {
+            foreach (string hand in new[] { "{LeftHand}", "{RightHand}" })
+            {
+                SetPose("<XRController>" + hand + "/", "devicePosition", "deviceRotation", new Vector3(0.1f, 1.3f, 0.3f), Quaternion.identity);
+                Controls.Set("<XRController>" + hand + "/pointerRotation", Quaternion.identity);
+            }
+            SetPose("<XRHMD>/", "centerEyePosition", "centerEyeRotation", new Vector3(0f, 1.6f, 0f), Quaternion.identity);
+            GameObject offset = new GameObject("offset");
+            IrisHeadset headset = offset.AddComponent<IrisHeadset>();
+            offset.AddComponent<IrisWorld>();
+            IrisHoloLens hololens = offset.AddComponent<IrisHoloLens>();
+            XROrigin origin = new GameObject("origin").AddComponent<XROrigin>();
+            origin.Trackables = new GameObject("trackables").transform;
+            hololens.SetUp(origin, null);
+            SessionClient client = new SessionClient(new Hello { Role = Role.Operator }, new NoIdentity(), new EndpointChooser(new[] { new WebEndpoint(false, "localhost", 1) }), new WebTransport());
+            try
+            {
+                hololens.Connect(client);
+                for (int i = 0; i < 20; i++) Engine.Step();
+                Assert.IsEmpty(Engine.Errors);
+                Assert.IsNotNull(FindText(offset.transform, "STOP all robots"));
+                Assert.AreEqual(InputKind.Hand, headset.Input.Reading[Side.Left].Kind);
+                Assert.LessOrEqual(IrisHoloLens.SceneDrawCalls + headset.Panels.All.Count + 2, IrisHoloLens.DrawCalls, "were all panels shown, and both rays");
             }
             finally
             {

@@ -67,6 +67,9 @@ namespace IrisSession.Interaction
         private Double3 grantAt;
         private Double3 refuseAt;
 
+        /// <summary>Commands are shown only while the back of the left hand looks at the eyes; else whenever that hand is tracked.</summary>
+        public bool NeedsGlance { get; set; } = true;
+
         /// <summary>Where a question is shown, in the tracking frame.</summary>
         public Double3 QuestionAt { get; private set; }
 
@@ -151,7 +154,7 @@ namespace IrisSession.Interaction
             if (commands.Count == 0 || !left.IsTracked || !reading.HasHead) return;
             Double3 line = reading.Head.Position - left.Pose.Position;
             Double3 up = left.Pose.Rotation.Rotate(new Double3(0, 0, 1));
-            if (Double3.Dot(up, line) < MinCosFacing * line.Length) return;
+            if (NeedsGlance && Double3.Dot(up, line) < MinCosFacing * line.Length) return;
             for (int i = 0; i < commands.Count; i++)
             {
                 Double3 at = left.Pose.Position + new Double3(0, 0, FirstM + (commands.Count - 1 - i) * ApartM);

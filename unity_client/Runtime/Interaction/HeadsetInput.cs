@@ -87,6 +87,9 @@ namespace IrisSession.Interaction
         /// <summary>Return the robot that a hand points at, empty for none.</summary>
         public string FindPointed(Side side) { return context.Pointed[(int)side]; }
 
+        /// <summary>Return the button that a hand points at.</summary>
+        public Button FindAimed(Side side) { return context.Aimed[(int)side]; }
+
         /// <summary>Return how far the ray of a hand goes until it meets something [m], 0: it meets nothing.</summary>
         public double FindHit(Side side) { return hits[(int)side]; }
 
@@ -176,6 +179,13 @@ namespace IrisSession.Interaction
             Denial newest = Denial;
             Denial = null;
             return newest;
+        }
+
+        /// <summary>Do what the lower, or the upper, button of a controller does: for devices without buttons.</summary>
+        public void PressEpisode(bool isLower)
+        {
+            long nowNs = Reading.CaptureNs;
+            Request(isLower ? Episode.PressLower(nowNs) : Episode.PressUpper(nowNs), nowNs);
         }
 
         /// <summary>The wearer recentred, or the runtime located itself anew.</summary>

@@ -44,6 +44,9 @@ namespace IrisSession.Unity.Input
         /// <summary>What the devices of the controls are.</summary>
         public InputKind ControlsKind { get; set; } = InputKind.Controller;
 
+        /// <summary>For hands that have one gesture: see <see cref="AirTap"/>. Set before <see cref="Connect"/>; null: trigger and squeeze are two.</summary>
+        public AirTap Taps { get; set; }
+
         public DeviceCondition Condition { get { return condition; } }
 
         /// <summary>Words of the application before the eyes, empty for none.</summary>
@@ -94,6 +97,7 @@ namespace IrisSession.Unity.Input
         {
             HeadsetReading reading = Input.Reading;
             reader.Read(reading);
+            Taps?.Apply(Input);
             ReportCondition(reading);
             while (client.TryTakeNews(out SessionNews news))
             {
