@@ -20,6 +20,27 @@ def test_manifest_has_the_version_of_the_session() -> None:
     assert re.fullmatch(r"com\.[a-z0-9._-]+", manifest["name"])
 
 
+#: Assembly of a package of Unity -> the package.
+PACKAGES_OF_UNITY = {
+    "Unity.InputSystem": "com.unity.inputsystem",
+    "Unity.TextMeshPro": "com.unity.ugui",
+    "Unity.XR.ARFoundation": "com.unity.xr.arfoundation",
+    "Unity.XR.ARSubsystems": "com.unity.xr.arfoundation",
+    "Unity.XR.CoreUtils": "com.unity.xr.core-utils",
+    "Unity.XR.Hands": "com.unity.xr.hands",
+    "Unity.XR.Management": "com.unity.xr.management",
+    "Unity.XR.OpenXR": "com.unity.xr.openxr",
+}
+
+
+def test_packages_that_layers_use_are_dependencies_of_one_version() -> None:
+    dependencies = json.loads((PACKAGE / "package.json").read_text())["dependencies"]
+    assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in dependencies.values())
+    for path in LAYERS:
+        for name in (name for name in ASSEMBLIES[path]["references"] if name.startswith("Unity.")):
+            assert PACKAGES_OF_UNITY[name] in dependencies, f"{path}: {name}"
+
+
 def test_each_layer_is_an_assembly_with_tests() -> None:
     assert {"IrisSession.Protocol", "IrisSession.Core"} <= {ASSEMBLIES[path]["name"] for path in LAYERS}
     for path, content in ASSEMBLIES.items():
