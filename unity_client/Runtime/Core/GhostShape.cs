@@ -24,7 +24,7 @@ namespace IrisSession.Core
     public sealed class GhostShape
     {
         /// <summary>Pieces that are drawn at most: each is a draw call.</summary>
-        public const int MaxPieces = 8;
+        public const int MaxPieces = 6;
         public readonly IReadOnlyList<GhostPiece> Pieces;
         private readonly long siteBody;
         private readonly RigidTransform T_body_site;

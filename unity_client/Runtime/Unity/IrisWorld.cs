@@ -33,6 +33,9 @@ namespace IrisSession.Unity
         /// <summary>Why nothing is drawn, for people; empty while all is well.</summary>
         public string Problem { get; private set; } = "";
 
+        /// <summary>Ghosts of the robots' hands that the wearer drives; null: none.</summary>
+        public HandGhosts Ghosts { get; set; }
+
         /// <summary>Materials of the package, for those who make this component in code.</summary>
         public IrisMaterials Materials { get { return materials; } }
 
@@ -52,6 +55,7 @@ namespace IrisSession.Unity
             try
             {
                 source.Update(World);
+                Ghosts?.Show(World);
                 World.Draw(source.SessionNowNs, Time.realtimeSinceStartupAsDouble, source.Participants);
             }
             catch (Exception error)

@@ -1,13 +1,15 @@
 // Transforms of the bodies of a scene, below one root: the world of the session.
 using System.Collections.Generic;
 using IrisSession.Core;
+using IrisSession.Interaction;
 using UnityEngine;
 
 namespace IrisSession.Unity
 {
     /// <summary>One transform for each moving body. What does not move is fixed to the root.</summary>
-    public sealed class SceneBodies
+    public sealed class SceneBodies : IBodies
     {
+        private readonly Dictionary<long, SceneBody> bodies = new Dictionary<long, SceneBody>();
         private readonly Dictionary<long, Transform> transforms = new Dictionary<long, Transform>();
         private readonly Dictionary<long, RigidTransform> poses = new Dictionary<long, RigidTransform>();
         private Transform[] rows = new Transform[0];
@@ -27,12 +29,28 @@ namespace IrisSession.Unity
         /// <summary>Return the transform of a body; the root for one that does not move, or is not known.</summary>
         public Transform Find(long body) { return transforms.TryGetValue(body, out Transform found) ? found : Root; }
 
+        public long FindParent(long body) { return bodies.TryGetValue(body, out SceneBody found) && found.Parent > 0 ? found.Parent : 0; }
+
+        public bool TryGetPosition(long body, out Double3 p_world_body)
+        {
+            bool isKnown = poses.TryGetValue(body, out RigidTransform pose);
+            if (!isKnown && bodies.TryGetValue(body, out SceneBody found))
+            {
+                pose = found.T_world_body;
+                isKnown = true;
+            }
+            p_world_body = pose.Position;
+            return isKnown;
+        }
+
         /// <summary>Make the bodies those of another plan. Bodies that stay keep their transforms, and all their pose if it is the same.</summary>
         public void Apply(ScenePlan plan, SceneChanges changes)
         {
             HashSet<long> begins = new HashSet<long>(changes.AddedBodies);
             begins.UnionWith(changes.ChangedBodies);
             HashSet<long> moving = new HashSet<long>();
+            bodies.Clear();
+            foreach (SceneBody body in plan.Bodies) bodies[body.Id] = body;
             foreach (SceneBody body in plan.Bodies)
             {
                 if (!body.IsMoving) continue;

@@ -11,7 +11,7 @@ namespace IrisSession.Unity
     public sealed class WorldView : IDisposable
     {
         /// <summary>Draw calls of a frame within which a Quest 3 keeps its rate, and how many of them are for the scene: others are avatars,
-        /// clouds, a ghost and panels.</summary>
+        /// clouds, ghosts and panels.</summary>
         public const int DrawCalls = 200;
         public const int SceneDrawCalls = 150;
 
@@ -19,7 +19,9 @@ namespace IrisSession.Unity
         public readonly BodyPoses Poses;
         public readonly AvatarTable Avatars;
         public readonly SceneView Scene;
-        public readonly GhostView Ghost;
+
+        /// <summary>Of the left and of the right hand.</summary>
+        public readonly GhostView[] Ghosts;
         private readonly Transform world;
         private readonly MaterialCache materials;
         private readonly AvatarViews avatarViews;
@@ -43,7 +45,7 @@ namespace IrisSession.Unity
             world = new GameObject("iris-session world").transform;
             world.SetParent(parent, false);
             Scene = new SceneView(world, materials, assets, Media);
-            Ghost = new GhostView(Scene, materials);
+            Ghosts = new[] { new GhostView(Scene, materials), new GhostView(Scene, materials) };
             avatarViews = new AvatarViews(Avatars, materials, world);
         }
 
@@ -81,7 +83,7 @@ namespace IrisSession.Unity
         {
             foreach (CloudView one in clouds) one.Dispose();
             clouds.Clear();
-            Ghost.Destroy();
+            foreach (GhostView one in Ghosts) one.Destroy();
             avatarViews.Destroy();
             Scene.Dispose();
             UnityEngine.Object.Destroy(world.gameObject);
