@@ -77,6 +77,12 @@ def test_layers_refer_to_assemblies_that_exist() -> None:
         assert own <= names
 
 
+def test_files_of_the_engine_can_be_read_at_once() -> None:
+    for layer in (path for path in LAYERS if not ASSEMBLIES[path]["noEngineReferences"]):
+        for source in layer.parent.rglob("*.cs"):
+            assert len(source.read_text().splitlines()) < 400, source
+
+
 def test_every_asset_has_an_id_of_its_own() -> None:
     """That each has one: tests/codegen."""
     ids = [re.search(r"^guid: ([0-9a-f]{32})$", path.read_text(), re.MULTILINE) for path in PACKAGE.rglob("*.meta")]

@@ -3,6 +3,8 @@ using System;
 using System.Collections.Generic;
 using System.Linq;
 using IrisSession.Core;
+using IrisSession.Interaction;
+using IrisSession.Interaction.Tests;
 using IrisSession.Protocol;
 using NUnit.Framework;
 using Standins;
@@ -114,6 +116,39 @@ namespace IrisSession.Unity.StandinTests
             stage.World.Ghosts[0].Hide();
             Engine.Step();
             Assert.AreEqual(before, Engine.Draws.Count);
+            stage.CheckNoErrors();
+        }
+
+        [Test]
+        public void AGhostFollowsTheHandThatDrives()
+        {
+            Stage stage = new Stage("aloha");
+            stage.Load();
+            stage.Show(1);
+            SceneBody hand = stage.Source.Plan.Bodies.Single(each => each.Name == "right/gripper_base");
+            Wearer wearer = new Wearer();
+            wearer.Take(Side.Right, "right");
+            wearer.Session.RobotTable["right"] = new RobotInfo { Name = "right", SiteBody = hand.Id, T_body_site = new Pose { P = new double[3], Q = new[] { 1.0, 0.0, 0.0, 0.0 } } };
+            wearer.Session.LeaseTable["right"].Scale = 0.5;
+            stage.Component.Ghosts = new HandGhosts(wearer.Input, wearer.Session);
+            Engine.Step();
+            Assert.IsNull(Engine.Draws.FirstOrDefault(each => each.Name == "ghost of right"), "the clutch is open");
+
+            wearer[Side.Right].Squeeze = 1;
+            wearer.Run(12);
+            Engine.Step();
+            RigidTransform pose = wearer[Side.Right].Pose;
+            wearer[Side.Right].Pose = new RigidTransform(pose.Position + new Double3(0.0, 0.0, 0.1), pose.Rotation);
+            wearer.Run();
+            Engine.Step();
+            DrawCall piece = Engine.Draws.First(each => each.Name == "ghost of right");
+            Vector3 wanted = piece.Matrices[0].MultiplyPoint3x4(piece.Mesh.vertices[0]) - new Vector3(0f, 0.05f, 0f);
+            Assert.IsTrue(Engine.Draws.Any(each => ReferenceEquals(each.Mesh, piece.Mesh) && each.Matrices.Any(m => (m.MultiplyPoint3x4(piece.Mesh.vertices[0]) - wanted).magnitude < 1e-4f)));
+
+            wearer[Side.Right].Squeeze = 0;
+            wearer.Run();
+            Engine.Step();
+            Assert.IsNull(Engine.Draws.FirstOrDefault(each => each.Name == "ghost of right"));
             stage.CheckNoErrors();
         }
 
