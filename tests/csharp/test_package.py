@@ -34,8 +34,12 @@ PACKAGES_OF_UNITY = {
 
 
 def test_packages_that_layers_use_are_dependencies_of_one_version() -> None:
-    dependencies = json.loads((PACKAGE / "package.json").read_text())["dependencies"]
-    assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in dependencies.values())
+    """A package that is for several headsets asks for the oldest that will do; the list of one headset is exact."""
+    dependencies = json.loads((PACKAGE / "Documentation~/quest-3.manifest.json").read_text())["dependencies"]
+    least = json.loads((PACKAGE / "package.json").read_text())["dependencies"]
+    assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in (*dependencies.values(), *least.values()))
+    numbers = {name: [int(part) for part in version.split(".")] for name, version in dependencies.items()}
+    assert all([int(part) for part in version.split(".")] <= numbers[name] for name, version in least.items())
     for path in LAYERS:
         for name in (name for name in ASSEMBLIES[path]["references"] if name.startswith("Unity.")):
             assert PACKAGES_OF_UNITY[name] in dependencies, f"{path}: {name}"
