@@ -354,6 +354,27 @@ namespace IrisSession.Unity.StandinTests
         }
 
         [Test]
+        public void ApplicationMayLeaveTheSessionWhenItHearsNews()
+        {
+            IrisHeadset headset = new GameObject("offset").AddComponent<IrisHeadset>();
+            SessionClient client = MakeClient();
+            headset.News += news => headset.Connect(null, null);
+            headset.Connect(client, new FakeBodies());
+            client.TryPost(loop => throw new InvalidOperationException("which is news"));
+            client.Start();
+            try
+            {
+                StepUntil(() => headset.Input == null);
+                Assert.AreEqual("", headset.Problem);
+                Assert.IsEmpty(Engine.Errors);
+            }
+            finally
+            {
+                client.Stop();
+            }
+        }
+
+        [Test]
         public void PulsesAreFeltByTheHandThatDrives()
         {
             using (ControllerHaptics haptics = new ControllerHaptics()) haptics.Play(Side.Right, new Pulse(0.5f, 0.25f));

@@ -52,10 +52,17 @@ namespace IrisSession.Transport
         /// <summary>Moves to a better address.</summary>
         public long Moves { get; private set; }
 
-        /// <summary>Add an address at the end, or before the others; one that is known stays where it is.</summary>
+        /// <summary>Add an address at the end, or before the others; one that is known stays where it is, with the newest key.</summary>
         public void Add(WebEndpoint endpoint, bool isPreferred = false)
         {
-            foreach (Candidate each in candidates) if (each.Endpoint.ToString() == endpoint.ToString()) return;
+            foreach (Candidate each in candidates)
+            {
+                if (each.Endpoint.ToString() != endpoint.ToString()) continue;
+                if (endpoint.Pin == null || CertificateHash.AreEqual(each.Endpoint.Pin, endpoint.Pin)) return;
+                each.Endpoint = endpoint; // paired anew
+                each.Blocked = default;
+                return;
+            }
             candidates.Insert(isPreferred ? 0 : candidates.Count, new Candidate { Endpoint = endpoint });
             if (!isPreferred) return;
             if (at >= 0) at++;

@@ -31,7 +31,7 @@ namespace IrisSession.Transport
             {
                 secret = new byte[SecretBytes];
                 using (RandomNumberGenerator random = RandomNumberGenerator.Create()) random.GetBytes(secret);
-                Write(SecretFile, secret);
+                if (Problem.Length == 0) Write(SecretFile, secret); // else one is there that cannot be read now: it is what sessions know
             }
             Secret = secret;
             ResumeToken = Read(TokenFile, MaxTokenBytes) ?? new byte[0];

@@ -124,6 +124,13 @@ namespace IrisSession.Transport.Tests
                 Assert.IsNotNull(second.FindPin("host10:1"));
                 Assert.AreEqual("", first.Problem + second.Problem);
                 CollectionAssert.AreNotEqual(first.Secret, new FileIdentityStore(folder + "/other").Secret);
+                using (new FileStream(Path.Combine(folder, "secret"), FileMode.Open, FileAccess.ReadWrite, FileShare.None))
+                {
+                    FileIdentityStore locked = new FileIdentityStore(folder);
+                    Assert.AreEqual(32, locked.Secret.Length);
+                    Assert.AreNotEqual("", locked.Problem);
+                }
+                CollectionAssert.AreEqual(first.Secret, new FileIdentityStore(folder).Secret, "one that cannot be read for a moment stays");
                 File.WriteAllBytes(Path.Combine(folder, "secret"), new byte[5]); // damaged: another one is made
                 Assert.AreEqual(32, new FileIdentityStore(folder).Secret.Length);
             }

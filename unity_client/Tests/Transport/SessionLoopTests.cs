@@ -277,6 +277,19 @@ namespace IrisSession.Transport.Tests
         }
 
         [Test]
+        public void AnAddressThatIsPairedAnewHasItsNewKey()
+        {
+            LoopRig rig = new LoopRig(Wifi);
+            rig.Loop.Open();
+            rig.Loop.Step();
+            rig.Transport.Break(LinkFailure.WrongCertificate, 0, TestCertificate.First.Hash);
+            rig.Run(Second);
+            rig.Endpoints.Add(Wifi.WithPin(TestCertificate.First.Hash));
+            rig.Join();
+            CollectionAssert.AreEqual(TestCertificate.First.Hash, rig.Transport.Newest.Pin);
+        }
+
+        [Test]
         public void AnotherCertificateOnOneAddressDoesNotStopTheOther()
         {
             LoopRig rig = new LoopRig(Wifi, Cable);

@@ -103,6 +103,7 @@ namespace IrisSession.Unity.Input
             {
                 Input.Take(news, reading.CaptureNs);
                 Pass(news);
+                if (client == null) return; // it has left the session
             }
             Input.Update(client.IsLive && focus == AppFocus.Focused, client.Suspensions, client.View.BodiesVersion);
             if (Input.CommandError != null) Debug.LogException(Input.CommandError);
