@@ -47,6 +47,7 @@ namespace IrisSession.Interaction
         private IReadOnlyDictionary<string, RobotInfo> robotsOf;
         private long bodiesOf = -1;
         private int suspensions;
+        private string sessionId = "";
 
         /// <param name="session">See <see cref="SessionClientPort"/>.</param>
         /// <param name="bodies">Bodies as they are shown.</param>
@@ -113,6 +114,7 @@ namespace IrisSession.Interaction
             if (suspensionCount != suspensions || !isLive) Suspend();
             suspensions = suspensionCount;
             TakeStops(isLive);
+            CheckSession();
             FillContext(bodiesVersion);
             Point();
             if (isLive)
@@ -138,6 +140,7 @@ namespace IrisSession.Interaction
         /// <summary>Take a message of the session.</summary>
         public void Take(ServerMessage message, long nowNs)
         {
+            CheckSession();
             switch (message)
             {
                 case Feedback feedback:
@@ -197,9 +200,11 @@ namespace IrisSession.Interaction
             Suspend();
         }
 
-        /// <summary>Another session: what the last one said is void.</summary>
-        public void OnWelcome()
+        /// <summary>In another session, what the last one said is void.</summary>
+        private void CheckSession()
         {
+            if (session.SessionId == sessionId) return;
+            sessionId = session.SessionId;
             pulses.Clear();
             consents.Clear();
         }

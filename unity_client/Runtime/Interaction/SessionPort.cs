@@ -11,6 +11,9 @@ namespace IrisSession.Interaction
     {
         bool IsJoined { get; }
 
+        /// <summary>Of the newest session that we were let into, empty before the first.</summary>
+        string SessionId { get; }
+
         string ParticipantId { get; }
 
         long SceneEpoch { get; }
@@ -61,6 +64,8 @@ namespace IrisSession.Interaction
         }
 
         public bool IsJoined { get { return client.View.IsJoined; } }
+
+        public string SessionId { get { return client.View.Welcome == null ? "" : client.View.Welcome.SessionId; } }
 
         public string ParticipantId { get { return client.View.ParticipantId; } }
 

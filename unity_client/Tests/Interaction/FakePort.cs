@@ -31,6 +31,8 @@ namespace IrisSession.Interaction.Tests
 
         public bool IsJoined { get; set; } = true;
 
+        public string SessionId { get; set; } = "s1";
+
         public string ParticipantId { get { return "p1"; } }
 
         public long SceneEpoch { get; set; }

@@ -61,6 +61,21 @@ namespace IrisSession.Interaction.Tests
         }
 
         [Test]
+        public void WhatAnotherSessionSaidIsForgotten()
+        {
+            Wearer wearer = new Wearer();
+            wearer.Input.Take(new Event { Body = new ConsentRequested { ConsentId = 7, Target = "right", Requester = "p2", Holder = "p1" } }, 0);
+            wearer.Input.Take(new Feedback { Robot = "right" }, 0);
+            wearer.Run();
+            Assert.IsNotNull(wearer.Input.Question);
+            Assert.IsNotNull(wearer.Input.FindFeedback("right"));
+            wearer.Session.SessionId = "s2";
+            wearer.Run();
+            Assert.IsNull(wearer.Input.Question);
+            Assert.IsNull(wearer.Input.FindFeedback("right"));
+        }
+
+        [Test]
         public void QuestionEndsWithItsTimeOrItsLease()
         {
             Wearer wearer = new Wearer();
