@@ -15,6 +15,7 @@ using NUnit.Framework;
 using Standins;
 using Unity.XR.CoreUtils;
 using UnityEngine;
+using UnityEngine.Android;
 using UnityEngine.XR;
 using UnityEngine.XR.ARFoundation;
 using UnityEngine.XR.ARSubsystems;
@@ -372,6 +373,26 @@ namespace IrisSession.Unity.StandinTests
             {
                 client.Stop();
             }
+        }
+
+        [Test]
+        public void PermissionIsAskedForOnceAndItsAnswerFollowed()
+        {
+            Permission.Granted.Clear();
+            Permission.Requested.Clear();
+            List<bool> answers = new List<bool>();
+            ScenePermission permission = new ScenePermission(answers.Add);
+            permission.Poll();
+            Assert.AreEqual(new[] { ScenePermission.UseScene }, Permission.Requested.ToArray());
+            Assert.IsEmpty(answers);
+            Permission.Granted.Add(ScenePermission.UseScene);
+            permission.Poll();
+            permission.Poll();
+            Assert.IsTrue(permission.IsAllowed);
+            Permission.Granted.Clear(); // in the settings
+            permission.Poll();
+            Assert.AreEqual(new[] { true, false }, answers.ToArray());
+            Assert.AreEqual(1, Permission.Requested.Count);
         }
 
         [Test]
