@@ -10,7 +10,7 @@ using IrisSession.Transport;
 /// <summary>
 /// Joins a session as an app does and logs the age of every state when an engine could take it. Prints `ready`; then each line
 /// `measure BEGIN END FILE` (session time [ns]) of its input is answered by `done`, with a line `tick handed_ns state_ns` for each state
-/// in FILE. It ends with its input.
+/// in FILE. It ends with its input, or when it has not joined in time.
 /// </summary>
 static class Live
 {
@@ -19,6 +19,9 @@ static class Live
 
     /// <summary>The estimate of session time may be wrong by so much [ns]; by more, this runtime's clock is not that of the session.</summary>
     const long MaxClockErrorNs = 1_000_000_000;
+
+    /// <summary>Time to join.</summary>
+    const long JoinNs = 50_000_000_000;
 
     sealed class Memory : IIdentityStore
     {
@@ -37,23 +40,44 @@ static class Live
         var hello = new Hello { Role = Role.Observer, Name = name, Software = "bench", Alignment = AlignmentKind.NotNeeded };
         var client = new SessionClient(hello, new Memory(), new EndpointChooser(WebEndpoint.Parse(address)), new WebTransport());
         client.Start();
-        while (!client.TakeState() || !client.HasClock)
+        var lines = new Queue<string>(); // the end of the input, as null, must be seen also while we join
+        new Thread(() =>
         {
-            if (client.View.Failure != null || client.HasEnded)
+            string line;
+            do
             {
-                Console.Error.WriteLine(client.View.Text + client.Crash);
+                line = Console.ReadLine();
+                lock (lines) lines.Enqueue(line);
+            }
+            while (line != null);
+        }) { IsBackground = true }.Start();
+        long until = MonotonicClock.NowNs + JoinNs;
+        bool isReady = false;
+        while (true)
+        {
+            if (!isReady && client.TakeState() && client.HasClock)
+            {
+                isReady = true;
+                Console.WriteLine("ready");
+            }
+            if (!isReady && (client.View.Failure != null || client.HasEnded || MonotonicClock.NowNs > until))
+            {
+                Console.Error.WriteLine(name + " has not joined: " + client.View.Phase + ", " + client.View.Text + ", " + client.View.Problem + ", " + client.Crash);
+                client.Stop();
                 return 1;
             }
-            Thread.Sleep(PollMs);
-        }
-        Console.WriteLine("ready");
-        for (string line = Console.ReadLine(); line != null; line = Console.ReadLine())
-        {
-            string[] words = line.Split(new[] { ' ' }, 4);
+            string next = "";
+            lock (lines) if (lines.Count > 0) next = lines.Dequeue();
+            if (next == null) return client.Stop() ? 0 : 1;
+            if (next.Length == 0)
+            {
+                Thread.Sleep(PollMs);
+                continue;
+            }
+            string[] words = next.Split(new[] { ' ' }, 4);
             Measure(client, originNs, long.Parse(words[1], CultureInfo.InvariantCulture), long.Parse(words[2], CultureInfo.InvariantCulture), words[3]);
             Console.WriteLine("done");
         }
-        return client.Stop() ? 0 : 1;
     }
 
     static void Measure(SessionClient client, long originNs, long beginNs, long endNs, string file)
