@@ -1,5 +1,5 @@
 // Listens for the beacons of sessions (UDP 7720) on a thread of its own. Android passes broadcasts on only while the app holds a
-// multicast lock: the engine's layer takes it while this runs.
+// multicast lock (WifiManager.createMulticastLock), which the application has to take while this runs.
 using System;
 using System.Collections.Generic;
 using System.Net;

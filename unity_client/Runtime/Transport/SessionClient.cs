@@ -219,7 +219,10 @@ namespace IrisSession.Transport
             return tickets;
         }
 
-        /// <summary>Stop all robots. Kept until the session has it, over any number of connections.</summary>
+        /// <summary>
+        /// Stop all robots. While a session is joined or being joined it is kept until the session has it, over any number of connections;
+        /// before that, and after a refusal, a notice says that it went nowhere.
+        /// </summary>
         /// <returns>False when the thread of the session has ended: nothing can be stopped from here any more.</returns>
         public bool EStop(string reason)
         {
