@@ -32,7 +32,7 @@ namespace IrisSession.Transport
         private const int KeptBytes = 2 << 20;
 
         /// <summary>Time for the last messages and the close frame of a link that ends [ns].</summary>
-        private const long DefaultLingerNs = 300_000_000;
+        private const long DefaultLingerNs = 500_000_000;
         private const string Guid = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"; // RFC 6455, section 1.3
 
         private readonly WebEndpoint endpoint;

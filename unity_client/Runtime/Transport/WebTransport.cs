@@ -22,7 +22,7 @@ namespace IrisSession.Transport
         private const long FirstPauseNs = 200_000_000;
         private const long LongestPauseNs = 5_000_000_000;
 
-        /// <summary>Longest time of <see cref="Dispose"/>: threads look every 50 ms whether they are to end, and linger for 300 ms.</summary>
+        /// <summary>Longest time of <see cref="Dispose"/>: threads look every 50 ms whether they are to end, and linger for 500 ms.</summary>
         private const int DisposeMs = 900;
 
         private readonly AutoResetEvent news = new AutoResetEvent(false);
@@ -200,7 +200,7 @@ namespace IrisSession.Transport
             long untilNs = MonotonicClock.NowNs + 1_000_000L * DisposeMs;
             foreach (WebSocketLink link in ending)
             {
-                if (!link.Join(RemainingMs(untilNs) / 2)) link.Abort();
+                if (!link.Join(RemainingMs(untilNs) * 3 / 4)) link.Abort();
             }
             HasEnded = probe == null || probe.Join(RemainingMs(untilNs));
             foreach (WebSocketLink link in ending) HasEnded &= link.Join(RemainingMs(untilNs));

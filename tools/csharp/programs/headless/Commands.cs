@@ -20,6 +20,12 @@ internal sealed class Commands
     private const int MaxPlaces = 20;
     private const int LookFrames = 40;
 
+    private static readonly Dictionary<string, string> Arguments = new Dictionary<string, string>
+    {
+        { "acquire", "ROBOT" }, { "release", "ROBOT" }, { "move", "ROBOT X Y Z" }, { "media", "STREAM SECONDS" }, { "measure", "SECONDS" },
+        { "body", "NAME" }, { "wait", "SECONDS" }, { "until", "EVENT" },
+    };
+
     private readonly Headset headset;
     private readonly Report report;
     private readonly Options options;
@@ -45,7 +51,7 @@ internal sealed class Commands
                 waiting.CompleteAdding();
             }) { IsBackground = true }.Start();
             bool isDone = true;
-            while (!waiting.IsCompleted)
+            while (!waiting.IsCompleted && !headset.IsInterrupted)
             {
                 if (!waiting.TryTake(out string line))
                 {
@@ -55,13 +61,31 @@ internal sealed class Commands
                 string[] words = line.Trim().Split(new[] { ' ' }, StringSplitOptions.RemoveEmptyEntries);
                 if (words.Length == 0) continue;
                 if (words[0] == "quit") break;
-                isDone &= Do(words);
+                isDone &= Check(words) && Do(words);
             }
             return isDone;
         }
     }
 
     private SessionClient Client { get { return headset.Client; } }
+
+    /// <summary>True when a session could not be joined.</summary>
+    public bool IsRefused { get; private set; }
+
+    /// <summary>Return whether a command has its arguments, with numbers where it needs them.</summary>
+    private bool Check(string[] words)
+    {
+        if (!Arguments.TryGetValue(words[0], out string wanted)) wanted = "";
+        string[] names = wanted.Split(new[] { ' ' }, StringSplitOptions.RemoveEmptyEntries);
+        bool isRight = words.Length > names.Length;
+        for (int i = 0; isRight && i < names.Length; i++)
+        {
+            bool isNumber = names[i] == "SECONDS" || names[i].Length == 1;
+            isRight = !isNumber || double.TryParse(words[i + 1], NumberStyles.Float, CultureInfo.InvariantCulture, out _);
+        }
+        if (!isRight) report.Write(words[0], false, "text", "it is written `" + words[0] + " " + wanted + "`");
+        return isRight;
+    }
 
     private bool Do(string[] words)
     {
@@ -109,6 +133,7 @@ internal sealed class Commands
         });
         SessionView view = Client.View;
         isJoined &= view.Phase == ConnectionPhase.Ready;
+        IsRefused = !isJoined;
         headset.SendsSamples = isJoined && options.RoleName != Role.Observer;
         report.Write(
             "join", isJoined, "phase", view.Phase.ToString(), "text", view.Text, "refusal", view.Failure == null ? "" : view.Failure.Code, "problem", view.Problem.Failure.ToString(),

@@ -2,12 +2,14 @@ using System;
 using System.Collections.Generic;
 using System.Threading;
 using IrisSession.Core;
+using IrisSession.Protocol;
 using IrisSession.Transport;
 
 /// <summary>Finds the gateway of a session: by an address or a link, or by beacons; pairs with it by a code.</summary>
 internal static class Finder
 {
     private const int BeaconMs = 10_000;
+    private const int OthersMs = 600;
     private const int PairMs = 60_000;
     private const string Software = "iris-session headless";
 
@@ -18,7 +20,7 @@ internal static class Finder
         foreach (string address in options.Address.Split(','))
         {
             string code = options.Code;
-            WebEndpoint endpoint = address.Length == 0 ? FindByBeacon(report) : FindByAddress(address, report, ref code);
+            WebEndpoint endpoint = address.Length == 0 ? FindByBeacon(options.Session, report) : FindByAddress(address, report, ref code);
             if (endpoint == null) return null;
             endpoint = identity.WithKnownPin(endpoint);
             if (code.Length > 0 && endpoint.IsSecure) endpoint = Pair(endpoint, code, options, identity, report);
@@ -48,24 +50,33 @@ internal static class Finder
         return finder.Endpoint;
     }
 
-    private static WebEndpoint FindByBeacon(Report report)
+    /// <summary>Listen for a moment, and return the only session that is heard, or the one with that name.</summary>
+    private static WebEndpoint FindByBeacon(string name, Report report)
     {
         BeaconListener listener = new BeaconListener();
         listener.Start();
-        List<FoundSession> sessions = listener.ListSessions();
-        for (long untilNs = MonotonicClock.NowNs + BeaconMs * 1_000_000L; sessions.Count == 0 && MonotonicClock.NowNs < untilNs; Thread.Sleep(50))
+        List<FoundSession> sessions = new List<FoundSession>();
+        long untilNs = MonotonicClock.NowNs + BeaconMs * 1_000_000L;
+        bool isHeard = false;
+        for (; MonotonicClock.NowNs < untilNs; Thread.Sleep(50))
         {
             sessions = listener.ListSessions();
+            sessions.RemoveAll(one => one.Beacon.Web == 0 || (name.Length > 0 && one.Beacon.SessionName != name));
+            if (isHeard || sessions.Count == 0) continue;
+            isHeard = true; // others announce themselves five times a second
+            untilNs = Math.Min(untilNs, MonotonicClock.NowNs + OthersMs * 1_000_000L);
         }
         string problem = listener.Problem;
         listener.Stop();
-        foreach (FoundSession session in sessions)
+        if (sessions.Count == 1)
         {
-            bool isPlain = HostName.IsLoopback(session.Beacon.Host) && session.Beacon.KeyFingerprint.Length == 0;
-            report.Write("find", true, "session", session.Beacon.SessionName, "host", session.Beacon.Host, "web", session.Beacon.Web);
-            if (session.Beacon.Web > 0) return new WebEndpoint(!isPlain, session.Beacon.Host, (int)session.Beacon.Web);
+            Beacon beacon = sessions[0].Beacon;
+            report.Write("find", true, "session", beacon.SessionName, "host", beacon.Host, "web", beacon.Web);
+            return new WebEndpoint(!HostName.IsLoopback(beacon.Host) || beacon.KeyFingerprint.Length > 0, beacon.Host, (int)beacon.Web);
         }
-        report.Write("find", false, "text", problem.Length > 0 ? problem : "no session is heard here");
+        string names = string.Join(", ", sessions.ConvertAll(one => one.Beacon.SessionName + " (" + one.Beacon.Host + ":" + one.Beacon.Web + ")"));
+        string none = problem.Length > 0 ? problem : "no session is heard here: give its --address";
+        report.Write("find", false, "text", sessions.Count == 0 ? none : "several sessions are heard, choose by --session or --address: " + names);
         return null;
     }
 

@@ -33,6 +33,9 @@ internal sealed class Headset : IDisposable
     public RigidTransform T_world_head = new RigidTransform(new Double3(-0.6, 0.0, 0.6), DoubleQuaternion.Identity);
     public bool SendsSamples;
 
+    /// <summary>Ctrl-C was pressed: nothing waits any more.</summary>
+    public volatile bool IsInterrupted;
+
     /// <summary>Frames, states, the longest time of a frame's calls, and after the newest stand-still the time until the state was fresh again [ms].</summary>
     public int Frames;
     public int States;
@@ -105,7 +108,7 @@ internal sealed class Headset : IDisposable
         long untilNs = MonotonicClock.NowNs + (long)(seconds * 1e9);
         while (!condition())
         {
-            if (MonotonicClock.NowNs >= untilNs || Client.Crash.Length > 0) return false;
+            if (IsInterrupted || MonotonicClock.NowNs >= untilNs || Client.Crash.Length > 0) return false;
             Frame();
         }
         return true;

@@ -1,10 +1,6 @@
 // A client without engine and screen: joins a session over the web wire as a headset app does, and does what it is asked to.
 //
-//     headless run [--address ADDRESS[,ADDRESS]] [--code CODE] [--identity FOLDER] [--name NAME] [--role ROLE] [--trust FINGERPRINT]
-//                  [--json] [--do "COMMAND; COMMAND"]
-//
-// Without --do, commands are lines of its input; see Commands.cs. Exit status: 0 when all of them succeeded, 1 when one failed, 2 when
-// no session could be joined. With --json, a line of JSON for each command.
+// Exit status: 0 when all commands succeeded, 1 when one failed, 2 when no session could be joined, 130 after Ctrl-C.
 using System;
 using System.Collections.Generic;
 using System.IO;
@@ -14,26 +10,59 @@ using IrisSession.Transport;
 
 internal static class Program
 {
-    private const int UsageStatus = 2;
+    private const int NotJoinedStatus = 2;
+    private const int InterruptedStatus = 130;
+
+    private const string Usage = @"usage: headless run [options]
+
+Join a session as a headset app does, and do what is asked: commands of --do, else lines of the input.
+
+  --address ADDRESS   host:port of the web channel, https://..., or a link of `iris-session pair --web`; several with commas, the
+                      preferred one first (default: a session that announces itself)
+  --session NAME      which of the sessions that announce themselves
+  --code CODE         join code of `iris-session pair`
+  --trust FINGERPRINT certificate to trust without a code, as `join` prints it
+  --identity FOLDER   secret, resume token and known certificates (default: in the folder for temporary files)
+  --name NAME         name that others see (headless)
+  --role ROLE         operator, observer, ... (operator)
+  --json              a line of JSON for each command
+  --do COMMANDS       commands, separated by semicolons
+
+Commands: join; scene; draw; align; acquire ROBOT; move ROBOT X Y Z (metres in the world); release ROBOT; measure SECONDS;
+media STREAM SECONDS; body NAME; view; until EVENT; wait SECONDS; estop; quit
+
+Example: headless run --code 7B60-VY33-DJ6M --do ""join; align; acquire left; move left 0 0 0.1""";
 
     private static int Main(string[] arguments)
     {
-        Options options = Options.Parse(arguments);
+        if (Array.IndexOf(arguments, "--help") >= 0 || Array.IndexOf(arguments, "-h") >= 0)
+        {
+            Console.Out.WriteLine(Usage);
+            return 0;
+        }
+        Options options = Options.Parse(arguments, out string problem);
         if (options == null)
         {
-            Console.Error.WriteLine("headless run [--address A] [--code C] [--identity FOLDER] [--name N] [--role R] [--trust F] [--json] [--do COMMANDS]");
-            return UsageStatus;
+            Console.Error.WriteLine("headless: " + problem + "; see headless --help");
+            return NotJoinedStatus;
         }
         Report report = new Report(options.IsJson);
         FileIdentityStore identity = new FileIdentityStore(options.Identity);
         WebEndpoint[] endpoints = Finder.Find(options, identity, report);
-        if (endpoints == null) return UsageStatus;
+        if (endpoints == null) return NotJoinedStatus;
         using (Headset headset = new Headset(options, identity, endpoints))
         {
+            Console.CancelKeyPress += (sender, pressed) =>
+            {
+                pressed.Cancel = !headset.IsInterrupted; // a second Ctrl-C ends at once
+                headset.IsInterrupted = true;
+            };
             Commands commands = new Commands(headset, report, options);
             bool isDone = commands.Run(options.Do == null ? ReadLines(Console.In) : options.Do.Split(';'));
             bool hasEnded = headset.Stop();
             if (!hasEnded) report.Write("stop", false, "text", "a thread did not end within a second");
+            if (headset.IsInterrupted) return InterruptedStatus;
+            if (commands.IsRefused) return NotJoinedStatus;
             return isDone && hasEnded ? 0 : 1;
         }
     }
@@ -47,6 +76,7 @@ internal static class Program
 internal sealed class Options
 {
     public string Address = "";
+    public string Session = "";
     public string Code = "";
     public string Identity = Path.Combine(Path.GetTempPath(), "iris-session-headless");
     public string Name = "headless";
@@ -55,8 +85,9 @@ internal sealed class Options
     public bool IsJson;
     public string Do;
 
-    public static Options Parse(string[] arguments)
+    public static Options Parse(string[] arguments, out string problem)
     {
+        problem = "the command is `run`";
         if (arguments.Length == 0 || arguments[0] != "run") return null;
         Options options = new Options();
         for (int i = 1; i < arguments.Length; i++)
@@ -66,11 +97,13 @@ internal sealed class Options
                 options.IsJson = true;
                 continue;
             }
+            problem = "\"" + arguments[i] + "\" is no option, or has no value";
             if (i + 1 == arguments.Length) return null;
             string value = arguments[i + 1];
             switch (arguments[i++])
             {
                 case "--address": options.Address = value; break;
+                case "--session": options.Session = value; break;
                 case "--code": options.Code = value; break;
                 case "--identity": options.Identity = value; break;
                 case "--name": options.Name = value; break;
