@@ -220,6 +220,7 @@ class Raw:
         self.attacker = attacker
         self.socket = attacker.open(zmq.DEALER, attacker.job.control, name)
         self.epoch = 0
+        self.clock_offset_ns = 0  # session time less this clock, to a round trip
 
     def send(self, message: ClientMessage) -> None:
         """Send a message; one for which there is no room is lost."""
@@ -234,6 +235,7 @@ class Raw:
             message = decode_server(self.socket.recv_multipart()[0]).message
             if isinstance(message, Welcome):
                 self.epoch = message.connection_epoch
+                self.clock_offset_ns = message.session_time - time.monotonic_ns()
                 counts["welcomed"] += 1
             elif isinstance(message, Refused):
                 counts["refused"] += 1
@@ -431,7 +433,7 @@ def attack_observations(attacker: Attacker) -> None:
     for n in attacker.paced(6 * 30.0):
         raw, shot = raws[n % len(raws)], n // len(raws)
         x, y, z = (attacker.random.gauss(0.0, 0.002) for _ in range(3))
-        viewpoint, now_ns = shot // 5, time.monotonic_ns()
+        viewpoint, now_ns = shot // 5, time.monotonic_ns() + raw.clock_offset_ns
         angle = 0.7 * viewpoint
         head = Pose((0.8 * math.cos(angle), 0.8 * math.sin(angle) - 0.45, 0.6), (1.0, 0.0, 0.0, 0.0))
         raw.send(Sample("head", "pose", shot + 1, now_ns, 1, 0, 0, pose=head))
