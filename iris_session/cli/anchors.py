@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from iris_session.protocol.server_messages import ParticipantInfo
     from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
 
-#: Edges of the code where none is given: with its marks it must be smaller to fit on A4.
-PLAIN_SHEET_M: Final = 0.150
+#: Edge of the code with marks where none is given: it must be smaller than the default sheet to fit on A4.
 MARKED_SHEET_M: Final = 0.140
 #: A printed sheet that is further off its size is no print of that sheet at 100 %.
 MAX_MISPRINT: Final = 0.05
@@ -240,12 +239,13 @@ def run_print(arguments: argparse.Namespace) -> int:
     """Write the sheet, and print its size."""
     from anchors.sheet import HEADSET_MIN_EDGE_M, Sheet, SheetError
     from anchors.sheet_print import to_pdf, to_svg
+    from iris_session.session.config import DEFAULT_SHEET_M
 
     out: Path = arguments.out or Path(re.sub(r"[^\w.-]+", "_", arguments.id) + ".pdf" if arguments.id else "sheet.pdf")
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise CommandError(f"{out}: the file must end in .pdf or .svg")
     try:
-        size_m = arguments.size or (MARKED_SHEET_M if arguments.marks else PLAIN_SHEET_M)
+        size_m = arguments.size or (MARKED_SHEET_M if arguments.marks else DEFAULT_SHEET_M)
         sheet = Sheet(arguments.id, arguments.measured or size_m, arguments.marks, arguments.layout)
         if arguments.measured:
             return _print_measured(arguments, sheet, size_m)

@@ -36,7 +36,7 @@ from iris_session.emulator.sheet_noise import SheetNoise, mix_viewpoint_noise
 #: Pose of the sheet in the demo scene: on the table in front of the operators, facing up (body `sheet`).
 DEFAULT_T_WORLD_ANCHOR: Final[PoseTuple] = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
 DEFAULT_ANCHOR_ID: Final = "table"
-DEFAULT_SHEET_M: Final = 0.16
+DEFAULT_SHEET_M: Final = 0.15
 T = TypeVar("T")
 MAX_VIEWPOINTS: Final = 256  # viewpoints whose systematic error is remembered
 

@@ -33,8 +33,8 @@ from iris_session.session.errors import ConfigError, short_repr
 
 #: A printed sheet lying at the near edge of the demo table; `T_world_anchor` of anchor id "table".
 DEFAULT_ANCHORS: Final[Mapping[str, PoseTuple]] = MappingProxyType({"table": ((0.0, -0.45, 0.0), IDENTITY_QUAT)})
-#: Edge of the code printed on it [m].
-DEFAULT_SHEET_M: Final = 0.16
+#: Edge of the code printed on it [m]: what `anchors print` prints by default.
+DEFAULT_SHEET_M: Final = 0.15
 #: Rates at which point clouds and pictures can be recorded.
 MIN_CLOUDS_HZ: Final = 0.01
 MAX_CLOUDS_HZ: Final = 60.0
@@ -64,7 +64,7 @@ class SessionConfig:
             come to an end, raw samples, media and assets are left out first; then the recording ends, and the session
             goes on. A resumed session has the budget anew.
         anchors: `T_world_anchor` by anchor id, as `((x, y, z), (w, x, y, z))` [m].
-        anchor_sizes: Edge of the printed sheets [m] that are to be checked for a misprint. The default sheet has 0.16.
+        anchor_sizes: Edge of the printed sheets [m] that are to be checked for a misprint. The default sheet has 0.15.
         anchor_errors: Stated p95 of the position error of anchors [m], which clients show.
         anchor_marks: Positions `(x, y, z)` of marks that can be touched, by anchor id and id of the mark, in the frame
             of the anchor [m].

@@ -11,7 +11,7 @@ from iris_session.cli import serve
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.scene import find_scene_file
 from iris_session.protocol.errors import IrisError
-from iris_session.session.config import SessionConfig
+from iris_session.session.config import DEFAULT_SHEET_M, SessionConfig
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 ARM = '<robot name="arm"><link name="base"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
@@ -139,7 +139,7 @@ def test_example_file_is_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str
         arguments = build_parser().parse_args(["serve", "arms4", "--no-record", "--anchors", str(path)])
         config = serve.create_session(arguments).config
         assert set(config.anchors) == {"table"}
-        assert config.sheet_sizes() == {"table": 0.16}
+        assert config.sheet_sizes() == {"table": DEFAULT_SHEET_M}
     own = serve.create_session(build_parser().parse_args(["serve", "arms4", "--no-record"])).config
     assert config.anchors == own.anchors, "that of the scene"
     assert main(["anchors", "example", "arms4", "--json"]) == 0

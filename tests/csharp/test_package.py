@@ -104,7 +104,7 @@ def test_sources_do_what_il2cpp_can_compile() -> None:
 
 
 def test_shaders_and_materials_fit_the_code() -> None:
-    """What the code names is in the shaders; each draws for both eyes; each material of the package has its shader."""
+    """Shaders have the properties that the code sets and draw for both eyes; each material has its shader."""
     folder = PACKAGE / "Runtime/Unity"
     sources = {path: path.read_text() for path in (folder / "Shaders").iterdir() if path.suffix in (".shader", ".hlsl")}
     names = re.findall(r'PropertyToID\("(\w+)"\)', (folder / "IrisMaterials.cs").read_text())

@@ -200,7 +200,7 @@ def test_suspended_machine_keeps_leases() -> None:
 
 
 def test_session_that_stands_still_is_reported_leases_stay_and_robots_hold_until_clutched_again() -> None:
-    """Its loop alone stands still: nobody is disconnected."""
+    """Its loop alone stands still: no client is disconnected."""
     with Rig(timestep=0.01) as rig:
         hand = rig.drive("ann", "left", (0.0, 0.05, 0.0))
         ann = hand.client

@@ -14,6 +14,7 @@ import pytest
 from iris_session import ConfigError, Session, SessionConfig, SessionError, StartError
 from iris_session.control import ControlConfig
 from iris_session.protocol.specs import RobotSpec
+from iris_session.session.config import DEFAULT_SHEET_M
 
 
 @pytest.mark.parametrize(
@@ -76,7 +77,7 @@ def test_invalid_types_and_anchors_are_named(fields: dict[str, Any], text: str) 
 
 def test_sheet_size_is_known_for_the_default_and_given_ones() -> None:
     door = {"door": ((1.2, 0.0, 0.4), (1.0, 0.0, 0.0, 0.0))}
-    assert SessionConfig().sheet_sizes() == {"table": 0.16}
+    assert SessionConfig().sheet_sizes() == {"table": DEFAULT_SHEET_M}
     assert SessionConfig(anchor_sizes={"table": 0.2}).sheet_sizes() == {"table": 0.2}
     assert SessionConfig(anchors=door).sheet_sizes() == {}
     assert SessionConfig(anchors=door, anchor_sizes={"door": 1}).sheet_sizes() == {"door": 1.0}

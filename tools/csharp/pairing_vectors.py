@@ -1,4 +1,4 @@
-"""What the Python client makes of addresses, links, join codes, keys and beacons, for the tests of the C# one.
+"""Vectors of addresses, links, join codes, keys and beacons, read by the Python client, for the tests of the C# one.
 
 A line is a kind and its values, with tabs between; texts and bytes in hexadecimal.
 

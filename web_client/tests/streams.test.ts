@@ -275,7 +275,6 @@ describe("deflate", () => {
     ["nothing", new Uint8Array(), 5],
     ["a byte more than is asked for", stream, text.length - 1],
     ["a byte less than is asked for", stream, text.length + 1],
-    ["a byte behind the stream", new Uint8Array([...stream, 0]), text.length],
     ["the end missing", stream.subarray(0, -1), text.length],
     ["a size that the stream cannot hold", stream, 2 ** 30],
   ])("refuses %s", (_name, bytes, size) => {

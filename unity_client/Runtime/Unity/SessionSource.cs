@@ -66,7 +66,7 @@ namespace IrisSession.Unity
             world.Scene.OnAssets();
         }
 
-        /// <summary>Take the newest state, whoever else has taken it, once its bodies are known.</summary>
+        /// <summary>Take the newest state once its bodies are known, also when other code has taken it.</summary>
         private void TakeState(WorldView world, SessionView view)
         {
             client.TakeState();

@@ -7,7 +7,7 @@ import { setPose } from "./axes.ts";
 import { Label } from "./labels.ts";
 
 /** Edge that is drawn for an anchor of unknown size [m]. */
-const UNKNOWN_SIZE_M = 0.16;
+const UNKNOWN_SIZE_M = 0.15;
 const COLOR = "#35d0ba";
 
 /** All anchors. Add `group` to the session's world. */
