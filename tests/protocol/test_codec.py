@@ -118,7 +118,7 @@ def test_unknown_names_and_fields_are_accepted() -> None:
         (pack([1, 0, "", {"type": "bye", "reason": b"x"}]), "Expected `str`, got `bytes`"),
         (pack([1, 0, "", {"type": "acquire", "request_id": 1, "robots": ["r"] * 33}]), "length <= 32"),
         (pack([1, 0, "", {"type": "bye"}]) + b"\0", "trailing"),
-        (BYE + b"\xa6reason\xa2\xff\xfe", "utf-8"),
+        (BYE + b"\xa6reason\xa2\xff\xfe", "(?i)utf-8"),
         (BYE + b"\xa1z" + b"\x91" * 3000 + b"\xc0", "recursion"),
         (BYE + b"\xa1z\xdd\xff\xff\xff\xff", "truncated"),
         (b"\x94\x01\x00\xa0\xdf\xff\xff\xff\xff\xa4type\xa3bye", "truncated"),
