@@ -31,6 +31,9 @@ namespace IrisSession.Transport
         /// <summary>Why nothing can be heard, in words of the system; empty while it listens.</summary>
         public string Problem { get { return problem; } }
 
+        /// <summary>Beacons of another version of the protocol that came.</summary>
+        public long OtherVersions { get { lock (table) return table.OtherVersion; } }
+
         public void Start()
         {
             thread.Start();

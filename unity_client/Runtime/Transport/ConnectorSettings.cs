@@ -45,6 +45,10 @@ namespace IrisSession.Transport
         public bool UsesThisMachine;
 
         internal int BeaconPort = BeaconTable.Port;
+
+        /// <summary>None heard for so long is said; an address that does not answer is tried again after this pause.</summary>
+        internal long SilenceNs = 3_000_000_000;
+        internal int AgainMs = 2_000;
         internal Func<ITransport> MakeTransport = () => new WebTransport();
     }
 }

@@ -1,4 +1,4 @@
-using System;
+using System.Collections.Generic;
 using IrisSession.Core;
 using IrisSession.Protocol;
 
@@ -42,13 +42,22 @@ namespace IrisSession.Transport
         public readonly bool IsKnown;
         internal readonly string Id;
 
-        internal OfferedSession(string id, string name, string host, int port, bool isKnown)
+        /// <summary>On each network from which it is heard, with the keys that are known.</summary>
+        internal readonly List<WebEndpoint> Endpoints = new List<WebEndpoint>();
+
+        internal OfferedSession(FoundSession found, FileIdentityStore identity)
         {
-            Id = id;
-            Name = name;
-            Host = host;
-            Port = port;
-            IsKnown = isKnown;
+            Beacon beacon = found.Beacon;
+            Id = beacon.SessionId;
+            Name = beacon.SessionName;
+            Host = beacon.Host;
+            Port = (int)beacon.Web;
+            foreach (string address in found.Addresses)
+            {
+                string host = address.Substring(0, address.LastIndexOf(':')).Trim('[', ']');
+                Endpoints.Add(identity.WithKnownPin(new WebEndpoint(!HostName.IsLoopback(host) || beacon.KeyFingerprint.Length > 0, host, Port)));
+            }
+            IsKnown = Endpoints.Exists(one => one.Pin != null);
         }
     }
 
@@ -69,6 +78,9 @@ namespace IrisSession.Transport
         /// <summary>Address in use or tried now, as a text; empty for none.</summary>
         public readonly string Endpoint;
 
+        /// <summary>Name of the session; empty while it is not known.</summary>
+        public readonly string Session;
+
         /// <summary>What became of the newest pairing, null for none.</summary>
         public readonly PairingResult Pairing;
 
@@ -81,21 +93,32 @@ namespace IrisSession.Transport
         internal readonly SessionClient Client;
         internal readonly SceneFetcher Scene;
 
-        internal static readonly ConnectorView Idle = new ConnectorView(ConnectorPhase.Idle, new Phrase("", ""), new OfferedSession[0], "", "", null, null, default, null, null);
+        internal static readonly ConnectorView Idle = new ConnectorView(ConnectorPhase.Idle, ConnectorWords.None);
 
         internal ConnectorView(
-            ConnectorPhase phase, Phrase phrase, OfferedSession[] sessions, string fingerprint, string endpoint, PairingResult pairing, Refused refusal, LinkEnd problem, SessionClient client, SceneFetcher scene)
+            ConnectorPhase phase, Phrase phrase, string endpoint = "", string session = "", OfferedSession[] sessions = null, PairingResult pairing = null, Refused refusal = null, LinkEnd problem = default,
+            SessionClient client = null, SceneFetcher scene = null)
         {
             Phase = phase;
             Phrase = phrase;
-            Sessions = sessions;
-            Fingerprint = fingerprint;
             Endpoint = endpoint;
+            Session = session;
+            Sessions = sessions ?? new OfferedSession[0];
             Pairing = pairing;
             Refusal = refusal;
             Problem = problem;
+            Fingerprint = phase == ConnectorPhase.Untrusted ? problem.Fingerprint : "";
             Client = client;
             Scene = scene;
+        }
+
+        internal bool IsSame(ConnectorView other)
+        {
+            bool isSame = Phase == other.Phase && Phrase.What == other.Phrase.What && Phrase.Remedy == other.Phrase.Remedy && Endpoint == other.Endpoint && Session == other.Session
+                && Pairing == other.Pairing && Refusal == other.Refusal && Problem.Failure == other.Problem.Failure && Fingerprint == other.Fingerprint && Client == other.Client
+                && Sessions.Length == other.Sessions.Length;
+            for (int i = 0; isSame && i < Sessions.Length; i++) isSame = Sessions[i] == other.Sessions[i];
+            return isSame;
         }
     }
 }

@@ -75,6 +75,13 @@ namespace IrisSession.Transport
             return pin == null ? endpoint : new WebEndpoint(true, endpoint.Host, endpoint.Port, pin);
         }
 
+        /// <summary>Return whether some gateway was known by a key: one that proves to have it is that gateway, also at another address.</summary>
+        public bool IsKnownPin(byte[] pin)
+        {
+            foreach (byte[] known in ReadPins().Values) if (CertificateHash.AreEqual(known, pin)) return true;
+            return false;
+        }
+
         /// <summary>Keep the key of a gateway, which was paired, or which the person has compared.</summary>
         public void KeepPin(string authority, byte[] pin)
         {

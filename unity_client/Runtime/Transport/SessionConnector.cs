@@ -1,24 +1,40 @@
 // From what an app was given (a pairing file, an address, a link, or nothing but a network) to a running session.
 //
+//     engine's thread                       thread of the connector
+//     Enter, Choose, Trust, ...  --orders-->  locate, pair, compare keys, join (SessionConnector.Running)
+//     Poll                       <--view----  phase, words, client
+//
 // All calls belong to one thread, the engine's. None waits but `Stop`; none throws what a network or a file did.
 using System;
+using System.Collections.Generic;
+using System.Threading;
 
 namespace IrisSession.Transport
 {
     /// <summary>Finds a session, pairs with it, and joins it. Start it once, poll it each frame, stop it once.</summary>
-    public sealed class SessionConnector
+    public sealed partial class SessionConnector
     {
-        private readonly ConnectorSettings settings;
+        /// <summary>Longest time of <see cref="Stop"/>: scene and client need less than a second each, and together when a network is stuck.</summary>
+        private const int StopMs = 2_000;
 
+        private readonly ConnectorSettings settings;
+        private readonly Thread thread;
+        private readonly object gate = new object(); // guards orders
+        private readonly Queue<Action> orders = new Queue<Action>();
+        private volatile ConnectorView newest = ConnectorView.Idle;
+        private volatile bool isStopping;
+
+        /// <param name="settings">With an identity and a cache.</param>
         public SessionConnector(ConnectorSettings settings)
         {
             this.settings = settings;
+            thread = new Thread(Run) { IsBackground = true, Name = "iris-session connector" };
         }
 
         /// <summary>What it does now, as of the last <see cref="Poll"/>.</summary>
         public ConnectorView View { get; private set; } = ConnectorView.Idle;
 
-        /// <summary>The session, null until `Running`, and again after it. Started and stopped by this.</summary>
+        /// <summary>The session, null unless `Running`. This starts and stops it.</summary>
         public SessionClient Client { get { return View.Client; } }
 
         /// <summary>The scene of <see cref="Client"/>, null with it.</summary>
@@ -26,44 +42,70 @@ namespace IrisSession.Transport
 
         public void Start()
         {
+            thread.Start();
         }
 
-        /// <summary>Leave the session and end all threads. Returns within about a second: whether they have ended.</summary>
+        /// <summary>Leave the session and end all threads. Returns within about a second, two when a network is stuck: whether they have ended.</summary>
         public bool Stop()
         {
-            return true;
+            isStopping = true;
+            Order(() => { }); // ends its wait
+            View = ConnectorView.Idle;
+            return (thread.ThreadState & ThreadState.Unstarted) != 0 || thread.Join(StopMs);
         }
 
-        /// <summary>Take what happened. Call it each frame: it waits for nothing, and allocates nothing while nothing changes.</summary>
+        /// <summary>Take what happened. Call it each frame: it waits for nothing, and allocates nothing.</summary>
         /// <returns>Whether <see cref="View"/> is another one.</returns>
         public bool Poll()
         {
-            return false;
+            ConnectorView now = newest;
+            if (now == View || isStopping) return false;
+            View = now;
+            return true;
         }
 
         /// <summary>Join one of `View.Sessions`.</summary>
         public void Choose(OfferedSession session)
         {
+            Order(() => goal.Chosen = session);
         }
 
         /// <summary>Leave what is there and go to an address or link, typed or scanned; one with a join code pairs. Empty: sessions that announce themselves.</summary>
         public void Enter(string address)
         {
+            Order(() => goal = new ConnectorGoal(null, address) { PairsFirst = true });
         }
 
         /// <summary>Pair by a join code, as typed, with the session whose key is not known, or that refused this headset.</summary>
         public void EnterCode(string code)
         {
+            Order(() =>
+            {
+                goal.Code = code;
+                goal.PairsFirst = true;
+            });
         }
 
         /// <summary>Accept the key whose `View.Fingerprint` the person has compared, and join.</summary>
         public void Trust()
         {
+            string compared = View.Fingerprint;
+            Order(() => TrustShown(compared));
         }
 
         /// <summary>Begin again with what was given or entered last.</summary>
         public void Retry()
         {
+            Order(() => goal.Chosen = null);
+        }
+
+        private void Order(Action change)
+        {
+            lock (gate)
+            {
+                orders.Enqueue(change);
+                Monitor.PulseAll(gate);
+            }
         }
     }
 }
