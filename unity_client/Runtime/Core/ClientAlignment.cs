@@ -47,6 +47,26 @@ namespace IrisSession.Core
         public bool IsSeen = true;
     }
 
+    /// <summary>A tip or fingertip at rest on a point.</summary>
+    public sealed class TouchReport
+    {
+        /// <summary>The sheet, or the name of a point that others touch too.</summary>
+        public string AnchorId = "";
+
+        /// <summary>Mark of the sheet, empty for its origin. Null: a point that others touch too.</summary>
+        public string Mark;
+        public string Device = "";
+
+        /// <summary>Position of the tip, rotation of the device.</summary>
+        public RigidTransform T_tracking_tip;
+
+        /// <summary>Session time [ns].</summary>
+        public long CaptureNs;
+
+        /// <summary>6x6 row-major [m], [rad]; empty: as the session has it for such a device.</summary>
+        public double[] Covariance = Array.Empty<double>();
+    }
+
     /// <summary>Reports observations of one connection, and says how it is aligned.</summary>
     public sealed class ClientAlignment
     {
@@ -125,24 +145,25 @@ namespace IrisSession.Core
             return connection.Send(observation);
         }
 
-        /// <summary>Report that the tip of `device` is on a mark of a sheet, or (kind `point`) on a point that others touch too.</summary>
+        /// <summary>Report that a tip is on a mark of a sheet, or on a point that others touch too.</summary>
         /// <returns>Whether it was queued.</returns>
-        public bool ReportTouch(string device, string anchorId, string mark, RigidTransform T_tracking_tip, long captureNs, bool isCommonPoint = false)
+        public bool ReportTouch(TouchReport touch)
         {
-            if (!IsUsable(T_tracking_tip) || !connection.IsJoined)
+            if (!IsUsable(touch.T_tracking_tip) || !connection.IsJoined)
             {
                 Ignored++;
                 return false;
             }
             return connection.Send(new Observation
             {
-                AnchorId = anchorId,
-                Kind = isCommonPoint ? AnchorKind.Point : AnchorKind.Touch,
-                T_tracking_anchor = ToPose(T_tracking_tip),
-                CaptureNs = captureNs,
+                AnchorId = touch.AnchorId,
+                Kind = touch.Mark == null ? AnchorKind.Point : AnchorKind.Touch,
+                T_tracking_anchor = ToPose(touch.T_tracking_tip),
+                CaptureNs = touch.CaptureNs,
                 TrackingEpoch = connection.TrackingEpoch,
-                Device = device,
-                Mark = mark,
+                Device = touch.Device,
+                Mark = touch.Mark ?? "",
+                Covariance = touch.Covariance,
             });
         }
 

@@ -82,6 +82,9 @@ namespace IrisSession.Interaction
         /// <summary>This participant may place itself, and is not aligned.</summary>
         public bool CanPlace;
 
+        /// <summary>Marks are touched: squeezes and the lower and upper buttons mean that, and triggers at no button.</summary>
+        public bool IsTouching;
+
         public void Clear()
         {
             Held.Clear();
@@ -93,7 +96,7 @@ namespace IrisSession.Interaction
                 Pointed[side] = "";
                 Aimed[side] = default;
             }
-            CanPlace = false;
+            CanPlace = IsTouching = false;
         }
     }
 }

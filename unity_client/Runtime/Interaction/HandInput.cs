@@ -41,6 +41,9 @@ namespace IrisSession.Interaction
         /// <summary>The clutch of a hand that has got a robot stays open this long: a session engages after it has seen it open.</summary>
         private const long OpenNs = 100_000_000;
         private const int Sides = 2;
+
+        /// <summary>What means something else while marks are touched.</summary>
+        private const long TouchingButtons = ButtonBits.Trigger | ButtonBits.Squeeze | ButtonBits.Lower | ButtonBits.Upper;
         private const long Never = long.MinValue;
 
         private sealed class Hand
@@ -72,6 +75,7 @@ namespace IrisSession.Interaction
         private readonly SampleInput[] controllers = { new SampleInput { Device = Device.ControllerLeft }, new SampleInput { Device = Device.ControllerRight } };
         private readonly SampleInput[] bare = { new SampleInput { Device = Device.HandLeft }, new SampleInput { Device = Device.HandRight } };
         private long frameNs = Never;
+        private bool isTouching;
 
         /// <summary>Take the buttons of the e-stop. Returns whether one is pressed that was not in the frame before.</summary>
         public bool TakeStops(HeadsetReading reading)
@@ -93,6 +97,8 @@ namespace IrisSession.Interaction
             double seconds = frameNs == Never ? 0 : (nowNs - frameNs) * 1e-9;
             if (frameNs == Never || nowNs - frameNs > GapNs) Suspend();
             frameNs = nowNs;
+            if (isTouching != context.IsTouching) Suspend();
+            isTouching = context.IsTouching;
             guessed.Clear();
             guessed.AddRange(context.Guessed);
             foreach (Hand hand in hands) if (hand.Driven.Length > 0 && !context.Held.Contains(hand.Driven)) hand.Driven = "";
@@ -199,7 +205,7 @@ namespace IrisSession.Interaction
                 if (isNamed) sample.Robots.Add(hand.Driven);
                 sample.Clutch = IsSqueezing((Side)side) && (hand.BoundNs == Never || reading.CaptureNs - hand.BoundNs >= OpenNs);
                 sample.Gripper = sample.Clutch ? hand.Grasp : null;
-                sample.Buttons = input.Buttons;
+                sample.Buttons = MaskButtons(input);
                 sample.HandJoints = isVisible ? input.Joints : InputReading.NoJoints;
                 samples.Add(sample);
             }
@@ -211,7 +217,7 @@ namespace IrisSession.Interaction
             bool isNew = !hand.IsKnown || hand.Kind != input.Kind;
             bool hadTrigger = hand.Trigger, hadSqueeze = hand.Squeeze;
             long hadButtons = hand.Buttons;
-            bool isSqueezed = IsPressed(input.Squeeze, isNew || hadSqueeze || hand.MustLetGo);
+            bool isSqueezed = IsPressed(isTouching ? 0 : input.Squeeze, isNew || hadSqueeze || hand.MustLetGo);
             bool trigger = IsPressed(input.Trigger, isNew || hadTrigger);
             hand.MustLetGo = isSqueezed && (isNew || hand.MustLetGo);
             hand.MustLetGoTrigger = trigger && (isNew || hand.MustLetGoTrigger);
@@ -219,7 +225,7 @@ namespace IrisSession.Interaction
             hand.Kind = input.Kind;
             hand.Trigger = trigger;
             hand.Squeeze = isSqueezed && !hand.MustLetGo;
-            hand.Buttons = input.Buttons;
+            hand.Buttons = MaskButtons(input);
             if (isNew)
             {
                 hand.PressedNs = hand.TappedNs = Never;
@@ -228,7 +234,7 @@ namespace IrisSession.Interaction
             }
             if (hand.Squeeze && !hadSqueeze) BeginSqueeze(side, context.Held);
             ReadTrigger(side, hadTrigger, nowNs, context, intents);
-            long pressed = input.Buttons & ~hadButtons;
+            long pressed = hand.Buttons & ~hadButtons;
             if ((pressed & ButtonBits.Lower) != 0) intents.Add(new HandIntent(IntentKind.EpisodeLower));
             if ((pressed & ButtonBits.Upper) != 0) intents.Add(new HandIntent(IntentKind.EpisodeUpper));
         }
@@ -242,6 +248,7 @@ namespace IrisSession.Interaction
             if (!hand.Trigger || hand.Squeeze || robot != hand.PressedAt) hand.PressedNs = Never;
             if (hand.Squeeze || robot.Length > 0 || button.IsSomething) hand.TappedNs = Never;
             if (isPress && button.IsSomething) intents.Add(new HandIntent(IntentKind.Press, button: button));
+            else if (isTouching) hand.PressedNs = hand.TappedNs = Never;
             else if (isPress && robot.Length > 0) PressAt(robot, side, nowNs, context.Held, intents);
             else if (isPress) hand.TappedNs = nowNs;
             if (hand.PressedNs != Never && nowNs - hand.PressedNs >= ReleaseNs)
@@ -336,6 +343,11 @@ namespace IrisSession.Interaction
                 break;
             }
             Bind(side, best);
+        }
+
+        private long MaskButtons(InputReading input)
+        {
+            return isTouching ? input.Buttons & ~TouchingButtons : input.Buttons;
         }
 
         private static bool IsPressed(double value, bool before)

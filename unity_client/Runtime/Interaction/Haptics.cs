@@ -22,6 +22,9 @@ namespace IrisSession.Interaction
 
         /// <summary>A second of a countdown.</summary>
         public static Pulse Tick { get { return new Pulse(0.3f, 0.03f); } }
+
+        /// <summary>A touch was taken.</summary>
+        public static Pulse Touch { get { return new Pulse(0.6f, 0.06f); } }
     }
 
     /// <summary>Compares the feedback of robots with that before.</summary>

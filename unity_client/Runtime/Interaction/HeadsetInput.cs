@@ -67,6 +67,9 @@ namespace IrisSession.Interaction
         public readonly EpisodeControl Episode = new EpisodeControl();
         public readonly Pointing Pointing = new Pointing();
 
+        /// <summary>Marks of a sheet that are touched: begun by itself where no codes are read, else by a trigger that is held.</summary>
+        public readonly MarkTouching Touching = new MarkTouching();
+
         /// <summary>Codes; null: none are looked for.</summary>
         public MarkerLooks Markers { get; set; }
 
@@ -120,6 +123,8 @@ namespace IrisSession.Interaction
             if (isLive)
             {
                 intents.Clear();
+                Touching.Update(Reading, context, session, haptics, IsTouchOffered);
+                context.IsTouching = Touching.IsActive;
                 Hands.Update(Reading, context, intents);
                 foreach (HandIntent intent in intents) Do(intent, nowNs);
             }
@@ -141,6 +146,7 @@ namespace IrisSession.Interaction
         public void Take(ServerMessage message, long nowNs)
         {
             CheckSession();
+            Touching.Take(message, session);
             switch (message)
             {
                 case Feedback feedback:
@@ -196,6 +202,7 @@ namespace IrisSession.Interaction
         {
             session.ReportRecentred();
             Markers?.Reset();
+            Touching.Reset();
             foreach (InputReading input in Reading.Inputs) input.HasPose = false;
             Suspend();
         }
@@ -207,6 +214,13 @@ namespace IrisSession.Interaction
             sessionId = session.SessionId;
             pulses.Clear();
             consents.Clear();
+            Touching.Reset();
+        }
+
+        /// <summary>The room is seen, and nothing reads its codes.</summary>
+        private bool IsTouchOffered
+        {
+            get { return !OwnPlace.HasValue && (Markers == null || Markers.Support == MarkerSupport.Missing || Markers.Support == MarkerSupport.NotAllowed); }
         }
 
         private void Suspend()
@@ -214,6 +228,7 @@ namespace IrisSession.Interaction
             Hands.Suspend();
             WristStop.Suspend();
             Episode.Cancel();
+            Touching.Suspend();
         }
 
         /// <summary>A button of the e-stop counts whenever the runtime reports it: also without tracking, and in the frame of a recentring.</summary>
@@ -274,7 +289,7 @@ namespace IrisSession.Interaction
                     hits[side] = distance;
                     continue;
                 }
-                if (!isPlaced) continue;
+                if (!isPlaced || Touching.IsActive) continue;
                 string robot = Pointing.FindPointed(input.Ray.In(T_world_tracking), bodies, out distance);
                 context.Pointed[side] = robot;
                 if (robot.Length > 0) hits[side] = distance;

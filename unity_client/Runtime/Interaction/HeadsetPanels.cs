@@ -60,6 +60,9 @@ namespace IrisSession.Interaction
         private const double AboveHandM = 0.13;
         private const double BelowHandM = 0.06;
 
+        /// <summary>Height of the line above the mark that is touched next [m].</summary>
+        private const double PoleM = 0.1;
+
         // Before the eyes: ahead and below, out of the way of the hands.
         private static readonly Double3 UrgentAt = new Double3(0.9, 0, -0.3);
 
@@ -67,10 +70,13 @@ namespace IrisSession.Interaction
         public readonly Panel Status = new Panel { Style = PanelStyle.Status, LineM = 0.012 };
         public readonly Panel Question = new Panel { Style = PanelStyle.Question, LineM = 0.03 };
         public readonly Panel Stop = new Panel { Style = PanelStyle.Stop, LineM = 0.018 };
+        public readonly Panel Mark = new Panel { Style = PanelStyle.Status, LineM = 0.02 };
         public readonly Panel[] Hands = { new Panel { Style = PanelStyle.Hand, LineM = 0.012 }, new Panel { Style = PanelStyle.Hand, LineM = 0.012 } };
         public readonly Panel[] Robots = Make(MaxRobots, PanelStyle.Robot, 0.03);
         public readonly Panel[] Buttons = Make(MaxButtons, PanelStyle.Button, 0.03);
-        public readonly PanelRay[] Rays = new PanelRay[2];
+
+        /// <summary>Rays of both hands, and the line from above to the mark that is touched next.</summary>
+        public readonly PanelRay[] Rays = new PanelRay[3];
         private readonly List<Panel> all = new List<Panel>();
         private readonly HeadsetInput input;
         private readonly ISessionPort session;
@@ -87,6 +93,7 @@ namespace IrisSession.Interaction
             all.Add(Status);
             all.Add(Question);
             all.Add(Stop);
+            all.Add(Mark);
             all.AddRange(Hands);
             all.AddRange(Robots);
             all.AddRange(Buttons);
@@ -106,6 +113,7 @@ namespace IrisSession.Interaction
             }
             PlaceTexts(reading);
             PlaceButtons();
+            PlaceMark();
             for (int side = 0; side < 2; side++) Rays[side] = FindRay(side);
         }
 
@@ -129,7 +137,8 @@ namespace IrisSession.Interaction
                 PanelWords.Wrap(text, one.Phrase.ToString());
                 said++;
             }
-            if (session.IsJoined && session.AlignmentState == AlignmentState.None) WrapIfAny(PanelWords.DescribeMarkers(input.Markers));
+            if (session.IsJoined && session.AlignmentState == AlignmentState.None && !input.Touching.IsActive) WrapIfAny(PanelWords.DescribeMarkers(input.Markers));
+            TouchWords.Describe(text, input.Touching, session, nowNs);
             WrapIfAny(input.Episode.Describe(nowNs));
             WrapIfAny(notice);
             Set(Urgent, text.ToString().TrimStart('\n'));
@@ -205,9 +214,25 @@ namespace IrisSession.Interaction
             }
         }
 
+        private void PlaceMark()
+        {
+            bool isThere = input.Touching.TryFindExpected(session, out RigidTransform T_tracking_mark);
+            Mark.Text = isThere ? input.Touching.Marks.Next : "";
+            Double3 up = T_tracking_mark.Rotation.Rotate(new Double3(0, 0, 1));
+            Mark.At = T_tracking_mark.Position + PoleM * up;
+            Rays[2] = isThere ? new PanelRay { Ray = new AimRay(Mark.At, -up), LengthM = PoleM, IsHit = true } : default;
+        }
+
+        /// <summary>Return the ray of a hand; while marks are touched, the line to the tip of its controller.</summary>
         private PanelRay FindRay(int side)
         {
             InputReading hand = input.Reading.Inputs[side];
+            bool isAtTip = input.Touching.IsActive && hand.Kind == InputKind.Controller && !input.FindAimed((Side)side).IsSomething;
+            if (isAtTip && input.Touching.TryFindTip(input.Reading, (Side)side, out Double3 tip))
+            {
+                Double3 line = tip - hand.Pose.Position;
+                return new PanelRay { Ray = new AimRay(hand.Pose.Position, (1 / line.Length) * line), LengthM = line.Length, IsHit = true };
+            }
             if (!hand.IsTracked || !hand.HasRay) return default;
             double hit = input.FindHit((Side)side);
             return new PanelRay { Ray = hand.Ray, LengthM = hit > 0 ? hit : RayM, IsHit = hit > 0 };

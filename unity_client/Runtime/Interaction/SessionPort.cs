@@ -44,6 +44,11 @@ namespace IrisSession.Interaction
 
         bool TryObserve(SheetSighting sighting);
 
+        void ReportTouch(TouchReport touch);
+
+        /// <summary>Report poses of a controller whose tip stayed in a hole. The answer is a `TipCalibrated`.</summary>
+        void ReportTipPoses(string device, RigidTransform[] T_tracking_grip, long captureNs);
+
         /// <summary>Send a request. Returns its ticket, 0 when it could not be sent.</summary>
         long Request(ClientMessage message);
 
@@ -108,6 +113,16 @@ namespace IrisSession.Interaction
         public bool TryObserve(SheetSighting sighting)
         {
             return client.TryObserve(sighting);
+        }
+
+        public void ReportTouch(TouchReport touch)
+        {
+            client.Post(loop => loop.Alignment.ReportTouch(touch));
+        }
+
+        public void ReportTipPoses(string device, RigidTransform[] T_tracking_grip, long captureNs)
+        {
+            client.Post(loop => loop.Alignment.ReportTipPoses(device, T_tracking_grip, captureNs));
         }
 
         public long Request(ClientMessage message)

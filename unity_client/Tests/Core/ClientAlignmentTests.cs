@@ -76,12 +76,14 @@ namespace IrisSession.Core.Tests
         public void TouchesAndTipsAreReported()
         {
             RigidTransform grip = new RigidTransform(new Double3(0.1, 0.2, 0.3), DoubleQuaternion.Identity);
-            Assert.IsTrue(alignment.ReportTouch(Device.ControllerRight, "table", "a", grip, 5));
+            TouchReport touch = new TouchReport { Device = Device.ControllerRight, AnchorId = "table", Mark = "a", T_tracking_tip = grip };
+            Assert.IsTrue(alignment.ReportTouch(touch));
             Assert.IsTrue(alignment.ReportTipPoses(Device.ControllerRight, new RigidTransform[250], 6));
             List<ClientMessage> sent = session.TakeSent();
             Assert.AreEqual(AnchorKind.Touch, ((Observation)sent[0]).Kind);
             Assert.AreEqual(100, ((Observation)sent[1]).GripPoses.Length);
-            Assert.IsFalse(alignment.ReportTouch(Device.ControllerRight, "table", "a", RigidTransform.Identity, 5));
+            touch.T_tracking_tip = RigidTransform.Identity;
+            Assert.IsFalse(alignment.ReportTouch(touch));
             alignment.StartRun();
             Assert.AreEqual(AlignAction.Start, ((Align)session.TakeSent()[0]).Action);
         }

@@ -10,6 +10,8 @@ namespace IrisSession.Interaction.Tests
         public const long SessionOffset = 5_000_000_000;
         public readonly List<ClientMessage> Requests = new List<ClientMessage>();
         public readonly List<SampleInput> Samples = new List<SampleInput>();
+        public readonly List<TouchReport> Touches = new List<TouchReport>();
+        public readonly List<RigidTransform[]> TipPoses = new List<RigidTransform[]>();
         public readonly List<SheetSighting> Looks = new List<SheetSighting>();
         public readonly List<string> Stops = new List<string>();
         public readonly Dictionary<string, Lease> LeaseTable = new Dictionary<string, Lease>();
@@ -75,6 +77,10 @@ namespace IrisSession.Interaction.Tests
             Looks.Add(new SheetSighting { AnchorId = sighting.AnchorId, CaptureNs = sighting.CaptureNs, SizeM = sighting.SizeM, T_tracking_anchor = sighting.T_tracking_anchor, T_tracking_camera = sighting.T_tracking_camera, Source = sighting.Source });
             return true;
         }
+
+        public void ReportTouch(TouchReport touch) { Touches.Add(touch); }
+
+        public void ReportTipPoses(string device, RigidTransform[] T_tracking_grip, long captureNs) { TipPoses.Add(T_tracking_grip); }
 
         public long Request(ClientMessage message)
         {

@@ -28,7 +28,7 @@ namespace IrisSession.Unity.Input
         private readonly HeadsetPanels panels;
         private readonly TextMesh[] texts;
         private readonly string[] shown;
-        private readonly LineRenderer[] rays = new LineRenderer[2];
+        private readonly LineRenderer[] rays;
 
         /// <param name="parent">The tracking frame.</param>
         /// <param name="rayMaterial">Unlit, null: no rays are drawn.</param>
@@ -38,7 +38,8 @@ namespace IrisSession.Unity.Input
             texts = new TextMesh[panels.All.Count];
             shown = new string[texts.Length];
             for (int i = 0; i < texts.Length; i++) texts[i] = MakeText(parent, panels.All[i]);
-            for (int side = 0; side < 2 && rayMaterial != null; side++) rays[side] = MakeRay(parent, rayMaterial);
+            rays = new LineRenderer[panels.Rays.Length];
+            for (int i = 0; i < rays.Length && rayMaterial != null; i++) rays[i] = MakeRay(parent, rayMaterial);
         }
 
         /// <summary>Draw the panels of a frame for a head at `p_tracking_head`.</summary>
@@ -56,7 +57,7 @@ namespace IrisSession.Unity.Input
                 texts[i].characterSize = (float)panel.LineM / (LinePerSize * FontSize);
                 one.transform.SetLocalPositionAndRotation(EnginePoses.ToEngine(panel.At), EnginePoses.ToEngine(HeadsetPanels.Face(panel.At, p_tracking_head)));
             }
-            for (int side = 0; side < 2; side++) UpdateRay(rays[side], panels.Rays[side]);
+            for (int i = 0; i < rays.Length; i++) UpdateRay(rays[i], panels.Rays[i]);
         }
 
         /// <summary>Remove all of it: what it says is not true any more.</summary>
