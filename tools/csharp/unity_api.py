@@ -25,6 +25,7 @@ MANUAL: Final = HERE / "unity_manual.json"
 TARGETS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     "unity": {"engine": ("6000.0.78f1", "6000.3.19f1")},
     "unity.input": {"engine": ("2022.3.76f1", "6000.0.78f1", "6000.3.19f1")},
+    "unity.app": {"engine": ("2022.3.76f1", "6000.0.78f1", "6000.3.19f1")},
     "hololens": {"engine": ("2022.3.76f1",), "com.unity.xr.arfoundation": ("5.1.6",)},
 }
 _ALIASES: Final = {

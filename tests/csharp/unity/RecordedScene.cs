@@ -47,7 +47,7 @@ namespace IrisSession.Unity.StandinTests
             string vectors = System.Environment.GetEnvironmentVariable("IRIS_VECTORS");
             if (vectors == null) Assert.Ignore("the scenes are written by python -m tools.csharp test");
             folder = Path.Combine(vectors, "unity", name);
-            Plan = new ScenePlan(ReadSpec(), WorldView.PlanBudget);
+            Plan = new ScenePlan(ReadSpec(), DrawBudget.Quest3.Scene);
             lines = new Queue<string[]>(File.ReadLines(Path.Combine(folder, "frames")).Select(line => line.Split('\t')));
             bodies = lines.Where(line => line[0] == "body").Select(line => long.Parse(line[1])).Distinct().Select(id => new BodyInfo { Id = id }).ToArray();
             decoder = new RigidDecoder(bodies.Length);

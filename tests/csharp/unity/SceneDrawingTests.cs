@@ -33,7 +33,7 @@ namespace IrisSession.Unity.StandinTests
                 if (!stage.Source.Plan.Bodies.Single(one => one.Id == body.Key).IsMoving) continue;
                 StandinTests.AssertNear(stage.Expect(body.Value[0], body.Value[1], body.Value[2]), stage.World.Scene.Bodies.Find(body.Key).position, ToleranceM);
             }
-            Assert.LessOrEqual(Engine.Draws.Count, WorldView.SceneDrawCalls);
+            Assert.LessOrEqual(Engine.Draws.Count, DrawBudget.Quest3.Scene.Objects);
             Assert.AreEqual(stage.Source.Plan.DrawCalls, Engine.Draws.Count);
         }
 
@@ -241,7 +241,7 @@ namespace IrisSession.Unity.StandinTests
             stage.Source.Hidden = new HashSet<string> { stage.Source.Plan.Deformables[0].Address };
             stage.Load();
             int few = Engine.Draws.Count;
-            stage.Source.Plan = new ScenePlan(stage.Source.ReadSpec(), WorldView.PlanBudget);
+            stage.Source.Plan = new ScenePlan(stage.Source.ReadSpec(), DrawBudget.Quest3.Scene);
             stage.Source.Hidden = new HashSet<string>();
             stage.Load();
             Assert.AreEqual(few + 1, Engine.Draws.Count);

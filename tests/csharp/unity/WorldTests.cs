@@ -84,10 +84,10 @@ namespace IrisSession.Unity.StandinTests
             stage.World.Avatars.Add(items, items.Count, stage.Source.NewestNs, "p0");
             Engine.Step();
             Assert.AreEqual(stage.Source.Plan.DrawCalls + AvatarTable.MaxAvatars, Engine.Draws.Count);
-            Assert.LessOrEqual(Engine.Draws.Count, WorldView.DrawCalls);
+            Assert.LessOrEqual(Engine.Draws.Count, DrawBudget.Quest3.Calls);
             Assert.AreEqual(57 - AvatarTable.MaxAvatars, stage.World.Avatars.Dropped);
-            int most = WorldView.SceneDrawCalls + AvatarTable.MaxAvatars + 2 * GhostShape.MaxPieces;
-            Assert.LessOrEqual(most, WorldView.DrawCalls - 8, "clouds and panels need some too");
+            int most = DrawBudget.Quest3.Scene.Objects + AvatarTable.MaxAvatars + 2 * GhostShape.MaxPieces;
+            Assert.LessOrEqual(most, DrawBudget.Quest3.Calls - 8, "clouds and panels need some too");
         }
 
         [Test]
@@ -163,7 +163,7 @@ namespace IrisSession.Unity.StandinTests
             Visual glass = spec.Visuals.Single(each => each.Rgba[3] < 1.0);
             glass.Rgba = new[] { 1.0, 0.0, 0.0, 0.5 };
             spec.Deformables = spec.Deformables.Where(each => each.Name == "cloth").ToArray();
-            stage.Source.Plan = new ScenePlan(spec, WorldView.PlanBudget);
+            stage.Source.Plan = new ScenePlan(spec, DrawBudget.Quest3.Scene);
             Engine.Step();
             stage.Load();
             Assert.AreSame(cloth, FindDraw("cloth").Mesh);
@@ -183,11 +183,11 @@ namespace IrisSession.Unity.StandinTests
             spec.Deformables = new Deformable[0];
             spec.Bodies = new[] { world }.Concat(Enumerable.Range(1, 400).Select(i => new Body { Id = i, Moving = true, T_parent_body = world.T_parent_body, T_world_body = world.T_world_body })).ToArray();
             spec.Visuals = Enumerable.Range(1, 400).Select(i => new Visual { Id = i, Body = i, T_body_visual = world.T_world_body, Geometry = new Geometry { Kind = GeometryKind.Box, Size = new[] { 0.001 * i, 0.1, 0.1 } }, Material = -1, Rgba = new[] { 1.0, 1.0, 1.0, 1.0 } }).ToArray();
-            stage.Source.Plan = new ScenePlan(spec, WorldView.PlanBudget);
+            stage.Source.Plan = new ScenePlan(spec, DrawBudget.Quest3.Scene);
             Engine.Step();
             while (!stage.World.Scene.IsSettled) Engine.Step();
             Engine.Step();
-            Assert.AreEqual(WorldView.SceneDrawCalls, Engine.Draws.Count);
+            Assert.AreEqual(DrawBudget.Quest3.Scene.Objects, Engine.Draws.Count);
             Assert.AreEqual(1, stage.World.Scene.Problems.Count);
             CollectionAssert.IsEmpty(Engine.Errors);
         }

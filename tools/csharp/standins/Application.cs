@@ -8,7 +8,20 @@ namespace UnityEngine
     {
         public static string persistentDataPath { get { Engine.CheckThread(); return PersistentDataPath; } }
 
+        public static RuntimePlatform platform { get { return Platform; } }
+
+        public static string version { get { Engine.CheckThread(); return "1.0"; } }
+
         internal static string PersistentDataPath = "";
+        internal static RuntimePlatform Platform = RuntimePlatform.LinuxPlayer;
+    }
+
+    public enum RuntimePlatform
+    {
+        Android = 11,
+        LinuxPlayer = 13,
+        WSAPlayerX64 = 19,
+        WSAPlayerARM = 20,
     }
 
     public class Time

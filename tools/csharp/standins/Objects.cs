@@ -64,7 +64,6 @@ namespace UnityEngine
         public T AddComponent<T>() where T : Component
         {
             Engine.CheckThread();
-            foreach (RequireComponent needed in typeof(T).GetCustomAttributes(typeof(RequireComponent), true)) Require(needed.m_Type0);
             return (T)Create(typeof(T));
         }
 
@@ -89,6 +88,7 @@ namespace UnityEngine
 
         private Component Create(Type type)
         {
+            foreach (RequireComponent needed in type.GetCustomAttributes(typeof(RequireComponent), true)) Require(needed.m_Type0);
             Component component = (Component)Activator.CreateInstance(type, true);
             component.Attach(this);
             Components.Add(component);

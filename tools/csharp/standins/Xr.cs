@@ -51,6 +51,8 @@ namespace UnityEngine
         internal static float Battery = -1f;
         internal static BatteryStatus Status = BatteryStatus.Unknown;
 
+        public static string deviceName { get { Engine.CheckThread(); return "a stand-in"; } }
+
         public static float batteryLevel { get { Engine.CheckThread(); return Battery; } }
 
         public static BatteryStatus batteryStatus { get { Engine.CheckThread(); return Status; } }

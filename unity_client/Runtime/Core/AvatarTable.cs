@@ -62,13 +62,16 @@ namespace IrisSession.Core
         private readonly List<Avatar> avatars = new List<Avatar>();
         private readonly List<Avatar> removed = new List<Avatar>();
         private readonly long delayNs;
+        private readonly int most;
 
-        public AvatarTable(long delayNs = 33_000_000)
+        /// <param name="most">Avatars that are drawn at most.</param>
+        public AvatarTable(long delayNs = 33_000_000, int most = MaxAvatars)
         {
             this.delayNs = delayNs;
+            this.most = most;
         }
 
-        /// <summary>Avatars beyond `MaxAvatars` that were not drawn.</summary>
+        /// <summary>Avatars beyond those that were not drawn.</summary>
         public long Dropped { get; private set; }
 
         public IReadOnlyList<Avatar> Avatars { get { return avatars; } }
@@ -95,7 +98,7 @@ namespace IrisSession.Core
                 PresenceItem item = items[i];
                 if (item.Participant == self || !IsDrawn(item.Device) || !IsFinite(item.Pose)) continue;
                 Avatar avatar = Find(item.Participant, item.Device);
-                if (avatar == null && avatars.Count == MaxAvatars)
+                if (avatar == null && avatars.Count == most)
                 {
                     Dropped++;
                     continue;

@@ -121,10 +121,15 @@ namespace IrisSession.Core
         /// <summary>False on a headset that finds no sheets by itself, as its system says.</summary>
         public bool HasMarkerSupport { get; set; } = true;
 
-        /// <summary>True unless the wearer has refused every way in which sheets are found.</summary>
+        /// <summary>False when the wearer was asked for a way in which sheets are found, and has allowed none.</summary>
         public bool CanSeeSheets
         {
-            get { return this[HeadsetPermission.Camera] != PermissionState.Denied || this[HeadsetPermission.Scene] == PermissionState.Granted; }
+            get
+            {
+                PermissionState camera = this[HeadsetPermission.Camera], scene = this[HeadsetPermission.Scene];
+                bool isDenied = camera == PermissionState.Denied || scene == PermissionState.Denied;
+                return !isDenied || camera == PermissionState.Granted || scene == PermissionState.Granted;
+            }
         }
 
         /// <summary>The headset was put on or taken off.</summary>

@@ -44,9 +44,6 @@ namespace IrisSession.Interaction
         /// <summary>Distance of a question from the eyes [m], and angle above the middle of the view [rad]: robots that are looked at stay free.</summary>
         private const double DistanceM = 0.8;
         private const double Above = 0.26;
-
-        /// <summary>A question that is farther than this from where it appeared in the view comes back before the eyes [rad].</summary>
-        private const double MaxOff = 0.7;
         private const double BelowM = 0.06;
         private const double BesideM = 0.11;
 
@@ -60,20 +57,16 @@ namespace IrisSession.Interaction
 
         private readonly List<Command> commands = new List<Command>();
         private readonly List<ShownButton> shown = new List<ShownButton>();
-        private bool hasQuestion;
-        private bool isAnswerable;
+        private readonly BeforeEyes place = new BeforeEyes(DistanceM, Above);
         private long questionId = -1;
-        private long sinceNs;
-        private Double3 grantAt;
-        private Double3 refuseAt;
 
         /// <summary>Commands are shown only while the back of the left hand looks at the eyes; else whenever that hand is tracked.</summary>
         public bool NeedsGlance { get; set; } = true;
 
         /// <summary>Where a question is shown, in the tracking frame.</summary>
-        public Double3 QuestionAt { get; private set; }
+        public Double3 QuestionAt { get { return place.At; } }
 
-        public bool HasQuestion { get { return hasQuestion; } }
+        public bool HasQuestion { get { return place.IsPlaced; } }
 
         /// <summary>The buttons of the newest frame.</summary>
         public IReadOnlyList<ShownButton> Shown { get { return shown; } }
@@ -99,16 +92,15 @@ namespace IrisSession.Interaction
         /// <param name="hasText">Something is to be said where questions are, such as one's own request that waits.</param>
         public void Update(HeadsetReading reading, long consentId, bool hasText)
         {
-            if (consentId != questionId) hasQuestion = false;
+            if (consentId != questionId || (consentId < 0 && !hasText)) place.Hide();
             questionId = consentId;
-            if (consentId < 0 && !hasText) hasQuestion = false;
-            else if (reading.HasHead && !(hasQuestion && IsBeforeEyes(reading.Head))) Place(reading.Head, reading.CaptureNs);
-            isAnswerable = hasQuestion && consentId >= 0 && reading.CaptureNs - sinceNs >= ReadNs;
+            if (consentId >= 0 || hasText) place.Update(reading);
             shown.Clear();
-            if (isAnswerable)
+            if (place.IsPlaced && consentId >= 0 && reading.CaptureNs - place.SinceNs >= ReadNs)
             {
-                shown.Add(new ShownButton { Button = new Button(Button.Grant), Text = "Give it", At = grantAt });
-                shown.Add(new ShownButton { Button = new Button(Button.Refuse), Text = "Keep it", At = refuseAt });
+                Double3 below = place.At - BelowM * place.Up;
+                shown.Add(new ShownButton { Button = new Button(Button.Grant), Text = "Give it", At = below + BesideM * place.Left });
+                shown.Add(new ShownButton { Button = new Button(Button.Refuse), Text = "Keep it", At = below - BesideM * place.Left });
             }
             ShowCommands(reading);
         }
@@ -160,29 +152,6 @@ namespace IrisSession.Interaction
                 Double3 at = left.Pose.Position + new Double3(0, 0, FirstM + (commands.Count - 1 - i) * ApartM);
                 shown.Add(new ShownButton { Button = new Button(Button.FirstCommand + i), Text = commands[i].Text, At = at });
             }
-        }
-
-        private void Place(RigidTransform head, long nowNs)
-        {
-            Double3 direction = FindDirection(head);
-            Double3 left = head.Rotation.Rotate(new Double3(0, 1, 0));
-            Double3 up = head.Rotation.Rotate(new Double3(-Math.Sin(Above), 0, Math.Cos(Above)));
-            QuestionAt = head.Position + DistanceM * direction;
-            grantAt = QuestionAt + BesideM * left - BelowM * up;
-            refuseAt = QuestionAt - BesideM * left - BelowM * up;
-            hasQuestion = true;
-            sinceNs = nowNs;
-        }
-
-        private bool IsBeforeEyes(RigidTransform head)
-        {
-            Double3 offset = QuestionAt - head.Position;
-            return Double3.Dot(offset, FindDirection(head)) > Math.Cos(MaxOff) * offset.Length;
-        }
-
-        private static Double3 FindDirection(RigidTransform head)
-        {
-            return head.Rotation.Rotate(new Double3(Math.Cos(Above), 0, Math.Sin(Above)));
         }
     }
 }

@@ -8,23 +8,9 @@ using IrisSession.Transport;
 
 namespace IrisSession.Interaction
 {
-    /// <summary>A question of another participant who asks for one's robot.</summary>
-    public sealed class ConsentQuestion
-    {
-        public long ConsentId;
-        public string Target = "";
-        public string Requester = "";
-
-        /// <summary>On the clock of readings [ns].</summary>
-        public long UntilNs;
-    }
-
     /// <summary>Input of one headset. For the engine's thread; a frame allocates nothing after the first ones.</summary>
     public sealed class HeadsetInput
     {
-        /// <summary>Time to answer where the session does not state it.</summary>
-        private const long ConsentNs = 15_000_000_000;
-        private const int MaxConsents = 16;
         private const int Sides = 2;
 
         private struct PendingRequest
@@ -41,7 +27,7 @@ namespace IrisSession.Interaction
         private readonly List<HandIntent> intents = new List<HandIntent>();
         private readonly List<SampleInput> samples = new List<SampleInput>();
         private readonly List<PendingRequest> pending = new List<PendingRequest>();
-        private readonly List<ConsentQuestion> consents = new List<ConsentQuestion>();
+        private readonly ConsentQuestions consents = new ConsentQuestions();
         private readonly FeedbackPulses pulses = new FeedbackPulses();
         private readonly double[] hits = new double[Sides];
         private IReadOnlyDictionary<string, RobotInfo> robotsOf;
@@ -70,6 +56,9 @@ namespace IrisSession.Interaction
         /// <summary>Marks of a sheet that are touched: begun by itself where no codes are read, else by a trigger that is held.</summary>
         public readonly MarkTouching Touching = new MarkTouching();
 
+        /// <summary>Whether the newest e-stop of this headset has stopped robots.</summary>
+        public readonly StopReport Stop = new StopReport();
+
         /// <summary>Codes; null: none are looked for.</summary>
         public MarkerLooks Markers { get; set; }
 
@@ -84,6 +73,14 @@ namespace IrisSession.Interaction
 
         /// <summary>A denial that the person has to see: taken by <see cref="TakeDenial"/>.</summary>
         public Denial Denial { get; private set; }
+
+        /// <summary>The newest thing that happened to the headset itself, and when [ns].</summary>
+        public HeadsetEvent Event { get; private set; }
+
+        public long EventNs { get; private set; } = long.MinValue / 2;
+
+        /// <summary>True while this participant holds a robot.</summary>
+        public bool HoldsRobots { get { return context.Held.Count > 0; } }
 
         /// <summary>What a command of the application threw, for a log; null: nothing. Clear it once it is said.</summary>
         public Exception CommandError { get; set; }
@@ -140,6 +137,11 @@ namespace IrisSession.Interaction
         {
             if (news.Kind == NewsKind.Reply) TakeReply(news.Ticket, news.Reply, nowNs);
             else if (news.Kind == NewsKind.Message) Take(news.Message.Message, nowNs);
+            else if (news.Kind == NewsKind.Headset && news.Headset != HeadsetEvent.PermissionGranted)
+            {
+                Event = news.Headset;
+                EventNs = nowNs;
+            }
         }
 
         /// <summary>Take a message of the session.</summary>
@@ -157,11 +159,10 @@ namespace IrisSession.Interaction
                     Denial = reply.Denial;
                     break;
                 case Event one when one.Body is ConsentRequested asked && asked.Holder == session.ParticipantId:
-                    if (consents.Count == MaxConsents) consents.RemoveAt(0);
-                    consents.Add(new ConsentQuestion { ConsentId = asked.ConsentId, Target = asked.Target, Requester = asked.Requester, UntilNs = nowNs + ConsentNs });
+                    consents.Add(asked, nowNs);
                     break;
                 case Event one when one.Body is LeaseChanged changed && changed.Cause != "queue":
-                    consents.RemoveAll(asked => asked.Target == changed.Lease.Target);
+                    consents.Remove(changed.Lease.Target);
                     break;
             }
         }
@@ -195,6 +196,13 @@ namespace IrisSession.Interaction
         {
             long nowNs = Reading.CaptureNs;
             Request(isLower ? Episode.PressLower(nowNs) : Episode.PressUpper(nowNs), nowNs);
+        }
+
+        /// <summary>Stop all robots.</summary>
+        public void StopAll(string reason)
+        {
+            Stop.Press(Reading.CaptureNs);
+            session.EStop(reason);
         }
 
         /// <summary>The wearer recentred, or the runtime located itself anew.</summary>
@@ -234,8 +242,9 @@ namespace IrisSession.Interaction
         /// <summary>A button of the e-stop counts whenever the runtime reports it: also without tracking, and in the frame of a recentring.</summary>
         private void TakeStops(bool isLive)
         {
-            if (Hands.TakeStops(Reading)) session.EStop("button of a controller");
-            if (isLive && WristStop.Update(Reading)) session.EStop("fingertip at the wrist");
+            if (Hands.TakeStops(Reading)) StopAll(StopInput.ByButton);
+            if (isLive && WristStop.Update(Reading)) StopAll(StopInput.ByWrist);
+            Stop.Update(session, Reading.CaptureNs);
         }
 
         private void FillContext(long bodiesVersion)
@@ -298,8 +307,7 @@ namespace IrisSession.Interaction
 
         private void UpdateQuestion()
         {
-            while (consents.Count > 0 && consents[0].UntilNs <= Reading.CaptureNs) consents.RemoveAt(0);
-            Question = consents.Count > 0 ? consents[0] : null;
+            Question = consents.Find(Reading.CaptureNs);
             AwaitedRobot = "";
             foreach (PendingRequest one in pending)
             {

@@ -4,6 +4,7 @@ using System;
 using System.Collections.Generic;
 using System.Text;
 using IrisSession.Core;
+using IrisSession.Protocol;
 
 namespace IrisSession.Interaction
 {
@@ -45,14 +46,27 @@ namespace IrisSession.Interaction
         public bool IsHit;
     }
 
+    /// <summary>Panels and rays for a layer to draw.</summary>
+    public interface IPanels
+    {
+        /// <summary>Every panel, shown or not: a layer makes one object for each.</summary>
+        IReadOnlyList<Panel> All { get; }
+
+        /// <summary>Of the left and of the right hand; beyond those other lines, such as the one to the mark that is touched next.</summary>
+        PanelRay[] Rays { get; }
+    }
+
     /// <summary>Decides about panels. For the engine's thread; texts are made ten times a second.</summary>
-    public sealed class HeadsetPanels
+    public sealed class HeadsetPanels : IPanels
     {
         /// <summary>Panels of robots; of more the rest have none.</summary>
         public const int MaxRobots = 12;
         private const int MaxButtons = 2 + ButtonPanel.MaxCommands;
         private const int MaxAdvice = 3;
         private const long PeriodNs = 100_000_000;
+
+        /// <summary>A denial, and what happened to the headset, are shown for so long.</summary>
+        private const long NoticeNs = 5_000_000_000;
 
         /// <summary>Length of a ray that meets nothing [m].</summary>
         private const double RayM = 2;
@@ -72,20 +86,21 @@ namespace IrisSession.Interaction
         public readonly Panel Stop = new Panel { Style = PanelStyle.Stop, LineM = 0.018 };
         public readonly Panel Mark = new Panel { Style = PanelStyle.Status, LineM = 0.02 };
         public readonly Panel[] Hands = { new Panel { Style = PanelStyle.Hand, LineM = 0.012 }, new Panel { Style = PanelStyle.Hand, LineM = 0.012 } };
-        public readonly Panel[] Robots = Make(MaxRobots, PanelStyle.Robot, 0.03);
+        public readonly Panel[] Robots;
         public readonly Panel[] Buttons = Make(MaxButtons, PanelStyle.Button, 0.03);
-
-        /// <summary>Rays of both hands, and the line from above to the mark that is touched next.</summary>
-        public readonly PanelRay[] Rays = new PanelRay[3];
         private readonly List<Panel> all = new List<Panel>();
         private readonly HeadsetInput input;
         private readonly ISessionPort session;
         private readonly IBodies bodies;
         private readonly StringBuilder text = new StringBuilder();
         private long textsAt = long.MinValue;
+        private string denied = "";
+        private long deniedUntil;
 
-        public HeadsetPanels(HeadsetInput input, ISessionPort session, IBodies bodies)
+        /// <param name="maxRobots">Panels of robots: each is a draw call.</param>
+        public HeadsetPanels(HeadsetInput input, ISessionPort session, IBodies bodies, int maxRobots = MaxRobots)
         {
+            Robots = Make(maxRobots, PanelStyle.Robot, 0.03);
             this.input = input;
             this.session = session;
             this.bodies = bodies;
@@ -99,8 +114,9 @@ namespace IrisSession.Interaction
             all.AddRange(Buttons);
         }
 
-        /// <summary>Every panel, shown or not: a layer makes one object for each.</summary>
         public IReadOnlyList<Panel> All { get { return all; } }
+
+        public PanelRay[] Rays { get; } = new PanelRay[3];
 
         /// <summary>Take a frame, after the input. `advice`: what is wrong, the most urgent first; `notice`: words of the application.</summary>
         public void Update(IReadOnlyList<Advice> advice, string notice)
@@ -130,6 +146,14 @@ namespace IrisSession.Interaction
         {
             long nowNs = input.Reading.CaptureNs;
             text.Clear();
+            if (input.Stop.IsUnconfirmed) WrapIfAny(StopReport.Unconfirmed.ToString());
+            Denial denial = input.TakeDenial();
+            if (denial != null)
+            {
+                denied = Words.OfDenial(denial).ToString();
+                deniedUntil = nowNs + NoticeNs;
+            }
+            if (nowNs < deniedUntil) WrapIfAny(denied);
             int said = 0;
             foreach (Advice one in advice)
             {
@@ -140,6 +164,7 @@ namespace IrisSession.Interaction
             if (session.IsJoined && session.AlignmentState == AlignmentState.None && !input.Touching.IsActive) WrapIfAny(PanelWords.DescribeMarkers(input.Markers));
             TouchWords.Describe(text, input.Touching, session, nowNs);
             WrapIfAny(input.Episode.Describe(nowNs));
+            if (nowNs - input.EventNs < NoticeNs) WrapIfAny(PanelWords.DescribeEvent(input.Event, input.HoldsRobots));
             WrapIfAny(notice);
             Set(Urgent, text.ToString().TrimStart('\n'));
             Set(Status, PanelWords.DescribeSelf(session, input.Hands));
@@ -155,10 +180,11 @@ namespace IrisSession.Interaction
             for (int i = 0; i < Robots.Length; i++) Set(Robots[i], i < input.Pointing.Robots.Count ? DescribeRobot(input.Pointing.Robots[i], nowNs) : "");
         }
 
-        /// <summary>What a robot holds for is said at the robot, and an open clutch is no trouble.</summary>
-        private static bool IsSaidHere(Advice one)
+        /// <summary>What a robot holds for is said at the robot, and an open clutch is no trouble. A denial is said first, and who is aligned needs no sheet.</summary>
+        private bool IsSaidHere(Advice one)
         {
-            return one.Kind != AdviceKind.Holding;
+            bool isAboutSheets = one.Kind == AdviceKind.NoMarkers || (one.Kind == AdviceKind.Permission && one.Reason == "sheets");
+            return one.Kind != AdviceKind.Holding && one.Kind != AdviceKind.Denied && !(isAboutSheets && session.AlignmentState == AlignmentState.Aligned);
         }
 
         private void WrapIfAny(string line)

@@ -94,6 +94,22 @@ namespace IrisSession.Interaction
             }
         }
 
+        /// <summary>Return the line about what happened to the headset, empty where nothing follows of it.</summary>
+        public static string DescribeEvent(HeadsetEvent one, bool holdsRobots)
+        {
+            switch (one)
+            {
+                case HeadsetEvent.Recentred:
+                    return "The room was recentred. Look at a sheet again" + (holdsRobots ? ", then open and close the clutch." : ".");
+                case HeadsetEvent.PutOn:
+                case HeadsetEvent.Focused:
+                case HeadsetEvent.TrackingFound:
+                    return holdsRobots ? "Robots held meanwhile: open and close the clutch." : "";
+                default:
+                    return "";
+            }
+        }
+
         /// <summary>Return how much of something is done, 0 to 1, as a bar.</summary>
         public static string DrawBar(double share)
         {
@@ -105,8 +121,10 @@ namespace IrisSession.Interaction
         public static void Wrap(StringBuilder target, string text)
         {
             int length = -1;
-            foreach (string word in text.Split(' '))
+            foreach (string one in text.Split(' '))
             {
+                string word = one;
+                for (; word.Length > Line; word = word.Substring(Line)) target.Append('\n').Append(word, 0, Line);
                 bool fits = length >= 0 && length + 1 + word.Length <= Line;
                 target.Append(fits ? ' ' : '\n').Append(word);
                 length = fits ? length + 1 + word.Length : word.Length;

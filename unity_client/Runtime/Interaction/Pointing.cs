@@ -68,7 +68,7 @@ namespace IrisSession.Interaction
                 foreach (long body in chain.Value)
                 {
                     if (!bodies.TryGetPosition(body, out Double3 at)) continue;
-                    Measure(ray, hasLast ? last : at, at, out double distance, out double offset);
+                    MeasureSegment(ray, hasLast ? last : at, at, out double distance, out double offset);
                     last = at;
                     hasLast = true;
                     if (distance > ReachM || offset > RadiusM + Spread * distance || offset >= bestOffset) continue;
@@ -107,7 +107,7 @@ namespace IrisSession.Interaction
         }
 
         /// <summary>Return how far along a ray it is nearest to the segment from `a` to `b`, and how far from it there.</summary>
-        private static void Measure(AimRay ray, Double3 a, Double3 b, out double distance, out double offset)
+        public static void MeasureSegment(AimRay ray, Double3 a, Double3 b, out double distance, out double offset)
         {
             Double3 link = b - a;
             Double3 toStart = a - ray.Origin;

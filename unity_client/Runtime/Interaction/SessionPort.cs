@@ -52,7 +52,8 @@ namespace IrisSession.Interaction
         /// <summary>Send a request. Returns its ticket, 0 when it could not be sent.</summary>
         long Request(ClientMessage message);
 
-        void EStop(string reason);
+        /// <summary>Stop all robots. False: nothing takes it any more.</summary>
+        bool EStop(string reason);
 
         /// <summary>The wearer recentred: what was aligned is void. Before anything of the new frame is sent.</summary>
         void ReportRecentred();
@@ -130,9 +131,9 @@ namespace IrisSession.Interaction
             return client.Request(message);
         }
 
-        public void EStop(string reason)
+        public bool EStop(string reason)
         {
-            client.EStop(reason);
+            return client.EStop(reason);
         }
 
         public void ReportRecentred()

@@ -160,6 +160,11 @@ namespace IrisSession.Transport
                 news.Next = new SessionNews { Kind = NewsKind.Message, Message = message };
                 news.Add();
             }
+            while (news.HasRoom && loop.Headset.TryTakeEvent(out HeadsetEvent happened))
+            {
+                news.Next = new SessionNews { Kind = NewsKind.Headset, Headset = happened };
+                news.Add();
+            }
             ClockSync clock = loop.Connection.Clock;
             if (clock.IsSynced)
             {

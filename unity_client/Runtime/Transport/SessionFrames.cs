@@ -208,6 +208,9 @@ namespace IrisSession.Transport
 
         /// <summary>Words for the person, of the gateway or about a call that could not be done.</summary>
         Notice,
+
+        /// <summary>Something happened to the headset itself: `Headset`.</summary>
+        Headset,
     }
 
     /// <summary>Something that happened, in order.</summary>
@@ -219,6 +222,7 @@ namespace IrisSession.Transport
         /// <summary>Of a reply: what <see cref="SessionClient.Request"/> returned.</summary>
         public long Ticket;
         public Reply Reply;
+        public HeadsetEvent Headset;
         public string Text;
     }
 }

@@ -36,6 +36,9 @@ namespace IrisSession.Unity
         /// <summary>Ghosts of the robots' hands that the wearer drives; null: none.</summary>
         public HandGhosts Ghosts { get; set; }
 
+        /// <summary>What is drawn at most; set before <see cref="Show"/>.</summary>
+        public DrawBudget Draws { get; set; } = DrawBudget.Quest3;
+
         /// <summary>Materials of the package, for those who make this component in code.</summary>
         public IrisMaterials Materials { get { return materials; } }
 
@@ -46,7 +49,7 @@ namespace IrisSession.Unity
             World = null;
             this.source = source;
             Problem = source != null && !materials.AreSet ? "IrisWorld has no materials: set IrisSurface and IrisPoints of the package" : "";
-            if (source != null && Problem.Length == 0) World = new WorldView(transform, materials, source, SceneBudget.Quest3);
+            if (source != null && Problem.Length == 0) World = new WorldView(transform, materials, source, Draws);
         }
 
         private void LateUpdate()

@@ -21,7 +21,7 @@ namespace IrisSession.Unity
         private bool isReleased;
 
         /// <param name="client">The session.</param>
-        /// <param name="scene">Its scene, planned within `WorldView.PlanBudget`. Nothing else may take its updates.</param>
+        /// <param name="scene">Its scene, planned within `IrisWorld.Draws.Scene`. Nothing else may take its updates.</param>
         public SessionSource(SessionClient client, SceneFetcher scene)
         {
             this.client = client;

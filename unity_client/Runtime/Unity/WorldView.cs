@@ -10,11 +10,6 @@ namespace IrisSession.Unity
     /// <summary>Draws a session. All calls are of the engine's thread; none throws what a session sent.</summary>
     public sealed class WorldView : IDisposable
     {
-        /// <summary>Draw calls of a frame within which a Quest 3 keeps its rate, and how many of them are for the scene: others are avatars,
-        /// clouds, ghosts and panels.</summary>
-        public const int DrawCalls = 200;
-        public const int SceneDrawCalls = 150;
-
         public readonly MediaStreams Media = new MediaStreams();
         public readonly BodyPoses Poses;
         public readonly AvatarTable Avatars;
@@ -33,14 +28,14 @@ namespace IrisSession.Unity
         /// <param name="parent">The frame in which the headset tracks: of an XR origin, its camera offset.</param>
         /// <param name="templates">Materials of the package.</param>
         /// <param name="assets">Called on another thread.</param>
-        /// <param name="budget">That of the headset; the scene's plan is made within <see cref="PlanBudget"/>.</param>
+        /// <param name="draws">Of the headset: the scene's plan is made within its `Scene`.</param>
         /// <param name="delayNs">Time by which what is shown is behind session time [ns].</param>
-        public WorldView(Transform parent, IrisMaterials templates, ISceneAssets assets, SceneBudget budget, long delayNs = 33_000_000)
+        public WorldView(Transform parent, IrisMaterials templates, ISceneAssets assets, DrawBudget draws, long delayNs = 33_000_000)
         {
-            this.budget = budget;
+            budget = draws.Scene;
             this.delayNs = delayNs;
             Poses = new BodyPoses(delayNs);
-            Avatars = new AvatarTable(delayNs);
+            Avatars = new AvatarTable(delayNs, draws.Avatars);
             materials = new MaterialCache(templates);
             world = new GameObject("iris-session world").transform;
             world.SetParent(parent, false);
@@ -48,9 +43,6 @@ namespace IrisSession.Unity
             Ghosts = new[] { new GhostView(Scene, materials), new GhostView(Scene, materials) };
             avatarViews = new AvatarViews(Avatars, materials, world);
         }
-
-        /// <summary>What a scene may have of a Quest 3.</summary>
-        public static SceneBudget PlanBudget { get { return SceneBudget.Quest3.WithObjects(SceneDrawCalls); } }
 
         /// <summary>The frame of the session's world.</summary>
         public Transform World { get { return world; } }

@@ -88,7 +88,11 @@ namespace IrisSession.Interaction.Tests
             return Requests.Count;
         }
 
-        public void EStop(string reason) { Stops.Add(reason); }
+        public bool EStop(string reason)
+        {
+            Stops.Add(reason);
+            return true;
+        }
 
         public void ReportRecentred() { Recentred++; }
 

@@ -89,6 +89,13 @@ namespace IrisSession.Unity.Input
             }
         }
 
+        /// <summary>Read the buttons of the e-stop and nothing else: no fault of another control keeps it from being pressed.</summary>
+        public void ReadStops(HeadsetReading reading)
+        {
+            reading.CaptureNs = MonotonicClock.NowNs;
+            for (int side = 0; side < 2; side++) reading.Inputs[side].Buttons = hands[side].ReadButtons() & ButtonBits.Stop;
+        }
+
         public bool TryRead(out RigidTransform T_tracking_gaze)
         {
             bool isSeen = gaze.Judge() == PoseValidity.Measured;
@@ -168,6 +175,13 @@ namespace IrisSession.Unity.Input
                 };
             }
 
+            public long ReadButtons()
+            {
+                long bits = 0;
+                foreach (KeyValuePair<long, InputAction> one in buttons) if (one.Value.IsPressed()) bits |= one.Key;
+                return bits;
+            }
+
             /// <summary>Where it is held, looking to where it points: one rigid frame of the controller, whose x axis others see as a ray.</summary>
             public void Read(InputReading input, InputKind kind)
             {
@@ -176,9 +190,7 @@ namespace IrisSession.Unity.Input
                 input.Clear();
                 input.Kind = kind;
                 input.Validity = validity;
-                long bits = 0;
-                foreach (KeyValuePair<long, InputAction> one in buttons) if (one.Value.IsPressed()) bits |= one.Key;
-                input.Buttons = bits;
+                input.Buttons = ReadButtons();
                 if (validity == PoseValidity.NotSeen) return;
                 RigidTransform aim = EnginePoses.ToWire(aimPosition.ReadValue<Vector3>(), aimRotation.ReadValue<Quaternion>());
                 input.Pose = new RigidTransform(EnginePoses.ToWire(grip.ReadPosition(), grip.ReadRotation()).Position, aim.Rotation);

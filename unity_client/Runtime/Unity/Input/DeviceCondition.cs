@@ -27,16 +27,16 @@ namespace IrisSession.Unity.Input
         /// <summary>The tracking frame has moved since this was last cleared: it may be reported several times at once.</summary>
         public bool HasMoved { get; set; }
 
-        /// <summary>Listen to subsystems, which come and go with the loader. Once a second.</summary>
+        /// <summary>Listen to subsystems, which come and go with the loader; one that comes later has another tracking frame. Each frame.</summary>
         public void Refresh()
         {
-            SubsystemManager.GetSubsystems(displays);
             SubsystemManager.GetSubsystems(inputs);
-            foreach (XRInputSubsystem one in inputs)
+            for (int i = 0; i < inputs.Count; i++)
             {
-                if (listened.Contains(one)) continue;
-                one.trackingOriginUpdated += moved;
-                listened.Add(one);
+                if (listened.Contains(inputs[i])) continue;
+                HasMoved |= listened.Count > 0;
+                inputs[i].trackingOriginUpdated += moved;
+                listened.Add(inputs[i]);
             }
         }
 
@@ -47,6 +47,7 @@ namespace IrisSession.Unity.Input
             BatteryStatus status = SystemInfo.batteryStatus;
             health.IsCharging = status == BatteryStatus.Charging || status == BatteryStatus.Full;
             health.Thermal = Thermal == null ? "" : Thermal();
+            SubsystemManager.GetSubsystems(displays);
             foreach (XRDisplaySubsystem display in displays)
             {
                 if (display.running && display.TryGetDroppedFrameCount(out int dropped)) health.DroppedFrames = dropped;

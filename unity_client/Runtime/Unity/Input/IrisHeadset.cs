@@ -1,4 +1,8 @@
 // The component that reads a headset: put it on the object in whose frame the headset tracks, beside IrisWorld.
+//
+//     without a session     the panel from which one is joined
+//     with a session        devices, samples, requests, panels
+//     after a defect        the e-stop alone, and words
 using System;
 using IrisSession.Core;
 using IrisSession.Interaction;
@@ -15,16 +19,21 @@ namespace IrisSession.Unity.Input
 
         [SerializeField] private Material rayMaterial = null;
         private readonly DeviceCondition condition = new DeviceCondition();
+        private readonly HeadsetReading ownReading = new HeadsetReading(); // while there is no input
+        private readonly PermissionState[] permissions = new PermissionState[3]; // by HeadsetPermission
         private ControlReader reader;
         private ControllerHaptics haptics;
         private SessionClient client;
         private SessionClientPort port;
         private PanelViews views;
+        private PanelViews startViews;
+        private StopInput stops;
         private double conditionAt;
         private bool isPaused;
         private bool hasFocus = true;
         private bool wasOnHead = true;
         private bool wasTracking = true;
+        private bool hadMarkers = true;
         private AppFocus focus = AppFocus.Focused;
 
         /// <summary>What the devices mean, null without a session. Commands of the application: `Input.Buttons.AddCommand`.</summary>
@@ -47,6 +56,12 @@ namespace IrisSession.Unity.Input
         /// <summary>For hands that have one gesture: see <see cref="AirTap"/>. Set before <see cref="Connect"/>; null: trigger and squeeze are two.</summary>
         public AirTap Taps { get; set; }
 
+        /// <summary>The panel that is shown while there is no session; null: none.</summary>
+        public StartPanel StartPanel { get; set; }
+
+        /// <summary>Panels of robots; set before <see cref="Connect"/>.</summary>
+        public int RobotPanels { get; set; } = HeadsetPanels.MaxRobots;
+
         public DeviceCondition Condition { get { return condition; } }
 
         /// <summary>Words of the application before the eyes, empty for none.</summary>
@@ -64,32 +79,42 @@ namespace IrisSession.Unity.Input
             this.client = client;
             Problem = "";
             Input = null;
+            stops = null;
             RemovePanels();
+            if (StartPanel != null) StartPanel.Session = null;
             if (client == null) return;
-            wasOnHead = wasTracking = true; // as a new client takes it; the next frame reports what differs
+            StartPanel?.Hide();
+            wasOnHead = wasTracking = hadMarkers = true; // as a new client takes it; the next frame reports what differs
             if (focus != AppFocus.Focused) ReportFocus(focus);
-            if (reader == null) reader = new ControlReader(Controls, ControlsKind);
+            for (int i = 0; i < permissions.Length; i++) if (permissions[i] != PermissionState.Unknown) ReportPermission((HeadsetPermission)i, permissions[i] == PermissionState.Granted);
             if (haptics == null) haptics = new ControllerHaptics();
-            reader.BareHands = BareHands;
             port = new SessionClientPort(client);
             Input = new HeadsetInput(port, bodies, haptics) { Markers = MarkerSource == null ? null : new MarkerLooks(MarkerSource) };
-            Panels = new HeadsetPanels(Input, port, bodies);
+            Panels = new HeadsetPanels(Input, port, bodies, RobotPanels);
             views = new PanelViews(Panels, transform, rayMaterial);
+        }
+
+        /// <summary>The wearer has answered a question of the system, or changed the settings. It is reported to every session.</summary>
+        public void SetPermission(HeadsetPermission permission, bool isGranted)
+        {
+            permissions[(int)permission] = isGranted ? PermissionState.Granted : PermissionState.Denied;
+            if (client != null) ReportPermission(permission, isGranted);
         }
 
         private void Update()
         {
-            if (Input == null) return;
             try
             {
-                Step();
+                if (reader == null) reader = new ControlReader(Controls, ControlsKind);
+                reader.BareHands = BareHands;
+                condition.Refresh();
+                if (Input != null) Step();
+                else if (client != null) StepStops();
+                else StepStart();
             }
             catch (Exception error)
             {
-                // A defect: it is said once, and robots hold, as no samples come any more.
-                Debug.LogException(error);
-                Connect(null, null);
-                Problem = "the headset cannot be read: " + error.Message;
+                EndInput(error);
             }
         }
 
@@ -105,10 +130,57 @@ namespace IrisSession.Unity.Input
                 Pass(news);
                 if (client == null) return; // it has left the session
             }
-            Input.Update(client.IsLive && focus == AppFocus.Focused, client.Suspensions, client.View.BodiesVersion);
+            Input.Update(IsLive, client.Suspensions, client.View.BodiesVersion);
             if (Input.CommandError != null) Debug.LogException(Input.CommandError);
             Input.CommandError = null;
             ShowPanels(reading);
+        }
+
+        private bool IsLive { get { return client.IsLive && focus == AppFocus.Focused; } }
+
+        private void StepStart()
+        {
+            condition.HasMoved = false; // a session that is joined later is aligned in the frame of then
+            reader.Read(ownReading);
+            ShowStart();
+        }
+
+        /// <summary>After a defect: no samples, so that robots hold; the e-stop goes on.</summary>
+        private void StepStops()
+        {
+            try
+            {
+                reader.Read(ownReading);
+            }
+            catch (Exception)
+            {
+                reader.ReadStops(ownReading); // the defect may be in what is read
+            }
+            string reason = stops.Update(ownReading, IsLive);
+            if (reason != null) port.EStop(reason);
+            while (client != null && client.TryTakeNews(out SessionNews news)) Pass(news);
+            if (client != null) ShowStart();
+        }
+
+        private void ShowStart()
+        {
+            if (StartPanel == null) return;
+            StartPanel.Update(ownReading);
+            if (startViews == null) startViews = new PanelViews(StartPanel, transform, rayMaterial);
+            startViews.Update(ownReading.Head.Position);
+        }
+
+        /// <summary>A defect: it is said once, robots hold as no samples come any more, and the e-stop goes on.</summary>
+        private void EndInput(Exception error)
+        {
+            if (Problem.Length > 0) return;
+            Debug.LogException(error);
+            Problem = "the headset cannot be read: " + error.Message + (client == null ? "" : ". Robots hold, the e-stop works");
+            if (client == null) return;
+            Input = null;
+            stops = new StopInput();
+            RemovePanels();
+            if (StartPanel != null) StartPanel.Session = port;
         }
 
         /// <summary>Hand news to the application. What it throws is its own: samples and the e-stop go on.</summary>
@@ -144,7 +216,8 @@ namespace IrisSession.Unity.Input
         private void RemovePanels()
         {
             views?.Destroy();
-            views = null;
+            startViews?.Destroy();
+            views = startViews = null;
         }
 
         private void ReportCondition(HeadsetReading reading)
@@ -160,8 +233,9 @@ namespace IrisSession.Unity.Input
             if (isTracking != wasTracking) ReportTracking(isTracking);
             if (Time.realtimeSinceStartupAsDouble < conditionAt) return;
             conditionAt = Time.realtimeSinceStartupAsDouble + ConditionS;
-            condition.Refresh();
             ReportHealth(condition.Read());
+            bool hasMarkers = MarkerSource != null && MarkerSource.Support != MarkerSupport.Missing;
+            if (hasMarkers != hadMarkers) ReportMarkers(hasMarkers);
         }
 
         // Each in a method of its own: what a lambda captures is allocated where it is declared, and other frames allocate nothing.
@@ -181,6 +255,17 @@ namespace IrisSession.Unity.Input
         private void ReportFocus(AppFocus now)
         {
             client.Post(loop => loop.Headset.SetFocus(now));
+        }
+
+        private void ReportMarkers(bool hasMarkers)
+        {
+            hadMarkers = hasMarkers;
+            client.Post(loop => loop.Headset.HasMarkerSupport = hasMarkers);
+        }
+
+        private void ReportPermission(HeadsetPermission permission, bool isGranted)
+        {
+            client.Post(loop => loop.Headset.SetPermission(permission, isGranted));
         }
 
         private void ReportHealth(DeviceHealth health)

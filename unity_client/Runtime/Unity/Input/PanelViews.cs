@@ -25,14 +25,14 @@ namespace IrisSession.Unity.Input
 
         private static readonly Color RayColor = new Color(0.79f, 0.82f, 0.88f, 0.7f);
         private static readonly Color HitColor = new Color(0.21f, 0.82f, 0.73f, 1);
-        private readonly HeadsetPanels panels;
+        private readonly IPanels panels;
         private readonly TextMesh[] texts;
         private readonly string[] shown;
         private readonly LineRenderer[] rays;
 
         /// <param name="parent">The tracking frame.</param>
         /// <param name="rayMaterial">Unlit, null: no rays are drawn.</param>
-        public PanelViews(HeadsetPanels panels, Transform parent, Material rayMaterial)
+        public PanelViews(IPanels panels, Transform parent, Material rayMaterial)
         {
             this.panels = panels;
             texts = new TextMesh[panels.All.Count];

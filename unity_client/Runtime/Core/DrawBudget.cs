@@ -1,0 +1,37 @@
+// Draw calls of a frame, and what they are for.
+namespace IrisSession.Core
+{
+    /// <summary>What a headset can draw at its rate. Immutable.</summary>
+    public sealed class DrawBudget
+    {
+        /// <summary>Quest 3: the rest is for clouds and panels.</summary>
+        public static readonly DrawBudget Quest3 = new DrawBudget(200, SceneBudget.Quest3.WithObjects(150), AvatarTable.MaxAvatars, 12, true);
+
+        /// <summary>HoloLens 2 at 60 Hz: panels and rays have 26 calls, avatars are those of two people.</summary>
+        public static readonly DrawBudget HoloLens2 = new DrawBudget(50, SceneBudget.HoloLens2.WithObjects(18), 6, 6, false);
+
+        /// <summary>Draw calls of a frame.</summary>
+        public readonly int Calls;
+
+        /// <summary>Within which the plan of a scene is made.</summary>
+        public readonly SceneBudget Scene;
+
+        /// <summary>Heads and hands of others.</summary>
+        public readonly int Avatars;
+
+        /// <summary>Panels of robots.</summary>
+        public readonly int RobotPanels;
+
+        /// <summary>Ghosts of the hands that the wearer drives are drawn.</summary>
+        public readonly bool HasGhosts;
+
+        public DrawBudget(int calls, SceneBudget scene, int avatars, int robotPanels, bool hasGhosts)
+        {
+            Calls = calls;
+            Scene = scene;
+            Avatars = avatars;
+            RobotPanels = robotPanels;
+            HasGhosts = hasGhosts;
+        }
+    }
+}
