@@ -9,6 +9,9 @@ namespace Standins
     public static class JavaCalls
     {
         public static readonly List<string> All = new List<string>();
+
+        /// <summary>What methods return, by their names, or throw; others return another object.</summary>
+        public static readonly Dictionary<string, object> Answers = new Dictionary<string, object>();
     }
 }
 
@@ -26,7 +29,8 @@ namespace UnityEngine
         public ReturnType Call<ReturnType>(string methodName, params object[] args)
         {
             Standins.JavaCalls.All.Add(methodName);
-            return (ReturnType)(object)new AndroidJavaObject(methodName);
+            if (!Standins.JavaCalls.Answers.TryGetValue(methodName, out object answer)) answer = new AndroidJavaObject(methodName);
+            return answer is Exception error ? throw error : (ReturnType)answer;
         }
 
         public FieldType GetStatic<FieldType>(string fieldName) { return (FieldType)(object)new AndroidJavaObject(fieldName); }

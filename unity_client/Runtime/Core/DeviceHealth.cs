@@ -17,6 +17,14 @@ namespace IrisSession.Core
         /// <summary>Frames that were not drawn in time, since the start; -1 where it is not known.</summary>
         public long DroppedFrames;
 
+        /// <summary>Return the `ThermalState` of a thermal status of Android's PowerManager, 0 none to 6 shutdown; empty for other numbers.</summary>
+        public static string ToThermal(int androidStatus)
+        {
+            if (androidStatus < 0 || androidStatus > 6) return "";
+            // 1 light, 2 moderate: little of it is felt; 3 severe and above: frames are lost.
+            return androidStatus == 0 ? ThermalState.Nominal : androidStatus <= 2 ? ThermalState.Warm : ThermalState.Hot;
+        }
+
         public static DeviceHealth Unknown { get { return new DeviceHealth { Battery = -1, Thermal = "", DroppedFrames = -1 }; } }
     }
 

@@ -14,9 +14,10 @@ namespace IrisSession.Unity.Input
         private readonly List<XRDisplaySubsystem> displays = new List<XRDisplaySubsystem>();
         private readonly List<XRInputSubsystem> inputs = new List<XRInputSubsystem>();
         private readonly List<XRInputSubsystem> listened = new List<XRInputSubsystem>();
+        private readonly AndroidThermal android = new AndroidThermal();
         private readonly Action<XRInputSubsystem> moved;
 
-        /// <summary>`ThermalState` by something of the application that knows it, null: nothing does.</summary>
+        /// <summary>`ThermalState` by something of the application that knows better than the system, null: nothing does.</summary>
         public Func<string> Thermal { get; set; }
 
         public DeviceCondition()
@@ -46,7 +47,7 @@ namespace IrisSession.Unity.Input
             health.Battery = SystemInfo.batteryLevel;
             BatteryStatus status = SystemInfo.batteryStatus;
             health.IsCharging = status == BatteryStatus.Charging || status == BatteryStatus.Full;
-            health.Thermal = Thermal == null ? "" : Thermal();
+            health.Thermal = Thermal == null ? android.Read() : Thermal();
             SubsystemManager.GetSubsystems(displays);
             foreach (XRDisplaySubsystem display in displays)
             {
@@ -59,6 +60,7 @@ namespace IrisSession.Unity.Input
         {
             foreach (XRInputSubsystem one in listened) one.trackingOriginUpdated -= moved;
             listened.Clear();
+            android.Dispose();
         }
     }
 }
