@@ -107,7 +107,7 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
     _add_layout_option(one)
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
-    one.add_argument("--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
+    one.add_argument("-o", "--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
     add_json_option(one)
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from anchors.pose import quat_normalize
 from iris_session.protocol.errors import IrisError
-from iris_session.protocol.names import AlignmentKind, AssignmentPolicy, LeaseMode
+from iris_session.protocol.names import AlignmentKind, AssignmentPolicy, LeaseMode, RefusalCode
 from iris_session.system.files import write_output
 
 if TYPE_CHECKING:
@@ -251,6 +251,17 @@ def describe_own_sessions() -> str:
         notes = []
     yours = (f"; your session {one.name!r} is at {one.hosts[0]}:{one.control}" for one in notes if one.hosts)
     return "".join(yours) or "; for a session on another machine, give its address or --session NAME"
+
+
+def describe_error(error: IrisError) -> str:
+    """Return an error as a line: of a key that is not on the list, with what the owner of a session here does."""
+    from iris_session.security import KeyHome, KeysError
+
+    try:
+        owns = getattr(error, "code", "") == RefusalCode.UNPAIRED and bool(KeyHome().sessions.read())
+    except KeysError:
+        owns = False
+    return f"{error}{'; if the session is your own: `iris-session keys allow me`' if owns else ''}"
 
 
 def add_session_options(parser: argparse.ArgumentParser) -> None:

@@ -19,6 +19,7 @@ from iris_session.cli.common import (
     add_address_options,
     add_command,
     add_json_option,
+    describe_error,
     find_participant,
     make_client,
     print_error,
@@ -142,7 +143,7 @@ def run(arguments: argparse.Namespace) -> int:
             result["session"] = client.address
             text, fields = arguments.act(client, arguments)
     except (DeniedError, RefusedError, NotConnectedError, RequestTimeoutError, CommandError) as error:
-        text = str(error)
+        text = describe_error(error)
         if isinstance(error, RefusedError) and error.code == DenialReason.ROLE and Role.DIRECTOR in arguments.roles:
             text += "; on the server: `iris-session pair --role director`"
         if isinstance(error, RefusedError) and arguments.act is stop_session:

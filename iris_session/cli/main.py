@@ -28,7 +28,7 @@ from iris_session.cli import (
     view,
     web,
 )
-from iris_session.cli.common import CommandError, join_negative_poses, print_error
+from iris_session.cli.common import CommandError, describe_error, join_negative_poses, print_error
 from iris_session.protocol.errors import IrisError
 from iris_session.system.extras import describe_import_error
 from iris_session.system.log import LEVEL_VARIABLE, configure_logging
@@ -120,7 +120,7 @@ def _run_command(argv: list[str] | None) -> int:
         in_use = str(error).startswith("port ") and "is in use" in str(error)
         # The library does not name options that help: a script has none.
         hint = " (here: --port-base 7730, or --control-port 0 --state-port 0)" if in_use else ""
-        for line in f"{error}{hint}".split("\n"):
+        for line in f"{describe_error(error)}{hint}".split("\n"):
             print_error(line)
         toml = getattr(error, "toml", "")  # of `AmbiguousModelError`
         if toml:  # to standard output: `iris-session robots scene.xml > robots.toml`

@@ -153,6 +153,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.unity is not None:
             assert certificate is not None, "made or loaded for --unity"
             _write_pairing_file(arguments.unity, certificate, [host for host, _ in places], web, invitation)
+            invitation["file"] = str(arguments.unity)
         _print_invitation(arguments, invitation)
         return 0 if arguments.no_wait else _wait_until_used(home, made, arguments)
     except BaseException:
@@ -168,6 +169,7 @@ def _write_pairing_file(
     path: Path, certificate: Certificate, hosts: list[str], web: int, invitation: dict[str, Any]
 ) -> None:
     """Write what a headset app needs to pair by itself: only this user may read it."""
+    from iris_session.link.config import is_loopback
     from iris_session.web.config import format_page_address
 
     pairing = {
@@ -182,6 +184,11 @@ def _write_pairing_file(
         write_atomic(path, json.dumps(pairing, indent=2).encode() + b"\n", permissions=0o600)
     except OSError as error:
         raise CommandError(f"{path} cannot be written: {error.strerror}") from error
+    if all(is_loopback(host) for host in hosts):
+        print_error(
+            f"{hosts[0]} is this machine alone: a headset reaches it only by cable, after `adb reverse tcp:{web} "
+            f"tcp:{web}`; serve with --interface for others"
+        )
 
 
 def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[str]) -> Certificate | None:
@@ -276,6 +283,8 @@ def _print_invitation(arguments: argparse.Namespace, invitation: dict[str, Any])
     print(f"address      {'  or  '.join(invitation['addresses'])}")
     print(f"fingerprint  {invitation['fingerprint']}")
     print(f"roles        {', '.join(invitation['roles']) or 'any'}")
+    if arguments.unity is not None:
+        print(f"file         {arguments.unity}    written; copy it to one headset before the code expires")
     if invitation["page"]:
         print(f"in a browser {invitation['page']}")
         print(f"certificate  {invitation['certificate']}    compare it when the browser warns")

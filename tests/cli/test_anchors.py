@@ -62,7 +62,7 @@ def test_default_sheet_is_the_one_that_sessions_expect(
 
 def test_printed_marks_are_those_of_the_anchors_file(tmp_path: Path, capsys: Capture) -> None:
     out = str(tmp_path / "table.pdf")
-    assert main(["anchors", "print", "--marks", "--out", out, "--json"]) == 0
+    assert main(["anchors", "print", "--marks", "-o", out, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert (result["size_m"], set(result["marks_m"])) == (0.14, set("1234"))
     assert main(["anchors", "print", "--marks", "--out", out]) == 0

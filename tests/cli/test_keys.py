@@ -14,11 +14,14 @@ import cv2
 import pytest
 from zmq.auth import create_certificates
 
-from iris_session.cli.common import CommandError, check_session_reachable, describe_own_sessions
+from iris_session.cli.common import CommandError, check_session_reachable, describe_error, describe_own_sessions
 from iris_session.cli.main import main
+from iris_session.client import RefusedError
 from iris_session.client.discovery import Address
 from iris_session.doctor.runner import LOCAL, find_default_address
 from iris_session.protocol import pairing
+from iris_session.protocol.names import RefusalCode
+from iris_session.protocol.server_messages import Refused
 from iris_session.security import KeyHome, KeyPair, RegisteredSession
 from iris_session.web.certificate import find_certificate, load_or_make_certificate
 
@@ -186,6 +189,7 @@ def test_pair_unity_writes_what_a_headset_reads_at_start(home: KeyHome, tmp_path
         "code": shown["code"],
         "expires": shown["expires"],
     }
+    assert shown["file"] == str(path)
     assert path.stat().st_mode & 0o077 == 0
     (code,) = home.join_codes.read()
     assert code.web_key == made.spki_hash, "the code is valid behind the gateway"
@@ -194,6 +198,20 @@ def test_pair_unity_writes_what_a_headset_reads_at_start(home: KeyHome, tmp_path
     home.sessions.add(RegisteredSession("s1", "lab-1", os.getpid(), ("10.0.0.5",), 7731, mark, 0))
     assert main(["pair", "--unity", str(path), "--no-wait"]) == 2
     assert "serves no page" in capsys.readouterr().err
+    home.sessions.add(RegisteredSession("s1", "lab-1", os.getpid(), ("127.0.0.1",), 7731, mark, 8443))
+    assert main(["pair", "--unity", str(path), "--no-wait"]) == 0
+    said = capsys.readouterr()
+    assert str(path) in said.out
+    assert "adb reverse tcp:8443" in said.err, "no headset reaches the address of this machine over a network"
+
+
+def test_refused_owner_of_a_session_reads_how_to_allow_the_own_key(lab: KeyHome) -> None:
+    refused = RefusedError(Refused(RefusalCode.UNPAIRED, "this key is not on the session's list", ""))
+    assert "keys allow me" in describe_error(refused)
+    assert "keys allow me" not in describe_error(RefusedError(Refused(RefusalCode.CODE, "wrong", "")))
+    for note in lab.sessions.read():
+        lab.sessions.remove(note.session_id, note.pid)
+    assert "keys allow me" not in describe_error(refused)
 
 
 def test_forget_removes_stored_key(home: KeyHome) -> None:

@@ -65,10 +65,11 @@ namespace IrisSession.Transport
         private const int IdleMs = 20;
 
         private readonly SessionClient client;
-        private readonly AssetCache cache; // of our thread, and of `Find` under the lock of `ready`
+        private readonly AssetCache cache;
+        private readonly object cacheGate = new object(); // guards it; held while files are read, written and hashed
         private readonly SceneFollower follower;
         private readonly AssetLoader loader = new AssetLoader();
-        private readonly Dictionary<string, byte[]> ready = new Dictionary<string, byte[]>();
+        private readonly Dictionary<string, byte[]> ready = new Dictionary<string, byte[]>(); // guarded by itself; held for moments
         private readonly Dictionary<string, GrowingBytes> parts = new Dictionary<string, GrowingBytes>();
         private readonly Queue<string> lookups = new Queue<string>();
         private readonly List<SceneAsset> wanted = new List<SceneAsset>();
@@ -135,11 +136,8 @@ namespace IrisSession.Transport
         /// <summary>Return the bytes of an asset of the scene, null while it is not here. May read a file: not for the engine's thread.</summary>
         public byte[] Find(string address)
         {
-            lock (ready)
-            {
-                if (ready.TryGetValue(address, out byte[] bytes)) return bytes;
-                return cache.Read(address);
-            }
+            lock (ready) if (ready.TryGetValue(address, out byte[] bytes)) return bytes;
+            lock (cacheGate) return cache.Read(address);
         }
 
         /// <summary>Let go of the bytes that the cache has too, once all is built: <see cref="Find"/> reads them again from there. Waits for nothing.</summary>
@@ -149,7 +147,7 @@ namespace IrisSession.Transport
             wake.Set();
         }
 
-        /// <summary>Bytes of assets that are held in memory. May wait for a file.</summary>
+        /// <summary>Bytes of assets that are held in memory.</summary>
         internal long HeldBytes
         {
             get
@@ -281,7 +279,7 @@ namespace IrisSession.Transport
             part.Append(answer.Bytes, answer.Count);
             if (!loader.IsComplete(address)) return;
             CacheResult kept;
-            lock (ready) kept = cache.Store(address, part.Bytes, 0, part.Count);
+            lock (cacheGate) kept = cache.Store(address, part.Bytes, 0, part.Count);
             if (kept == CacheResult.Damaged)
             {
                 DamagedCount++;
@@ -313,13 +311,11 @@ namespace IrisSession.Transport
         {
             ScenePlan before = follower.Plan;
             follower.OnAsset(address, bytes, 0, count);
+            bool isPlan = follower.Plan != before; // that was the specification
+            if (isPlan) lock (cacheGate) cache.Pin(follower.Plan.Assets);
             lock (ready)
             {
-                if (follower.Plan != before) // that was the specification
-                {
-                    cache.Pin(follower.Plan.Assets);
-                    ready.Clear();
-                }
+                if (isPlan) ready.Clear();
                 else ready[address] = bytes;
             }
         }
@@ -327,10 +323,10 @@ namespace IrisSession.Transport
         private void ReleaseKept()
         {
             isReleasing = false;
-            lock (ready)
-            {
-                foreach (string address in new List<string>(ready.Keys)) if (cache.Contains(address)) ready.Remove(address);
-            }
+            List<string> held;
+            lock (ready) held = new List<string>(ready.Keys);
+            lock (cacheGate) held.RemoveAll(address => !cache.Contains(address));
+            lock (ready) foreach (string address in held) ready.Remove(address);
         }
 
         private void Publish()

@@ -15,6 +15,8 @@ namespace IrisSession.Transport
         private int requestGeneration;
         private long statesReplaced;
         private long newsDropped;
+        private long callsInvalid;
+        private string newestInvalid = "";
         private readonly List<Advice> adviceNow = new List<Advice>();
         private long adviceAt = long.MinValue;
         private long seenSnapshots = -1;
@@ -78,9 +80,7 @@ namespace IrisSession.Transport
                 catch (Exception error)
                 {
                     // Actions and messages of the application may throw anything. The session goes on: the next call may be an e-stop.
-                    loop.Invalid++;
-                    if (call.Kind == CallKind.Request) AddNews(new SessionNews { Kind = NewsKind.Reply, Ticket = call.Ticket, Text = error.Message });
-                    else if (call.Kind == CallKind.Action) AddNews(new SessionNews { Kind = NewsKind.Notice, Text = error.Message });
+                    NoteInvalid(call, error.Message);
                 }
                 call.Clear();
                 calls.Remove();
@@ -105,10 +105,20 @@ namespace IrisSession.Transport
                 }
                 catch (Exception error)
                 {
-                    loop.Invalid++;
+                    Interlocked.Increment(ref callsInvalid);
                     AddNews(new SessionNews { Kind = NewsKind.Notice, Text = error.Message });
                 }
             }
+        }
+
+        /// <summary>Count a call that could not be done and say why; of samples that repeat each frame, once.</summary>
+        private void NoteInvalid(SessionCall call, string text)
+        {
+            Interlocked.Increment(ref callsInvalid);
+            bool isRepeated = call.Kind != CallKind.Action && text == newestInvalid;
+            newestInvalid = text;
+            if (call.Kind == CallKind.Request) AddNews(new SessionNews { Kind = NewsKind.Reply, Ticket = call.Ticket, Text = text });
+            else if (!isRepeated) AddNews(new SessionNews { Kind = NewsKind.Notice, Text = text });
         }
 
         private void Do(SessionCall call)

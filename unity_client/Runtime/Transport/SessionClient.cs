@@ -96,6 +96,9 @@ namespace IrisSession.Transport
         /// <summary>Calls that were dropped because too many waited.</summary>
         public long CallsDropped { get; private set; }
 
+        /// <summary>Calls that could not be done, such as samples with bad numbers or unknown robots: a notice says why.</summary>
+        public long CallsInvalid { get { return Interlocked.Read(ref callsInvalid); } }
+
         /// <summary>Replies and notices that were dropped because the engine took none.</summary>
         public long NewsDropped { get { return Interlocked.Read(ref newsDropped); } }
 

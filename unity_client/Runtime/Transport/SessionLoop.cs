@@ -95,9 +95,6 @@ namespace IrisSession.Transport
         /// <summary>How the newest socket that failed ended.</summary>
         public LinkEnd LastEnd { get; private set; }
 
-        /// <summary>Application's messages that could not be made: bad numbers, unknown robots.</summary>
-        public long Invalid { get; set; }
-
         /// <summary>Join the session, also after a refusal.</summary>
         public void Open()
         {

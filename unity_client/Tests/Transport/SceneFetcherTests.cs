@@ -29,9 +29,12 @@ namespace IrisSession.Transport.Tests
         }
 
         /// <summary>Files in memory.</summary>
-        private sealed class MemoryFiles : IAssetFiles
+        internal sealed class MemoryFiles : IAssetFiles
         {
             public readonly Dictionary<string, byte[]> Files = new Dictionary<string, byte[]>();
+
+            /// <summary>Called within every reading: a test may block there.</summary>
+            public Action OnRead = () => { };
 
             public IReadOnlyList<AssetFile> List()
             {
@@ -42,6 +45,7 @@ namespace IrisSession.Transport.Tests
 
             public byte[] Read(string name, long maxBytes)
             {
+                OnRead();
                 return Files.TryGetValue(name, out byte[] bytes) ? bytes : null;
             }
 
@@ -95,6 +99,34 @@ namespace IrisSession.Transport.Tests
                 Assert.IsTrue(client.Stop());
                 Assert.AreEqual("", scene.Crash + client.Crash);
                 return scene;
+            }
+        }
+
+        [Test]
+        public void WhatIsInMemoryDoesNotWaitForAFile()
+        {
+            MemoryFiles files = new MemoryFiles();
+            string other = AddressOf(new byte[] { 1 });
+            files.Files[other] = new byte[] { 1 };
+            using (ManualResetEvent isBlocked = new ManualResetEvent(false))
+            using (ManualResetEvent isReleased = new ManualResetEvent(false))
+            {
+                Fetch((peer, request, n) => SendPart(peer, request, Asset), files, scene =>
+                {
+                    if (!IsUnreadable(scene)) return false;
+                    files.OnRead = () =>
+                    {
+                        isBlocked.Set();
+                        isReleased.WaitOne();
+                    };
+                    Thread reader = new Thread(() => scene.Find(other));
+                    reader.Start();
+                    isBlocked.WaitOne();
+                    Assert.IsNotNull(scene.Find(Address)); // had it waited for the file, the test would never end
+                    isReleased.Set();
+                    reader.Join();
+                    return true;
+                });
             }
         }
 

@@ -35,8 +35,8 @@ namespace IrisSession.Transport.Tests
             Serve(peer, stalls, null, "");
         }
 
-        /// <summary>The same with a scene, whose assets are fetched with a ticket; `request`: that was read.</summary>
-        internal static void Serve(Peer peer, ManualResetEvent stalls, string[] request, string sceneHash)
+        /// <summary>The same with a scene, whose assets are fetched with a ticket; `request`: that was read; `answer`: comes before the usual answer.</summary>
+        internal static void Serve(Peer peer, ManualResetEvent stalls, string[] request, string sceneHash, Func<ClientMessage, ServerMessage> answer = null)
         {
             peer.AcceptWebSocket(int.MaxValue, request);
             WireReader reader = new WireReader();
@@ -48,7 +48,9 @@ namespace IrisSession.Transport.Tests
                 if (frame.Key != 0x82 || frame.Value[0] != WebMessage.Control) continue;
                 reader.Reset(frame.Value, 6, frame.Value.Length - 6);
                 ClientMessage message = ClientEnvelope.Read(reader).Message;
-                if (message is Hello)
+                ServerMessage own = answer?.Invoke(message);
+                if (own != null) Send(peer, own);
+                else if (message is Hello)
                 {
                     Send(peer, new Welcome { SessionId = "s1", ParticipantId = "p1", ConnectionEpoch = 1, Role = Role.Operator, ResumeToken = new byte[] { 1 }, HeartbeatNs = 1_000_000_000 });
                     WireWriter ticket = new WireWriter();
@@ -62,7 +64,7 @@ namespace IrisSession.Transport.Tests
                     Send(peer, new ClockPong { T0Ns = ping.T0Ns, T1Ns = ping.T0Ns, T2Ns = ping.T0Ns });
                     SendState(peer, ping.T0Ns);
                 }
-                else if (message is GetSnapshot) Send(peer, new Snapshot { EventSeq = 10, SceneEpoch = 3, SceneHash = sceneHash, Bodies = new[] { new BodyInfo { Id = 1, Name = "a" } } }, new byte[56]);
+                else if (message is GetSnapshot) Send(peer, new Snapshot { EventSeq = 10, SceneEpoch = 3, SceneHash = sceneHash, Robots = new[] { new RobotInfo { Name = "left" } }, Bodies = new[] { new BodyInfo { Id = 1, Name = "a" } } }, new byte[56]);
                 else if (message is Acquire acquire) Send(peer, new Reply { RequestId = acquire.RequestId });
             }
         }
@@ -110,6 +112,25 @@ namespace IrisSession.Transport.Tests
                 Assert.AreEqual("", client.Crash);
                 Assert.IsTrue(client.Stop());
                 Assert.AreEqual(ConnectionPhase.Closed, client.View.Phase);
+            }
+        }
+
+        [Test]
+        public void SamplesThatCannotBeSentAreCountedAndOneNoticeSaysWhy()
+        {
+            using (FakeGateway gateway = new FakeGateway(peer => Serve(peer, null)))
+            {
+                SessionClient client = new SessionClient(MakeHello(), new MemoryIdentity(), new EndpointChooser(gateway.MakeEndpoint()), new WebTransport());
+                client.Start();
+                WaitUntil(() => client.View.Phase == ConnectionPhase.Ready, "not ready");
+                SampleInput sample = new SampleInput { Device = Device.ControllerRight, HasPose = false };
+                sample.Robots.Add("none");
+                for (int i = 0; i < 3; i++) Assert.IsTrue(client.TrySendSample(sample));
+                WaitUntil(() => client.CallsInvalid == 3, "they are not counted");
+                Assert.IsTrue(client.Stop());
+                int notices = 0;
+                while (client.TryTakeNews(out SessionNews one)) if (one.Kind == NewsKind.Notice) notices++;
+                Assert.AreEqual(1, notices);
             }
         }
 

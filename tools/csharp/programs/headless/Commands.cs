@@ -28,16 +28,14 @@ internal sealed class Commands
 
     private readonly Headset headset;
     private readonly Report report;
-    private readonly Options options;
     private int newsAt;
     private Drawing drawing;
     private ScenePlan scenePlan;
 
-    public Commands(Headset headset, Report report, Options options)
+    public Commands(Headset headset, Report report)
     {
         this.headset = headset;
         this.report = report;
-        this.options = options;
     }
 
     /// <summary>Run commands; frames go on while none has come. Returns whether all succeeded.</summary>
@@ -51,7 +49,7 @@ internal sealed class Commands
                 waiting.CompleteAdding();
             }) { IsBackground = true }.Start();
             bool isDone = true;
-            while (!waiting.IsCompleted && !headset.IsInterrupted)
+            while (!waiting.IsCompleted && !headset.IsInterrupted && !headset.IsHopeless)
             {
                 if (!waiting.TryTake(out string line))
                 {
@@ -89,6 +87,11 @@ internal sealed class Commands
 
     private bool Do(string[] words)
     {
+        if (Client == null && words[0] != "join" && words[0] != "wait")
+        {
+            report.Write(words[0], false, "text", "no session was joined");
+            return false;
+        }
         switch (words[0])
         {
             case "join": return Join();
@@ -118,28 +121,28 @@ internal sealed class Commands
 
     private bool Join()
     {
-        bool isTrusted = false;
-        bool isJoined = headset.RunUntil(() =>
-        {
-            SessionView now = Client.View;
-            if (now.Problem.Failure == LinkFailure.UnknownCertificate && !isTrusted && options.Trust.Length > 0 && now.Problem.Fingerprint == options.Trust)
-            {
-                isTrusted = true;
-                byte[] hash = now.Problem.CertificateHash;
-                Client.TryPost(loop => loop.Trust(hash));
-            }
-            bool isOver = now.Failure != null || (now.Problem.Failure != LinkFailure.None && !isTrusted);
-            return isOver || (now.Phase == ConnectionPhase.Ready && headset.States > 0);
-        });
-        SessionView view = Client.View;
-        isJoined &= view.Phase == ConnectionPhase.Ready;
+        bool isJoined = headset.RunUntil(() => headset.NeedsPerson || (IsRunning() && Client.View.Phase == ConnectionPhase.Ready && headset.States > 0));
+        isJoined &= IsRunning() && Client.View.Phase == ConnectionPhase.Ready;
         IsRefused = !isJoined;
-        headset.SendsSamples = isJoined && options.RoleName != Role.Observer;
+        headset.SendsSamples = isJoined && headset.SendsDevices;
+        ConnectorView now = headset.Connector.View;
+        if (!IsRunning())
+        {
+            report.Write(
+                "join", false, "phase", now.Phase.ToString(), "text", now.Phrase.ToString(), "refusal", now.Refusal == null ? "" : now.Refusal.Code, "problem", now.Problem.Failure.ToString(),
+                "fingerprint", now.Fingerprint);
+            return false;
+        }
+        SessionView view = Client.View;
         report.Write(
-            "join", isJoined, "phase", view.Phase.ToString(), "text", view.Text, "refusal", view.Failure == null ? "" : view.Failure.Code, "problem", view.Problem.Failure.ToString(),
-            "fingerprint", view.Problem.Fingerprint ?? "", "participant", view.ParticipantId, "resumed", view.Welcome != null && view.Welcome.Resumed,
-            "bodies", view.Bodies.Length, "robots", new List<string>(view.Robots.Keys).ToArray(), "scene", view.SceneHash, "crash", Client.Crash);
+            "join", isJoined, "phase", view.Phase.ToString(), "text", view.Text, "refusal", "", "problem", "None", "fingerprint", "", "participant", view.ParticipantId,
+            "resumed", view.Welcome != null && view.Welcome.Resumed, "bodies", view.Bodies.Length, "robots", new List<string>(view.Robots.Keys).ToArray(), "scene", view.SceneHash, "crash", Client.Crash);
         return isJoined;
+    }
+
+    private bool IsRunning()
+    {
+        return headset.Connector.View.Phase == ConnectorPhase.Running;
     }
 
     /// <summary>Wait for the scene and its assets, and hash all of them once more.</summary>

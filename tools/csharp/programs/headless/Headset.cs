@@ -12,14 +12,17 @@ internal sealed class Headset : IDisposable
 {
     public const int FrameMs = 14;
     private const long FreshNs = 100_000_000;
+    private const long SilentNs = 10_000_000_000;
     private const double WalkingSpeed = 0.7; // m/s
 
     /// <summary>Where the tracking frame is: nothing about it is special.</summary>
     public static readonly RigidTransform T_world_tracking = new RigidTransform(
         new Double3(-0.4, 0.3, -0.75), DoubleQuaternion.FromAxisAngle(new Double3(0, 0, 1), 0.61));
 
-    public readonly SessionClient Client;
-    public readonly SceneFetcher Scene;
+    /// <summary>The newest session that was joined and its scene, null before.</summary>
+    public SessionClient Client;
+    public SceneFetcher Scene;
+    public readonly SessionConnector Connector;
     public readonly List<SessionNews> News = new List<SessionNews>();
     public readonly Dictionary<string, Feedback> Feedbacks = new Dictionary<string, Feedback>();
 
@@ -41,34 +44,54 @@ internal sealed class Headset : IDisposable
     public int States;
     public double LongestCallMs;
     public double RecoveryMs = -1;
+    private readonly Options options;
+    private readonly Report report;
+    private readonly long beganNs;
+    private PairingResult pairing; // that was reported
+    private ConnectorPhase phase;
+    private string what = "";
     private readonly SampleInput head = new SampleInput { Device = Device.Head };
     private readonly SampleInput controller = new SampleInput { Device = Device.ControllerRight };
     private long frameNs;
     private long awakeNs = -1;
 
-    public Headset(Options options, IIdentityStore identity, WebEndpoint[] endpoints)
+    public Headset(Options options, Report report)
     {
+        this.options = options;
+        this.report = report;
         string run = BitConverter.ToString(Guid.NewGuid().ToByteArray()).Replace("-", "").ToLowerInvariant();
-        Hello hello = new Hello
+        Connector = new SessionConnector(new ConnectorSettings
         {
             Role = options.RoleName,
             Name = options.Name,
             Software = "iris-session headless",
-            Devices = options.RoleName == Role.Observer ? new string[0] : new[] { Device.Head, Device.ControllerRight },
+            Devices = SendsDevices ? new[] { Device.Head, Device.ControllerRight } : new string[0],
             Capabilities = new[] { "run:" + run },
-        };
-        Client = new SessionClient(hello, identity, new EndpointChooser(endpoints), new WebTransport());
-        AssetCache cache = new AssetCache(new DiskAssetFiles(Path.Combine(options.Identity, "assets")));
-        Scene = new SceneFetcher(Client, cache, SceneBudget.Quest3);
-        Client.Start();
-        Scene.Start();
+            Identity = new FileIdentityStore(options.Identity),
+            Cache = new AssetCache(new DiskAssetFiles(Path.Combine(options.Identity, "assets"))),
+            Address = options.Address,
+            PairingFile = options.PairingFile,
+            SessionName = options.Session,
+            UsesThisMachine = true,
+        });
+        if (options.Code.Length > 0) Connector.EnterCode(options.Code);
+        Connector.Start();
+        beganNs = MonotonicClock.NowNs;
     }
+
+    /// <summary>True for a role that has devices.</summary>
+    public bool SendsDevices { get { return options.RoleName != Role.Observer; } }
+
+    /// <summary>True when the connector waits for what a person decides.</summary>
+    public bool NeedsPerson { get { return phase == ConnectorPhase.Failed || (phase == ConnectorPhase.Untrusted && Connector.View.Fingerprint != options.Trust); } }
+
+    /// <summary>True when no session was joined, and none will be.</summary>
+    public bool IsHopeless { get; private set; }
 
     /// <summary>Leave the session. Returns whether all threads have ended within the time that is promised.</summary>
     public bool Stop()
     {
-        bool hasEnded = Scene.Stop();
-        return Client.Stop() && hasEnded;
+        return Connector.Stop();
     }
 
     public void Dispose()
@@ -83,9 +106,12 @@ internal sealed class Headset : IDisposable
         if (frameNs > 0 && beganNs - frameNs > 1_000_000_000) awakeNs = beganNs; // this process stood still
         frameNs = beganNs;
         Frames++;
-        bool isNew = Client.TakeState();
-        Client.TakePresence();
-        while (Client.TryTakeNews(out SessionNews one)) TakeNews(one);
+        if (Connector.Poll()) TakeView(Connector.View);
+        bool isSilent = phase == ConnectorPhase.Searching && options.Address.Length == 0 && options.PairingFile == null && beganNs - this.beganNs >= SilentNs;
+        IsHopeless |= Client == null && (isSilent || phase == ConnectorPhase.Choosing);
+        bool isNew = Client != null && Client.TakeState();
+        Client?.TakePresence();
+        while (Client != null && Client.TryTakeNews(out SessionNews one)) TakeNews(one);
         if (SendsSamples) SendSamples();
         LongestCallMs = Math.Max(LongestCallMs, (MonotonicClock.NowNs - beganNs) * 1e-6);
         if (isNew)
@@ -102,13 +128,47 @@ internal sealed class Headset : IDisposable
         Thread.Sleep(FrameMs);
     }
 
+    /// <summary>Take and report what the connector does.</summary>
+    private void TakeView(ConnectorView view)
+    {
+        if (view.Phase == ConnectorPhase.Idle) return;
+        if (view.Pairing != null && view.Pairing != pairing) Write(view.Pairing);
+        if (view.Phase != phase || view.Phrase.What != what)
+        {
+            List<string> names = new List<string>();
+            foreach (OfferedSession one in view.Sessions) names.Add(one.Name + " (" + HostName.Format(one.Host, one.Port) + ")");
+            report.Write(
+                "find", view.Phrase.What.Length == 0, "phase", view.Phase.ToString(), "session", view.Session, "endpoint", view.Endpoint, "text", view.Phrase.ToString(), "sessions", names.ToArray());
+        }
+        phase = view.Phase;
+        what = view.Phrase.What;
+        if (Connector.Client != null)
+        {
+            Client = Connector.Client;
+            Scene = Connector.Scene;
+        }
+        if (phase == ConnectorPhase.Untrusted && view.Fingerprint == options.Trust) Connector.Trust();
+        bool isUnpaired = view.Pairing != null && view.Pairing.Outcome != PairingOutcome.Paired;
+        bool isFault = view.Refusal == null && view.Problem.Failure == LinkFailure.None; // of what was given
+        IsHopeless |= Client == null && phase == ConnectorPhase.Failed && (isUnpaired || isFault);
+    }
+
+    private void Write(PairingResult result)
+    {
+        pairing = result;
+        string text = result.Outcome == PairingOutcome.Paired ? "" : LinkWords.OfPairing(result).ToString();
+        report.Write(
+            "pair", result.Outcome == PairingOutcome.Paired, "outcome", result.Outcome.ToString(), "code", result.Refusal == null ? "" : result.Refusal.Code, "failure", result.End.Failure.ToString(), "text", text,
+            "roles", result.Roles);
+    }
+
     /// <summary>Run frames until a condition holds. False: not within the time.</summary>
     public bool RunUntil(Func<bool> condition, double seconds = 60.0)
     {
         long untilNs = MonotonicClock.NowNs + (long)(seconds * 1e9);
         while (!condition())
         {
-            if (IsInterrupted || MonotonicClock.NowNs >= untilNs || Client.Crash.Length > 0) return false;
+            if (IsInterrupted || IsHopeless || MonotonicClock.NowNs >= untilNs || (Client != null && Client.Crash.Length > 0)) return false;
             Frame();
         }
         return true;

@@ -20,6 +20,7 @@ Join a session as a headset app does, and do what is asked: commands of --do, el
   --address ADDRESS   host:port of the web channel, https://..., or a link of `iris-session pair --web`; several with commas, the
                       preferred one first (default: a session that announces itself)
   --session NAME      which of the sessions that announce themselves
+  --pairing-file FILE file of `iris-session pair --unity`
   --code CODE         join code of `iris-session pair`
   --trust FINGERPRINT certificate to trust without a code, as `join` prints it
   --identity FOLDER   secret, resume token and known certificates (default: in the folder for temporary files)
@@ -47,22 +48,19 @@ Example: headless run --code 7B60-VY33-DJ6M --do ""join; align; acquire left; mo
             return NotJoinedStatus;
         }
         Report report = new Report(options.IsJson);
-        FileIdentityStore identity = new FileIdentityStore(options.Identity);
-        WebEndpoint[] endpoints = Finder.Find(options, identity, report);
-        if (endpoints == null) return NotJoinedStatus;
-        using (Headset headset = new Headset(options, identity, endpoints))
+        using (Headset headset = new Headset(options, report))
         {
             Console.CancelKeyPress += (sender, pressed) =>
             {
                 pressed.Cancel = !headset.IsInterrupted; // a second Ctrl-C ends at once
                 headset.IsInterrupted = true;
             };
-            Commands commands = new Commands(headset, report, options);
+            Commands commands = new Commands(headset, report);
             bool isDone = commands.Run(options.Do == null ? ReadLines(Console.In) : options.Do.Split(';'));
             bool hasEnded = headset.Stop();
-            if (!hasEnded) report.Write("stop", false, "text", "a thread did not end within a second");
+            if (!hasEnded) report.Write("stop", false, "text", "a thread did not end in time");
             if (headset.IsInterrupted) return InterruptedStatus;
-            if (commands.IsRefused) return NotJoinedStatus;
+            if (headset.IsHopeless || commands.IsRefused) return NotJoinedStatus;
             return isDone && hasEnded ? 0 : 1;
         }
     }
@@ -77,6 +75,7 @@ internal sealed class Options
 {
     public string Address = "";
     public string Session = "";
+    public string PairingFile;
     public string Code = "";
     public string Identity = Path.Combine(Path.GetTempPath(), "iris-session-headless");
     public string Name = "headless";
@@ -104,6 +103,11 @@ internal sealed class Options
             {
                 case "--address": options.Address = value; break;
                 case "--session": options.Session = value; break;
+                case "--pairing-file":
+                    problem = "the file " + value + " cannot be read";
+                    if (!File.Exists(value)) return null;
+                    options.PairingFile = File.ReadAllText(value);
+                    break;
                 case "--code": options.Code = value; break;
                 case "--identity": options.Identity = value; break;
                 case "--name": options.Name = value; break;
