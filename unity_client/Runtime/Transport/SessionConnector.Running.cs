@@ -16,6 +16,8 @@ namespace IrisSession.Transport
         /// <summary>A client that has not joined within it says why [ns].</summary>
         private const long JoinNs = 1_000_000_000;
 
+        /// <summary>Characters of a name, before the three dots of one that is longer: the protocol has room for 64.</summary>
+        private const int MaxName = 60;
         private const int LookMs = 10;
         private const int SlowLookMs = 100;
 
@@ -175,7 +177,7 @@ namespace IrisSession.Transport
         private PairingResult AskToPair(WebEndpoint endpoint)
         {
             Publish(new ConnectorView(ConnectorPhase.Pairing, newest.Phrase, endpoint.ToString(), goal.Session, pairing: goal.Pairing));
-            PairingClient pairing = new PairingClient(endpoint, goal.Code, settings.Identity.KeyHash, settings.Name, settings.Software);
+            PairingClient pairing = new PairingClient(endpoint, goal.Code, settings.Identity.KeyHash, Words.ToLine(settings.Name, MaxName), Words.ToLine(settings.Software, MaxName));
             pairing.Start();
             bool isDone = WaitFor(() => pairing.Result != null);
             pairing.Stop();
@@ -271,7 +273,7 @@ namespace IrisSession.Transport
 
         private Hello MakeHello()
         {
-            return new Hello { Role = settings.Role, Name = settings.Name, Software = settings.Software, Devices = settings.Devices, Capabilities = settings.Capabilities };
+            return new Hello { Role = settings.Role, Name = Words.ToLine(settings.Name, MaxName), Software = Words.ToLine(settings.Software, MaxName), Devices = settings.Devices, Capabilities = settings.Capabilities };
         }
 
         /// <summary>Say how a client fares until there is an order, null then, or until the session or its key ends it.</summary>

@@ -70,7 +70,7 @@ namespace IrisSession.Transport.Tests
                 Stop();
                 ConnectorSettings settings = new ConnectorSettings
                 {
-                    Name = "ann", Devices = new[] { Device.Head }, Identity = Identity, Cache = new AssetCache(new SceneFetcherTests.MemoryFiles()), AgainMs = 10, SilenceNs = 0, BeaconPort = FindFreePort(),
+                    Name = new string('a', 100), Devices = new[] { Device.Head }, Identity = Identity, Cache = new AssetCache(new SceneFetcherTests.MemoryFiles()), AgainMs = 10, SilenceNs = 0, BeaconPort = FindFreePort(),
                 };
                 set(settings);
                 connector = new SessionConnector(settings);

@@ -29,6 +29,8 @@ Join a session as a headset app does, and do what is asked: commands of --do, el
   --json              a line of JSON for each command
   --do COMMANDS       commands, separated by semicolons
 
+Ctrl-C leaves the session; on Mono only in a terminal: a signal from elsewhere ends the program without a goodbye.
+
 Commands: join; scene; draw; align; acquire ROBOT; move ROBOT X Y Z (metres in the world); release ROBOT; measure SECONDS;
 media STREAM SECONDS; body NAME; view; until EVENT; wait SECONDS; estop; quit
 
