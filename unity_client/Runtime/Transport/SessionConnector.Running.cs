@@ -19,6 +19,7 @@ namespace IrisSession.Transport
         /// <summary>Characters of a name, before the three dots of one that is longer: the protocol has room for 64.</summary>
         private const int MaxName = 60;
         private const int LookMs = 10;
+        private const int ListenLookMs = 50;
         private const int SlowLookMs = 100;
 
         private ConnectorGoal goal;
@@ -99,7 +100,7 @@ namespace IrisSession.Transport
             List<string> others = new List<string>();
             long beganNs = MonotonicClock.NowNs;
             long heardNs = -1;
-            while (Wait(LookMs))
+            while (Wait(ListenLookMs))
             {
                 UpdateOffers(others);
                 long nowNs = MonotonicClock.NowNs;
@@ -111,6 +112,7 @@ namespace IrisSession.Transport
                 else if (offers.Length == 1 && nowNs - heardNs >= OthersNs)
                 {
                     goal.Chosen = offers[0];
+                    Publish(new ConnectorView(ConnectorPhase.Searching, ConnectorWords.None, session: goal.Session));
                     return true;
                 }
             }
@@ -176,7 +178,7 @@ namespace IrisSession.Transport
 
         private PairingResult AskToPair(WebEndpoint endpoint)
         {
-            Publish(new ConnectorView(ConnectorPhase.Pairing, newest.Phrase, endpoint.ToString(), goal.Session, pairing: goal.Pairing));
+            Publish(new ConnectorView(ConnectorPhase.Pairing, FindObstacle(), endpoint.ToString(), goal.Session, pairing: goal.Pairing));
             PairingClient pairing = new PairingClient(endpoint, goal.Code, settings.Identity.KeyHash, Words.ToLine(settings.Name, MaxName), Words.ToLine(settings.Software, MaxName));
             pairing.Start();
             bool isDone = WaitFor(() => pairing.Result != null);
@@ -341,11 +343,15 @@ namespace IrisSession.Transport
             lock (gate) while (orders.Count == 0) Monitor.Wait(gate);
         }
 
-        /// <summary>Say what is searched now; what was in the way before stays, until it is not any more.</summary>
         private void Search(string where)
         {
-            bool isAgain = newest.Phase == ConnectorPhase.Searching || newest.Phase == ConnectorPhase.Pairing;
-            Publish(new ConnectorView(ConnectorPhase.Searching, isAgain ? newest.Phrase : ConnectorWords.None, where, goal.Session, pairing: goal.Pairing));
+            Publish(new ConnectorView(ConnectorPhase.Searching, FindObstacle(), where, goal.Session, pairing: goal.Pairing));
+        }
+
+        /// <summary>Return what was in the way of the attempt before this one: it is said until one gets further.</summary>
+        private Phrase FindObstacle()
+        {
+            return newest.Phase == ConnectorPhase.Searching || newest.Phase == ConnectorPhase.Pairing ? newest.Phrase : ConnectorWords.None;
         }
 
         private void TryAgain(LinkEnd end)
@@ -358,6 +364,7 @@ namespace IrisSession.Transport
         private void TryAgain(Phrase phrase, LinkEnd end)
         {
             Publish(new ConnectorView(ConnectorPhase.Searching, phrase, newest.Endpoint, goal.Session, pairing: goal.Pairing, problem: end));
+            goal.Chosen = null; // it may announce itself elsewhere
             Wait(settings.AgainMs);
         }
 
