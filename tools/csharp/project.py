@@ -31,6 +31,8 @@ from tools.csharp.vectors import render_message_vectors
 
 ROOT: Final = HERE.parents[1]
 PACKAGES: Final = ("unity_client", "hololens_client", "tools/csharp/standins", "tests/csharp/unity")
+#: How names of assemblies of the engine's packages begin.
+OF_OTHERS: Final = ("Unity", "Microsoft", "Oculus", "meta")
 #: The assembly that stands for the engine and its packages.
 STANDINS: Final = "UnityEngine"
 RUNNER: Final = "runner"
@@ -87,7 +89,7 @@ def find_projects(root: Path = ROOT) -> list[Project]:
         for path in sorted((root / package).rglob("*.asmdef")):
             text = json.loads(path.read_text(encoding="utf-8"))
             has_engine = not text.get("noEngineReferences")
-            named = tuple(name for name in text.get("references", ()) if not name.startswith(("Unity", "Microsoft")))
+            named = tuple(name for name in text.get("references", ()) if not name.startswith(OF_OTHERS))
             references = (*named, *([STANDINS] if has_engine else []))
             is_test = NUNIT.name in text.get("precompiledReferences", ())
             project = Project(text["name"], path.parent, references, is_test, has_engine or text["name"] == STANDINS)
