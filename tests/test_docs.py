@@ -30,7 +30,14 @@ from iris_session.protocol import names
 
 ROOT = Path(__file__).parents[1]
 #: `docs/protocol.md` has its own tests (tests/protocol); only its links are checked here.
-PAGES = (ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md")))
+PACKAGES = tuple(ROOT / name for name in ("unity_client", "hololens_client"))
+PAGES = (
+    ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *(folder / "README.md" for folder in PACKAGES),
+    *(page for folder in PACKAGES for page in sorted((folder / "Documentation~").glob("*.md"))),
+)
 EXAMPLES = tuple(sorted((ROOT / "examples").glob("*.py")))
 #: Those that are a session with a loop of their own.
 LOOPS = ("share_a_script", "own_loop", "publish_scene")
@@ -407,7 +414,7 @@ def test_links_resolve(page: Path) -> None:
 
 
 #: A name with a folder and one of these endings, written as code, is a file of the repository.
-FILE = re.compile(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|md|xml|toml|json|png))`")
+FILE = re.compile(r"`(?!Packages/|Assets/)((?:[\w.-]+/)+[\w.-]+\.(?:py|md|xml|toml|json|png))`")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -10,8 +10,11 @@ from pathlib import Path
 from tools.csharp.project import ROOT
 
 PACKAGE = ROOT / "unity_client"
+HOLOLENS = ROOT / "hololens_client"
 ASSEMBLIES = {path: json.loads(path.read_text()) for path in sorted(PACKAGE.rglob("*.asmdef"))}
 LAYERS = [path for path in ASSEMBLIES if path.relative_to(PACKAGE).parts[0] == "Runtime"]
+#: Of both packages, for the editor alone.
+COMMANDS = [path for folder in (PACKAGE, HOLOLENS) for path in sorted((folder / "Editor").rglob("*.asmdef"))]
 
 
 def test_manifest_has_the_version_of_the_session() -> None:
@@ -22,6 +25,7 @@ def test_manifest_has_the_version_of_the_session() -> None:
 
 #: Assembly of a package of Unity -> the package.
 PACKAGES_OF_UNITY = {
+    "Microsoft.MixedReality.OpenXR": "com.microsoft.mixedreality.openxr",
     "Unity.InputSystem": "com.unity.inputsystem",
     "Unity.TextMeshPro": "com.unity.ugui",
     "Unity.XR.ARFoundation": "com.unity.xr.arfoundation",
@@ -29,7 +33,11 @@ PACKAGES_OF_UNITY = {
     "Unity.XR.CoreUtils": "com.unity.xr.core-utils",
     "Unity.XR.Hands": "com.unity.xr.hands",
     "Unity.XR.Management": "com.unity.xr.management",
+    "Unity.XR.Management.Editor": "com.unity.xr.management",
     "Unity.XR.OpenXR": "com.unity.xr.openxr",
+    "Unity.XR.OpenXR.Editor": "com.unity.xr.openxr",
+    "Oculus.VR": "com.meta.xr.sdk.core",
+    "meta.xr.mrutilitykit": "com.meta.xr.mrutilitykit",
 }
 
 
@@ -62,27 +70,82 @@ def test_each_layer_is_an_assembly_with_tests() -> None:
 def test_layers_with_an_engine_stay_thin() -> None:
     """A layer that runs on stand-ins only must be short enough to be read."""
     sources = {path: len(path.read_text().splitlines()) for path in (PACKAGE / "Runtime/Unity").rglob("*.cs")}
-    hololens = {path: len(path.read_text().splitlines()) for path in (ROOT / "hololens_client").rglob("*.cs")}
+    hololens = {path: len(path.read_text().splitlines()) for path in HOLOLENS.rglob("*.cs")}
     assert hololens
     assert max({**sources, **hololens}.values()) < 400
     assert sum(hololens.values()) < 1000
 
 
+def test_page_quotes_what_the_panels_say() -> None:
+    page = (PACKAGE / "Documentation~/index.md").read_text()
+    table = page.split("## What the panels say")[1].split("\n## ")[0]
+    sources = "".join(path.read_text() for path in (PACKAGE / "Runtime").rglob("*.cs")).lower().replace('\\"', '"')
+    cells = [line.split("|")[1] for line in table.splitlines() if line.startswith("| *")]
+    quoted = [
+        part.strip(" .'").lower()
+        for cell in cells
+        for one in re.findall(r"\*([^*]+)\*", cell)
+        for part in one.split("...")
+    ]
+    assert len(quoted) > 20
+    assert not [part for part in quoted if len(part) > 5 and part not in sources]
+
+
 def test_hololens_needs_this_core() -> None:
-    manifest = json.loads((ROOT / "hololens_client/package.json").read_text())
+    manifest = json.loads((HOLOLENS / "package.json").read_text())
     core = json.loads((PACKAGE / "package.json").read_text())
     assert manifest["dependencies"][core["name"]] == core["version"] == manifest["version"]
 
 
-def test_layers_refer_to_assemblies_that_exist() -> None:
-    names = {content["name"] for content in ASSEMBLIES.values()}
-    for content in ASSEMBLIES.values():
-        own = {name for name in content["references"] if name.startswith("IrisSession.")}
-        assert own <= names
+def test_assemblies_refer_to_those_that_exist() -> None:
+    """Ours, and of packages that come with this one: what needs more waits for it by a constraint."""
+    everything = {**ASSEMBLIES, **{path: json.loads(path.read_text()) for path in HOLOLENS.rglob("*.asmdef")}}
+    names = {content["name"] for content in everything.values()} | {"UnityEngine.TestRunner", "UnityEditor.TestRunner"}
+    come_with = {
+        # The OpenXR plug-in brings the other two.
+        PACKAGE: {"com.unity.inputsystem", "com.unity.xr.openxr", "com.unity.xr.management", "com.unity.xr.core-utils"},
+        HOLOLENS: {*json.loads((HOLOLENS / "package.json").read_text())["dependencies"], "com.unity.xr.core-utils"},
+    }
+    for path, content in everything.items():
+        needs = {PACKAGES_OF_UNITY[name] for name in content["references"] if name not in names}
+        folder = PACKAGE if PACKAGE in path.parents else HOLOLENS
+        missing = needs - come_with[folder]
+        defined = {one["name"] for one in content.get("versionDefines", ())}
+        assert not missing or defined & missing, f"{path}: {missing}"
+
+
+def test_commands_are_for_the_editor_alone() -> None:
+    assert len(COMMANDS) > 2
+    for path in COMMANDS:
+        assert json.loads(path.read_text())["includePlatforms"] == ["Editor"], path
+    for path in [*LAYERS, *(HOLOLENS / "Runtime").rglob("*.asmdef")]:
+        assert not re.search(r"\bUnityEditor\b", "".join(one.read_text() for one in path.parent.rglob("*.cs"))), path
+
+
+def test_package_manager_shows_samples_and_pages() -> None:
+    for folder in (PACKAGE, HOLOLENS):
+        manifest = json.loads((folder / "package.json").read_text())
+        for name in ("README.md", "LICENSE.md", "CHANGELOG.md", "Documentation~/index.md"):
+            assert (folder / name).stat().st_size, name
+        assert "[Unreleased] " + manifest["version"] in (folder / "CHANGELOG.md").read_text()
+        listed = {sample["path"]: sample for sample in manifest.get("samples", ())}
+        samples = {path.relative_to(folder).as_posix() for path in folder.glob("Samples~/*")}
+        assert samples == {*listed}
+        assert all(one["displayName"] and one["description"] for one in listed.values())
+
+
+def test_page_has_the_versions_of_the_list() -> None:
+    versions = json.loads((PACKAGE / "Documentation~/quest-3.manifest.json").read_text())["dependencies"]
+    page = (PACKAGE / "Documentation~/index.md").read_text()
+    shown = set(re.findall(r"\b\d+\.\d+\.\d+\b(?!f)", page)) - {"127.0.0.1"}
+    assert shown <= {*versions.values()}, shown - {*versions.values()}
+    holo = json.loads((HOLOLENS / "package.json").read_text())["dependencies"]
+    page = (HOLOLENS / "Documentation~/index.md").read_text()
+    assert all(version in page for name, version in holo.items() if not name.startswith("com.iris-session"))
 
 
 def test_files_of_the_engine_can_be_read_at_once() -> None:
-    for layer in (path for path in LAYERS if not ASSEMBLIES[path]["noEngineReferences"]):
+    for layer in [path for path in LAYERS if not ASSEMBLIES[path]["noEngineReferences"]] + COMMANDS:
         for source in layer.parent.rglob("*.cs"):
             assert len(source.read_text().splitlines()) < 400, source
 

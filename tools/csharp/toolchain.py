@@ -36,7 +36,7 @@ HERE: Final = Path(__file__).parent
 RUNTIMES: Final = ("dotnet", "mono")
 LANGUAGE: Final = "9"
 #: Of Mono, what stands for the surface; further libraries of Mono are not part of the standard.
-MONO_LIBRARIES: Final = ("mscorlib", "System", "System.Core", "System.IO.Compression", "System.Numerics")
+MONO_LIBRARIES: Final = ("mscorlib", "System", "System.Core", "System.IO.Compression", "System.Numerics", "System.Xml")
 NUNIT: Final = Path("/usr/lib/cli/nunit.framework-2.6.3/nunit.framework.dll")
 _MONO_FOLDER: Final = Path("/usr/lib/mono/4.5")
 #: Of the surface, what `Compiler.cs` itself refers to.

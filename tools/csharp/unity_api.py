@@ -23,10 +23,22 @@ EXTRACT: Final = HERE / "unity_api.json"
 MANUAL: Final = HERE / "unity_manual.json"
 #: Layer -> package -> versions in which a member must be there; of packages that are not listed, the primary one.
 TARGETS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
-    "unity": {"engine": ("6000.0.78f1", "6000.3.19f1")},
-    "unity.input": {"engine": ("2022.3.76f1", "6000.0.78f1", "6000.3.19f1")},
-    "unity.app": {"engine": ("2022.3.76f1", "6000.0.78f1", "6000.3.19f1")},
-    "hololens": {"engine": ("2022.3.76f1",), "com.unity.xr.arfoundation": ("5.1.6",)},
+    "unity": {"engine": ("2022.3.76f1", "6000.0.78f1", "6000.3.19f1")},
+    "hololens": {
+        "engine": ("2022.3.76f1",),
+        "editor": ("2022.3.76f1",),
+        "com.unity.xr.arfoundation": ("5.1.6",),
+        "com.unity.xr.openxr": ("1.13.0",),
+    },
+    "editor": {
+        "engine": ("2022.3.76f1", "6000.0.78f1", "6000.3.19f1"),
+        "editor": ("2022.3.76f1", "6000.0.78f1", "6000.3.19f1"),
+        "com.unity.xr.openxr": ("1.13.0", "1.17.1"),
+    },
+    "editor.quest": {
+        "engine": ("6000.0.78f1", "6000.3.19f1"),
+        "editor": ("6000.0.78f1", "6000.3.19f1"),
+    },
 }
 _ALIASES: Final = {
     "Boolean": "bool", "Byte": "byte", "SByte": "sbyte", "Int16": "short", "UInt16": "ushort", "Int32": "int",
@@ -181,7 +193,8 @@ def load_api(path: Path, manual: Path = MANUAL) -> Api:
     content = json.loads(path.read_text(encoding="utf-8"))
     types = content["types"]
     for one in json.loads(manual.read_text(encoding="utf-8")):
-        home = types.setdefault(one["type"], {"pkg": one["package"], "kind": one["kind"], "src": one["page"]})
+        made = {"pkg": one["package"], "kind": one["kind"], "src": one["page"], "base": one.get("base", [])}
+        home = types.setdefault(one["type"], made)
         if one.get("section"):
             home.setdefault(one["section"], {}).setdefault(one["name"], []).append(one["signature"])
     return Api(types, content["packages"], tuple(content["messages"]["list"]))
@@ -191,11 +204,10 @@ def find_problems(api: Api, assemblies: Mapping[str, list[Member]]) -> list[str]
     """Return what is wrong with the members of assemblies, by their names."""
     found = []
     for name, members in assemblies.items():
+        named = max((target for target in TARGETS if f".{target}" in name.lower()), key=len, default="")
         for member in members:
-            targets = [target for target in TARGETS if f".{target}" in name.lower()] or list(TARGETS)
-            problems = [api.find_problem(member, target) for target in targets]
-            named = any(f".{target}" in name.lower() for target in TARGETS)
-            if (any if named else all)(problems):  # stand-ins are for any layer
+            problems = [api.find_problem(member, target) for target in ([named] if named else TARGETS)]
+            if all(problems):  # stand-ins are for any layer
                 found.append(next(filter(None, problems)))
     return found
 

@@ -7,6 +7,7 @@ using IrisSession.Protocol;
 using NUnit.Framework;
 using Standins;
 using UnityEngine;
+using ColorSpace = IrisSession.Protocol.ColorSpace;
 
 namespace IrisSession.Unity.StandinTests
 {

@@ -6,12 +6,15 @@ namespace UnityEngine
 {
     public class Application
     {
+        public static string dataPath { get { return DataPath; } }
+
         public static string persistentDataPath { get { Engine.CheckThread(); return PersistentDataPath; } }
 
         public static RuntimePlatform platform { get { return Platform; } }
 
         public static string version { get { Engine.CheckThread(); return "1.0"; } }
 
+        internal static string DataPath = "";
         internal static string PersistentDataPath = "";
         internal static RuntimePlatform Platform = RuntimePlatform.LinuxPlayer;
     }

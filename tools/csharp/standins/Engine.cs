@@ -27,6 +27,9 @@ namespace Standins
 
         /// <summary>False: as the engine draws where a graphics card has no instancing.</summary>
         public static bool HasInstancing = true;
+
+        /// <summary>No message reaches a component: as in the editor while nothing is played.</summary>
+        public static bool IsEditing;
         internal static double Now;
         internal static double LastStep;
         internal static int Frame;
@@ -50,6 +53,7 @@ namespace Standins
             Log.Clear();
             Draws.Clear();
             IsRecording = HasInstancing = true;
+            IsEditing = false;
             BeforeRender = null;
             Now = LastStep = 0.0;
             Frame = 0;
@@ -94,6 +98,8 @@ namespace Standins
         }
 
         internal static void Add(GameObject one) { Objects.Add(one); }
+
+        internal static GameObject[] FindRoots() { return Objects.FindAll(one => one.transform.parent == null).ToArray(); }
 
         internal static void Remove(GameObject one) { Objects.Remove(one); }
 
@@ -151,7 +157,7 @@ namespace Standins
 
         public void UpdateEnabled()
         {
-            if (isEnded) return;
+            if (isEnded || Engine.IsEditing) return;
             bool isOn = behaviour.isActiveAndEnabled;
             if (!isAwake && behaviour.gameObject.activeInHierarchy)
             {

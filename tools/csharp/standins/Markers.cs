@@ -98,14 +98,86 @@ namespace UnityEngine.XR.ARFoundation
     }
 }
 
+namespace UnityEngine.XR.ARSubsystems
+{
+    public class XRSessionSubsystem
+    {
+        public class Provider
+        {
+        }
+    }
+
+    public class XRSessionSubsystemDescriptor
+    {
+    }
+
+    public class XRCameraSubsystem
+    {
+        public class Provider
+        {
+        }
+    }
+
+    public class XRCameraSubsystemDescriptor
+    {
+    }
+
+    public class XRMarkerSubsystem
+    {
+        public abstract class Provider
+        {
+        }
+    }
+
+    public class XRMarkerSubsystemDescriptor
+    {
+    }
+}
+
+namespace UnityEngine.XR.ARFoundation
+{
+    public class SubsystemLifecycleManager<TSubsystem, TSubsystemDescriptor, TProvider> : MonoBehaviour
+    {
+    }
+
+    public abstract class ARTrackableManager<TSubsystem, TSubsystemDescriptor, TProvider, TSessionRelativeData, TTrackable> : SubsystemLifecycleManager<TSubsystem, TSubsystemDescriptor, TProvider>
+    {
+    }
+
+    public sealed class ARSession : SubsystemLifecycleManager<XRSessionSubsystem, XRSessionSubsystemDescriptor, XRSessionSubsystem.Provider>
+    {
+    }
+
+    public sealed class ARCameraManager : SubsystemLifecycleManager<XRCameraSubsystem, XRCameraSubsystemDescriptor, XRCameraSubsystem.Provider>
+    {
+    }
+
+    public class ARMarkerManager : ARTrackableManager<XRMarkerSubsystem, XRMarkerSubsystemDescriptor, XRMarkerSubsystem.Provider, XRMarker, ARMarker>
+    {
+    }
+}
+
 namespace Unity.XR.CoreUtils
 {
     public class XROrigin : UnityEngine.MonoBehaviour
     {
+        public enum TrackingOriginMode
+        {
+            NotSpecified = 0,
+            Device = 1,
+            Floor = 2,
+        }
+
         internal UnityEngine.Transform Trackables;
 
         public UnityEngine.Transform TrackablesParent { get { return Trackables; } }
 
+        public UnityEngine.GameObject Origin { get; set; }
+
         public UnityEngine.GameObject CameraFloorOffsetObject { get; set; }
+
+        public UnityEngine.Camera Camera { get; set; }
+
+        public TrackingOriginMode RequestedTrackingOriginMode { get; set; }
     }
 }

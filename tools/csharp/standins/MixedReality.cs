@@ -1,6 +1,7 @@
 // Markers of Microsoft's Mixed Reality OpenXR plug-in, as objects below the origin's parent of trackables.
 using UnityEngine;
 using UnityEngine.XR.ARFoundation;
+using UnityEngine.XR.ARSubsystems;
 
 namespace Microsoft.MixedReality.OpenXR
 {
@@ -8,6 +9,18 @@ namespace Microsoft.MixedReality.OpenXR
     {
         MostStable = 0,
         Center = 1,
+    }
+
+    public enum ARMarkerType
+    {
+        QRCode = 1,
+    }
+
+    /// <summary>The subsystem is one of this plug-in, with these names.</summary>
+    public sealed class ARMarkerManager : ARTrackableManager<XRMarkerSubsystem, XRMarkerSubsystemDescriptor, XRMarkerSubsystem.Provider, ARSubsystems.XRMarker, ARMarker>
+    {
+        public ARMarkerType[] enabledMarkerTypes;
+        public TransformMode defaultTransformMode;
     }
 
     public sealed class ARMarker : ARTrackable<ARSubsystems.XRMarker, ARMarker>

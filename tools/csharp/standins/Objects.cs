@@ -54,6 +54,8 @@ namespace UnityEngine
 
         public int layer { get; set; }
 
+        public string tag { get; set; } = "Untagged";
+
         public bool activeSelf { get { return isActive; } }
 
         public bool activeInHierarchy

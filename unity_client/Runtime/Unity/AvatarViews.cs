@@ -4,6 +4,7 @@ using IrisSession.Core;
 using IrisSession.Protocol;
 using UnityEngine;
 using UnityEngine.Rendering;
+using Avatar = IrisSession.Core.Avatar;
 using Material = UnityEngine.Material;
 using Mesh = UnityEngine.Mesh;
 

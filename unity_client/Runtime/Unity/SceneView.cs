@@ -4,6 +4,7 @@ using System.Collections.Generic;
 using IrisSession.Core;
 using IrisSession.Protocol;
 using UnityEngine;
+using ColorSpace = IrisSession.Protocol.ColorSpace;
 using Mesh = UnityEngine.Mesh;
 using Material = UnityEngine.Material;
 
