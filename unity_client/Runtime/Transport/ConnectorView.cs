@@ -42,19 +42,24 @@ namespace IrisSession.Transport
         public readonly bool IsKnown;
         internal readonly string Id;
 
-        /// <summary>On each network from which it is heard, with the keys that are known.</summary>
+        /// <summary>Number of addresses that its beacons named.</summary>
+        internal readonly int HeardAt;
+
+        /// <summary>On each network from which it is heard, with the keys that are known. See <see cref="ConnectorSettings.UsesThisMachine"/>.</summary>
         internal readonly List<WebEndpoint> Endpoints = new List<WebEndpoint>();
 
-        internal OfferedSession(FoundSession found, FileIdentityStore identity)
+        internal OfferedSession(FoundSession found, FileIdentityStore identity, bool usesThisMachine)
         {
             Beacon beacon = found.Beacon;
             Id = beacon.SessionId;
             Name = beacon.SessionName;
             Host = beacon.Host;
             Port = (int)beacon.Web;
+            HeardAt = found.Addresses.Count;
             foreach (string address in found.Addresses)
             {
                 string host = address.Substring(0, address.LastIndexOf(':')).Trim('[', ']');
+                if (!usesThisMachine && HostName.IsLoopback(host)) continue; // whatever the first beacon named
                 Endpoints.Add(identity.WithKnownPin(new WebEndpoint(!HostName.IsLoopback(host) || beacon.KeyFingerprint.Length > 0, host, Port)));
             }
             IsKnown = Endpoints.Exists(one => one.Pin != null);

@@ -129,10 +129,11 @@ namespace IrisSession.Transport
                 Beacon beacon = found.Beacon;
                 bool isWanted = settings.SessionName.Length == 0 || beacon.SessionName == settings.SessionName;
                 if (!isWanted || beacon.Web < 1 || beacon.Web > 65535) others.Add(beacon.SessionName);
-                else if (settings.UsesThisMachine || !HostName.IsLoopback(beacon.Host))
+                else
                 {
-                    OfferedSession before = Array.Find(offers, one => one.Id == beacon.SessionId && one.Endpoints.Count == found.Addresses.Count);
-                    now.Add(before ?? new OfferedSession(found, settings.Identity));
+                    OfferedSession before = Array.Find(offers, each => each.Id == beacon.SessionId && each.HeardAt == found.Addresses.Count);
+                    OfferedSession one = before ?? new OfferedSession(found, settings.Identity, settings.UsesThisMachine);
+                    if (one.Endpoints.Count > 0) now.Add(one);
                 }
             }
             offers = now.ToArray();
@@ -260,13 +261,19 @@ namespace IrisSession.Transport
             Search(ways[0].ToString());
             SessionClient client = new SessionClient(MakeHello(), settings.Identity, new EndpointChooser(ways.ToArray()), settings.MakeTransport());
             SceneFetcher scene = new SceneFetcher(client, settings.Cache, settings.Budget);
-            client.Start();
-            scene.Start();
-            SessionView end = Follow(client, scene);
-            if (end == null) Publish(new ConnectorView(ConnectorPhase.Searching, ConnectorWords.None)); // the engine lets go of the client
-            else Publish(new ConnectorView(ConnectorPhase.Searching, ConnectorWords.None, newest.Endpoint, goal.Session));
-            scene.Stop();
-            client.Stop();
+            SessionView end = null;
+            try
+            {
+                client.Start();
+                scene.Start();
+                end = Follow(client, scene);
+            }
+            finally // also after a defect: no session goes on without an engine, which lets go of the client first
+            {
+                Publish(new ConnectorView(ConnectorPhase.Searching, ConnectorWords.None, end == null ? "" : newest.Endpoint, end == null ? "" : goal.Session));
+                scene.Stop();
+                client.Stop();
+            }
             if (end == null) return;
             bool isStranger = end.Problem.Failure == LinkFailure.WrongCertificate || (end.Failure != null && (end.Failure.Code == RefusalCode.Unpaired || end.Failure.Code == RefusalCode.Identity));
             if (isStranger && goal.Code.Length > 0) goal.PairsFirst = true;
@@ -322,13 +329,16 @@ namespace IrisSession.Transport
             }
         }
 
+        /// <summary>`gate` is held. To stop is no order that could be taken before a wait begins.</summary>
+        private bool HasNoOrder { get { return orders.Count == 0 && !isStopping; } }
+
         /// <summary>Wait for a time. False: there is an order, or it is to stop.</summary>
         private bool Wait(int milliseconds)
         {
             lock (gate)
             {
-                if (orders.Count == 0) Monitor.Wait(gate, milliseconds);
-                return orders.Count == 0;
+                if (HasNoOrder) Monitor.Wait(gate, milliseconds);
+                return HasNoOrder;
             }
         }
 
@@ -340,7 +350,7 @@ namespace IrisSession.Transport
 
         private void WaitForOrder()
         {
-            lock (gate) while (orders.Count == 0) Monitor.Wait(gate);
+            lock (gate) while (HasNoOrder) Monitor.Wait(gate);
         }
 
         private void Search(string where)

@@ -19,7 +19,7 @@ namespace IrisSession.Transport
 
         private readonly ConnectorSettings settings;
         private readonly Thread thread;
-        private readonly object gate = new object(); // guards orders
+        private readonly object gate = new object(); // guards orders, and wakes the thread
         private readonly Queue<Action> orders = new Queue<Action>();
         private volatile ConnectorView newest = ConnectorView.Idle;
         private volatile bool isStopping;
@@ -48,8 +48,11 @@ namespace IrisSession.Transport
         /// <summary>Leave the session and end all threads. Returns within about a second, two when a network is stuck: whether they have ended.</summary>
         public bool Stop()
         {
-            isStopping = true;
-            Order(() => { }); // ends its wait
+            lock (gate)
+            {
+                isStopping = true;
+                Monitor.PulseAll(gate);
+            }
             View = ConnectorView.Idle;
             return (thread.ThreadState & ThreadState.Unstarted) != 0 || thread.Join(StopMs);
         }

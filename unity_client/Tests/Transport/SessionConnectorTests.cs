@@ -362,6 +362,16 @@ namespace IrisSession.Transport.Tests
                 connector = Start(isHeadset: true); // there, what announces itself at localhost is another app
                 int announced = 0;
                 app.WaitUntil(() => Announce(lab, "lab") && ++announced > 100 && connector.View.Phrase.What.Length > 0, "it does not say that nothing is heard");
+                connector = Start(isHeadset: true);
+                Beacon elsewhere = MakeBeacon("lab", lab); // the same app names another machine first
+                elsewhere.Host = Nowhere;
+                app.WaitUntil(
+                    () =>
+                    {
+                        sender.SendTo(elsewhere.Encode(), new IPEndPoint(IPAddress.Loopback, port));
+                        return Announce(lab, "lab") && (connector.View.Problem.Failure == LinkFailure.Unreachable || connector.Client != null);
+                    },
+                    "it does not try the other machine");
                 app.Stop();
                 Assert.AreEqual(hellos, lab.Hellos + gym.Hellos);
             }
