@@ -1,3 +1,4 @@
 using System.Runtime.CompilerServices;
 
 [assembly: InternalsVisibleTo("IrisSession.Transport.Tests")]
+[assembly: InternalsVisibleTo("IrisSession.Unity.StandinTests")]
