@@ -58,6 +58,7 @@ namespace IrisSession.Interaction
         private readonly List<MarkerReport> reports = new List<MarkerReport>();
         private ConnectorView view;
         private ConnectorView declined;
+        private ConnectorView answered; // by a press: another one waits for what comes of it
         private string notice = "";
         private bool isStopShown;
         private bool isChanged = true;
@@ -173,7 +174,9 @@ namespace IrisSession.Interaction
 
         private void Do(int button)
         {
+            if (view == answered) return;
             action = actions[button];
+            if (action == StartAction.Choose || action == StartAction.Trust || action == StartAction.Retry) answered = view;
             Chosen = offered[button];
             if (action == StartAction.Retry) Scanned = "";
             if (action != StartAction.None) return;

@@ -58,6 +58,9 @@ namespace IrisSession.Unity.App
         /// <summary>The session, null while there is none.</summary>
         public SessionClient Client { get { return client; } }
 
+        /// <summary>Its scene, null with it.</summary>
+        public SceneFetcher Scene { get { return connector == null ? null : connector.Scene; } }
+
         /// <summary>What the wearer sees while there is no session.</summary>
         public StartPanel Panel { get; } = new StartPanel();
 
