@@ -19,6 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
+import zmq
 from filelock import FileLock
 
 from tools.csharp.deflate_vectors import render_deflate_vectors
@@ -140,11 +141,20 @@ def build(folder: Path | None = None) -> Build:
                 )
                 for runtime in RUNTIMES:
                     shutil.copy(NUNIT, built / runtime)
+                    copy_libzmq(built / runtime)
                 built.rename(target)
             _remove_old(builds)
         os.utime(target)
     with_engine = tuple(project.name for project in projects if project.has_engine and not project.is_test)
     return Build(toolchain, target, tests, with_engine)
+
+
+def copy_libzmq(folder: Path) -> None:
+    """Copy the libzmq of pyzmq's wheel, with what it needs, to where both runtimes look for native libraries."""
+    for path in Path(zmq.__file__).parents[1].joinpath("pyzmq.libs").glob("*.so*"):
+        shutil.copy(path, folder)
+        if path.name.startswith("libzmq"):
+            shutil.copy(path, folder / "libzmq.so")
 
 
 def _list_assemblies(

@@ -20,7 +20,7 @@ namespace IrisSession.Core
         public readonly long Offset;
         public readonly int Length;
 
-        internal ChunkRequest(long requestId, string address, long offset, int length)
+        public ChunkRequest(long requestId, string address, long offset, int length)
         {
             RequestId = requestId;
             Address = address;

@@ -1,4 +1,4 @@
-// What a session loop needs of sockets. The web wire implements it (WebTransport), tests do, and ZeroMQ can.
+// What a session loop needs of sockets. The web wire (WebTransport), ZeroMQ (ZmqTransport) and tests implement it.
 //
 // Sockets run on threads of their own. Nothing here waits for one, but `Wait`, and `Dispose` for a bounded time. Every queue is bounded,
 // and what is dropped is counted.

@@ -9,7 +9,7 @@ using IrisSession.Transport;
 
 /// <summary>
 /// Commands of a headset: `join`, `scene` (until all of it is here), `draw` (all of it by the Unity layer; instead of `scene`), `draw dimmed`
-/// (until the world is grey), `align`, `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `media STREAM SECONDS` (counts
+/// (until the world is grey), `align`, `marks` (align by touching those of a sheet), `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `media STREAM SECONDS` (counts
 /// frames of a cloud, cloth or picture, and decodes them), `measure SECONDS`, `body NAME`,
 /// `view`, `wait SECONDS`, `until TEXT` (an event of this kind), `estop`, `quit`.
 /// </summary>
@@ -98,6 +98,7 @@ internal sealed class Commands
             case "scene": return Scene();
             case "draw": return Draw(words.Length > 1 ? words[1] : "");
             case "align": return Align();
+            case "marks": return new Touching(headset).Run(report);
             case "acquire": return Acquire(words[1]);
             case "release": return Release(words[1]);
             case "move": return Move(words[1], new Double3(Number(words[2]), Number(words[3]), Number(words[4])));
@@ -125,9 +126,9 @@ internal sealed class Commands
         isJoined &= IsRunning() && Client.View.Phase == ConnectionPhase.Ready;
         IsRefused = !isJoined;
         headset.SendsSamples = isJoined && headset.SendsDevices;
-        ConnectorView now = headset.Connector.View;
         if (!IsRunning())
         {
+            ConnectorView now = headset.Connector.View;
             report.Write(
                 "join", false, "phase", now.Phase.ToString(), "text", now.Phrase.ToString(), "refusal", now.Refusal == null ? "" : now.Refusal.Code, "problem", now.Problem.Failure.ToString(),
                 "fingerprint", now.Fingerprint);
@@ -142,7 +143,7 @@ internal sealed class Commands
 
     private bool IsRunning()
     {
-        return headset.Connector.View.Phase == ConnectorPhase.Running;
+        return headset.IsRunning;
     }
 
     /// <summary>Wait for the scene and its assets, and hash all of them once more.</summary>

@@ -22,6 +22,8 @@ internal sealed class Headset : IDisposable
     /// <summary>The newest session that was joined and its scene, null before.</summary>
     public SessionClient Client;
     public SceneFetcher Scene;
+
+    /// <summary>Null for a session by ZeroMQ.</summary>
     public readonly SessionConnector Connector;
     public readonly List<SessionNews> News = new List<SessionNews>();
     public readonly Dictionary<string, Feedback> Feedbacks = new Dictionary<string, Feedback>();
@@ -60,6 +62,12 @@ internal sealed class Headset : IDisposable
         this.options = options;
         this.report = report;
         string run = BitConverter.ToString(Guid.NewGuid().ToByteArray()).Replace("-", "").ToLowerInvariant();
+        beganNs = MonotonicClock.NowNs;
+        if (options.Zmq.Length > 0)
+        {
+            ConnectByZmq(run);
+            return;
+        }
         Connector = new SessionConnector(new ConnectorSettings
         {
             Role = options.RoleName,
@@ -76,8 +84,10 @@ internal sealed class Headset : IDisposable
         });
         if (options.Code.Length > 0) Connector.EnterCode(options.Code);
         Connector.Start();
-        beganNs = MonotonicClock.NowNs;
     }
+
+    /// <summary>True when there is a client.</summary>
+    public bool IsRunning { get { return Connector == null || Connector.View.Phase == ConnectorPhase.Running; } }
 
     /// <summary>True for a role that has devices.</summary>
     public bool SendsDevices { get { return options.RoleName != Role.Observer; } }
@@ -91,7 +101,9 @@ internal sealed class Headset : IDisposable
     /// <summary>Leave the session. Returns whether all threads have ended within the time that is promised.</summary>
     public bool Stop()
     {
-        return Connector.Stop();
+        if (Connector != null) return Connector.Stop();
+        bool hasEnded = Scene.Stop();
+        return Client.Stop() && hasEnded;
     }
 
     public void Dispose()
@@ -106,7 +118,7 @@ internal sealed class Headset : IDisposable
         if (frameNs > 0 && beganNs - frameNs > 1_000_000_000) awakeNs = beganNs; // this process stood still
         frameNs = beganNs;
         Frames++;
-        if (Connector.Poll()) TakeView(Connector.View);
+        if (Connector != null && Connector.Poll()) TakeView(Connector.View);
         bool isSilent = phase == ConnectorPhase.Searching && options.Address.Length == 0 && options.PairingFile == null && beganNs - this.beganNs >= SilentNs;
         IsHopeless |= Client == null && (isSilent || phase == ConnectorPhase.Choosing);
         bool isNew = Client != null && Client.TakeState();
@@ -126,6 +138,17 @@ internal sealed class Headset : IDisposable
             }
         }
         Thread.Sleep(FrameMs);
+    }
+
+    private void ConnectByZmq(string run)
+    {
+        Hello hello = new Hello { Role = options.RoleName, Name = options.Name, Devices = new[] { Device.Head, Device.ControllerRight }, Capabilities = new[] { "run:" + run } };
+        WebEndpoint endpoint = WebEndpoint.Parse("http://" + options.Zmq);
+        FileIdentityStore identity = new FileIdentityStore(options.Identity);
+        Client = new SessionClient(hello, identity, new EndpointChooser(endpoint), new ZmqTransport(null));
+        Scene = new SceneFetcher(Client, new AssetCache(new DiskAssetFiles(Path.Combine(options.Identity, "assets"))), SceneBudget.Quest3);
+        Client.Start();
+        Scene.Start();
     }
 
     /// <summary>Take and report what the connector does.</summary>

@@ -19,6 +19,7 @@ Join a session as a headset app does, and do what is asked: commands of --do, el
 
   --address ADDRESS   host:port of the web channel, https://..., or a link of `iris-session pair --web`; several with commas, the
                       preferred one first (default: a session that announces itself)
+  --zmq HOST:PORT     control channel of a session on this machine: by ZeroMQ, without a gateway
   --session NAME      which of the sessions that announce themselves
   --pairing-file FILE file of `iris-session pair --unity`
   --code CODE         join code of `iris-session pair`
@@ -31,7 +32,7 @@ Join a session as a headset app does, and do what is asked: commands of --do, el
 
 Ctrl-C leaves the session; on Mono only in a terminal: a signal from elsewhere ends the program without a goodbye.
 
-Commands: join; scene; draw; align; acquire ROBOT; move ROBOT X Y Z (metres in the world); release ROBOT; measure SECONDS;
+Commands: join; scene; draw; align; marks; acquire ROBOT; move ROBOT X Y Z (metres in the world); release ROBOT; measure SECONDS;
 media STREAM SECONDS; body NAME; view; until EVENT; wait SECONDS; estop; quit
 
 Example: headless run --code 7B60-VY33-DJ6M --do ""join; align; acquire left; move left 0 0 0.1""";
@@ -76,6 +77,7 @@ Example: headless run --code 7B60-VY33-DJ6M --do ""join; align; acquire left; mo
 internal sealed class Options
 {
     public string Address = "";
+    public string Zmq = "";
     public string Session = "";
     public string PairingFile;
     public string Code = "";
@@ -104,6 +106,7 @@ internal sealed class Options
             switch (arguments[i++])
             {
                 case "--address": options.Address = value; break;
+                case "--zmq": options.Zmq = value; break;
                 case "--session": options.Session = value; break;
                 case "--pairing-file":
                     problem = "the file " + value + " cannot be read";
