@@ -228,7 +228,8 @@ namespace IrisSession.Unity.StandinTests
                 stage.StepUntil(() => stage.App.Problem.Length > 0, "it is said");
                 Assert.AreEqual(1, Engine.Errors.Count);
                 Engine.Errors.Clear();
-                for (int i = 0; i < 3; i++) Engine.Step();
+                stage.StepUntil(() => Unwrap(stage.Text).Contains(stage.App.Problem), "the wearer reads it");
+                Assert.IsFalse(IsDrawn(stage, "Try again"), "nothing can be done here");
                 Assert.IsNull(stage.App.Client);
             }
         }

@@ -266,6 +266,52 @@ namespace IrisSession.Unity.StandinTests
             }
         }
 
+        /// <summary>Throws from the second frame on.</summary>
+        private sealed class BrokenSubsystem : XRInputSubsystem
+        {
+            public override bool Equals(object other) { throw new InvalidOperationException("of the runtime"); }
+
+            public override int GetHashCode() { return 0; }
+        }
+
+        [Test]
+        public void ADefectBesideTheControlsLeavesTheEStop()
+        {
+            IrisHeadset headset = new GameObject("offset").AddComponent<IrisHeadset>();
+            headset.StartPanel = new StartPanel();
+            SessionClient client = MakeClient();
+            headset.Connect(client, new FakeBodies());
+            Subsystems.Running.Add(new BrokenSubsystem());
+            for (int i = 0; i < 3; i++) Engine.Step();
+            Assert.IsNull(headset.Input);
+            Assert.AreEqual(1, Engine.Errors.Count, "logged once");
+            Assert.IsFalse(headset.StartPanel.Stop.IsUnconfirmed);
+            Controls.Set("<XRController>{LeftHand}/thumbstickClicked", 1f);
+            Engine.Step();
+            Assert.IsTrue(headset.StartPanel.Stop.IsUnconfirmed, "it was pressed, and no session has it");
+            client.Stop();
+        }
+
+        [Test]
+        public void AnEStopThatDidNotArriveIsSaidAlsoAfterTheSessionAndInTheNextOne()
+        {
+            IrisHeadset headset = new GameObject("offset").AddComponent<IrisHeadset>();
+            headset.StartPanel = new StartPanel();
+            SessionClient first = MakeClient(), second = MakeClient();
+            headset.Connect(first, new FakeBodies());
+            SetPose("<XRHMD>/", "centerEyePosition", "centerEyeRotation", new Vector3(0f, 1.6f, 0f), Quaternion.identity);
+            Controls.Set("<XRController>{LeftHand}/thumbstickClicked", 1f);
+            Engine.Step();
+            headset.Connect(null, null);
+            Engine.Step();
+            StringAssert.Contains(StopReport.Unconfirmed.ToString(), headset.StartPanel.Text.Replace('\n', ' '));
+            headset.Connect(second, new FakeBodies());
+            Engine.Step();
+            StringAssert.Contains(StopReport.Unconfirmed.ToString(), headset.Panels.Urgent.Text.Replace('\n', ' '));
+            first.Stop();
+            second.Stop();
+        }
+
         [Test]
         public void MistakesOfTheApplicationDoNotEndTheInput()
         {

@@ -57,7 +57,7 @@ namespace IrisSession.Interaction
         public readonly MarkTouching Touching = new MarkTouching();
 
         /// <summary>Whether the newest e-stop of this headset has stopped robots.</summary>
-        public readonly StopReport Stop = new StopReport();
+        public StopReport Stop { get; set; } = new StopReport();
 
         /// <summary>Codes; null: none are looked for.</summary>
         public MarkerLooks Markers { get; set; }

@@ -53,10 +53,9 @@ namespace IrisSession.Interaction
         private readonly PanelRay[] rays = new PanelRay[2];
         private readonly BeforeEyes place = new BeforeEyes(DistanceM, 0);
         private readonly HandInput stops = new HandInput();
-        private readonly StopReport stop = new StopReport();
         private readonly bool[] isDown = { true, true };
         private readonly List<MarkerReport> reports = new List<MarkerReport>();
-        private ConnectorView view;
+        private ConnectorView view = ConnectorView.Idle;
         private ConnectorView declined;
         private ConnectorView answered; // by a press: another one waits for what comes of it
         private string notice = "";
@@ -82,6 +81,9 @@ namespace IrisSession.Interaction
 
         /// <summary>A session whose input has failed, which an e-stop of this headset reaches; null: none.</summary>
         public ISessionPort Session { get; set; }
+
+        /// <summary>Whether the newest e-stop of this headset has stopped robots: the same before, in and after a session.</summary>
+        public StopReport Stop { get; } = new StopReport();
 
         /// <summary>Whether the device has a keyboard: else nothing can be typed.</summary>
         public bool CanType { get; set; }
@@ -116,12 +118,11 @@ namespace IrisSession.Interaction
         /// <summary>Take a frame.</summary>
         public void Update(HeadsetReading reading)
         {
-            if (view == null) return;
             long nowNs = reading.CaptureNs;
-            if (stops.TakeStops(reading)) stop.Press(nowNs);
-            stop.Update(Session, nowNs);
-            isChanged |= isStopShown != stop.IsUnconfirmed;
-            isStopShown = stop.IsUnconfirmed;
+            if (stops.TakeStops(reading)) Stop.Press(nowNs);
+            Stop.Update(Session, nowNs);
+            isChanged |= isStopShown != Stop.IsUnconfirmed;
+            isStopShown = Stop.IsUnconfirmed;
             if (isChanged) Fill(nowNs);
             place.Update(reading);
             text.At = place.At;

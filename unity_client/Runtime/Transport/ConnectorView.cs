@@ -98,7 +98,8 @@ namespace IrisSession.Transport
         internal readonly SessionClient Client;
         internal readonly SceneFetcher Scene;
 
-        internal static readonly ConnectorView Idle = new ConnectorView(ConnectorPhase.Idle, ConnectorWords.None);
+        /// <summary>Of no connector, or of one that does nothing.</summary>
+        public static readonly ConnectorView Idle = new ConnectorView(ConnectorPhase.Idle, ConnectorWords.None);
 
         internal ConnectorView(
             ConnectorPhase phase, Phrase phrase, string endpoint = "", string session = "", OfferedSession[] sessions = null, PairingResult pairing = null, Refused refusal = null, LinkEnd problem = default,

@@ -72,12 +72,12 @@ namespace IrisSession.Unity.App
             try
             {
                 headset = GetComponent<IrisHeadset>();
+                headset.StartPanel = Panel;
                 world = GetComponent<IrisWorld>();
                 kind = GetComponent<IHeadsetKind>();
                 kind?.Prepare(headset);
                 world.Draws = kind == null ? DrawBudget.Quest3 : kind.Draws;
                 headset.RobotPanels = world.Draws.RobotPanels;
-                headset.StartPanel = Panel;
                 Panel.Markers = headset.MarkerSource;
                 Panel.CanType = TextKeyboard.IsSupported;
                 Open();
@@ -219,23 +219,40 @@ namespace IrisSession.Unity.App
             Debug.LogException(error);
             Problem = "This app has a defect and left the session: start it again. " + error.Message;
             Panel.Notice = Problem;
-            Close();
+            TryClose();
         }
 
-        /// <summary>Leave the session. Within about a second.</summary>
+        /// <summary>Leave the session, within about a second, whatever else fails: nothing would drive it any more.</summary>
         private void Close()
         {
             SessionConnector ended = connector;
             connector = null;
             client = null;
-            multicast.Hold(false);
-            if (headset != null) headset.Connect(null, null);
-            if (world != null)
+            Panel.Show(ConnectorView.Idle);
+            try
             {
+                multicast.Hold(false);
+                if (headset != null) headset.Connect(null, null);
+                if (world == null) return;
                 world.Ghosts = null;
                 world.Show(null);
             }
-            ended?.Stop();
+            finally
+            {
+                ended?.Stop();
+            }
+        }
+
+        private void TryClose()
+        {
+            try
+            {
+                Close();
+            }
+            catch (Exception error)
+            {
+                Debug.LogException(error);
+            }
         }
 
         /// <summary>In the background nothing is searched for; a session that was joined is kept, in which robots hold (IrisHeadset reports it).</summary>
@@ -253,16 +270,6 @@ namespace IrisSession.Unity.App
             }
         }
 
-        private void OnDestroy()
-        {
-            try
-            {
-                Close();
-            }
-            catch (Exception error)
-            {
-                Debug.LogException(error);
-            }
-        }
+        private void OnDestroy() { TryClose(); }
     }
 }

@@ -93,7 +93,7 @@ namespace IrisSession.Unity.Input
         public void ReadStops(HeadsetReading reading)
         {
             reading.CaptureNs = MonotonicClock.NowNs;
-            for (int side = 0; side < 2; side++) reading.Inputs[side].Buttons = hands[side].ReadButtons() & ButtonBits.Stop;
+            for (int side = 0; side < 2; side++) reading.Inputs[side].Buttons = hands[side].ReadButtons(ButtonBits.Stop);
         }
 
         public bool TryRead(out RigidTransform T_tracking_gaze)
@@ -175,10 +175,10 @@ namespace IrisSession.Unity.Input
                 };
             }
 
-            public long ReadButtons()
+            public long ReadButtons(long which = -1)
             {
                 long bits = 0;
-                foreach (KeyValuePair<long, InputAction> one in buttons) if (one.Value.IsPressed()) bits |= one.Key;
+                foreach (KeyValuePair<long, InputAction> one in buttons) if ((one.Key & which) != 0 && one.Value.IsPressed()) bits |= one.Key;
                 return bits;
             }
 

@@ -90,6 +90,7 @@ namespace IrisSession.Unity.Input
             if (haptics == null) haptics = new ControllerHaptics();
             port = new SessionClientPort(client);
             Input = new HeadsetInput(port, bodies, haptics) { Markers = MarkerSource == null ? null : new MarkerLooks(MarkerSource) };
+            if (StartPanel != null) Input.Stop = StartPanel.Stop;
             Panels = new HeadsetPanels(Input, port, bodies, RobotPanels);
             views = new PanelViews(Panels, transform, rayMaterial);
         }
@@ -106,16 +107,21 @@ namespace IrisSession.Unity.Input
             try
             {
                 if (reader == null) reader = new ControlReader(Controls, ControlsKind);
-                reader.BareHands = BareHands;
-                condition.Refresh();
-                if (Input != null) Step();
-                else if (client != null) StepStops();
-                else StepStart();
+                if (client != null && Input == null) StepStops(); // needs the reader alone of all that may be in the way
+                else StepDevices();
             }
             catch (Exception error)
             {
                 EndInput(error);
             }
+        }
+
+        private void StepDevices()
+        {
+            reader.BareHands = BareHands;
+            condition.Refresh();
+            if (Input != null) Step();
+            else StepStart();
         }
 
         private void Step()
@@ -157,9 +163,15 @@ namespace IrisSession.Unity.Input
                 reader.ReadStops(ownReading); // the defect may be in what is read
             }
             string reason = stops.Update(ownReading, IsLive);
-            if (reason != null) port.EStop(reason);
+            if (reason != null) StopAll(reason);
             while (client != null && client.TryTakeNews(out SessionNews news)) Pass(news);
             if (client != null) ShowStart();
+        }
+
+        private void StopAll(string reason)
+        {
+            port.EStop(reason);
+            StartPanel?.Stop.Press(ownReading.CaptureNs);
         }
 
         private void ShowStart()
@@ -179,8 +191,8 @@ namespace IrisSession.Unity.Input
             if (client == null) return;
             Input = null;
             stops = new StopInput();
-            RemovePanels();
             if (StartPanel != null) StartPanel.Session = port;
+            RemovePanels();
         }
 
         /// <summary>Hand news to the application. What it throws is its own: samples and the e-stop go on.</summary>

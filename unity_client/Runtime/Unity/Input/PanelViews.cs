@@ -63,7 +63,7 @@ namespace IrisSession.Unity.Input
         /// <summary>Remove all of it: what it says is not true any more.</summary>
         public void Destroy()
         {
-            foreach (TextMesh text in texts) Object.Destroy(text.gameObject);
+            foreach (TextMesh text in texts) if (text != null) Object.Destroy(text.gameObject);
             foreach (LineRenderer ray in rays) if (ray != null) Object.Destroy(ray.gameObject);
         }
 
