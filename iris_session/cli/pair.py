@@ -287,7 +287,7 @@ def _print_invitation(arguments: argparse.Namespace, invitation: dict[str, Any])
         print(f"file         {arguments.unity}    written; copy it to one headset before the code expires")
     if invitation["page"]:
         print(f"in a browser {invitation['page']}")
-        print(f"certificate  {invitation['certificate']}    compare it when the browser warns")
+        print(f"certificate  {invitation['certificate']}    compare it when a browser warns or a headset shows it")
     print(f"from Python  Client({invitation['addresses'][0]!r}, join_code={invitation['code']!r})")
     print(f"or           {invitation['uri']}", flush=True)
 
