@@ -137,7 +137,7 @@ namespace IrisSession.Unity.StandinTests
                 stage.Press("other", () => !HasBoth() && stage.App.View.Phase == ConnectorPhase.Untrusted, "the key is shown again");
                 stage.Press("Yes", () => stage.App.View.Phase == ConnectorPhase.Running, "it is joined");
                 Assert.AreEqual(0, first.Count<Hello>());
-                Assert.AreEqual(1, second.Count<Hello>());
+                Assert.Greater(second.Count<Hello>(), 0);
             }
         }
 
@@ -152,7 +152,7 @@ namespace IrisSession.Unity.StandinTests
                 stage.ShowCode("table");
                 stage.ShowCode(session.Address + "/#c=" + GatewaySession.Code);
                 stage.WaitFor(ConnectorPhase.Running);
-                Assert.AreEqual(1, session.Count<Pair>());
+                Assert.Greater(session.Count<Pair>(), 0);
                 Assert.AreEqual(PairingOutcome.Paired, stage.App.View.Pairing.Outcome);
             }
         }
@@ -189,7 +189,7 @@ namespace IrisSession.Unity.StandinTests
                 Controls.Set("<XRController>{LeftHand}/thumbstickClicked", 1f);
                 string said = Unwrap(StopReport.Unconfirmed.ToString());
                 stage.StepUntil(() => Unwrap(isInSession ? stage.Urgent : stage.Text).Contains(said), "it is said");
-                Assert.AreEqual(isInSession ? 1 : 0, session.Count<EStop>());
+                Assert.AreEqual(isInSession, session.Count<EStop>() > 0);
                 if (!isInSession) return;
                 session.Stops = true;
                 Controls.Set("<XRController>{LeftHand}/thumbstickClicked", 0f);
@@ -211,11 +211,20 @@ namespace IrisSession.Unity.StandinTests
                 stage.StepUntil(() => stage.Headset.Input == null, "the defect");
                 Assert.AreEqual(1, Engine.Errors.Count, "logged once");
                 Engine.Errors.Clear();
-                int samples = session.Count<Sample>();
                 stage.StepUntil(() => stage.Text.Contains(stage.Headset.Problem.Substring(0, 20)), "the wearer reads it");
                 Controls.Set("<XRController>{RightHand}/thumbstickClicked", 1f);
                 stage.StepUntil(() => stage.App.Client.View.IsStopped, "robots are stopped");
-                Assert.AreEqual(samples, session.Count<Sample>());
+                int[] samples = new int[2];
+                for (int i = 0; i < 2; i++) // what was on its way comes before the first of these
+                {
+                    int stops = session.Count<EStop>();
+                    Controls.Set("<XRController>{RightHand}/thumbstickClicked", 0f);
+                    Engine.Step();
+                    Controls.Set("<XRController>{RightHand}/thumbstickClicked", 1f);
+                    stage.StepUntil(() => session.Count<EStop>() > stops, "another stop");
+                    samples[i] = session.Count<Sample>();
+                }
+                Assert.AreEqual(samples[0], samples[1]);
                 Assert.IsNotNull(stage.App.Client);
             }
         }

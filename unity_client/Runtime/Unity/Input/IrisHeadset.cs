@@ -185,7 +185,7 @@ namespace IrisSession.Unity.Input
         /// <summary>A defect: it is said once, robots hold as no samples come any more, and the e-stop goes on.</summary>
         private void EndInput(Exception error)
         {
-            if (Problem.Length > 0) return;
+            if (Input == null && Problem.Length > 0) return; // also after a defect of panels alone, the e-stop goes on
             Debug.LogException(error);
             Problem = "the headset cannot be read: " + error.Message + (client == null ? "" : ". Robots hold, the e-stop works");
             if (client == null) return;
