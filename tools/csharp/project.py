@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -132,6 +133,7 @@ def build(folder: Path | None = None) -> Build:
     tests = tuple(project.name for project in projects if project.is_test)
     with FileLock(builds / ".lock"):
         if not target.exists():
+            print("compiling the C# of this checkout ...", file=sys.stderr, flush=True)
             with tempfile.TemporaryDirectory(dir=builds) as temporary:
                 built = Path(temporary, key)
                 toolchain.compile(

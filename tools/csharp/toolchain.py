@@ -234,6 +234,7 @@ def _fetch(
     target = folder / f"{package.name.rpartition('/')[2]}-{package.version}-{package.sha256[:12]}{mark}"
     if target.exists():
         return target
+    print(f"fetching {package.name} {package.version} ...", file=sys.stderr, flush=True)
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         archive = (_download_npm if package.registry == "npm" else _download_pypi)(package, Path(temporary))
         if (found := hashlib.sha256(archive.read_bytes()).hexdigest()) != package.sha256:

@@ -27,7 +27,7 @@ namespace IrisSession.Interaction
             string where = view.Endpoint.Length > 0 ? " " + view.Endpoint : "";
             if (view.Phase == ConnectorPhase.Searching && view.Phrase.What.Length == 0) yield return where.Length > 0 ? "Joining" + where + "." : "Looking for a session in this network.";
             if (view.Phase == ConnectorPhase.Pairing) yield return "Pairing with" + (where.Length > 0 ? where : " the session") + ".";
-            if (view.Phase == ConnectorPhase.Untrusted) yield return "The key of" + (where.Length > 0 ? where : " this session") + " is not known here. Compare it with the one that iris-session pair shows:";
+            if (view.Phase == ConnectorPhase.Untrusted) yield return "The key of" + (where.Length > 0 ? where : " this session") + " is not known here. Compare its certificate with that of iris-session pair:";
             else if (view.Phrase.What.Length > 0) yield return view.Phrase.ToString();
             if (view.Phase == ConnectorPhase.Choosing) yield return "Point at yours and press the trigger.";
             if (readsCodes && MayScan(view.Phase)) yield return "Or look at the code that iris-session pair shows.";
