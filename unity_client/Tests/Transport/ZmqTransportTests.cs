@@ -181,6 +181,22 @@ namespace IrisSession.Transport.Tests
             }
         }
 
+        [Test]
+        public void NothingIsSentInTheClearToASessionThatIsEncrypted()
+        {
+            using (session = new Session())
+            using (transport = new ZmqTransport(null))
+            {
+                transport.Open(new WebEndpoint(true, session.Endpoint.Host, session.Endpoint.Port));
+                Assert.AreEqual(TransportState.Closed, transport.State);
+                Assert.AreEqual(CloseCode.NotAllowed, transport.End.Code);
+                message = new Multipart();
+                Join(out _); // another endpoint, without encryption
+            }
+            string bad = new string('~', 40);
+            Assert.Throws<ArgumentException>(() => new ZmqTransport(new ZmqKeys(bad, bad, bad)));
+        }
+
         private static ZmqKeys MakePair(string serverPublic)
         {
             byte[] own = new byte[41];

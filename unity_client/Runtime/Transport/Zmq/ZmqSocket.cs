@@ -34,6 +34,7 @@ namespace IrisSession.Transport
         private ZmqSocket monitor;
 
         /// <param name="keys">Null: not encrypted.</param>
+        /// <exception cref="ArgumentException">libzmq does not take the keys: it would go on without them, in the clear.</exception>
         public ZmqSocket(IntPtr context, int kind, ZmqKeys keys = null)
         {
             this.context = context;
@@ -46,9 +47,10 @@ namespace IrisSession.Transport
             Set(LibZmq.KeepAliveInterval, 2);
             Set(LibZmq.KeepAliveCount, 3);
             if (keys == null) return;
-            Set(LibZmq.CurveServerKey, Text(keys.ServerPublic));
-            Set(LibZmq.CurvePublicKey, Text(keys.Public));
-            Set(LibZmq.CurveSecretKey, Text(keys.Secret));
+            bool isTaken = Set(LibZmq.CurveServerKey, Text(keys.ServerPublic)) && Set(LibZmq.CurvePublicKey, Text(keys.Public)) && Set(LibZmq.CurveSecretKey, Text(keys.Secret));
+            if (isTaken) return;
+            Dispose();
+            throw new ArgumentException("libzmq does not take the keys: they are not Z85 text, or it was built without CURVE");
         }
 
         /// <summary>State of the connection of a socket that <see cref="Watch"/> was called for.</summary>
@@ -59,9 +61,9 @@ namespace IrisSession.Transport
             LibZmq.zmq_setsockopt(handle, option, ref value, (UIntPtr)4);
         }
 
-        public void Set(int option, byte[] value)
+        public bool Set(int option, byte[] value)
         {
-            LibZmq.zmq_setsockopt(handle, option, value, (UIntPtr)value.Length);
+            return LibZmq.zmq_setsockopt(handle, option, value, (UIntPtr)value.Length) == 0;
         }
 
         /// <summary>The socket of libzmq.</summary>

@@ -46,12 +46,15 @@ namespace IrisSession.Transport
         private WebEndpoint probed;
         private long mediaEpoch;
         private bool isDisposed;
+        private bool lacksKeys; // the newest endpoint wants some
 
         /// <param name="keys">Null: a session on loopback, which is not encrypted.</param>
         /// <exception cref="DllNotFoundException">libzmq is not there.</exception>
+        /// <exception cref="ArgumentException">libzmq does not take the keys.</exception>
         public ZmqTransport(ZmqKeys keys)
         {
             this.keys = keys;
+            new ZmqSocket(context, LibZmq.Dealer, keys).Dispose();
             woken = new ZmqSocket(context, LibZmq.Pull);
             waking = new ZmqSocket(context, LibZmq.Push);
             woken.BindInside("wake");
@@ -73,6 +76,7 @@ namespace IrisSession.Transport
         {
             get
             {
+                if (lacksKeys) return new LinkEnd(LinkFailure.Closed, CloseCode.NotAllowed, "this session is encrypted, and this app has no keys for it: nothing was sent");
                 if (control != null && control.Link == ZmqLink.Refused) return new LinkEnd(LinkFailure.Closed, CloseCode.NotAllowed, "the session does not know the key of this app: add it to its keys");
                 return control != null && control.Link == ZmqLink.Lost ? new LinkEnd(LinkFailure.Unreachable, 0, "no session answers at " + endpoint.Authority) : default;
             }
@@ -86,6 +90,8 @@ namespace IrisSession.Transport
             Close();
             Counters.Opened++;
             lock (gate) this.endpoint = endpoint;
+            lacksKeys = keys == null && endpoint.IsSecure;
+            if (lacksKeys) return;
             control = new ZmqSocket(context, LibZmq.Dealer, keys);
             control.Set(LibZmq.SendMark, ControlMark);
             control.Set(LibZmq.ReceiveMark, MostEvents);
