@@ -244,6 +244,17 @@ namespace IrisSession.Unity.StandinTests
         }
 
         [Test]
+        public void AnIdentityThatCannotBeKeptIsSaid()
+        {
+            using (AppStage stage = new AppStage(false))
+            {
+                stage.WriteFile("identity", "a file where the folder would be");
+                stage.StepUntil(() => Unwrap(stage.Text).Contains("cannot keep its identity"), "it is said");
+                Assert.IsNotNull(stage.App.View, "it goes on");
+            }
+        }
+
+        [Test]
         public void InTheBackgroundASearchEndsAndASessionIsKept()
         {
             using (GatewaySession session = new GatewaySession())

@@ -194,6 +194,8 @@ namespace IrisSession.Unity.App
                 UsesCable = useCable,
                 UsesThisMachine = platform != RuntimePlatform.Android && platform != RuntimePlatform.WSAPlayerARM && platform != RuntimePlatform.WSAPlayerX64,
             };
+            string problem = settings.Identity.Problem;
+            if (problem.Length > 0) notice = "This headset cannot keep its identity, and has to be paired anew at each start: " + problem;
             Configuring?.Invoke(settings);
             return settings;
         }
@@ -204,13 +206,15 @@ namespace IrisSession.Unity.App
             try
             {
                 FileInfo file = new FileInfo(path);
-                return file.Exists && file.Length <= MaxFileBytes ? File.ReadAllText(path) : null;
+                if (!file.Exists) return null;
+                if (file.Length <= MaxFileBytes) return File.ReadAllText(path);
+                notice = PairingFile.Name + " has " + file.Length + " bytes: it is no file of iris-session pair --unity";
             }
             catch (Exception error) when (error is IOException || error is UnauthorizedAccessException)
             {
                 notice = PairingFile.Name + " cannot be read: " + error.Message;
-                return null;
             }
+            return null;
         }
 
         /// <summary>A defect: it is said once, the session is left, so that robots hold, and the application goes on.</summary>
