@@ -23,6 +23,9 @@ namespace IrisSession.Transport
         /// <summary>Pair even where the key is known: the person just gave the code, or the session does not know this headset.</summary>
         public bool PairsFirst;
 
+        /// <summary>The code is that of a link which was entered: this headset may have used it already.</summary>
+        public bool MayBeUsed;
+
         /// <summary>What became of the newest pairing, null for none.</summary>
         public PairingResult Pairing;
 
@@ -50,6 +53,15 @@ namespace IrisSession.Transport
 
         /// <summary>Name of the session, empty while it is not known.</summary>
         public string Session { get { return File != null ? File.Session : Chosen != null ? Chosen.Name : Links.Count > 0 ? Links[0].SessionName : ""; } }
+
+        /// <summary>Forget the code of a link that was seen once more. Returns whether it did: a key that is known is enough then.</summary>
+        public bool ForgetUsedCode(PairingResult failed)
+        {
+            if (!MayBeUsed || failed.Outcome != PairingOutcome.Refused || failed.Refusal.Code != Protocol.RefusalCode.Code) return false;
+            Code = "";
+            PairsFirst = MayBeUsed = false;
+            return true;
+        }
 
         /// <summary>Return the endpoints of the pairing file, with its key, best first.</summary>
         public List<WebEndpoint> ListFileEndpoints()

@@ -169,7 +169,7 @@ namespace IrisSession.Transport
                 if (failed == null || !IsFinal(result)) failed = result;
                 if (result.Outcome != PairingOutcome.NotReached && result.Outcome != PairingOutcome.NoAnswer) break;
             }
-            if (failed == null) return true; // without TLS there is nothing to pair
+            if (failed == null || (endpoints.Exists(one => one.Pin != null) && goal.ForgetUsedCode(failed))) return true; // without TLS there is nothing to pair
             goal.Pairing = failed;
             Phrase phrase = ConnectorWords.OfPairing(failed, goal.File, (DateTime.UtcNow - DateTime.UnixEpoch).TotalSeconds);
             if (IsFinal(failed)) Fail(phrase, failed.End, failed.Refusal);

@@ -76,7 +76,7 @@ namespace IrisSession.Transport
         /// <summary>Leave what is there and go to an address or link, typed or scanned; one with a join code pairs. Empty: sessions that announce themselves.</summary>
         public void Enter(string address)
         {
-            Order(() => goal = new ConnectorGoal(null, address) { PairsFirst = true });
+            Order(() => goal = new ConnectorGoal(null, address) { PairsFirst = true, MayBeUsed = true });
         }
 
         /// <summary>Pair by a join code, as typed, with the session whose key is not known, or that refused this headset.</summary>
@@ -86,6 +86,7 @@ namespace IrisSession.Transport
             {
                 goal.Code = code;
                 goal.PairsFirst = true;
+                goal.MayBeUsed = false;
             });
         }
 

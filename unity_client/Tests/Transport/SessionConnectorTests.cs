@@ -242,6 +242,23 @@ namespace IrisSession.Transport.Tests
         }
 
         [Test]
+        public void ALinkThatIsSeenOnceMoreJoinsByTheKnownKey()
+        {
+            using (App app = new App())
+            using (Lab lab = new Lab(TestCertificate.First, true))
+            {
+                app.Identity.KeepPin(lab.Gateway.MakeEndpoint().Authority, TestCertificate.First.Hash);
+                SessionConnector connector = app.Start(settings => { });
+                connector.Enter(lab.Address + "/#c=AAAA-AAAA-AAAA"); // the session does not take it any more
+                app.WaitFor(ConnectorPhase.Running);
+                Assert.AreEqual(1, lab.Pairings);
+                connector.EnterCode("AAAA-AAAA-AAAA");
+                app.WaitFor(ConnectorPhase.Failed);
+                Assert.AreEqual(RefusalCode.Code, connector.View.Refusal.Code);
+            }
+        }
+
+        [Test]
         public void AnotherKeyThanTheKnownOneIsRefusedAndACodeProvesIt()
         {
             using (App app = new App())
