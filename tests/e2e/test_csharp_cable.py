@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from tests.csharp.conftest import built as built  # noqa: PLC0414  a fixture
+from tests.e2e.command_process import Headset
 from tests.e2e.session_process import SessionProcess
-from tests.e2e.test_csharp import Headset
 from tests.e2e.test_web_gateway import page_of
 from tools.csharp.project import Build
 from tools.csharp.toolchain import RUNTIMES

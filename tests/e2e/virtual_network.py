@@ -65,7 +65,9 @@ class Machine(Namespace):
         assert process.returncode == (1 if report["failed"] else 0), errors
         return report
 
-    def serve(self, *arguments: str, scene: str = "handover", command: Sequence[str] = COMMAND) -> ServedSession:
+    def serve(
+        self, *arguments: str, scene: str = "handover", command: Sequence[str] = COMMAND, keys: str = "keys"
+    ) -> ServedSession:
         out = self.folder / f"serve{len(self.running)}.out"
         with out.open("wb") as file:
             process = subprocess.Popen(
@@ -73,7 +75,7 @@ class Machine(Namespace):
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 cwd=self.folder,
-                env=self.environment(),
+                env=self.environment(keys),
             )
         self.running.append(process)
         served = ServedSession(process, out)

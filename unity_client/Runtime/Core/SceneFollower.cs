@@ -53,6 +53,9 @@ namespace IrisSession.Core
         /// <summary>The newest plan, null before the first. It stays while another scene is fetched.</summary>
         public ScenePlan Plan { get; private set; }
 
+        /// <summary>Address of the specification of the plan, empty before the first.</summary>
+        public string PlanHash { get; private set; } = "";
+
         /// <summary>Why the specification cannot be had, for people; else empty.</summary>
         public string Failure { get; private set; } = "";
 
@@ -126,6 +129,7 @@ namespace IrisSession.Core
             if (!hasChanges) before = Plan;
             hasChanges = true;
             Plan = plan;
+            PlanHash = address;
             State = SceneState.Shown;
             FailedCount = 0;
             foreach (SceneAsset asset in plan.Assets) Want(asset);

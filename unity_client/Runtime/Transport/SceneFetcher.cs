@@ -48,11 +48,15 @@ namespace IrisSession.Transport
     /// <summary>A plan of the scene, and what differs from the one before.</summary>
     public sealed class SceneUpdate
     {
+        /// <summary>Address of its specification, as `SessionView.SceneHash` has it.</summary>
+        public readonly string SceneHash;
         public readonly ScenePlan Plan;
         public readonly SceneChanges Changes;
 
-        internal SceneUpdate(ScenePlan plan, SceneChanges changes)
+        internal SceneUpdate(string sceneHash, ScenePlan plan, SceneChanges changes)
         {
+            SceneHash = sceneHash;
+            SceneHash = sceneHash;
             Plan = plan;
             Changes = changes;
         }
@@ -339,7 +343,7 @@ namespace IrisSession.Transport
             }
             if (Volatile.Read(ref update) != null) return;
             SceneChanges next = follower.TakeChanges();
-            if (next != null) Volatile.Write(ref update, new SceneUpdate(follower.Plan, next));
+            if (next != null) Volatile.Write(ref update, new SceneUpdate(follower.PlanHash, follower.Plan, next));
         }
     }
 

@@ -105,6 +105,9 @@ namespace IrisSession.Transport
         /// <summary>States that a newer one replaced before the engine took them.</summary>
         public long StatesReplaced { get { return Interlocked.Read(ref statesReplaced); } }
 
+        /// <summary>Media frames that a newer one of their stream replaced before the engine took them.</summary>
+        public long MediaReplaced { get { return media.Superseded + transport.Counters.MediaSuperseded; } }
+
         /// <summary>The error that ended the thread, empty while it runs as it should.</summary>
         public string Crash { get { return crash; } }
 

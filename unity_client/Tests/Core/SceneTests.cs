@@ -214,6 +214,7 @@ namespace IrisSession.Core.Tests
             follower.OnAsset(new string('9', 64), scene, 0, scene.Length);
             Assert.IsNull(follower.Plan, "it was not wanted");
             follower.OnAsset(first, scene, 0, scene.Length);
+            Assert.AreEqual(first, follower.PlanHash);
             Assert.AreEqual(SceneState.Shown, follower.State);
             Assert.AreEqual(follower.Plan.Parts.Length, follower.TakeChanges().AddedParts.Count);
             Assert.IsNull(follower.TakeChanges());
@@ -235,6 +236,7 @@ namespace IrisSession.Core.Tests
             follower.OnAsset(new string('b', 64), scene, 0, scene.Length - 1);
             Assert.AreEqual(SceneState.Unreadable, follower.State);
             Assert.AreSame(shown, follower.Plan);
+            Assert.AreEqual(first, follower.PlanHash);
             Name(mirror, "model:abc");
             follower.Follow(mirror, 0);
             Assert.AreEqual(SceneState.NotShared, follower.State);

@@ -8,10 +8,9 @@ using IrisSession.Protocol;
 using IrisSession.Transport;
 
 /// <summary>
-/// Commands of a headset: `join`, `scene` (until all of it is here), `draw` (all of it by the Unity layer; instead of `scene`), `draw dimmed`
-/// (until the world is grey), `align`, `marks` (align by touching those of a sheet), `acquire ROBOT`, `release ROBOT`, `move ROBOT X Y Z` (world, metres), `media STREAM SECONDS` (counts
-/// frames of a cloud, cloth or picture, and decodes them), `measure SECONDS`, `body NAME`,
-/// `view`, `wait SECONDS`, `until TEXT` (an event of this kind), `estop`, `quit`.
+/// Commands of a headset: `join`, `draw` (all of the scene by the Unity layer; instead of `scene`), `draw dimmed` (until the world is grey),
+/// `align`, `marks` (align by touching those of a sheet), `acquire ROBOT`, `release ROBOT`, `episode ACTION`, `measure SECONDS`, `body NAME`, `view`,
+/// `wait SECONDS`, `until TEXT` (an event of this kind), `estop`, `quit`; those of `Scenes`, `Driving` and `Streams`.
 /// </summary>
 internal sealed class Commands
 {
@@ -22,20 +21,26 @@ internal sealed class Commands
 
     private static readonly Dictionary<string, string> Arguments = new Dictionary<string, string>
     {
-        { "acquire", "ROBOT" }, { "release", "ROBOT" }, { "move", "ROBOT X Y Z" }, { "media", "STREAM SECONDS" }, { "measure", "SECONDS" },
+        { "acquire", "ROBOT" }, { "release", "ROBOT" }, { "move", "ROBOT X Y Z" }, { "touch", "ROBOT X Y Z" },
+        { "episode", "ACTION" }, { "visual", "ID" }, { "follow", "COUNT FILE" }, { "media", "STREAM COUNT FILE" }, { "measure", "SECONDS" },
         { "body", "NAME" }, { "wait", "SECONDS" }, { "until", "EVENT" },
     };
 
     private readonly Headset headset;
     private readonly Report report;
+    private readonly Driving driving;
+    private readonly Scenes scenes;
+    private readonly Streams streams;
     private int newsAt;
     private Drawing drawing;
-    private ScenePlan scenePlan;
 
     public Commands(Headset headset, Report report)
     {
         this.headset = headset;
         this.report = report;
+        driving = new Driving(headset, report);
+        scenes = new Scenes(headset, report);
+        streams = new Streams(headset, report, scenes);
     }
 
     /// <summary>Run commands; frames go on while none has come. Returns whether all succeeded.</summary>
@@ -78,7 +83,7 @@ internal sealed class Commands
         bool isRight = words.Length > names.Length;
         for (int i = 0; isRight && i < names.Length; i++)
         {
-            bool isNumber = names[i] == "SECONDS" || names[i].Length == 1;
+            bool isNumber = names[i] == "SECONDS" || names[i] == "COUNT" || names[i] == "ID" || names[i].Length == 1;
             isRight = !isNumber || double.TryParse(words[i + 1], NumberStyles.Float, CultureInfo.InvariantCulture, out _);
         }
         if (!isRight) report.Write(words[0], false, "text", "it is written `" + words[0] + " " + wanted + "`");
@@ -95,14 +100,18 @@ internal sealed class Commands
         switch (words[0])
         {
             case "join": return Join();
-            case "scene": return Scene();
+            case "scene": return scenes.Wait();
             case "draw": return Draw(words.Length > 1 ? words[1] : "");
             case "align": return Align();
             case "marks": return new Touching(headset).Run(report);
             case "acquire": return Acquire(words[1]);
             case "release": return Release(words[1]);
-            case "move": return Move(words[1], new Double3(Number(words[2]), Number(words[3]), Number(words[4])));
-            case "media": return Media(words[1], Number(words[2]));
+            case "move": return driving.Move(words[1], Vector(words, 2));
+            case "touch": return driving.Touch(words[1], Vector(words, 2));
+            case "visual": return scenes.ShowVisual((long)Number(words[1]));
+            case "follow": return streams.Follow((int)Number(words[1]), words[2]);
+            case "media": return streams.Receive(words[1], (int)Number(words[2]), words[3]);
+            case "episode": return RequestEpisode(words[1]);
             case "measure": return Measure(Number(words[1]));
             case "body": return ShowBody(words[1]);
             case "view": return ShowView();
@@ -113,6 +122,11 @@ internal sealed class Commands
                 report.Write(words[0], false, "text", "unknown command");
                 return false;
         }
+    }
+
+    private static Double3 Vector(string[] words, int at)
+    {
+        return new Double3(Number(words[at]), Number(words[at + 1]), Number(words[at + 2]));
     }
 
     private static double Number(string text)
@@ -144,36 +158,6 @@ internal sealed class Commands
     private bool IsRunning()
     {
         return headset.IsRunning;
-    }
-
-    /// <summary>Wait for the scene and its assets, and hash all of them once more.</summary>
-    private bool Scene()
-    {
-        SceneFetcher scene = headset.Scene;
-        bool isComplete = headset.RunUntil(() =>
-        {
-            scenePlan = scene.TakeUpdate()?.Plan ?? scenePlan;
-            return scene.Progress.IsComplete && (scenePlan != null || scene.Progress.State != SceneState.Shown);
-        }, 120.0);
-        ScenePlan plan = scenePlan;
-        int right = 0;
-        long bytes = 0;
-        if (plan != null)
-        {
-            foreach (SceneAsset asset in plan.Assets)
-            {
-                byte[] found = scene.Find(asset.Address);
-                if (found == null || !AssetCache.HasAddress(found, 0, found.Length, asset.Address)) continue;
-                right++;
-                bytes += found.Length;
-            }
-        }
-        int count = plan == null ? 0 : plan.Assets.Length;
-        bool isDone = isComplete && right == count && scene.Crash.Length == 0;
-        report.Write(
-            "scene", isDone, "state", scene.Progress.State.ToString(), "assets", count, "equal", right, "bytes", bytes, "fetched", scene.FetchedCount, "fetched_bytes", scene.FetchedBytes, "failed",
-            scene.Progress.FailedCount, "parts", plan == null ? 0 : plan.Parts.Length, "text", scene.Progress.Text, "crash", scene.Crash);
-        return isDone;
     }
 
     private bool Draw(string what)
@@ -241,6 +225,14 @@ internal sealed class Commands
         return isDone;
     }
 
+    private bool RequestEpisode(string action)
+    {
+        Reply reply = Ask(new Episode { Action = action }, out string text);
+        bool isDone = reply != null && reply.Denial == null;
+        report.Write("episode", isDone, "action", action, "text", reply?.Denial == null ? text : reply.Denial.Message);
+        return isDone;
+    }
+
     private Reply Ask(ClientMessage request, out string text)
     {
         long ticket = Client.Request(request);
@@ -252,55 +244,6 @@ internal sealed class Commands
         });
         text = isThere ? found.Text ?? "" : "no reply";
         return found.Reply;
-    }
-
-    /// <summary>Close the clutch, move the controller within a second, and measure how far the end effector went.</summary>
-    private bool Move(string robot, Double3 by)
-    {
-        headset.Robots.Clear();
-        headset.Robots.Add(robot);
-        headset.RunUntil(() => headset.Feedbacks.ContainsKey(robot), 2.0);
-        bool hasBegun = headset.TryGetSite(robot, out RigidTransform before);
-        RigidTransform from = headset.T_world_controller;
-        bool isEngaged = Engage(robot);
-        hasBegun &= headset.TryGetSite(robot, out before);
-        long beganNs = MonotonicClock.NowNs;
-        double error = double.NaN;
-        double contact = 0;
-        bool isThere = headset.RunUntil(() =>
-        {
-            double share = Math.Min(1.0, (MonotonicClock.NowNs - beganNs) * 1e-9 / 2.0);
-            double smooth = share * share * (3.0 - 2.0 * share);
-            headset.T_world_controller = new RigidTransform(from.Position + smooth * by, from.Rotation);
-            if (headset.Feedbacks.TryGetValue(robot, out Feedback now)) contact = Math.Max(contact, now.ContactN);
-            if (share < 1.0 || !headset.TryGetSite(robot, out RigidTransform after)) return false;
-            error = (after.Position - before.Position - by).Length;
-            return error < 0.002;
-        }, 8.0);
-        string hold = headset.Feedbacks.TryGetValue(robot, out Feedback last) ? last.HoldReason : "";
-        List<string> rejected = new List<string>();
-        if (last != null) foreach (KeyValuePair<string, long> one in last.Rejected) rejected.Add(one.Key + " " + one.Value);
-        headset.Clutch = false;
-        headset.TryGetSite(robot, out RigidTransform at);
-        bool isDone = hasBegun && isEngaged && error <= 0.005;
-        report.Write(
-            "move", isDone, "robot", robot, "error_mm", 1000.0 * error, "moved_m", (at.Position - before.Position).Length, "settled", isThere, "engaged", isEngaged, "hold", hold, "contact_n", contact,
-            "rejected", rejected.ToArray());
-        return isDone;
-    }
-
-    /// <summary>Close the clutch, again after a reason for which the session wants it opened.</summary>
-    private bool Engage(string robot)
-    {
-        for (int attempt = 0; attempt < 5; attempt++)
-        {
-            headset.Clutch = true;
-            headset.Feedbacks.Remove(robot);
-            if (headset.RunUntil(() => headset.Feedbacks.TryGetValue(robot, out Feedback now) && now.HoldReason.Length == 0, 3.0)) return true;
-            headset.Clutch = false;
-            headset.RunUntil(() => false, 0.3);
-        }
-        return false;
     }
 
     private bool Measure(double seconds)
@@ -318,55 +261,6 @@ internal sealed class Commands
             "measure", ages.Length > 0, "states", headset.States, "frames", headset.Frames, "age_ms_p50", p50, "age_ms_p99", p99, "longest_call_ms", headset.LongestCallMs,
             "recovery_ms", headset.RecoveryMs, "collections", GC.CollectionCount(0) - collections, "replaced", Client.StatesReplaced, "dropped_calls", Client.CallsDropped);
         return ages.Length > 0;
-    }
-
-    /// <summary>Receive a stream, and decode what the core decodes.</summary>
-    private bool Media(string stream, double seconds)
-    {
-        Client.TryPost(loop => loop.SetMediaWishes(new[] { stream }));
-        MediaHeader header = new MediaHeader();
-        WireReader reader = new WireReader();
-        Multipart frame = new Multipart();
-        Cloud cloud = new Cloud();
-        DeformableDecoder cloth = MakeDeformableDecoder(stream);
-        int frames = 0;
-        int decoded = 0;
-        long points = 0;
-        string encoding = "";
-        long beganNs = 0;
-        bool isThere = headset.RunUntil(() =>
-        {
-            while (Client.TryTakeMedia(ref frame))
-            {
-                if (frames == 0) beganNs = MonotonicClock.NowNs;
-                frames++;
-                reader.Reset(frame.Buffer, frame.OffsetOf(1), frame.LengthOf(1));
-                reader.ReadInto(header);
-                encoding = header.Encoding;
-                if (encoding == MediaEncoding.Cloud) cloud.Decode(frame.Buffer, frame.OffsetOf(2), frame.LengthOf(2));
-                else if (encoding == MediaEncoding.Deformable && cloth != null) cloth.Decode(frame.Buffer, frame.OffsetOf(2), frame.LengthOf(2));
-                else continue;
-                decoded++;
-                points = encoding == MediaEncoding.Cloud ? cloud.Count : cloth.Topology.VertexCount;
-            }
-            return frames > 0 && MonotonicClock.NowNs - beganNs > seconds * 1e9;
-        });
-        Client.TryPost(loop => loop.SetMediaWishes(new string[0]));
-        report.Write("media", isThere, "stream", stream, "encoding", encoding, "frames", frames, "hz", frames / Math.Max(seconds, 1e-3), "decoded", decoded, "points", points, "class", header.BudgetClass);
-        return isThere;
-    }
-
-    private DeformableDecoder MakeDeformableDecoder(string stream)
-    {
-        if (scenePlan == null) return null;
-        foreach (Deformable deformable in scenePlan.Deformables)
-        {
-            byte[] bytes = deformable.Stream == stream ? headset.Scene.Find(deformable.Address) : null;
-            if (bytes == null) continue;
-            byte[] plan = new ArrayDecoder().Decode(bytes).RequireBytes(ArrayName.Plan, ArrayAsset.Any);
-            return new DeformableDecoder(new DeformableTopology(plan, 0, plan.Length), new Inflater());
-        }
-        return null;
     }
 
     private bool ShowBody(string name)
@@ -391,9 +285,11 @@ internal sealed class Commands
         List<string> streams = new List<string>();
         if (view.Budget != null) foreach (StreamBudget one in view.Budget.Streams) streams.Add(one.Stream + " " + one.BudgetClass);
         foreach (Lease lease in view.Leases.Values) if (view.IsOurs(lease.Target)) ours.Add(lease.Target);
+        headset.CountUnsent();
         report.Write(
             "view", true, "phase", view.Phase.ToString(), "text", view.Text, "ours", ours.ToArray(), "alignment", view.AlignmentState.ToString(), "event_seq", view.EventSeq, "scene", view.SceneHash,
-            "endpoint", view.Endpoint == null ? "" : view.Endpoint.ToString(), "streams", streams.ToArray(), "stopped", view.IsStopped, "epoch", view.Welcome == null ? 0 : view.Welcome.ConnectionEpoch, "resumed", view.Welcome != null && view.Welcome.Resumed, "crash", Client.Crash);
+            "endpoint", view.Endpoint == null ? "" : view.Endpoint.ToString(), "streams", streams.ToArray(), "stopped", view.IsStopped, "epoch", view.Welcome == null ? 0 : view.Welcome.ConnectionEpoch, "resumed", view.Welcome != null && view.Welcome.Resumed,
+            "episode", view.Episode == null ? "" : view.Episode.Number + " " + view.Episode.State, "unsent", headset.Unsent, "crash", Client.Crash);
         return true;
     }
 

@@ -3,6 +3,7 @@ using System.Collections.Generic;
 using System.IO;
 using System.Threading;
 using IrisSession.Core;
+using IrisSession.Interaction;
 using IrisSession.Protocol;
 using IrisSession.Storage;
 using IrisSession.Transport;
@@ -26,7 +27,13 @@ internal sealed class Headset : IDisposable
     /// <summary>Null for a session by ZeroMQ.</summary>
     public readonly SessionConnector Connector;
     public readonly List<SessionNews> News = new List<SessionNews>();
-    public readonly Dictionary<string, Feedback> Feedbacks = new Dictionary<string, Feedback>();
+
+    /// <summary>Feedback of the robots that we hold, and the strongest vibration that a contact has made.</summary>
+    public readonly FeedbackPulses Pulses = new FeedbackPulses();
+    public Pulse ContactPulse;
+
+    /// <summary>Samples that could not be sent, at the newest <see cref="CountUnsent"/>.</summary>
+    public long Unsent;
 
     /// <summary>Ages of states when the frame took them [ms].</summary>
     public readonly List<double> Ages = new List<double>();
@@ -211,6 +218,18 @@ internal sealed class Headset : IDisposable
         });
     }
 
+    /// <summary>Ask the thread of the session how many samples could not be sent.</summary>
+    public void CountUnsent()
+    {
+        bool isCounted = false;
+        Client.Post(loop =>
+        {
+            Unsent = loop.Connection.Counters.SamplesNotSent;
+            Volatile.Write(ref isCounted, true);
+        });
+        RunUntil(() => Volatile.Read(ref isCounted), 10.0);
+    }
+
     /// <summary>Return the pose of a robot's end effector in the newest state.</summary>
     public bool TryGetSite(string robot, out RigidTransform T_world_site)
     {
@@ -254,7 +273,11 @@ internal sealed class Headset : IDisposable
 
     private void TakeNews(SessionNews one)
     {
-        if (one.Kind == NewsKind.Message && one.Message.Message is Feedback feedback) Feedbacks[feedback.Robot] = feedback;
+        if (one.Kind == NewsKind.Message && one.Message.Message is Feedback feedback)
+        {
+            Pulse pulse = Pulses.Take(feedback);
+            if (feedback.ContactN > 0 && pulse.Intensity > ContactPulse.Intensity) ContactPulse = pulse;
+        }
         else if (News.Count < 10_000) News.Add(one);
     }
 }

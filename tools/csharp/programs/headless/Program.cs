@@ -32,8 +32,9 @@ Join a session as a headset app does, and do what is asked: commands of --do, el
 
 Ctrl-C leaves the session; on Mono only in a terminal: a signal from elsewhere ends the program without a goodbye.
 
-Commands: join; scene; draw; align; marks; acquire ROBOT; move ROBOT X Y Z (metres in the world); release ROBOT; measure SECONDS;
-media STREAM SECONDS; body NAME; view; until EVENT; wait SECONDS; estop; quit
+Commands: join; scene; draw; align; marks; acquire ROBOT; move ROBOT X Y Z (metres in the world); touch ROBOT X Y Z;
+release ROBOT; episode ACTION; measure SECONDS; follow COUNT FILE; media STREAM COUNT FILE; visual ID; body NAME; view;
+until EVENT; wait SECONDS; estop; quit
 
 Example: headless run --code 7B60-VY33-DJ6M --do ""join; align; acquire left; move left 0 0 0.1""";
 
