@@ -78,6 +78,13 @@ class CommandProcess:
 class Headset(CommandProcess):
     """A headset in C#."""
 
+    def pair_and_join(self) -> dict[str, Any]:
+        """Join by the code that it was given, however often a busy gateway lets it try."""
+        joined = self.do("join")
+        assert joined["ok"], self.results
+        assert any(one["command"] == "pair" and one["ok"] for one in self.results), self.results
+        return joined
+
     def wait_for_view(self, condition: Callable[[dict[str, Any]], object], what: str) -> dict[str, Any]:
         """Ask for what it sees of the session until a condition holds."""
         wait_until(lambda: condition(self.do("view")), what)

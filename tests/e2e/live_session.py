@@ -9,6 +9,7 @@ arrives. The client receives the cloth and the cloud. Both answer each line of t
 
 from __future__ import annotations
 
+import contextlib
 import json
 import queue
 import ssl
@@ -108,7 +109,8 @@ class Served:
         assert web is not None
         context = ssl.create_default_context()
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-        urllib.request.urlopen(f"{web.address}v1/info", timeout=WAIT_S, context=context).close()
+        with contextlib.suppress(OSError):  # a busy gateway may refuse it: it has started then
+            urllib.request.urlopen(f"{web.address}v1/info", timeout=WAIT_S, context=context).close()
         answer("serve", address=self.session.address)
         read_lines(self._lines.put)
 

@@ -144,8 +144,7 @@ def test_two_headsets_find_pair_align_and_move_arms(network: Network, start: Sta
     assert (stranger["ok"], stranger["problem"]) == (False, "UnknownCertificate")
     ann, bob = start("mono", "ann", "--code", pair(network)), start("dotnet", "bob", "--code", pair(network))
     for headset in (ann, bob):
-        assert headset.wait_for("pair")["ok"]
-        assert headset.do("join")["bodies"] > 0
+        assert headset.pair_and_join()["bodies"] > 0
     for headset in (ann, bob, ann):  # those who saw a sheet before are asked to glance at it once more
         aligned = headset.do("align")
         assert aligned["true_m"] <= aligned["stated_m"]
@@ -176,7 +175,7 @@ def test_what_fails_costs_neither_lease_nor_alignment(network: Network, start: S
     served = serve(network, "handover")
     user = f"kim-{runtime}"
     headset = start(runtime, user, "--code", pair(network))
-    assert headset.do("join")["ok"]
+    headset.pair_and_join()
     assert headset.do("align")["ok"]
     assert headset.do("acquire left")["ok"]
     for module in ("web.gateway", "front.main"):
@@ -220,8 +219,7 @@ def test_wrong_code_and_wrong_certificate_are_refused_and_all_of_aloha_comes(
     stranger = start(runtime, user, *at).do("join")
     assert (stranger["ok"], stranger["problem"]) == (False, "UnknownCertificate")
     headset = start(runtime, user, "--code", pair(network))
-    assert headset.wait_for("pair")["ok"]
-    assert headset.do("join")["ok"]
+    headset.pair_and_join()
     scene = headset.do("scene")
     assert scene["ok"], str(scene)
     assert scene["equal"] == scene["assets"] > 0
@@ -242,7 +240,7 @@ def test_contact_is_felt_and_an_episode_goes_on_after_the_network_was_cut(
     recording = network.server.folder / f"{runtime}.rrd"
     live = serve_live(network, start_live, "handover", str(recording))
     headset = start(runtime, f"eva-{runtime}", "--code", pair(network))
-    assert headset.do("join")["ok"]
+    headset.pair_and_join()
     assert headset.do("align")["ok"]
     assert headset.do("acquire left")["ok"]
     assert headset.do("episode start")["ok"]
@@ -283,7 +281,7 @@ def test_patched_scene_and_another_one_are_followed(
 ) -> None:
     live = serve_live(network, start_live, "handover")
     headset = start(runtime, f"fay-{runtime}", "--code", pair(network))
-    assert headset.do("join")["ok"]
+    headset.pair_and_join()
     assert headset.do("align")["ok"]
     assert headset.do("acquire left")["ok"]
     first = headset.do("scene")
@@ -320,7 +318,7 @@ def test_bodies_a_cloth_and_a_cloud_arrive_as_the_session_has_them(
     """Every frame arrives, or was dropped and counted; how many arrive is compared with a Python client."""
     live = serve_live(network, start_live, "cloth")
     headset = start(runtime, f"gil-{runtime}", "--code", pair(network), "--role", "observer")
-    assert headset.do("join")["ok"]
+    headset.pair_and_join()
     scene = headset.do("scene")
     assert scene["ok"], str(scene)
     assert scene["deformables"] == [live_session.CLOTH]

@@ -66,7 +66,7 @@ internal sealed class Streams
         List<double> numbers = new List<double>();
         int frames = 0;
         MediaHeader first = new MediaHeader();
-        long replaced = 0;
+        long replaced = Client.MediaReplaced; // before the first frame: one that came after it may be replaced at once
         long points = 0;
         bool isDone;
         using (BinaryWriter file = new BinaryWriter(File.Create(path)))
@@ -100,7 +100,6 @@ internal sealed class Streams
                     {
                         reader.Reset(message.Buffer, message.OffsetOf(1), message.LengthOf(1));
                         reader.ReadInto(first);
-                        replaced = Client.MediaReplaced;
                     }
                     WriteFrame(file, header.CaptureNs, numbers.ToArray());
                 }
