@@ -15,7 +15,8 @@ from tests.e2e.test_csharp import network as network  # noqa: PLC0414  a fixture
 from tests.e2e.virtual_network import Network
 from tools.csharp.project import Build
 
-pytestmark = pytest.mark.e2e
+# Long: the wearer walks and reaches in real time.
+pytestmark = [pytest.mark.e2e, pytest.mark.long]
 
 #: What an alignment by exact sheets may be away from the true one [mm].
 ALIGNED_MM: Final = 20.0

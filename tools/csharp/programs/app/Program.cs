@@ -46,6 +46,7 @@ internal static class Program
     /// <summary>Look at each sheet from one place after the other, as a person would, until the session has an alignment.</summary>
     private static void Align(Wearer wearer)
     {
+        wearer.RunUntil(() => wearer.Words.Contains("sheet")); // panels have their texts some frames after the session is joined
         string words = wearer.Words;
         bool isAligned = false;
         for (int place = 0; place < MaxPlaces && !(isAligned && place > 2); place++)
