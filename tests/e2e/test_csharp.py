@@ -254,7 +254,7 @@ def test_contact_is_felt_and_an_episode_goes_on_after_the_network_was_cut(
     machine = network.headset
     ip("-n", machine.name, "link", "set", machine.interface, "down")
     lost = headset.wait_for_view(lambda v: v["phase"] != "Ready" and v["unsent"] > before["unsent"], "it notices")
-    wait_until(lambda: "ParticipantLeft" in live.do("events")["kinds"], "others are told")
+    wait_until(lambda: "ParticipantLeft" in live.do("events")["kinds"], "the session says that it left")
     ip("-n", machine.name, "link", "set", machine.interface, "up")
     back = headset.wait_until_back(before["epoch"])
     assert (back["resumed"], back["ours"], back["alignment"]) == (True, ["left"], "Aligned")
