@@ -1,6 +1,6 @@
 // Hostile bytes for a decoder: golden vectors with changes, and random ones. The same inputs every time.
 //
-// IRIS_FUZZ=300000 sets how many inputs each decoder gets; 10,000 by default, which a busy machine too does within the limit of a test.
+// IRIS_FUZZ=100000 sets how many inputs each decoder gets; 10,000 by default, which a busy machine too does within the limit of a test.
 
 import { expect } from "vitest";
 import { WireError } from "../src/core/errors.ts";
