@@ -40,10 +40,14 @@ class CommandProcess:
 
     def do(self, command: str) -> dict[str, Any]:
         """Have a command done and return its result."""
+        return self.begin(command)()
+
+    def begin(self, command: str) -> Callable[[], dict[str, Any]]:
+        """Have a command done while others do theirs. Returns what waits for its result."""
         name = command.split(maxsplit=1)[0]
         before = self._count(name)
         self.send(command)
-        return self.wait_for(name, before + 1)
+        return lambda: self.wait_for(name, before + 1)
 
     def wait_for(self, name: str, n: int = 1) -> dict[str, Any]:
         """Wait for the `n`-th result of a command."""

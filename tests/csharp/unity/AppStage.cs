@@ -29,6 +29,7 @@ namespace IrisSession.Unity.StandinTests
         public readonly IrisApp App;
         public readonly IrisHeadset Headset;
         public readonly XROrigin Origin;
+        private readonly Socket beacons = new Socket(AddressFamily.InterNetwork, SocketType.Dgram, ProtocolType.Udp);
         private readonly string folder = Path.Combine(Path.GetTempPath(), "iris-app-" + Guid.NewGuid().ToString("N"));
 
         /// <param name="isQuest">With the component of a Quest, whose system reads codes.</param>
@@ -97,6 +98,15 @@ namespace IrisSession.Unity.StandinTests
             }
         }
 
+        /// <summary>Announce a session once.</summary>
+        /// <returns>True, so that it can be in a condition.</returns>
+        public bool Announce(string name, GatewaySession session)
+        {
+            byte[] beacon = new Protocol.Beacon { Protocol = Protocol.Wire.Version, SessionId = name, SessionName = name, Host = "127.0.0.1", Control = 7721, Web = session.Port, Kind = "sim", KeyFingerprint = session.IsSecure ? "ab" : "" }.Encode();
+            beacons.SendTo(beacon, new IPEndPoint(IPAddress.Loopback, BeaconPort));
+            return true;
+        }
+
         public void WaitFor(ConnectorPhase phase) { StepUntil(() => App.View != null && App.View.Phase == phase, phase.ToString()); }
 
         /// <summary>Point at a button of the panel and press the trigger, until a condition holds.</summary>
@@ -120,6 +130,7 @@ namespace IrisSession.Unity.StandinTests
 
         public void Dispose()
         {
+            beacons.Dispose();
             UnityEngine.Object.Destroy(Offset);
             Engine.Step();
             Application.Platform = RuntimePlatform.LinuxPlayer;

@@ -2,8 +2,6 @@
 using System;
 using System.Collections.Generic;
 using System.Linq;
-using System.Net;
-using System.Net.Sockets;
 using IrisSession.Core;
 using IrisSession.Interaction;
 using IrisSession.Protocol;
@@ -110,19 +108,10 @@ namespace IrisSession.Unity.StandinTests
             using (GatewaySession first = new GatewaySession(TestCertificate.First))
             using (GatewaySession second = new GatewaySession(TestCertificate.Second))
             using (AppStage stage = new AppStage(false))
-            using (Socket socket = new Socket(AddressFamily.InterNetwork, SocketType.Dgram, ProtocolType.Udp))
             {
-                void Announce(string name, GatewaySession session)
-                {
-                    byte[] beacon = new Beacon { Protocol = Wire.Version, SessionId = name, SessionName = name, Host = "127.0.0.1", Control = 7721, Web = session.Port, Kind = "sim", KeyFingerprint = "ab" }.Encode();
-                    socket.SendTo(beacon, new IPEndPoint(IPAddress.Loopback, stage.BeaconPort));
-                }
-
                 bool HasBoth()
                 {
-                    Announce("lab", first);
-                    Announce("other", second);
-                    return stage.App.View != null && stage.App.View.Phase == ConnectorPhase.Choosing && stage.App.View.Sessions.Length == 2;
+                    return stage.Announce("lab", first) && stage.Announce("other", second) && stage.App.View != null && stage.App.View.Phase == ConnectorPhase.Choosing && stage.App.View.Sessions.Length == 2;
                 }
 
                 stage.StepUntil(HasBoth, "two sessions");
@@ -142,7 +131,7 @@ namespace IrisSession.Unity.StandinTests
         }
 
         [Test]
-        public void ALinkThatIsSeenIsEnteredByItselfAndOthersAreNot()
+        public void ALinkThatIsSeenIsAButtonAndOthersAreNot()
         {
             using (GatewaySession session = new GatewaySession(TestCertificate.First))
             using (AppStage stage = new AppStage(true))
@@ -151,15 +140,18 @@ namespace IrisSession.Unity.StandinTests
                 stage.ShowCode("https://localhost:" + session.Port + "/about");
                 stage.ShowCode("table");
                 stage.ShowCode(session.Address + "/#c=" + GatewaySession.Code);
-                stage.WaitFor(ConnectorPhase.Running);
-                Assert.Greater(session.Count<Pair>(), 0);
+                stage.StepUntil(() => IsDrawn(stage, "Join localhost"), "a button");
+                Assert.IsFalse(IsDrawn(stage, "about"));
+                Assert.AreEqual(0, session.Count<Pair>(), "nothing is entered unasked");
+                stage.Press("Join localhost", () => stage.App.View.Phase == ConnectorPhase.Running, "it is joined");
                 Assert.AreEqual(PairingOutcome.Paired, stage.App.View.Pairing.Outcome);
             }
         }
 
-        [TestCase("Type an address")]
-        [TestCase("Type a join code")]
-        public void WhatIsTypedIsEntered(string button)
+        [TestCase("Type an address", false)]
+        [TestCase("Type a join code", false)]
+        [TestCase("Type a join code", true)]
+        public void WhatIsTypedIsEntered(string button, bool hasDamagedFile)
         {
             bool isCode = button != "Type an address";
             using (GatewaySession session = new GatewaySession(TestCertificate.First))
@@ -168,12 +160,13 @@ namespace IrisSession.Unity.StandinTests
                 TouchScreenKeyboard.IsThere = true;
                 TouchScreenKeyboard.Newest = null;
                 session.Refuse = message => new Refused { Code = RefusalCode.Code };
-                if (isCode) stage.App.Address = session.Address + "/#c=AAAA-AAAA-AAAA";
+                if (hasDamagedFile) stage.WriteFile(PairingFile.Name, "{");
+                else if (isCode) stage.App.Address = session.Address + "/#c=AAAA-AAAA-AAAA";
                 stage.Press(button, () => TouchScreenKeyboard.Newest != null, "a keyboard");
                 session.Refuse = message => null;
                 TouchScreenKeyboard.Newest.text = isCode ? GatewaySession.Code : session.Address;
                 TouchScreenKeyboard.Newest.status = TouchScreenKeyboard.Status.Done;
-                stage.WaitFor(isCode ? ConnectorPhase.Running : ConnectorPhase.Untrusted);
+                stage.StepUntil(() => stage.Announce("lab", session) && stage.App.View.Phase == (isCode ? ConnectorPhase.Running : ConnectorPhase.Untrusted), "it is entered");
             }
         }
 
@@ -275,6 +268,24 @@ namespace IrisSession.Unity.StandinTests
                 Engine.Pause(false);
                 stage.StepUntil(() => client.IsLive, "they may move");
                 Assert.AreSame(client, stage.App.Client);
+            }
+        }
+
+        [Test]
+        public void ALostSessionIsLookedForAnewAndTheWearerCanGoElsewhere()
+        {
+            using (GatewaySession next = new GatewaySession())
+            using (AppStage stage = new AppStage(false, settings => settings.LostNs = 0))
+            {
+                using (GatewaySession session = new GatewaySession())
+                {
+                    stage.App.Address = session.Address;
+                    stage.WaitFor(ConnectorPhase.Running);
+                }
+                stage.StepUntil(() => stage.App.Client == null && stage.App.View.Phrase.What.Length > 0, "it is lost, and the panel says why");
+                stage.Press("Look for sessions", () => stage.App.View.Endpoint.Length == 0, "those that announce themselves");
+                stage.StepUntil(() => stage.Announce("next", next) && stage.App.View.Phase == ConnectorPhase.Running, "another one is joined");
+                Assert.Greater(next.Count<Hello>(), 0);
             }
         }
 

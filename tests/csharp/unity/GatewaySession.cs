@@ -55,6 +55,8 @@ namespace IrisSession.Unity.StandinTests
 
         public int Port { get { return gateway.Port; } }
 
+        public bool IsSecure { get { return certificate != null; } }
+
         public void Dispose() { gateway.Dispose(); }
 
         /// <summary>Return how many messages of a kind came.</summary>

@@ -17,6 +17,9 @@ namespace IrisSession.Interaction
 
         /// <summary>Go to <see cref="StartPanel.Scanned"/>, a link that was seen.</summary>
         Enter,
+
+        /// <summary>Leave what was given or entered, and look for sessions that announce themselves.</summary>
+        Search,
         Trust,
         Retry,
         TypeAddress,
@@ -28,7 +31,7 @@ namespace IrisSession.Interaction
     {
         /// <summary>Sessions that are listed; of more the address has to be typed.</summary>
         public const int MaxSessions = 6;
-        private const int MaxButtons = MaxSessions + 2;
+        private const int MaxButtons = MaxSessions + 2; // an invitation, an address
         private const double Press = 0.6;
         private const double LetGo = 0.4;
 
@@ -58,11 +61,13 @@ namespace IrisSession.Interaction
         private ConnectorView view = ConnectorView.Idle;
         private ConnectorView declined;
         private ConnectorView answered; // by a press: another one waits for what comes of it
+        private PairingLink invitation; // that was seen, and not answered; null: none
         private string notice = "";
         private bool isStopShown;
         private bool isChanged = true;
         private bool areNew; // buttons
         private long sinceNs;
+        private long scannedNs;
         private int count;
         private StartAction action;
 
@@ -102,7 +107,7 @@ namespace IrisSession.Interaction
         /// <summary>The session of <see cref="StartAction.Choose"/>.</summary>
         public OfferedSession Chosen { get; private set; }
 
-        /// <summary>The newest link that was seen, empty before one.</summary>
+        /// <summary>The link of <see cref="StartAction.Enter"/>: the newest one that was seen, empty before one.</summary>
         public string Scanned { get; private set; } = "";
 
         /// <summary>What the panel says.</summary>
@@ -148,6 +153,7 @@ namespace IrisSession.Interaction
         {
             place.Hide();
             action = StartAction.None;
+            invitation = null;
             isDown[0] = isDown[1] = true; // what is pressed now counts from its next press
         }
 
@@ -177,15 +183,15 @@ namespace IrisSession.Interaction
         {
             if (view == answered) return;
             action = actions[button];
-            if (action == StartAction.Choose || action == StartAction.Trust || action == StartAction.Retry) answered = view;
+            if (action == StartAction.Choose || action == StartAction.Trust || action == StartAction.Retry || action == StartAction.Search) answered = view;
             Chosen = offered[button];
-            if (action == StartAction.Retry) Scanned = "";
+            if (action != StartAction.None) invitation = null;
+            isChanged = true;
             if (action != StartAction.None) return;
             declined = view; // "No": nothing was sent, and nothing is
-            isChanged = true;
         }
 
-        /// <summary>A link that is seen is entered by itself, once.</summary>
+        /// <summary>A link that is seen becomes a button: it may be that of another session, or of another person, whose code it would use up.</summary>
         private void ReadCodes(long nowNs)
         {
             if (Markers == null) return;
@@ -197,23 +203,31 @@ namespace IrisSession.Interaction
             {
                 MarkerReport report = reports[i];
                 bool isSeen = report.IsTracked && (report.SeenNs < 0 || nowNs - report.SeenNs < FreshNs);
-                if (!isSeen || string.IsNullOrEmpty(report.Text) || report.Text == Scanned || !IsInvitation(report.Text)) continue;
+                if (!isSeen || string.IsNullOrEmpty(report.Text)) continue;
+                bool isSame = report.Text == Scanned;
+                if (isSame) scannedNs = nowNs;
+                if (isSame ? invitation != null || view.Phase != ConnectorPhase.Failed : invitation != null && nowNs - scannedNs < FreshNs) continue; // it is offered; another one is
+                PairingLink link = FindInvitation(report.Text);
+                if (link == null) continue;
                 Scanned = report.Text;
-                action = StartAction.Enter;
+                scannedNs = nowNs;
+                invitation = link;
+                isChanged = true;
             }
         }
 
-        /// <summary>Return whether a code is what `iris-session pair` shows, and no other link in the room.</summary>
-        private static bool IsInvitation(string text)
+        /// <summary>Return the link of a code that `iris-session pair` shows, null for every other code in the room.</summary>
+        private static PairingLink FindInvitation(string text)
         {
-            if (!text.StartsWith("iris://", StringComparison.OrdinalIgnoreCase) && !text.StartsWith("https://", StringComparison.OrdinalIgnoreCase)) return false;
+            if (!text.StartsWith("iris://", StringComparison.OrdinalIgnoreCase) && !text.StartsWith("https://", StringComparison.OrdinalIgnoreCase)) return null;
             try
             {
-                return PairingLink.Parse(text).Code.Length > 0;
+                PairingLink link = PairingLink.Parse(text);
+                return link.Code.Length > 0 ? link : null;
             }
             catch (LinkException)
             {
-                return false;
+                return null;
             }
         }
 
@@ -236,7 +250,9 @@ namespace IrisSession.Interaction
             }
             for (int i = 0; i < view.Sessions.Length && i < MaxSessions && view.Phase == ConnectorPhase.Choosing; i++) Add(StartWords.Describe(view.Sessions[i]), StartAction.Choose, view.Sessions[i]);
             bool isOver = view.Phase == ConnectorPhase.Failed || isDeclined;
+            if (invitation != null && StartWords.MayScan(view.Phase)) Add(StartWords.Describe(invitation), StartAction.Enter);
             if (isOver) Add("Try again", StartAction.Retry);
+            if (isOver || (view.Phase == ConnectorPhase.Searching && view.Endpoint.Length > 0)) Add("Look for sessions", StartAction.Search);
             if (CanType && isOver) Add("Type a join code", StartAction.TypeCode);
             if (CanType && view.Phase == ConnectorPhase.Untrusted && !isDeclined) Add("Type its join code", StartAction.TypeCode);
             if (CanType && (isOver || view.Phase == ConnectorPhase.Searching || view.Phase == ConnectorPhase.Choosing)) Add("Type an address", StartAction.TypeAddress);

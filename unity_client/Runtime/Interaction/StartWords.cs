@@ -33,7 +33,13 @@ namespace IrisSession.Interaction
             if (readsCodes && MayScan(view.Phase)) yield return "Or look at the code that iris-session pair shows.";
         }
 
-        /// <summary>Return whether a link that is scanned now is entered.</summary>
+        /// <summary>Return the button of a link that was seen.</summary>
+        public static string Describe(PairingLink invitation)
+        {
+            return "Join " + (invitation.SessionName.Length > 0 ? Words.ToLine(invitation.SessionName, 24) + " at " : "") + Words.ToLine(invitation.Host, 40);
+        }
+
+        /// <summary>Return whether a link can be scanned now.</summary>
         public static bool MayScan(ConnectorPhase phase)
         {
             return phase == ConnectorPhase.Searching || phase == ConnectorPhase.Choosing || phase == ConnectorPhase.Untrusted || phase == ConnectorPhase.Failed;

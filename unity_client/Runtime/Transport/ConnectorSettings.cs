@@ -49,6 +49,9 @@ namespace IrisSession.Transport
         /// <summary>None heard for so long is said; an address that does not answer is tried again after this pause.</summary>
         internal long SilenceNs = 3_000_000_000;
         internal int AgainMs = 2_000;
+
+        /// <summary>A session that was lost for so long may have ended: it is looked for anew. By default the grace of a session.</summary>
+        internal long LostNs = 30_000_000_000;
         internal Func<ITransport> MakeTransport = () => new WebTransport();
     }
 }

@@ -16,7 +16,7 @@ namespace IrisSession.Transport
         private volatile bool hasEnded;
 
         /// <param name="endpoint">With a pin, if it has TLS.</param>
-        /// <param name="news">Set when there is an answer.</param>
+        /// <param name="news">Set when there is an answer; null: nobody waits for it.</param>
         public GatewayProbe(WebEndpoint endpoint, AutoResetEvent news)
         {
             this.endpoint = endpoint;
@@ -74,7 +74,7 @@ namespace IrisSession.Transport
             }
             Answer = new ProbeAnswer(endpoint, end, sessionId);
             hasEnded = true;
-            news.Set();
+            news?.Set();
         }
 
         private string Ask(HttpConnection connection)

@@ -201,7 +201,7 @@ namespace IrisSession.Transport
             foreach (WebEndpoint one in endpoints)
             {
                 Search(one.ToString());
-                GatewayProbe probe = new GatewayProbe(one, new AutoResetEvent(false));
+                GatewayProbe probe = new GatewayProbe(one, null);
                 probe.Start();
                 bool isDone = WaitFor(() => probe.HasEnded);
                 probe.Abort();
@@ -285,22 +285,29 @@ namespace IrisSession.Transport
             return new Hello { Role = settings.Role, Name = Words.ToLine(settings.Name, MaxName), Software = Words.ToLine(settings.Software, MaxName), Devices = settings.Devices, Capabilities = settings.Capabilities };
         }
 
-        /// <summary>Say how a client fares until there is an order, null then, or until the session or its key ends it.</summary>
+        /// <summary>Say how a client fares until there is an order, or it was lost for long: null then; or until the session or its key ends it.</summary>
         private SessionView Follow(SessionClient client, SceneFetcher scene)
         {
             bool isRunning = false;
             WebEndpoint endpoint = null;
             string text = newest.Endpoint;
-            long beganNs = MonotonicClock.NowNs;
+            long joinedNs = MonotonicClock.NowNs; // or begun
             while (Wait(isRunning ? SlowLookMs : LookMs))
             {
                 SessionView now = client.View;
                 if (now.Failure != null || now.Problem.Failure != LinkFailure.None) return now;
                 isRunning |= now.IsJoined;
+                long nowNs = MonotonicClock.NowNs;
+                if (now.IsJoined) joinedNs = nowNs;
+                else if (isRunning && nowNs - joinedNs >= settings.LostNs)
+                {
+                    goal.Chosen = null; // of those that announce themselves now
+                    return null;
+                }
                 if (now.Endpoint != null && now.Endpoint != endpoint) text = (endpoint = now.Endpoint).ToString();
                 bool isSame = newest.Endpoint == text && newest.Phase == ConnectorPhase.Running;
                 if (isRunning && !isSame) Publish(new ConnectorView(ConnectorPhase.Running, ConnectorWords.None, text, goal.Session, pairing: goal.Pairing, client: client, scene: scene));
-                else if (!isRunning && MonotonicClock.NowNs - beganNs >= JoinNs) Publish(new ConnectorView(ConnectorPhase.Searching, FindReason(client), text, goal.Session, pairing: goal.Pairing));
+                else if (!isRunning && nowNs - joinedNs >= JoinNs) Publish(new ConnectorView(ConnectorPhase.Searching, FindReason(client), text, goal.Session, pairing: goal.Pairing));
             }
             return null;
         }
@@ -313,45 +320,7 @@ namespace IrisSession.Transport
             return ConnectorWords.None;
         }
 
-        // --- waits ------------------------------------------------------------------------------------------------------------------
-
-        private void TakeOrders()
-        {
-            while (true)
-            {
-                Action order;
-                lock (gate)
-                {
-                    if (orders.Count == 0) return;
-                    order = orders.Dequeue();
-                }
-                order();
-            }
-        }
-
-        /// <summary>`gate` is held. To stop is no order that could be taken before a wait begins.</summary>
-        private bool HasNoOrder { get { return orders.Count == 0 && !isStopping; } }
-
-        /// <summary>Wait for a time. False: there is an order, or it is to stop.</summary>
-        private bool Wait(int milliseconds)
-        {
-            lock (gate)
-            {
-                if (HasNoOrder) Monitor.Wait(gate, milliseconds);
-                return HasNoOrder;
-            }
-        }
-
-        private bool WaitFor(Func<bool> condition)
-        {
-            while (!condition()) if (!Wait(LookMs)) return false;
-            return true;
-        }
-
-        private void WaitForOrder()
-        {
-            lock (gate) while (HasNoOrder) Monitor.Wait(gate);
-        }
+        // --- what is said -----------------------------------------------------------------------------------------------------------
 
         private void Search(string where)
         {

@@ -84,6 +84,7 @@ namespace IrisSession.Transport
         {
             Order(() =>
             {
+                if (goal.Fault.What.Length > 0) goal = new ConnectorGoal(null, ""); // sessions that announce themselves, in place of what cannot be used
                 goal.Code = code;
                 goal.PairsFirst = true;
                 goal.MayBeUsed = false;
@@ -103,6 +104,8 @@ namespace IrisSession.Transport
             Order(() => goal.Chosen = null);
         }
 
+        // --- orders, and waits that they end ----------------------------------------------------------------------------------------
+
         private void Order(Action change)
         {
             lock (gate)
@@ -110,6 +113,44 @@ namespace IrisSession.Transport
                 orders.Enqueue(change);
                 Monitor.PulseAll(gate);
             }
+        }
+
+        private void TakeOrders()
+        {
+            while (true)
+            {
+                Action order;
+                lock (gate)
+                {
+                    if (orders.Count == 0) return;
+                    order = orders.Dequeue();
+                }
+                order();
+            }
+        }
+
+        /// <summary>`gate` is held. To stop is no order that could be taken before a wait begins.</summary>
+        private bool HasNoOrder { get { return orders.Count == 0 && !isStopping; } }
+
+        /// <summary>Wait for a time. False: there is an order, or it is to stop.</summary>
+        private bool Wait(int milliseconds)
+        {
+            lock (gate)
+            {
+                if (HasNoOrder) Monitor.Wait(gate, milliseconds);
+                return HasNoOrder;
+            }
+        }
+
+        private bool WaitFor(Func<bool> condition)
+        {
+            while (!condition()) if (!Wait(LookMs)) return false;
+            return true;
+        }
+
+        private void WaitForOrder()
+        {
+            lock (gate) while (HasNoOrder) Monitor.Wait(gate);
         }
     }
 }

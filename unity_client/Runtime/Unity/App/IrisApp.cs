@@ -144,6 +144,9 @@ namespace IrisSession.Unity.App
                 case StartAction.Enter:
                     Enter(Panel.Scanned);
                     break;
+                case StartAction.Search:
+                    Enter("");
+                    break;
                 case StartAction.Trust:
                     connector.Trust();
                     break;
@@ -262,7 +265,8 @@ namespace IrisSession.Unity.App
         /// <summary>In the background nothing is searched for; a session that was joined is kept, in which robots hold (IrisHeadset reports it).</summary>
         private void OnApplicationPause(bool pauseStatus)
         {
-            if (client != null || headset == null || Problem.Length > 0) return;
+            bool isKept = client != null || (connector != null && connector.View.Phase == ConnectorPhase.Pairing); // its code works once: the answer is waited for
+            if (isKept || headset == null || Problem.Length > 0) return;
             try
             {
                 if (pauseStatus) Close();

@@ -136,7 +136,9 @@ namespace IrisSession.Unity.Input
                 Pass(news);
                 if (client == null) return; // it has left the session
             }
-            Input.Update(IsLive, client.Suspensions, client.View.BodiesVersion);
+            HeadsetInput input = Input;
+            input.Update(IsLive, client.Suspensions, client.View.BodiesVersion);
+            if (Input != input) return; // a command has left the session
             if (Input.CommandError != null) Debug.LogException(Input.CommandError);
             Input.CommandError = null;
             ShowPanels(reading);
@@ -307,7 +309,14 @@ namespace IrisSession.Unity.Input
 
         private void OnDestroy()
         {
-            Connect(null, null);
+            try
+            {
+                Connect(null, null);
+            }
+            catch (Exception error)
+            {
+                Debug.LogException(error);
+            }
             reader?.Dispose();
             haptics?.Dispose();
             condition.Dispose();
