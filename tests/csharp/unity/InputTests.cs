@@ -396,7 +396,7 @@ namespace IrisSession.Unity.StandinTests
                 Assert.IsEmpty(Engine.Errors);
                 Assert.IsNotNull(FindText(offset.transform, "STOP all robots"));
                 Assert.AreEqual(InputKind.Hand, headset.Input.Reading[Side.Left].Kind);
-                int most = hololens.Draws.Scene.Objects + headset.Panels.All.Count + headset.Panels.Rays.Length + hololens.Draws.Avatars;
+                int most = hololens.Draws.Scene.Objects + headset.Panels.All.Count + headset.Panels.Rays.Length + hololens.Draws.Avatars + hololens.Draws.Clouds;
                 Assert.LessOrEqual(most, hololens.Draws.Calls, "were all panels shown, and both rays");
             }
             finally

@@ -150,6 +150,21 @@ namespace IrisSession.Unity.StandinTests
         }
 
         [Test]
+        public void CloudsBeyondThoseOfTheHeadsetAreSaidToBeMissing()
+        {
+            Stage stage = new Stage("lab");
+            stage.Component.Draws = new DrawBudget(50, SceneBudget.HoloLens2, 0, 0, 0, false);
+            stage.Component.Show(stage.Source);
+            stage.Load();
+            stage.Show(3);
+            Assert.IsEmpty(Engine.Draws.Where(each => each.Mesh is null));
+            Assert.AreEqual(1, stage.World.CloudsLeftOut);
+            Assert.IsNotEmpty(stage.Component.Problem);
+            stage.Component.Show(null);
+            Assert.IsEmpty(stage.Component.Problem);
+        }
+
+        [Test]
         public void PointsAreInTheBuffer()
         {
             Stage stage = new Stage("lab");

@@ -26,11 +26,12 @@ namespace IrisSession.Unity
     {
         [SerializeField] private IrisMaterials materials = new IrisMaterials();
         private IWorldSource source;
+        private int cloudsLeftOut;
 
         /// <summary>What is drawn, null without a session.</summary>
         public WorldView World { get; private set; }
 
-        /// <summary>Why nothing is drawn, for people; empty while all is well.</summary>
+        /// <summary>What is not drawn, and why, for people; empty while all is well.</summary>
         public string Problem { get; private set; } = "";
 
         /// <summary>Ghosts of the robots' hands that the wearer drives; null: none.</summary>
@@ -47,6 +48,7 @@ namespace IrisSession.Unity
         {
             World?.Dispose();
             World = null;
+            cloudsLeftOut = 0;
             this.source = source;
             Problem = source != null && !materials.AreSet ? "IrisWorld has no materials: set IrisSurface and IrisPoints of the package" : "";
             if (source != null && Problem.Length == 0) World = new WorldView(transform, materials, source, Draws);
@@ -60,6 +62,9 @@ namespace IrisSession.Unity
                 source.Update(World);
                 Ghosts?.Show(World);
                 World.Draw(source.SessionNowNs, Time.realtimeSinceStartupAsDouble, source.Participants);
+                if (World.CloudsLeftOut == cloudsLeftOut) return;
+                cloudsLeftOut = World.CloudsLeftOut;
+                Problem = cloudsLeftOut == 0 ? "" : cloudsLeftOut + " clouds of points are not shown: this headset draws " + Draws.Clouds;
             }
             catch (Exception error)
             {

@@ -22,7 +22,7 @@ namespace IrisSession.Unity
         private readonly AvatarViews avatarViews;
         private readonly LightingView lighting = new LightingView();
         private readonly List<CloudView> clouds = new List<CloudView>();
-        private readonly SceneBudget budget;
+        private readonly DrawBudget budget;
         private readonly long delayNs;
 
         /// <param name="parent">The frame in which the headset tracks: of an XR origin, its camera offset.</param>
@@ -32,7 +32,7 @@ namespace IrisSession.Unity
         /// <param name="delayNs">Time by which what is shown is behind session time [ns].</param>
         public WorldView(Transform parent, IrisMaterials templates, ISceneAssets assets, DrawBudget draws, long delayNs = 33_000_000)
         {
-            budget = draws.Scene;
+            budget = draws;
             this.delayNs = delayNs;
             Poses = new BodyPoses(delayNs);
             Avatars = new AvatarTable(delayNs, draws.Avatars);
@@ -52,6 +52,9 @@ namespace IrisSession.Unity
 
         /// <summary>Points of clouds that are drawn.</summary>
         public int PointsDrawn { get; private set; }
+
+        /// <summary>Clouds beyond those that this headset draws.</summary>
+        public int CloudsLeftOut { get; private set; }
 
         /// <summary>Put the world where the alignment says that it is.</summary>
         public void SetAlignment(RigidTransform T_world_tracking) { UnityValues.Place(world, T_world_tracking.Inverse); }
@@ -92,11 +95,13 @@ namespace IrisSession.Unity
                 clouds[i].Dispose();
                 clouds.RemoveAt(i);
             }
+            int count = Math.Min(streams.Count, budget.Clouds);
             long wanted = 0;
-            for (int k = 0; k < streams.Count; k++) wanted += streams[k].Cloud.Count;
-            double share = budget.Points > 0 && wanted > budget.Points ? (double)budget.Points / wanted : 1.0;
+            for (int k = 0; k < count; k++) wanted += streams[k].Cloud.Count;
+            double share = budget.Scene.Points > 0 && wanted > budget.Scene.Points ? (double)budget.Scene.Points / wanted : 1.0;
             PointsDrawn = 0;
-            for (int k = 0; k < streams.Count; k++)
+            CloudsLeftOut = streams.Count - count;
+            for (int k = 0; k < count; k++)
             {
                 CloudView view = null;
                 for (int i = 0; i < clouds.Count; i++) if (clouds[i].Name == streams[k].Name) view = clouds[i];

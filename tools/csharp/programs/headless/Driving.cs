@@ -97,7 +97,7 @@ internal sealed class Driving
         if (last != null) foreach (KeyValuePair<string, long> one in last.Rejected) rejected.Add(one.Key + " " + one.Value);
         headset.Clutch = false;
         headset.TryGetSite(robot, out RigidTransform at);
-        List<object> all = new List<object> { "robot", robot, "moved_m", (at.Position - before.Position).Length, "hold", last == null ? "" : last.HoldReason, "rejected", rejected.ToArray() };
+        List<object> all = new List<object> { "robot", robot, "moved_m", (at.Position - before.Position).Length, "hold", last == null ? "" : last.HoldReason, "text", last == null || last.HoldReason.Length == 0 ? "" : Words.OfHold(last.HoldReason).ToString(), "rejected", rejected.ToArray() };
         all.AddRange(fields);
         report.Write(command, isDone, all.ToArray());
     }
