@@ -134,6 +134,7 @@ namespace IrisSession.Unity.StandinTests
         public void ALinkThatIsSeenIsAButtonAndOthersAreNot()
         {
             using (GatewaySession session = new GatewaySession(TestCertificate.First))
+            using (GatewaySession other = new GatewaySession(TestCertificate.Second))
             using (AppStage stage = new AppStage(true))
             {
                 Permission.Granted.Add(ScenePermission.UseScene);
@@ -143,8 +144,10 @@ namespace IrisSession.Unity.StandinTests
                 stage.StepUntil(() => IsDrawn(stage, "Join localhost"), "a button");
                 Assert.IsFalse(IsDrawn(stage, "about"));
                 Assert.AreEqual(0, session.Count<Pair>(), "nothing is entered unasked");
+                stage.ShowCode(other.Address + "/#c=" + GatewaySession.Code);
                 stage.Press("Join localhost", () => stage.App.View.Phase == ConnectorPhase.Running, "it is joined");
                 Assert.AreEqual(PairingOutcome.Paired, stage.App.View.Pairing.Outcome);
+                Assert.AreEqual(0, other.Count<Pair>(), "a code that is seen later is not entered");
             }
         }
 
@@ -162,6 +165,9 @@ namespace IrisSession.Unity.StandinTests
                 session.Refuse = message => new Refused { Code = RefusalCode.Code };
                 if (hasDamagedFile) stage.WriteFile(PairingFile.Name, "{");
                 else if (isCode) stage.App.Address = session.Address + "/#c=AAAA-AAAA-AAAA";
+                ConnectorView before = null;
+                if (hasDamagedFile) stage.WaitFor(ConnectorPhase.Failed);
+                if (hasDamagedFile) stage.Press("Try again", () => stage.App.View != (before = before ?? stage.App.View), "the same answer");
                 stage.Press(button, () => TouchScreenKeyboard.Newest != null, "a keyboard");
                 session.Refuse = message => null;
                 TouchScreenKeyboard.Newest.text = isCode ? GatewaySession.Code : session.Address;
@@ -274,18 +280,29 @@ namespace IrisSession.Unity.StandinTests
         [Test]
         public void ALostSessionIsLookedForAnewAndTheWearerCanGoElsewhere()
         {
+            ConnectorSettings kept = null;
             using (GatewaySession next = new GatewaySession())
-            using (AppStage stage = new AppStage(false, settings => settings.LostNs = 0))
+            using (AppStage stage = new AppStage(false, settings => kept = settings))
             {
                 using (GatewaySession session = new GatewaySession())
                 {
                     stage.App.Address = session.Address;
                     stage.WaitFor(ConnectorPhase.Running);
+                    Assert.IsTrue(session.Received.OfType<Hello>().All(hello => hello.Capabilities.Any(one => one.StartsWith("run:"))), "its alignment outlives a loss");
                 }
+                stage.StepUntil(() => !stage.App.Client.View.IsJoined, "the connection is lost");
+                Controls.Set("<XRController>{LeftHand}/thumbstickClicked", 1f);
+                stage.StepUntil(() => Unwrap(stage.Urgent).Contains(Unwrap(StopReport.Unconfirmed.ToString())), "nothing is stopped yet");
+                SessionClient client = stage.App.Client;
+                Engine.Pause(true);
+                kept.LostNs = 0;
+                for (int i = 0; i < 100; i++) Engine.Step();
+                Assert.AreSame(client, stage.App.Client, "nobody wears it");
+                Engine.Pause(false);
                 stage.StepUntil(() => stage.App.Client == null && stage.App.View.Phrase.What.Length > 0, "it is lost, and the panel says why");
                 stage.Press("Look for sessions", () => stage.App.View.Endpoint.Length == 0, "those that announce themselves");
                 stage.StepUntil(() => stage.Announce("next", next) && stage.App.View.Phase == ConnectorPhase.Running, "another one is joined");
-                Assert.Greater(next.Count<Hello>(), 0);
+                stage.StepUntil(() => next.Count<EStop>() > 0, "the same session, which gets the e-stop of before");
             }
         }
 

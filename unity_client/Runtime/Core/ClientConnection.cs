@@ -147,10 +147,10 @@ namespace IrisSession.Core
         /// <summary>Queue a bye, which releases leases at once. Send what <see cref="PeekOutgoing"/> still shows.</summary>
         public void Close()
         {
-            if (Welcome != null)
+            if (IsJoined) // else the session does not hear it, and the next connection resumes this one
             {
                 Queue(new Bye());
-                if (Phase != ConnectionPhase.Refused) Identity.Remember(new byte[0]);
+                Identity.Remember(new byte[0]);
             }
             Phase = ConnectionPhase.Closed;
         }

@@ -38,6 +38,9 @@ namespace IrisSession.Interaction
         /// <summary>Buttons answer this long after they appeared: a press that was meant for something before is none.</summary>
         private const long ReadNs = 500_000_000;
 
+        /// <summary>What comes of a press is waited for so long at most.</summary>
+        private const long AnswerNs = 2_000_000_000;
+
         /// <summary>A code that was seen longer ago is remembered by the runtime.</summary>
         private const long FreshNs = 1_000_000_000;
 
@@ -60,14 +63,16 @@ namespace IrisSession.Interaction
         private readonly List<MarkerReport> reports = new List<MarkerReport>();
         private ConnectorView view = ConnectorView.Idle;
         private ConnectorView declined;
-        private ConnectorView answered; // by a press: another one waits for what comes of it
-        private PairingLink invitation; // that was seen, and not answered; null: none
+        private ConnectorView answered; // by a press at `answeredNs`: another one waits for what comes of it
+        private long answeredNs;
+        private PairingLink invitation; // of `seenText`, and not answered; null: none
+        private string seenText = "";
         private string notice = "";
         private bool isStopShown;
         private bool isChanged = true;
         private bool areNew; // buttons
         private long sinceNs;
-        private long scannedNs;
+        private long seenNs;
         private int count;
         private StartAction action;
 
@@ -107,7 +112,7 @@ namespace IrisSession.Interaction
         /// <summary>The session of <see cref="StartAction.Choose"/>.</summary>
         public OfferedSession Chosen { get; private set; }
 
-        /// <summary>The link of <see cref="StartAction.Enter"/>: the newest one that was seen, empty before one.</summary>
+        /// <summary>The link of <see cref="StartAction.Enter"/>, empty before one.</summary>
         public string Scanned { get; private set; } = "";
 
         /// <summary>What the panel says.</summary>
@@ -176,41 +181,53 @@ namespace IrisSession.Interaction
             rays[side] = new PanelRay { Ray = hand.Ray, LengthM = distance, IsHit = best >= 0 };
             if (best < 0) return;
             buttons[best].Style = PanelStyle.AimedButton;
-            if (isDown[side] && !wasDown && nowNs - sinceNs >= ReadNs) Do(best);
+            if (isDown[side] && !wasDown && nowNs - sinceNs >= ReadNs) Do(best, nowNs);
         }
 
-        private void Do(int button)
+        private void Do(int button, long nowNs)
         {
-            if (view == answered) return;
+            if (IsAnswered(nowNs)) return;
             action = actions[button];
-            if (action == StartAction.Choose || action == StartAction.Trust || action == StartAction.Retry || action == StartAction.Search) answered = view;
+            answered = view;
+            answeredNs = nowNs;
             Chosen = offered[button];
-            if (action != StartAction.None) invitation = null;
             isChanged = true;
-            if (action != StartAction.None) return;
-            declined = view; // "No": nothing was sent, and nothing is
+            if (action == StartAction.None)
+            {
+                declined = view; // "No": nothing was sent, and nothing is
+                return;
+            }
+            answered = view;
+            answeredNs = nowNs;
+            if (action == StartAction.Enter) Scanned = seenText;
+            invitation = null;
+        }
+
+        private bool IsAnswered(long nowNs)
+        {
+            return view == answered && nowNs - answeredNs < AnswerNs;
         }
 
         /// <summary>A link that is seen becomes a button: it may be that of another session, or of another person, whose code it would use up.</summary>
         private void ReadCodes(long nowNs)
         {
             if (Markers == null) return;
-            bool isWanted = StartWords.MayScan(view.Phase) && Markers.Support == MarkerSupport.Ready;
+            bool isWanted = StartWords.MayScan(view) && Markers.Support == MarkerSupport.Ready;
             Markers.SetActive(isWanted);
-            if (!isWanted) return;
+            if (!isWanted || IsAnswered(nowNs)) return;
             int read = Markers.Read(reports);
             for (int i = 0; i < read; i++)
             {
                 MarkerReport report = reports[i];
                 bool isSeen = report.IsTracked && (report.SeenNs < 0 || nowNs - report.SeenNs < FreshNs);
                 if (!isSeen || string.IsNullOrEmpty(report.Text)) continue;
-                bool isSame = report.Text == Scanned;
-                if (isSame) scannedNs = nowNs;
-                if (isSame ? invitation != null || view.Phase != ConnectorPhase.Failed : invitation != null && nowNs - scannedNs < FreshNs) continue; // it is offered; another one is
+                bool isSame = report.Text == seenText;
+                if (isSame) seenNs = nowNs;
+                if (isSame ? invitation != null || view.Phase != ConnectorPhase.Failed : invitation != null && nowNs - seenNs < FreshNs) continue; // it is offered; another one is
                 PairingLink link = FindInvitation(report.Text);
                 if (link == null) continue;
-                Scanned = report.Text;
-                scannedNs = nowNs;
+                seenText = report.Text;
+                seenNs = nowNs;
                 invitation = link;
                 isChanged = true;
             }
@@ -250,7 +267,7 @@ namespace IrisSession.Interaction
             }
             for (int i = 0; i < view.Sessions.Length && i < MaxSessions && view.Phase == ConnectorPhase.Choosing; i++) Add(StartWords.Describe(view.Sessions[i]), StartAction.Choose, view.Sessions[i]);
             bool isOver = view.Phase == ConnectorPhase.Failed || isDeclined;
-            if (invitation != null && StartWords.MayScan(view.Phase)) Add(StartWords.Describe(invitation), StartAction.Enter);
+            if (invitation != null && StartWords.MayScan(view)) Add(StartWords.Describe(invitation), StartAction.Enter);
             if (isOver) Add("Try again", StartAction.Retry);
             if (isOver || (view.Phase == ConnectorPhase.Searching && view.Endpoint.Length > 0)) Add("Look for sessions", StartAction.Search);
             if (CanType && isOver) Add("Type a join code", StartAction.TypeCode);

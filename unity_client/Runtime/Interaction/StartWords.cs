@@ -30,7 +30,7 @@ namespace IrisSession.Interaction
             if (view.Phase == ConnectorPhase.Untrusted) yield return "The key of" + (where.Length > 0 ? where : " this session") + " is not known here. Compare its certificate with that of iris-session pair:";
             else if (view.Phrase.What.Length > 0) yield return view.Phrase.ToString();
             if (view.Phase == ConnectorPhase.Choosing) yield return "Point at yours and press the trigger.";
-            if (readsCodes && MayScan(view.Phase)) yield return "Or look at the code that iris-session pair shows.";
+            if (readsCodes && MayScan(view)) yield return "Or look at the code that iris-session pair shows.";
         }
 
         /// <summary>Return the button of a link that was seen.</summary>
@@ -39,10 +39,11 @@ namespace IrisSession.Interaction
             return "Join " + (invitation.SessionName.Length > 0 ? Words.ToLine(invitation.SessionName, 24) + " at " : "") + Words.ToLine(invitation.Host, 40);
         }
 
-        /// <summary>Return whether a link can be scanned now.</summary>
-        public static bool MayScan(ConnectorPhase phase)
+        /// <summary>Return whether a link can be scanned now: not while one is entered, and nothing is wrong with it.</summary>
+        public static bool MayScan(ConnectorView view)
         {
-            return phase == ConnectorPhase.Searching || phase == ConnectorPhase.Choosing || phase == ConnectorPhase.Untrusted || phase == ConnectorPhase.Failed;
+            if (view.Phase == ConnectorPhase.Searching) return view.Endpoint.Length == 0 || view.Phrase.What.Length > 0;
+            return view.Phase == ConnectorPhase.Choosing || view.Phase == ConnectorPhase.Untrusted || view.Phase == ConnectorPhase.Failed;
         }
 
         /// <summary>Return the button of a session.</summary>

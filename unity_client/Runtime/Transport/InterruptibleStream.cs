@@ -19,6 +19,9 @@ namespace IrisSession.Transport
         /// <summary>Longest time until an interrupt or a deadline is seen [ms].</summary>
         private const int LookMs = 50;
 
+        /// <summary>Bytes that the system keeps to send: an e-stop goes behind them.</summary>
+        private const int SendBytes = 16 << 10;
+
         /// <summary>Bytes that a socket which is ready to be written to takes at once.</summary>
         private const int PieceBytes = 4096;
 
@@ -179,6 +182,7 @@ namespace IrisSession.Transport
                 if (failed != 0) throw new SocketException(failed);
                 socket.Blocking = true;
                 socket.SendTimeout = socket.ReceiveTimeout = LookMs;
+                socket.SendBufferSize = SendBytes;
                 InterruptibleStream stream = new InterruptibleStream(socket, interrupt) { DeadlineNs = deadlineNs };
                 socket = null;
                 return stream;

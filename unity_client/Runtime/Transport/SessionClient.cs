@@ -237,6 +237,9 @@ namespace IrisSession.Transport
             return !HasEnded;
         }
 
+        /// <summary>The e-stop that no session has, null for none. After the end of the thread.</summary>
+        internal EStop UnsentStop { get { return HasEnded ? loop.Connection.PendingEStop.Message : null; } }
+
         /// <summary>Say how the scene is, so that advice has it. From any thread.</summary>
         internal void NoteScene(SceneFacts facts)
         {

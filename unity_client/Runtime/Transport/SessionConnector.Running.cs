@@ -18,6 +18,9 @@ namespace IrisSession.Transport
 
         /// <summary>Characters of a name, before the three dots of one that is longer: the protocol has room for 64.</summary>
         private const int MaxName = 60;
+
+        /// <summary>With it an alignment outlives a loss of the connection (docs/protocol.md, `hello`).</summary>
+        private const string RunPrefix = "run:";
         private const int LookMs = 10;
         private const int ListenLookMs = 50;
         private const int SlowLookMs = 100;
@@ -25,6 +28,8 @@ namespace IrisSession.Transport
         private ConnectorGoal goal;
         private BeaconListener listener;
         private OfferedSession[] offers = new OfferedSession[0];
+        private EStop unsent; // of a client before, to the session of this id
+        private string unsentFor = "";
         private LinkEnd shown; // with the key that was shown for comparison, and the addresses of that session
         private List<WebEndpoint> shownBy;
 
@@ -255,6 +260,7 @@ namespace IrisSession.Transport
 
         private void Join(List<WebEndpoint> endpoints)
         {
+            if (!WaitFor(() => !isPaused)) return;
             WebEndpoint known = endpoints.Find(one => one.Pin != null);
             List<WebEndpoint> ways = WithCable(endpoints);
             if (known != null) for (int i = 0; i < ways.Count; i++) if (ways[i].IsSecure && ways[i].Pin == null) ways[i] = ways[i].WithPin(known.Pin); // one session, one key
@@ -272,7 +278,13 @@ namespace IrisSession.Transport
             {
                 Publish(new ConnectorView(ConnectorPhase.Searching, ConnectorWords.None, end == null ? "" : newest.Endpoint, end == null ? "" : goal.Session));
                 scene.Stop();
+                bool isLost = client.View.Welcome != null && !client.View.IsJoined;
                 client.Stop();
+                if (isLost && client.UnsentStop != null)
+                {
+                    unsent = client.UnsentStop;
+                    unsentFor = client.View.Welcome.SessionId;
+                }
             }
             if (end == null) return;
             bool isStranger = end.Problem.Failure == LinkFailure.WrongCertificate || (end.Failure != null && (end.Failure.Code == RefusalCode.Unpaired || end.Failure.Code == RefusalCode.Identity));
@@ -280,9 +292,12 @@ namespace IrisSession.Transport
             else Fail(end.Failure != null ? Words.OfRefusal(end.Failure) : LinkWords.OfEnd(end.Problem), end.Problem, end.Failure);
         }
 
+        /// <summary>Return the hello of a new client. Its run is its own: what happens to the tracking frame between two clients is not known.</summary>
         private Hello MakeHello()
         {
-            return new Hello { Role = settings.Role, Name = Words.ToLine(settings.Name, MaxName), Software = Words.ToLine(settings.Software, MaxName), Devices = settings.Devices, Capabilities = settings.Capabilities };
+            List<string> capabilities = new List<string>(settings.Capabilities);
+            if (!capabilities.Exists(one => one.StartsWith(RunPrefix, StringComparison.Ordinal))) capabilities.Add(RunPrefix + Guid.NewGuid().ToString("N"));
+            return new Hello { Role = settings.Role, Name = Words.ToLine(settings.Name, MaxName), Software = Words.ToLine(settings.Software, MaxName), Devices = settings.Devices, Capabilities = capabilities.ToArray() };
         }
 
         /// <summary>Say how a client fares until there is an order, or it was lost for long: null then; or until the session or its key ends it.</summary>
@@ -298,8 +313,13 @@ namespace IrisSession.Transport
                 if (now.Failure != null || now.Problem.Failure != LinkFailure.None) return now;
                 isRunning |= now.IsJoined;
                 long nowNs = MonotonicClock.NowNs;
-                if (now.IsJoined) joinedNs = nowNs;
-                else if (isRunning && nowNs - joinedNs >= settings.LostNs)
+                if (now.IsJoined || isPaused) joinedNs = nowNs;
+                if (now.IsJoined && unsent != null && now.Welcome.SessionId == unsentFor)
+                {
+                    client.EStop(unsent.Reason);
+                    unsent = null;
+                }
+                if (!now.IsJoined && isRunning && nowNs - joinedNs >= settings.LostNs)
                 {
                     goal.Chosen = null; // of those that announce themselves now
                     return null;
@@ -350,7 +370,7 @@ namespace IrisSession.Transport
         /// <summary>Say why it does not go on, and wait for an order.</summary>
         private void Fail(Phrase phrase, LinkEnd problem = default, Refused refusal = null)
         {
-            Publish(new ConnectorView(ConnectorPhase.Failed, phrase, newest.Endpoint, goal.Session, pairing: goal.Pairing, refusal: refusal, problem: problem));
+            newest = new ConnectorView(ConnectorPhase.Failed, phrase, newest.Endpoint, goal.Session, pairing: goal.Pairing, refusal: refusal, problem: problem); // also the same: it answers
             WaitForOrder();
         }
 

@@ -23,6 +23,7 @@ namespace IrisSession.Transport
         private readonly Queue<Action> orders = new Queue<Action>();
         private volatile ConnectorView newest = ConnectorView.Idle;
         private volatile bool isStopping;
+        private volatile bool isPaused;
 
         /// <param name="settings">With an identity and a cache.</param>
         public SessionConnector(ConnectorSettings settings)
@@ -55,6 +56,12 @@ namespace IrisSession.Transport
             }
             View = ConnectorView.Idle;
             return (thread.ThreadState & ThreadState.Unstarted) != 0 || thread.Join(StopMs);
+        }
+
+        /// <summary>Nobody wears the headset now, or again: meanwhile no session is joined, and one that is lost is not looked for elsewhere.</summary>
+        public void SetPaused(bool isPaused)
+        {
+            this.isPaused = isPaused;
         }
 
         /// <summary>Take what happened. Call it each frame: it waits for nothing, and allocates nothing.</summary>

@@ -23,8 +23,11 @@ namespace IrisSession.Transport
     /// <summary>A WebSocket, opened once. Stop it from any thread; its threads end within a fraction of a second.</summary>
     internal sealed class WebSocketLink
     {
-        /// <summary>Bytes that may wait to be written: above, messages are not taken.</summary>
-        public const int MaxWaitingBytes = 64 << 10;
+        /// <summary>Bytes that may wait to be written: above, messages are not taken. Two frames of samples: an e-stop goes behind what waits here.</summary>
+        public const int MaxWaitingBytes = 8 << 10;
+
+        /// <summary>Buffers for writing above this size are not used again.</summary>
+        private const int KeptWriteBytes = 128 << 10;
 
         private const int ReadBytes = 64 << 10;
 
@@ -291,7 +294,7 @@ namespace IrisSession.Transport
                         bytes = writer.Take(spare);
                     }
                     opened.Write(bytes, count);
-                    spare = bytes.Length <= 2 * MaxWaitingBytes ? bytes : new byte[4096];
+                    spare = bytes.Length <= KeptWriteBytes ? bytes : new byte[4096];
                 }
             }
             catch (Exception)

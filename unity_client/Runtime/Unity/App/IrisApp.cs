@@ -262,10 +262,11 @@ namespace IrisSession.Unity.App
             }
         }
 
-        /// <summary>In the background nothing is searched for; a session that was joined is kept, in which robots hold (IrisHeadset reports it).</summary>
+        /// <summary>In the background nothing is searched for or joined; a session that was joined is kept, in which robots hold (IrisHeadset reports it).</summary>
         private void OnApplicationPause(bool pauseStatus)
         {
             bool isKept = client != null || (connector != null && connector.View.Phase == ConnectorPhase.Pairing); // its code works once: the answer is waited for
+            if (isKept) connector.SetPaused(pauseStatus);
             if (isKept || headset == null || Problem.Length > 0) return;
             try
             {
