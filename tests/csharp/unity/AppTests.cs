@@ -281,23 +281,25 @@ namespace IrisSession.Unity.StandinTests
         public void ALostSessionIsLookedForAnewAndTheWearerCanGoElsewhere()
         {
             ConnectorSettings kept = null;
+            using (GatewaySession session = new GatewaySession())
             using (GatewaySession next = new GatewaySession())
             using (AppStage stage = new AppStage(false, settings => kept = settings))
             {
-                using (GatewaySession session = new GatewaySession())
-                {
-                    stage.App.Address = session.Address;
-                    stage.WaitFor(ConnectorPhase.Running);
-                    Assert.IsTrue(session.Received.OfType<Hello>().All(hello => hello.Capabilities.Any(one => one.StartsWith("run:"))), "its alignment outlives a loss");
-                }
-                stage.StepUntil(() => !stage.App.Client.View.IsJoined, "the connection is lost");
+                stage.App.Address = session.Address;
+                stage.WaitFor(ConnectorPhase.Running);
+                Assert.IsTrue(session.Received.OfType<Hello>().All(hello => hello.Capabilities.Any(one => one.StartsWith("run:"))), "its alignment outlives a loss");
+                session.CloseCode = 1013; // try again later (RFC 6455, section 7.4, registry)
+                SessionClient client = stage.App.Client;
+                client.Post(loop => loop.Connection.HandleDisconnect(MonotonicClock.NowNs));
+                stage.StepUntil(() => !client.View.IsJoined, "the connection is lost");
                 Controls.Set("<XRController>{LeftHand}/thumbstickClicked", 1f);
                 stage.StepUntil(() => Unwrap(stage.Urgent).Contains(Unwrap(StopReport.Unconfirmed.ToString())), "nothing is stopped yet");
-                SessionClient client = stage.App.Client;
+                Controls.Set("<XRController>{LeftHand}/thumbstickClicked", 0f);
                 Engine.Pause(true);
                 kept.LostNs = 0;
-                for (int i = 0; i < 100; i++) Engine.Step();
-                Assert.AreSame(client, stage.App.Client, "nobody wears it");
+                int before = session.Count<Hello>();
+                stage.StepUntil(() => session.Count<Hello>() >= before + 4, "it tries again");
+                Assert.AreSame(client, stage.App.Client, "and looks for nothing else while nobody wears it");
                 Engine.Pause(false);
                 stage.StepUntil(() => stage.App.Client == null && stage.App.View.Phrase.What.Length > 0, "it is lost, and the panel says why");
                 stage.Press("Look for sessions", () => stage.App.View.Endpoint.Length == 0, "those that announce themselves");
