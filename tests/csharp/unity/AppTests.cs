@@ -296,7 +296,7 @@ namespace IrisSession.Unity.StandinTests
                 stage.StepUntil(() => Unwrap(stage.Urgent).Contains(Unwrap(StopReport.Unconfirmed.ToString())), "nothing is stopped yet");
                 Controls.Set("<XRController>{LeftHand}/thumbstickClicked", 0f);
                 Engine.Pause(true);
-                kept.LostNs = 0;
+                kept.LostNs = 1;
                 int before = session.Count<Hello>();
                 stage.StepUntil(() => session.Count<Hello>() >= before + 4, "it tries again");
                 Assert.AreSame(client, stage.App.Client, "and looks for nothing else while nobody wears it");
