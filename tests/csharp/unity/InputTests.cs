@@ -10,7 +10,6 @@ using IrisSession.Interaction.Tests;
 using IrisSession.Protocol;
 using IrisSession.Transport;
 using IrisSession.Unity.App;
-using IrisSession.Unity.ArFoundation;
 using IrisSession.Unity.Input;
 using NUnit.Framework;
 using Standins;
@@ -18,11 +17,6 @@ using Unity.XR.CoreUtils;
 using UnityEngine;
 using UnityEngine.Android;
 using UnityEngine.XR;
-using UnityEngine.XR.ARFoundation;
-using UnityEngine.XR.ARSubsystems;
-using UnityEngine.XR.Hands;
-using EnginePose = UnityEngine.Pose;
-using MicrosoftMarker = Microsoft.MixedReality.OpenXR.ARMarker;
 
 namespace IrisSession.Unity.StandinTests
 {
@@ -92,76 +86,6 @@ namespace IrisSession.Unity.StandinTests
                 Controls.Set("<XRHMD>/userPresence", 0f);
                 Assert.IsFalse(reader.IsOnHead);
             }
-        }
-
-        [Test]
-        public void BareHandsPinchAndHaveJoints()
-        {
-            XRHandSubsystem subsystem = new XRHandSubsystem();
-            XrHands hands = new XrHands();
-            Assert.IsFalse(hands.IsSupported);
-            Subsystems.Running.Add(subsystem);
-            Assert.IsTrue(hands.IsSupported);
-            InputReading reading = new InputReading();
-            Assert.IsFalse(hands.TryRead(Side.Left, true, reading));
-            Dictionary<XRHandJointID, EnginePose> joints = new Dictionary<XRHandJointID, EnginePose>();
-            for (XRHandJointID id = XRHandJointID.Wrist; id < XRHandJointID.EndMarker; id++) joints[id] = At(0.01f * (int)id, 1f, 0.3f);
-            joints[XRHandJointID.ThumbTip] = joints[XRHandJointID.IndexTip] = At(0.2f, 1.1f, 0.4f);
-            subsystem.leftHand = new XRHand { isTracked = true, Joints = joints };
-            subsystem.leftHandCommonGestures.Aim = At(0.1f, 1f, 0.3f);
-            Assert.IsTrue(hands.TryRead(Side.Left, true, reading));
-            Assert.AreEqual(InputKind.Hand, reading.Kind);
-            Assert.AreEqual(1, reading.Trigger, "thumb and index finger touch");
-            AssertNear(new Double3(0.4, -0.2, 1.1), reading.Tip);
-            AssertNear(new Double3(0.3, -0.01, 1), reading.Pose.Position); // of the wrist
-            AssertNear(new Double3(0.3, -0.1, 1), reading.Ray.Origin);
-            Assert.AreEqual(26 * 7, reading.Joints.Length);
-            Assert.AreEqual(-0.02, reading.Joints[1], 1e-6, "the palm first");
-            Assert.AreEqual(-0.01, reading.Joints[8], 1e-6);
-            Assert.AreEqual(-0.26, reading.Joints[25 * 7 + 1], 1e-6);
-            joints.Remove(XRHandJointID.MiddleTip);
-            hands.TryRead(Side.Left, true, reading);
-            Assert.AreEqual(PoseValidity.NotSeen, reading.Validity);
-        }
-
-        [Test]
-        public void CodesAreReportedInTheTrackingFrame()
-        {
-            Transform offset = new GameObject("offset").transform;
-            offset.SetPositionAndRotation(new Vector3(3f, 1f, -2f), Quaternion.AngleAxis(30f, Vector3.up));
-            XROrigin origin = new GameObject("origin").AddComponent<XROrigin>();
-            origin.Trackables = new GameObject("trackables").transform;
-            Behaviour manager = new GameObject("manager").AddComponent<XROrigin>(); // any component stands for the manager
-            ArMarkers source = new ArMarkers(origin, manager, offset);
-            ARMarker marker = new GameObject("marker").AddComponent<ARMarker>();
-            marker.transform.SetParent(origin.Trackables, false);
-            // Upright on a wall 1 m ahead, 0.2 m to the right: its normal, local Y, points back to the person.
-            Vector3 position = new Vector3(0.2f, 1.1f, 1f);
-            Quaternion rotation = Quaternion.AngleAxis(-90f, Vector3.right);
-            marker.transform.SetPositionAndRotation(offset.TransformPoint(position), offset.rotation * rotation);
-            marker.size = new Vector2(0.15f, 0.15f);
-            List<MarkerReport> reports = new List<MarkerReport>();
-            Assert.AreEqual(1, source.Read(reports));
-            Assert.AreEqual("", reports[0].Text, "not decoded yet");
-            marker.Data = "table";
-            for (int i = 0; i < 100; i++) source.Read(reports);
-            Assert.AreEqual("table", reports[0].Text);
-            Assert.LessOrEqual(marker.Reads, 3, "the text is asked for rarely, and never again");
-            RigidTransform sheet = reports[0].Pose.T_tracking_anchor;
-            AssertNear(new Double3(1, -0.2, 1.1), sheet.Position);
-            AssertNear(new Double3(-1, 0, 0), sheet.Rotation.Rotate(new Double3(0, 0, 1)));
-            AssertNear(new Double3(0, 0, 1), sheet.Rotation.Rotate(new Double3(0, 1, 0)));
-            Assert.AreEqual(0.15, reports[0].Pose.SizeM, 1e-6);
-            marker.trackingState = TrackingState.Limited;
-            source.Read(reports);
-            Assert.IsFalse(reports[0].IsTracked);
-            source.SetActive(false);
-            Assert.IsFalse(manager.enabled);
-            source.IsAllowed = false;
-            source.SetActive(true);
-            Assert.IsFalse(manager.enabled, "it stays off until the person has allowed it");
-            Assert.AreEqual(MarkerSupport.NotAllowed, source.Support);
-            Assert.AreEqual(MarkerSupport.Missing, new ArMarkers(origin, null, offset).Support);
         }
 
         [Test]
@@ -334,42 +258,6 @@ namespace IrisSession.Unity.StandinTests
         }
 
         [Test]
-        public void CodesThatAHoloLensRemembersAreNoLooks()
-        {
-            Transform offset = new GameObject("offset").transform;
-            XROrigin origin = new GameObject("origin").AddComponent<XROrigin>();
-            origin.Trackables = new GameObject("trackables").transform;
-            HoloLensMarkers source = new HoloLensMarkers(origin, new GameObject("manager").AddComponent<XROrigin>(), offset);
-            MicrosoftMarker marker = new GameObject("marker").AddComponent<MicrosoftMarker>();
-            marker.transform.SetParent(origin.Trackables, false);
-            // Upright on a wall 1 m ahead: local X right, Y down, Z back to the person.
-            marker.transform.SetPositionAndRotation(new Vector3(0.1f, 1.4f, 1f), Quaternion.AngleAxis(180f, Vector3.right));
-            marker.Data = "table";
-            marker.size = new Vector2(0.15f, 0.15f);
-            Wearer wearer = new Wearer();
-            wearer.Session.T_world_tracking = null;
-            wearer.Input.Markers = new MarkerLooks(source);
-            for (int i = 0; i < 60; i++)
-            {
-                Engine.Step();
-                marker.transform.SetPositionAndRotation(new Vector3(0.1f + 1e-5f * i, 1.4f, 1f), Quaternion.AngleAxis(180f, Vector3.right));
-                wearer.Input.Reading.CaptureNs = MonotonicClock.NowNs + i * Wearer.FrameNs; // the engine's clock is that of the steps
-                marker.lastSeenTime = -100f; // of another app, before this one was started
-                wearer.Input.Update(true, 0, 1);
-            }
-            Assert.AreEqual(0, wearer.Session.Looks.Count);
-            Assert.AreEqual(60, wearer.Input.Markers.Filter.Count(MarkerVerdict.Remembered));
-            List<MarkerReport> reports = new List<MarkerReport>();
-            marker.lastSeenTime = (float)Time.realtimeSinceStartupAsDouble;
-            source.Read(reports);
-            Assert.LessOrEqual(System.Math.Abs(MonotonicClock.NowNs - reports[0].SeenNs), 10_000_000_000, "now, on our clock");
-            AssertNear(new Double3(1, -0.1, 1.4), new Double3(reports[0].Pose.T_tracking_anchor.Position.X, -0.1, reports[0].Pose.T_tracking_anchor.Position.Z));
-            AssertNear(new Double3(-1, 0, 0), reports[0].Pose.T_tracking_anchor.Rotation.Rotate(new Double3(0, 0, 1)));
-            AssertNear(new Double3(0, 0, 1), reports[0].Pose.T_tracking_anchor.Rotation.Rotate(new Double3(0, 1, 0)));
-            Assert.AreEqual(Microsoft.MixedReality.OpenXR.TransformMode.Center, marker.transformMode);
-        }
-
-        [Test]
         public void HoloLensIsAHeadsetWithCommandsAndFewDrawCalls()
         {
             foreach (string hand in new[] { "{LeftHand}", "{RightHand}" })
@@ -471,8 +359,6 @@ namespace IrisSession.Unity.StandinTests
             Controls.Set(device + "trackingState", 3);
         }
 
-        private static EnginePose At(float x, float y, float z) { return new EnginePose(new Vector3(x, y, z), Quaternion.identity); }
-
         private static TextMesh FindText(Transform parent, string text)
         {
             for (int i = 0; i < parent.childCount; i++)
@@ -483,7 +369,7 @@ namespace IrisSession.Unity.StandinTests
             return null;
         }
 
-        private static void AssertNear(Double3 expected, Double3 actual)
+        internal static void AssertNear(Double3 expected, Double3 actual)
         {
             Assert.LessOrEqual((expected - actual).Length, 1e-5, expected + " is not " + actual);
         }

@@ -53,12 +53,14 @@ namespace UnityEngine.XR.Hands
 
     public class XRCommonHandGestures
     {
+        /// <summary>Whether the runtime has enabled the hand interaction profile: without it there are no poses.</summary>
+        internal static bool HasProfile;
         internal Pose? Aim;
 
         public bool TryGetAimPose(out Pose aimPose)
         {
             aimPose = Aim ?? default;
-            return Aim.HasValue;
+            return HasProfile && Aim.HasValue;
         }
     }
 

@@ -1,21 +1,24 @@
 // Bare hands by the package XR Hands.
+using System;
 using System.Collections.Generic;
 using IrisSession.Core;
 using IrisSession.Interaction;
 using IrisSession.Unity.Input;
 using UnityEngine;
+using UnityEngine.InputSystem;
 using UnityEngine.XR.Hands;
 
 namespace IrisSession.Unity.ArFoundation
 {
-    /// <summary>Hands that the runtime tracks: pinch is the trigger, a fist the squeeze.</summary>
-    public sealed class XrHands : IHands
+    /// <summary>Hands that the runtime tracks: pinch is the trigger, a fist the squeeze. Dispose of it to give the actions back.</summary>
+    public sealed class XrHands : IHands, IDisposable
     {
         private const int JointCount = 26;
         private const int RowLength = 7;
 
         private readonly List<XRHandSubsystem> subsystems = new List<XRHandSubsystem>();
         private readonly double[][] joints = { new double[JointCount * RowLength], new double[JointCount * RowLength] };
+        private readonly Aim[] aims = { new Aim("<MetaAimHand>{LeftHand}/"), new Aim("<MetaAimHand>{RightHand}/") };
         private XRHandSubsystem subsystem;
 
         public bool IsSupported
@@ -49,10 +52,15 @@ namespace IrisSession.Unity.ArFoundation
             reading.Trigger = Gestures.Pinch(thumb.Position, index.Position);
             reading.Squeeze = Gestures.Fist(wrist.Position, knuckle.Position, middle.Position);
             XRCommonHandGestures gestures = side == Side.Left ? subsystem.leftHandCommonGestures : subsystem.rightHandCommonGestures;
-            reading.HasRay = gestures.TryGetAimPose(out Pose aim);
+            reading.HasRay = aims[(int)side].TryRead(out Pose aim) || gestures.TryGetAimPose(out aim);
             if (reading.HasRay) reading.Ray = AimRay.Along(EnginePoses.ToWire(aim.position, aim.rotation));
             if (wantsJoints) reading.Joints = ReadJoints(hand, joints[(int)side]);
             return true;
+        }
+
+        public void Dispose()
+        {
+            foreach (Aim one in aims) one.Dispose();
         }
 
         /// <summary>Return the rows of all joints in the order of OpenXR (the palm first); none unless all are known.</summary>
@@ -72,6 +80,47 @@ namespace IrisSession.Unity.ArFoundation
             bool isThere = hand.GetJoint(id).TryGetPose(out Pose found);
             pose = isThere ? EnginePoses.ToWire(found.position, found.rotation) : RigidTransform.Identity;
             return isThere;
+        }
+
+        /// <summary>
+        /// Where a hand points, by the feature "Meta Hand Tracking Aim": it is a device of the Input System. The gestures of XR Hands have
+        /// a ray only where the runtime has enabled the hand interaction profile, whose devices would be taken for controllers.
+        /// </summary>
+        private sealed class Aim : IDisposable
+        {
+            /// <summary>`MetaAimFlags.Valid`: the hand points away from the face.</summary>
+            private const int Valid = 2;
+
+            private readonly InputAction position;
+            private readonly InputAction rotation;
+            private readonly InputAction flags;
+
+            public Aim(string device)
+            {
+                position = Bind(device + "devicePosition");
+                rotation = Bind(device + "deviceRotation");
+                flags = Bind(device + "aimFlags");
+            }
+
+            public bool TryRead(out Pose pose)
+            {
+                pose = new Pose(position.ReadValue<Vector3>(), rotation.ReadValue<Quaternion>());
+                return (flags.ReadValue<int>() & Valid) != 0;
+            }
+
+            public void Dispose()
+            {
+                position.Dispose();
+                rotation.Dispose();
+                flags.Dispose();
+            }
+
+            private static InputAction Bind(string path)
+            {
+                InputAction action = new InputAction(binding: path);
+                action.Enable();
+                return action;
+            }
         }
     }
 }

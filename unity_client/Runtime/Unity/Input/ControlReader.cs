@@ -84,8 +84,9 @@ namespace IrisSession.Unity.Input
             for (int side = 0; side < 2; side++)
             {
                 InputReading input = reading.Inputs[side];
-                if (BareHands != null && BareHands.IsSupported && BareHands.TryRead((Side)side, wantsJoints, input)) continue;
-                hands[side].Read(input, Kind);
+                bool isBare = BareHands != null && BareHands.IsSupported && BareHands.TryRead((Side)side, wantsJoints, input);
+                if (isBare) input.Buttons |= hands[side].ReadButtons(ButtonBits.Stop); // a hand that holds a controller may be tracked as bare
+                else hands[side].Read(input, Kind);
             }
         }
 

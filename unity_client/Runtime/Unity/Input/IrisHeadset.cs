@@ -318,6 +318,7 @@ namespace IrisSession.Unity.Input
                 Debug.LogException(error);
             }
             reader?.Dispose();
+            (BareHands as IDisposable)?.Dispose();
             haptics?.Dispose();
             condition.Dispose();
         }
