@@ -23,27 +23,26 @@ namespace IrisSession.HoloLens
         }
 
         private readonly XROrigin origin;
-        private readonly Behaviour manager;
+        private readonly ARMarkerManager manager;
+        private readonly MarkerSwitch search;
         private readonly Transform trackingFrame;
         private readonly List<Known> markers = new List<Known>();
 
-        /// <param name="manager">Microsoft's ARMarkerManager, with QR codes enabled; null: there is none.</param>
+        /// <param name="manager">With QR codes enabled; null: there is none.</param>
         /// <param name="trackingFrame">The frame of the headset's poses: the origin's camera offset.</param>
-        public HoloLensMarkers(XROrigin origin, Behaviour manager, Transform trackingFrame)
+        public HoloLensMarkers(XROrigin origin, ARMarkerManager manager, Transform trackingFrame)
         {
             this.origin = origin;
             this.manager = manager;
+            search = new MarkerSwitch(manager, Judge);
             this.trackingFrame = trackingFrame;
         }
 
-        public MarkerSupport Support { get { return manager == null ? MarkerSupport.Missing : MarkerSupport.Ready; } }
+        public MarkerSupport Support { get { return search.Support; } }
 
         public string Source { get { return ObservationSource.QrSystem; } }
 
-        public void SetActive(bool isActive)
-        {
-            if (manager != null && manager.enabled != isActive) manager.enabled = isActive;
-        }
+        public void SetActive(bool isActive) { search.Set(isActive); }
 
         public int Read(List<MarkerReport> reports)
         {
@@ -56,6 +55,12 @@ namespace IrisSession.HoloLens
             }
             markers.RemoveAll(one => one.Marker == null); // destroyed
             return reports.Count;
+        }
+
+        private MarkerSupport Judge()
+        {
+            if (manager.subsystem == null) return MarkerSupport.Missing;
+            return manager.subsystem.running ? MarkerSupport.Ready : MarkerSupport.Starting;
         }
 
         private MarkerReport Fill(Known known)

@@ -4,6 +4,7 @@ using IrisSession.Interaction;
 using IrisSession.Protocol;
 using IrisSession.Unity.App;
 using IrisSession.Unity.Input;
+using Microsoft.MixedReality.OpenXR;
 using Unity.XR.CoreUtils;
 using UnityEngine;
 
@@ -14,7 +15,7 @@ namespace IrisSession.HoloLens
     public sealed class IrisHoloLens : MonoBehaviour, IHeadsetKind
     {
         [SerializeField] private XROrigin origin = null;
-        [SerializeField] private Behaviour markerManager = null;
+        [SerializeField] private ARMarkerManager markerManager = null;
 
         public string[] Devices { get { return new[] { Device.Head, Device.HandLeft, Device.HandRight, Device.Gaze }; } }
 
@@ -39,7 +40,7 @@ namespace IrisSession.HoloLens
         }
 
         /// <summary>Set what the inspector sets otherwise.</summary>
-        public void SetUp(XROrigin origin, Behaviour markerManager)
+        public void SetUp(XROrigin origin, ARMarkerManager markerManager)
         {
             this.origin = origin;
             this.markerManager = markerManager;

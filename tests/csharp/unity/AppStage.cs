@@ -17,6 +17,7 @@ using Unity.XR.CoreUtils;
 using UnityEngine;
 using UnityEngine.Android;
 using UnityEngine.XR.ARFoundation;
+using UnityEngine.XR.ARSubsystems;
 
 namespace IrisSession.Unity.StandinTests
 {
@@ -39,6 +40,7 @@ namespace IrisSession.Unity.StandinTests
             Engine.Reset();
             Controls.Clear();
             Subsystems.Running.Clear();
+            Subsystems.Loaded.Clear();
             Permission.Granted.Clear();
             Permission.Requested.Clear();
             JavaCalls.All.Clear();
@@ -55,8 +57,13 @@ namespace IrisSession.Unity.StandinTests
             materials.Points = new Material(new Shader("points"));
             Origin = new GameObject("origin").AddComponent<XROrigin>();
             Origin.Trackables = new GameObject("trackables").transform;
-            // Any component stands for the manager.
-            if (isQuest) Offset.AddComponent<IrisQuest>().SetUp(Origin, new GameObject("manager").AddComponent<XROrigin>(), null);
+            if (isQuest)
+            {
+                Subsystems.Loaded.Add(XRMarkerSubsystem.Make(XRMarkerType.QRCode));
+                ARMarkerManager manager = Origin.gameObject.AddComponent<ARMarkerManager>();
+                manager.enabled = false;
+                Offset.AddComponent<IrisQuest>().SetUp(Origin, manager, null);
+            }
             BeaconPort = FindFreePort();
             App.Configuring += settings =>
             {

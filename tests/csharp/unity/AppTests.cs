@@ -76,6 +76,7 @@ namespace IrisSession.Unity.StandinTests
         [TestCase(AdviceKind.Permission, "scene")]
         [TestCase(AdviceKind.Permission, "camera")]
         [TestCase(AdviceKind.NoMarkers, "")]
+        [TestCase(AdviceKind.NoMarkers, "scene")]
         [TestCase(AdviceKind.CacheFull, "")]
         [TestCase(AdviceKind.OverBudget, "")]
         public void InASessionThePanelSaysWhatIsMissing(AdviceKind kind, string permission)
@@ -88,8 +89,13 @@ namespace IrisSession.Unity.StandinTests
 
             bool hasScene = kind == AdviceKind.CacheFull || kind == AdviceKind.OverBudget;
             using (GatewaySession session = new GatewaySession(null, hasScene ? "lab" : null))
-            using (AppStage stage = new AppStage(kind == AdviceKind.Permission, Set))
+            using (AppStage stage = new AppStage(permission.Length > 0, Set))
             {
+                if (kind == AdviceKind.NoMarkers)
+                {
+                    Permission.Granted.Add(ScenePermission.UseScene);
+                    Subsystems.Loaded.Clear();
+                }
                 stage.App.Address = session.Address;
                 stage.WaitFor(ConnectorPhase.Running);
                 if (permission == "camera") stage.Headset.SetPermission(HeadsetPermission.Camera, false);

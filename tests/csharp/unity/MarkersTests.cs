@@ -6,13 +6,16 @@ using IrisSession.Interaction;
 using IrisSession.Interaction.Tests;
 using IrisSession.Transport;
 using IrisSession.Unity.ArFoundation;
+using IrisSession.Unity.Input;
 using NUnit.Framework;
 using Standins;
 using Unity.XR.CoreUtils;
 using UnityEngine;
+using UnityEngine.Android;
 using UnityEngine.XR.ARFoundation;
 using UnityEngine.XR.ARSubsystems;
 using MicrosoftMarker = Microsoft.MixedReality.OpenXR.ARMarker;
+using MicrosoftMarkerManager = Microsoft.MixedReality.OpenXR.ARMarkerManager;
 
 namespace IrisSession.Unity.StandinTests
 {
@@ -24,6 +27,7 @@ namespace IrisSession.Unity.StandinTests
         {
             Engine.Reset();
             Subsystems.Running.Clear();
+            Subsystems.Loaded.Clear();
         }
 
         [Test]
@@ -33,7 +37,7 @@ namespace IrisSession.Unity.StandinTests
             offset.SetPositionAndRotation(new Vector3(3f, 1f, -2f), Quaternion.AngleAxis(30f, Vector3.up));
             XROrigin origin = new GameObject("origin").AddComponent<XROrigin>();
             origin.Trackables = new GameObject("trackables").transform;
-            Behaviour manager = new GameObject("manager").AddComponent<XROrigin>(); // any component stands for the manager
+            ARMarkerManager manager = origin.gameObject.AddComponent<ARMarkerManager>();
             ArMarkers source = new ArMarkers(origin, manager, offset);
             ARMarker marker = new GameObject("marker").AddComponent<ARMarker>();
             marker.transform.SetParent(origin.Trackables, false);
@@ -66,13 +70,120 @@ namespace IrisSession.Unity.StandinTests
             Assert.AreEqual(MarkerSupport.Missing, new ArMarkers(origin, null, offset).Support);
         }
 
+        /// <summary>What a runtime has that reads no QR codes.</summary>
+        public enum Lack
+        {
+            NoSubsystem,
+            OtherCodes,
+            NoAnswer,
+            NoStart,
+        }
+
+        [TestCase(Lack.NoSubsystem)]
+        [TestCase(Lack.OtherCodes)]
+        [TestCase(Lack.NoAnswer)]
+        [TestCase(Lack.NoStart)]
+        public void ARuntimeThatReadsNoCodesIsNoticedAndTriedAgainRarely(Lack lack)
+        {
+            XRMarkerSubsystem subsystem = XRMarkerSubsystem.Make(lack == Lack.OtherCodes ? XRMarkerType.ArUco : XRMarkerType.QRCode);
+            if (lack == Lack.NoStart) subsystem.Failure = "the runtime says no";
+            if (lack == Lack.NoAnswer) subsystem.subsystemDescriptor = new XRMarkerSubsystemDescriptor();
+            if (lack != Lack.NoSubsystem) Subsystems.Loaded.Add(subsystem);
+            ARMarkerManager manager = AddManager(out ArMarkers source);
+            Seek(source, 29.0);
+            Assert.AreEqual(MarkerSupport.Missing, source.Support);
+            Assert.IsFalse(manager.enabled);
+            Assert.AreEqual(lack == Lack.NoSubsystem ? 0 : 1, subsystem.Starts);
+            Assert.AreEqual(lack == Lack.NoStart ? 1 : 0, Engine.Log.Count);
+            Seek(source, 3.0);
+            Assert.AreEqual(MarkerSupport.Missing, source.Support);
+            Assert.AreEqual(lack == Lack.NoSubsystem ? 0 : 2, subsystem.Starts);
+            subsystem.Failure = null;
+            Subsystems.Loaded.Clear();
+            Subsystems.Loaded.Add(XRMarkerSubsystem.Make(XRMarkerType.ArUco, XRMarkerType.QRCode));
+            Seek(source, 30.0);
+            Assert.AreEqual(MarkerSupport.Ready, source.Support, "it was not ready before");
+            Assert.IsTrue(manager.enabled);
+        }
+
+        [Test]
+        public void ASearchThatStartsSlowlyIsNotMissing()
+        {
+            XRMarkerSubsystem subsystem = XRMarkerSubsystem.Make(XRMarkerType.QRCode);
+            subsystem.IsSlow = true;
+            Subsystems.Loaded.Add(subsystem);
+            ARMarkerManager manager = AddManager(out ArMarkers source);
+            Assert.AreEqual(MarkerSupport.Ready, source.Support, "nothing is known against it");
+            Seek(source, 60.0);
+            Assert.AreEqual(MarkerSupport.Starting, source.Support);
+            Assert.AreEqual(1, subsystem.Starts);
+            subsystem.Start();
+            Seek(source, 0.1);
+            Assert.AreEqual(MarkerSupport.Ready, source.Support);
+            source.SetActive(false);
+            Assert.IsFalse(manager.enabled);
+            Assert.AreEqual(MarkerSupport.Ready, source.Support);
+        }
+
+        [Test]
+        public void AHoloLensWithoutTheSubsystemReadsNoCodes()
+        {
+            XROrigin origin = new GameObject("origin").AddComponent<XROrigin>();
+            HoloLensMarkers source = new HoloLensMarkers(origin, origin.gameObject.AddComponent<MicrosoftMarkerManager>(), origin.transform);
+            Seek(source, 1.0);
+            Assert.AreEqual(MarkerSupport.Missing, source.Support);
+            Subsystems.Loaded.Add(XRMarkerSubsystem.Make());
+            Seek(source, 30.0);
+            Assert.AreEqual(MarkerSupport.Ready, source.Support);
+        }
+
+        [Test]
+        public void ThePanelBeforeASessionAsksForACodeOnlyWhereOneIsRead()
+        {
+            using (AppStage stage = new AppStage(true))
+            {
+                Permission.Granted.Add(ScenePermission.UseScene);
+                XRMarkerSubsystem subsystem = (XRMarkerSubsystem)Subsystems.Loaded[0];
+                subsystem.Failure = "the runtime says no";
+                int before = subsystem.Starts;
+                bool AsksForCode() { return stage.Text.Replace('\n', ' ').Contains("Or look at the code"); }
+                stage.StepUntil(AsksForCode, "it may read codes");
+                stage.StepUntil(() => !AsksForCode(), "it has failed");
+                Assert.AreEqual(before + 1, subsystem.Starts);
+                subsystem.Failure = null;
+                Engine.Step(30.0);
+                stage.StepUntil(() => AsksForCode() && subsystem.running, "it reads codes now");
+            }
+        }
+
+        private static ARMarkerManager AddManager(out ArMarkers source)
+        {
+            XROrigin origin = new GameObject("origin").AddComponent<XROrigin>();
+            GameObject one = new GameObject("manager");
+            one.SetActive(false);
+            ARMarkerManager manager = one.AddComponent<ARMarkerManager>();
+            manager.enabled = false; // as in the scene
+            one.SetActive(true);
+            source = new ArMarkers(origin, manager, origin.transform);
+            return manager;
+        }
+
+        private static void Seek(IMarkerSource source, double seconds)
+        {
+            for (double s = 0.0; s < seconds; s += 0.1)
+            {
+                Engine.Step(0.1);
+                source.SetActive(true);
+            }
+        }
+
         [Test]
         public void CodesThatAHoloLensRemembersAreNoLooks()
         {
             Transform offset = new GameObject("offset").transform;
             XROrigin origin = new GameObject("origin").AddComponent<XROrigin>();
             origin.Trackables = new GameObject("trackables").transform;
-            HoloLensMarkers source = new HoloLensMarkers(origin, new GameObject("manager").AddComponent<XROrigin>(), offset);
+            HoloLensMarkers source = new HoloLensMarkers(origin, origin.gameObject.AddComponent<MicrosoftMarkerManager>(), offset);
             MicrosoftMarker marker = new GameObject("marker").AddComponent<MicrosoftMarker>();
             marker.transform.SetParent(origin.Trackables, false);
             // Upright on a wall 1 m ahead: local X right, Y down, Z back to the person.

@@ -1,4 +1,8 @@
 // Markers of AR Foundation, as objects below the origin's parent of trackables; and the poses of both.
+using System.Collections.Generic;
+using Standins;
+using Unity.XR.CoreUtils.Collections;
+using UnityEngine.SubsystemsImplementation;
 using UnityEngine.XR.ARSubsystems;
 
 namespace UnityEngine
@@ -50,6 +54,8 @@ namespace UnityEngine.XR.ARSubsystems
         }
 
         public bool IsSuccess() { return isGood; }
+
+        public bool IsError() { return !isGood; }
     }
 
     public struct Result<T>
@@ -122,8 +128,37 @@ namespace UnityEngine.XR.ARSubsystems
     {
     }
 
-    public class XRMarkerSubsystem
+    public enum XRMarkerType
     {
+        QRCode = 1000743000,
+        ArUco = 1000743002,
+    }
+
+    public class XRSubsystem<TSubsystem, TSubsystemDescriptor, TProvider> : SubsystemWithProvider<TSubsystem, TSubsystemDescriptor, TProvider>
+    {
+        /// <summary>Starts that were asked for.</summary>
+        internal int Starts;
+
+        /// <summary>Why it cannot start, null: it can.</summary>
+        internal string Failure;
+
+        /// <summary>Whether it runs only when a test says so.</summary>
+        internal bool IsSlow;
+    }
+
+    public abstract class TrackingSubsystem<TTrackable, TSubsystem, TSubsystemDescriptor, TProvider> : XRSubsystem<TSubsystem, TSubsystemDescriptor, TProvider>
+    {
+    }
+
+    public class XRMarkerSubsystem : TrackingSubsystem<XRMarker, XRMarkerSubsystem, XRMarkerSubsystemDescriptor, XRMarkerSubsystem.Provider>
+    {
+        /// <summary>Make one that reads codes of these types.</summary>
+        internal static XRMarkerSubsystem Make(params XRMarkerType[] types)
+        {
+            ReadOnlyListSpan<XRMarkerType> list = new ReadOnlyListSpan<XRMarkerType>(types);
+            return new XRMarkerSubsystem { subsystemDescriptor = new XRMarkerSubsystemDescriptor { supportedMarkerTypes = new Result<ReadOnlyListSpan<XRMarkerType>>(new XRResultStatus(true), list) } };
+        }
+
         public abstract class Provider
         {
         }
@@ -131,16 +166,34 @@ namespace UnityEngine.XR.ARSubsystems
 
     public class XRMarkerSubsystemDescriptor
     {
+        public Result<ReadOnlyListSpan<XRMarkerType>> supportedMarkerTypes { get; internal set; }
     }
 }
 
 namespace UnityEngine.XR.ARFoundation
 {
-    public class SubsystemLifecycleManager<TSubsystem, TSubsystemDescriptor, TProvider> : MonoBehaviour
+    public class SubsystemLifecycleManager<TSubsystem, TSubsystemDescriptor, TProvider> : MonoBehaviour where TSubsystem : class
     {
+        public TSubsystem subsystem { get; private set; }
+
+        private void OnEnable()
+        {
+            subsystem = Subsystems.Loaded.Find(one => one is TSubsystem) as TSubsystem;
+            if (!(subsystem is XRSubsystem<TSubsystem, TSubsystemDescriptor, TProvider> found)) return;
+            found.Starts++;
+            if (found.Failure != null)
+            {
+                Debug.LogError(found.Failure);
+                enabled = false;
+            }
+            else if (!found.IsSlow) found.Start();
+        }
+
+        private void OnDisable() { (subsystem as SubsystemWithProvider)?.Stop(); }
     }
 
     public abstract class ARTrackableManager<TSubsystem, TSubsystemDescriptor, TProvider, TSessionRelativeData, TTrackable> : SubsystemLifecycleManager<TSubsystem, TSubsystemDescriptor, TProvider>
+        where TSubsystem : class
     {
     }
 
@@ -154,6 +207,23 @@ namespace UnityEngine.XR.ARFoundation
 
     public class ARMarkerManager : ARTrackableManager<XRMarkerSubsystem, XRMarkerSubsystemDescriptor, XRMarkerSubsystem.Provider, XRMarker, ARMarker>
     {
+    }
+}
+
+namespace Unity.XR.CoreUtils.Collections
+{
+    public struct ReadOnlyListSpan<T>
+    {
+        private readonly IReadOnlyList<T> list;
+
+        public ReadOnlyListSpan(IReadOnlyList<T> list)
+        {
+            this.list = list;
+        }
+
+        public int Count { get { return list == null ? 0 : list.Count; } }
+
+        public T this[int index] { get { return list[index]; } }
     }
 }
 

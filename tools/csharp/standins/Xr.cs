@@ -5,9 +5,12 @@ using Standins;
 
 namespace Standins
 {
-    /// <summary>The subsystems that run now.</summary>
     public static class Subsystems
     {
+        /// <summary>Those that the loader has made: components start them.</summary>
+        public static readonly List<UnityEngine.ISubsystem> Loaded = new List<UnityEngine.ISubsystem>();
+
+        /// <summary>Those that run now.</summary>
         public static readonly List<UnityEngine.ISubsystem> Running = new List<UnityEngine.ISubsystem>();
     }
 }
@@ -64,10 +67,15 @@ namespace UnityEngine.SubsystemsImplementation
     public abstract class SubsystemWithProvider : ISubsystem
     {
         public bool running { get { return Subsystems.Running.Contains(this); } }
+
+        public void Start() { Subsystems.Running.Add(this); }
+
+        public void Stop() { Subsystems.Running.Remove(this); }
     }
 
     public abstract class SubsystemWithProvider<TSubsystem, TSubsystemDescriptor, TProvider> : SubsystemWithProvider
     {
+        public TSubsystemDescriptor subsystemDescriptor { get; internal set; }
     }
 }
 

@@ -69,6 +69,7 @@ namespace IrisSession.Interaction
         private string seenText = "";
         private string notice = "";
         private bool isStopShown;
+        private bool readsCodes;
         private bool isChanged = true;
         private bool areNew; // buttons
         private long sinceNs;
@@ -133,6 +134,8 @@ namespace IrisSession.Interaction
             Stop.Update(Session, nowNs);
             isChanged |= isStopShown != Stop.IsUnconfirmed;
             isStopShown = Stop.IsUnconfirmed;
+            isChanged |= readsCodes != ReadsCodes;
+            readsCodes = ReadsCodes;
             if (isChanged) Fill(nowNs);
             place.Update(reading);
             text.At = place.At;
@@ -208,13 +211,15 @@ namespace IrisSession.Interaction
             return view == answered && nowNs - answeredNs < AnswerNs;
         }
 
+        private bool ReadsCodes { get { return Markers != null && (Markers.Support == MarkerSupport.Ready || Markers.Support == MarkerSupport.Starting); } }
+
         /// <summary>A link that is seen becomes a button: it may be that of another session, or of another person, whose code it would use up.</summary>
         private void ReadCodes(long nowNs)
         {
             if (Markers == null) return;
-            bool isWanted = StartWords.MayScan(view) && Markers.Support == MarkerSupport.Ready;
+            bool isWanted = StartWords.MayScan(view);
             Markers.SetActive(isWanted);
-            if (!isWanted || IsAnswered(nowNs)) return;
+            if (!isWanted || !readsCodes || IsAnswered(nowNs)) return;
             int read = Markers.Read(reports);
             for (int i = 0; i < read; i++)
             {
@@ -258,7 +263,7 @@ namespace IrisSession.Interaction
             if (isStopShown) PanelWords.Wrap(lines, StopReport.Unconfirmed.ToString());
             if (notice.Length > 0) PanelWords.Wrap(lines, notice);
             bool isDeclined = view == declined;
-            foreach (string line in StartWords.Describe(view, isDeclined, Markers != null && Markers.Support == MarkerSupport.Ready)) PanelWords.Wrap(lines, line);
+            foreach (string line in StartWords.Describe(view, isDeclined, readsCodes)) PanelWords.Wrap(lines, line);
             if (view.Phase == ConnectorPhase.Untrusted && !isDeclined)
             {
                 lines.Append('\n').Append(StartWords.FormatFingerprint(view.Fingerprint));

@@ -55,7 +55,8 @@ internal sealed class Wearer
         World.Materials.Points = new UnityEngine.Material(new Shader("points"));
         origin = new GameObject("origin").AddComponent<XROrigin>();
         origin.Trackables = new GameObject("trackables").transform;
-        offset.AddComponent<IrisQuest>().SetUp(origin, new GameObject("manager").AddComponent<XROrigin>(), null); // any component stands for it
+        Subsystems.Loaded.Add(XRMarkerSubsystem.Make(XRMarkerType.QRCode));
+        offset.AddComponent<IrisQuest>().SetUp(origin, origin.gameObject.AddComponent<ARMarkerManager>(), null);
         Headset.News += news =>
         {
             if (news.Kind == NewsKind.Message && news.Message.Message is Feedback feedback) Feedbacks[feedback.Robot] = feedback;

@@ -5,6 +5,7 @@ using IrisSession.Interaction;
 using IrisSession.Protocol;
 using IrisSession.Unity.Input;
 using Unity.XR.CoreUtils;
+using Unity.XR.CoreUtils.Collections;
 using UnityEngine;
 using UnityEngine.XR.ARFoundation;
 using UnityEngine.XR.ARSubsystems;
@@ -25,31 +26,29 @@ namespace IrisSession.Unity.ArFoundation
         }
 
         private readonly XROrigin origin;
-        private readonly Behaviour manager;
+        private readonly ARMarkerManager manager;
+        private readonly MarkerSwitch search;
         private readonly Transform trackingFrame;
         private readonly List<Known> markers = new List<Known>();
 
-        /// <param name="manager">The ARMarkerManager, null: this device has none. It stays off until the permission is there.</param>
+        /// <param name="manager">Null: this device has none. It stays off until the permission is there.</param>
         /// <param name="trackingFrame">The frame of the headset's poses: the origin's camera offset.</param>
-        public ArMarkers(XROrigin origin, Behaviour manager, Transform trackingFrame)
+        public ArMarkers(XROrigin origin, ARMarkerManager manager, Transform trackingFrame)
         {
             this.origin = origin;
             this.manager = manager;
+            search = new MarkerSwitch(manager, Judge);
             this.trackingFrame = trackingFrame;
         }
 
         /// <summary>Set by what asks for the permission: `com.oculus.permission.USE_SCENE` on Quest.</summary>
         public bool IsAllowed { get; set; } = true;
 
-        public MarkerSupport Support { get { return manager == null ? MarkerSupport.Missing : IsAllowed ? MarkerSupport.Ready : MarkerSupport.NotAllowed; } }
+        public MarkerSupport Support { get { return manager == null || IsAllowed ? search.Support : MarkerSupport.NotAllowed; } }
 
         public string Source { get { return ObservationSource.QrSystem; } }
 
-        public void SetActive(bool isActive)
-        {
-            bool isOn = isActive && Support == MarkerSupport.Ready;
-            if (manager != null && manager.enabled != isOn) manager.enabled = isOn;
-        }
+        public void SetActive(bool isActive) { search.Set(isActive && IsAllowed); }
 
         public int Read(List<MarkerReport> reports)
         {
@@ -62,6 +61,17 @@ namespace IrisSession.Unity.ArFoundation
             }
             markers.RemoveAll(one => one.Marker == null); // destroyed
             return reports.Count;
+        }
+
+        private MarkerSupport Judge()
+        {
+            XRMarkerSubsystem subsystem = manager.subsystem;
+            if (subsystem == null) return MarkerSupport.Missing; // no provider, or its feature is not in the build
+            if (!subsystem.running) return MarkerSupport.Starting;
+            Result<ReadOnlyListSpan<XRMarkerType>> types = subsystem.subsystemDescriptor.supportedMarkerTypes;
+            if (types.status.IsError()) return MarkerSupport.Missing;
+            for (int i = 0; i < types.value.Count; i++) if (types.value[i] == XRMarkerType.QRCode) return MarkerSupport.Ready;
+            return MarkerSupport.Missing;
         }
 
         private MarkerReport Fill(Known known)

@@ -5,6 +5,7 @@ using IrisSession.Unity.App;
 using IrisSession.Unity.Input;
 using Unity.XR.CoreUtils;
 using UnityEngine;
+using UnityEngine.XR.ARFoundation;
 
 namespace IrisSession.Unity.ArFoundation
 {
@@ -15,7 +16,7 @@ namespace IrisSession.Unity.ArFoundation
         private const double PollS = 1.0;
 
         [SerializeField] private XROrigin origin = null;
-        [SerializeField] private Behaviour markerManager = null;
+        [SerializeField] private ARMarkerManager markerManager = null;
         [SerializeField] private Behaviour cameraManager = null;
         private IrisHeadset headset;
         private ArMarkers markers;
@@ -47,7 +48,7 @@ namespace IrisSession.Unity.ArFoundation
         }
 
         /// <summary>Set what the inspector sets otherwise.</summary>
-        public void SetUp(XROrigin origin, Behaviour markerManager, Behaviour cameraManager)
+        public void SetUp(XROrigin origin, ARMarkerManager markerManager, Behaviour cameraManager)
         {
             this.origin = origin;
             this.markerManager = markerManager;
