@@ -46,7 +46,7 @@ namespace IrisSession.Unity.StandinTests
             Project.Packages["com.iris-session.unity"] = "0.1.0";
             string list = File.ReadAllText(Path.Combine(package, "Documentation~/quest-3.manifest.json"));
             foreach (Match one in Regex.Matches(list, "\"(com\\.[a-z0-9.-]+)\": \"([0-9.]+)\"")) Project.Packages[one.Groups[1].Value] = one.Groups[2].Value;
-            Project.Packages.Remove("com.unity.modules.imageconversion"); // what is part of the editor is not found as a package
+            foreach (string module in new[] { "androidjni", "imageconversion" }) Project.Packages.Remove("com.unity.modules." + module); // what is part of the editor is not found as a package
             foreach (string name in new[] { "IrisSurface", "IrisPoints", "IrisRay" })
                 Project.Assets["Packages/com.iris-session.unity/Runtime/Unity/Materials/" + name + ".mat"] = new Material(new Shader(name));
             FeatureHelpers.Ids[BuildTargetGroup.Android] = new[]
@@ -101,6 +101,31 @@ namespace IrisSession.Unity.StandinTests
         }
 
         [Test]
+        public void PackagesThatCannotBeInstalledAreSaid()
+        {
+            Project.Packages.Remove("com.unity.xr.hands");
+            QuestSetup.SetUp();
+            QuestSetup.SetUp(); // an impatient person
+            EditorApplication.update();
+            Assert.IsFalse(Engine.Log.Any(line => line.StartsWith("error")), "it may take minutes");
+            Project.Request.Error = new UnityEditor.PackageManager.Error("Cannot find com.unity.xr.hands@1.7.3");
+            Project.Request.IsCompleted = true;
+            EditorApplication.update();
+            Assert.IsNull(EditorApplication.update, "it is said once");
+            StringAssert.Contains("Cannot find com.unity.xr.hands@1.7.3", Engine.Log.Single(line => line.StartsWith("error")));
+        }
+
+        [Test]
+        public void AnIdThatIsTheTemplatesIsLeftToAPerson()
+        {
+            PlayerSettings.Identifier = "com.UnityTechnologies.com.unity.template.urpblank";
+            QuestSetup.SetUp();
+            Assert.AreEqual(1, CountWarnings());
+            Assert.IsTrue(Engine.Log.Any(line => line.Contains("Override Default Package Name") && line.Contains(PlayerSettings.Identifier)));
+            Assert.AreEqual(BuildTarget.Android, EditorUserBuildSettings.activeBuildTarget, "the other steps are done");
+        }
+
+        [Test]
         public void StepsThatCannotBeDoneAreSaid()
         {
             BuildPipeline.Modules.Remove(BuildTarget.Android);
@@ -137,9 +162,11 @@ namespace IrisSession.Unity.StandinTests
                 "android.permission.ACCESS_WIFI_STATE", "android.permission.CHANGE_WIFI_MULTICAST_STATE", "android.permission.INTERNET",
                 "com.oculus.permission.HAND_TRACKING", "com.oculus.permission.USE_SCENE",
             };
-            Assert.AreEqual(permissions, Read(manifest, "/manifest/uses-permission", "name"));
-            Assert.AreEqual(new[] { "com.oculus.feature.PASSTHROUGH", "oculus.software.handtracking", "oculus.software.overlay_keyboard" }, Read(manifest, "/manifest/uses-feature", "name"));
-            Assert.AreEqual(new[] { "false", "false", "false" }, Read(manifest, "/manifest/uses-feature", "required"));
+            Assert.AreEqual(permissions, Read(manifest, "/manifest/uses-permission[count(@*) = 1]", "name"));
+            string[] refused = { "android.permission.CAMERA", "com.oculus.permission.USE_PASSTHROUGH_CAMERA", "horizonos.permission.HEADSET_CAMERA" };
+            Assert.AreEqual(refused, Read(manifest, "/manifest/uses-permission[@*[name() = 'tools:node'] = 'remove']", "name"));
+            Assert.AreEqual(new[] { "oculus.software.handtracking", "oculus.software.overlay_keyboard" }, Read(manifest, "/manifest/uses-feature", "name"));
+            Assert.AreEqual(new[] { "false", "false" }, Read(manifest, "/manifest/uses-feature", "required"));
             const string Activity = "/manifest/application/activity";
             Assert.AreEqual(new[] { AndroidManifest.Activity }, Read(manifest, Activity, "name"));
             Assert.AreEqual(new[] { "android.app.lib_name", "com.oculus.vr.focusaware", "unityplayer.UnityActivity" }, Read(manifest, Activity + "/meta-data", "name"));
@@ -157,7 +184,7 @@ namespace IrisSession.Unity.StandinTests
         {
             string path = Path.Combine(folder, AndroidManifest.File);
             Directory.CreateDirectory(Path.GetDirectoryName(path));
-            const string Own = "<manifest xmlns:android=\"http://schemas.android.com/apk/res/android\">\r\n  <!-- ours -->\r\n  <uses-permission android:name=\"android.permission.INTERNET\" />\r\n  <application>\r\n    <activity android:name=\"com.unity3d.player.UnityPlayerGameActivity\" />\r\n"
+            const string Own = "<manifest xmlns:android=\"http://schemas.android.com/apk/res/android\">\r\n  <!-- ours -->\r\n  <uses-permission android:name=\"android.permission.INTERNET\" />\r\n  <uses-permission android:name=\"android.permission.CAMERA\" />\r\n  <application>\r\n    <activity android:name=\"com.unity3d.player.UnityPlayerGameActivity\" />\r\n"
                 + "    <meta-data android:name=\"com.oculus.supportedDevices\" android:value=\"quest3\" />\r\n  </application>\r\n</manifest>";
             File.WriteAllText(path, Own);
             QuestSetup.SetUp();
@@ -165,6 +192,7 @@ namespace IrisSession.Unity.StandinTests
             StringAssert.Contains("<!-- ours -->", text);
             Assert.AreEqual(1, Regex.Matches(text, "android.permission.INTERNET").Count);
             StringAssert.Contains("com.oculus.permission.USE_SCENE", text);
+            Assert.AreEqual(2, Regex.Matches(text, "tools:node=\"remove\"").Count, "the project has pictures of its own to take");
             Assert.AreEqual(1, CountWarnings(), "two values of supported devices end a build");
 
             File.WriteAllText(path, "<manifest");

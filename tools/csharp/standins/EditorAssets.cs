@@ -16,6 +16,9 @@ namespace Standins
         /// <summary>Identifiers that were asked of the package manager.</summary>
         public static readonly List<string> Requests = new List<string>();
 
+        /// <summary>The newest of the requests: tests complete it.</summary>
+        internal static UnityEditor.PackageManager.Requests.AddAndRemoveRequest Request;
+
         /// <summary>Names of objects and components that can be undone.</summary>
         public static readonly List<string> Undos = new List<string>();
         public static readonly HashSet<string> Folders = new HashSet<string>();
@@ -42,6 +45,7 @@ namespace Standins
             UnityEditor.EditorBuildSettings.Objects.Clear();
             UnityEditor.SceneManagement.EditorSceneManager.OpenPath = "";
             UnityEditor.PlayerSettings.Reset();
+            UnityEditor.EditorApplication.update = null;
             UnityEngine.XR.OpenXR.OpenXRSettings.All.Clear();
             UnityEngine.Rendering.GraphicsSettings.Pipeline = new UniversalPipeline();
         }
@@ -89,6 +93,13 @@ namespace UnityEditor
         public static T LoadAssetAtPath<T>(string assetPath) where T : UnityEngine.Object { return LoadMainAssetAtPath(assetPath) as T; }
 
         public static void SaveAssets() { }
+    }
+
+    public sealed class EditorApplication
+    {
+        public delegate void CallbackFunction();
+
+        public static CallbackFunction update;
     }
 
     public class EditorUtility
@@ -228,19 +239,54 @@ namespace UnityEditor.PackageManager
         }
     }
 
+    public class PackageCollection
+    {
+        internal PackageCollection()
+        {
+        }
+    }
+
+    public class Error
+    {
+        internal Error(string message)
+        {
+            this.message = message;
+        }
+
+        public string message { get; }
+    }
+
     public static class Client
     {
         public static Requests.AddAndRemoveRequest AddAndRemove(string[] packagesToAdd = null, string[] packagesToRemove = null)
         {
             Standins.Project.Requests.AddRange(packagesToAdd);
-            return null;
+            return Standins.Project.Request = new Requests.AddAndRemoveRequest();
         }
     }
 }
 
 namespace UnityEditor.PackageManager.Requests
 {
-    public sealed class AddAndRemoveRequest
+    public abstract class Request
+    {
+        internal Request()
+        {
+        }
+
+        public bool IsCompleted { get; internal set; }
+
+        public Error Error { get; internal set; }
+    }
+
+    public abstract class Request<T> : Request
+    {
+        internal Request()
+        {
+        }
+    }
+
+    public sealed class AddAndRemoveRequest : Request<PackageCollection>
     {
         internal AddAndRemoveRequest()
         {

@@ -113,7 +113,9 @@ namespace UnityEditor
 
         public static void SetGraphicsAPIs(BuildTarget platform, GraphicsDeviceType[] apis) { Graphics[platform] = apis; }
 
-        public static string GetApplicationIdentifier(Build.NamedBuildTarget buildTarget) { return "com.DefaultCompany.Lab"; }
+        public static string GetApplicationIdentifier(Build.NamedBuildTarget buildTarget) { return Identifier; }
+
+        internal static string Identifier;
 
         internal static void Reset()
         {
@@ -122,6 +124,7 @@ namespace UnityEditor
             Graphics.Clear();
             OwnGraphics.Clear();
             colorSpace = ColorSpace.Gamma;
+            Identifier = "com.DefaultCompany.Lab";
             runInBackground = Android.forceInternetPermission = false;
             defaultInterfaceOrientation = UIOrientation.AutoRotation;
             Android.targetArchitectures = AndroidArchitecture.ARMv7 | AndroidArchitecture.ARM64;

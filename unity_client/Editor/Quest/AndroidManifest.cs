@@ -16,6 +16,7 @@ namespace IrisSession.Editor.Quest
         public const string Activity = "com.unity3d.player.UnityPlayerGameActivity";
         public const string SupportedDevices = "com.oculus.supportedDevices";
         private const string Android = "http://schemas.android.com/apk/res/android";
+        private const string Tools = "http://schemas.android.com/tools";
         private const string Indent = "    ";
 
         private static readonly string[] Permissions =
@@ -26,8 +27,14 @@ namespace IrisSession.Editor.Quest
             "com.oculus.permission.HAND_TRACKING",
         };
 
+        /// <summary>
+        /// Permissions to take pictures, which the app does not: "OpenXR: Meta" 2.4.0 asks for them wherever the room is shown, in a library whose
+        /// manifest is merged below this one, and Android would ask the wearer at the first start.
+        /// </summary>
+        private static readonly string[] Unwanted = { "android.permission.CAMERA", "horizonos.permission.HEADSET_CAMERA", "com.oculus.permission.USE_PASSTHROUGH_CAMERA" };
+
         /// <summary>Features that the app can do without.</summary>
-        private static readonly string[] Features = { "oculus.software.handtracking", "com.oculus.feature.PASSTHROUGH", "oculus.software.overlay_keyboard" };
+        private static readonly string[] Features = { "oculus.software.handtracking", "oculus.software.overlay_keyboard" };
 
         /// <summary>A manifest of Unity 6 with the entry point GameActivity, as its manual has it.</summary>
         private const string Start = @"<?xml version=""1.0"" encoding=""utf-8""?>
@@ -60,6 +67,7 @@ namespace IrisSession.Editor.Quest
             }
             XmlElement manifest = document.DocumentElement;
             foreach (string name in Permissions) Add(manifest, "uses-permission", name, null, null, report);
+            foreach (string name in Unwanted) Remove(manifest, name, report);
             foreach (string name in Features) Add(manifest, "uses-feature", name, "required", "false", report);
             XmlElement application = Find(manifest, "application", null);
             XmlElement activity = application == null ? null : Find(application, "activity", Activity);
@@ -83,6 +91,19 @@ namespace IrisSession.Editor.Quest
             if (key != null) SetAttribute(added, key, value);
             Append(parent, added);
             report.Change(File + ": " + name);
+        }
+
+        /// <summary>Keep a permission of plug-ins out of the app, unless the project asks for it itself.</summary>
+        private static void Remove(XmlElement manifest, string permission, SetupReport report)
+        {
+            if (Find(manifest, "uses-permission", permission) != null) return;
+            XmlElement added = manifest.OwnerDocument.CreateElement("uses-permission");
+            SetAttribute(added, "name", permission);
+            XmlAttribute node = manifest.OwnerDocument.CreateAttribute("tools", "node", Tools);
+            node.Value = "remove";
+            added.Attributes.Append(node);
+            Append(manifest, added);
+            report.Change(File + ": without " + permission);
         }
 
         private static XmlElement Find(XmlElement parent, string kind, string name)

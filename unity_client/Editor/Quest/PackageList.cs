@@ -2,7 +2,11 @@
 using System.Collections.Generic;
 using System.IO;
 using System.Text.RegularExpressions;
+using UnityEditor;
 using UnityEditor.PackageManager;
+using UnityEditor.PackageManager.Requests;
+using UnityEngine;
+using PackageInfo = UnityEditor.PackageManager.PackageInfo;
 
 namespace IrisSession.Editor.Quest
 {
@@ -11,6 +15,7 @@ namespace IrisSession.Editor.Quest
     {
         private const string Home = "Packages/com.iris-session.unity/package.json";
         private const string Module = "com.unity.modules.";
+        private static AddAndRemoveRequest request;
 
         /// <summary>Ask Unity for packages of the list that are missing or older. False: it has to install first.</summary>
         public static bool Install(string list, SetupReport report)
@@ -24,10 +29,20 @@ namespace IrisSession.Editor.Quest
                 if (there == null || IsOlder(there.version, one.Groups[2].Value)) missing.Add(one.Groups[1].Value + "@" + one.Groups[2].Value);
             }
             if (missing.Count == 0) return true;
-            Client.AddAndRemove(missing.ToArray());
+            request = Client.AddAndRemove(missing.ToArray());
+            EditorApplication.update -= Watch;
+            EditorApplication.update += Watch;
             report.Change("packages are being added: " + string.Join(", ", missing));
             report.Leave("wait until Unity has installed them (answer Yes where it asks about the Input System), then choose the command again");
             return false;
+        }
+
+        /// <summary>Say why the packages were not installed. Once they are, Unity loads all code anew, and this ends.</summary>
+        private static void Watch()
+        {
+            if (!request.IsCompleted) return;
+            EditorApplication.update -= Watch;
+            if (request.Error != null) Debug.LogError("Iris Session: no package was installed: " + request.Error.message);
         }
 
         /// <summary>Compare versions like 1.17.1 or 2.5.0-pre.1, which counts as 2.5.0.</summary>

@@ -38,6 +38,7 @@ namespace IrisSession.Editor.Quest
             if (!PackageList.Install("quest-3.manifest.json", report)) return;
             PlayerSetup.Apply(NamedBuildTarget.Android, BuildTarget.Android, GraphicsDeviceType.Vulkan, report);
             SetAndroid(report);
+            CheckId(report);
             WriteManifest(report);
             XrSetup.EnableLoader(BuildTargetGroup.Android, report);
             FeatureHelpers.RefreshFeatures(BuildTargetGroup.Android);
@@ -59,6 +60,14 @@ namespace IrisSession.Editor.Quest
             report.Set("application entry point", PlayerSettings.Android.applicationEntry, AndroidApplicationEntry.GameActivity, value => PlayerSettings.Android.applicationEntry = value);
             report.Set("orientation", PlayerSettings.defaultInterfaceOrientation, UIOrientation.LandscapeLeft, value => PlayerSettings.defaultInterfaceOrientation = value);
             report.Set("texture compression", EditorUserBuildSettings.androidBuildSubtarget, MobileTextureSubtarget.ASTC, value => EditorUserBuildSettings.androidBuildSubtarget = value);
+        }
+
+        /// <summary>Two apps of the template would be one to a headset. An id is for good, so a person chooses it.</summary>
+        private static void CheckId(SetupReport report)
+        {
+            string id = PlayerSettings.GetApplicationIdentifier(NamedBuildTarget.Android);
+            if (!id.Contains(".unity.template.")) return;
+            report.Leave("Edit > Project Settings > Player, Android tab > Other Settings > Identification: tick Override Default Package Name and set an id of your own, such as org.yourlab.iris; " + id + " is that of Unity's template");
         }
 
         private static void WriteManifest(SetupReport report)
