@@ -107,6 +107,7 @@ namespace IrisSession.Unity.StandinTests
             Assert.Greater(Vector3.Dot(away, expected - head) / (expected - head).magnitude, 0.999f, "it is read from the eyes");
             StringAssert.Contains("press the trigger to take it", robot.text);
             Assert.IsFalse(robot.richText, "a name is no markup");
+            Assert.AreSame(robot.font.material, robot.GetComponent<MeshRenderer>().sharedMaterial, "letters are drawn");
             Assert.IsNull(FindText(frame, "STOP"));
             wearer.Session.Give("left", "p1");
             wearer.PointUp(Side.Left);

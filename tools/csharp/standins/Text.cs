@@ -31,8 +31,23 @@ namespace UnityEngine
         Right = 2,
     }
 
+    public sealed class Font : Object
+    {
+        internal static readonly Font Builtin = new Font();
+
+        public Material material { get; set; } = new Material(new Shader("GUI/Text Shader"));
+    }
+
+    public sealed class Resources
+    {
+        public static T GetBuiltinResource<T>(string path) where T : Object { return path == "LegacyRuntime.ttf" ? Font.Builtin as T : null; }
+    }
+
+    [RequireComponent(typeof(MeshRenderer))]
     public sealed class TextMesh : Component
     {
+        public Font font { get; set; }
+
         public string text { get; set; } = "";
 
         public bool richText { get; set; } = true;

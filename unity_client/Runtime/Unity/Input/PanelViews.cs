@@ -82,6 +82,8 @@ namespace IrisSession.Unity.Input
             GameObject one = new GameObject("iris-session panel " + panel.Style);
             one.transform.SetParent(parent, false);
             TextMesh text = one.AddComponent<TextMesh>();
+            text.font = Resources.GetBuiltinResource<Font>("LegacyRuntime.ttf"); // in every player; a text made by code may have none
+            one.GetComponent<Renderer>().sharedMaterial = text.font.material;
             text.richText = false; // names of others are in it
             text.fontSize = FontSize;
             text.anchor = TextAnchor.LowerCenter;

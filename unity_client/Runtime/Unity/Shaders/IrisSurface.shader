@@ -84,7 +84,7 @@ Shader "IrisSession/Surface"
             {
                 UNITY_SETUP_STEREO_EYE_INDEX_POST_VERTEX(input);
                 float4 base = _BaseColor * input.color;
-                float3 normal = normalize(input.normalWS) * (isFront ? 1.0 : -1.0);
+                float3 normal = SafeNormalize(input.normalWS) * (isFront ? 1.0 : -1.0);
                 float3 toEye = normalize(GetCameraPositionWS() - input.positionWS);
                 float3 forward = -UNITY_MATRIX_V[2].xyz;
                 float4 seen = float4(IrisLight(input.positionWS, normal, toEye, forward, base.rgb, _Highlight, _Emission), base.a);
