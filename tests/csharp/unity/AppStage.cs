@@ -125,8 +125,7 @@ namespace IrisSession.Unity.StandinTests
                 {
                     Panel found = Find(button);
                     if (found != null) SetPose("<XRController>{RightHand}/", "devicePosition", "deviceRotation", EnginePoses.ToEngine(found.At) - Vector3.forward, Quaternion.identity);
-                    if (found != null) Controls.Set("<XRController>{RightHand}/pointerPosition", EnginePoses.ToEngine(found.At) - Vector3.forward);
-                    Controls.Set("<XRController>{RightHand}/pointerRotation", Quaternion.identity); // ahead, as the eyes
+                    if (found != null) SetPose("<XRController>{RightHand}/pointer/", "position", "rotation", EnginePoses.ToEngine(found.At) - Vector3.forward, Quaternion.identity); // ahead, as the eyes
                     isDown = found != null && !isDown;
                     Controls.Set("<XRController>{RightHand}/trigger", isDown ? 1f : 0f);
                     return condition();

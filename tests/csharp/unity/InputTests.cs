@@ -38,8 +38,7 @@ namespace IrisSession.Unity.StandinTests
         {
             SetPose("<XRHMD>/", "centerEyePosition", "centerEyeRotation", new Vector3(0.1f, 1.6f, 0.2f), Quaternion.AngleAxis(90f, Vector3.up));
             SetPose("<XRController>{RightHand}/", "devicePosition", "deviceRotation", new Vector3(0.3f, 1.2f, 0.5f), Quaternion.AngleAxis(40f, Vector3.right));
-            Controls.Set("<XRController>{RightHand}/pointerPosition", new Vector3(0.3f, 1.25f, 0.55f));
-            Controls.Set("<XRController>{RightHand}/pointerRotation", Quaternion.AngleAxis(90f, Vector3.up)); // points to the right
+            SetPose("<XRController>{RightHand}/pointer/", "position", "rotation", new Vector3(0.3f, 1.25f, 0.55f), Quaternion.AngleAxis(90f, Vector3.up)); // points to the right
             Controls.Set("<XRController>{RightHand}/trigger", 0.75f);
             Controls.Set("<XRController>{RightHand}/grip", 0.25f);
             Controls.Set("<XRController>{RightHand}/thumbstickClicked", 1f);
@@ -62,9 +61,19 @@ namespace IrisSession.Unity.StandinTests
                 Assert.IsFalse(reading[Side.Left].IsPresent);
                 Assert.IsFalse(reading.HasGaze);
 
-                Controls.Set("<XRController>{RightHand}/isTracked", 0f); // valid, not tracked: an estimate
+                foreach (string pose in new[] { "pointer/", "" }) // its rotation is that of the pointer
+                {
+                    Controls.Set("<XRController>{RightHand}/" + pose + "isTracked", 0f); // valid, not tracked: an estimate
+                    reader.Read(reading);
+                    Assert.AreEqual(PoseValidity.Emulated, right.Validity);
+                    Controls.Set("<XRController>{RightHand}/" + pose + "isTracked", 1f);
+                }
+                Controls.Set("<XRController>{RightHand}/pointer/trackingState", 0);
+                Controls.Set("<XRController>{RightHand}/pointer/rotation", default(Quaternion));
                 reader.Read(reading);
-                Assert.AreEqual(PoseValidity.Emulated, right.Validity);
+                Assert.AreEqual(PoseValidity.NotSeen, right.Validity);
+                AssertNear(new Double3(0, -1, 0), right.Pose.Rotation.Rotate(new Double3(1, 0, 0))); // as it was
+                Controls.Set("<XRController>{RightHand}/pointer/trackingState", 3);
                 Controls.Set("<XRController>{RightHand}/trackingState", 0);
                 Controls.Set("<XRController>{RightHand}/devicePosition", Vector3.zero);
                 reader.Read(reading);
@@ -263,8 +272,8 @@ namespace IrisSession.Unity.StandinTests
         {
             foreach (string hand in new[] { "{LeftHand}", "{RightHand}" })
             {
-                SetPose("<XRController>" + hand + "/", "devicePosition", "deviceRotation", new Vector3(0.1f, 1.3f, 0.3f), Quaternion.identity);
-                Controls.Set("<XRController>" + hand + "/pointerRotation", Quaternion.identity);
+                SetPose("<XRController>" + hand + "/", "devicePosition", "deviceRotation", new Vector3(0.1f, 1.3f, 0.3f), Quaternion.AngleAxis(90f, Vector3.up));
+                SetPose("<XRController>" + hand + "/pointer/", "position", "rotation", new Vector3(0.1f, 1.3f, 0.4f), Quaternion.identity);
             }
             SetPose("<XRHMD>/", "centerEyePosition", "centerEyeRotation", new Vector3(0f, 1.6f, 0f), Quaternion.identity);
             GameObject offset = new GameObject("offset");
@@ -284,7 +293,10 @@ namespace IrisSession.Unity.StandinTests
                 for (int i = 0; i < 20; i++) Engine.Step();
                 Assert.IsEmpty(Engine.Errors);
                 Assert.IsNotNull(FindText(offset.transform, "STOP all robots"));
-                Assert.AreEqual(InputKind.Hand, headset.Input.Reading[Side.Left].Kind);
+                InputReading left = headset.Input.Reading[Side.Left];
+                Assert.AreEqual(InputKind.Hand, left.Kind);
+                AssertNear(new Double3(0, -1, 0), left.Pose.Rotation.Rotate(new Double3(1, 0, 0))); // the hand's, not that of its ray
+                AssertNear(new Double3(1, 0, 0), left.Ray.Direction);
                 int most = hololens.Draws.Scene.Objects + headset.Panels.All.Count + headset.Panels.Rays.Length + hololens.Draws.Avatars + hololens.Draws.Clouds;
                 Assert.LessOrEqual(most, hololens.Draws.Calls, "were all panels shown, and both rays");
             }

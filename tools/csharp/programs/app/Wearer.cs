@@ -155,7 +155,7 @@ internal sealed class Wearer
         Place("<XRHMD>/centerEye", "<XRHMD>/", "Position", "Rotation", eyes);
         RigidTransform grip = ToTracking(new RigidTransform(hand, HeadsetPanels.Face(aim, hand)));
         Place("<XRController>{RightHand}/device", "<XRController>{RightHand}/", "Position", "Rotation", grip);
-        Place("<XRController>{RightHand}/pointer", "<XRController>{RightHand}/", "Position", "Rotation", grip);
+        Place("<XRController>{RightHand}/pointer/", "<XRController>{RightHand}/pointer/", "position", "rotation", grip);
         if (Client != null) foreach (AnchorInfo anchor in Client.View.Anchors.Values) Show(anchor);
         Engine.Step(0.001 * FrameMs);
         Thread.Sleep(FrameMs);

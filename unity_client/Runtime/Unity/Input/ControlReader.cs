@@ -151,8 +151,7 @@ namespace IrisSession.Unity.Input
         private sealed class HandActions
         {
             private readonly PoseActions grip;
-            private readonly InputAction aimPosition;
-            private readonly InputAction aimRotation;
+            private readonly PoseActions aim;
             private readonly InputAction trigger;
             private readonly InputAction squeeze;
             private readonly KeyValuePair<long, InputAction>[] buttons;
@@ -160,8 +159,7 @@ namespace IrisSession.Unity.Input
             public HandActions(ControlReader reader, string device, ControlNames names)
             {
                 grip = new PoseActions(reader, device, "devicePosition", "deviceRotation");
-                aimPosition = reader.Add(device + "pointerPosition");
-                aimRotation = reader.Add(device + "pointerRotation");
+                aim = new PoseActions(reader, device + "pointer/", "position", "rotation");
                 trigger = reader.Add(device + names.Trigger);
                 squeeze = reader.Add(device + names.Grip);
                 buttons = new[]
@@ -183,21 +181,27 @@ namespace IrisSession.Unity.Input
                 return bits;
             }
 
-            /// <summary>Where it is held, looking to where it points: one rigid frame of the controller, whose x axis others see as a ray.</summary>
+            /// <summary>
+            /// A controller is where it is held, looking to where it points: one rigid frame, as well known as the worse of both. A hand is its
+            /// grip: the runtime steadies its ray, which turns when the hand moves, and not when it turns.
+            /// </summary>
             public void Read(InputReading input, InputKind kind)
             {
-                PoseValidity validity = grip.Judge();
+                PoseValidity held = grip.Judge();
+                PoseValidity aimed = aim.Judge();
+                bool isHand = kind == InputKind.Hand;
                 if (input.Kind != kind) input.HasPose = false; // that of another device
                 input.Clear();
                 input.Kind = kind;
-                input.Validity = validity;
+                input.Validity = isHand || held < aimed ? held : aimed;
                 input.Buttons = ReadButtons();
-                if (validity == PoseValidity.NotSeen) return;
-                RigidTransform aim = EnginePoses.ToWire(aimPosition.ReadValue<Vector3>(), aimRotation.ReadValue<Quaternion>());
-                input.Pose = new RigidTransform(EnginePoses.ToWire(grip.ReadPosition(), grip.ReadRotation()).Position, aim.Rotation);
+                if (input.Validity == PoseValidity.NotSeen) return;
+                RigidTransform ray = aim.Read();
+                input.Pose = grip.Read();
+                if (!isHand) input.Pose = new RigidTransform(input.Pose.Position, ray.Rotation);
                 input.IsPresent = input.HasPose = true;
-                input.Ray = AimRay.Along(aim);
-                input.HasRay = true;
+                input.Ray = AimRay.Along(ray);
+                input.HasRay = aimed != PoseValidity.NotSeen;
                 input.Trigger = trigger.ReadValue<float>();
                 input.Squeeze = squeeze.ReadValue<float>();
             }
