@@ -230,6 +230,12 @@ namespace IrisSession.Unity.StandinTests
                     samples[i] = session.Count<Sample>();
                 }
                 Assert.AreEqual(samples[0], samples[1]);
+                Controls.Set("<XRHMD>/centerEyePosition", new Vector3(0f, 1.6f, 0f));
+                int before = session.Count<EStop>();
+                stage.Press("STOP all robots", () => session.Count<EStop>() > before, "a hand without a stick");
+                Controls.Set("<XRHMD>/centerEyePosition", 1f);
+                Engine.Step();
+                Assert.AreEqual(0, stage.App.Panel.Rays[(int)Side.Right].LengthM, "a hand that cannot be read points at nothing");
                 Assert.IsNotNull(stage.App.Client);
             }
         }

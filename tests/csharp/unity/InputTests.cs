@@ -293,6 +293,7 @@ namespace IrisSession.Unity.StandinTests
                 for (int i = 0; i < 20; i++) Engine.Step();
                 Assert.IsEmpty(Engine.Errors);
                 Assert.IsNotNull(FindText(offset.transform, "STOP all robots"));
+                Assert.AreEqual("", headset.Panels.Stop.Text, "no finger is read that could touch it");
                 InputReading left = headset.Input.Reading[Side.Left];
                 Assert.AreEqual(InputKind.Hand, left.Kind);
                 AssertNear(new Double3(0, -1, 0), left.Pose.Rotation.Rotate(new Double3(1, 0, 0))); // the hand's, not that of its ray

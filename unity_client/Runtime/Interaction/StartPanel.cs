@@ -24,6 +24,9 @@ namespace IrisSession.Interaction
         Retry,
         TypeAddress,
         TypeCode,
+
+        /// <summary>Stop all robots of <see cref="StartPanel.Session"/>: the panel does it.</summary>
+        Stop,
     }
 
     /// <summary>Decides what the panel says and which of its buttons is pressed. For the engine's thread; frames without news allocate nothing.</summary>
@@ -31,7 +34,7 @@ namespace IrisSession.Interaction
     {
         /// <summary>Sessions that are listed; of more the address has to be typed.</summary>
         public const int MaxSessions = 6;
-        private const int MaxButtons = MaxSessions + 2; // an invitation, an address
+        private const int MaxButtons = MaxSessions + 3; // the e-stop, an invitation, an address
         private const double Press = 0.6;
         private const double LetGo = 0.4;
 
@@ -67,6 +70,7 @@ namespace IrisSession.Interaction
         private long answeredNs;
         private PairingLink invitation; // of `seenText`, and not answered; null: none
         private string seenText = "";
+        private ISessionPort session;
         private string notice = "";
         private bool isStopShown;
         private bool readsCodes;
@@ -90,8 +94,16 @@ namespace IrisSession.Interaction
         /// <summary>Codes, in which the link of `iris-session pair` is looked for; null: none.</summary>
         public IMarkerSource Markers { get; set; }
 
-        /// <summary>A session whose input has failed, which an e-stop of this headset reaches; null: none.</summary>
-        public ISessionPort Session { get; set; }
+        /// <summary>A session whose input has failed, which an e-stop of this headset reaches: the first button; null: none.</summary>
+        public ISessionPort Session
+        {
+            get { return session; }
+            set
+            {
+                isChanged |= session != value;
+                session = value;
+            }
+        }
 
         /// <summary>Whether the newest e-stop of this headset has stopped robots: the same before, in and after a session.</summary>
         public StopReport Stop { get; } = new StopReport();
@@ -131,7 +143,7 @@ namespace IrisSession.Interaction
         {
             long nowNs = reading.CaptureNs;
             if (stops.TakeStops(reading)) Stop.Press(nowNs);
-            Stop.Update(Session, nowNs);
+            Stop.Update(session, nowNs);
             isChanged |= isStopShown != Stop.IsUnconfirmed;
             isStopShown = Stop.IsUnconfirmed;
             isChanged |= readsCodes != ReadsCodes;
@@ -189,6 +201,12 @@ namespace IrisSession.Interaction
 
         private void Do(int button, long nowNs)
         {
+            if (actions[button] == StartAction.Stop)
+            {
+                Stop.Press(nowNs);
+                session.EStop(StopInput.ByPanel);
+                return;
+            }
             if (IsAnswered(nowNs)) return;
             action = actions[button];
             answered = view;
@@ -262,6 +280,7 @@ namespace IrisSession.Interaction
             StringBuilder lines = new StringBuilder();
             if (isStopShown) PanelWords.Wrap(lines, StopReport.Unconfirmed.ToString());
             if (notice.Length > 0) PanelWords.Wrap(lines, notice);
+            if (session != null) Add("STOP all robots", StartAction.Stop);
             bool isDeclined = view == declined;
             foreach (string line in StartWords.Describe(view, isDeclined, readsCodes)) PanelWords.Wrap(lines, line);
             if (view.Phase == ConnectorPhase.Untrusted && !isDeclined)

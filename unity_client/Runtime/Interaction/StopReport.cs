@@ -51,5 +51,6 @@ namespace IrisSession.Interaction
 
         internal const string ByButton = "button of a controller";
         internal const string ByWrist = "fingertip at the wrist";
+        internal const string ByPanel = "panel of a headset whose input has failed";
     }
 }

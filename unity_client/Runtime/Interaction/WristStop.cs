@@ -62,7 +62,7 @@ namespace IrisSession.Interaction
 
         private void MoveBall(InputReading left, long nowNs)
         {
-            if (left.IsTracked && left.Kind == InputKind.Hand)
+            if (left.IsTracked && left.HasTip) // its fingers are read: on HoloLens none are, and nothing could touch the ball
             {
                 Center = left.Pose.TransformPoint(Offset);
                 HasBall = true;

@@ -241,9 +241,12 @@ namespace IrisSession.Interaction.Tests
         public void FingertipAtTheWristStops()
         {
             Wearer wearer = new Wearer();
-            foreach (InputReading hand in wearer.Input.Reading.Inputs) hand.Kind = InputKind.Hand;
+            foreach (InputReading hand in wearer.Input.Reading.Inputs)
+            {
+                hand.Kind = InputKind.Hand;
+                hand.HasTip = true;
+            }
             InputReading right = wearer[Side.Right];
-            right.HasTip = true;
             right.Tip = new Double3(0.6, -0.3, 1.1);
             wearer.Run(2);
             Double3 ball = wearer.Input.WristStop.Center;

@@ -94,7 +94,11 @@ namespace IrisSession.Unity.Input
         public void ReadStops(HeadsetReading reading)
         {
             reading.CaptureNs = MonotonicClock.NowNs;
-            for (int side = 0; side < 2; side++) reading.Inputs[side].Buttons = hands[side].ReadButtons(ButtonBits.Stop);
+            for (int side = 0; side < 2; side++)
+            {
+                reading.Inputs[side].Clear(); // it points at nothing
+                reading.Inputs[side].Buttons = hands[side].ReadButtons(ButtonBits.Stop);
+            }
         }
 
         public bool TryRead(out RigidTransform T_tracking_gaze)

@@ -16,6 +16,7 @@ namespace IrisSession.Unity.Input
     public sealed class IrisHeadset : MonoBehaviour
     {
         private const double ConditionS = 1.0;
+        private const string AfterDefect = ". Robots hold. To stop them press the stick of a controller, or the button here; if neither answers, use the stop of the robots themselves";
 
         [SerializeField] private Material rayMaterial = null;
         private readonly DeviceCondition condition = new DeviceCondition();
@@ -189,7 +190,7 @@ namespace IrisSession.Unity.Input
         {
             if (Input == null && Problem.Length > 0) return; // also after a defect of panels alone, the e-stop goes on
             Debug.LogException(error);
-            Problem = "the headset cannot be read: " + error.Message + (client == null ? "" : ". Robots hold, the e-stop works");
+            Problem = "the headset cannot be read: " + error.Message + (client == null ? "" : AfterDefect);
             if (client == null) return;
             Input = null;
             stops = new StopInput();
