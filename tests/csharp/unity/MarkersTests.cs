@@ -199,7 +199,7 @@ namespace IrisSession.Unity.StandinTests
                 marker.transform.SetPositionAndRotation(new Vector3(0.1f + 1e-5f * i, 1.4f, 1f), Quaternion.AngleAxis(180f, Vector3.right));
                 wearer.Input.Reading.CaptureNs = MonotonicClock.NowNs + i * Wearer.FrameNs; // the engine's clock is that of the steps
                 marker.lastSeenTime = -100f; // of another app, before this one was started
-                wearer.Input.Update(true, 0, 1);
+                wearer.Input.Update(true, 0);
             }
             Assert.AreEqual(0, wearer.Session.Looks.Count);
             Assert.AreEqual(60, wearer.Input.Markers.Filter.Count(MarkerVerdict.Remembered));

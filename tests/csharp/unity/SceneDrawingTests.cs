@@ -4,6 +4,7 @@ using System.Collections.Generic;
 using System.Linq;
 using IrisSession.Core;
 using IrisSession.Protocol;
+using IrisSession.Unity.Input;
 using NUnit.Framework;
 using Standins;
 using UnityEngine;
@@ -29,8 +30,11 @@ namespace IrisSession.Unity.StandinTests
                 Assert.Greater(stage.Source.Probes.Count, 100);
                 foreach (double[] probe in stage.Source.Probes) Stage.AssertDrawn(drawn, stage.Expect(probe[0], probe[1], probe[2]), ToleranceM);
             }
+            WorldBodies bodies = new WorldBodies(stage.Component);
             foreach (KeyValuePair<long, double[]> body in stage.Source.Bodies)
             {
+                Assert.IsTrue(bodies.TryGetPosition(body.Key, out Double3 at), "also of a base that is fixed");
+                Assert.LessOrEqual((at - new Double3(body.Value[0], body.Value[1], body.Value[2])).Length, ToleranceM);
                 if (!stage.Source.Plan.Bodies.Single(one => one.Id == body.Key).IsMoving) continue;
                 StandinTests.AssertNear(stage.Expect(body.Value[0], body.Value[1], body.Value[2]), stage.World.Scene.Bodies.Find(body.Key).position, ToleranceM);
             }

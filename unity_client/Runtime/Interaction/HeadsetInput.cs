@@ -107,15 +107,14 @@ namespace IrisSession.Interaction
         /// <summary>Take a frame, before the scene is drawn.</summary>
         /// <param name="isLive">The person sees the scene, and their input reaches it.</param>
         /// <param name="suspensionCount">`HeadsetState.Suspensions`: when it has grown, buttons count from their next press.</param>
-        /// <param name="bodiesVersion">Changes with the bodies of the scene.</param>
-        public void Update(bool isLive, int suspensionCount, long bodiesVersion)
+        public void Update(bool isLive, int suspensionCount)
         {
             long nowNs = Reading.CaptureNs;
             if (suspensionCount != suspensions || !isLive) Suspend();
             suspensions = suspensionCount;
             TakeStops(isLive);
             CheckSession();
-            FillContext(bodiesVersion);
+            FillContext();
             Point();
             if (isLive)
             {
@@ -247,15 +246,15 @@ namespace IrisSession.Interaction
             Stop.Update(session, Reading.CaptureNs);
         }
 
-        private void FillContext(long bodiesVersion)
+        private void FillContext()
         {
             context.Clear();
             IReadOnlyDictionary<string, RobotInfo> robots = session.Robots;
-            if (!ReferenceEquals(robots, robotsOf) || bodiesVersion != bodiesOf)
+            if (!ReferenceEquals(robots, robotsOf) || bodies.Version != bodiesOf)
             {
                 Pointing.SetRobots(robots.Values, bodies);
                 robotsOf = robots;
-                bodiesOf = bodiesVersion;
+                bodiesOf = bodies.Version;
             }
             foreach (string robot in Pointing.Robots)
             {

@@ -10,6 +10,9 @@ namespace IrisSession.Interaction
     /// <summary>Bodies of the scene as they are shown.</summary>
     public interface IBodies
     {
+        /// <summary>Changes with the bodies and their parents.</summary>
+        long Version { get; }
+
         /// <summary>Return the parent of a body, 0 for the world or one that is not known.</summary>
         long FindParent(long body);
 

@@ -23,6 +23,8 @@ namespace IrisSession.Unity
         /// <summary>The frame of the session's world.</summary>
         public Transform Root { get; }
 
+        public long Version { get; private set; }
+
         /// <summary>Poses in the world by id, as they are shown now.</summary>
         public IReadOnlyDictionary<long, RigidTransform> Poses { get { return poses; } }
 
@@ -66,6 +68,7 @@ namespace IrisSession.Unity
             }
             foreach (long id in new List<long>(transforms.Keys)) if (!moving.Contains(id)) Remove(id);
             rowsVersion = -1;
+            Version++;
         }
 
         /// <summary>Move the bodies to the poses that were chosen. Allocates nothing while the bodies are the same.</summary>

@@ -112,7 +112,10 @@ namespace IrisSession.Interaction.Tests
     /// <summary>Two arms of three links, each 0.3 m long and upright: left at y = 0.3, right at y = -0.3, one metre ahead.</summary>
     public sealed class FakeBodies : IBodies
     {
-        public long FindParent(long body) { return body % 10 > 1 ? body - 1 : 0; }
+        /// <summary>0: the plan of the scene is still to come.</summary>
+        public long Version { get; set; } = 1;
+
+        public long FindParent(long body) { return Version > 0 && body % 10 > 1 ? body - 1 : 0; }
 
         public bool TryGetPosition(long body, out Double3 p_world_body)
         {
@@ -194,7 +197,7 @@ namespace IrisSession.Interaction.Tests
             for (int i = 0; i < frames; i++)
             {
                 Input.Reading.CaptureNs += FrameNs;
-                Input.Update(IsLive, Suspensions, 1);
+                Input.Update(IsLive, Suspensions);
             }
         }
 

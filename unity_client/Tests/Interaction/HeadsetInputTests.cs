@@ -14,6 +14,10 @@ namespace IrisSession.Interaction.Tests
         public void RayFindsTheNearestRobotAndHowFarItIs()
         {
             Wearer wearer = new Wearer();
+            wearer.Bodies.Version = 0;
+            wearer.Run();
+            Assert.AreEqual("", wearer.Input.FindPointed(Side.Left), "its links are not known yet");
+            wearer.Bodies.Version = 1;
             wearer.Run();
             Assert.AreEqual("left", wearer.Input.FindPointed(Side.Left));
             Assert.AreEqual(0.8, wearer.Input.FindHit(Side.Left), 1e-6);

@@ -138,7 +138,7 @@ namespace IrisSession.Unity.Input
                 if (client == null) return; // it has left the session
             }
             HeadsetInput input = Input;
-            input.Update(IsLive, client.Suspensions, client.View.BodiesVersion);
+            input.Update(IsLive, client.Suspensions);
             if (Input != input) return; // a command has left the session
             if (Input.CommandError != null) Debug.LogException(Input.CommandError);
             Input.CommandError = null;
