@@ -62,7 +62,7 @@ namespace IrisSession.Core
         Unwritable,
     }
 
-    /// <summary>Assets on the headset, at most `LimitBytes` of them; the ones that were not used for longest go first. For one thread.</summary>
+    /// <summary>Assets on the headset, at most `LimitBytes` of them; the ones that were not used for longest go first. Threads that share it lock it.</summary>
     public sealed class AssetCache
     {
         /// <summary>Room for many scenes on a headset with 128 GB.</summary>

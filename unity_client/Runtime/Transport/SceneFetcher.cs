@@ -56,7 +56,6 @@ namespace IrisSession.Transport
         internal SceneUpdate(string sceneHash, ScenePlan plan, SceneChanges changes)
         {
             SceneHash = sceneHash;
-            SceneHash = sceneHash;
             Plan = plan;
             Changes = changes;
         }
@@ -69,8 +68,7 @@ namespace IrisSession.Transport
         private const int IdleMs = 20;
 
         private readonly SessionClient client;
-        private readonly AssetCache cache;
-        private readonly object cacheGate = new object(); // guards it; held while files are read, written and hashed
+        private readonly AssetCache cache; // guarded by itself, as other fetchers may have it; held while files are read, written and hashed
         private readonly SceneFollower follower;
         private readonly AssetLoader loader = new AssetLoader();
         private readonly Dictionary<string, byte[]> ready = new Dictionary<string, byte[]>(); // guarded by itself; held for moments
@@ -91,7 +89,7 @@ namespace IrisSession.Transport
         private int pending; // requests that wait for an answer
 
         /// <param name="client">Its session.</param>
-        /// <param name="cache">Assets that are kept; used by this thread alone from now on.</param>
+        /// <param name="cache">Assets that are kept. Whoever else uses it locks it.</param>
         /// <param name="budget">What the device can show.</param>
         public SceneFetcher(SessionClient client, AssetCache cache, SceneBudget budget)
         {
@@ -141,7 +139,7 @@ namespace IrisSession.Transport
         public byte[] Find(string address)
         {
             lock (ready) if (ready.TryGetValue(address, out byte[] bytes)) return bytes;
-            lock (cacheGate) return cache.Read(address);
+            lock (cache) return cache.Read(address);
         }
 
         /// <summary>Let go of the bytes that the cache has too, once all is built: <see cref="Find"/> reads them again from there. Waits for nothing.</summary>
@@ -283,7 +281,7 @@ namespace IrisSession.Transport
             part.Append(answer.Bytes, answer.Count);
             if (!loader.IsComplete(address)) return;
             CacheResult kept;
-            lock (cacheGate) kept = cache.Store(address, part.Bytes, 0, part.Count);
+            lock (cache) kept = cache.Store(address, part.Bytes, 0, part.Count);
             if (kept == CacheResult.Damaged)
             {
                 DamagedCount++;
@@ -316,7 +314,7 @@ namespace IrisSession.Transport
             ScenePlan before = follower.Plan;
             follower.OnAsset(address, bytes, 0, count);
             bool isPlan = follower.Plan != before; // that was the specification
-            if (isPlan) lock (cacheGate) cache.Pin(follower.Plan.Assets);
+            if (isPlan) lock (cache) cache.Pin(follower.Plan.Assets);
             lock (ready)
             {
                 if (isPlan) ready.Clear();
@@ -329,7 +327,7 @@ namespace IrisSession.Transport
             isReleasing = false;
             List<string> held;
             lock (ready) held = new List<string>(ready.Keys);
-            lock (cacheGate) held.RemoveAll(address => !cache.Contains(address));
+            lock (cache) held.RemoveAll(address => !cache.Contains(address));
             lock (ready) foreach (string address in held) ready.Remove(address);
         }
 

@@ -130,6 +130,18 @@ namespace IrisSession.Transport.Tests
             }
         }
 
+        [Test]
+        public void FetchersOfOneCacheKeepEachOtherOut()
+        {
+            MemoryFiles files = new MemoryFiles();
+            files.Files[Address] = Asset;
+            AssetCache cache = new AssetCache(files);
+            bool isLocked = false;
+            files.OnRead = () => isLocked = Monitor.IsEntered(cache); // after a retry the one before may still read
+            Assert.IsNotNull(new SceneFetcher(null, cache, SceneBudget.Quest3).Find(Address));
+            Assert.IsTrue(isLocked);
+        }
+
         private static bool IsUnreadable(SceneFetcher scene)
         {
             return scene.Progress.State == SceneState.Unreadable;
