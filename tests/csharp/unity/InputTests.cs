@@ -258,6 +258,11 @@ namespace IrisSession.Unity.StandinTests
             try
             {
                 StepUntil(() => Engine.Errors.Count > 0);
+                StepUntil(() => headset.Panels.Urgent.Text.Contains("which is news"));
+                StepUntil(() => Engine.Log.Count > 0);
+                Assert.AreEqual("warning: iris-session: calls that could not be done: 1", Engine.Log[0]);
+                for (int i = 0; i < 200; i++) Engine.Step();
+                Assert.AreEqual(1, Engine.Log.Count, "once");
                 Assert.IsNotNull(headset.Input);
                 Assert.AreEqual("", headset.Problem);
             }

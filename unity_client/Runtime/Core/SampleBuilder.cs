@@ -124,7 +124,7 @@ namespace IrisSession.Core
         }
 
         /// <summary>Write a pose in the form of messages.</summary>
-        internal static void WritePose(RigidTransform pose, Pose target)
+        public static void WritePose(RigidTransform pose, Pose target)
         {
             target.P[0] = pose.Position.X;
             target.P[1] = pose.Position.Y;

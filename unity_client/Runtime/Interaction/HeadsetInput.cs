@@ -52,6 +52,7 @@ namespace IrisSession.Interaction
         public readonly ButtonPanel Buttons = new ButtonPanel();
         public readonly EpisodeControl Episode = new EpisodeControl();
         public readonly Pointing Pointing = new Pointing();
+        public readonly WearerNews News = new WearerNews();
 
         /// <summary>Marks of a sheet that are touched: begun by itself where no codes are read, else by a trigger that is held.</summary>
         public readonly MarkTouching Touching = new MarkTouching();
@@ -70,14 +71,6 @@ namespace IrisSession.Interaction
 
         /// <summary>Whom one's own request waits for: the robot, empty for none.</summary>
         public string AwaitedRobot { get; private set; } = "";
-
-        /// <summary>A denial that the person has to see: taken by <see cref="TakeDenial"/>.</summary>
-        public Denial Denial { get; private set; }
-
-        /// <summary>The newest thing that happened to the headset itself, and when [ns].</summary>
-        public HeadsetEvent Event { get; private set; }
-
-        public long EventNs { get; private set; } = long.MinValue / 2;
 
         /// <summary>True while this participant holds a robot.</summary>
         public bool HoldsRobots { get { return context.Held.Count > 0; } }
@@ -136,11 +129,8 @@ namespace IrisSession.Interaction
         {
             if (news.Kind == NewsKind.Reply) TakeReply(news.Ticket, news.Reply, nowNs);
             else if (news.Kind == NewsKind.Message) Take(news.Message.Message, nowNs);
-            else if (news.Kind == NewsKind.Headset && news.Headset != HeadsetEvent.PermissionGranted)
-            {
-                Event = news.Headset;
-                EventNs = nowNs;
-            }
+            else if (news.Kind == NewsKind.Headset && news.Headset != HeadsetEvent.PermissionGranted) News.Set(news.Headset, nowNs);
+            if (!string.IsNullOrEmpty(news.Text)) News.Set(news.Text, nowNs); // a notice, or why a request was not sent
         }
 
         /// <summary>Take a message of the session.</summary>
@@ -155,10 +145,14 @@ namespace IrisSession.Interaction
                     if (pulse.IsFelt && Hands.TryFindDriver(feedback.Robot, out Side side)) haptics?.Play(side, pulse);
                     break;
                 case Reply reply when reply.Denial != null:
-                    Denial = reply.Denial;
+                    News.Set(reply.Denial, nowNs);
                     break;
                 case Event one when one.Body is ConsentRequested asked && asked.Holder == session.ParticipantId:
                     consents.Add(asked, nowNs);
+                    break;
+                case Event one when one.Body is Notice notice && (notice.Participant.Length == 0 || notice.Participant == session.ParticipantId):
+                    bool isSaid = Touching.IsActive && notice.Reason == DenialReason.AlignmentRefused; // by `Touching`
+                    if (!isSaid) News.Set(notice.Text, nowNs);
                     break;
                 case Event one when one.Body is LeaseChanged changed && changed.Cause != "queue":
                     consents.Remove(changed.Lease.Target);
@@ -177,17 +171,9 @@ namespace IrisSession.Interaction
                 bool isGranted = reply != null && reply.Ok;
                 if (one.Robot != null) Hands.Settle(one.Robot, isGranted, nowNs);
                 if (one.IsEpisode) Episode.Settle();
-                if (reply != null && reply.Denial != null) Denial = reply.Denial;
+                if (reply != null && reply.Denial != null) News.Set(reply.Denial, nowNs);
                 return;
             }
-        }
-
-        /// <summary>Return the newest denial once, null for none.</summary>
-        public Denial TakeDenial()
-        {
-            Denial newest = Denial;
-            Denial = null;
-            return newest;
         }
 
         /// <summary>Do what the lower, or the upper, button of a controller does: for devices without buttons.</summary>
@@ -341,7 +327,7 @@ namespace IrisSession.Interaction
                 case IntentKind.Place:
                     if (!OwnPlace.HasValue) break;
                     PlaceAlignment place = new PlaceAlignment { Participant = session.ParticipantId };
-                    place.T_world_tracking = ToPose(OwnPlace.Value);
+                    SampleBuilder.WritePose(OwnPlace.Value, place.T_world_tracking);
                     session.Request(place);
                     break;
             }
@@ -386,13 +372,6 @@ namespace IrisSession.Interaction
         {
             haptics?.Play(Side.Left, pulse);
             haptics?.Play(Side.Right, pulse);
-        }
-
-        private static Pose ToPose(RigidTransform transform)
-        {
-            Double3 p = transform.Position;
-            DoubleQuaternion q = transform.Rotation;
-            return new Pose { P = new[] { p.X, p.Y, p.Z }, Q = new[] { q.W, q.X, q.Y, q.Z } };
         }
     }
 }

@@ -63,10 +63,13 @@ namespace IrisSession.Interaction
         public const int MaxRobots = 12;
         private const int MaxButtons = 2 + ButtonPanel.MaxCommands;
         private const int MaxAdvice = 3;
+
+        /// <summary>Characters of a notice: those of the session say first what is wrong, then what to do.</summary>
+        private const int MaxNotice = 240;
         private const long PeriodNs = 100_000_000;
 
-        /// <summary>A denial, and what happened to the headset, are shown for so long.</summary>
-        private const long NoticeNs = 5_000_000_000;
+        /// <summary><see cref="WearerNews"/> are shown for so long.</summary>
+        private const long NewsNs = 5_000_000_000;
 
         /// <summary>Length of a ray that meets nothing [m].</summary>
         private const double RayM = 2;
@@ -94,8 +97,6 @@ namespace IrisSession.Interaction
         private readonly IBodies bodies;
         private readonly StringBuilder text = new StringBuilder();
         private long textsAt = long.MinValue;
-        private string denied = "";
-        private long deniedUntil;
 
         /// <param name="maxRobots">Panels of robots: each is a draw call.</param>
         public HeadsetPanels(HeadsetInput input, ISessionPort session, IBodies bodies, int maxRobots = MaxRobots)
@@ -147,13 +148,9 @@ namespace IrisSession.Interaction
             long nowNs = input.Reading.CaptureNs;
             text.Clear();
             if (input.Stop.IsUnconfirmed) WrapIfAny(StopReport.Unconfirmed.ToString());
-            Denial denial = input.TakeDenial();
-            if (denial != null)
-            {
-                denied = Words.OfDenial(denial).ToString();
-                deniedUntil = nowNs + NoticeNs;
-            }
-            if (nowNs < deniedUntil) WrapIfAny(denied);
+            WearerNews news = input.News;
+            if (nowNs - news.DenialNs < NewsNs) WrapIfAny(Words.OfDenial(news.Denial).ToString());
+            if (nowNs - news.NoticeNs < NewsNs) WrapIfAny(Words.ToLine(news.Notice, MaxNotice));
             int said = 0;
             foreach (Advice one in advice)
             {
@@ -164,7 +161,7 @@ namespace IrisSession.Interaction
             if (session.IsJoined && session.AlignmentState == AlignmentState.None && !input.Touching.IsActive) WrapIfAny(PanelWords.DescribeMarkers(input.Markers));
             TouchWords.Describe(text, input.Touching, session, nowNs);
             WrapIfAny(input.Episode.Describe(nowNs));
-            if (nowNs - input.EventNs < NoticeNs) WrapIfAny(PanelWords.DescribeEvent(input.Event, input.HoldsRobots));
+            if (nowNs - news.EventNs < NewsNs) WrapIfAny(PanelWords.DescribeEvent(news.Event, input.HoldsRobots));
             WrapIfAny(notice);
             Set(Urgent, text.ToString().TrimStart('\n'));
             Set(Status, PanelWords.DescribeSelf(session, input.Hands));

@@ -37,8 +37,7 @@ namespace IrisSession.Interaction.Tests
             wearer.Run();
             wearer.Tap(Side.Right);
             wearer.Input.TakeReply(1, new Reply { Denial = new Denial { Reason = DenialReason.Held } }, 0);
-            Assert.AreEqual(DenialReason.Held, wearer.Input.TakeDenial().Reason);
-            Assert.IsNull(wearer.Input.TakeDenial());
+            Assert.AreEqual(DenialReason.Held, wearer.Input.News.Denial.Reason);
             wearer.Session.Give("right", "p1");
             wearer.Run();
             Assert.AreEqual("", wearer.Input.Hands.FindDriven(Side.Right), "it came by other ways: a hand that works does not find itself at it");

@@ -1,6 +1,7 @@
 using System;
 using IrisSession.Core;
 using IrisSession.Protocol;
+using IrisSession.Transport;
 using NUnit.Framework;
 
 namespace IrisSession.Interaction.Tests
@@ -239,6 +240,24 @@ namespace IrisSession.Interaction.Tests
             wearer.Run();
             wearer.Tap(Side.Right);
             Assert.AreEqual(-2, ((PlaceAlignment)wearer.Session.Requests[0]).T_world_tracking.P[0]);
+        }
+
+        [Test]
+        public void WordsForTheWearerAreShownForFiveSeconds()
+        {
+            Wearer wearer = new Wearer();
+            HeadsetPanels panels = new HeadsetPanels(wearer.Input, wearer.Session, wearer.Bodies);
+            wearer.Run();
+            foreach (string id in new[] { "p1", "p2" }) wearer.Input.Take(new Event { Body = new Notice { Participant = id, Text = "look longer, " + id } }, wearer.Input.Reading.CaptureNs);
+            panels.Update(new Advice[0], "");
+            Assert.AreEqual("look longer, p1", panels.Urgent.Text);
+            wearer.RunFor(Second);
+            wearer.Input.Take(new SessionNews { Kind = NewsKind.Reply, Text = "not sent" }, wearer.Input.Reading.CaptureNs);
+            panels.Update(new Advice[0], "");
+            Assert.AreEqual("not sent", panels.Urgent.Text);
+            wearer.RunFor(5 * Second);
+            panels.Update(new Advice[0], "");
+            Assert.AreEqual("", panels.Urgent.Text);
         }
 
         [Test]

@@ -249,6 +249,8 @@ namespace IrisSession.Unity.Input
             if (Time.realtimeSinceStartupAsDouble < conditionAt) return;
             conditionAt = Time.realtimeSinceStartupAsDouble + ConditionS;
             ReportHealth(condition.Read());
+            string losses = client.DescribeLosses();
+            if (losses != null) Debug.LogWarning("iris-session: " + losses);
             bool hasMarkers = MarkerSource != null && MarkerSource.Support != MarkerSupport.Missing;
             if (hasMarkers != hadMarkers) ReportMarkers(hasMarkers);
         }
