@@ -10,10 +10,10 @@ namespace IrisSession.Core
     public readonly struct SceneBudget
     {
         /// <summary>Where a Quest 3 begins to struggle.</summary>
-        public static readonly SceneBudget Quest3 = new SceneBudget(750_000, 700L << 20, 200, 100_000);
+        public static readonly SceneBudget Quest3 = new SceneBudget(750_000, 700L << 20, 200, 100_000, 2048 * 2048);
 
         /// <summary>An estimate for HoloLens 2, never measured on one.</summary>
-        public static readonly SceneBudget HoloLens2 = new SceneBudget(100_000, 200L << 20, 50, 20_000);
+        public static readonly SceneBudget HoloLens2 = new SceneBudget(100_000, 200L << 20, 50, 20_000, 1024 * 1024);
 
         public readonly long Triangles;
 
@@ -26,16 +26,20 @@ namespace IrisSession.Core
         /// <summary>Points of all clouds together.</summary>
         public readonly int Points;
 
-        public SceneBudget(long triangles, long textureBytes, int objects, int points)
+        /// <summary>Pixels of one texture that has coarser levels: it goes to the graphics card on the engine's thread, in one frame.</summary>
+        public readonly long TexturePixels;
+
+        public SceneBudget(long triangles, long textureBytes, int objects, int points, long texturePixels = 0)
         {
             Triangles = triangles;
             TextureBytes = textureBytes;
             Objects = objects;
             Points = points;
+            TexturePixels = texturePixels;
         }
 
         /// <summary>Return the same budget with another number of objects.</summary>
-        public SceneBudget WithObjects(int objects) { return new SceneBudget(Triangles, TextureBytes, objects, Points); }
+        public SceneBudget WithObjects(int objects) { return new SceneBudget(Triangles, TextureBytes, objects, Points, TexturePixels); }
     }
 
     /// <summary>Levels chosen for a budget.</summary>
@@ -89,7 +93,7 @@ namespace IrisSession.Core
                 else besides += CountTriangles(spec, visual.Geometry, 0);
             }
             chosen.Triangles = ChooseMeshes(spec, uses, budget.Triangles, besides, chosen.Meshes);
-            chosen.TextureBytes = ChooseTextures(spec, budget.TextureBytes, chosen.Textures);
+            chosen.TextureBytes = ChooseTextures(spec, budget, chosen.Textures);
             chosen.Objects = kept + bending;
             chosen.Fits = IsWithin(chosen.Triangles, budget.Triangles) && IsWithin(chosen.TextureBytes, budget.TextureBytes) && IsWithin(chosen.Objects, budget.Objects);
             return chosen;
@@ -170,7 +174,7 @@ namespace IrisSession.Core
             return Coarsen(costs, losses, limit, besides, levels);
         }
 
-        private static double ChooseTextures(SceneSpec spec, long limit, int[] levels)
+        private static double ChooseTextures(SceneSpec spec, SceneBudget budget, int[] levels)
         {
             double[][] costs = new double[spec.Textures.Length][];
             double[][] losses = new double[spec.Textures.Length][];
@@ -181,29 +185,35 @@ namespace IrisSession.Core
                 losses[t] = new double[texture.Levels.Length - 1];
                 for (int k = 0; k < costs[t].Length; k++) costs[t][k] = MeasureMemory(texture, texture.Levels[k]);
                 for (int k = 0; k < losses[t].Length; k++) losses[t][k] = -costs[t][k];
+                while (levels[t] < losses[t].Length && !IsWithin(CountPixels(texture, texture.Levels[levels[t]]), budget.TexturePixels)) levels[t]++;
             }
-            return Coarsen(costs, losses, limit, 0.0, levels);
+            return Coarsen(costs, losses, budget.TextureBytes, 0.0, levels);
         }
 
         /// <summary>Bytes on a graphics card: four a pixel, and a third more for mipmaps.</summary>
         private static double MeasureMemory(Texture texture, TextureLevel level)
         {
-            double faces = texture.Kind == TextureKind.Image ? 1.0 : 6.0;
-            return Math.Floor((double)level.Width * level.Height * 4.0 * faces * 4.0 / 3.0);
+            return Math.Floor(CountPixels(texture, level) * 4.0 * 4.0 / 3.0);
+        }
+
+        private static double CountPixels(Texture texture, TextureLevel level)
+        {
+            return (double)level.Width * level.Height * (texture.Kind == TextureKind.Image ? 1.0 : 6.0);
         }
 
         /// <summary>
         /// Choose the level of each thing, and return the cost of all with `besides`: at most `limit` (0: none) if that can be.
         /// </summary>
         /// <param name="losses">Of each step to a coarser level; the step that loses least comes first, 0 is not taken.</param>
+        /// <param name="levels">Of each thing: where it begins, and what is chosen.</param>
         private static double Coarsen(double[][] costs, double[][] losses, long limit, double besides, int[] levels)
         {
             double total = besides;
             SortedSet<Step> queue = new SortedSet<Step>(StepOrder.Only);
             for (int k = 0; k < costs.Length; k++)
             {
-                total += costs[k][0];
-                AddStep(queue, losses, k, 0);
+                total += costs[k][levels[k]];
+                AddStep(queue, losses, k, levels[k]);
             }
             while (limit > 0 && total > limit && queue.Count > 0)
             {

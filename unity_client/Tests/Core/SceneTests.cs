@@ -65,6 +65,17 @@ namespace IrisSession.Core.Tests
             Assert.Greater(hidden, 10);
         }
 
+        [TestCase(TextureKind.Image, 4096, 1, 2)]
+        [TestCase(TextureKind.Image, 1024, 0, 0)]
+        [TestCase(TextureKind.Cube, 2048, 2, 3)]
+        public void OneTextureIsUploadedWithinAFrame(string kind, int side, int ofQuest, int ofHoloLens)
+        {
+            TextureLevel[] levels = Enumerable.Range(0, 5).Select(k => new TextureLevel { Encoding = AssetEncoding.Png, Width = side >> k, Height = side >> k }).ToArray();
+            SceneSpec spec = new SceneSpec { Textures = new[] { new Texture { Kind = kind, Levels = levels } } };
+            Assert.AreEqual(ofQuest, SceneLevels.Choose(spec, DrawBudget.Quest3.Scene).Textures[0]);
+            Assert.AreEqual(ofHoloLens, SceneLevels.Choose(spec, DrawBudget.HoloLens2.Scene).Textures[0]);
+        }
+
         [Test]
         public void EveryShownVisualIsInOnePlaceOfOnePart()
         {
