@@ -23,10 +23,10 @@ namespace IrisSession.Interaction
         private const int Most = 16;
         private readonly List<ConsentQuestion> waiting = new List<ConsentQuestion>();
 
-        public void Add(ConsentRequested asked, long nowNs)
+        public void Add(ConsentRequested asked, long timeoutNs, long nowNs)
         {
             if (waiting.Count == Most) waiting.RemoveAt(0);
-            waiting.Add(new ConsentQuestion { ConsentId = asked.ConsentId, Target = asked.Target, Requester = asked.Requester, UntilNs = nowNs + AnswerNs });
+            waiting.Add(new ConsentQuestion { ConsentId = asked.ConsentId, Target = asked.Target, Requester = asked.Requester, UntilNs = nowNs + (timeoutNs > 0 ? timeoutNs : AnswerNs) });
         }
 
         /// <summary>The lease of a robot has changed: what was asked about it is void.</summary>

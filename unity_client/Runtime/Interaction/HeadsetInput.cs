@@ -148,7 +148,7 @@ namespace IrisSession.Interaction
                     News.Set(reply.Denial, nowNs);
                     break;
                 case Event one when one.Body is ConsentRequested asked && asked.Holder == session.ParticipantId:
-                    consents.Add(asked, nowNs);
+                    consents.Add(asked, session.ConsentTimeoutNs, nowNs);
                     break;
                 case Event one when one.Body is Notice notice && (notice.Participant.Length == 0 || notice.Participant == session.ParticipantId):
                     bool isSaid = Touching.IsActive && notice.Reason == DenialReason.AlignmentRefused; // by `Touching`

@@ -20,6 +20,9 @@ namespace IrisSession.Interaction
 
         bool IsStopped { get; }
 
+        /// <summary>Time to answer a question of consent, 0 where the session does not state it.</summary>
+        long ConsentTimeoutNs { get; }
+
         EpisodeChanged Episode { get; }
 
         IReadOnlyDictionary<string, ParticipantInfo> Participants { get; }
@@ -78,6 +81,8 @@ namespace IrisSession.Interaction
         public long SceneEpoch { get { return client.View.SceneEpoch; } }
 
         public bool IsStopped { get { return client.View.IsStopped; } }
+
+        public long ConsentTimeoutNs { get { return client.View.ConsentTimeoutNs; } }
 
         public EpisodeChanged Episode { get { return client.View.Episode; } }
 

@@ -127,6 +127,9 @@ namespace IrisSession.Transport
         public readonly long SceneRevision;
         public readonly string SceneHash;
         public readonly long TickPeriodNs;
+
+        /// <summary>Time to answer a question of consent, 0 where the session does not state it.</summary>
+        public readonly long ConsentTimeoutNs;
         public readonly bool IsPaused;
         public readonly bool IsStopped;
         public readonly long StopSeq;
@@ -161,6 +164,7 @@ namespace IrisSession.Transport
             SceneRevision = mirror.SceneRevision;
             SceneHash = mirror.SceneHash;
             TickPeriodNs = mirror.TickPeriodNs;
+            ConsentTimeoutNs = mirror.ConsentTimeoutNs;
             IsPaused = mirror.IsPaused;
             IsStopped = mirror.IsStopped;
             StopSeq = mirror.StopSeq;

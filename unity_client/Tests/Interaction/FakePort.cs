@@ -41,6 +41,8 @@ namespace IrisSession.Interaction.Tests
 
         public bool IsStopped { get; set; }
 
+        public long ConsentTimeoutNs { get; set; }
+
         public EpisodeChanged Episode { get; set; }
 
         public IReadOnlyDictionary<string, ParticipantInfo> Participants { get { return PeopleTable; } }

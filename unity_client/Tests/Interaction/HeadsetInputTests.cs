@@ -97,6 +97,12 @@ namespace IrisSession.Interaction.Tests
             wearer.Input.Take(asked, wearer.Input.Reading.CaptureNs);
             wearer.RunFor(16 * Second);
             Assert.IsNull(wearer.Input.Question);
+            wearer.Session.ConsentTimeoutNs = 40 * Second;
+            wearer.Input.Take(asked, wearer.Input.Reading.CaptureNs);
+            wearer.RunFor(39 * Second);
+            Assert.IsNotNull(wearer.Input.Question, "the session waits so long");
+            wearer.RunFor(2 * Second);
+            Assert.IsNull(wearer.Input.Question);
         }
 
         [Test]

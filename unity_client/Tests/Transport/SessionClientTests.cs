@@ -64,7 +64,7 @@ namespace IrisSession.Transport.Tests
                     Send(peer, new ClockPong { T0Ns = ping.T0Ns, T1Ns = ping.T0Ns, T2Ns = ping.T0Ns });
                     SendState(peer, ping.T0Ns);
                 }
-                else if (message is GetSnapshot) Send(peer, new Snapshot { EventSeq = 10, SceneEpoch = 3, SceneHash = sceneHash, Robots = new[] { new RobotInfo { Name = "left" } }, Bodies = new[] { new BodyInfo { Id = 1, Name = "a" } } }, new byte[56]);
+                else if (message is GetSnapshot) Send(peer, new Snapshot { EventSeq = 10, SceneEpoch = 3, ConsentTimeoutNs = 4_000_000_000, SceneHash = sceneHash, Robots = new[] { new RobotInfo { Name = "left" } }, Bodies = new[] { new BodyInfo { Id = 1, Name = "a" } } }, new byte[56]);
                 else if (message is Acquire acquire) Send(peer, new Reply { RequestId = acquire.RequestId });
             }
         }
@@ -102,6 +102,7 @@ namespace IrisSession.Transport.Tests
                 WaitUntil(() => client.View.Phase == ConnectionPhase.Ready && client.TakeState(), "no state");
                 Assert.AreEqual(client.View.BodiesVersion, client.State.BodiesVersion);
                 Assert.AreEqual(1, client.View.Bodies.Length);
+                Assert.AreEqual(4_000_000_000, client.View.ConsentTimeoutNs);
                 Assert.AreEqual(1.0 + client.State.StateSeq, client.State.Poses[0]);
                 Assert.IsTrue(client.HasClock);
                 long ticket = client.Request(new Acquire { Robots = new[] { "left" } });
@@ -131,6 +132,8 @@ namespace IrisSession.Transport.Tests
                 int notices = 0;
                 while (client.TryTakeNews(out SessionNews one)) if (one.Kind == NewsKind.Notice) notices++;
                 Assert.AreEqual(1, notices);
+                Assert.AreEqual("calls that could not be done: 3", client.DescribeLosses());
+                Assert.IsNull(client.DescribeLosses());
             }
         }
 
