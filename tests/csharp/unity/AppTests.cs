@@ -241,6 +241,18 @@ namespace IrisSession.Unity.StandinTests
         }
 
         [Test]
+        public void ADefectOfTheInputIsSaidBeforeASessionToo()
+        {
+            using (AppStage stage = new AppStage(false))
+            {
+                Controls.Set("<XRController>{RightHand}/trackingState", 1f); // a value of another type: reading it throws
+                stage.StepUntil(() => IsDrawn(stage, "the headset cannot be read"), "the wearer reads it");
+                Assert.AreEqual(1, Engine.Errors.Count, "logged once");
+                Engine.Errors.Clear();
+            }
+        }
+
+        [Test]
         public void ADefectOfTheAppIsSaidAndLeavesTheSession()
         {
             using (AppStage stage = new AppStage(false, settings => throw new InvalidOperationException("of the application")))

@@ -108,7 +108,7 @@ namespace IrisSession.Unity.Input
             try
             {
                 if (reader == null) reader = new ControlReader(Controls, ControlsKind);
-                if (client != null && Input == null) StepStops(); // needs the reader alone of all that may be in the way
+                if (Input == null && (client != null || Problem.Length > 0)) StepStops(); // needs the reader alone of all that may be in the way
                 else StepDevices();
             }
             catch (Exception error)
@@ -154,7 +154,7 @@ namespace IrisSession.Unity.Input
             ShowStart();
         }
 
-        /// <summary>After a defect: no samples, so that robots hold; the e-stop goes on.</summary>
+        /// <summary>After a defect: no samples, so that robots hold; the e-stop goes on, and the panel that says so.</summary>
         private void StepStops()
         {
             try
@@ -165,10 +165,10 @@ namespace IrisSession.Unity.Input
             {
                 reader.ReadStops(ownReading); // the defect may be in what is read
             }
-            string reason = stops.Update(ownReading, IsLive);
+            string reason = client == null ? null : stops.Update(ownReading, IsLive);
             if (reason != null) StopAll(reason);
             while (client != null && client.TryTakeNews(out SessionNews news)) Pass(news);
-            if (client != null) ShowStart();
+            if (Input == null) ShowStart(); // no session was joined by news
         }
 
         private void StopAll(string reason)
