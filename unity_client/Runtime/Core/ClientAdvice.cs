@@ -2,7 +2,6 @@
 // nothing.
 using System;
 using System.Collections.Generic;
-using System.Text;
 using IrisSession.Protocol;
 
 namespace IrisSession.Core
@@ -69,9 +68,6 @@ namespace IrisSession.Core
             Phrase = phrase;
             Reason = reason;
         }
-
-        /// <summary>True for what a person must see before anything else.</summary>
-        public bool IsUrgent { get { return Kind <= AdviceKind.Unconfirmed; } }
     }
 
     /// <summary>What of a scene and its cache a person may have to know. Never changes: another one replaces it.</summary>
@@ -191,28 +187,6 @@ namespace IrisSession.Core
             }
             if (mirror.IsPaused) Add(advice, AdviceKind.Paused, new Phrase("the session is paused", ""));
             advice.Sort((a, b) => a.Kind.CompareTo(b.Kind));
-        }
-
-        /// <summary>Return the lines of a panel: the first `most` things that are wrong.</summary>
-        public static List<string> Wrap(IReadOnlyList<Advice> advice, int most, int width = 44)
-        {
-            List<string> lines = new List<string>();
-            for (int i = 0; i < advice.Count && i < most; i++)
-            {
-                StringBuilder line = new StringBuilder();
-                foreach (string word in advice[i].Phrase.ToString().Split(' '))
-                {
-                    if (line.Length > 0 && line.Length + 1 + word.Length > width)
-                    {
-                        lines.Add(line.ToString());
-                        line.Clear();
-                    }
-                    if (line.Length > 0) line.Append(' ');
-                    line.Append(word);
-                }
-                lines.Add(line.ToString());
-            }
-            return lines;
         }
 
         private static void Add(List<Advice> advice, AdviceKind kind, Phrase phrase, string reason = "")

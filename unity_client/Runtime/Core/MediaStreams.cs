@@ -83,13 +83,6 @@ namespace IrisSession.Core
             }
         }
 
-        /// <summary>Clear everything, for another session.</summary>
-        public void Reset()
-        {
-            deformables.Clear();
-            clouds.Clear();
-        }
-
         /// <summary>Process a message of the media channel: topic, header, bytes.</summary>
         public void Process(Multipart message)
         {

@@ -36,9 +36,6 @@ namespace IrisSession.Transport
         /// <summary>Address in use or tried now, null for none.</summary>
         public WebEndpoint Current { get { return at < 0 ? null : candidates[at].Endpoint; } }
 
-        /// <summary>True when every address shows another key than the known one.</summary>
-        public bool IsBlocked { get { return candidates.Count > 0 && candidates.TrueForAll(each => each.Blocked.Failure != LinkFailure.None); } }
-
         /// <summary>Certificate of the first address that shows another key than the known one, none without.</summary>
         public LinkEnd Blocked
         {

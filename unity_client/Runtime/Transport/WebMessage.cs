@@ -21,9 +21,6 @@ namespace IrisSession.Transport
         /// <summary>Bytes before the frame of a message that has one.</summary>
         public const int HeadBytes = 6;
 
-        /// <summary>Most bytes of a message from a client.</summary>
-        public const int MaxClientBytes = 48_006;
-
         /// <summary>Set the frames of `message` to those of a message in its buffer. Returns the channel; -1: it is malformed.</summary>
         public static int Unpack(Multipart message, int length)
         {

@@ -91,7 +91,6 @@ namespace IrisSession.Core.Tests
             Advice advice = List(session, out _).Single();
             Assert.AreEqual(AdviceKind.Refused, advice.Kind);
             Assert.AreEqual(RefusalCode.Unpaired, advice.Reason);
-            Assert.IsTrue(advice.IsUrgent);
             session.Client.Open(0);
             session.Receive(new Refused { Code = RefusalCode.Version, SupportedVersions = new long[] { 2 } });
             Assert.AreEqual(AdviceKind.OtherVersion, List(session, out _).Single().Kind);
@@ -144,7 +143,6 @@ namespace IrisSession.Core.Tests
                 },
                 list.Select(one => one.Kind));
             Assert.AreEqual(HoldReason.Frozen, list[3].Reason);
-            Assert.IsTrue(ClientAdvice.Wrap(list, 9).All(line => line.Length <= 44 && line.Trim() == line));
             headset.HasMarkerSupport = false;
             panel.TakeFeedback(new Feedback { Robot = "left", HoldReason = HoldReason.Unconfirmed });
             panel.List(session.NowNs + 6 * FakeSession.Second, list);
