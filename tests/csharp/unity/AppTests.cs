@@ -150,7 +150,7 @@ namespace IrisSession.Unity.StandinTests
                 stage.StepUntil(() => IsDrawn(stage, "Join localhost"), "a button");
                 Assert.IsFalse(IsDrawn(stage, "about"));
                 Assert.AreEqual(0, session.Count<Pair>(), "nothing is entered unasked");
-                stage.ShowCode(other.Address + "/#c=" + GatewaySession.Code);
+                stage.ShowCode("https://127.0.0.1:" + other.Port + "/#c=" + GatewaySession.Code);
                 stage.Press("Join localhost", () => stage.App.View.Phase == ConnectorPhase.Running, "it is joined");
                 Assert.AreEqual(PairingOutcome.Paired, stage.App.View.Pairing.Outcome);
                 Assert.AreEqual(0, other.Count<Pair>(), "a code that is seen later is not entered");

@@ -209,8 +209,6 @@ namespace IrisSession.Interaction
             }
             if (IsAnswered(nowNs)) return;
             action = actions[button];
-            answered = view;
-            answeredNs = nowNs;
             Chosen = offered[button];
             isChanged = true;
             if (action == StartAction.None)
