@@ -1,5 +1,7 @@
 // The transport over ZeroMQ with the sockets of a session, on loopback.
 using System;
+using System.Net;
+using System.Net.Sockets;
 using System.Runtime.InteropServices;
 using System.Text;
 using IrisSession.Core;
@@ -18,15 +20,15 @@ namespace IrisSession.Transport.Tests
         {
             private readonly IntPtr context = LibZmq.zmq_ctx_new();
             private readonly Multipart message = new Multipart();
-            public readonly ZmqSocket Control, State, Media, Assets;
+            public readonly LibZmqSocket Control, State, Media, Assets;
             public readonly Welcome Welcome = new Welcome { SessionId = "s1", ConnectionEpoch = 12 };
             public readonly WebEndpoint Endpoint;
 
             public Session(string secret = null)
             {
-                ZmqSocket Bind(int kind, Action<int> tell)
+                LibZmqSocket Bind(int kind, Action<int> tell)
                 {
-                    ZmqSocket socket = new ZmqSocket(context, kind);
+                    LibZmqSocket socket = new LibZmqSocket(context, kind);
                     if (secret != null) socket.Set(CurveServer, 1);
                     if (secret != null) socket.Set(LibZmq.CurveSecretKey, Encoding.ASCII.GetBytes(secret));
                     tell(BindLoopback(socket));
@@ -42,7 +44,7 @@ namespace IrisSession.Transport.Tests
             }
 
             /// <summary>Take the frames of a message as text, null for none.</summary>
-            public string[] Take(ZmqSocket socket)
+            public string[] Take(LibZmqSocket socket)
             {
                 if (!socket.TryReceive(message)) return null;
                 string[] frames = new string[message.Count];
@@ -50,7 +52,7 @@ namespace IrisSession.Transport.Tests
                 return frames;
             }
 
-            public void Send(ZmqSocket socket, params object[] frames)
+            public void Send(LibZmqSocket socket, params object[] frames)
             {
                 for (int i = 0; i < frames.Length; i++)
                 {
@@ -68,7 +70,7 @@ namespace IrisSession.Transport.Tests
 
             public void Dispose()
             {
-                foreach (ZmqSocket socket in new[] { Control, State, Media, Assets }) socket.Dispose();
+                foreach (LibZmqSocket socket in new[] { Control, State, Media, Assets }) socket.Dispose();
                 LibZmq.zmq_ctx_term(context);
             }
         }
@@ -80,7 +82,7 @@ namespace IrisSession.Transport.Tests
         private static extern int zmq_curve_keypair(byte[] publicKey, byte[] secretKey);
 
         /// <summary>Bind to a free port. Returns it.</summary>
-        private static int BindLoopback(ZmqSocket socket)
+        private static int BindLoopback(LibZmqSocket socket)
         {
             LibZmq.zmq_bind(socket.Handle, Encoding.ASCII.GetBytes("tcp://127.0.0.1:*\0"));
             byte[] address = new byte[64];
@@ -197,6 +199,31 @@ namespace IrisSession.Transport.Tests
             Assert.Throws<ArgumentException>(() => new ZmqTransport(new ZmqKeys(bad, bad, bad)));
         }
 
+        [Test]
+        public void APeerThatCannotEncryptIsTakenForNoSession()
+        {
+            byte[] spoken = { 0xff, 0, 0, 0, 0, 0, 0, 0, 1, 0x7f, 1, 6, 0, 0, 0, 2, 0x68, 0x69 }; // ZMTP 2.0 (RFC 15): signature, revision, ROUTER, no identity; "hi"
+            TcpListener listener = new TcpListener(IPAddress.Loopback, 0);
+            listener.Start();
+            using (transport = new ZmqTransport(MakePair("")))
+            {
+                message = new Multipart();
+                transport.Open(new WebEndpoint(true, "127.0.0.1", ((IPEndPoint)listener.LocalEndpoint).Port));
+                using (TcpClient peer = listener.AcceptTcpClient())
+                {
+                    peer.Client.Send(spoken);
+                    WaitFor(() =>
+                    {
+                        Assert.IsFalse(transport.TryTakeControl(ref message), "what was not encrypted");
+                        Assert.AreNotEqual(TransportState.Open, transport.State);
+                        return transport.State == TransportState.Closed;
+                    }, "an end");
+                    Assert.AreNotEqual(LinkFailure.None, transport.End.Failure);
+                }
+            }
+            listener.Stop();
+        }
+
         private static ZmqKeys MakePair(string serverPublic)
         {
             byte[] own = new byte[41];
@@ -210,7 +237,12 @@ namespace IrisSession.Transport.Tests
         {
             transport.Open(session.Endpoint);
             Assert.IsFalse(transport.TrySend(new byte[1], 1), "it is not open yet");
-            WaitFor(() => !transport.TryTakeControl(ref message) && transport.State == TransportState.Open, "the channel");
+            string[] early = null;
+            WaitFor(() =>
+            {
+                if ((early = session.Take(session.Control)) != null) session.Send(session.Control, early[0], session.Encode(new ProtocolFault { Code = FaultCode.Hello }));
+                return !transport.TryTakeControl(ref message) && transport.State == TransportState.Open;
+            }, "the channel");
             Assert.IsTrue(transport.TrySend(Encoding.ASCII.GetBytes("hello"), 5));
             string[] hello = null;
             WaitFor(() => (hello = session.Take(session.Control)) != null, "the hello");

@@ -3,6 +3,11 @@ using System;
 using System.Collections.Generic;
 using IrisSession.Core;
 using IrisSession.Protocol;
+#if IRIS_NETMQ
+using ZmqSocket = IrisSession.Transport.NetMqSocket;
+#else
+using ZmqSocket = IrisSession.Transport.LibZmqSocket;
+#endif
 
 namespace IrisSession.Transport
 {

@@ -6,6 +6,11 @@ using System.Text;
 using System.Threading;
 using IrisSession.Core;
 using IrisSession.Protocol;
+#if IRIS_NETMQ
+using ZmqSocket = IrisSession.Transport.NetMqSocket;
+#else
+using ZmqSocket = IrisSession.Transport.LibZmqSocket;
+#endif
 
 namespace IrisSession.Transport
 {
@@ -27,7 +32,7 @@ namespace IrisSession.Transport
         private const int DisposeMs = 800;
 
         private static readonly byte[] Wakening = new byte[1];
-        private readonly IntPtr context = LibZmq.zmq_ctx_new();
+        private readonly IntPtr context = ZmqSocket.OpenContext();
         private readonly ZmqKeys keys;
         private readonly object gate = new object(); // guards the waking socket, and what channels of assets read
         private readonly ZmqSocket waking;
@@ -78,6 +83,7 @@ namespace IrisSession.Transport
             {
                 if (lacksKeys) return new LinkEnd(LinkFailure.Closed, CloseCode.NotAllowed, "this session is encrypted, and this app has no keys for it: nothing was sent");
                 if (control != null && control.Link == ZmqLink.Refused) return new LinkEnd(LinkFailure.Closed, CloseCode.NotAllowed, "the session does not know the key of this app: add it to its keys");
+                if (control != null && control.Link == ZmqLink.Clear) return new LinkEnd(LinkFailure.Closed, CloseCode.NotAllowed, "what answers at " + endpoint.Authority + " does not encrypt: another machine may pretend to be the session, nothing was sent to it");
                 return control != null && control.Link == ZmqLink.Lost ? new LinkEnd(LinkFailure.Unreachable, 0, "no session answers at " + endpoint.Authority) : default;
             }
         }
@@ -219,7 +225,7 @@ namespace IrisSession.Transport
             }
             waking.Dispose();
             woken.Dispose();
-            Thread ending = new Thread(() => LibZmq.zmq_ctx_term(context)) { IsBackground = true, Name = "iris-session libzmq" };
+            Thread ending = new Thread(() => ZmqSocket.CloseContext(context)) { IsBackground = true, Name = "iris-session ZeroMQ" };
             ending.Start();
             ending.Join(DisposeMs);
         }

@@ -17,10 +17,13 @@ namespace IrisSession.Transport
 
         /// <summary>The session does not know our key.</summary>
         Refused,
+
+        /// <summary>We have keys, and the session does not encrypt. Only <see cref="NetMqSocket"/> gets so far.</summary>
+        Clear,
     }
 
     /// <summary>A socket with the settings of all sockets to a session. Nothing waits, but <see cref="Wait"/>.</summary>
-    internal sealed class ZmqSocket : IDisposable
+    internal sealed class LibZmqSocket : IDisposable
     {
         private const int MaxBytes = 64 << 20;
         private static readonly bool IsWindows = Environment.OSVersion.Platform == PlatformID.Win32NT;
@@ -31,11 +34,11 @@ namespace IrisSession.Transport
         private readonly IntPtr frame = Marshal.AllocHGlobal(LibZmq.MessageBytes);
         private readonly Multipart happened = new Multipart();
         private IntPtr handle;
-        private ZmqSocket monitor;
+        private LibZmqSocket monitor;
 
         /// <param name="keys">Null: not encrypted.</param>
         /// <exception cref="ArgumentException">libzmq does not take the keys: it would go on without them, in the clear.</exception>
-        public ZmqSocket(IntPtr context, int kind, ZmqKeys keys = null)
+        public LibZmqSocket(IntPtr context, int kind, ZmqKeys keys = null)
         {
             this.context = context;
             handle = LibZmq.zmq_socket(context, kind);
@@ -52,6 +55,11 @@ namespace IrisSession.Transport
             Dispose();
             throw new ArgumentException("libzmq does not take the keys: they are not Z85 text, or it was built without CURVE");
         }
+
+        public static IntPtr OpenContext() { return LibZmq.zmq_ctx_new(); }
+
+        /// <summary>Wait until all sockets are closed and what lingers is sent.</summary>
+        public static void CloseContext(IntPtr context) { LibZmq.zmq_ctx_term(context); }
 
         /// <summary>State of the connection of a socket that <see cref="Watch"/> was called for.</summary>
         public ZmqLink Link { get; private set; }
@@ -87,7 +95,7 @@ namespace IrisSession.Transport
             string name = "iris-session-" + Interlocked.Increment(ref monitors);
             const int events = LibZmq.Connected | LibZmq.Retried | LibZmq.Disconnected | LibZmq.HandshakeFailed | LibZmq.KeyRefused;
             LibZmq.zmq_socket_monitor(handle, Text("inproc://" + name + "\0"), events);
-            monitor = new ZmqSocket(context, LibZmq.Pair);
+            monitor = new LibZmqSocket(context, LibZmq.Pair);
             monitor.ConnectInside(name);
         }
 
@@ -143,11 +151,11 @@ namespace IrisSession.Transport
         }
 
         /// <summary>Wait until one of the sockets, or what became of one's connection, can be taken, or the time is over.</summary>
-        public static void Wait(List<ZmqSocket> sockets, int milliseconds)
+        public static void Wait(List<LibZmqSocket> sockets, int milliseconds)
         {
             IntPtr items = Marshal.AllocHGlobal(2 * sockets.Count * ItemBytes);
             int count = 0;
-            foreach (ZmqSocket socket in sockets)
+            foreach (LibZmqSocket socket in sockets)
             {
                 Add(items, ref count, socket);
                 if (socket.monitor != null) Add(items, ref count, socket.monitor);
@@ -156,7 +164,7 @@ namespace IrisSession.Transport
             Marshal.FreeHGlobal(items);
         }
 
-        private static void Add(IntPtr items, ref int count, ZmqSocket socket)
+        private static void Add(IntPtr items, ref int count, LibZmqSocket socket)
         {
             IntPtr item = items + ItemBytes * count++;
             Marshal.WriteIntPtr(item, socket.handle);
