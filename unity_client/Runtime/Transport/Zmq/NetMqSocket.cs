@@ -69,8 +69,8 @@ namespace IrisSession.Transport
         /// <summary>NetMQ has one context for all of a program. A number keeps the names of one transport apart from those of another.</summary>
         public static IntPtr OpenContext() { return (IntPtr)Interlocked.Increment(ref numbers); }
 
-        /// <summary>NetMQ's own threads close sockets and send what lingers, while the program goes on.</summary>
-        public static void CloseContext(IntPtr context) { }
+        /// <summary>Wait as long as a last bye may take: a program may end then, and with it NetMQ's threads, which do not say when it is sent.</summary>
+        public static void CloseContext(IntPtr context) { Thread.Sleep(ZmqTransport.LingerMs); }
 
         /// <summary>State of the connection of a socket that <see cref="Watch"/> was called for. NetMQ does not say why a handshake failed.</summary>
         public ZmqLink Link { get; private set; }

@@ -28,7 +28,7 @@ namespace IrisSession.Transport
         private const int MediaBytes = 128 << 10;
 
         /// <summary>A last bye has this time to be sent, and all sockets to end [ms].</summary>
-        private const int LingerMs = 200;
+        internal const int LingerMs = 200;
         private const int DisposeMs = 800;
 
         private static readonly byte[] Wakening = new byte[1];
