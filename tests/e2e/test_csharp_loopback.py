@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq.auth
 
 from tests.csharp.conftest import built as built  # noqa: PLC0414  a fixture
 from tests.e2e.browser import printed_address
 from tests.e2e.session_process import COMMAND_S, SessionProcess, run_in_process
 from tools.csharp.project import Build
-from tools.csharp.toolchain import RUNTIMES
 
 pytestmark = [pytest.mark.e2e, pytest.mark.long]
 
@@ -47,12 +47,24 @@ def test_touched_marks_align_and_the_arm_follows(
     assert results["marks"]["true_m"] <= results["marks"]["stated_m"] < 0.006
 
 
-@pytest.mark.parametrize("runtime", RUNTIMES)
+def make_keys(folder: Path) -> tuple[list[str], list[str]]:
+    """Write certificates (docs/network.md). Return the options of a session, and of a client on its list."""
+    (folder / "clients").mkdir()
+    for name in ("server", "ann"):
+        zmq.auth.create_certificates(folder, name)
+        (folder / f"{name}.key_secret").chmod(0o600)
+    (folder / "ann.key").rename(folder / "clients/ann.key")
+    session = ["--curve-key", str(folder / "server.key_secret"), "--curve-clients", str(folder / "clients")]
+    return session, ["--curve-server", str(folder / "server.key"), "--curve-key", str(folder / "ann.key_secret")]
+
+
+@pytest.mark.parametrize(("runtime", "is_encrypted"), [("dotnet", True), ("mono", False)])
 def test_a_headset_drives_by_zeromq(
-    serve: Callable[..., SessionProcess], built: Build, tmp_path: Path, runtime: str
+    serve: Callable[..., SessionProcess], built: Build, tmp_path: Path, runtime: str, is_encrypted: bool
 ) -> None:
-    server = serve("handover")
+    of_session, of_client = make_keys(tmp_path) if is_encrypted else ([], [])
+    server = serve("handover", *of_session)
     commands = "join; scene; align; acquire left; move left 0 0 0.05; measure 1"
     command = built.make_command(runtime, "headless")
-    results = run_headset(command, tmp_path, "--zmq", server.address, "--do", commands)
+    results = run_headset(command, tmp_path, "--zmq", server.address, *of_client, "--do", commands)
     assert results["measure"]["states"] > 0

@@ -150,9 +150,10 @@ internal sealed class Headset : IDisposable
     private void ConnectByZmq(string run)
     {
         Hello hello = new Hello { Role = options.RoleName, Name = options.Name, Devices = new[] { Device.Head, Device.ControllerRight }, Capabilities = new[] { "run:" + run } };
-        WebEndpoint endpoint = WebEndpoint.Parse("http://" + options.Zmq);
+        ZmqKeys keys = options.CurveKey.Length > 0 ? ZmqKeys.Read(options.CurveServer, options.CurveKey) : null;
+        WebEndpoint endpoint = WebEndpoint.Parse((keys == null ? "http://" : "https://") + options.Zmq);
         FileIdentityStore identity = new FileIdentityStore(options.Identity);
-        Client = new SessionClient(hello, identity, new EndpointChooser(endpoint), new ZmqTransport(null));
+        Client = new SessionClient(hello, identity, new EndpointChooser(endpoint), new ZmqTransport(keys));
         Scene = new SceneFetcher(Client, new AssetCache(new DiskAssetFiles(Path.Combine(options.Identity, "assets"))), SceneBudget.Quest3);
         Client.Start();
         Scene.Start();

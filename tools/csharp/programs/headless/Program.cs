@@ -19,7 +19,9 @@ Join a session as a headset app does, and do what is asked: commands of --do, el
 
   --address ADDRESS   host:port of the web channel, https://..., or a link of `iris-session pair --web`; several with commas, the
                       preferred one first (default: a session that announces itself)
-  --zmq HOST:PORT     control channel of a session on this machine: by ZeroMQ, without a gateway
+  --zmq HOST:PORT     control channel of a session: by ZeroMQ, without a gateway; without certificates only on this machine
+  --curve-server FILE certificate *.key of the session, with --zmq
+  --curve-key FILE    our own, *.key_secret
   --session NAME      which of the sessions that announce themselves
   --pairing-file FILE file of `iris-session pair --unity`
   --code CODE         join code of `iris-session pair`
@@ -79,6 +81,8 @@ internal sealed class Options
 {
     public string Address = "";
     public string Zmq = "";
+    public string CurveServer = "";
+    public string CurveKey = "";
     public string Session = "";
     public string PairingFile;
     public string Code = "";
@@ -108,6 +112,8 @@ internal sealed class Options
             {
                 case "--address": options.Address = value; break;
                 case "--zmq": options.Zmq = value; break;
+                case "--curve-server": options.CurveServer = value; break;
+                case "--curve-key": options.CurveKey = value; break;
                 case "--session": options.Session = value; break;
                 case "--pairing-file":
                     problem = "the file " + value + " cannot be read";
