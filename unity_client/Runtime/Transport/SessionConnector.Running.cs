@@ -287,6 +287,13 @@ namespace IrisSession.Transport
                 }
             }
             if (end == null) return;
+            if (end.IsJoined) // another session, which was started at this address
+            {
+                Phrase phrase = ConnectorWords.OfOtherSession(end.Welcome.SessionName);
+                if (goal.Chosen != null) TryAgain(phrase, default);
+                else Fail(phrase);
+                return;
+            }
             bool isStranger = end.Problem.Failure == LinkFailure.WrongCertificate || (end.Failure != null && (end.Failure.Code == RefusalCode.Unpaired || end.Failure.Code == RefusalCode.Identity));
             if (isStranger && goal.Code.Length > 0) goal.PairsFirst = true;
             else Fail(end.Failure != null ? Words.OfRefusal(end.Failure) : LinkWords.OfEnd(end.Problem), end.Problem, end.Failure);
@@ -300,7 +307,7 @@ namespace IrisSession.Transport
             return new Hello { Role = settings.Role, Name = Words.ToLine(settings.Name, MaxName), Software = Words.ToLine(settings.Software, MaxName), Devices = settings.Devices, Capabilities = capabilities.ToArray() };
         }
 
-        /// <summary>Say how a client fares until there is an order, or it was lost for long: null then; or until the session or its key ends it.</summary>
+        /// <summary>Say how a client fares until there is an order, or it was lost for long: null then; or until the session or its key ends it, or it is another session.</summary>
         private SessionView Follow(SessionClient client, SceneFetcher scene)
         {
             bool isRunning = false;
@@ -311,6 +318,7 @@ namespace IrisSession.Transport
             {
                 SessionView now = client.View;
                 if (now.Failure != null || now.Problem.Failure != LinkFailure.None) return now;
+                if (now.IsJoined && settings.SessionName.Length > 0 && now.Welcome.SessionName != settings.SessionName) return now;
                 isRunning |= now.IsJoined;
                 long nowNs = MonotonicClock.NowNs;
                 if (now.IsJoined || isPaused) joinedNs = nowNs;

@@ -296,8 +296,8 @@ internal sealed class Commands
     private bool Wait(double seconds)
     {
         headset.RunUntil(() => false, seconds);
-        report.Write("wait", true);
-        return true;
+        report.Write("wait", !headset.IsInterrupted);
+        return !headset.IsInterrupted;
     }
 
     /// <summary>Wait for an event of a kind, from the last one on.</summary>

@@ -72,6 +72,14 @@ internal sealed class Driving
     /// <summary>Drive a robot. Close the clutch, again after a reason for which the session wants it opened.</summary>
     private bool Begin(string command, string robot, out RigidTransform T_world_site)
     {
+        T_world_site = RigidTransform.Identity;
+        SessionView view = headset.Client.View;
+        string why = !view.Robots.ContainsKey(robot) ? "no robot has this name" : !view.IsOurs(robot) ? "this robot is not yours: acquire it" : view.IsStopped ? Words.OfHold(HoldReason.Estop).ToString() : "";
+        if (why.Length > 0)
+        {
+            report.Write(command, false, "robot", robot, "text", why);
+            return false;
+        }
         headset.Robots.Clear();
         headset.Robots.Add(robot);
         headset.RunUntil(() => headset.Pulses.Find(robot) != null, 2.0);
@@ -84,7 +92,7 @@ internal sealed class Driving
             headset.Clutch = false;
             headset.RunUntil(() => false, 0.3);
         }
-        T_world_site = RigidTransform.Identity;
+        headset.TryGetSite(robot, out T_world_site);
         End(command, robot, false, T_world_site);
         return false;
     }

@@ -168,8 +168,10 @@ internal sealed class Headset : IDisposable
         {
             List<string> names = new List<string>();
             foreach (OfferedSession one in view.Sessions) names.Add(one.Name + " (" + HostName.Format(one.Host, one.Port) + ")");
+            string option = view.Phase == ConnectorPhase.Choosing ? " (--session NAME)" : view.Phase == ConnectorPhase.Untrusted ? " (--code CODE, or --trust FINGERPRINT)" : "";
+            bool isOnItsWay = view.Phase == ConnectorPhase.Searching || view.Phase == ConnectorPhase.Pairing || view.Phase == ConnectorPhase.Running;
             report.Write(
-                "find", view.Phrase.What.Length == 0, "phase", view.Phase.ToString(), "session", view.Session, "endpoint", view.Endpoint, "text", view.Phrase.ToString(), "sessions", names.ToArray());
+                "find", isOnItsWay, "phase", view.Phase.ToString(), "session", view.Session, "endpoint", view.Endpoint, "text", view.Phrase + option, "sessions", names.ToArray());
         }
         phase = view.Phase;
         what = view.Phrase.What;
