@@ -11,17 +11,13 @@ from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Join, Lost
 from iris_session.protocol.names import AlignmentDoubt, HoldReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentChanged, Notice, SamplesRejected
-from iris_session.protocol.status import AlignmentReport
 
 from .table import SECOND, Person, Table, proposal
+from .test_alignment import report
 
 #: A step may be a minute long.
 LONG = {"gap_ns": 3600 * SECOND, "heartbeat_timeout_ns": 36_000 * SECOND}
 CONFIG = AuthorityConfig(anchors={"table": Pose((0.0, -0.5, 0.0), IDENTITY.q)}, **LONG)  # type: ignore[arg-type]
-
-
-def report(t: Table, person: Person) -> AlignmentReport:
-    return t.authority.build_alignment_reports()[person.id]
 
 
 def warnings(t: Table, person: Person) -> list[str]:

@@ -127,22 +127,6 @@ def test_a_look_that_has_begun_is_no_refusal() -> None:
     assert [e.reason for e in t.since(Notice)] == ["alignment_refused"]
 
 
-def test_after_a_new_alignment_a_held_squeeze_is_asked_for_again() -> None:
-    t = Table()
-    anna = t.operator("left")
-    anna.engage("left")
-    anna.does(TrackingEpoch(1))
-    anna.tracking_epoch = 1
-    anna.sends("left", clutch=True)
-    assert t.hold() == "unaligned"
-    t.step(anna.says(proposal(tracking_epoch=1)))
-    anna.alignment_version = 2
-    anna.sends("left", clutch=True)
-    assert t.hold() == "rearm"
-    anna.engage("left")
-    assert t.command().kind == "pose"
-
-
 def test_a_tilt_that_noise_explains_is_no_warning() -> None:
     t = Table()
     anna, bert = t.join(), t.join()
@@ -201,21 +185,10 @@ def test_advice_that_changes_with_every_measurement_is_told_every_five_seconds()
     assert "25 mm (24 more of these meanwhile)" in notices[1][1]
 
 
-def test_alignment_is_frozen_while_engaged() -> None:
+def test_twists_turn_with_the_alignment() -> None:
     t = Table()
     anna = t.operator("left")
-    anna.engage("left")
     t.step(anna.says(proposal(T_world_tracking=yawed(math.pi / 2))))
-    for _ in range(2):
-        anna.sends("left", clutch=True)
-        source = t.command().sources[0]
-        assert source.new
-        assert source.pose_world.p == (1.0, 0.0, 1.0)
-    anna.sends("left")
-    assert t.hold() == "clutch_open"
-    t.wait(2 * SECOND)
-    anna.sends("left")
-    assert t.last(SamplesRejected).reason == "alignment_version"
     anna.alignment_version = 2
     anna.engage("left", kind="twist", twist=(1.0, 0.0, 0.0, 0.0, 0.0, 1.0))
     assert t.command().sources[0].twist_world == pytest.approx((0.0, 1.0, 0.0, 0.0, 0.0, 1.0), abs=1e-12)
@@ -232,8 +205,13 @@ def test_a_tracking_jump_voids_alignment_and_engagement() -> None:
     assert t.since(ParticipantChanged) == []
     t.step(anna.says(proposal()))
     assert t.since(AlignmentChanged) == []
+    anna.tracking_epoch = 1
+    anna.sends("left", clutch=True)
+    assert t.hold() == "unaligned"
     t.step(anna.says(proposal(tracking_epoch=1)))
-    anna.tracking_epoch, anna.alignment_version = 1, 2
+    anna.alignment_version = 2
+    anna.sends("left", clutch=True)
+    assert t.hold() == "rearm", "the squeeze is still held"
     anna.engage("left", p=(5.0, 0.0, 0.0))
     assert t.command().kind == "pose"
     anna.sends("left", clutch=True, p=(5.0, 0.0, 0.0), tracking_epoch=0)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from iris_session.authority import Authority, AuthorityConfig
+from iris_session.authority import AuthorityConfig
 from iris_session.protocol.client_messages import Align, Bye, Heartbeat, MoveAnchor, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import AlignmentAlarm, CrossChecked, Lost, SessionResumed
@@ -117,8 +117,6 @@ def test_an_anchor_moves_far_only_where_that_is_said_to_be_meant() -> None:
     wide = Table(AuthorityConfig(anchors={"table": TABLE}, max_anchor_move_m=500.0))
     wide.step(wide.host(MoveAnchor(1, "table", far)))
     assert wide.authority.anchors["table"] == far
-    with pytest.raises(ValueError, match="max_anchor_move_m is 0"):
-        Authority(AuthorityConfig(max_anchor_move_m=0.0), (), ())
 
 
 def test_what_was_measured_to_the_old_place_counts_no_more() -> None:
@@ -150,11 +148,6 @@ def test_anchors_survive_a_snapshot_and_are_given_anew_to_a_session_that_goes_on
     assert again.authority.anchors == {"wall": TABLE, "door": DOOR}
 
 
-def test_anchors_must_be_poses() -> None:
-    with pytest.raises(ValueError, match="anchor 'x'"):
-        Authority(AuthorityConfig(anchors={"x": Pose((math.nan, 0.0, 0.0), IDENTITY.q)}), (), ())
-
-
 # --- alarms -----------------------------------------------------------------------------------------------------------
 
 
@@ -177,29 +170,6 @@ def test_a_jump_voids_the_alignment_at_once_and_the_robot_holds() -> None:
     anna.alignment_version = 2
     anna.engage("left", p=(3.0, 0.0, 0.0))  # as far away in its frame as the jump has put it
     assert t.command().kind == "pose"
-
-
-@pytest.mark.parametrize("kind", ["changed", "differs"])
-def test_a_doubt_is_said_and_stays_until_a_new_alignment_answers(kind: str) -> None:
-    t = Table(CONFIG)
-    anna = t.operator("left")
-    anna.engage("left")
-    t.step(anna.says(AlignmentAlarm(kind, 0, "table", 0.03)))
-    assert t.command().kind == "pose", "a doubt moves nothing and stops nobody"
-    assert t.since(AlignmentAlarmed) == [AlignmentAlarmed(anna.id, kind, "table", 0.03)]
-    assert [e.participant for e in t.since(Notice)] == [anna.id]
-    t.step(anna.says(AlignmentAlarm(kind, 0, "table", 0.03)))
-    assert (len(t.since(AlignmentAlarmed)), t.since(Notice)) == (1, []), "the wearer is not told again and again"
-    anna.sends("left")
-    t.step()
-    r = report(t, anna)
-    assert (r.alarm, r.alarm_size_m, r.version) == (kind, 0.03, 1)
-    assert r.alarm_ns > 0
-    t.step(anna.says(proposal()))
-    for _ in range(30):
-        t.step(anna.says(Heartbeat()), dt_ns=20 * MS)
-    assert t.last(AlignmentChanged).alignment.version == 2, "a new look that says the same answers it too"
-    assert report(t, anna).alarm == ""
 
 
 def test_a_moved_sheet_is_not_answered_by_a_new_alignment_but_by_a_new_place() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -9,8 +10,8 @@ import pytest
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.authority.config import SpeedLimit
 from iris_session.protocol.client_messages import Acquire, Bye, Heartbeat, Marker, Release
-from iris_session.protocol.common import Pose
-from iris_session.protocol.entries import Entry, Lost
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.entries import Audit, Entry, ExternalReset, Lost, PhysicsDiverged, RecordingGap, SceneLoaded
 from iris_session.protocol.server_messages import MarkerAdded, SamplesRejected, Snapshot
 from iris_session.protocol.specs import ObjectSpec
 
@@ -48,6 +49,15 @@ def test_host_has_no_quota_and_the_rights_of_a_director() -> None:
     t.step(*(t.host(Marker(i, "x")) for i in range(3)))
     assert len(t.since(MarkerAdded)) == 3
     assert t.since(MarkerAdded)[0].participant == "host"
+
+
+def test_what_only_the_host_may_say_does_nothing_from_others() -> None:
+    t = Table()
+    boss = t.join("director")
+    loaded = SceneLoaded("0" * 32, (), ())
+    for message in (ExternalReset(), PhysicsDiverged(1, "NaN"), RecordingGap(3), Audit("flood"), loaded):
+        t.step(boss.says(message))
+        assert t.decision.events == ()
 
 
 def test_strangers_and_wrong_envelopes_are_answered() -> None:
@@ -97,6 +107,12 @@ def test_presence_is_in_the_world_and_only_of_the_aligned() -> None:
         ({"leader_apart": "jump"}, (), (), "must be 'ramp' or 'refuse'"),
         ({"speed_limits": {"head": SpeedLimit(1.0, 1.0)}}, (), (), "speed_limits lacks controller/left, "),
         ({"contact_step_n": 0.0}, (), (), "contact_step_n is 0.0; it must be positive"),
+        ({"max_anchor_move_m": 0.0}, (), (), "max_anchor_move_m is 0"),
+        ({"anchors": {"x": Pose((math.nan, 0.0, 0.0), IDENTITY.q)}}, (), (), "anchor 'x'"),
+        ({"min_scale": 0.0}, (), (), "min_scale"),
+        ({"min_scale": 2.0, "max_scale": 1.0}, (), (), "min_scale"),
+        ({"max_scale": math.inf}, (), (), "min_scale"),
+        ({"min_scale": math.nan}, (), (), "min_scale"),
     ],
 )
 def test_construction_says_what_would_be_right(config: dict[str, Any], robots: Any, objects: Any, text: str) -> None:

@@ -9,14 +9,10 @@ from iris_session.protocol.client_messages import Grasp, PlaceAlignment
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import AlignmentAlarm
 from iris_session.protocol.names import AlarmKind, AlignmentDoubt, HoldReason, RejectReason
-from iris_session.protocol.server_messages import Notice, SamplesRejected
-from iris_session.protocol.status import AlignmentReport
+from iris_session.protocol.server_messages import AlignmentAlarmed, Notice, SamplesRejected
 
 from .table import SECOND, Person, Table, proposal
-
-
-def report(t: Table, person: Person) -> AlignmentReport:
-    return t.authority.build_alignment_reports()[person.id]
+from .test_alignment import report
 
 
 def doubted(t: Table) -> Person:
@@ -32,9 +28,13 @@ def test_a_contradiction_lets_nothing_begin_until_a_look_agrees(kind: str) -> No
     anna.engage("left")
     t.step(anna.says(AlignmentAlarm(kind, 0, "table", 0.03)))
     told = [(n.level, n.participant) for n in t.since(Notice)]
+    assert t.since(AlignmentAlarmed) == [AlignmentAlarmed(anna.id, kind, "table", 0.03)]
+    t.step(anna.says(AlignmentAlarm(kind, 0, "table", 0.03)))
+    assert (len(t.since(AlignmentAlarmed)), t.since(Notice)) == (1, []), "the wearer is not told again and again"
     anna.sends("left", clutch=True)
     assert t.command().kind == "pose", "what is engaged goes on"
-    assert report(t, anna).doubt == AlignmentDoubt.CONTRADICTED
+    r = report(t, anna)
+    assert (r.doubt, r.alarm, r.alarm_size_m, r.alarm_ns > 0) == (AlignmentDoubt.CONTRADICTED, kind, 0.03, True)
     assert told == [("warning", anna.id)]
     anna.engage("left")
     assert t.hold() == HoldReason.UNCONFIRMED

@@ -74,14 +74,6 @@ def test_clearing_needs_a_director_and_a_new_clutch() -> None:
     assert t.command().kind == "pose"
 
 
-def test_a_stop_in_the_same_step_beats_the_clear() -> None:
-    t, op, boss = playing()
-    op.does(EStop())
-    t.step(boss.says(ClearEStop(1, 1)), op.says(EStop()))
-    assert not boss.replies()[0].ok
-    assert t.decision.estop
-
-
 def test_every_stop_is_counted_and_announced_also_while_stopped() -> None:
     t, op, boss = playing()
     watcher = t.join("observer")
@@ -186,12 +178,10 @@ def test_physics_that_diverged_takes_no_ticks_and_stays_paused_when_a_director_w
 
 
 def test_what_diverged_before_a_reset_is_over() -> None:
-    t, op, boss = playing()
+    t, _, boss = playing()
     boss.asks(Control(1, "reset"))
     t.step(t.host(PhysicsDiverged(1, "NaN")))
     assert not t.decision.paused
-    t.step(op.says(PhysicsDiverged(2, "NaN")))
-    assert not t.decision.paused, "only the owner says so"
 
 
 def test_reset_starts_a_scene_epoch_and_keeps_leases() -> None:
@@ -219,9 +209,7 @@ def test_a_loop_of_the_user_is_not_paused_or_reset() -> None:
 
 def test_an_owner_that_listens_is_asked_to_reset() -> None:
     t = Table(AuthorityConfig(user_owned_loop=True))
-    boss, op = t.join("director"), t.operator("left")
-    op.does(OwnerListens())
-    assert boss.denied(Control(1, "reset")) == "user_owned", "only the host says that it listens"
+    boss = t.join("director")
     t.step(t.host(OwnerListens()))
     assert boss.denied(Control(1, "pause")) == "user_owned"
     assert boss.asks(Control(2, "reset")).ok
@@ -275,12 +263,10 @@ def test_where_every_step_is_a_gap_the_silent_and_the_lost_expire_all_the_same()
     assert gone[(op.id, False)] == pytest.approx(33.3, abs=0.5)
 
 
-def test_recording_gap_is_announced_and_only_by_the_host() -> None:
-    t, op, _ = playing()
+def test_recording_gap_is_announced() -> None:
+    t, *_ = playing()
     t.step(t.host(RecordingGap(3)))
     assert t.since(Gap) == [Gap("recording", 0, 3)]
-    t.step(op.says(RecordingGap(3)))
-    assert t.since(Gap) == []
 
 
 # --- episodes ---
@@ -388,14 +374,6 @@ def test_who_waits_for_what_is_no_more_is_answered_and_the_others_wait_on() -> N
     assert stays.connection not in answers
     assert answers[any_robot.connection].ok, "a robot has become free"
     assert answers[any_robot.connection].leases[0].target == "third"
-
-
-def test_nobody_but_the_owner_of_the_session_loads_a_scene() -> None:
-    t = Table()
-    boss = t.join("director")
-    t.step(boss.says(other("left")))
-    assert not t.since(SceneChanged)
-    assert t.hold("right") == "no_lease"
 
 
 def test_a_snapshot_knows_the_scene_it_is_of() -> None:
