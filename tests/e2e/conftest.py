@@ -33,7 +33,7 @@ SHUTDOWN_S: Final = 10.0
 #: Those that compute most lie between those that wait most.
 LONGEST: Final = (
     "test_resume.py", "test_joining.py", "test_process_failures.py", "test_soak.py", "test_process.py",
-    "test_shutdown.py", "test_security.py", "test_hostile_clients.py",
+    "test_shutdown.py", "test_security.py",
 )  # fmt: skip
 
 

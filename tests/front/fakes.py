@@ -66,6 +66,8 @@ class FakePublisher:
 
     scene = SceneInfo("")
 
+    def replace_socket(self, state: object) -> None: ...
+
 
 class FakeChannel:
     """In place of the services of media and of assets."""

@@ -153,20 +153,6 @@ def test_gateway_sends_for_participants_and_they_leave_with_it(session: FrontSes
     assert [e.connection for e in session.wait_entries(Lost, 2)] == [2, 3]
 
 
-def test_silent_gateway_disconnects_its_participants(open_session: OpenSession) -> None:
-    session = open_session(silence_ns=1_000_000_000)
-    gateway, other = session.client(), session.client()
-    gateway.join("gateway", "Gate")
-    gateway.send(Hello("operator", "Web", secret=os.urandom(16)), on_behalf_of="tab1")
-    session.wait_entries(Join, 2)
-    session.wait_entries(Lost, 2)  # it says nothing any more, its TCP connection stands
-    assert {e.connection for e in session.entries if isinstance(e.message, Lost)} == {1, 2}
-    other.join(name="Ann")
-    gateway.send(EStop("from behind"), on_behalf_of="tab1", epoch=2)
-    (stop,) = session.wait_entries(EStop)
-    assert stop.connection == 2
-
-
 def test_stalled_authority_gets_a_bounded_batch_with_the_estop_first(session: FrontSession) -> None:
     client, other = session.client(), session.client()
     client.join()

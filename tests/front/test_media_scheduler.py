@@ -212,23 +212,6 @@ def test_stream_belongs_to_one_connection_of_its_key() -> None:
     assert not push(12)
 
 
-def test_streams_of_a_sender_that_has_left_end_and_do_not_come_back() -> None:
-    wire = Wire()
-
-    def push(stream: str, sender: int) -> bool:
-        push = MediaPush(stream, 3, wire.now_ns, connection_epoch=sender)
-        return wire.hub.push(push, [b"x"], "a" if sender == ANN else "b", wire.now_ns, sender)
-
-    assert push("cloud", ANN)
-    assert push("cloud-front", ANN)
-    assert push("other", BOB)
-    wire.hub.end_sender(ANN)
-    assert set(wire.hub.read_streams()) == {"other"}
-    assert not push("cloud", ANN), "it was on its way"
-    assert wire.hub.pop_drops()[0] == {"media_source_left": 1}
-    assert push("cloud", BOB)
-
-
 def test_rates_cover_the_last_seconds() -> None:
     wire = Wire()
     for _ in range(12):

@@ -169,6 +169,8 @@ def test_streams_end_with_the_participant_and_not_with_its_connection() -> None:
     room.service.end_sources(camera.participant_id)
     room.tick()
     assert [one.stream for one in room.budgets[-1].streams] == ["hall"]
+    assert not room.push_from(8), "it was on its way"
+    assert room.proxy.scheduler.pop_drops()[0] == {"media_source_left": 1}
     room.service.end_sources(other.participant_id)  # while its connection is there
     room.tick()
     assert room.budgets[-1].streams == ()

@@ -20,7 +20,7 @@ from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired
 from iris_session.security import KeyHome, KeyPair
 from iris_session.security.keyring import PAIRING_PREFIX, Keyring
-from tests.front.fakes import make_context
+from tests.front.fakes import FakePublisher, make_context
 from tests.front.slow_disk import slow_disk, turns
 
 
@@ -34,13 +34,6 @@ class Outbox:
         self.sent.setdefault(route.routing_id, []).append(message)
 
 
-class Publisher:
-    """Stands for the state socket."""
-
-    def replace_socket(self, state: object) -> None:
-        pass
-
-
 class PairingRig:
     """Keyring, pairing and revocation of a front, with ticks by the test. Addresses are made of descriptors."""
 
@@ -50,7 +43,7 @@ class PairingRig:
         self.outbox: Any = Outbox()
         clients = self.home.clients
         self.keyring = Keyring(self.server, self.home, clients.read, lambda: clients.signature)
-        publisher: Any = Publisher()
+        publisher: Any = FakePublisher()
         front = make_context(self.outbox, lambda: self.now_ns, keyring=self.keyring, publisher=publisher, max_tokens=16)
         self.tokens, self.drops = front.tokens, front.drops
         self.pairing = PairingService(front)

@@ -23,14 +23,31 @@ from tests.front.lab import Lab, Open
 pytestmark = pytest.mark.e2e
 
 
-def test_floods_of_unauthenticated_connections_keep_no_known_key_out(open_process: Open, tmp_path: Path) -> None:
+def is_closed(tcp: socket.socket) -> bool:
+    tcp.setblocking(False)
+    try:
+        while tcp.recv(65536):
+            pass
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def test_floods_of_unauthenticated_connections_keep_no_known_key_out_and_end(
+    open_process: Open, tmp_path: Path
+) -> None:
     """Half-open TCP connections on every socket, unfinished handshakes, unknown keys, and a frame that is too large."""
-    lab = Lab(lambda **config: open_process(limits=FrontLimits(unauthenticated=64), **config), tmp_path / "home")
+    limits = FrontLimits(unauthenticated=64, hello_timeout_ns=6_000_000_000)
+    lab = Lab(lambda **config: open_process(limits=limits, **config), tmp_path / "home")
     session = lab.session
     ports = (session.ports.control, session.ports.state, session.ports.assets)
     crowd = [socket.create_connection((session.host, port)) for port in ports for _ in range(100)]
     for tcp in crowd[::3]:
         tcp.sendall(b"\xff" + bytes(8) + b"\x7f")  # the beginning of a greeting
+    for tcp in crowd[1::3]:
+        tcp.sendall(os.urandom(200))
     unknown = [lab.client(KeyPair.generate()) for _ in range(20)]
     for client in unknown:
         client.send(Hello("operator", "Eve"))
@@ -49,6 +66,9 @@ def test_floods_of_unauthenticated_connections_keep_no_known_key_out(open_proces
     assert session.wait_drops("strangers_too_many") > 0
     assert not [entry for entry in session.entries if isinstance(entry.message, Lost)]
     assert unknown[0].wait_for(Refused).code == RefusalCode.UNPAIRED
+    session.pump(lambda: all(is_closed(tcp) for tcp in crowd), "all of them are closed")
+    lab.client(KeyPair.generate())  # which says no hello
+    assert session.wait_drops("no_hello") > 0
     for tcp in crowd:
         tcp.close()
 
