@@ -61,11 +61,6 @@ def run_with(rig: Rig, rounds: int) -> np.ndarray:
     return np.array(states)
 
 
-def test_without_anybody_the_trajectory_is_the_owners_to_the_bit(rig: Rig) -> None:
-    rig.policy = swing(rig)
-    assert np.array_equal(run_with(rig, 300), run_without(rig, 300))
-
-
 def test_observers_and_a_holder_that_has_not_engaged_change_nothing(rig: Rig) -> None:
     rig.policy = swing(rig)
     expected = run_without(rig, 300)

@@ -254,21 +254,10 @@ def test_session_goes_on_after_the_budget_of_its_recording(tmp_path: Path, monke
         assert processes is not None
         session.run(until=lambda: processes.make_report(session.stepper).recorder.state == "ended")
         steps = session.stepper.step_count
-        session.run(seconds=1.0)  # restarts would be announced within it
-        status, report = session.status(), _make_report(session)
+        session.run(seconds=1.0)  # a restart would be within it
         assert session.stepper.step_count > steps
-        announced = [body.text for body in _bodies(session) if isinstance(body, MarkerAdded)]
+        assert session.status().restarts == {"front": 0, "recorder": 0}
     assert session.recording_fault == ""
-    assert report.recorder is not None
-    assert (report.recorder.state, report.recorder.lost_rows, report.recorder.spilled_bytes) == ("ended", 0, 0)
-    assert (status.restarts, status.drops.get("journal_rows", 0)) == ({"front": 0, "recorder": 0}, 0)
-    ended = "recording ended: budget of 2 MB is used up"
-    assert report.recorder.text == ended
-    assert ended in report.warnings
-    left, end = announced
-    assert "MB are left of the recording's budget" in left
-    assert end == f"{ended}; the session goes on without it"
-    assert sorted(one.name for one in tmp_path.iterdir() if one.suffix == ".rrd") == ["session.rrd"]
     verified = verify_recording(path)
     assert verified.ok, verified.line()
     assert verified.finished
