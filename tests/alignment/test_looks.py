@@ -89,13 +89,6 @@ def test_poses_at_the_origin_never_align(q: tuple[float, float, float, float]) -
     assert error_at_anchor(ann, ann.proposals()[-1]) < 0.01
 
 
-def test_identical_poses_never_align() -> None:
-    lab = Lab()
-    ann = lab.wearer()
-    _look(ann, ann.place(), repeats=60)
-    assert ann.proposals() == []
-
-
 @pytest.mark.parametrize("number", [next, lambda n: 0], ids=["each", "zero"])
 @pytest.mark.parametrize("seed", [1])
 def test_numbers_of_viewpoints_change_nothing(number: Callable[[count[int]], int], seed: int) -> None:

@@ -38,14 +38,6 @@ def test_log_is_the_inverse_of_exp(axis: Array, angle: float) -> None:
         assert _is_same_rotation(lie.quat_exp(back), q)
 
 
-@given(vectors, vectors, vectors)
-def test_product_applies_the_right_factor_first(a: Array, b: Array, v: Array) -> None:
-    qa, qb = lie.quat_exp(a), lie.quat_exp(b)
-    both = lie.quat_multiply(qa, qb)
-    assert np.allclose(lie.quat_to_matrix(both) @ v, lie.quat_to_matrix(qa) @ (lie.quat_to_matrix(qb) @ v), atol=1e-9)
-    assert np.allclose(lie.quat_multiply(both, lie.quat_conjugate(both)), [1.0, 0.0, 0.0, 0.0], atol=1e-12)
-
-
 @given(arrays(np.float64, (5, 3), elements=st.floats(-3.0, 3.0)))
 def test_batches_agree_with_single_values_and_tuples(r: Array) -> None:
     q = lie.quat_exp(r)
