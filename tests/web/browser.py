@@ -109,11 +109,6 @@ class WebBrowser:
         await self.wait(lambda: len(self.got(kind)) >= n, f"{n} {kind.__name__}")
         return self.got(kind)[n - 1]
 
-    async def wait_closed(self, timeout_s: float = DEADLINE_S) -> int:
-        await self.wait(lambda: self.close_code is not None, "closed", timeout_s)
-        assert self.close_code is not None
-        return self.close_code
-
     async def fetch(self, address: str, ticket: str | None = None, **headers: str) -> tuple[int, bytes, dict[str, str]]:
         """Return status, body and headers of a request for an asset."""
         sent = {"X-Iris-Ticket": self.ticket if ticket is None else ticket, **headers}

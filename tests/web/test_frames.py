@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from iris_session.protocol.limits import TokenBucket
@@ -51,6 +51,7 @@ class Counted(FrameMeter):
     ),
     st.lists(st.integers(1, 70_000), max_size=40),
 )
+@example([(PING, 0, True), (MESSAGE, 130, True)], [1] * 150)
 def test_frames_are_counted_however_their_bytes_come(sent: list[tuple[int, int, bool]], cuts: list[int]) -> None:
     data = b"".join(make_frame(first, length, masked=masked) for first, length, masked in sent)
     meter, at = Counted(), 0
@@ -58,14 +59,6 @@ def test_frames_are_counted_however_their_bytes_come(sent: list[tuple[int, int, 
         assert meter.feed(data[at : at + cut], 0)
         at += cut
     assert meter.taken == [first for first, _, _ in sent]
-
-
-def test_single_bytes_are_frames_too() -> None:
-    meter = Counted()
-    for first in (PING, FRAGMENT, END, MESSAGE):
-        for byte in make_frame(first, 130):
-            assert meter.feed(bytes((byte,)), 0)
-    assert meter.taken == [PING, FRAGMENT, END, MESSAGE]
 
 
 @pytest.mark.parametrize("first", [PING, PONG, FRAGMENT, END, 0x00, 0x01, 0x88])

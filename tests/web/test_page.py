@@ -89,7 +89,9 @@ def test_pages_of_others_are_refused(origin: str | None, own: bool) -> None:
 
 
 def test_the_policy_allows_nothing_from_elsewhere() -> None:
-    policy = make_security_headers("10.0.0.1:7725")["Content-Security-Policy"]
+    headers = make_security_headers("10.0.0.1:7725")
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    policy = headers["Content-Security-Policy"]
     rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
     assert rules["default-src"] == "'self'"
     assert rules["connect-src"] == "'self' ws://10.0.0.1:7725 wss://10.0.0.1:7725"

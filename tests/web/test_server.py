@@ -242,6 +242,8 @@ def test_too_many_requests_are_answered() -> None:
         (f"HEAD /v1/asset/{'ab' * 32}", "\r\n", 404),
         ("HEAD /v1/session", "\r\n", 404),
         ("HEAD /", "\r\n", 200),
+        ("POST /v1/info", "Content-Length: 0\r\n\r\n", 405),
+        ("GET /v1/nothing", "\r\n", 404),
     ],
 )
 def test_requests_with_a_body_and_heads_of_no_page(request_line: str, more: str, status: int) -> None:
