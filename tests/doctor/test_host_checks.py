@@ -64,7 +64,9 @@ def test_programs_are_named_without_folders_and_options(command: list[str], prog
     assert host_checks._name_program(command) == program
 
 
-def test_key_home_readable_by_others_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_key_home_that_others_can_read_or_that_is_damaged_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
     assert host_checks.check_key_home().state == "ok"  # does not exist yet
     KeyHome().load_server_key()
@@ -74,11 +76,7 @@ def test_key_home_readable_by_others_is_reported(tmp_path: Path, monkeypatch: py
     assert found.failed
     assert "server.key_secret" in found.text
     assert "chmod" in found.advice
-
-
-def test_damaged_key_home_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
-    KeyHome().load_server_key()
+    (tmp_path / "home" / "server.key_secret").chmod(0o600)
     path = tmp_path / "home" / "clients.json"
     path.write_text("[{}]")
     path.chmod(0o600)

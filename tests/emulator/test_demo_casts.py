@@ -1,4 +1,4 @@
-"""A cast of the demos with real physics and control; people with two hands; deformables that are not there."""
+"""People with two hands, and deformables that are not there."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import random
 
 import pytest
 
-from iris_session.demo.demos import make_demo
 from iris_session.emulator.behaviours import CombinedBehaviour, Folder, HandInput, OperatorView, Stower, make_behaviour
 from iris_session.emulator.behaviours.phases import SEARCH_S
-from tools.deformable_rig import SoftRig, soft_demo
 from tools.handover_rig import LateView
 
 
@@ -46,15 +44,6 @@ def test_failure_of_one_hand_is_a_failure_of_the_person() -> None:
     hands.update(view())
     assert hands.failed == "dropped it"
     assert not hands.done
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("untraced")
-def test_two_people_fold_a_cloth() -> None:
-    rig = soft_demo(make_demo("cloth"), seed=1)
-    rig.run(30.0, until=SoftRig.over)
-    assert rig.verdict() == ""
-    assert rig.world.dropped_counts == {}
 
 
 @pytest.mark.parametrize("name", ["folder", "stower"])
