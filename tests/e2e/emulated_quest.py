@@ -44,12 +44,10 @@ const moveOn = (callback) => (time) => (advance(), tremble(), callback(time));
 window.requestAnimationFrame = (callback) => setTimeout(() => request(moveOn(callback)), 25);
 window.quest = new IWER.XRDevice(IWER.metaQuest3);
 quest.installRuntime({ forceInstall: true });
-// Measured poses are never the same twice, to the last bit: these move by less than 0.1 mm, unless they are frozen.
-window.isFrozen = false;
+// Measured poses are never the same twice, to the last bit: these move by less than 0.1 mm.
 let beat = 0;
 let advance = () => {};
 const tremble = () => {
-  if (isFrozen) return;
   const shift = 5e-5 * (Math.cos(beat + 1) - Math.cos(beat++));
   const inputs = [...Object.values(quest.controllers), ...Object.values(quest.hands)];
   for (const { position } of [quest, ...inputs]) position.x += shift;
@@ -57,23 +55,6 @@ const tremble = () => {
 // The emulator says of every pose that it is an estimate; headsets say so of devices that their cameras do not see.
 window.isGuess = false;
 Object.defineProperty(XRPose.prototype, "emulatedPosition", { get: () => window.isGuess });
-// Some runtimes report the origin of a device before they have a pose of it; the head is where it is.
-window.isZero = false;
-const { get: readTransform } = Object.getOwnPropertyDescriptor(XRPose.prototype, "transform");
-const { getViewerPose } = XRFrame.prototype;
-let isHead = false;
-XRFrame.prototype.getViewerPose = function (space) {
-  isHead = true;
-  const pose = getViewerPose.call(this, space);
-  isHead = false;
-  return pose;
-};
-Object.defineProperty(XRPose.prototype, "transform", {
-  get() {
-    const isDevice = !isHead && !(this instanceof XRViewerPose);
-    return window.isZero && isDevice ? new XRRigidTransform() : readTransform.call(this);
-  },
-});
 window.place = (input, [x, y, z, qx, qy, qz, qw]) => {
   input.position.set(x, y, z);
   input.quaternion.set(qx, qy, qz, qw);
@@ -268,41 +249,6 @@ class EmulatedQuest:
                 return math.dist(tip[0], target)
             assert_only_late(rejected, self.read_feedback(robot)["rejected"], [b.reason for b in held])
         raise AssertionError(f"{robot} held in each of {ATTEMPTS} attempts\n{self.page.describe()}")
-
-    def disturb(self, robot: str, begin: PoseTuple, disturbance: str, end: str) -> tuple[str, float]:
-        """Engage with the right controller at `begin`, and disturb its poses until the robot holds.
-
-        Args:
-            robot: Name of a robot that the right controller drives.
-            begin: Pose of the controller in the aligned world.
-            disturbance: Script that begins it.
-            end: Script that ends it.
-
-        Returns:
-            Why the robot holds, and how far its end effector has moved [m]. Holds for what comes late on a busy machine
-            count for nothing: the robot is engaged again.
-        """
-        for _ in range(ATTEMPTS):
-            self.press("squeeze", 0.0)
-            self.place("quest.controllers.right", begin)
-            self.engage(robot)
-            tip, seen = self.host.scene.tip_pose(robot), len(self.scenario.events["host"])
-            self.evaluate(disturbance)
-            self.run_until(lambda: self.list_hold_reasons(robot, seen), f"{robot} holds: {disturbance}")  # noqa: B023
-            self.evaluate(end)
-            rested_ns = self.host.session_now_ns() + 500_000_000
-            self.run_until(lambda: self.has_state_since(rested_ns), "it has come to rest")  # noqa: B023
-            now, reason = self.host.scene.tip_pose(robot), self.list_hold_reasons(robot, seen)[0]
-            assert tip
-            assert now
-            if reason not in {HoldReason.STALE, HoldReason.REJECTED, HoldReason.GAP}:
-                return reason, math.dist(tip[0], now[0])
-        raise AssertionError(f"{robot} held for late samples only\n{self.page.describe()}")
-
-    def list_hold_reasons(self, robot: str, seen: int) -> list[str]:
-        """Return why engagements of a robot ended, by the events after the first `seen`."""
-        bodies = [event.body for event in self.scenario.events["host"][seen:]]
-        return [b.reason for b in bodies if isinstance(b, EngagementChanged) and b.robot == robot and b.reason]
 
     @property
     def person(self) -> ParticipantInfo:

@@ -1,4 +1,4 @@
-"""The demos beside the handover, each by its command: real robots' models and deformables, recorded and verified.
+"""Each demo by its command: the handover, real robots' models and deformables, recorded and verified.
 
 Their recordings are looked at in Rerun's viewer by `tools/look_at_recordings.py`, and read as its dataframes.
 """
@@ -39,8 +39,19 @@ def run_demo(folder: Path, *arguments: str, max_attempts: int = 2) -> dict[str, 
     problems = "\n".join([*result["problems"], done.stderr[-6000:], done.stdout])
     assert (done.returncode, result["ok"], result["verified"]) == (0, True, True), problems
     assert result["takes"] <= max_attempts, problems
-    assert result["participants"] == ["ann", "bob"]
+    assert result["participants"][:2] == ["ann", "bob"], "before a watcher"
     return result
+
+
+@pytest.mark.long
+def test_hammer_is_handed_over(tmp_path: Path) -> None:
+    """How well emulated people do it is tested in simulated time, in `tests/rig/test_demos.py`."""
+    result = run_demo(tmp_path, "handover")
+    assert {"seconds", "recording", "alignment_mm", "late_tick_share"} <= set(result)
+    (handover,) = result["handovers"]
+    assert set(handover) == {"object", "giver", "receiver", "at_s", "duration_s"}
+    assert (handover["object"], handover["giver"], handover["receiver"]) == ("hammer", "left", "right")
+    assert_looks_right(tmp_path / result["recording"])
 
 
 @pytest.mark.long

@@ -9,7 +9,7 @@ from typing import Final
 import pytest
 
 from anchors.pose import PoseTuple, compose
-from iris_session.protocol.names import AlignmentKind, HoldReason
+from iris_session.protocol.names import AlignmentKind
 from tests.e2e.browser import Page, join_as
 from tests.e2e.emulated_quest import (
     FEEDBACK,
@@ -111,28 +111,6 @@ def test_the_end_effector_is_where_the_hand_takes_it(quest: EmulatedQuest) -> No
     error = quest.move_robot("left", lease_in_ar(quest), MOTION_M)
     print(f"the hand moved {100 * math.hypot(*MOTION_M):.0f} cm, the end effector is {1e3 * error:.1f} mm from there")
     assert error <= FOLLOWS_M
-
-
-#: By how much the end effector may move by poses that no hand makes [m].
-DISTURBED_M: Final = 0.02
-
-
-@pytest.mark.long
-def test_poses_that_no_hand_makes_hold(quest: EmulatedQuest) -> None:
-    """Poses that are frozen, at the origin, or 30 cm away at the next frame: each holds, and a new squeeze drives."""
-    pose = lease_in_ar(quest)
-    away = "quest.controllers.right.position.x += 0.3"
-    found = {
-        HoldReason.FROZEN: quest.disturb("left", pose, "window.isFrozen = true", "window.isFrozen = false"),
-        HoldReason.ZERO_POSE: quest.disturb("left", pose, "window.isZero = true", "window.isZero = false"),
-        HoldReason.JUMP: quest.disturb("left", pose, away, "null"),
-    }
-    print({reason: f"{1e3 * moved:.1f} mm" for reason, (_, moved) in found.items()})
-    assert [reason for reason, _ in found.values()] == list(found)
-    assert max(moved for _, moved in found.values()) <= DISTURBED_M
-    quest.place("quest.controllers.right", pose)
-    quest.engage("left")
-    assert quest.page.errors == []
 
 
 @pytest.mark.long
