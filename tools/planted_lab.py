@@ -19,12 +19,21 @@ from typing import Any, Final
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the namespaces are those of the tests
 
+from iris_session.demo.scenes import scene_path
 from tests.network_namespaces import Namespace, connect
-from tests.slow_scene import write_slow_scene
 
 COMMAND: Final = (sys.executable, "-m", "iris_session.cli.main")
 DEADLINE_S: Final = 60.0
 NETWORK: Final = "10.77.2"
+
+
+def write_slow_scene(folder: Path) -> Path:
+    """Write the handover scene at 100 Hz, and return its file: a machine busy for some ms makes no tick late."""
+    for file in (scene_path("handover"), scene_path("arm")):
+        text, n = re.subn(r'timestep="[\d.]+"', 'timestep="0.01"', file.read_text())
+        assert n == 1, file
+        (folder / file.name).write_text(text)
+    return folder / "handover.xml"
 
 
 class LabError(Exception):
