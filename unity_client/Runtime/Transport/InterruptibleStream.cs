@@ -159,7 +159,7 @@ namespace IrisSession.Transport
             }
             catch (Exception error) when (error is SocketException || error is ArgumentException)
             {
-                throw new TransportException(LinkFailure.Unreachable, host + " is not known: " + error.Message);
+                throw new TransportException(LinkFailure.Unreachable, "the name " + host + " is not known: " + error.Message);
             }
         }
 

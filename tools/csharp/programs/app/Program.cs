@@ -20,8 +20,8 @@ internal static class Program
     {
         if (arguments.Length != 5 || arguments[0] != "run")
         {
-            Console.Error.WriteLine("app run FOLDER ADDRESS NAME ROBOT");
-            return 2;
+            Console.Error.WriteLine("app run FOLDER ADDRESS NAME ROBOT: files of the app, link of `iris-session pair --web`, name of the person, name of a robot");
+            return arguments.Length == 1 && arguments[0] == "--help" ? 0 : 2;
         }
         Wearer wearer = new Wearer(arguments[1], arguments[2], arguments[3]);
         string robot = arguments[4];
