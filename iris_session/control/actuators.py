@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from iris_session.control.arm_model import Floats, find_id
 from iris_session.control.config import ControlConfig, ControlError
 from iris_session.control.hold import Servos
+from iris_session.physics.names import get_reference
 from iris_session.protocol.specs import RobotSpec
 
 GRAVITY_PD = "gravity_pd"
@@ -62,14 +63,19 @@ class ActuatorLaws:
         bounds: list[tuple[float, float]] = []
         servos: list[tuple[float, ...]] = []
         for robot in robots:
+            if not robot.actuators:
+                raise ControlError(
+                    f"robot {robot.name!r} has no actuators, so only its owner's program can move it: give that the "
+                    'end-effector targets, ControlConfig(output="targets")'
+                )
             if len(robot.actuators) != len(robot.joints):
                 raise ControlError(
                     f"robot {robot.name!r} has {len(robot.joints)} joints and {len(robot.actuators)} actuators; "
                     "it must have one actuator per joint, in the same order"
                 )
             for joint_name, name in zip(robot.joints, robot.actuators, strict=True):
-                actuator = find_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name, "actuator")
-                joint = find_id(model, mujoco.mjtObj.mjOBJ_JOINT, joint_name, "joint")
+                actuator = find_id(model, "actuator", name)
+                joint = find_id(model, "joint", joint_name)
                 kind, scale, offset = _find_law(model, robot, actuator, joint)
                 rows.append((kind, actuator, joint, scale, offset))
                 bounds.append(_find_bounds(model, kind, actuator, joint, scale, offset))
@@ -158,8 +164,7 @@ def _make_group(model: mujoco.MjModel, rows: list[tuple[str, int, int, float, fl
 
 def _find_law(model: mujoco.MjModel, robot: RobotSpec, actuator: int, joint: int) -> tuple[str, float, float]:
     """Type of one actuator, and scale and offset of its `ctrl`. MuJoCo: force = gain * (ctrl or act) + bias."""
-    name = mujoco.mj_id2name(model, int(mujoco.mjtObj.mjOBJ_ACTUATOR), actuator)
-    what = f"robot {robot.name!r}: actuator {name!r}"
+    what = f"robot {robot.name!r}: actuator {get_reference(model, 'actuator', actuator)!r}"
     if int(model.actuator_trntype[actuator]) not in _JOINT_TRANSMISSIONS or model.actuator_trnid[actuator, 0] != joint:
         raise ControlError(f"{what} must act on the joint of the same place in the robot's list of joints")
     gear, gain = float(model.actuator_gear[actuator, 0]), float(model.actuator_gainprm[actuator, 0])
@@ -227,20 +232,17 @@ def _find_bounds(
 
 
 class Grippers:
-    """Gripper `ctrl` of all robots that have one. `ctrl`, `goal`: shape (n_grippers,), in actuator units.
+    """Gripper `ctrl` of all robots that have one. `ctrl`, `goal`: shape (n_actuators,), in actuator units.
 
     The closing share 0..1 follows its goal at a bounded speed; it is unchanged in hold and in the first engaged step.
     """
 
     def __init__(self, model: mujoco.MjModel, robots: Sequence[RobotSpec], config: ControlConfig, dt: float) -> None:
-        fitted = [(i, r) for i, r in enumerate(robots) if r.gripper_actuator]
-        self._row = {i: k for k, (i, _) in enumerate(fitted)}
-        self._open = [r.gripper_open for _, r in fitted]
-        self._closed = [r.gripper_closed for _, r in fitted]
-        self._actuators = np.array(
-            [find_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, r.gripper_actuator, "actuator") for _, r in fitted],
-            dtype=np.intp,
-        )
+        fitted = [(i, one) for i, robot in enumerate(robots) for one in robot.gripper_actuators]
+        self._rows = {i: [k for k, (j, _) in enumerate(fitted) if j == i] for i, _ in fitted}
+        self._open = [one.open for _, one in fitted]
+        self._closed = [one.closed for _, one in fitted]
+        self._actuators = np.array([find_id(model, "actuator", one.actuator) for _, one in fitted], dtype=np.intp)
         self._step = np.abs(np.subtract(self._closed, self._open)) * (config.gripper_speed * dt)
         self.ctrl = np.zeros(len(fitted))
         self.goal = np.zeros(len(fitted))
@@ -252,26 +254,25 @@ class Grippers:
 
     def place(self, robot: int, ctrl: Floats) -> None:
         """Hold the gripper of one robot at its value in `ctrl` (nu,)."""
-        row = self._row.get(robot)
-        if row is not None:
+        for row in self._rows.get(robot, ()):
             self.ctrl[row] = self.goal[row] = ctrl[self._actuators[row]]
 
     def find_output(self, robot: int, dt: float) -> tuple[list[int], list[float]]:
-        """Return the actuator of a robot's gripper and how fast its `ctrl` may change [1/s]; empty without one."""
-        row = self._row.get(robot)
-        return ([], []) if row is None else ([int(self._actuators[row])], [float(self._step[row]) / dt])
+        """Return the actuators of a robot's gripper and how fast their `ctrl` may change [1/s]; empty without one."""
+        rows = self._rows.get(robot, [])
+        return [int(self._actuators[row]) for row in rows], [float(self._step[row]) / dt for row in rows]
 
     def set_goal(self, robot: int, closed: float | None) -> None:
         """Set the closing share 0 (open) to 1 (closed); `None` leaves the goal as it is."""
-        row = self._row.get(robot)
-        if row is not None and closed is not None and math.isfinite(closed):
-            share = min(max(closed, 0.0), 1.0)
+        if closed is None or not math.isfinite(closed):
+            return
+        share = min(max(closed, 0.0), 1.0)
+        for row in self._rows.get(robot, ()):
             self.goal[row] = (1.0 - share) * self._open[row] + share * self._closed[row]
 
     def stop(self, robot: int) -> None:
         """Hold the gripper at its present `ctrl`."""
-        row = self._row.get(robot)
-        if row is not None:
+        for row in self._rows.get(robot, ()):
             self.goal[row] = self.ctrl[row]
 
     def tick(self, data: mujoco.MjData) -> None:

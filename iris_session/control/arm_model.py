@@ -15,33 +15,41 @@ from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple
 from iris_session.control.config import ControlError
-from iris_session.protocol.specs import RobotSpec
+from iris_session.physics.errors import UnknownNameError
+from iris_session.physics.names import find_element_id
+from iris_session.physics.tip import Tip
+from iris_session.protocol.common import Pose
+from iris_session.protocol.specs import HAND, RobotSpec
 
 Floats = NDArray[np.float64]
 
 _JOINT_TYPES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
-def find_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, what: str) -> int:
+def find_id(model: mujoco.MjModel, kind: str, name: str) -> int:
     """Return the id of a named element. Raises `ControlError` with the available names."""
-    found = int(mujoco.mj_name2id(model, int(kind), name))
-    if found < 0:
-        count = {"joint": model.njnt, "site": model.nsite, "actuator": model.nu, "body": model.nbody}[what]
-        names = [mujoco.mj_id2name(model, int(kind), i) or "(unnamed)" for i in range(count)]
-        raise ControlError(f"{what} {name!r} does not exist in the model. Available {what}s: {', '.join(names)}")
-    return found
+    try:
+        return find_element_id(model, kind, name)
+    except UnknownNameError as error:
+        raise ControlError(str(error)) from None
 
 
 class ArmModel:
-    """Forward kinematics of one robot's chain. Joint vectors are in the order of `RobotSpec.joints`, shape (n,)."""
+    """Forward kinematics of one robot's chain. Joint vectors are in the order of `RobotSpec.joints`, shape (n,).
+
+    Joints of a hand that do not move its tip (its fingers') are not in the model.
+    """
 
     def __init__(self, scene: mujoco.MjModel, robot: RobotSpec) -> None:
-        """Raise `ControlError` when the joints do not form one hinge/slide chain that ends at the site."""
-        self.joint_ids = [find_id(scene, mujoco.mjtObj.mjOBJ_JOINT, name, "joint") for name in robot.joints]
-        self.site_id = find_id(scene, mujoco.mjtObj.mjOBJ_SITE, robot.site, "site")
-        chain = _find_chain(scene, robot, self.joint_ids, int(scene.site_bodyid[self.site_id]))
-        self.root_body = int(scene.body_parentid[chain[0]])
-        self.model = _build_arm(scene, chain, self.site_id)
+        """Raise `ControlError` when the joints do not form one hinge/slide chain that ends at the end effector."""
+        self.joint_ids = [find_id(scene, "joint", name) for name in robot.joints]
+        try:
+            self.tip = Tip(scene, robot)
+        except UnknownNameError as error:
+            raise ControlError(str(error)) from None
+        chain = _find_chain(scene, robot, self.joint_ids, self.tip.body)
+        self.root_body = int(scene.body_parentid[chain[0]]) if chain else self.tip.body
+        self.model = _build_arm(scene, chain, self.tip.T_body_tip)
         self.data = mujoco.MjData(self.model)
         chain_ids = [j for body in chain for j in _list_joints(scene, body)]
         #: `q_chain = q[to_chain]`, `q = q_chain[from_chain]`.
@@ -86,7 +94,7 @@ def _list_joints(scene: mujoco.MjModel, body: int) -> list[int]:
 
 
 def _find_chain(scene: mujoco.MjModel, robot: RobotSpec, joint_ids: list[int], tip: int) -> list[int]:
-    """Return the bodies from the first arm joint to the site's body."""
+    """Return the bodies from the first arm joint to the body of the tip; none for a hand without a wrist."""
     path = []
     body = tip
     while body > 0:
@@ -97,23 +105,24 @@ def _find_chain(scene: mujoco.MjModel, robot: RobotSpec, joint_ids: list[int], t
     carrying = [k for k, b in enumerate(path) if any(j in wanted for j in _list_joints(scene, b))]
     chain = path[carrying[0] :] if carrying else []
     found = [j for b in chain for j in _list_joints(scene, b)]
+    tip_name = f"site {robot.site!r}" if robot.site else f"body {robot.tip_body!r}"
     for joint, name in zip(joint_ids, robot.joints, strict=True):
-        if joint not in found:
+        if joint not in found and robot.kind != HAND:
             raise ControlError(
-                f"robot {robot.name!r}: joint {name!r} does not move site {robot.site!r}; name joints on its chain only"
+                f"robot {robot.name!r}: joint {name!r} does not move {tip_name}; name joints on its chain only"
             )
         if int(scene.jnt_type[joint]) not in _JOINT_TYPES:
             raise ControlError(f"robot {robot.name!r}: joint {name!r} must be a hinge or a slide joint")
     extra = [mujoco.mj_id2name(scene, int(mujoco.mjtObj.mjOBJ_JOINT), j) or f"#{j}" for j in found if j not in wanted]
-    if extra or not found:
+    if extra or (not found and robot.kind != HAND):
         raise ControlError(
-            f"robot {robot.name!r}: joints {', '.join(extra) or '(none)'} lie between its joints and site "
-            f"{robot.site!r}; the chain must consist of the robot's own joints"
+            f"robot {robot.name!r}: joints {', '.join(extra) or '(none)'} lie between its joints and {tip_name}; "
+            "the chain must consist of the robot's own joints"
         )
     return chain
 
 
-def _build_arm(scene: mujoco.MjModel, chain: list[int], site_id: int) -> mujoco.MjModel:
+def _build_arm(scene: mujoco.MjModel, chain: list[int], T_body_tip: Pose) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     parent = spec.worldbody
@@ -129,5 +138,5 @@ def _build_arm(scene: mujoco.MjModel, chain: list[int], site_id: int) -> mujoco.
                 ref=scene.qpos0[scene.jnt_qposadr[joint]],
                 limited=int(mujoco.mjtLimited.mjLIMITED_FALSE),  # limits are bounds of the solver, see `ik`
             )
-    parent.add_site(name="tip", pos=scene.site_pos[site_id], quat=scene.site_quat[site_id])
+    parent.add_site(name="tip", pos=T_body_tip.p, quat=T_body_tip.q)
     return spec.compile()

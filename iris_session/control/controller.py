@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from anchors.pose import PoseTuple
 from iris_session.control import clutch
 from iris_session.control.actuators import ActuatorLaws, Grippers
-from iris_session.control.arm_model import ArmModel, Floats, has_moving_base, read_joint_ranges, read_site_pose
+from iris_session.control.arm_model import ArmModel, Floats, has_moving_base, read_joint_ranges
 from iris_session.control.clutch import compute_leader_goal, is_ramping
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig, ControlError
 from iris_session.control.grasp import Grasps
@@ -28,6 +28,7 @@ from iris_session.control.ik import InverseKinematics
 from iris_session.control.interpolate import JointInterpolator, read_speed_limits
 from iris_session.control.proximity import ProximityLimiter
 from iris_session.control.state import ControllerState, RobotState, decode_state, encode_state
+from iris_session.physics.tip import Tip
 from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -46,6 +47,13 @@ class RobotOutput(NamedTuple):
 
     actuators: NDArray[np.intp]
     rates: Floats
+
+
+def check_robot(model: mujoco.MjModel, robot: RobotSpec, config: ControlConfig) -> None:
+    """Raise `ControlError` for a robot that cannot be driven as described. Needs no mink."""
+    ArmModel(model, robot)
+    if config.output == OUTPUT_CTRL:
+        ActuatorLaws(model, [robot], config)
 
 
 class Controller:
@@ -110,7 +118,7 @@ class Controller:
         for i, arm in enumerate(self._arms):
             r = self._states[i]
             r.T_world_root = _require_finite(_read_body_pose(data, arm.root_body)) or before[i].T_world_root
-            tip = None if self._writes_ctrl else _require_finite(read_site_pose(data, arm.site_id))
+            tip = None if self._writes_ctrl else _require_finite(arm.tip.read_pose(data))
             r.commanded = tip or self._ik.compute_tip(i, r)
 
     def follow_robots(self, data: mujoco.MjData, robots: Sequence[int]) -> None:
@@ -125,7 +133,7 @@ class Controller:
             r = self._states[i]
             r.lagging = False
             if not self._writes_ctrl:
-                r.commanded = _require_finite(read_site_pose(data, self._arms[i].site_id)) or r.commanded
+                r.commanded = _require_finite(self._arms[i].tip.read_pose(data)) or r.commanded
 
     def place_robot(self, i: int, data: mujoco.MjData, ctrl: Floats) -> None:
         """Take a robot over from the owner, whose `ctrl` is given, shape (nu,): it stands where that commands it, and
@@ -144,7 +152,7 @@ class Controller:
             self._hold.forget(columns)
         self._ik.rest[columns] = q[columns]
         r = self._states[i] = RobotState(T_world_root=self._states[i].T_world_root)
-        tip = None if self._writes_ctrl else _require_finite(read_site_pose(data, self._arms[i].site_id))
+        tip = None if self._writes_ctrl else _require_finite(self._arms[i].tip.read_pose(data))
         r.commanded = tip or self._ik.compute_tip(i, r)
 
     def list_outputs(self) -> list[RobotOutput]:
@@ -472,10 +480,10 @@ class Controller:
         The law of `hold.HoldLaw` for a servo of which only the bound is known.
         """
         config = self._config
-        tip = _require_finite(read_site_pose(data, self._arms[i].site_id))
+        tip = _require_finite(self._arms[i].tip.read_pose(data))
         if tip is None:
             return
-        speed, angular_speed = _measure_site_speed(self._model, data, self._arms[i].site_id)
+        speed, angular_speed = _measure_speed(self._arms[i].tip, data)
         m, rad = config.target_lag_s * speed, config.target_lag_s * angular_speed
         apart = clutch.measure_separation(tip, r.commanded)
         at_rest = (_DEAD_BAND * config.target_lead_m, _DEAD_BAND * config.target_lead_rad)
@@ -536,10 +544,9 @@ def _read_body_pose(data: mujoco.MjData, body: int) -> PoseTuple:
     return ((x, y, z), (w, i, j, k))
 
 
-def _measure_site_speed(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> tuple[float, float]:
-    """Return linear [m/s] and angular [rad/s] speed of a site; zero if they are not finite."""
-    velocity = np.zeros(6)
-    mujoco.mj_objectVelocity(model, data, int(mujoco.mjtObj.mjOBJ_SITE), site, velocity, 0)
+def _measure_speed(tip: Tip, data: mujoco.MjData) -> tuple[float, float]:
+    """Return linear [m/s] and angular [rad/s] speed of an end effector; zero if they are not finite."""
+    velocity = tip.read_velocity(data)
     angular, linear = float(np.linalg.norm(velocity[:3])), float(np.linalg.norm(velocity[3:]))
     return (linear, angular) if math.isfinite(linear + angular) else (0.0, 0.0)
 

@@ -32,7 +32,7 @@ class Grasps:
         #: All bodies of an object, by its own body: those with a free joint hang on the world, so they are its root.
         self._parts: dict[int, NDArray[np.intp]] = {}
         for item in objects:
-            body = find_id(model, mujoco.mjtObj.mjOBJ_BODY, item.body, "body")
+            body = find_id(model, "body", item.body)
             joint = int(model.body_jntadr[body])
             if joint < 0 or int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
                 raise ControlError(f"object {item.name!r}: body {item.body!r} must have a free joint")

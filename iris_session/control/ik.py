@@ -27,10 +27,12 @@ from iris_session.control.config import OUTPUT_CTRL, ControlConfig
 from iris_session.control.interpolate import JointInterpolator
 from iris_session.control.state import RobotState
 from iris_session.protocol.names import CommandKind
-from iris_session.protocol.specs import RobotSpec
+from iris_session.protocol.specs import HAND, RobotSpec
 
 _MAX_STALLS = 5  # solves in a row without progress after which a target counts as out of reach
 _WAYPOINTS, _HALVINGS = 8, 10  # how finely the way to a joint goal is searched for the edge of the workspace
+#: Limit of a robot that no pose moves.
+JOINTS_ONLY = "joints_only"
 _PROGRESS = 0.02  # share of the remaining error that a solve must go to count as progress
 
 
@@ -110,7 +112,12 @@ class InverseKinematics:
         self._robots, self._arms, self._columns = robots, arms, columns
         self._joints, self._config = joints, config
         self._lower, self._upper = bounds
-        self._solvers = [IkSolver(arm, config) for arm in arms] if config.output == OUTPUT_CTRL else []
+        #: By robot that follows poses.
+        self._solvers = {
+            i: IkSolver(arm, config)
+            for i, (robot, arm) in enumerate(zip(robots, arms, strict=True))
+            if config.output == OUTPUT_CTRL and robot.kind != HAND
+        }
         self.rest: Floats = np.zeros(len(joints.q))
         self._solve_ticks = max(1, math.ceil(1.0 / (config.solve_rate_hz * joints.dt) - 1e-9))
         self._slow_interval = max(1.0 / config.sample_rate_min_hz, self._solve_ticks * joints.dt)
@@ -178,7 +185,13 @@ class InverseKinematics:
         return all(min(box[0][k], b[k]) - slack <= p[k] <= max(box[1][k], b[k]) + slack for k in range(3))
 
     def solve(self, i: int, r: RobotState, state: clutch.Latch, tick: int) -> None:
-        """Take one step from the last solution toward the target; the joints arrive about one sample later."""
+        """Take one step from the last solution toward the target; the joints arrive about one sample later.
+
+        A hand follows joints only: a pose does not move it, and that is one of its limits.
+        """
+        if i not in self._solvers:
+            r.want_solve, r.last_solve, r.solver_limits = False, tick, (JOINTS_ONLY,)
+            return
         columns, joints, config = self._columns[i], self._joints, self._config
         interval = self.get_interval(r, tick)
         goal, commanded, speed = joints.goal[columns], joints.q[columns], joints.velocity[columns]

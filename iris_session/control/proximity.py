@@ -38,7 +38,7 @@ class ProximityLimiter:
         self._geoms = [_guarded_geoms(model, robot) for robot in robots]
         self._dofs = [
             np.array(
-                [model.jnt_dofadr[find_id(model, mujoco.mjtObj.mjOBJ_JOINT, j, "joint")] for j in robot.joints],
+                [model.jnt_dofadr[find_id(model, "joint", j)] for j in robot.joints],
                 dtype=np.intp,
             )
             for robot in robots
@@ -157,8 +157,8 @@ def compute_box_bounds(
 
 def _guarded_geoms(model: mujoco.MjModel, robot: RobotSpec) -> NDArray[np.intp]:
     """Return the geoms of the robot's subtree that may collide, without its fingers."""
-    base = find_id(model, mujoco.mjtObj.mjOBJ_BODY, robot.base_body, "body")
-    fingers = {find_id(model, mujoco.mjtObj.mjOBJ_BODY, name, "body") for name in robot.finger_bodies}
+    base = find_id(model, "body", robot.base_body)
+    fingers = {find_id(model, "body", name) for name in robot.finger_bodies}
     inside, exempt = {base}, set(fingers)
     for body in range(base + 1, model.nbody):  # parents come before their children
         parent = int(model.body_parentid[body])

@@ -4,7 +4,6 @@ Imports only `protocol`. No sockets, no clock: `Pacer` takes the time as an argu
 """
 
 from iris_session.physics.errors import (
-    AmbiguousModelError,
     ModelInvalidError,
     ModelNotFoundError,
     ModelUnsupportedError,
@@ -17,7 +16,7 @@ from iris_session.physics.errors import (
 )
 from iris_session.physics.load import compute_scene_hash, decode_model, encode_model, load_model
 from iris_session.physics.pacer import Pacer, PacerStats
-from iris_session.physics.robots import find_objects, find_robots
+from iris_session.physics.robots import FoundRobots, RobotNotice, find_objects, find_robots
 from iris_session.physics.robots_toml import dump_robots_toml, load_robots_toml
 from iris_session.physics.world import World
 
@@ -30,11 +29,12 @@ __all__ = [
     "decode_model",
     "compute_scene_hash",
     "find_robots",
+    "FoundRobots",
+    "RobotNotice",
     "find_objects",
     "load_robots_toml",
     "dump_robots_toml",
     "PhysicsError",
-    "AmbiguousModelError",
     "ModelInvalidError",
     "ModelNotFoundError",
     "ModelUnsupportedError",

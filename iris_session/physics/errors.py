@@ -7,7 +7,6 @@ PhysicsError
 ├── UnknownNameError          a joint, actuator, site, body or keyframe that the model does not have
 ├── RobotsFileError           a mistake in a robots TOML
 ├── SpecError                 robots or objects that contradict each other
-├── AmbiguousModelError       robots cannot be found without help; `.toml` is a ready-to-edit description
 ├── SnapshotError             bytes that are no snapshot, or one of another model
 └── SimulationDivergedError   the state became NaN, infinite or huge
 """
@@ -53,16 +52,6 @@ class RobotsFileError(PhysicsError):
 
 class SpecError(PhysicsError):
     """Robots or objects that cannot be used together: a joint, actuator, body or name of two of them."""
-
-
-class AmbiguousModelError(PhysicsError):
-    """A model whose robots `find_robots` cannot decide. One line of text; `toml` describes the robots found, to be
-    completed.
-    """
-
-    def __init__(self, message: str, toml: str) -> None:
-        super().__init__(f"{one_line(message)}. Complete the robots file below and pass it with the model.")
-        self.toml = toml
 
 
 class SnapshotError(PhysicsError):

@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.physics.names import get_element_name
 from iris_session.physics.tree import KinematicTree
 
 #: Fingers without a joint range are tried this far from their reference [m or rad].
@@ -18,36 +17,68 @@ _MIN_CHANGE = 1e-4
 
 
 @dataclass(frozen=True)
-class GripperActuation:
-    """Ids in the model. `open` and `closed` are ctrl values; None when they cannot be distinguished."""
+class FoundGripper:
+    """Ids in the model. `members`: actuators with their `ctrl` open and closed. `unclear`: others, with the reason."""
 
-    actuators: tuple[int, ...]
+    members: tuple[tuple[int, float, float], ...]
+    unclear: dict[int, str]
     finger_bodies: tuple[int, ...]
-    range: tuple[float, float] | None
-    open: float | None
-    closed: float | None
 
 
-def find_gripper(tree: KinematicTree, palm: int, finger_roots: list[int]) -> GripperActuation | None:
+def find_gripper(tree: KinematicTree, palm: int, finger_roots: list[int]) -> FoundGripper | None:
     """Return the gripper on the link `palm`, None when nothing drives it. `finger_roots`: the moving bodies right below
     it.
 
-    An actuator belongs to it when all joints it drives, directly or by a tendon, are below the palm.
+    An actuator belongs to it when all joints it drives, directly or by a tendon, are below the palm. The fingers of a
+    hand with several joints each close towards the end of their range that is far from zero; joints that spread them
+    to both sides alike stay where they are.
     """
     bodies = [b for root in finger_roots for b in tree.list_subtree(root)]
-    below = set(bodies)
-    actuators = tuple(
-        a for a, driven in enumerate(tree.driven) if driven and all(tree.joint_body[j] in below for j in driven)
-    )
+    actuators = _list_actuators(tree, bodies)
     if not actuators:
         return None
     with_geoms = tuple(b for b in bodies if int(tree.model.body_geomnum[b]))
-    ctrl_range = _find_ctrl_range(tree, actuators[0])
-    larger_opens = _larger_ctrl_opens(tree, actuators[0], palm, finger_roots)
-    if len(actuators) > 1 or ctrl_range is None or larger_opens is None:
-        return GripperActuation(actuators, with_geoms, ctrl_range, None, None)
-    low, high = ctrl_range
-    return GripperActuation(actuators, with_geoms, ctrl_range, *((high, low) if larger_opens else (low, high)))
+    is_hand = len(actuators) > max(2, len(finger_roots))
+    members, unclear = [], {}
+    for actuator in actuators:
+        ctrl_range = _find_ctrl_range(tree, actuator)
+        if ctrl_range is None or ctrl_range[0] >= ctrl_range[1]:
+            unclear[actuator] = "has no ctrlrange"
+            continue
+        low, high = ctrl_range
+        opens = _find_far_end(low, high) if is_hand else _larger_ctrl_opens(tree, actuator, palm, finger_roots)
+        if opens is None:
+            unclear[actuator] = "spreads the fingers" if is_hand else "has an unknown open end"
+        elif is_hand:
+            members.append((actuator, min(max(0.0, low), high), low if opens else high))
+        else:
+            members.append((actuator, high, low) if opens else (actuator, low, high))
+    return FoundGripper(tuple(members), unclear, with_geoms)
+
+
+def find_partners(tree: KinematicTree, link: int, actuators: list[int]) -> list[int]:
+    """Return the actuators that are missing in `actuators`, which move one of the two fingers on a link."""
+    roots = tree.list_jointed_below(link)
+    sides = [_list_actuators(tree, tree.list_subtree(root)) for root in roots]
+    everything = _list_actuators(tree, [b for root in roots for b in tree.list_subtree(root)])
+    if [len(side) for side in sides] != [1, 1] or len(everything) != 2:
+        return []
+    return [a for a in everything if a not in actuators] if set(actuators) & set(everything) else []
+
+
+def _list_actuators(tree: KinematicTree, bodies: list[int]) -> list[int]:
+    """Return the actuators that drive joints of these bodies only."""
+    below = set(bodies)
+    return [a for a, driven in enumerate(tree.driven) if driven and all(tree.joint_body[j] in below for j in driven)]
+
+
+def _find_far_end(low: float, high: float) -> bool | None:
+    """Return false when a larger `ctrl` goes away from zero, true when a smaller one does; None for a range to both
+    sides.
+    """
+    if max(abs(low), abs(high)) < 1.5 * min(abs(low), abs(high)) and low < 0.0 < high:
+        return None
+    return abs(low) > abs(high)
 
 
 def _find_ctrl_range(tree: KinematicTree, actuator: int) -> tuple[float, float] | None:
@@ -121,10 +152,9 @@ def _jaw_aperture(tree: KinematicTree, data: mujoco.MjData, palm: int, root: int
     """
     model = tree.model
     anchor = data.xanchor[tree.list_scalar_joints(root)[0]]
-    geoms = np.flatnonzero(np.isin(model.geom_bodyid, tree.list_subtree(root))).tolist()
-    if not geoms:
+    corners = np.concatenate([tree.list_corners(b, data) for b in tree.list_subtree(root)])
+    if not len(corners):
         return 0.0
-    corners = np.concatenate([_find_corners(model, data, g) for g in geoms])
     # Rounded, so that among corners equally far the same one is taken at both ends.
     tip = corners[int(np.argmax(np.round(np.linalg.norm(corners - anchor, axis=1), 6)))]
     rigid = [b for b, weld in enumerate(tree.weld) if weld == tree.weld[palm]]
@@ -134,23 +164,3 @@ def _jaw_aperture(tree: KinematicTree, data: mujoco.MjData, palm: int, root: int
         local = data.geom_xmat[geom].reshape(3, 3).T @ (tip - data.geom_xpos[geom]) - centre
         distances.append(float(np.linalg.norm(np.maximum(np.abs(local) - half, 0.0))))
     return min(distances, default=float(np.linalg.norm(tip - data.xpos[palm])))
-
-
-def _find_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np.float64]:
-    """World positions [m] of the corners of a geom's bounding box, shape (8, 3)."""
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
-    corners: NDArray[np.float64] = data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T
-    return corners
-
-
-def describe_problem(tree: KinematicTree, gripper: GripperActuation) -> str:
-    """Return the undecided property of the gripper in words, empty when there is none."""
-    names = [get_element_name(tree.model, "actuator", a) or f"number {a}" for a in gripper.actuators]
-    if len(names) > 1:
-        return f"{len(names)} actuators move its gripper ({', '.join(names)})"
-    if gripper.range is None:
-        return f"gripper actuator {names[0]!r} has no ctrlrange"
-    if gripper.open is None:
-        return f"the open end of gripper actuator {names[0]!r} is unknown"
-    return ""

@@ -1,7 +1,7 @@
 """Names of model elements: MuJoCo allows none at all, the wire needs one for everything, at most 64 characters.
 
 Unnamed bodies get `body_<id>`, which is stable for a model; a generated or shortened name that is already taken gets
-`~2`, `~3`, ... Joints, actuators and sites of robots must be named in the model.
+`~2`, `~3`, ... Joints, actuators and sites without a usable name are called `#` and their number: `#7`.
 """
 
 from __future__ import annotations
@@ -39,11 +39,32 @@ def list_element_names(model: mujoco.MjModel, kind: str) -> tuple[str, ...]:
 
 
 def find_element_id(model: mujoco.MjModel, kind: str, name: str, where: str = "") -> int:
-    """Return the id of a named element. Raises `UnknownNameError` with the available names; `where` begins its text."""
+    """Return the id of an element by its name, as `get_reference` and `list_body_names` have it.
+
+    Raises `UnknownNameError` with the available names; `where` begins its text.
+    """
     index = int(mujoco.mj_name2id(model, _TYPES[kind][0], name)) if name else -1
+    if index < 0 and kind == "body" and name in (names := list_body_names(model)):
+        index = names.index(name)
+    elif index < 0:
+        index = parse_number(name, getattr(model, _TYPES[kind][1]))
     if index < 0:
         raise UnknownNameError(kind, name, (n for n in list_element_names(model, kind) if n), where)
     return index
+
+
+def get_reference(model: mujoco.MjModel, kind: str, index: int) -> str:
+    """Return what `find_element_id` finds the element by: its name, or `#7` where it has none that fits the wire."""
+    name = get_element_name(model, kind, index)
+    return name if is_wire_name(name) else f"#{index}"
+
+
+def parse_number(reference: str, count: int) -> int:
+    """Return the number of a reference like `#7` to one of `count` elements, -1 for anything else."""
+    digits = reference[1:]
+    if not (reference.startswith("#") and digits.isascii() and digits.isdigit() and int(digits) < count):
+        return -1
+    return int(digits)
 
 
 def list_body_names(model: mujoco.MjModel) -> tuple[str, ...]:

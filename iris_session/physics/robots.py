@@ -1,102 +1,93 @@
-"""Robots and objects found in any model: serial chains of at least three actuated joints; free bodies.
+"""Robots and objects found in any model: arms and hands; free bodies.
 
-Rules, in order. A chain follows the actuated hinges and slides from the root of the tree; it ends at a leaf, or where
-the tree branches into fingers (fewer than three actuated joints; behind a chain of three, fewer than six). It is cut
-where it branches into several longer parts: the part before (a torso) is no part of a robot. Trailing joints that are
-named like a jaw belong to the gripper. The end-effector site is on the last link, preferred by name. Cases that these
-rules leave open are never guessed: `AmbiguousModelError` names them and carries a robots file (`robots_toml`) to
-complete.
+Arms are serial chains of at least three actuated joints that are no legs, fingers, heads or bases (`limbs`). Trailing
+joints that are named like a jaw belong to the gripper. A hand without an arm is one robot, controlled in joint space.
+Nothing here raises for a model that MuJoCo compiles: what is unclear about a robot is a notice with the lines of a
+robots file (`robots_toml`) to edit. An arm with an unclear gripper is found without it; a robot of which a joint has
+several actuators is left out, so that it can only be watched.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
-from typing import Final
+from collections.abc import Iterable
+from typing import Final, NamedTuple
 
+import msgspec
 import mujoco
 
-from iris_session.physics.errors import AmbiguousModelError
-from iris_session.physics.gripper import describe_problem, find_gripper
-from iris_session.physics.names import get_element_name, is_wire_name, list_body_names, list_element_names
+from iris_session.physics.end_effector import TIP_WORDS, find_end_effector, list_tip_sites, rank_name
+from iris_session.physics.gripper import FoundGripper, find_gripper
+from iris_session.physics.limbs import ARM, FINGER, HAND, LEG, MIN_JOINTS, Limb, find_limbs
+from iris_session.physics.names import (
+    get_element_name,
+    get_reference,
+    is_wire_name,
+    list_body_names,
+    list_element_names,
+)
 from iris_session.physics.robots_toml import dump_robots_toml
 from iris_session.physics.tree import KinematicTree
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.common import Pose
+from iris_session.protocol.specs import GripperActuator, ObjectSpec, RobotSpec
 
-MIN_JOINTS: Final = 3
-#: A branch with this many actuated joints is an arm on a torso; a finger has at most five.
-ARM_JOINTS: Final = 6
-#: Words in the names of end-effector sites, best first: the grasp point before the flange that carries a gripper.
-SITE_WORDS: Final = (
-    *("tcp", "pinch", "grasp", "grip", "ee", "eef", "effector", "endeffector", "gripper"),
-    *("tool", "hand", "attachment", "flange"),
+_JAW = re.compile(r"jaw|finger|fngr|grip", re.IGNORECASE)
+#: A link called gripper may be the last one of the arm, which carries the fingers.
+_JAW_LINK = re.compile(r"jaw|finger|fngr", re.IGNORECASE)
+_GENERIC_BASES: Final = frozenset(
+    {"base", "base_link", "link0", "link_0", "pedestal", "mount", "root", "torso", "body", "palm", "hand"}
 )
-_JAW = re.compile(r"jaw|finger|grip", re.IGNORECASE)
-_GENERIC_BASES = frozenset({"base", "base_link", "link0", "link_0", "pedestal", "mount", "root", "torso", "body"})
-_SEPARATORS = "/_-."
+_SEPARATORS = "/_-.:"
+_FIXED, _NO_BIAS, _NO_DYNAMICS = (
+    int(mujoco.mjtGain.mjGAIN_FIXED),
+    int(mujoco.mjtBias.mjBIAS_NONE),
+    int(mujoco.mjtDyn.mjDYN_NONE),
+)
 
 
-@dataclass
-class _Arm:
-    """A chain on its way to a `RobotSpec`. `link`: body that the last joint moves. `notes`: field -> TOML comment."""
+class RobotNotice(NamedTuple):
+    """Something unclear about a robot. `text`: one line; `toml`: the lines of a robots file that a person completes."""
 
-    joints: list[int]
-    fingers: list[int] = field(default_factory=list)
-    link: int = 0
-    problems: list[str] = field(default_factory=list)
-    notes: dict[str, str] = field(default_factory=dict)
+    robot: str
+    text: str
+    toml: str
 
 
-def find_robots(model: mujoco.MjModel) -> tuple[RobotSpec, ...]:
-    """Return all robots of the model by their first joint; there may be none.
+class FoundRobots(NamedTuple):
+    """Robots of a model by their first joint, and what is unclear. `notices` may be of robots that are not found."""
 
-    Raises `AmbiguousModelError` when a chain has no single end-effector site, actuator or gripper, or lacks names.
+    robots: tuple[RobotSpec, ...]
+    notices: tuple[RobotNotice, ...] = ()
+
+
+def find_robots(model: mujoco.MjModel, *, all_limbs: bool = False) -> FoundRobots:
+    """Return the robots of a model; there may be none. Raises nothing for a compiled model.
+
+    Args:
+        model: The model.
+        all_limbs: Also legs, heads, and the fingers of hands (instead of the hands), which are not offered otherwise.
     """
     tree = KinematicTree(model)
-    arms: list[_Arm] = []
-    for root in tree.list_jointed_below(0):
-        _walk_chain(tree, root, [], arms)
-    for arm in arms:
-        _split_jaw(tree, arm)
-    names = _robot_names(tree, arms)
-    specs = tuple(_build_spec(tree, arm, name, arms) for arm, name in zip(arms, names, strict=True))
-    problems = [f"robot {s.name!r}: {p}" for s, arm in zip(specs, arms, strict=True) for p in arm.problems]
-    if problems:
-        raise AmbiguousModelError("; ".join(problems), dump_robots_toml(specs, [arm.notes for arm in arms]))
-    return specs
+    limbs = find_limbs(tree)
+    wanted = [b for b in limbs if b.kind != HAND] if all_limbs else [b for b in limbs if b.kind in (ARM, HAND)]
+    for limb in wanted:
+        if limb.kind == ARM:
+            _split_jaw(tree, limb)
+    robots, notices = [], []
+    for limb, name in zip(wanted, _name_robots(tree, wanted, limbs), strict=True):
+        spec, problems, notes = _build_spec(tree, limb, name, limbs)
+        is_clear = "actuators" not in notes
+        if is_clear:
+            robots.append(spec)
+        for problem in problems:
+            how = "is found without its whole gripper" if is_clear else "can only be watched"
+            text = f"robot {name!r} {how}: {problem}"
+            notices.append(RobotNotice(name, text, dump_robots_toml([spec], [notes])))
+    return FoundRobots(tuple(robots), tuple(notices))
 
 
-# --- chains -----------------------------------------------------------------------------------------------------------
-
-
-def _count_reach(tree: KinematicTree, body: int) -> int:
-    """Return the most directly actuated joints on any path down from `body`, its own included."""
-    own = len(_list_actuated(tree, body))
-    return own + max((_count_reach(tree, b) for b in tree.list_jointed_below(body)), default=0)
-
-
-def _list_actuated(tree: KinematicTree, body: int) -> list[int]:
-    return [j for j in tree.list_scalar_joints(body) if tree.actuators_of_joint[j]]
-
-
-def _walk_chain(tree: KinematicTree, body: int, chain: list[int], arms: list[_Arm]) -> None:
-    """Follow one chain down from `body`; add it to `arms` where it ends, and the chains it splits into."""
-    chain = chain + _list_actuated(tree, body)
-    branches = tree.list_jointed_below(body)
-    # Behind an arm only another arm goes on; several shorter branches are fingers.
-    least = ARM_JOINTS if len(chain) >= MIN_JOINTS and len(branches) > 1 else MIN_JOINTS
-    long = [b for b in branches if _count_reach(tree, b) >= least]
-    if len(branches) == 1 or len(long) == 1:
-        _walk_chain(tree, (long or branches)[0], chain, arms)
-    elif long:
-        for branch in [b for b in branches if _count_reach(tree, b) >= MIN_JOINTS]:
-            _walk_chain(tree, branch, [], arms)
-    elif len(chain) >= MIN_JOINTS:
-        arms.append(_Arm(chain))
-
-
-def _split_jaw(tree: KinematicTree, arm: _Arm) -> None:
-    """Move trailing jaw joints to the gripper, and record the last link and the moving bodies below it."""
+def _split_jaw(tree: KinematicTree, arm: Limb) -> None:
+    """Move trailing jaw joints to the gripper."""
     while len(arm.joints) > MIN_JOINTS and _is_jaw(tree, arm.joints[-1], arm.joints[-2]):
         arm.joints.pop()
     arm.link = tree.joint_body[arm.joints[-1]]
@@ -105,143 +96,132 @@ def _split_jaw(tree: KinematicTree, arm: _Arm) -> None:
 
 def _is_jaw(tree: KinematicTree, last: int, before: int) -> bool:
     """Return true for a jaw, by its names, or because the end-effector site sits on the link before it."""
+    if tree.joint_body[last] == tree.joint_body[before]:
+        return False
     names = [get_element_name(tree.model, "joint", last)]
     names += [get_element_name(tree.model, "actuator", a) for a in tree.actuators_of_joint[last]]
-    if any(_JAW.search(n) for n in names):
+    link = get_element_name(tree.model, "body", tree.joint_body[last])
+    if any(_JAW.search(n) for n in names) or _JAW_LINK.search(link):
         return True
-    on_last, on_before = _sites_on(tree, tree.joint_body[last]), _sites_on(tree, tree.joint_body[before])
-    ranks = [_rank_site(get_element_name(tree.model, "site", s))[0] for s in on_before]
-    return not on_last and any(rank < len(SITE_WORDS) for rank in ranks)
+    on_last, on_before = (list_tip_sites(tree, tree.joint_body[j]) for j in (last, before))
+    ranks = [rank_name(get_element_name(tree.model, "site", s))[0] for s in on_before]
+    return not on_last and any(rank < len(TIP_WORDS) for rank in ranks)
 
 
 # --- one robot --------------------------------------------------------------------------------------------------------
 
 
-def _build_spec(tree: KinematicTree, arm: _Arm, name: str, arms: list[_Arm]) -> RobotSpec:
-    """Return the robot of `arm`; missing parts go into its problems and notes."""
+def _build_spec(
+    tree: KinematicTree, limb: Limb, name: str, limbs: list[Limb]
+) -> tuple[RobotSpec, list[str], dict[str, str]]:
+    """Return the robot of a limb, what is unclear about it, and comments on keys of its lines in a robots file."""
     model = tree.model
     bodies = list_body_names(model)
-    site = _choose_site(tree, arm)
-    actuators = _choose_actuators(tree, arm)
-    gripper = find_gripper(tree, arm.link, arm.fingers) if arm.fingers else None
-    base = _find_base(tree, arm, arms)
-    if not base:
-        arm.problems.append(f"body {tree.joint_body[arm.joints[0]]} needs a name of 1 to 64 characters in the model")
-    gripper_actuator, opened, closed = "", 0.0, 0.0
-    if gripper:
-        problem = describe_problem(tree, gripper)
-        if problem:
-            arm.problems.append(problem)
-            choices = ", ".join(get_element_name(model, "actuator", a) for a in gripper.actuators)
-            arm.notes["gripper_actuator"] = f"{problem}; choices: {choices}"
-        gripper_actuator = _get_wire_name(tree, arm, "actuator", gripper.actuators[0])
-        low, high = gripper.range or (0.0, 0.0)
-        opened = high if gripper.open is None else gripper.open
-        closed = low if gripper.closed is None else gripper.closed
-    return RobotSpec(
+    problems: list[str] = []
+    notes: dict[str, str] = {}
+    if limb.kind == HAND:
+        limb.joints = [j for j in limb.joints if len(tree.actuators_of_joint[j]) == 1]
+    actuators = tuple(_choose_actuator(tree, joint, problems, notes) for joint in limb.joints)
+    tip = find_end_effector(tree, limb.joints[-1], limb.link, limb.fingers)
+    if tip.note:
+        notes["tip_body"] = tip.note
+    gripper = find_gripper(tree, limb.link, limb.fingers) if limb.fingers and limb.kind != HAND else None
+    members = _choose_gripper(tree, gripper, problems, notes)
+    site = "" if tip.site is None else get_element_name(model, "site", tip.site)
+    spec = RobotSpec(
         name=name,
-        joints=tuple(_get_wire_name(tree, arm, "joint", j) for j in arm.joints),
-        actuators=actuators,
-        site=get_element_name(model, "site", site) if site is not None else "",
-        base_body=base,
-        gripper_actuator=gripper_actuator,
-        gripper_open=opened,
-        gripper_closed=closed,
-        finger_bodies=tuple(bodies[b] for b in gripper.finger_bodies) if gripper else (),
+        joints=tuple(get_reference(model, "joint", j) for j in limb.joints),
+        actuators=tuple(get_reference(model, "actuator", a) for a in actuators),
+        site=site,
+        base_body=bodies[_find_base(tree, limb, limbs)],
+        finger_bodies=tuple(bodies[b] for b in gripper.finger_bodies) if gripper and members else (),
+        hold="gravity_pd" if any(_is_torque(model, a) for a in actuators) else "",
+        tip_body="" if site else bodies[tip.body],
+        T_body_tip=Pose(tip.offset, (1.0, 0.0, 0.0, 0.0)),
+        gripper_partners=tuple(members[1:]),
+        kind=HAND if limb.kind == HAND else ARM,
+    )
+    if members:
+        first = members[0]
+        spec = msgspec.structs.replace(
+            spec, gripper_actuator=first.actuator, gripper_open=first.open, gripper_closed=first.closed
+        )
+    return spec, problems, notes
+
+
+def _choose_actuator(tree: KinematicTree, joint: int, problems: list[str], notes: dict[str, str]) -> int:
+    """Return the actuator of a joint, the first of several."""
+    candidates = tree.actuators_of_joint[joint]
+    if len(candidates) > 1:
+        listed = ", ".join(get_reference(tree.model, "actuator", a) for a in candidates)
+        problem = f"joint {get_reference(tree.model, 'joint', joint)!r} has {len(candidates)} actuators ({listed})"
+        problems.append(problem)
+        notes["actuators"] = f"one per joint; {problem}"
+    return candidates[0]
+
+
+def _choose_gripper(
+    tree: KinematicTree, gripper: FoundGripper | None, problems: list[str], notes: dict[str, str]
+) -> list[GripperActuator]:
+    if gripper is None:
+        return []
+    names = {a: get_reference(tree.model, "actuator", a) for a in gripper.unclear}
+    if not gripper.members or any("spreads" not in why for why in gripper.unclear.values()):
+        reasons = [f"gripper actuator {names[a]!r} {why}" for a, why in gripper.unclear.items()]
+        problems.extend(reasons)
+        if reasons:
+            notes["gripper_actuator"] = f"{', '.join(reasons)}; give it with its gripper_open and gripper_closed"
+    return [GripperActuator(get_reference(tree.model, "actuator", a), *ends) for a, *ends in gripper.members]
+
+
+def _is_torque(model: mujoco.MjModel, actuator: int) -> bool:
+    """Return true for an actuator whose `ctrl` is a force or torque, which cannot hold by itself."""
+    return (
+        int(model.actuator_gaintype[actuator]) == _FIXED
+        and int(model.actuator_biastype[actuator]) == _NO_BIAS
+        and int(model.actuator_dyntype[actuator]) == _NO_DYNAMICS
     )
 
 
-def _get_wire_name(tree: KinematicTree, arm: _Arm, kind: str, index: int) -> str:
-    name = get_element_name(tree.model, kind, index)
-    if not is_wire_name(name):
-        arm.problems.append(f"{kind} {index} needs a name of 1 to 64 characters in the model")
-    return name
-
-
-def _choose_actuators(tree: KinematicTree, arm: _Arm) -> tuple[str, ...]:
-    chosen = []
-    for joint in arm.joints:
-        candidates = tree.actuators_of_joint[joint]
-        if len(candidates) > 1:
-            listed = ", ".join(get_element_name(tree.model, "actuator", a) or f"number {a}" for a in candidates)
-            problem = (
-                f"joint {get_element_name(tree.model, 'joint', joint)!r} has {len(candidates)} actuators ({listed})"
-            )
-            arm.problems.append(problem)
-            arm.notes["actuators"] = f"one per joint; {problem}"
-        chosen.append(_get_wire_name(tree, arm, "actuator", candidates[0]))
-    return tuple(chosen)
-
-
-def _sites_on(tree: KinematicTree, link: int) -> list[int]:
-    """Return the named sites on the rigid link that body `link` belongs to."""
-    model = tree.model
-    return [
-        s
-        for s in range(model.nsite)
-        if tree.weld[int(model.site_bodyid[s])] == tree.weld[link] and is_wire_name(get_element_name(model, "site", s))
-    ]
-
-
-def _rank_site(site: str) -> tuple[int, int]:
-    """Return the position of the best `SITE_WORDS` word in a site's name (beyond the last: none), then its number of
-    words.
-    """
-    words = [w for w in re.split(r"[^a-z]+", site.lower()) if w]
-    return min((SITE_WORDS.index(w) for w in words if w in SITE_WORDS), default=len(SITE_WORDS)), len(words)
-
-
-def _choose_site(tree: KinematicTree, arm: _Arm) -> int | None:
-    sites = _sites_on(tree, arm.link)
-    names = {s: get_element_name(tree.model, "site", s) for s in sites}
-    best = min((_rank_site(n) for n in names.values()), default=(0, 0))
-    chosen = [s for s in sites if _rank_site(names[s]) == best]
-    if len(chosen) == 1:
-        return chosen[0]
-    link = list_body_names(tree.model)[arm.link]
-    if not sites:
-        arm.problems.append(f"there is no end-effector site on its last link {link!r}")
-        arm.notes["site"] = f"add a site to body {link} in the model and name it here"
-    else:
-        listed = ", ".join(names[s] for s in chosen)
-        arm.problems.append(f"{len(chosen)} sites on its last link {link!r} could be the end effector ({listed})")
-        arm.notes["site"] = f"choose one of: {listed}"
-    return None
-
-
-def _find_base(tree: KinematicTree, arm: _Arm, arms: list[_Arm]) -> str:
-    """Return the highest named body above the first joint whose subtree holds no other robot."""
-    path = tree.list_ancestors(tree.joint_body[arm.joints[0]])
-    others = {tree.joint_body[a.joints[0]] for a in arms if a is not arm}
-    names = [get_element_name(tree.model, "body", b) for b in path]
-    free = [
-        n for b, n in zip(path, names, strict=True) if is_wire_name(n) and not others.intersection(tree.list_subtree(b))
-    ]
-    return free[-1] if free else ""
+def _find_base(tree: KinematicTree, limb: Limb, limbs: list[Limb]) -> int:
+    """Return the highest body above the first joint whose subtree holds no other limb, a named one where there is."""
+    path = tree.list_ancestors(tree.joint_body[limb.joints[0]])
+    own = set(limb.joints)
+    others = {tree.joint_body[one.joints[0]] for one in limbs if one is not limb and own.isdisjoint(one.joints)}
+    free = [b for b in path if not others.intersection(tree.list_subtree(b))] or path[:1]
+    named = [b for b in free if is_wire_name(get_element_name(tree.model, "body", b))]
+    return (named or free)[-1]
 
 
 # --- names ------------------------------------------------------------------------------------------------------------
 
 
-def _robot_names(tree: KinematicTree, arms: list[_Arm]) -> list[str]:
-    """Return per arm the prefix of its joints' names, else the base body, else the model's name, else `robot`; made
+def _name_robots(tree: KinematicTree, wanted: list[Limb], limbs: list[Limb]) -> list[str]:
+    """Return per limb the prefix of its joints' names, else the base body, else the model's name, else `robot`; made
     unique.
     """
     names: list[str] = []
-    for arm in arms:
-        stem = _find_prefix([get_element_name(tree.model, "joint", j) for j in arm.joints])
-        folder, _, base = _find_base(tree, arm, arms).rpartition("/")
+    for limb in wanted:
+        stem = _find_prefix([get_element_name(tree.model, "joint", j) for j in limb.joints])
+        base = get_element_name(tree.model, "body", _find_base(tree, limb, limbs))
+        folder, _, base = base.rpartition("/")
         if not stem:
             stem = folder or ("" if base.lower() in _GENERIC_BASES else base)
-        if not stem and len(arms) == 1:
+        if not stem and len(wanted) == 1:
             stem = _model_name(tree.model)
-        stem = (stem or "robot")[:60]
-        name, number = stem, 1
-        while name in names:
-            number += 1
-            name = f"{stem}_{number}"
-        names.append(name)
+        stem = stem or (limb.kind if limb.kind != ARM else "robot")
+        if limb.kind in (LEG, FINGER) and limb.kind not in stem.lower():
+            stem += f"_{limb.kind}"
+        names.append(_make_unique(stem[:60], names))
     return names
+
+
+def _make_unique(stem: str, taken: Iterable[str]) -> str:
+    name, number = stem, 1
+    while name in taken:
+        number += 1
+        name = f"{stem}_{number}"
+    return name
 
 
 def _find_prefix(names: list[str]) -> str:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _BALL = int(mujoco.mjtJoint.mjJNT_BALL)
@@ -11,6 +15,16 @@ _TRN_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPA
 _TRN_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _WRAP_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
 _EQ_JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
+
+
+#: Geoms without a box.
+_UNBOUNDED = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+
+def _to_matrix(data: Any, geom: int) -> NDArray[np.float64]:
+    matrix: NDArray[np.float64] = data.geom_xmat[geom].reshape(3, 3)
+    return matrix
 
 
 class KinematicTree:
@@ -54,6 +68,27 @@ class KinematicTree:
             for w in wraps
             if int(model.wrap_type[w]) == _WRAP_JOINT
         }
+
+    @functools.cached_property
+    def rest(self) -> Any:
+        """Data of the model with the kinematics of its reference configuration, `qpos0`."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_kinematics(self.model, data)
+        return data
+
+    def list_corners(self, body: int, data: Any = None) -> NDArray[np.float64]:
+        """Return the corners of the bounding boxes of a body's geoms in the world [m], shape (8 n, 3).
+
+        `data`: where the bodies are; `rest` if none is given. Planes have no corners.
+        """
+        model, data = self.model, self.rest if data is None else data
+        first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
+        corners = [
+            data.geom_xpos[g] + (model.geom_aabb[g, :3] + _SIGNS * model.geom_aabb[g, 3:]) @ _to_matrix(data, g).T
+            for g in range(first, first + count)
+            if int(model.geom_type[g]) not in _UNBOUNDED
+        ]
+        return np.concatenate(corners) if corners else np.empty((0, 3))
 
     def list_joints(self, body: int) -> range:
         """Return the joint ids of one body, in order."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from iris_session.physics.contacts import ContactTables
 from iris_session.physics.errors import UnknownNameError
 from iris_session.physics.names import find_element_id, get_element_name
+from iris_session.physics.tip import Tip
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ObjectContact
@@ -38,7 +39,7 @@ class MujocoView:
     ) -> None:
         self._data = data
         self._tables = tables
-        self._site = {r.name: find_element_id(model, "site", r.site, f"robot {r.name!r}: ") for r in robots}
+        self._tip = {r.name: Tip(model, r) for r in robots}
         self._qpos = {
             r.name: np.array(
                 [model.jnt_qposadr[find_element_id(model, "joint", j, f"robot {r.name!r}: ")] for j in r.joints],
@@ -48,9 +49,7 @@ class MujocoView:
         }
         self._body = {o.name: find_element_id(model, "body", o.body, f"object {o.name!r}: ") for o in objects}
         self._index = {r.name: i for i, r in enumerate(robots)}
-        self._site_xpos, self._site_xmat = data.site_xpos, data.site_xmat
         self._xpos, self._xquat, self._q = data.xpos, data.xquat, data.qpos
-        self._quat = np.empty(4)
         self._tick = 0
         self._forces: tuple[float, ...] = (0.0,) * len(robots)
         #: Simulated time of one tick [ns].
@@ -76,12 +75,10 @@ class MujocoView:
         return float(self._data.time)
 
     def tip_pose(self, robot: str) -> Pose:
-        """Return `T_world_tip` of the robot's end-effector site."""
+        """Return `T_world_tip` of the robot's end effector."""
         pose = self._tips.get(robot)
         if pose is None:
-            site = _find(self._site, "robot", robot)
-            mujoco.mju_mat2Quat(self._quat, self._site_xmat[site])
-            pose = self._tips[robot] = _to_pose(self._site_xpos[site].tolist(), self._quat.tolist())
+            pose = self._tips[robot] = Pose(*_find(self._tip, "robot", robot).read_pose(self._data))
         return pose
 
     def joints(self, robot: str) -> tuple[float, ...]:

@@ -29,9 +29,9 @@ from iris_session.physics.errors import (
 )
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.physics.names import find_element_id, list_body_names, list_element_names
+from iris_session.physics.tip import Tip
 from iris_session.physics.tree import KinematicTree
 from iris_session.physics.view import Flexes, MujocoView
-from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
@@ -302,7 +302,10 @@ class RobotSignals:
         slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
         self.units = tuple(tuple("m" if int(model.jnt_type[j]) == slide else "rad" for j in one) for one in joints)
         self._qpos = np.array([int(model.jnt_qposadr[j]) for one in joints for j in one], np.int64)
-        self._sites = np.array([site for robot in robots for site in find("site", [robot.site], robot)], np.int64)
+        self._tips = [Tip(model, robot) for robot in robots]
+        sites = [tip.site for tip in self._tips]
+        #: All end effectors at once, where each is a site.
+        self._sites = np.array(sites, np.int64) if all(site >= 0 for site in sites) else None
         laws = [
             (i, actuator, *law)
             for i, robot in enumerate(robots)
@@ -325,7 +328,11 @@ class RobotSignals:
         values[: len(self._qpos)] = data.qpos[self._qpos]
         if len(self._scale):
             self._openings[self._grippers[0]] = data.actuator_length[self._grippers[1]] * self._scale + self._offset
-        values[len(self._qpos) + len(self._sites) :] = data.site_xpos[self._sites].ravel()
+        tips = values[len(self._qpos) + len(self._tips) :]
+        if self._sites is not None:
+            tips[:] = data.site_xpos[self._sites].ravel()
+        else:
+            tips[:] = np.concatenate([tip.read_position(data) for tip in self._tips])
         return values.tobytes()
 
 
@@ -375,14 +382,13 @@ def _body_infos(model: mujoco.MjModel, tree: KinematicTree, objects: Sequence[Ob
 
 
 def _robot_info(model: mujoco.MjModel, spec: RobotSpec) -> RobotInfo:
-    site = find_element_id(model, "site", spec.site, f"robot {spec.name!r}: ")
-    (x, y, z), (w, i, j, k) = model.site_pos[site].tolist(), model.site_quat[site].tolist()
+    tip = Tip(model, spec)
     return RobotInfo(
         name=spec.name,
         joints=spec.joints,
         base_body=find_element_id(model, "body", spec.base_body, f"robot {spec.name!r}: "),
-        site_body=int(model.site_bodyid[site]),
-        T_body_site=Pose((x, y, z), (w, i, j, k)),
+        site_body=tip.body,
+        T_body_site=tip.T_body_tip,
         gripper=bool(spec.gripper_actuator),
     )
 
@@ -399,7 +405,7 @@ def _check_specs(model: mujoco.MjModel, robots: Sequence[RobotSpec], objects: Se
 
 
 def _list_owned(robot: RobotSpec) -> list[tuple[str, str]]:
-    actuators = [name for name in (*robot.actuators, robot.gripper_actuator) if name]
+    actuators = [*robot.actuators, *(one.actuator for one in robot.gripper_actuators)]
     return [("name", robot.name), *(("joint", j) for j in robot.joints), *(("actuator", a) for a in actuators)]
 
 

@@ -2,24 +2,50 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import msgspec
 
-from iris_session.protocol.common import Name
+from iris_session.protocol.common import IDENTITY, Name, Pose
+
+#: Kinds of robots: an arm follows poses and joints; a hand, whose fingers are no chain, follows joints only.
+ARM: Final = "arm"
+HAND: Final = "hand"
+
+
+class GripperActuator(msgspec.Struct, frozen=True):
+    """One of several actuators that open and close a gripper together.
+
+    Attributes:
+        actuator: Its name in the model, or `#` and its number.
+        open, closed: Values of its `ctrl`.
+    """
+
+    actuator: Name
+    open: float
+    closed: float
 
 
 class RobotSpec(msgspec.Struct, frozen=True):
     """A named group of joints, actuators, end-effector site and gripper that is controlled as one.
 
+    What has no name in the model is called `#` and its number there: `#7`.
+
     Attributes:
         name: Name of the robot.
-        joints, actuators: Names in the model, in the same order: one actuator per arm joint.
-        site: Site of the end effector.
+        joints, actuators: Names in the model, in the same order: one actuator per arm joint; no actuators for a robot
+            that only its owner's program moves.
+        site: Site of the end effector; empty: it is given by `tip_body`.
         base_body: Root of the robot's subtree.
         gripper_actuator: Empty without a gripper.
         gripper_open, gripper_closed: Values of its `ctrl`.
         finger_bodies: Bodies whose geoms count as the gripper (contacts, handover).
         mode: Lease mode (`LeaseMode`).
         hold: Declared hold law of torque actuators (`gravity_pd`); empty: none, and torque actuators are refused.
+        tip_body: Body that carries the end effector where there is no site.
+        T_body_tip: Pose of the end effector in the frame of `tip_body`.
+        gripper_partners: Further actuators of the same gripper. Its opening is measured at `gripper_actuator`.
+        kind: `arm`, or `hand`: fingers that are controlled in joint space only.
     """
 
     name: Name
@@ -33,6 +59,18 @@ class RobotSpec(msgspec.Struct, frozen=True):
     finger_bodies: tuple[Name, ...] = ()
     mode: Name = "exclusive"
     hold: Name = ""
+    tip_body: Name = ""
+    T_body_tip: Pose = IDENTITY
+    gripper_partners: tuple[GripperActuator, ...] = ()
+    kind: Name = ARM
+
+    @property
+    def gripper_actuators(self) -> tuple[GripperActuator, ...]:
+        """All actuators of the gripper, `gripper_actuator` first; empty without a gripper."""
+        if not self.gripper_actuator:
+            return ()
+        first = GripperActuator(self.gripper_actuator, self.gripper_open, self.gripper_closed)
+        return (first, *self.gripper_partners)
 
 
 class ObjectSpec(msgspec.Struct, frozen=True):

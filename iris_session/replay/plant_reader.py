@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from iris_session.physics.contacts import ContactTables
 from iris_session.physics.names import find_element_id
+from iris_session.physics.tip import Tip
 from iris_session.physics.tree import KinematicTree
 from iris_session.physics.world import STATE, find_opening_law
 from iris_session.protocol.common import Pose
@@ -104,18 +105,16 @@ class PlantReader:
         return {POSES: Quantity(POSE, lambda: (*data.xpos[body].tolist(), *data.xquat[body].tolist()))}
 
     def _make_ctrl(self, spec: RobotSpec) -> Quantity:
-        names = (*spec.actuators, spec.gripper_actuator) if spec.gripper_actuator else spec.actuators
+        names = (*spec.actuators, *(one.actuator for one in spec.gripper_actuators))
         rows = np.array([find_element_id(self._model, "actuator", name) for name in names], np.intp)
         return Quantity(names, _make_reader(self._data.ctrl, rows))
 
     def _make_speed(self, spec: RobotSpec) -> Callable[[], Sequence[float]]:
-        """Return a function that returns linear [m/s] and angular [rad/s] speed of the end-effector site."""
-        site = find_element_id(self._model, "site", spec.site)
-        velocity: NDArray[np.float64] = np.empty(6)
+        """Return a function that returns linear [m/s] and angular [rad/s] speed of the end effector."""
+        tip = Tip(self._model, spec)
 
         def read() -> Sequence[float]:
-            mujoco.mj_objectVelocity(self._model, self._data, int(mujoco.mjtObj.mjOBJ_SITE), site, velocity, 0)
-            wx, wy, wz, vx, vy, vz = velocity.tolist()
+            wx, wy, wz, vx, vy, vz = tip.read_velocity(self._data).tolist()
             return math.hypot(vx, vy, vz), math.hypot(wx, wy, wz)
 
         return read

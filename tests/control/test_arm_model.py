@@ -9,7 +9,7 @@ import pytest
 
 from anchors.pose import compose
 from iris_session.control import ControlError
-from iris_session.control.arm_model import ArmModel, has_moving_base, read_site_pose
+from iris_session.control.arm_model import ArmModel, has_moving_base
 from iris_session.protocol.specs import RobotSpec
 from tests.control.rigs import aloha_model, aloha_robots, apart, panda_arms, panda_model, panda_spec
 
@@ -24,7 +24,7 @@ def check_fk(model: mujoco.MjModel, robot: RobotSpec) -> None:
         x, y, z = data.xpos[arm.root_body].tolist()
         w, i, j, k = data.xquat[arm.root_body].tolist()
         tip = compose(((x, y, z), (w, i, j, k)), arm.forward_kinematics(q))
-        distance, angle = apart(tip, read_site_pose(data, arm.site_id))
+        distance, angle = apart(tip, arm.tip.read_pose(data))
         assert distance < 1e-12
         assert angle < 1e-6
 
