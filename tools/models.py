@@ -26,12 +26,15 @@ from iris_session.control.arm_model import ArmModel
 from iris_session.control.config import ControlConfig
 from iris_session.control.controller import Controller
 from iris_session.physics import PhysicsError, World, find_objects, load_model
+from iris_session.physics.tree import KinematicTree
 from iris_session.physics.tip import Tip
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ARM, RobotSpec
 from iris_session.protocol.steps import Command, CommandSource, Decision
 from iris_session.session.robots import find_drivable_robots
 
+#: Numbers in `qpos` and `qvel` by type of joint: free, ball, slide, hinge.
+_WIDTHS: Final = ((7, 6), (4, 3), (1, 1), (1, 1))
 #: The arm holds for some seconds, the hand moves so far [m] in so many seconds, then waits.
 DISTANCE_M: Final = 0.05
 HOLD_S, MOVE_S, WAIT_S, SAMPLE_S = 1.0, 1.0, 2.0, 1 / 72
@@ -83,12 +86,17 @@ def measure_move(model: mujoco.MjModel, robot: RobotSpec) -> float:
 
 
 def _measure_axis(model: mujoco.MjModel, robot: RobotSpec, axis: Any) -> float:
-    """Return what is left [mm] when a hand moves 5 cm along `axis` from where the arm holds itself."""
+    """Return what is left [mm] when a hand moves 5 cm along `axis` from where the arm holds itself.
+
+    What carries the arm, as the pelvis of a humanoid, is held still: nobody drives its legs.
+    """
     world = World(model, (robot,), ())
     data, tip, root = world.data, Tip(model, robot), ArmModel(model, robot).root_body
     controller = Controller(model, [robot])
     controller.reset(data)
     dt = float(model.opt.timestep)
+    carriers = [j for j in range(model.njnt) if model.jnt_bodyid[j] in KinematicTree(model).list_ancestors(root)]
+    still = data.qpos.copy()
 
     def read_tip() -> Any:
         return (np.array(tip.read_pose(data)[0]) - data.xpos[root]) @ data.xmat[root].reshape(3, 3)
@@ -106,6 +114,10 @@ def _measure_axis(model: mujoco.MjModel, robot: RobotSpec, axis: Any) -> float:
         controller.begin(round(now * 1e9), 1, Decision((command,)), world.view())
         controller.tick(data)
         mujoco.mj_step2(model, data)
+        for joint in carriers:
+            q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            width = _WIDTHS[int(model.jnt_type[joint])]
+            data.qpos[q : q + width[0]], data.qvel[v : v + width[1]] = still[q : q + width[0]], 0.0
         mujoco.mj_step1(model, data)
     left = float(np.linalg.norm(goal - read_tip()))
     return 1e3 * left if np.isfinite(left) else 1e6
