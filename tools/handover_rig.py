@@ -184,7 +184,7 @@ class Rig:
     def __post_init__(self) -> None:
         self.rng = random.Random(self.seed)
         model = self.model or mujoco.MjModel.from_xml_path(str(scene_path("handover")))
-        self.robots, self.objects = find_robots(model), find_objects(model)
+        self.robots, self.objects = find_robots(model).robots, find_objects(model)
         self.world = World(model, self.robots, self.objects)
         objects = tuple(filter(None, (self.object, *self.also)))
         for name in objects if self.shift else ():

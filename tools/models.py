@@ -26,8 +26,8 @@ from iris_session.control.arm_model import ArmModel
 from iris_session.control.config import ControlConfig
 from iris_session.control.controller import Controller
 from iris_session.physics import PhysicsError, World, find_objects, load_model
-from iris_session.physics.tree import KinematicTree
 from iris_session.physics.tip import Tip
+from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ARM, RobotSpec
 from iris_session.protocol.steps import Command, CommandSource, Decision

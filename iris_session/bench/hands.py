@@ -84,7 +84,7 @@ class HandScenario:
 
     def __init__(self, device: str, rate_hz: int, motion: str, seed: int) -> None:
         model = n_arms_scene(1, 0).compile()
-        robots = find_robots(model)
+        robots = find_robots(model).robots
         self.core = SessionCore(model, CoreConfig(AuthorityConfig(), ControlConfig(), robots, ()))
         self.robot = robots[0].name
         self.device, self.rate_hz = device, rate_hz
@@ -267,7 +267,7 @@ class FastHour(msgspec.Struct, frozen=True):
 def count_false_holds(device: str, rate_hz: int, seconds: float, seed: int) -> FastHour:
     """Drive by fast motion; after a hold the clutch is opened and closed."""
     rng = np.random.default_rng(seed)
-    person, robots = PEOPLE[device], find_robots(n_arms_scene(1, 0).compile())
+    person, robots = PEOPLE[device], find_robots(n_arms_scene(1, 0).compile()).robots
     robot = robots[0]
     view = FixedView(tips={robot.name: IDENTITY}, q={robot.name: (0.0,) * len(robot.joints)})
     authority = Authority(AuthorityConfig(), robots, ())

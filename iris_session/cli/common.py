@@ -362,12 +362,12 @@ def format_scene_names() -> str:
 
 def explain_no_robots(model: mujoco.MjModel) -> str:
     """Return one line that says why no robot was found in a model, and what a robot needs."""
-    from iris_session.physics.robots import MIN_JOINTS
+    from iris_session.physics.limbs import MIN_JOINTS
 
     has = f"the model has {model.nu} actuators and {model.njnt} joints" if model.nu else "the model has no actuators"
     return (
-        f"no robots found, so participants can only watch and take objects: a robot is a chain of at least "
-        f"{MIN_JOINTS} actuated joints, and {has}"
+        f"no robots found, so participants can only watch and take objects: a robot is an arm of at least "
+        f"{MIN_JOINTS} actuated joints or a hand, no leg, and {has}"
     )
 
 

@@ -122,9 +122,6 @@ def _run_command(argv: list[str] | None) -> int:
         hint = " (here: --port-base 7730, or --control-port 0 --state-port 0)" if in_use else ""
         for line in f"{describe_error(error)}{hint}".split("\n"):
             print_error(line)
-        toml = getattr(error, "toml", "")  # of `AmbiguousModelError`
-        if toml:  # to standard output: `iris-session robots scene.xml > robots.toml`
-            print(toml)
         return error.status if isinstance(error, CommandError) else 2
     finally:
         session_log.setLevel(logging.NOTSET)

@@ -23,6 +23,7 @@ from iris_session.cli.common import (
     open_scene,
     print_json,
     print_result,
+    to_printable,
 )
 
 if TYPE_CHECKING:
@@ -90,30 +91,37 @@ def _register_robots(commands: argparse._SubParsersAction[argparse.ArgumentParse
         "robots",
         run_robots,
         help="show the robots found in a model, as TOML to edit",
-        description="Print the robots found in a model. Edit the output and pass it as `serve --robots FILE`.",
+        description="Print the robots found in a model. Edit the output and pass it as `serve --robots FILE`. Where "
+        "something about a robot is unclear, a comment says so.",
         examples="""
             iris-session robots scene.xml > robots.toml
+            iris-session robots quadruped.xml --all
             iris-session robots handover
         """,
     )
     parser.add_argument("scene", help="MJCF or MJB file, or the name of a scene (see `iris-session serve --help`)")
+    parser.add_argument("--all", action="store_true", help="also legs, heads and fingers, which are not offered")
     add_json_option(parser)
 
 
 def run_robots(arguments: argparse.Namespace) -> int:
-    """Print the result of `find_robots`. An ambiguous model is an error that carries the same TOML."""
-    from iris_session.physics import dump_robots_toml, find_objects, find_robots
+    """Print the robots that a session offers, and those that can only be watched."""
+    from iris_session.control.config import ControlConfig
+    from iris_session.physics import find_objects
+    from iris_session.session.robots import find_drivable_robots
 
     model = open_scene(arguments.scene).model
-    robots = find_robots(model)
-    objects = find_objects(model)
+    found = find_drivable_robots(model, ControlConfig(), all_limbs=arguments.all)
+    robots, objects, notices = found.robots, find_objects(model), [notice.text for notice in found.notices]
     if not robots:
         print(explain_no_robots(model), file=sys.stderr)
+    for text in notices:
+        print(to_printable(text), file=sys.stderr)
     first = f"# {len(robots)} robots, {len(objects)} free objects: {', '.join(o.name for o in objects) or 'none'}"
     if arguments.json:
-        print_json({"robots": robots, "objects": objects})
+        print_json({"robots": robots, "objects": objects, "notices": notices})
     else:
-        print(f"{first}\n{dump_robots_toml(robots)}", flush=True)  # a file: names as they are
+        print(f"{first}\n{found.to_toml()}", flush=True)  # a file: names as they are
     return 0
 
 

@@ -58,7 +58,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         notes=f"named scenes (panda and aloha need the package mujoco-menagerie):\n{format_scene_names()}",
     )
     parser.add_argument("scene", nargs="?", help="MJCF or MJB file, a file to show, or the name of a scene, see below")
-    parser.add_argument("--robots", type=Path, metavar="TOML", help="robots of the model; see `iris-session robots`")
+    parser.add_argument(
+        "--robots",
+        metavar="WHICH",
+        help="a robots file (.toml; see `iris-session robots`), names of robots found, separated by commas, `none`, or "
+        "`auto` (default)",
+    )
     parser.add_argument(
         "--anchors",
         type=Path,
@@ -186,17 +191,15 @@ def make_session_name(path: Path) -> str:
 
 def create_session(arguments: argparse.Namespace) -> Session:
     """Return a new session of a MuJoCo scene."""
-    from iris_session.physics import load_robots_toml
     from iris_session.session.session import Session
 
     if arguments.scene is None:
         raise CommandError("no scene is given: give an MJCF or MJB file, the name of a scene, or --resume RECORDING")
     scene = open_scene(arguments.scene)
-    robots = None if arguments.robots is None else load_robots_toml(arguments.robots, scene.model)
     config = make_session_config(arguments, make_session_name(Path(arguments.scene)))
     cameras = (*scene.cameras, *config.cameras)
     config = dataclasses.replace(config, anchors=scene.anchors, anchor_sizes=scene.anchor_sizes, cameras=cameras)
-    return Session(scene.model, config=apply_anchors_file(config, arguments.anchors), robots=robots)
+    return Session(scene.model, config=apply_anchors_file(config, arguments.anchors), robots=arguments.robots)
 
 
 def create_publisher(arguments: argparse.Namespace, path: Path) -> ScenePublisher:
@@ -244,7 +247,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _serve(arguments, publisher, lambda session: _describe_shown_file(session, shown))
     session = resume_session(arguments) if arguments.resume is not None else create_session(arguments)
     hint = ""
-    if not session.robots:
+    if not session.robots and arguments.robots != "none":
         tip = f"see `iris-session robots {arguments.scene}`, or give them with --robots FILE"
         hint = f"{explain_no_robots(session.model)}; {tip}"
     return _serve(arguments, session, lambda _: hint, ", ".join(robot.name for robot in session.robots))

@@ -10,7 +10,7 @@ several actuators is left out, so that it can only be watched.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 
 import msgspec
@@ -46,11 +46,18 @@ _FIXED, _NO_BIAS, _NO_DYNAMICS = (
 
 
 class RobotNotice(NamedTuple):
-    """Something unclear about a robot. `text`: one line; `toml`: the lines of a robots file that a person completes."""
+    """Something unclear about a robot. `text`: one line; `spec`: what is known of it; `notes`: what is open, by key of
+    the robots file.
+    """
 
-    robot: str
     text: str
-    toml: str
+    spec: RobotSpec
+    notes: Mapping[str, str] = {}
+
+    @property
+    def toml(self) -> str:
+        """Lines of a robots file for a person to complete; it is accepted as it is."""
+        return dump_robots_toml([self.spec], [self.notes])
 
 
 class FoundRobots(NamedTuple):
@@ -58,6 +65,14 @@ class FoundRobots(NamedTuple):
 
     robots: tuple[RobotSpec, ...]
     notices: tuple[RobotNotice, ...] = ()
+
+    def to_toml(self) -> str:
+        """Return the robots file of all robots, those that can only be watched last; it is accepted as it is."""
+        notes = {notice.spec.name: notice.notes for notice in self.notices}
+        watched = {notice.spec.name: notice.spec for notice in self.notices}
+        specs = {**watched, **{robot.name: robot for robot in self.robots}}
+        order = dict.fromkeys([*(robot.name for robot in self.robots), *watched])
+        return dump_robots_toml([specs[name] for name in order], [notes.get(name, {}) for name in order])
 
 
 def find_robots(model: mujoco.MjModel, *, all_limbs: bool = False) -> FoundRobots:
@@ -81,8 +96,7 @@ def find_robots(model: mujoco.MjModel, *, all_limbs: bool = False) -> FoundRobot
             robots.append(spec)
         for problem in problems:
             how = "is found without its whole gripper" if is_clear else "can only be watched"
-            text = f"robot {name!r} {how}: {problem}"
-            notices.append(RobotNotice(name, text, dump_robots_toml([spec], [notes])))
+            notices.append(RobotNotice(f"robot {name!r} {how}: {problem}", spec, notes))
     return FoundRobots(tuple(robots), tuple(notices))
 
 
@@ -184,8 +198,9 @@ def _is_torque(model: mujoco.MjModel, actuator: int) -> bool:
 
 
 def _find_base(tree: KinematicTree, limb: Limb, limbs: list[Limb]) -> int:
-    """Return the highest body above the first joint whose subtree holds no other limb, a named one where there is."""
-    path = tree.list_ancestors(tree.joint_body[limb.joints[0]])
+    """Return the highest body that carries the limb and no other one, a named one where there is."""
+    moved = [tree.list_ancestors(tree.joint_body[j]) for j in limb.joints]
+    path = [b for b in moved[0] if all(b in one for one in moved)]
     own = set(limb.joints)
     others = {tree.joint_body[one.joints[0]] for one in limbs if one is not limb and own.isdisjoint(one.joints)}
     free = [b for b in path if not others.intersection(tree.list_subtree(b))] or path[:1]

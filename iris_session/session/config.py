@@ -30,6 +30,7 @@ from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording.budget import MIN_BUDGET_BYTES
 from iris_session.rrd.assets import RECORD_ASSETS, SCENE
 from iris_session.session.errors import ConfigError, short_repr
+from iris_session.session.robots import RobotChoice
 
 #: A printed sheet lying at the near edge of the demo table; `T_world_anchor` of anchor id "table".
 DEFAULT_ANCHORS: Final[Mapping[str, PoseTuple]] = MappingProxyType({"table": ((0.0, -0.45, 0.0), IDENTITY_QUAT)})
@@ -187,8 +188,8 @@ class SessionConfig:
 _Spec = TypeVar("_Spec", RobotSpec, ObjectSpec)
 #: Error texts: what is expected as robots and objects.
 _ROBOTS: Final = (
-    "a list of RobotSpec is expected; load_robots_toml(file, model) of iris_session.physics reads one from a robots "
-    "file, and without robots= they are found in the model"
+    "a list of RobotSpec or names of robots, the path of a robots file, 'auto' or 'none' is expected; without robots= "
+    "they are found in the model"
 )
 _OBJECTS: Final = (
     'a list of ObjectSpec is expected, as [ObjectSpec(name="hammer", body="hammer")] of iris_session.protocol.specs; '
@@ -284,9 +285,18 @@ def check_timestep(model: mujoco.MjModel) -> None:
         )
 
 
-def check_robots(robots: object) -> tuple[RobotSpec, ...] | None:
-    """Return the specifications as a tuple, `None` to find them in the model. Raises `ConfigError`."""
-    return None if robots is None else _check_specs("robots", robots, RobotSpec, _ROBOTS)
+def check_robots(robots: object) -> RobotChoice:
+    """Return names or specifications as a tuple, anything else that `choose_robots` takes as it is.
+
+    Raises `ConfigError`.
+    """
+    if robots is None or isinstance(robots, str | Path):
+        return robots
+    if isinstance(robots, Iterable) and not isinstance(robots, bytes | Mapping):
+        robots = tuple(robots)
+        if robots and all(isinstance(one, str) for one in robots):
+            return robots
+    return _check_specs("robots", robots, RobotSpec, _ROBOTS)
 
 
 def check_objects(objects: object) -> tuple[ObjectSpec, ...] | None:

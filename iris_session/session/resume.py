@@ -23,7 +23,7 @@ import zlib
 from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import mujoco
@@ -37,7 +37,6 @@ from iris_session.physics import (
     compute_scene_hash,
     encode_model,
     find_objects,
-    find_robots,
     load_model,
 )
 from iris_session.protocol.common import MAX_TEXT, Pose
@@ -63,6 +62,7 @@ from iris_session.security.resume_tokens import encode_handback
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots
 from iris_session.session.core import SessionCore
 from iris_session.session.errors import ConfigError, ResumeError
+from iris_session.session.robots import RobotChoice, choose_robots
 from iris_session.session.verification import ReplayCore
 from iris_session.system.files import Replacement
 
@@ -80,8 +80,14 @@ MAX_KEYFRAMES: Final = 8
 
 _log = logging.getLogger(__name__)
 
-#: A model, its robots and its objects.
-Scene = tuple[mujoco.MjModel, tuple[RobotSpec, ...], tuple[ObjectSpec, ...]]
+
+class Scene(NamedTuple):
+    """A model, its robots and its objects. `notices`: what is unclear about robots, a line each."""
+
+    model: mujoco.MjModel
+    robots: tuple[RobotSpec, ...]
+    objects: tuple[ObjectSpec, ...]
+    notices: tuple[str, ...] = ()
 
 
 class PastSession:
@@ -147,7 +153,7 @@ class PastSession:
         if model is not None:
             self._check_model(model)
         core = self.core
-        return self._merge_settings(given), (core.world.model, core.scene.robots, core.scene.objects)
+        return self._merge_settings(given), Scene(core.world.model, core.scene.robots, core.scene.objects)
 
     def _merge_settings(self, given: SessionConfig) -> SessionConfig:
         plain, core = SessionConfig(), self.core.config
@@ -256,7 +262,7 @@ def prepare_session(
     given: SessionConfig | None,
     model: mujoco.MjModel | str | Path | None,
     data: mujoco.MjData | None,
-    robots: Sequence[RobotSpec] | None,
+    robots: RobotChoice,
     objects: Sequence[ObjectSpec] | None,
 ) -> tuple[PastSession | None, SessionConfig, Scene]:
     """Return what a session begins with: the checked arguments of `Session`, or with `resume` the past session."""
@@ -265,9 +271,9 @@ def prepare_session(
     if not isinstance(config, SessionConfig) or config.resume is None:
         check_arguments(model, data, config)
         assert isinstance(model, mujoco.MjModel)
-        named, things = check_robots(robots), check_objects(objects)
-        found = tuple(find_robots(model)) if named is None else named
-        return None, config, (model, found, tuple(find_objects(model)) if things is None else things)
+        found, things = choose_robots(model, check_robots(robots), config.control), check_objects(objects)
+        notices = tuple(notice.text for notice in found.notices)
+        return None, config, Scene(model, found.robots, find_objects(model) if things is None else things, notices)
     past = PastSession(Path(config.resume))
     try:
         return past, *past.merge_config(config, model, data, robots, objects)

@@ -35,16 +35,17 @@ from iris_session.journal.environment import use_one_blas_thread
 from iris_session.physics import Pacer, PacerStats, PhysicsError, load_model
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.client_messages import Assign, Control, EStop, SetScale
-from iris_session.protocol.common import Pose
+from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.specs import ObjectSpec
 from iris_session.session.attachment import Attachment, find_simulation
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots, check_timestep
 from iris_session.session.core import SessionCore, make_session_core, read_plant_state
 from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.resume import prepare_session
+from iris_session.session.robots import RobotChoice
 from iris_session.session.scene_change import adopt_timestep, prepare_scene
 from iris_session.session.session_base import SessionBase
 from iris_session.session.status import DataFault
@@ -81,7 +82,8 @@ class Session(SessionBase):
         data: The state to begin with; `None` for keyframe `home`, else the model's default. `run()` advances a copy of
             it, which is `session.data` from then on.
         config: Settings; `None` for the defaults.
-        robots: Robots that can be driven; `None` finds them in the model.
+        robots: Robots that can be driven: `None` or `auto` finds them in the model, `none` offers none; or names of
+            robots found (legs and fingers, too), the path of a robots file, or specifications.
         objects: Free bodies that robots and hands can take; `None` finds them in the model.
 
     Attributes:
@@ -91,7 +93,6 @@ class Session(SessionBase):
         recording_fault: After `close()`, why the recording is incomplete; empty when it is complete.
 
     Raises:
-        AmbiguousModelError: Robots cannot be found in the model without help.
         ConfigError: A value that cannot be used.
         ResumeError: The recording of `config.resume` cannot be continued.
         TypeError: `model` is no model, `data` no `MjData`.
@@ -103,11 +104,11 @@ class Session(SessionBase):
         data: mujoco.MjData | None = None,
         config: SessionConfig | None = None,
         *,
-        robots: Sequence[RobotSpec] | None = None,
+        robots: RobotChoice = None,
         objects: Sequence[ObjectSpec] | None = None,
     ) -> None:
         self._past, self.config, scene = prepare_session(config, model, data, robots, objects)
-        self.model, self.robots, self.objects = scene
+        self.model, self.robots, self.objects, self._robot_notices = scene
         self.data = data
         self.origin_ns = time.monotonic_ns() if self._past is None else self._past.origin_ns
         self.clock = make_session_clock(self.origin_ns)
@@ -125,6 +126,17 @@ class Session(SessionBase):
         self._scheduling = "normal"
         self._next_overrun_log_ns = 0
         self.recording_fault = ""
+        self._log_robot_notices()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes for the user, one line each: how the session started (another name, other addresses), which robots can
+        only be watched, and which parts of the present scene clients do not see."""
+        return (*self._robot_notices, *super().notes)
+
+    def _log_robot_notices(self) -> None:
+        for text in self._robot_notices:
+            _log.warning("%s", text)
 
     # --- life --------------------------------------------------------------------------------------------------------
 
@@ -148,6 +160,7 @@ class Session(SessionBase):
                 if self._past is not None:
                     self._past.close()  # else no other process could resume it until this one ends
                 raise
+            processes.reporter.warning_sources.append(lambda: [text[:MAX_TEXT] for text in self._robot_notices])
             self._processes = processes
 
     def close(self) -> bool:
@@ -306,6 +319,7 @@ class Session(SessionBase):
         *,
         environment: object = None,
         step: str = "step",
+        robots: RobotChoice = None,
     ) -> Self:
         """Share a script's own simulation: every `mj_step(model, data)` after this line is one tick of the session.
 
@@ -321,6 +335,7 @@ class Session(SessionBase):
                 or any object with `model` and `data`. The session follows it to the model and data that it builds at a
                 reset. Its step is a tick by itself where it does not call MuJoCo's functions in Python.
             step: Name of its method that advances the simulation.
+            robots: As of `Session`.
 
         Returns:
             The started session.
@@ -338,7 +353,7 @@ class Session(SessionBase):
             model, data = found
         if environment is not None and not callable(getattr(environment, step, None)):
             raise OwnershipError(f"environment of type {type(environment).__name__} has no method {step!r} to wrap")
-        session = cls(model, data, config)
+        session = cls(model, data, config, robots=robots)
         try:
             session.start()
             loop = session._require_user_loop()
@@ -360,6 +375,8 @@ class Session(SessionBase):
                 scene = prepare_scene(stepper.core, scenes, model, state, self.robots, self.objects)
             except (PhysicsError, ControlError):  # other robots or objects
                 scene = prepare_scene(stepper.core, scenes, model, state, None, None)
+                self._robot_notices = scene.notices
+                self._log_robot_notices()
             with scenes.lock:
                 scenes.show(scene.shown)
             return scene
@@ -461,7 +478,7 @@ class Session(SessionBase):
         model: mujoco.MjModel | str | Path,
         data: mujoco.MjData | None = None,
         *,
-        robots: Sequence[RobotSpec] | None = None,
+        robots: RobotChoice = None,
         objects: Sequence[ObjectSpec] | None = None,
     ) -> Future[None]:
         """Load another scene into the running session: a new `scene_epoch` with the same participants.
@@ -476,12 +493,12 @@ class Session(SessionBase):
         Args:
             model: An `MjModel`, or the path of an MJCF or MJB file.
             data: The state to begin with; `None` for keyframe `home`, else the model's default.
-            robots: `None` finds them in the model.
+            robots: As of `Session`.
             objects: `None` finds them in the model.
 
         Returns:
             A future that is done when the scene is ready for the next step. It raises `ModelNotFoundError`,
-            `ModelInvalidError`, `AmbiguousModelError`, `ControlError`, or `ConfigError` for a timestep out of range.
+            `ModelInvalidError`, `ControlError`, or `ConfigError` for a timestep out of range.
 
         Raises:
             OwnershipError: In a user loop, whose model is not ours, and before the first `run()`.
@@ -526,7 +543,8 @@ class Session(SessionBase):
             return
         plant = scene.plant
         self.model, self.data = plant.world.model, plant.world.data
-        self.robots, self.objects = plant.scene.robots, plant.scene.objects
+        self.robots, self.objects, self._robot_notices = plant.scene.robots, plant.scene.objects, scene.notices
+        self._log_robot_notices()
 
     # --- inside ------------------------------------------------------------------------------------------------------
 

@@ -60,13 +60,16 @@ _log = logging.getLogger(__name__)
 
 
 class NextScene(NamedTuple):
-    """A scene that is to replace the present one. `packed_model`: for the recording; `shown`: for clients."""
+    """A scene that is to replace the present one. `packed_model`: for the recording; `shown`: for clients; `notices`:
+    what is unclear about its robots, a line each.
+    """
 
     plant: Plant
     model_hash: str
     packed_model: bytes
     shown: SharedScene
     deformables: Sequence[DeformableSourceMesh] = ()
+    notices: tuple[str, ...] = ()
 
 
 class NextPatch(NamedTuple):

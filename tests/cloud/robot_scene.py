@@ -45,7 +45,7 @@ def load_robots(scene: str, folder: Path) -> RobotScene:
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)
-    names, robots, thing = list_body_names(model), find_robots(model), find_objects(model)[0].body
+    names, robots, thing = list_body_names(model), find_robots(model).robots, find_objects(model)[0].body
     store = AssetStore(folder)
     spec = parse_mujoco(model, store, options=EncodeOptions(levels=False)).spec
     return RobotScene(

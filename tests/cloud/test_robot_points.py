@@ -53,7 +53,7 @@ def hold_object(scene: str, folder: Path) -> Holding:
     thing = next(body.id for body in known.streamed if body.object)
     free = next(j for j in range(model.njnt) if model.jnt_bodyid[j] == thing)
     start = model.jnt_qposadr[free]
-    data.qpos[start : start + 3] = data.site(find_robots(model)[0].site).xpos
+    data.qpos[start : start + 3] = data.site(find_robots(model).robots[0].site).xpos
     for joint in range(model.njnt):
         if "finger" in model.joint(joint).name:
             data.qpos[model.jnt_qposadr[joint]] = 0.013  # half the width of the objects

@@ -32,7 +32,7 @@ def play(request: pytest.FixtureRequest) -> Demo:
 
 
 def test_robots_of_each_person_exist_and_are_exclusive(play: Demo) -> None:
-    robots = {robot.name for robot in find_robots(play.model)}
+    robots = {robot.name for robot in find_robots(play.model).robots}
     taken = [task.robot for person in play.headsets for task in person.tasks]
     assert sorted(taken) == sorted(set(taken))
     assert set(taken) == robots
@@ -54,7 +54,7 @@ def test_every_object_goes_from_one_person_to_another(play: Demo) -> None:
 
 
 def test_every_goal_is_a_task_with_the_corners_of_the_scene(play: Demo) -> None:
-    world = World(play.model, find_robots(play.model), find_objects(play.model))
+    world = World(play.model, find_robots(play.model).robots, find_objects(play.model))
     for goal in play.goals:
         assert goal.deformable in {task.object for person in play.headsets for task in person.tasks}
         vertices = world.flexes.read_vertices(goal.deformable)

@@ -23,7 +23,7 @@ def test_names_in_the_help_are_available() -> None:
 )
 def test_scene_has_its_robots_and_a_sheet_of_known_size(name: str, robots: int) -> None:
     scene = scene_by_name(name)
-    assert len(find_robots(scene.model)) == robots
+    assert len(find_robots(scene.model).robots) == robots
     assert scene.anchor_sizes == {DEFAULT_ANCHOR_ID: DEFAULT_SHEET_M}
     if name not in ("handover", "arm", "bodies"):
         drawn = scene.model.body("sheet").pos

@@ -83,7 +83,7 @@ def aloha() -> mujoco.MjModel:
 @pytest.mark.parametrize("n", [2, 8])
 def test_panda_arms_stand_around_a_table_and_hold_still(n: int) -> None:
     model = panda_scene(n).compile()
-    robots = find_robots(model)
+    robots = find_robots(model).robots
     assert len(robots) == n
     assert [o.name for o in find_objects(model)] == [f"object{k + 1}" for k in range(n // 2)]
     assert _is_held_by_friction_only(model)

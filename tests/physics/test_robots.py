@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import re
+
 import mujoco
 import pytest
 
-from iris_session.physics import AmbiguousModelError, World, find_objects, find_robots
+from iris_session.physics import World, find_objects, load_model, load_robots_toml
+from iris_session.physics import find_robots as detect
 from iris_session.physics.names import find_element_id, list_body_names, list_element_names
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.specs import HAND, GripperActuator, ObjectSpec, RobotSpec
+from tests.models import MENAGERIE
 from tests.physics.models import FINGERS, GRIPPER_TENDON, arm, model, scene
+
+
+def find_robots(m: mujoco.MjModel, **how: bool) -> tuple[RobotSpec, ...]:
+    """Return the robots of a model in which everything is clear."""
+    found = detect(m, **how)
+    assert found.notices == ()
+    return found.robots
+
 
 VIPERX = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
 
@@ -53,8 +65,12 @@ def test_gripper_with_a_coupled_finger(slope: int, axis: str, opened: float | No
     equality = f'<equality><joint joint1="a/finger_r" joint2="a/finger_l" polycoef="0 {slope} 0 0 0"/></equality>'
     grip = '<position name="a/grip" joint="a/finger_l" ctrlrange="0 .04"/>'
     if opened is None:
-        with pytest.raises(AmbiguousModelError, match="gripper actuator 'a/grip'"):
-            find_robots(scene(body, actuators + grip, equality.replace("0 1 0 0 0", "0 1 0 0 0")))
+        found = detect(scene(body, actuators + grip, equality))
+        (notice,) = found.notices
+        assert notice.text == (
+            "robot 'a' is found without its whole gripper: gripper actuator 'a/grip' has an unknown open end"
+        )
+        assert [robot.gripper_actuator for robot in found.robots] == [""]
         return
     (robot,) = find_robots(scene(body, actuators + grip, equality))
     assert (robot.gripper_open, robot.gripper_closed) == (opened, 0.0)
@@ -93,33 +109,204 @@ def test_mobile_base_is_part_of_its_arm_and_a_camera_is_not() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kwargs", "extra", "text"),
+    ("kwargs", "extra", "text", "offered"),
     [
-        ({"end": ""}, "", "last link 'a/link3'"),
-        ({"end": '<site name="p1"/><site name="p2"/>'}, "", r"2 sites .* \(p1, p2\)"),
-        ({"end": '<site name="l_tcp"/><site name="r_tcp"/><site name="x"/>'}, "", r"2 sites .* \(l_tcp, r_tcp\)"),
-        ({}, '<velocity name="twice" joint="a/j1"/>', r"'a/j1' .*\(a/a1, twice\)"),
-        ({"end": FINGERS}, "", ""),
         (
-            {"end": FINGERS},
-            '<position name="f1" joint="a/finger_l"/><position name="f2" joint="a/finger_r"/>',
-            r"2 actuators .*\(f1, f2\)",
+            {},
+            '<velocity name="twice" joint="a/j1"/>',
+            "can only be watched: joint 'a/j1' has 2 actuators (a/a1, twice)",
+            0,
         ),
-        ({"end": FINGERS}, '<motor name="f1" joint="a/finger_l"/>', "'f1' has no ctrlrange"),
-        ({"end": FINGERS}, '<position joint="a/finger_l" ctrlrange="0 .04"/>', "actuator 4 needs"),
+        ({"end": FINGERS}, '<motor name="f1" joint="a/finger_l"/>', "gripper actuator 'f1' has no ctrlrange", 1),
+        ({"end": FINGERS}, '<motor joint="a/finger_l"/>', "gripper actuator '#4' has no ctrlrange", 1),
     ],
 )
-def test_ambiguous_models_are_refused_with_a_file_to_edit(kwargs: dict[str, str], extra: str, text: str) -> None:
+def test_unclear_robots_are_notices_with_a_file_that_is_accepted(
+    kwargs: dict[str, str], extra: str, text: str, offered: int
+) -> None:
     body, actuators = arm("a", **kwargs)  # type: ignore[arg-type]
     m = scene(body, actuators + extra)
-    if not text:
-        assert find_robots(m)[0].gripper_actuator == ""
-        return
-    with pytest.raises(AmbiguousModelError, match=text) as caught:
-        find_robots(m)
-    assert "\n" not in str(caught.value)
-    assert str(caught.value).startswith("robot 'a': ")
-    assert 'joints = ["a/j0", "a/j1", "a/j2", "a/j3"]' in caught.value.toml
+    found = detect(m)
+    (notice,) = found.notices
+    assert text in notice.text
+    assert "\n" not in notice.text
+    assert notice.text.startswith("robot 'a' ")
+    assert len(found.robots) == offered
+    assert text.removeprefix("can only be watched: ") in notice.toml
+    (robot,) = load_robots_toml(notice.toml, m)
+    assert load_robots_toml(found.to_toml(), m) == (robot,)
+    assert robot.joints == ("a/j0", "a/j1", "a/j2", "a/j3")
+
+
+# --- the end effector ---
+
+
+@pytest.mark.parametrize(
+    ("end", "expected"),
+    [
+        ('<site name="imu"/><site name="{p}end"/>', "a/end"),
+        ('<site name="wrist"/><site name="flange"/><site name="grasp"/>', "grasp"),
+        ('<site name="p1"/><site name="p2"/>', ("a/link3", (0.0, 0.0, 0.12))),
+        ('<site name="l_tcp"/><site name="r_tcp"/>', ("a/link3", (0.0, 0.0, 0.12))),
+        ("", ("a/link3", (0.0, 0.0, 0.12))),
+        ('<body name="right_hand" pos="0 0 .2"/>', ("right_hand", (0.0, 0.0, 0.0))),
+        ('<body pos="0 0 .2"><geom size=".01"/></body>', ("a/link3", (0.0, 0.0, 0.21))),
+    ],
+)
+def test_end_effector_is_a_site_or_the_end_of_the_last_link(end: str, expected: object) -> None:
+    (robot,) = find_robots(scene(*arm("a", end=end)))
+    if isinstance(expected, str):
+        assert (robot.site, robot.tip_body) == (expected, "")
+    else:
+        assert robot.site == ""
+        assert (robot.tip_body, robot.T_body_tip.p) == expected
+
+
+def test_end_effector_is_the_middle_between_finger_tips() -> None:
+    (robot,) = find_robots(scene(*arm("a", end=FINGERS.replace('<site name="{p}pinch" pos="0 0 .15"/>', ""))))
+    assert (robot.tip_body, robot.T_body_tip.p) == ("a/hand", (0.0, 0.0, 0.06))  # a centimetre before their ends
+
+
+# --- grippers of several actuators ---
+
+
+def test_two_actuators_of_two_fingers_are_one_gripper() -> None:
+    body, actuators = arm("a", end=FINGERS)
+    left = '<position name="l" joint="a/finger_l" ctrlrange="0 .04"/>'
+    right = '<position joint="a/finger_r" gear="-1" ctrlrange="-.04 0"/>'
+    (robot,) = find_robots(scene(body, actuators + left + right))
+    assert robot.gripper_actuators == (GripperActuator("l", 0.04, 0.0), GripperActuator("#5", -0.04, 0.0))
+
+
+def hand(prefix: str, fingers: int = 3) -> tuple[str, str]:
+    """Return bodies and actuators of the fingers of a hand: two curling joints each, and one that spreads."""
+    bodies, actuators = "", ""
+    for i in range(fingers):
+        inner = f"""<body name="{prefix}d{i}" pos="0 0 .04"><joint name="{prefix}d{i}" axis="1 0 0" range="0 1.6"/>
+          <geom type="box" size=".008 .008 .02" pos="0 0 .02"/></body>"""
+        bodies += f"""<body name="{prefix}f{i}" pos="{0.03 * i} 0 .05">
+          <joint name="{prefix}s{i}" axis="0 1 0" range="-.4 .4"/>
+          <joint name="{prefix}k{i}" axis="1 0 0" range="0 1.6"/>
+          <geom type="box" size=".008 .008 .02" pos="0 0 .02"/>{inner}</body>"""
+        for joint, low, high in (("s", -0.4, 0.4), ("k", 0, 1.6), ("d", 0, 1.6)):
+            actuators += f'<position name="{prefix}{joint}{i}" joint="{prefix}{joint}{i}" ctrlrange="{low} {high}"/>'
+    return bodies, actuators
+
+
+def test_fingers_of_a_hand_close_together_and_do_not_spread() -> None:
+    fingers, closing = hand("h_")
+    body, actuators = arm("a", joints=6, end=fingers)
+    (robot,) = find_robots(scene(body, actuators + closing))
+    assert robot.gripper_actuators == tuple(GripperActuator(f"h_{j}{i}", 0.0, 1.6) for i in range(3) for j in "kd")
+    assert len(robot.joints) == 6
+
+
+@pytest.mark.parametrize("wrist", ["", '<joint name="wrist" axis="0 0 1"/>'])
+def test_hand_without_an_arm_is_one_robot(wrist: str) -> None:
+    fingers, closing = hand("h_", 4)
+    palm = f'<body name="palm">{wrist}<geom type="box" size=".05 .02 .03"/>{fingers}</body>'
+    m = scene(palm, closing + ('<position name="wrist" joint="wrist"/>' if wrist else ""))
+    (robot,) = find_robots(m)
+    assert (robot.kind, robot.name, robot.tip_body) == (HAND, "h", "palm") if not wrist else ("hand", "hand", "palm")
+    assert len(robot.joints) == 12 + bool(wrist)
+    fingers_only = find_robots(m, all_limbs=True)
+    assert [r.name for r in fingers_only] == [f"h_finger{n}" for n in ("", "_2", "_3", "_4")]
+
+
+# --- real models ---
+
+
+@pytest.mark.parametrize(
+    ("file", "expected"),
+    [
+        ("franka_emika_panda/panda.xml", [("panda", 7, "hand", ["actuator8"])]),
+        ("franka_emika_panda/mjx_panda_nohand.xml", [("panda", 7, "link7", [])]),
+        ("boston_dynamics_spot/spot_arm.xml", [("arm", 6, "arm_link_wr1", ["arm_f1x"])]),
+        ("boston_dynamics_spot/spot.xml", []),
+        ("unitree_go1/scene.xml", []),
+        ("google_barkour_vb/scene.xml", []),
+        ("leap_hand/scene_right.xml", [("right", 16, "palm", [])]),
+        ("robotiq_2f85_v4/2f85.xml", []),
+        ("tetheria_aero_hand_open/right_hand.xml", []),
+    ],
+)
+def test_robots_of_menagerie(file: str, expected: list[object]) -> None:
+    m = load_model(MENAGERIE / file)
+    found = [
+        (r.name, len(r.joints), r.tip_body or r.site, [g.actuator for g in r.gripper_actuators]) for r in find_robots(m)
+    ]
+    assert found == expected
+    for all_limbs in (False, True):
+        robots = detect(m, all_limbs=all_limbs)
+        assert load_robots_toml(robots.to_toml(), m) == robots.robots
+        World(m, robots.robots, ())
+
+
+def test_grip_point_of_the_panda() -> None:
+    """Its manufacturer puts the tool point 103.4 mm before the flange of the hand."""
+    (robot,) = find_robots(load_model(MENAGERIE / "franka_emika_panda" / "panda.xml"))
+    assert robot.T_body_tip.p == pytest.approx((0.0, 0.0, 0.1034), abs=0.005)
+
+
+# --- legs, heads, bases ---
+
+
+def leg(name: str, pos: str, words: bool) -> tuple[str, str]:
+    """Return a leg that stands at `pos`; `words`: its joints are named like those of a leg."""
+    joints = ("hip", "thigh", "knee") if words else ("a", "b", "c")
+    body = '<geom size=".02" pos="0 0 -.2"/>'
+    for joint in reversed(joints):
+        body = f"""<body name="{name}_{joint}" pos="0 0 -.15"><joint name="{name}_{joint}" axis="0 1 0"/>
+          <geom size=".02"/>{body}</body>"""
+    return f'<body pos="{pos}">{body}</body>', "".join(
+        f'<position name="{name}_{joint}" joint="{name}_{joint}"/>' for joint in joints
+    )
+
+
+@pytest.mark.parametrize("words", [True, False])
+def test_legs_of_a_humanoid_are_not_offered(words: bool) -> None:
+    left, right = arm("left", joints=5), arm("right", joints=5)
+    legs = [leg("LL", "0 .1 0", words), leg("LR", "0 -.1 0", words)]
+    head = '<body name="neck"><joint name="neck" axis="0 0 1"/><geom size=".05"/></body>'
+    upper = f'<body name="chest"><joint name="waist" axis="0 0 1"/><geom size=".1"/>{left[0]}{right[0]}{head}</body>'
+    pelvis = f'<body name="pelvis" pos="0 0 1"><freejoint/><geom size=".1"/>{upper}{legs[0][0]}{legs[1][0]}</body>'
+    drives = '<position name="waist" joint="waist"/><position name="neck" joint="neck"/>'
+    m = scene(pelvis, drives + left[1] + right[1] + legs[0][1] + legs[1][1])
+    assert [(r.name, r.base_body) for r in find_robots(m)] == [("left", "left/base"), ("right", "right/base")]
+    assert [r.name for r in find_robots(m, all_limbs=True)] == ["left", "right", "LL_leg", "LR_leg"]
+
+
+def test_arm_on_a_quadruped_is_offered_and_its_base_carries_no_leg() -> None:
+    body, actuators = arm("arm", joints=6)
+    legs = [leg(name, pos, True) for name, pos in (("FL", ".2 .1 0"), ("FR", ".2 -.1 0"), ("RL", "-.2 .1 0"))]
+    trunk = f'<body name="trunk" pos="0 0 .6"><freejoint/><geom size=".1"/>{"".join(b for b, _ in legs)}{body}</body>'
+    (robot,) = find_robots(scene(trunk, actuators + "".join(a for _, a in legs)))
+    assert (robot.name, robot.base_body, len(robot.joints)) == ("arm", "arm/base", 6)
+
+
+def test_a_base_on_wheels_is_no_robot() -> None:
+    joints = "".join(f'<joint name="{j}" type="slide" axis="{a}"/>' for j, a in (("x", "1 0 0"), ("y", "0 1 0")))
+    lift = '<body name="lift"><joint name="z" type="slide" axis="0 0 1"/><geom size=".1"/></body>'
+    base = f'<body name="base">{joints}<joint name="yaw" axis="0 0 1"/><geom size=".2"/>{lift}</body>'
+    drives = "".join(f'<velocity name="{j}" joint="{j}"/>' for j in ("x", "y", "yaw", "z"))
+    assert find_robots(scene(base, drives)) == ()
+
+
+# --- actuators ---
+
+
+def test_torque_actuators_get_a_hold() -> None:
+    (robot,) = find_robots(scene(*arm("a", actuator="motor")))
+    assert robot.hold == "gravity_pd"
+
+
+def test_unnamed_actuators_and_joints_are_called_by_their_numbers() -> None:
+    body, actuators = arm("a")
+    anonymous = re.sub(r' name="a/a\d"', "", actuators)
+    m = scene(body, anonymous)
+    (robot,) = find_robots(m)
+    assert robot.actuators == ("#0", "#1", "#2", "#3")
+    World(m, (robot,), ())
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import mujoco
 import pytest
 
 from iris_session.physics import PhysicsError, RobotsFileError, dump_robots_toml, find_robots, load_robots_toml
-from tests.physics.models import arm, scene
+from iris_session.protocol.common import Pose
+from iris_session.protocol.specs import GripperActuator
+from tests.physics.models import FINGERS, arm, scene
 
 
 @pytest.mark.parametrize("name", ["aloha", "panda", "handover"])
 def test_detected_robots_round_trip(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     m = request.getfixturevalue(name)
-    robots = find_robots(m)
+    robots = find_robots(m).robots
     text = dump_robots_toml(robots)
     assert load_robots_toml(text, m) == robots
     (tmp_path / "robots.toml").write_text(text)
@@ -42,20 +45,31 @@ ACTS = '["left/joint1", "left/joint2", "left/joint3", "left/joint4", "left/joint
 MISTAKES = [
     ({"joints": '["left_j1"]'}, "joint 'left_j1' does not exist in the model. Available joints: left/joint1, left/"),
     ({"site": '"tip"'}, "site 'tip' does not exist in the model. Available sites: "),
-    ({"joints": '"left/joint1"'}, "'joints' must be a list of strings"),
+    ({"joints": '"left/joint1"'}, "'joints' must be a list of names or numbers"),
     ({"gripper_open": '"wide"'}, "'gripper_open' must be a number"),
     ({"joint": "[]"}, "unknown key 'joint'. Available keys: name, joints, actuators"),
     ({"name": '"' + "x" * 65 + '"'}, "longer than 64 characters"),
-    ({"joints": '["left/finger_joint_left"]'}, "needs one named actuator, has none"),
+    ({"joints": '["left/finger_joint_left"]'}, "needs one actuator, has none; actuators = [] is for"),
     ({"actuators": '["left/joint1"]'}, "6 joints but 1 actuators"),
     ({"actuators": ACTS.replace("left/joint3", "left/joint7")}, "actuator 'left/joint7' does not drive joint"),
-    ({"base_body": '"table"'}, "base_body 'table' must carry all its joints and its site. Available bodies: left/"),
+    (
+        {"base_body": '"table"'},
+        "base_body 'table' must carry all its joints and its end effector. Available bodies:",
+    ),
     ({"finger_bodies": '["left/finger_left"]'}, "gripper values or finger bodies without a gripper_actuator"),
     ({**GRIP, "gripper_open": "0"}, "gripper_open and gripper_closed are both 0.0"),
     ({**GRIP, "gripper_open": "4"}, "gripper value 4.0 is outside the ctrlrange 0.0 to 0.04 of 'left/gripper'"),
     ({**GRIP, "gripper_actuator": '"left/joint1"'}, "is also an actuator of the arm"),
     ({"mode": '"mine"'}, "mode 'mine' is none of exclusive, priority, request, shared, takeover"),
-    ({"hold": '"magic"'}, "hold 'magic' must be empty or 'gravity_pd'"),
+    ({"tip_body": '"table"'}, "site and tip_body both say where the end effector is"),
+    ({"site": '""'}, "'site' is missing or empty; without a site, tip_body and tip_offset"),
+    ({"site": '""', "tip_body": '"left/hnd"'}, "body 'left/hnd' does not exist in the model. Available bodies: "),
+    ({"tip_offset": "[0, 1]"}, "'tip_offset' must be three numbers [m], not [0, 1]"),
+    ({"tip_rotation": "[0, 0, 0, 0]"}, "'tip_rotation' must be a quaternion, w first"),
+    ({"joints": "[0, 99]"}, "joint '#99' does not exist in the model"),
+    ({**GRIP, "gripper_open": "[0.04, 0]"}, "1 gripper actuators but 2 values of gripper_open"),
+    ({"kind": '"leg"'}, "kind 'leg' is none of arm, hand"),
+    ({"hold": '"magic"'}, "hold 'magic' is none of empty, gravity_pd"),
 ]
 
 
@@ -83,7 +97,57 @@ def test_invalid_files_are_rejected(handover: mujoco.MjModel, tmp_path: Path) ->
 def test_free_joints_and_unusual_names() -> None:
     body, actuators = arm("é'", joints=3)
     m = scene(body + '<body name="b"><freejoint name="float"/><geom size=".1"/></body>', actuators)
-    (robot,) = find_robots(m)
+    (robot,) = find_robots(m).robots
     assert load_robots_toml(dump_robots_toml([robot]), m) == (robot,)
     with pytest.raises(RobotsFileError, match="joint 'float' is"):
         load_robots_toml(dump_robots_toml([robot]).replace("joints = [", 'joints = ["float", '), m)
+
+
+def test_end_effector_is_a_body_with_an_offset(panda: mujoco.MjModel) -> None:
+    joints = ", ".join(f'"joint{i}"' for i in range(1, 8))
+    text = f"""[[robot]]
+name = "p"
+joints = [{joints}]
+tip_body = "link7"
+tip_offset = [0, 0, 0.107]
+tip_rotation = [2, 0, 0, 0]
+"""
+    (robot,) = load_robots_toml(text, panda)
+    assert (robot.site, robot.tip_body) == ("", "link7")
+    assert robot.T_body_tip == Pose((0.0, 0.0, 0.107), (1.0, 0.0, 0.0, 0.0))
+    assert load_robots_toml(dump_robots_toml([robot]), panda) == (robot,)
+
+
+def test_joints_and_actuators_are_given_by_number_or_joint() -> None:
+    body, actuators = arm(end=FINGERS)
+    m = scene(body, re.sub(r' name="a\d"', "", actuators) + '<position joint="finger_l" ctrlrange="0 .04"/>')
+    fingers = 'gripper_actuator = "finger_l"\ngripper_open = 0.04\n'
+    text = f'[[robot]]\nname = "r"\njoints = [0, 1, "j2", "#3"]\nsite = "pinch"\n{fingers}'
+    (robot,) = load_robots_toml(text, m)
+    assert robot.joints == ("j0", "j1", "j2", "j3")
+    assert robot.actuators == ("#0", "#1", "#2", "#3")
+    assert robot.gripper_actuator == "#4"
+    assert load_robots_toml(text + 'actuators = [0, "j1", "#2", 3]\n', m) == (robot,)
+    assert load_robots_toml(dump_robots_toml([robot]), m) == (robot,)
+
+
+def test_robot_without_actuators(handover: mujoco.MjModel) -> None:
+    text = "[[robot]]\n" + "".join(f"{k} = {v}\n" for k, v in GOOD.items()) + "actuators = []\n"
+    (robot,) = load_robots_toml(text, handover)
+    assert robot.actuators == ()
+    assert load_robots_toml(dump_robots_toml([robot]), handover) == (robot,)
+
+
+def test_one_of_two_finger_actuators_is_refused_with_both() -> None:
+    body, actuators = arm(end=FINGERS)
+    both = (
+        '<position name="l" joint="finger_l" ctrlrange="0 .04"/><position name="r" joint="finger_r" ctrlrange="0 .04"/>'
+    )
+    m = scene(body, actuators + both)
+    text = '[[robot]]\nname = "r"\njoints = ["j0", "j1", "j2", "j3"]\nsite = "pinch"\n'
+    with pytest.raises(RobotsFileError, match=r"moves one of two fingers: gripper_actuator = \[\"l\", \"r\"\]"):
+        load_robots_toml(text + 'gripper_actuator = "l"\ngripper_open = 0.04\n', m)
+    ends = "gripper_open = [0.04, 0.04]\ngripper_closed = [0, 0]\n"
+    (robot,) = load_robots_toml(f'{text}gripper_actuator = ["l", "r"]\n{ends}', m)
+    assert robot.gripper_actuators == (GripperActuator("l", 0.04, 0.0), GripperActuator("r", 0.04, 0.0))
+    assert load_robots_toml(dump_robots_toml([robot]), m) == (robot,)

@@ -51,7 +51,7 @@ GRASP = (
 
 def grasp_world(cone: str) -> World:
     m = model(GRASP.format(cone=cone).replace('range="0 .04"', 'range="-.04 .04"'))
-    robots = find_robots(m)
+    robots = find_robots(m).robots
     assert [r.name for r in robots] == ["robot"]
     assert robots[0].finger_bodies == ("left_pad", "right_pad")
     assert (robots[0].gripper_open, robots[0].gripper_closed) == (20.0, -20.0)
@@ -67,7 +67,7 @@ def test_grasp_is_reported_with_its_force(cone: str) -> None:
     world = grasp_world(cone)
     view: WorldView = world.view()
     objects = find_objects(world.model)
-    tables = ContactTables(world.model, find_robots(world.model), objects, KinematicTree(world.model))
+    tables = ContactTables(world.model, find_robots(world.model).robots, objects, KinematicTree(world.model))
 
     def forces() -> dict[str, float]:
         mujoco.mj_forward(world.model, world.data)
@@ -102,7 +102,7 @@ def test_grasp_is_reported_with_its_force(cone: str) -> None:
 
 def test_single_finger_grips_only_where_it_is_the_only_one() -> None:
     world = grasp_world("elliptic")
-    m, robots, objects = world.model, find_robots(world.model), find_objects(world.model)
+    m, robots, objects = world.model, find_robots(world.model).robots, find_objects(world.model)
     push = lambda w: (w.data.qpos.__setitem__(slice(0, 3), (0.0, 0.026, 0.02)), w.restore_state(w.save_state()))  # noqa: E731
     push(world)
     assert contacts_of(world)["cube"].touching == ("robot",)
@@ -131,7 +131,7 @@ def test_objects_touch_each_other_the_world_and_cloth() -> None:
 
 
 def test_poses_and_joints(panda: mujoco.MjModel) -> None:
-    world = World(panda, find_robots(panda), ())
+    world = World(panda, find_robots(panda).robots, ())
     view = world.view()
     assert view.tick == 0
     for _ in range(20):
@@ -149,7 +149,7 @@ def test_poses_and_joints(panda: mujoco.MjModel) -> None:
 
 
 def test_unknown_names_are_rejected_with_known_ones(handover: mujoco.MjModel) -> None:
-    view = World(handover, find_robots(handover), find_objects(handover)).view()
+    view = World(handover, find_robots(handover).robots, find_objects(handover)).view()
     with pytest.raises(UnknownNameError, match=r"robot 'lift' .*: left, right\."):
         view.tip_pose("lift")
     with pytest.raises(UnknownNameError, match="robot 'lift'"):
@@ -175,7 +175,7 @@ def soft() -> Any:
 
 
 def world_of(flex_model: Any) -> World:
-    return World(flex_model, find_robots(flex_model), find_objects(flex_model))
+    return World(flex_model, find_robots(flex_model).robots, find_objects(flex_model))
 
 
 def slides_of(world: World, name: str) -> list[int]:

@@ -69,7 +69,7 @@ def test_ticks_equal_mj_steps_bit_for_bit(integrator: str, option: str, flag: st
 @pytest.mark.parametrize("name", ["aloha", "panda", "handover"])
 def test_real_models_tick_like_mj_step_and_restore(name: str, request: pytest.FixtureRequest) -> None:
     m = request.getfixturevalue(name)
-    robots, objects = find_robots(m), find_objects(m)
+    robots, objects = find_robots(m).robots, find_objects(m)
     world, plain = World(m, robots, objects), mujoco.MjData(m)
     mujoco.mj_resetDataKeyframe(m, plain, 0)
     assert world.save_state() == state_of(m, plain)
@@ -231,7 +231,7 @@ def test_foreign_snapshots_are_rejected(handover: mujoco.MjModel) -> None:
     state[0] = np.nan  # the time
     with pytest.raises(SimulationDivergedError, match="not finite"):
         world.restore_state(state.tobytes())
-    with_robots = World(handover, find_robots(handover), ())
+    with_robots = World(handover, find_robots(handover).robots, ())
     with pytest.raises(SnapshotError, match=r"0 robots, .* 2"):
         with_robots.restore(World(handover, (), ()).snapshot())
 
@@ -256,7 +256,7 @@ def test_scene_hash_does_not_depend_on_the_folder(panda: mujoco.MjModel) -> None
 
 
 def test_actuators_and_bodies_belong_to_one_robot(handover: mujoco.MjModel) -> None:
-    left, right = find_robots(handover)
+    left, right = find_robots(handover).robots
     (hammer, *_) = find_objects(handover)
     for change, named in (
         ({"joints": left.joints}, f"joint {left.joints[0]!r}"),
@@ -274,7 +274,7 @@ def test_actuators_and_bodies_belong_to_one_robot(handover: mujoco.MjModel) -> N
 
 def test_shown_state_depends_only_on_its_bytes(handover: mujoco.MjModel) -> None:
     """The state of an open session does not depend on earlier states, and its bytes are kept."""
-    robots, objects = find_robots(handover), find_objects(handover)
+    robots, objects = find_robots(handover).robots, find_objects(handover)
     source = World(handover, robots, objects)
     states = []
     for k in range(40):

@@ -126,7 +126,7 @@ def test_scene_that_was_loaded_later_is_drawn(tmp_path: Path, reference: Referen
     at = 25
     arms = n_arms_scene(1, objects=1).compile()
     arms.vis.quality.shadowsize, arms.vis.quality.offsamples = 64, 0
-    scene = SceneLoaded(compute_scene_hash(encode_model(arms)), find_robots(arms), find_objects(arms))
+    scene = SceneLoaded(compute_scene_hash(encode_model(arms)), find_robots(arms).robots, find_objects(arms))
     first = make_drawn_core()
     core = SessionCore(first.world.model, first.config, lambda _: decode_model(bytes(encode_model(arms))))
 

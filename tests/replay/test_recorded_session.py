@@ -203,7 +203,7 @@ AT = 60
 def changed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Played, SceneLoaded]:
     """Return a session in which another scene, with other robots and objects, is loaded at step `AT`."""
     arms = n_arms_scene(3, objects=3).compile()
-    scene = SceneLoaded(compute_scene_hash(encode_model(arms)), find_robots(arms), find_objects(arms))
+    scene = SceneLoaded(compute_scene_hash(encode_model(arms)), find_robots(arms).robots, find_objects(arms))
     first = make_core()
     core = SessionCore(first.world.model, first.config, lambda _: decode_model(bytes(encode_model(arms))))
 

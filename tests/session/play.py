@@ -28,7 +28,7 @@ def make_core(model: mujoco.MjModel | None = None, **authority: object) -> Sessi
     config = CoreConfig(
         AuthorityConfig(**authority),  # type: ignore[arg-type]
         ControlConfig(),
-        find_robots(model),
+        find_robots(model).robots,
         find_objects(model),
     )
     return SessionCore(model, config)

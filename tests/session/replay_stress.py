@@ -83,7 +83,9 @@ class Person(msgspec.Struct):
 
 
 def make_config(model: Any, user_owned: bool) -> CoreConfig:
-    robots = tuple(msgspec.structs.replace(r, mode=mode) for r, mode in zip(find_robots(model), MODES, strict=True))
+    robots = tuple(
+        msgspec.structs.replace(r, mode=mode) for r, mode in zip(find_robots(model).robots, MODES, strict=True)
+    )
     authority = AuthorityConfig(
         heartbeat_timeout_ns=1000 * MS, grace_ns=500 * MS, max_participants=8, user_owned_loop=user_owned
     )

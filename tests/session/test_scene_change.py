@@ -30,7 +30,7 @@ def bench_scene(timestep: float = 0.002) -> mujoco.MjModel:
 
 
 def loaded(model: mujoco.MjModel, state: bytes = b"") -> SceneLoaded:
-    return SceneLoaded(compute_scene_hash(encode_model(model)), find_robots(model), find_objects(model), state)
+    return SceneLoaded(compute_scene_hash(encode_model(model)), find_robots(model).robots, find_objects(model), state)
 
 
 def with_models(*models: mujoco.MjModel) -> SessionCore:
