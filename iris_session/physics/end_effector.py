@@ -1,4 +1,4 @@
-"""Where the end effector of a chain is: a site, else the middle between the finger tips, else the end of its last link.
+"""End effectors of chains: a site, else the middle between the finger tips, else the end of the last link.
 
 The choice between sites goes by their names. Without one, the end effector is a body with an offset in its frame, and
 has the directions of that body.

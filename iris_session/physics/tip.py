@@ -8,9 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.pose import PoseTuple
 from iris_session.physics.names import find_element_id
-from iris_session.protocol.common import Pose
+from iris_session.protocol.common import Pose, Quat, Vec3
 from iris_session.protocol.specs import RobotSpec
 
 _SITE, _BODY = int(mujoco.mjtObj.mjOBJ_SITE), int(mujoco.mjtObj.mjOBJ_XBODY)
@@ -46,7 +45,7 @@ class Tip:
         mujoco.mju_rotVecQuat(self._p, self._offset, data.xquat[self.body])
         return data.xpos[self.body] + self._p
 
-    def read_pose(self, data: Any) -> PoseTuple:
+    def read_pose(self, data: Any) -> tuple[Vec3, Quat]:
         """Return `T_world_tip` as plain floats."""
         if self.site >= 0:
             mujoco.mju_mat2Quat(self._q, data.site_xmat[self.site])
