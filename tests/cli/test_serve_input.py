@@ -11,25 +11,27 @@ import pytest
 
 from tests.e2e.session_process import FREE_PORTS, run_command, run_in_process, wait_until
 
-#: An arm with two sites that may be its end effector.
-AMBIGUOUS = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
+#: An arm with two actuators on one joint.
+UNCLEAR = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
 <body name="arm"><joint name="j1" axis="0 0 1"/><geom size=".05"/>
 <body name="link" pos=".3 0 0"><joint name="j2" axis="0 1 0"/><geom size=".05"/>
 <body name="hand" pos=".3 0 0"><joint name="j3" axis="1 0 0"/><geom size=".05"/>
-<site name="p1"/><site name="p2"/></body></body></body></worldbody>
-<actuator><position name="a1" joint="j1"/><position name="a2" joint="j2"/><position name="a3" joint="j3"/></actuator>
+<site name="p1"/></body></body></body></worldbody>
+<actuator><position name="a1" joint="j1"/><position name="a2" joint="j2"/><position name="a3" joint="j3"/>
+<velocity name="b2" joint="j2"/></actuator>
 </mujoco>"""
 #: Torque actuators and no declared hold law.
-TORQUE = AMBIGUOUS.replace('<site name="p2"/>', "").replace("<position", "<motor")
+TORQUE = UNCLEAR.replace('<velocity name="b2" joint="j2"/>', "").replace("<position", "<motor")
 
 FILES = {
     "unknown.xml": '<mujoco><worldbody><geom type="cube" size="1"/></worldbody></mujoco>',
     "scene.txt": "hello",
-    "ambiguous.xml": AMBIGUOUS,
+    "unclear.xml": UNCLEAR,
     "torque.xml": TORQUE,
     "bad.toml": "[[robot]\nname = ",
     "unknown.toml": '[[robot]]\nname = "left"\njoints = ["no_such_joint"]\nactuators = ["x"]\nsite = "left/tip"\n'
     'base_body = "left/base"\n',
+    "torque.toml": '[[robot]]\nname = "arm"\njoints = ["j1", "j2", "j3"]\nsite = "p1"\n',
     "keys.toml": '[[robot]]\nname = "left"\ncolour = "red"\n',
     "taken": "a file where a folder is expected",
     "old.rrd": "an existing file",
@@ -50,7 +52,7 @@ def folder(tmp_path: Path) -> Path:
         (["nowhere"], "handover"),  # lists the packaged scenes
         (["unknown.xml"], "cube"),
         (["scene.txt"], "scene.txt"),
-        (["torque.xml", "--no-record", *FREE_PORTS], "hold"),
+        (["torque.xml", "--robots", "torque.toml", "--no-record", *FREE_PORTS], "hold"),
         (["handover", "--robots", "bad.toml"], "bad.toml"),
         (["handover", "--robots", "unknown.toml"], "no_such_joint"),
         (["handover", "--robots", "keys.toml"], "colour"),
@@ -76,19 +78,18 @@ def test_invalid_input_is_one_line_that_names_the_value(
 
 
 @pytest.mark.e2e
-def test_ambiguous_model_prints_a_robot_file_to_edit(folder: Path) -> None:
-    done = run_command("serve", "ambiguous.xml", "--no-record", cwd=folder)
-    assert done.returncode == 2, (done.stdout, done.stderr)
-    assert done.stderr.startswith("iris-session: ")
-    assert "\n" not in done.stderr.strip()
-    toml = folder / "robots.toml"
-    toml.write_text(done.stdout.replace('site = ""', 'site = "p2"'))
-    assert "p1, p2" in done.stdout
-    edited = run_command(
-        "serve", "ambiguous.xml", "--robots", str(toml), *FREE_PORTS, "--no-record", "--seconds", "0.1", cwd=folder
-    )
-    assert edited.returncode == 0, edited.stderr
-    assert "robots: arm" in edited.stdout
+def test_unclear_robot_is_watched_until_a_robot_file_says_more(folder: Path) -> None:
+    """The file that is printed is accepted as printed; a session starts without it, too, and says what is unclear."""
+    options = (*FREE_PORTS, "--no-record", "--seconds", "0.1")
+    watched = run_command("serve", "unclear.xml", *options, cwd=folder)
+    assert watched.returncode == 0, watched.stderr
+    assert "robots: none" in watched.stdout
+    assert "robot 'arm' can only be watched: joint 'j2' has 2 actuators (a2, b2)" in watched.stdout
+    printed = run_command("robots", "unclear.xml", cwd=folder)
+    (folder / "robots.toml").write_text(printed.stdout)
+    served = run_command("serve", "unclear.xml", "--robots", "robots.toml", *options, cwd=folder)
+    assert served.returncode == 0, served.stderr
+    assert "robots: arm" in served.stdout
     assert_no_process_in(folder)
 
 

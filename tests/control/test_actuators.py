@@ -9,7 +9,7 @@ import pytest
 
 from iris_session.control import ControlConfig, ControlError
 from iris_session.control.actuators import ActuatorLaws, Grippers
-from iris_session.protocol.specs import RobotSpec
+from iris_session.protocol.specs import GripperActuator, RobotSpec
 from tests.control.rigs import aloha_model, aloha_robots
 
 MODEL = """<mujoco><compiler angle="radian"/><option integrator="implicitfast"/>
@@ -160,3 +160,23 @@ def test_closing_is_as_fast_as_allowed_and_ends_exactly() -> None:
         grippers.tick(data)
     assert data.ctrl[left] == 0.002
     assert data.ctrl[right] == 0.037
+
+
+def test_actuators_of_one_gripper_arrive_together() -> None:
+    """The second one closes the other way, over half the stroke."""
+    model = aloha_model()
+    data = mujoco.MjData(model)
+    partner = GripperActuator("right/gripper", 0.002, 0.02)
+    robot = msgspec.structs.replace(aloha_robots()[0], gripper_partners=(partner,))
+    left, right = model.actuator("left/gripper").id, model.actuator("right/gripper").id
+    data.ctrl[[left, right]] = robot.gripper_open, partner.open
+    grippers = Grippers(model, [robot], ControlConfig(gripper_speed=4.0), 0.002)
+    grippers.reset(data)
+    assert grippers.find_output(0, 0.002)[0] == [left, right]
+    grippers.set_goal(0, 0.5)
+    for _ in range(20):
+        grippers.tick(data)
+        shares = (data.ctrl[left] - 0.037) / (0.002 - 0.037), (data.ctrl[right] - 0.002) / (0.02 - 0.002)
+        assert shares[0] == pytest.approx(shares[1])
+    grippers.stop(0)
+    assert grippers.goal.tolist() == grippers.ctrl.tolist()

@@ -10,6 +10,8 @@ import pytest
 from anchors.pose import compose
 from iris_session.control import ControlError
 from iris_session.control.arm_model import ArmModel, has_moving_base
+from iris_session.physics.tip import Tip
+from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import RobotSpec
 from tests.control.rigs import aloha_model, aloha_robots, apart, panda_arms, panda_model, panda_spec
 
@@ -43,6 +45,25 @@ def test_fk_equals_the_scene_for_turned_arms() -> None:
 def test_joint_order_of_the_robot_need_not_be_the_chains() -> None:
     robot = panda_spec()
     check_fk(panda_model(), msgspec.structs.replace(robot, joints=robot.joints[::-1], actuators=robot.actuators[::-1]))
+
+
+def test_fk_equals_the_scene_for_a_body_with_an_offset() -> None:
+    T = Pose((0.01, -0.02, 0.1), (0.5, 0.5, -0.5, 0.5))
+    check_fk(panda_model(), msgspec.structs.replace(panda_spec(), site="", tip_body="link7", T_body_tip=T))
+
+
+def test_a_body_with_an_offset_is_the_site_there() -> None:
+    """Pose and velocity, to the last digits."""
+    model, rng = panda_model(), np.random.default_rng(3)
+    site = model.site(panda_spec().site)
+    T = Pose(tuple(site.pos.tolist()), tuple(site.quat.tolist()))
+    body = model.body(int(site.bodyid[0])).name
+    spec = msgspec.structs.replace(panda_spec(), site="", tip_body=body, T_body_tip=T)
+    of_site, of_body, data = Tip(model, panda_spec()), Tip(model, spec), mujoco.MjData(model)
+    data.qpos[:7], data.qvel[:7] = rng.normal(size=(2, 7))
+    mujoco.mj_forward(model, data)
+    assert apart(of_site.read_pose(data), of_body.read_pose(data)) == pytest.approx((0.0, 0.0), abs=1e-5)
+    assert of_site.read_velocity(data) == pytest.approx(of_body.read_velocity(data), abs=1e-9)
 
 
 SLIDER = """<mujoco><worldbody><body name="base">{base}

@@ -13,6 +13,7 @@ import pytest
 from anchors.pose import quat_from_rotvec
 from iris_session.control import ControlConfig, ControlError, Controller
 from iris_session.control.arm_model import read_site_pose
+from iris_session.physics import find_robots, load_model
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.protocol.steps import Command, ObjectCommand
@@ -29,7 +30,7 @@ from tests.control.rigs import (
     panda_spec,
     pose_command,
 )
-from tests.models import PANDA
+from tests.models import MENAGERIE, PANDA
 
 #: No environment moves the arm here, so that the target may lead it by any distance; see `test_hold` for the bound.
 TARGETS = ControlConfig(output="targets", target_lead_m=9.0, target_lead_rad=9.0)
@@ -295,3 +296,22 @@ def test_a_snapshot_of_other_robots_is_refused() -> None:
         two.controller.restore(one.controller.snapshot())
     with pytest.raises(msgspec.DecodeError):
         two.controller.restore(b"\x00")
+
+
+def test_a_hand_follows_joints_and_no_pose() -> None:
+    """Each finger is a chain of its own; the palm has no joint."""
+    model = load_model(MENAGERIE / "leap_hand" / "scene_right.xml")
+    (hand,) = find_robots(model).robots
+    made = Rig(model, [hand])
+    made.hold(5)
+    before = made.data.ctrl.copy()
+    for k in range(20):
+        made.step(decision([pose_command(hand.name, made.source((0.01 * k, 0.0, 0.0)))]))
+    assert (made.data.ctrl == before).all()
+    assert made.controller.get_status()[0].limits == ("joints_only",)
+    made.hold(5)
+    goal = tuple(0.1 for _ in hand.joints)
+    for k in range(300):
+        source = made.source((0.0, 0.0, 0.0), engagement=2, pose_world=None, q=goal, device="joints", new=k < 2)
+        made.step(decision([Command(hand.name, "joints", sources=(source,))]))
+    assert made.data.ctrl == pytest.approx(np.full(16, 0.1))

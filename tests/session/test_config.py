@@ -106,8 +106,9 @@ def test_invalid_scene_is_named() -> None:
             {"objects": [RobotSpec("left", (), (), "tcp", "base")]},
             r"^objects\[0\] is RobotSpec.*ObjectSpec",
         ),
-        ({"robots": ["left"]}, r"^robots\[0\] is 'left'.*RobotSpec"),
-        ({"robots": "robots.toml"}, "^robots is 'robots.toml': .*load_robots_toml"),
+        ({"robots": ["left", 3]}, r"^robots\[0\] is 'left'.*RobotSpec"),
+        ({"robots": {"left": 3}}, r"^robots is \{'left': 3\}: .*RobotSpec"),
+        ({"robots": ["left"]}, r"^robots: 'left' does not exist in the model. Available robots: none"),
         ({"robots": [RobotSpec("left", "joint1", (), "tcp", "base")]}, r"^robots\[0\] is a RobotSpec .*joints"),  # type: ignore[arg-type]
     ],
 )

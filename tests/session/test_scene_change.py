@@ -92,8 +92,8 @@ def test_load_scene_requires_a_running_session() -> None:
     ports = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, web=False)
     with Session(str(scene_path("handover")), config=ports) as run:
         run.run(seconds=0.01)
-        with pytest.raises(ConfigError, match=r"robots is 'robots\.toml'"):
-            run.load_scene(bench_scene(), robots="robots.toml")  # type: ignore[arg-type]
+        with pytest.raises(ConfigError, match=r"robots\[0\] is 3"):
+            run.load_scene(bench_scene(), robots=[3])  # type: ignore[list-item]
         change = run.load_scene(bench_scene())  # between two runs
         change.result(timeout=60)
         run.run(seconds=0.05)
