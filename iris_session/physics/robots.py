@@ -38,6 +38,8 @@ _GENERIC_BASES: Final = frozenset(
     {"base", "base_link", "link0", "link_0", "pedestal", "mount", "root", "torso", "body", "palm", "hand"}
 )
 _SEPARATORS = "/_-.:"
+#: Problems of a robot that its notice names.
+_SHOWN: Final = 3
 _FIXED, _NO_BIAS, _NO_DYNAMICS = (
     int(mujoco.mjtGain.mjGAIN_FIXED),
     int(mujoco.mjtBias.mjBIAS_NONE),
@@ -94,9 +96,11 @@ def find_robots(model: mujoco.MjModel, *, all_limbs: bool = False) -> FoundRobot
         is_clear = "actuators" not in notes
         if is_clear:
             robots.append(spec)
-        for problem in problems:
+        if problems:
             how = "is found without its whole gripper" if is_clear else "can only be watched"
-            notices.append(RobotNotice(f"robot {name!r} {how}: {problem}", spec, notes))
+            more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+            text = f"robot {name!r} {how}: {'; '.join(problems[:_SHOWN])}{more}"
+            notices.append(RobotNotice(text, spec, notes))
     return FoundRobots(tuple(robots), tuple(notices))
 
 
@@ -134,7 +138,7 @@ def _build_spec(
     problems: list[str] = []
     notes: dict[str, str] = {}
     if limb.kind == HAND:
-        limb.joints = [j for j in limb.joints if len(tree.actuators_of_joint[j]) == 1]
+        limb.joints = [j for j in limb.joints if len(tree.actuators_of_joint[j]) == 1] or limb.joints
     actuators = tuple(_choose_actuator(tree, joint, problems, notes) for joint in limb.joints)
     tip = find_end_effector(tree, limb.joints[-1], limb.link, limb.fingers)
     if tip.note:
