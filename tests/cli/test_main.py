@@ -18,6 +18,7 @@ from iris_session.cli.common import join_negative_poses
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import make_session_config
 from iris_session.session.config import SessionConfig
+from tests.models import MENAGERIE
 
 
 def list_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -106,6 +107,16 @@ def test_model_without_robots_says_what_a_robot_needs(tmp_path: Path, capsys: py
     scene.write_text("<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
     assert main(["robots", str(scene)]) == 0
     assert "3 actuated joints" in capsys.readouterr().err
+
+
+def test_legs_are_listed_on_request(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = str(MENAGERIE / "unitree_go1" / "go1.xml")
+    assert main(["robots", scene, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["robots"] == []
+    assert main(["robots", scene, "--json", "--all"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [robot["name"] for robot in found["robots"]] == ["FR_leg", "FL_leg", "RR_leg", "RL_leg"]
+    assert found["notices"] == []
 
 
 def test_options_of_a_session_reach_its_configuration() -> None:
