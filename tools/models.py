@@ -22,6 +22,7 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
+from iris_session.authority import AuthorityConfig
 from iris_session.control.arm_model import ArmModel
 from iris_session.control.config import ControlConfig
 from iris_session.control.controller import Controller
@@ -31,6 +32,7 @@ from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ARM, RobotSpec
 from iris_session.protocol.steps import Command, CommandSource, Decision
+from iris_session.session.core import CoreConfig, SessionCore
 from iris_session.session.robots import find_drivable_robots
 
 #: Numbers in `qpos` and `qvel` by type of joint: free, ball, slide, hinge.
@@ -56,7 +58,8 @@ def examine(path: Path, move: bool) -> dict[str, Any]:
     except PhysicsError as error:
         return {"file": str(path), "compiles": False, "error": str(error)[:120]}
     found = find_drivable_robots(model, ControlConfig())
-    World(model, found.robots, find_objects(model))  # what a session makes first
+    # What a session makes first; it raises what would end one.
+    SessionCore(model, CoreConfig(AuthorityConfig(), ControlConfig(), found.robots, find_objects(model)))
     rows = []
     for robot in found.robots:
         fingers = [one.actuator for one in robot.gripper_actuators]

@@ -31,9 +31,9 @@ from iris_session.protocol.specs import HAND, RobotSpec
 
 _MAX_STALLS = 5  # solves in a row without progress after which a target counts as out of reach
 _WAYPOINTS, _HALVINGS = 8, 10  # how finely the way to a joint goal is searched for the edge of the workspace
+_PROGRESS = 0.02  # share of the remaining error that a solve must go to count as progress
 #: Limit of a robot that no pose moves.
 JOINTS_ONLY = "joints_only"
-_PROGRESS = 0.02  # share of the remaining error that a solve must go to count as progress
 
 
 class IkStep(NamedTuple):
