@@ -42,12 +42,7 @@ class ArmModel:
 
     def __init__(self, scene: mujoco.MjModel, robot: RobotSpec) -> None:
         """Raise `ControlError` when the joints do not form one hinge/slide chain that ends at the end effector."""
-        self.joint_ids = [find_id(scene, "joint", name) for name in robot.joints]
-        try:
-            self.tip = Tip(scene, robot)
-        except UnknownNameError as error:
-            raise ControlError(str(error)) from None
-        chain = _find_chain(scene, robot, self.joint_ids, self.tip.body)
+        self.joint_ids, self.tip, chain = find_arm(scene, robot)
         self.root_body = int(scene.body_parentid[chain[0]]) if chain else self.tip.body
         self.model = _build_arm(scene, chain, self.tip.T_body_tip)
         self.data = mujoco.MjData(self.model)
@@ -61,6 +56,19 @@ class ArmModel:
         self.data.qpos[:] = q[self.to_chain]
         mujoco.mj_kinematics(self.model, self.data)
         return read_site_pose(self.data, 0)
+
+
+def find_arm(scene: mujoco.MjModel, robot: RobotSpec) -> tuple[list[int], Tip, list[int]]:
+    """Return the ids of the robot's joints, its tip, and the bodies from the first joint to the tip.
+
+    Raises `ControlError` as `ArmModel` does; compiles nothing.
+    """
+    joint_ids = [find_id(scene, "joint", name) for name in robot.joints]
+    try:
+        tip = Tip(scene, robot)
+    except UnknownNameError as error:
+        raise ControlError(str(error)) from None
+    return joint_ids, tip, _find_chain(scene, robot, joint_ids, tip.body)
 
 
 def read_site_pose(data: mujoco.MjData, site_id: int) -> PoseTuple:

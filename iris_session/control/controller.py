@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from anchors.pose import PoseTuple
 from iris_session.control import clutch
 from iris_session.control.actuators import ActuatorLaws, Grippers
-from iris_session.control.arm_model import ArmModel, Floats, has_moving_base, read_joint_ranges
+from iris_session.control.arm_model import ArmModel, Floats, find_arm, has_moving_base, read_joint_ranges
 from iris_session.control.clutch import compute_leader_goal, is_ramping
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig, ControlError
 from iris_session.control.grasp import Grasps
@@ -50,8 +50,8 @@ class RobotOutput(NamedTuple):
 
 
 def check_robot(model: mujoco.MjModel, robot: RobotSpec, config: ControlConfig) -> None:
-    """Raise `ControlError` for a robot that cannot be driven as described. Needs no mink."""
-    ArmModel(model, robot)
+    """Raise `ControlError` for a robot that cannot be driven as described. Needs no mink, and compiles nothing."""
+    find_arm(model, robot)
     if config.output == OUTPUT_CTRL:
         ActuatorLaws(model, [robot], config)
 
