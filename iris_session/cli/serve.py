@@ -248,7 +248,7 @@ def run(arguments: argparse.Namespace) -> int:
     session = resume_session(arguments) if arguments.resume is not None else create_session(arguments)
     hint = ""
     if not session.robots and arguments.robots != "none":
-        tip = f"see `iris-session robots {arguments.scene}`, or give them with --robots FILE"
+        tip = f"see `iris-session robots {arguments.scene} --all`, or give them with --robots FILE"
         hint = f"{explain_no_robots(session.model)}; {tip}"
     return _serve(arguments, session, lambda _: hint, ", ".join(robot.name for robot in session.robots))
 
