@@ -277,3 +277,8 @@ def test_steps_that_are_not_seen_are_a_warning(attached: Attached) -> None:
     for _ in range(600):
         ORIGINALS["mj_step"](attached.model, attached.data)
     assert any("outside of the session's ticks" in text for text in attached.rig.loop.list_warnings())
+
+
+def test_attach_offers_the_robots_that_are_chosen(model: mujoco.MjModel) -> None:
+    with Session.attach(model, make_data(model), QUIET, robots="right") as session:
+        assert [robot.name for robot in session.robots] == ["right"]

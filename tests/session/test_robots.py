@@ -59,9 +59,7 @@ def test_robots_are_chosen_by_a_word_names_or_a_file(tmp_path: Path) -> None:
     file.write_text('[[robot]]\nname = "r"\njoints = ["right/j0", "right/j1"]\ntip_body = "right/link1"\n')
     assert [r.name for r in choose_robots(model, str(file), CTRL).robots] == ["r"]
     assert choose_robots(model, file, CTRL) == choose_robots(model, str(file), CTRL)
-    with pytest.raises(
-        ConfigError, match=r"^robots: 'top' does not exist .* Available robots: left, right"
-    ):
+    with pytest.raises(ConfigError, match=r"^robots: 'top' does not exist .* Available robots: left, right"):
         choose_robots(model, "top", CTRL)
     with pytest.raises(RobotsFileError, match="cannot be read"):
         choose_robots(model, "other.toml", CTRL)
