@@ -61,12 +61,14 @@ def find_end_effector(tree: KinematicTree, joint: int, link: int, fingers: list[
 
 
 def list_tip_sites(tree: KinematicTree, link: int) -> list[int]:
-    """Return the named sites on the rigid link that body `link` belongs to, without those of sensors and goals."""
+    """Return the named sites on body `link` and what is fixed on it, without those of sensors and goals."""
     model = tree.model
+    # Not all of the same weld id: everything that is fixed to the world has one.
+    rigid = {b for b in tree.list_subtree(link) if tree.weld[b] == tree.weld[link]}
     return [
         s
         for s in range(model.nsite)
-        if tree.weld[int(model.site_bodyid[s])] == tree.weld[link]
+        if int(model.site_bodyid[s]) in rigid
         and is_wire_name(name := get_element_name(model, "site", s))
         and not split_words(name) & _OTHER_WORDS
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -14,6 +15,10 @@ from iris_session.physics.tree import KinematicTree
 _TRIAL = 0.02
 #: Smallest change of the aperture between the two ends that decides which one is open [m].
 _MIN_CHANGE = 1e-4
+#: Why an actuator of a hand is no member of its gripper, which is clear without it.
+SPREADS: Final = "spreads the fingers"
+#: Two fingers of a gripper have the same mass, to this share.
+_ALIKE = 0.1
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,7 @@ def find_gripper(tree: KinematicTree, palm: int, finger_roots: list[int]) -> Fou
         low, high = ctrl_range
         opens = _find_far_end(low, high) if is_hand else _larger_ctrl_opens(tree, actuator, palm, finger_roots)
         if opens is None:
-            unclear[actuator] = "spreads the fingers" if is_hand else "has an unknown open end"
+            unclear[actuator] = SPREADS if is_hand else "has an unknown open end"
         elif is_hand:
             members.append((actuator, min(max(0.0, low), high), low if opens else high))
         else:
@@ -59,11 +64,22 @@ def find_gripper(tree: KinematicTree, palm: int, finger_roots: list[int]) -> Fou
 def find_partners(tree: KinematicTree, link: int, actuators: list[int]) -> list[int]:
     """Return the actuators that are missing in `actuators`, which move one of the two fingers on a link."""
     roots = tree.list_jointed_below(link)
+    if len(roots) != 2 or not _are_alike(tree, *roots):
+        return []
     sides = [_list_actuators(tree, tree.list_subtree(root)) for root in roots]
     everything = _list_actuators(tree, [b for root in roots for b in tree.list_subtree(root)])
     if [len(side) for side in sides] != [1, 1] or len(everything) != 2:
         return []
     return [a for a in everything if a not in actuators] if set(actuators) & set(everything) else []
+
+
+def _are_alike(tree: KinematicTree, a: int, b: int) -> bool:
+    """Return true for branches with the same joints and mass: two fingers, not a jaw and a camera that tilts."""
+    kinds = [
+        [tree.joint_type[j] for body in tree.list_subtree(root) for j in tree.list_joints(body)] for root in (a, b)
+    ]
+    masses = [float(tree.model.body_subtreemass[root]) for root in (a, b)]
+    return kinds[0] == kinds[1] and abs(masses[0] - masses[1]) <= _ALIKE * max(masses)
 
 
 def _list_actuators(tree: KinematicTree, bodies: list[int]) -> list[int]:

@@ -3,21 +3,21 @@
 Arms are serial chains of at least three actuated joints that are no legs, fingers, heads or bases (`limbs`). Trailing
 joints that are named like a jaw belong to the gripper. A hand without an arm is one robot, controlled in joint space.
 Nothing here raises for a model that MuJoCo compiles: what is unclear about a robot is a notice with the lines of a
-robots file (`robots_toml`) to edit. An arm with an unclear gripper is found without it; a robot of which a joint has
-several actuators is left out, so that it can only be watched.
+robots file (`robots_toml`) to edit. An arm with an unclear gripper is found without it, a hand without the joints that
+have several actuators; an arm of which a joint has several is left out, so that it can only be watched.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from typing import Final, NamedTuple
 
 import msgspec
 import mujoco
 
 from iris_session.physics.end_effector import TIP_WORDS, find_end_effector, list_tip_sites, rank_name
-from iris_session.physics.gripper import FoundGripper, find_gripper
+from iris_session.physics.gripper import SPREADS, FoundGripper, find_gripper
 from iris_session.physics.limbs import ARM, FINGER, HAND, LEG, MIN_JOINTS, Limb, find_limbs
 from iris_session.physics.names import (
     get_element_name,
@@ -40,6 +40,10 @@ _GENERIC_BASES: Final = frozenset(
 _SEPARATORS = "/_-.:"
 #: Problems of a robot that its notice names.
 _SHOWN: Final = 3
+#: Kinds of limbs that are offered; others are on request.
+_OFFERED: Final = (ARM, HAND)
+#: By key of the robots file with a comment: what the robot is found without.
+_WITHOUT: Final = {"gripper_actuator": "its gripper", "joints": "some joints"}
 _FIXED, _NO_BIAS, _NO_DYNAMICS = (
     int(mujoco.mjtGain.mjGAIN_FIXED),
     int(mujoco.mjtBias.mjBIAS_NONE),
@@ -63,10 +67,26 @@ class RobotNotice(NamedTuple):
 
 
 class FoundRobots(NamedTuple):
-    """Robots of a model by their first joint, and what is unclear. `notices` may be of robots that are not found."""
+    """Robots of a model by their first joint, and what is unclear. `notices` may be of robots that are not found.
+    `hidden`: names of limbs that are not offered because they are named like legs or heads.
+    """
 
     robots: tuple[RobotSpec, ...]
     notices: tuple[RobotNotice, ...] = ()
+    hidden: tuple[str, ...] = ()
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Lines about what is unclear."""
+        texts = tuple(notice.text for notice in self.notices)
+        if not self.hidden:
+            return texts
+        limbs = (
+            "1 limb named as a leg or head is"
+            if len(self.hidden) == 1
+            else f"{len(self.hidden)} limbs named as legs or heads are"
+        )
+        return (*texts, f"{limbs} not offered: {', '.join(self.hidden)}")
 
     def to_toml(self) -> str:
         """Return the robots file of all robots, those that can only be watched last; it is accepted as it is."""
@@ -86,22 +106,27 @@ def find_robots(model: mujoco.MjModel, *, all_limbs: bool = False) -> FoundRobot
     """
     tree = KinematicTree(model)
     limbs = find_limbs(tree)
-    wanted = [b for b in limbs if b.kind != HAND] if all_limbs else [b for b in limbs if b.kind in (ARM, HAND)]
-    for limb in wanted:
+    for limb in limbs:
         if limb.kind == ARM:
             _split_jaw(tree, limb)
-    robots, notices = [], []
-    for limb, name in zip(wanted, _name_robots(tree, wanted, limbs), strict=True):
+    robots, notices, hidden = [], [], []
+    for limb, name in zip(limbs, _name_robots(tree, limbs), strict=True):
+        if not (limb.kind != HAND if all_limbs else limb.kind in _OFFERED):
+            if limb.is_by_name:
+                hidden.append(name)
+            continue
         spec, problems, notes = _build_spec(tree, limb, name, limbs)
         is_clear = "actuators" not in notes
         if is_clear:
             robots.append(spec)
         if problems:
-            how = "is found without its whole gripper" if is_clear else "can only be watched"
+            how = (
+                "can only be watched" if not is_clear else f"is found without {_WITHOUT[min(_WITHOUT.keys() & notes)]}"
+            )
             more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
             text = f"robot {name!r} {how}: {'; '.join(problems[:_SHOWN])}{more}"
             notices.append(RobotNotice(text, spec, notes))
-    return FoundRobots(tuple(robots), tuple(notices))
+    return FoundRobots(tuple(robots), tuple(notices), tuple(hidden))
 
 
 def _split_jaw(tree: KinematicTree, arm: Limb) -> None:
@@ -137,9 +162,16 @@ def _build_spec(
     bodies = list_body_names(model)
     problems: list[str] = []
     notes: dict[str, str] = {}
-    if limb.kind == HAND:
-        limb.joints = [j for j in limb.joints if len(tree.actuators_of_joint[j]) == 1] or limb.joints
-    actuators = tuple(_choose_actuator(tree, joint, problems, notes) for joint in limb.joints)
+    joints = limb.joints
+    several = [j for j in joints if len(tree.actuators_of_joint[j]) > 1]
+    problems += [_describe_actuators(tree, j) for j in several]
+    if limb.kind == HAND and len(several) < len(joints):
+        joints = [j for j in joints if j not in several]
+        if several:
+            notes["joints"] = f"left out: {'; '.join(problems)}"
+    elif several:
+        notes["actuators"] = f"one per joint; candidates: {_list_candidates(tree, joints)}"
+    actuators = () if "actuators" in notes else tuple(tree.actuators_of_joint[j][0] for j in joints)
     tip = find_end_effector(tree, limb.joints[-1], limb.link, limb.fingers)
     if tip.note:
         notes["tip_body"] = tip.note
@@ -148,7 +180,7 @@ def _build_spec(
     site = "" if tip.site is None else get_element_name(model, "site", tip.site)
     spec = RobotSpec(
         name=name,
-        joints=tuple(get_reference(model, "joint", j) for j in limb.joints),
+        joints=tuple(get_reference(model, "joint", j) for j in joints),
         actuators=tuple(get_reference(model, "actuator", a) for a in actuators),
         site=site,
         base_body=bodies[_find_base(tree, limb, limbs)],
@@ -167,29 +199,36 @@ def _build_spec(
     return spec, problems, notes
 
 
-def _choose_actuator(tree: KinematicTree, joint: int, problems: list[str], notes: dict[str, str]) -> int:
-    """Return the actuator of a joint, the first of several."""
-    candidates = tree.actuators_of_joint[joint]
-    if len(candidates) > 1:
-        listed = ", ".join(get_reference(tree.model, "actuator", a) for a in candidates)
-        problem = f"joint {get_reference(tree.model, 'joint', joint)!r} has {len(candidates)} actuators ({listed})"
-        problems.append(problem)
-        notes["actuators"] = f"one per joint; {problem}"
-    return candidates[0]
+def _describe_actuators(tree: KinematicTree, joint: int) -> str:
+    listed = [get_reference(tree.model, "actuator", a) for a in tree.actuators_of_joint[joint]]
+    return f"joint {get_reference(tree.model, 'joint', joint)!r} has {len(listed)} actuators ({', '.join(listed)})"
+
+
+def _list_candidates(tree: KinematicTree, joints: list[int]) -> str:
+    """Return the actuators of joints for a person to choose from: `j0: m0 or p0; j1: m1`."""
+    actuators = [[get_reference(tree.model, "actuator", a) for a in tree.actuators_of_joint[j]] for j in joints]
+    names = [get_reference(tree.model, "joint", j) for j in joints]
+    return "; ".join(f"{name}: {' or '.join(found)}" for name, found in zip(names, actuators, strict=True))
 
 
 def _choose_gripper(
     tree: KinematicTree, gripper: FoundGripper | None, problems: list[str], notes: dict[str, str]
 ) -> list[GripperActuator]:
+    """Return the actuators of a gripper; none where one of them is unclear, as half a gripper would move half of it."""
     if gripper is None:
         return []
-    names = {a: get_reference(tree.model, "actuator", a) for a in gripper.unclear}
-    if not gripper.members or any("spreads" not in why for why in gripper.unclear.values()):
-        reasons = [f"gripper actuator {names[a]!r} {why}" for a, why in gripper.unclear.items()]
-        problems.extend(reasons)
-        if reasons:
-            notes["gripper_actuator"] = f"{', '.join(reasons)}; give it with its gripper_open and gripper_closed"
-    return [GripperActuator(get_reference(tree.model, "actuator", a), *ends) for a, *ends in gripper.members]
+    reasons = [
+        f"gripper actuator {get_reference(tree.model, 'actuator', a)!r} {why}" for a, why in gripper.unclear.items()
+    ]
+    if gripper.members and all(why == SPREADS for why in gripper.unclear.values()):
+        return [GripperActuator(get_reference(tree.model, "actuator", a), *ends) for a, *ends in gripper.members]
+    problems.extend(reasons)
+    actuators = sorted([*(a for a, *_ in gripper.members), *gripper.unclear])
+    listed = ", ".join(get_reference(tree.model, "actuator", a) for a in actuators)
+    notes["gripper_actuator"] = (
+        f"{'; '.join(reasons)}; candidates: {listed}; give them with their gripper_open and gripper_closed"
+    )
+    return []
 
 
 def _is_torque(model: mujoco.MjModel, actuator: int) -> bool:
@@ -215,27 +254,28 @@ def _find_base(tree: KinematicTree, limb: Limb, limbs: list[Limb]) -> int:
 # --- names ------------------------------------------------------------------------------------------------------------
 
 
-def _name_robots(tree: KinematicTree, wanted: list[Limb], limbs: list[Limb]) -> list[str]:
+def _name_robots(tree: KinematicTree, limbs: list[Limb]) -> list[str]:
     """Return per limb the prefix of its joints' names, else the base body, else the model's name, else `robot`; made
-    unique.
+    unique. Those that are offered choose first, so that a name means one robot whether or not all limbs are listed.
     """
-    names: list[str] = []
-    for limb in wanted:
+    offered = [limb for limb in limbs if limb.kind in _OFFERED]
+    names: dict[int, str] = {}
+    for limb in sorted(limbs, key=lambda limb: limb.kind not in _OFFERED):
         stem = _find_prefix([get_element_name(tree.model, "joint", j) for j in limb.joints])
         base = get_element_name(tree.model, "body", _find_base(tree, limb, limbs))
         folder, _, base = base.rpartition("/")
         if not stem:
             stem = folder or ("" if base.lower() in _GENERIC_BASES else base)
-        if not stem and len(wanted) == 1:
+        if not stem and (offered or limbs) == [limb]:
             stem = _model_name(tree.model)
         stem = stem or (limb.kind if limb.kind != ARM else "robot")
         if limb.kind in (LEG, FINGER) and limb.kind not in stem.lower():
             stem += f"_{limb.kind}"
-        names.append(_make_unique(stem[:60], names))
-    return names
+        names[id(limb)] = _make_unique(stem[:60], names.values())
+    return [names[id(limb)] for limb in limbs]
 
 
-def _make_unique(stem: str, taken: Iterable[str]) -> str:
+def _make_unique(stem: str, taken: Collection[str]) -> str:
     name, number = stem, 1
     while name in taken:
         number += 1

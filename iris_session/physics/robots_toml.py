@@ -302,13 +302,13 @@ def _take_gripper(tree: KinematicTree, fields: dict[str, Any], joints: list[int]
     ]
     if len(set(actuators)) < len(actuators):
         raise RobotsFileError(f"{where}a gripper_actuator is listed twice: {', '.join(names)}")
-    missing = find_partners(tree, tree.joint_body[joints[-1]], actuators)
+    missing = [] if fields.get("finger_bodies") else find_partners(tree, tree.joint_body[joints[-1]], actuators)
     if missing:
         both = [*actuators, *missing]
         listed = json.dumps([get_reference(tree.model, "actuator", a) for a in both], ensure_ascii=False)
         raise RobotsFileError(
             f"{where}gripper_actuator {names[0]!r} moves one of two fingers: gripper_actuator = {listed}, with lists "
-            "of the same length as gripper_open and gripper_closed, moves both"
+            "of the same length as gripper_open and gripper_closed, moves both; or finger_bodies of the one alone"
         )
     first, bodies = members[0], list_body_names(tree.model)
     fingers = [find_element_id(tree.model, "body", body, where) for body in fields.get("finger_bodies", ())]

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, Final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.physics.errors import SpecError
 from iris_session.physics.names import find_element_id
 from iris_session.protocol.common import Pose, Quat, Vec3
 from iris_session.protocol.specs import RobotSpec
 
+#: A quaternion that is shorter has no direction.
+_SHORTEST: Final = 1e-6
 _SITE, _BODY = int(mujoco.mjtObj.mjOBJ_SITE), int(mujoco.mjtObj.mjOBJ_XBODY)
 
 
 class Tip:
-    """The end effector of `robot` in `model`. Raises `UnknownNameError`.
+    """The end effector of `robot` in `model`. Raises `UnknownNameError`, and `SpecError` for a rotation that is
+    none.
 
     Attributes:
         site: Id of its site, -1 where it is a body with an offset.
@@ -30,7 +35,13 @@ class Tip:
         self.site = -1 if robot.tip_body and not robot.site else find_element_id(model, "site", robot.site, where)
         if self.site < 0:
             self.body = find_element_id(model, "body", robot.tip_body, where)
-            self.T_body_tip = robot.T_body_tip
+            w, x, y, z = robot.T_body_tip.q
+            length = math.hypot(w, x, y, z)
+            if not _SHORTEST < length < math.inf:
+                raise SpecError(
+                    f"{where}the quaternion of T_body_tip is {robot.T_body_tip.q}: (w, x, y, z) is expected"
+                )
+            self.T_body_tip = Pose(robot.T_body_tip.p, (w / length, x / length, y / length, z / length))
         else:
             self.body = int(model.site_bodyid[self.site])
             (x, y, z), (w, i, j, k) = model.site_pos[self.site].tolist(), model.site_quat[self.site].tolist()

@@ -76,6 +76,15 @@ class KinematicTree:
         mujoco.mj_kinematics(self.model, data)
         return data
 
+    @functools.cached_property
+    def reach(self) -> list[int]:
+        """Per body: most hinges and slides with an actuator of their own on any path down from it, its own included."""
+        reach = [0] * len(self.parent)
+        for body in range(len(reach) - 1, 0, -1):  # parents have lower ids
+            own = sum(bool(self.actuators_of_joint[j]) for j in self.list_scalar_joints(body))
+            reach[body] = own + max((reach[child] for child in self.children[body]), default=0)
+        return reach
+
     def list_corners(self, body: int, data: Any = None) -> NDArray[np.float64]:
         """Return the corners of the bounding boxes of a body's geoms in the world [m], shape (8 n, 3).
 
@@ -117,8 +126,13 @@ class KinematicTree:
     def list_jointed_below(self, body: int) -> list[int]:
         """Return the nearest bodies below `body` that have hinges or slides: the branches at this body."""
         found: list[int] = []
-        for child in self.children[body]:
-            found.extend([child] if self.list_scalar_joints(child) else self.list_jointed_below(child))
+        left = self.children[body][::-1]  # not by recursion: chains may be longer than Python's stack
+        while left:
+            child = left.pop()
+            if self.list_scalar_joints(child):
+                found.append(child)
+            else:
+                left.extend(reversed(self.children[child]))
         return found
 
     def find_moving_bodies(self) -> list[bool]:

@@ -68,7 +68,7 @@ def test_gripper_with_a_coupled_finger(slope: int, axis: str, opened: float | No
         found = detect(scene(body, actuators + grip, equality))
         (notice,) = found.notices
         assert notice.text == (
-            "robot 'a' is found without its whole gripper: gripper actuator 'a/grip' has an unknown open end"
+            "robot 'a' is found without its gripper: gripper actuator 'a/grip' has an unknown open end"
         )
         assert [robot.gripper_actuator for robot in found.robots] == [""]
         return
@@ -132,10 +132,31 @@ def test_unclear_robots_are_notices_with_a_file_that_is_accepted(
     assert "\n" not in notice.text
     assert notice.text.startswith("robot 'a' ")
     assert len(found.robots) == offered
-    assert text.removeprefix("can only be watched: ") in notice.toml
     (robot,) = load_robots_toml(notice.toml, m)
     assert load_robots_toml(found.to_toml(), m) == (robot,)
     assert robot.joints == ("a/j0", "a/j1", "a/j2", "a/j3")
+
+
+def test_an_arm_with_several_actuators_per_joint_is_not_driven_by_its_file_as_printed() -> None:
+    body, actuators = arm("a", joints=3, actuator="motor")
+    more = "".join(f'<position name="p{i}" joint="a/j{i}"/>' for i in range(2))
+    m = scene(body, actuators + more)
+    (notice,) = detect(m).notices
+    candidates = "a/j0: a/a0 or p0; a/j1: a/a1 or p1; a/j2: a/a2"
+    assert f"actuators = []  # one per joint; candidates: {candidates}\n" in notice.toml
+    (robot,) = load_robots_toml(detect(m).to_toml(), m)
+    assert robot.actuators == ()
+
+
+def test_half_a_gripper_is_not_offered() -> None:
+    body, actuators = arm("a", end=FINGERS)
+    left = '<position name="l" joint="a/finger_l" ctrlrange="0 .04"/><motor name="r" joint="a/finger_r"/>'
+    m = scene(body, actuators + left)
+    found = detect(m)
+    (robot,) = found.robots
+    assert (robot.gripper_actuators, robot.finger_bodies) == ((), ())
+    assert "# gripper_actuator: gripper actuator 'r' has no ctrlrange; candidates: l, r;" in found.to_toml()
+    assert load_robots_toml(found.to_toml(), m) == (robot,)
 
 
 # --- the end effector ---
@@ -165,6 +186,17 @@ def test_end_effector_is_a_site_or_the_end_of_the_last_link(end: str, expected: 
 def test_end_effector_is_the_middle_between_finger_tips() -> None:
     (robot,) = find_robots(scene(*arm("a", end=FINGERS.replace('<site name="{p}pinch" pos="0 0 .15"/>', ""))))
     assert (robot.tip_body, robot.T_body_tip.p) == ("a/hand", (0.0, 0.0, 0.06))  # a centimetre before their ends
+
+
+def test_sites_of_other_things_that_are_fixed_to_the_world_are_not_taken() -> None:
+    """All of them have the weld id of a palm that is fixed to the world."""
+    fingers, closing = hand("h_", 4)
+    table = '<body name="table"><geom size=".1"/><site name="tool_rack"/></body>'
+    palm = f'<body name="palm" pos="1 0 0"><geom type="box" size=".05 .02 .03"/>{fingers}</body>'
+    m = scene(table + palm, closing)
+    (robot,) = find_robots(m)
+    assert (robot.site, robot.tip_body) == ("", "palm")
+    assert load_robots_toml(detect(m).to_toml(), m) == (robot,)
 
 
 # --- grippers of several actuators ---
@@ -211,6 +243,17 @@ def test_hand_without_an_arm_is_one_robot(wrist: str) -> None:
     assert len(robot.joints) == 12 + bool(wrist)
     fingers_only = find_robots(m, all_limbs=True)
     assert [r.name for r in fingers_only] == [f"h_finger{n}" for n in ("", "_2", "_3", "_4")]
+
+
+def test_joints_of_a_hand_that_are_left_out_are_a_notice() -> None:
+    fingers, closing = hand("h_")
+    palm = f'<body name="palm"><geom type="box" size=".05 .02 .03"/>{fingers}</body>'
+    m = scene(palm, closing + '<velocity name="twice" joint="h_k0"/>')
+    found = detect(m)
+    (robot,), (notice,) = found.robots, found.notices
+    assert len(robot.joints) == 8
+    assert notice.text == "robot 'h' is found without some joints: joint 'h_k0' has 2 actuators (h_k0, twice)"
+    assert load_robots_toml(found.to_toml(), m) == (robot,)
 
 
 # --- real models ---
@@ -282,6 +325,44 @@ def test_arm_on_a_quadruped_is_offered_and_its_base_carries_no_leg() -> None:
     trunk = f'<body name="trunk" pos="0 0 .6"><freejoint/><geom size=".1"/>{"".join(b for b, _ in legs)}{body}</body>'
     (robot,) = find_robots(scene(trunk, actuators + "".join(a for _, a in legs)))
     assert (robot.name, robot.base_body, len(robot.joints)) == ("arm", "arm/base", 6)
+
+
+@pytest.mark.parametrize(("body", "name"), [("link4", "tool_head"), ("link4", "eye_in_hand"), ("link0", "toe_robot")])
+def test_one_body_named_like_a_leg_or_head_hides_no_arm(body: str, name: str) -> None:
+    bodies, actuators = arm(joints=5)
+    (robot,) = find_robots(scene(bodies.replace(f'"{body}"', f'"{name}"'), actuators))
+    assert len(robot.joints) == 5
+
+
+def test_limbs_that_are_named_like_legs_on_a_fixed_base_are_not_offered_and_said() -> None:
+    legs = [leg(name, pos, True) for name, pos in (("L", "0 .1 0"), ("R", "0 -.1 0"))]
+    m = scene(f'<body pos="0 0 1">{legs[0][0]}{legs[1][0]}</body>', legs[0][1] + legs[1][1])
+    found = detect(m)
+    assert (found.robots, found.notices) == ((), ())
+    assert found.texts == ("2 limbs named as legs or heads are not offered: L_leg, R_leg",)
+    assert detect(m, all_limbs=True).texts == ()
+
+
+def test_a_head_has_few_joints() -> None:
+    assert find_robots(scene(*arm(joints=3, joint_name="neck{i}"))) == ()
+    (robot,) = find_robots(scene(*arm(joints=5, joint_name="neck{i}")))
+    assert len(robot.joints) == 5
+
+
+def test_chains_of_any_length_are_found() -> None:
+    """600 hinges in series, too many for Python's stack; the last three are driven; beside it a rope."""
+    spec = mujoco.MjSpec()
+    for driven in (True, False):
+        body = spec.worldbody
+        for i in range(600):
+            body = body.add_body(pos=[0, 0, 0.02])
+            joint = body.add_joint(name=f"{driven}_{i}")
+            body.add_geom(size=[0.005, 0, 0], mass=0.01)
+            if driven and i >= 597:
+                actuator = spec.add_actuator(target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+                actuator.set_to_position(kp=1.0)
+    (robot,) = find_robots(spec.compile())
+    assert robot.joints == ("True_597", "True_598", "True_599")
 
 
 def test_a_base_on_wheels_is_no_robot() -> None:

@@ -147,7 +147,20 @@ def test_one_of_two_finger_actuators_is_refused_with_both() -> None:
     text = '[[robot]]\nname = "r"\njoints = ["j0", "j1", "j2", "j3"]\nsite = "pinch"\n'
     with pytest.raises(RobotsFileError, match=r"moves one of two fingers: gripper_actuator = \[\"l\", \"r\"\]"):
         load_robots_toml(text + 'gripper_actuator = "l"\ngripper_open = 0.04\n', m)
+    alone = 'gripper_actuator = "l"\ngripper_open = 0.04\nfinger_bodies = ["left_pad"]\n'
+    assert [one.actuator for one in load_robots_toml(text + alone, m)[0].gripper_actuators] == ["l"]
     ends = "gripper_open = [0.04, 0.04]\ngripper_closed = [0, 0]\n"
     (robot,) = load_robots_toml(f'{text}gripper_actuator = ["l", "r"]\n{ends}', m)
     assert robot.gripper_actuators == (GripperActuator("l", 0.04, 0.0), GripperActuator("r", 0.04, 0.0))
     assert load_robots_toml(dump_robots_toml([robot]), m) == (robot,)
+
+
+def test_a_camera_beside_a_jaw_is_no_second_finger() -> None:
+    jaw = """<body name="jaw" pos="0 0 .1"><joint name="jaw" axis="1 0 0" range="0 1"/>
+      <geom type="box" size=".01 .005 .03"/></body>"""
+    camera = '<body name="cam" pos="0 .05 .1"><joint name="tilt" axis="1 0 0"/><geom size=".01"/></body>'
+    body, actuators = arm(end=f'<site name="tcp"/>{jaw}{camera}')
+    drives = '<position name="jaw" joint="jaw" ctrlrange="0 1"/><position name="tilt" joint="tilt" ctrlrange="-1 1"/>'
+    text = '[[robot]]\nname = "r"\njoints = ["j0", "j1", "j2", "j3"]\nsite = "tcp"\ngripper_actuator = "jaw"\n'
+    (robot,) = load_robots_toml(text + "gripper_open = 1\n", scene(body, actuators + drives))
+    assert robot.gripper_actuators == (GripperActuator("jaw", 1.0, 0.0),)

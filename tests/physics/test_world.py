@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import msgspec
@@ -20,11 +21,13 @@ from iris_session.physics import (
     find_objects,
     find_robots,
 )
+from iris_session.physics.tip import Tip
 from iris_session.physics.world import STATE, RobotSignals
+from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from tests.models import MENAGERIE
-from tests.physics.models import clutter, model
+from tests.physics.models import arm, clutter, model, scene
 
 NAMES = {"EULER": "Euler", "RK4": "RK4"}
 INTEGRATORS = [n.removeprefix("mjINT_") for n in dir(mujoco.mjtIntegrator) if n.startswith("mjINT_")]
@@ -338,3 +341,14 @@ def test_robot_signals_are_joints_openings_and_tips() -> None:
     assert values[4:].reshape(2, 3) == pytest.approx(data.site_xpos)
     assert signals.units == (("rad",), ("rad",))
     assert RobotSignals(model, []).read(data) == b""
+
+
+def test_rotation_of_an_end_effector_is_normalised_once() -> None:
+    m = scene(*arm(end=""))
+    (robot,) = find_robots(m).robots
+    turned = msgspec.structs.replace(robot, T_body_tip=Pose(robot.T_body_tip.p, (0.0, 2.0, 0.0, 0.0)))
+    assert Tip(m, turned).T_body_tip.q == (0.0, 1.0, 0.0, 0.0)
+    assert World(m, (turned,), ()).view().tip_pose(robot.name).q == (0.0, 1.0, 0.0, 0.0)
+    for q in ((0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 0.0)):
+        with pytest.raises(SpecError, match=r"quaternion of T_body_tip"):
+            World(m, (msgspec.structs.replace(robot, T_body_tip=Pose((0.0, 0.0, 0.0), q)),), ())
