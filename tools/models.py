@@ -68,7 +68,7 @@ def examine(path: Path, move: bool) -> dict[str, Any]:
         if move and robot.kind == ARM:
             row["left_mm"] = measure_move(model, robot)
         rows.append(row)
-    notices = [notice.text for notice in found.notices]
+    notices = list(found.texts)
     return {"file": str(path), "compiles": True, "actuators": model.nu, "robots": rows, "notices": notices}
 
 

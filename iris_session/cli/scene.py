@@ -112,7 +112,7 @@ def run_robots(arguments: argparse.Namespace) -> int:
 
     model = open_scene(arguments.scene).model
     found = find_drivable_robots(model, ControlConfig(), all_limbs=arguments.all)
-    robots, objects, notices = found.robots, find_objects(model), [notice.text for notice in found.notices]
+    robots, objects, notices = found.robots, find_objects(model), found.texts
     if not robots:
         print(explain_no_robots(model), file=sys.stderr)
     for text in notices:

@@ -62,7 +62,7 @@ from iris_session.security.resume_tokens import encode_handback
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots
 from iris_session.session.core import SessionCore
 from iris_session.session.errors import ConfigError, ResumeError
-from iris_session.session.robots import RobotChoice, choose_robots
+from iris_session.session.robots import RobotChoice, choose_robots, list_notices_again
 from iris_session.session.verification import ReplayCore
 from iris_session.system.files import Replacement
 
@@ -153,7 +153,9 @@ class PastSession:
         if model is not None:
             self._check_model(model)
         core = self.core
-        return self._merge_settings(given), Scene(core.world.model, core.scene.robots, core.scene.objects)
+        model, robots = core.world.model, core.scene.robots
+        notices = list_notices_again(model, robots, core.config.control)
+        return self._merge_settings(given), Scene(model, robots, core.scene.objects, notices)
 
     def _merge_settings(self, given: SessionConfig) -> SessionConfig:
         plain, core = SessionConfig(), self.core.config
@@ -272,8 +274,7 @@ def prepare_session(
         check_arguments(model, data, config)
         assert isinstance(model, mujoco.MjModel)
         found, things = choose_robots(model, check_robots(robots), config.control), check_objects(objects)
-        notices = tuple(notice.text for notice in found.notices)
-        return None, config, Scene(model, found.robots, find_objects(model) if things is None else things, notices)
+        return None, config, Scene(model, found.robots, find_objects(model) if things is None else things, found.texts)
     past = PastSession(Path(config.resume))
     try:
         return past, *past.merge_config(config, model, data, robots, objects)

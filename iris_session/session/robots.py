@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -11,7 +12,8 @@ import mujoco
 
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig, ControlError
 from iris_session.control.controller import check_robot
-from iris_session.physics import FoundRobots, RobotNotice, find_robots, load_robots_toml
+from iris_session.physics import FoundRobots, PhysicsError, RobotNotice, World, find_robots, load_robots_toml
+from iris_session.physics.names import list_body_names, list_element_names
 from iris_session.protocol.specs import RobotSpec
 from iris_session.session.errors import ConfigError
 
@@ -20,6 +22,8 @@ AUTO: Final = "auto"
 NONE: Final = "none"
 #: What may be given as the robots of a session: specifications, names, a word, or the path of a robots file.
 RobotChoice = Sequence[RobotSpec] | Sequence[str] | str | Path | None
+#: A choice that can be repeated for another model: all robots found, or these names and specifications.
+FixedChoice = tuple[RobotSpec | str, ...] | None
 
 
 def find_drivable_robots(model: mujoco.MjModel, control: ControlConfig, *, all_limbs: bool = False) -> FoundRobots:
@@ -31,15 +35,15 @@ def find_drivable_robots(model: mujoco.MjModel, control: ControlConfig, *, all_l
         all_limbs: Also legs, heads and fingers.
     """
     found = find_robots(model, all_limbs=all_limbs)
-    robots, notices = [], list(found.notices)
+    robots, notices = [], {notice.spec.name: notice for notice in found.notices}
     for robot in found.robots:
         try:
             check_robot(model, robot, control)
         except ControlError as error:
-            notices.append(_make_watched(robot, str(error)))
+            notices[robot.name] = _make_watched(robot, str(error), notices.get(robot.name))
         else:
             robots.append(robot)
-    return FoundRobots(tuple(robots), tuple(notices))
+    return FoundRobots(tuple(robots), tuple(notices.values()), found.hidden)
 
 
 def choose_robots(model: mujoco.MjModel, choice: RobotChoice, control: ControlConfig) -> FoundRobots:
@@ -47,36 +51,134 @@ def choose_robots(model: mujoco.MjModel, choice: RobotChoice, control: ControlCo
 
     Args:
         model: The model.
-        choice: `None` or `auto` for those found; `none`; the path of a robots file; names of robots found, legs and
-            fingers included, as a sequence or separated by commas; or specifications.
+        choice: `None` or `auto` for those found; `none`; the path of a robots file, which exists or ends in `.toml`;
+            names of robots found, legs and fingers included, as a sequence or separated by commas; or specifications.
         control: How they are driven.
 
     Raises:
         ConfigError: A name that the model does not have.
         PhysicsError: The robots file cannot be used.
     """
-    if choice is None or choice == AUTO:
+    if _is_auto(choice):
         return find_drivable_robots(model, control)
-    if isinstance(choice, Path) or (isinstance(choice, str) and choice.endswith(".toml")):
-        return _split_watched(load_robots_toml(Path(choice), model), control)
-    if isinstance(choice, str):
-        choice = [] if choice == NONE else [name.strip() for name in choice.split(",")]
-    names = [one for one in choice if isinstance(one, str)]
-    specs = [one for one in choice if isinstance(one, RobotSpec)]
+    given = _read_choice(model, choice)
+    names = [one for one in given if isinstance(one, str)]
+    specs = [one for one in given if isinstance(one, RobotSpec)]
     return _pick(model, names, control) if names else _split_watched(specs, control)
+
+
+def fix_choice(model: mujoco.MjModel, choice: RobotChoice, control: ControlConfig) -> FixedChoice:
+    """Return a choice for `model` as `choose_again` repeats it for others.
+
+    Specifications as they are found in the model become their names, so that they are found again.
+    """
+    if _is_auto(choice):
+        return None
+    given = _read_choice(model, choice)
+    found: list[RobotSpec] = []
+    if any(isinstance(one, RobotSpec) for one in given):
+        found = [robot for every in (False, True) for robot in find_robots(model, all_limbs=every).robots]
+    return tuple(one.name if isinstance(one, RobotSpec) and one in found else one for one in given)
+
+
+def choose_again(model: mujoco.MjModel, choice: FixedChoice, control: ControlConfig) -> FoundRobots:
+    """Return the robots of another model by the choice for the first one. Raises nothing for a robot.
+
+    What was chosen and is not there is a notice; nothing else is offered in its place. A specification with a number of
+    an element is not used: the number may mean another element here.
+    """
+    if choice is None:
+        return find_drivable_robots(model, control)
+    known, notices = _find_all(model, control)
+    robots: list[RobotSpec] = []
+    said: dict[str, RobotNotice] = {}
+    for one in choice:
+        name = one if isinstance(one, str) else one.name
+        spec = known.get(one) if isinstance(one, str) else one
+        if isinstance(one, str) and one in notices:
+            said[name] = notices[one]
+        if spec is None:
+            said.setdefault(name, _make_watched(RobotSpec(name, (), (), "", ""), "the new model has no such robot"))
+            continue
+        why = _find_misfit(model, robots, spec, control, by_hand=not isinstance(one, str))
+        if why:
+            said[name] = _make_watched(spec, why)
+        else:
+            robots.append(spec)
+    found = _split_watched(robots, control)
+    return FoundRobots(found.robots, (*said.values(), *found.notices))
+
+
+def _find_misfit(
+    model: mujoco.MjModel, others: Sequence[RobotSpec], spec: RobotSpec, control: ControlConfig, *, by_hand: bool
+) -> str:
+    """Return why a robot cannot be used in another model, empty where it can."""
+    if by_hand and _has_numbers(model, spec):
+        return "it names elements by number, which may mean others in the new model: give them names"
+    try:
+        World(model, (*others, spec), ())
+        check_robot(model, spec, control)
+    except (ControlError, PhysicsError) as error:
+        return str(error)
+    return ""
+
+
+def list_notices_again(model: mujoco.MjModel, robots: Sequence[RobotSpec], control: ControlConfig) -> tuple[str, ...]:
+    """Return what is unclear about the robots of a session that goes on, a line each: of all robots found where they
+    are those offered, else of the offered ones.
+    """
+    found = find_drivable_robots(model, control)
+    if found.robots == tuple(robots):
+        return found.texts
+    names = {robot.name for robot in robots}
+    return tuple(notice.text for notice in found.notices if notice.spec.name in names)
+
+
+def _has_numbers(model: mujoco.MjModel, robot: RobotSpec) -> bool:
+    """Return true for a robot with an element that has no name in the model."""
+    references = (*robot.joints, *robot.actuators, robot.site, *(one.actuator for one in robot.gripper_actuators))
+    bodies = {robot.base_body, robot.tip_body, *robot.finger_bodies}
+    unnamed = set(list_body_names(model)) - set(list_element_names(model, "body"))
+    return any(reference.startswith("#") for reference in references) or bool(bodies & unnamed)
+
+
+def _is_auto(choice: RobotChoice) -> bool:
+    return choice is None or choice == AUTO
+
+
+def _read_choice(model: mujoco.MjModel, choice: RobotChoice) -> Sequence[RobotSpec | str]:
+    """Return the names or specifications of a choice other than `auto`."""
+    assert choice is not None
+    if isinstance(choice, str) and choice == NONE:
+        return ()
+    if isinstance(choice, Path) or (isinstance(choice, str) and _is_file(choice)):
+        return load_robots_toml(Path(choice), model)
+    return [name.strip() for name in choice.split(",")] if isinstance(choice, str) else tuple(choice)
+
+
+def _is_file(text: str) -> bool:
+    return text.endswith(".toml") or os.path.isfile(os.path.expanduser(text))
+
+
+def _find_all(model: mujoco.MjModel, control: ControlConfig) -> tuple[dict[str, RobotSpec], dict[str, RobotNotice]]:
+    """Return the robots and the notices of all limbs of a model by name, those that are offered first."""
+    both = [find_drivable_robots(model, control, all_limbs=every) for every in (False, True)]
+    robots = {robot.name: robot for found in both for robot in found.robots}
+    return robots, {notice.spec.name: notice for found in both for notice in found.notices}
 
 
 def _pick(model: mujoco.MjModel, names: Sequence[str], control: ControlConfig) -> FoundRobots:
     """Return the robots of these names."""
-    offered, others = find_drivable_robots(model, control), find_drivable_robots(model, control, all_limbs=True)
-    known = {robot.name: robot for robot in (*others.robots, *offered.robots)}
+    known, notices = _find_all(model, control)
     for name in names:
         if name not in known:
-            reasons = [notice.text for notice in (*offered.notices, *others.notices) if notice.spec.name == name]
             listed = ", ".join(known) or "none"
-            why = f": {reasons[0]}" if reasons else f" does not exist in the model. Available robots: {listed}"
-            raise ConfigError(f"robots: {name!r}{why}")
-    return FoundRobots(tuple(known[name] for name in dict.fromkeys(names)))
+            missing = f" does not exist in the model. Available robots: {listed}"
+            raise ConfigError(f"robots: {name!r}{f': {notices[name].text}' if name in notices else missing}")
+    chosen = tuple(dict.fromkeys(names))
+    return FoundRobots(
+        tuple(known[name] for name in chosen), tuple(notices[name] for name in chosen if name in notices)
+    )
 
 
 def _split_watched(robots: Sequence[RobotSpec], control: ControlConfig) -> FoundRobots:
@@ -86,7 +188,13 @@ def _split_watched(robots: Sequence[RobotSpec], control: ControlConfig) -> Found
     return FoundRobots(tuple(robot for robot in robots if robot not in watched), notices)
 
 
-def _make_watched(robot: RobotSpec, reason: str) -> RobotNotice:
-    """Return the notice of a robot that control cannot drive: in the lines of a robots file it has no actuators."""
+def _make_watched(robot: RobotSpec, reason: str, earlier: RobotNotice | None = None) -> RobotNotice:
+    """Return the notice of a robot that control cannot drive: in the lines of a robots file it has no actuators.
+
+    `earlier`: what is unclear about it besides, which becomes part of the one notice.
+    """
     spec = msgspec.structs.replace(robot, actuators=())
-    return RobotNotice(f"robot {robot.name!r} can only be watched: {reason}", spec, {"actuators": reason})
+    text, notes = f"robot {robot.name!r} can only be watched: {reason}", {"actuators": reason}
+    if earlier is None:
+        return RobotNotice(text, spec, notes)
+    return RobotNotice(f"{text}; {earlier.text.partition(': ')[2]}", spec, {**earlier.notes, **notes})

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from iris_session.authority.config import check_config
-from iris_session.physics import Pacer, find_objects
+from iris_session.physics import FoundRobots, Pacer, find_objects
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.entries import HOST, Entry, SceneLoaded, decode_entry, encode_entry
 from iris_session.protocol.names import GeometryKind
@@ -26,7 +26,6 @@ from iris_session.session.config import check_timestep
 from iris_session.session.core import SessionCore, make_plant
 from iris_session.session.deformables import list_flexes
 from iris_session.session.errors import ConfigError
-from iris_session.session.robots import RobotChoice, choose_robots
 from iris_session.session.shared_scene import SharedScenes
 from iris_session.session.stepper import NextScene, Stepper
 from iris_session.session.tick_times import TickTimes
@@ -54,7 +53,7 @@ def prepare_scene(
     scenes: SharedScenes,
     model: mujoco.MjModel,
     state: bytes,
-    robots: RobotChoice,
+    found: FoundRobots,
     objects: tuple[ObjectSpec, ...] | None,
 ) -> NextScene:
     """Make everything of a scene that takes long, without touching the session of `core`.
@@ -64,7 +63,7 @@ def prepare_scene(
         scenes: Where the specification and its assets are stored.
         model: The new model.
         state: `mjSTATE_INTEGRATION` to begin with; empty for the model's own.
-        robots: As in `choose_robots`.
+        found: The robots to offer, and what is unclear about them.
         objects: `None` to find them in the model.
 
     Raises:
@@ -72,7 +71,6 @@ def prepare_scene(
         PhysicsError, ControlError: The model cannot be driven.
     """
     binary = encode_model(model)
-    found = choose_robots(model, robots, core.config.control)
     all_robots = found.robots
     all_objects = tuple(find_objects(model) if objects is None else objects)
     message = SceneLoaded(compute_scene_hash(binary), all_robots, all_objects, state)
@@ -86,8 +84,7 @@ def prepare_scene(
     check_timestep(model)
     plant = make_plant(model, scene, core.config.control)
     shown = scenes.make(plant.world, state)
-    notices = tuple(notice.text for notice in found.notices)
-    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)), shown, list_flexes(plant.world), notices)
+    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)), shown, list_flexes(plant.world), found.texts)
 
 
 def _to_plain(value: object) -> object:

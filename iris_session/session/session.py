@@ -30,9 +30,8 @@ from typing import Final, Self
 
 import mujoco
 
-from iris_session.control import ControlError
 from iris_session.journal.environment import use_one_blas_thread
-from iris_session.physics import Pacer, PacerStats, PhysicsError, load_model
+from iris_session.physics import Pacer, PacerStats, load_model
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.client_messages import Assign, Control, EStop, SetScale
 from iris_session.protocol.common import MAX_TEXT, Pose
@@ -45,7 +44,7 @@ from iris_session.session.core import SessionCore, make_session_core, read_plant
 from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.resume import prepare_session
-from iris_session.session.robots import RobotChoice
+from iris_session.session.robots import FixedChoice, RobotChoice, choose_again, choose_robots, fix_choice
 from iris_session.session.scene_change import adopt_timestep, prepare_scene
 from iris_session.session.session_base import SessionBase
 from iris_session.session.status import DataFault
@@ -109,6 +108,7 @@ class Session(SessionBase):
     ) -> None:
         self._past, self.config, scene = prepare_session(config, model, data, robots, objects)
         self.model, self.robots, self.objects, self._robot_notices = scene
+        self._robot_choice: FixedChoice = None
         self.data = data
         self.origin_ns = time.monotonic_ns() if self._past is None else self._past.origin_ns
         self.clock = make_session_clock(self.origin_ns)
@@ -335,7 +335,8 @@ class Session(SessionBase):
                 or any object with `model` and `data`. The session follows it to the model and data that it builds at a
                 reset. Its step is a tick by itself where it does not call MuJoCo's functions in Python.
             step: Name of its method that advances the simulation.
-            robots: As of `Session`.
+            robots: As of `Session`. The choice holds for models that `environment` builds at a reset, too; what one of
+                them lacks is in `notes`.
 
         Returns:
             The started session.
@@ -353,8 +354,10 @@ class Session(SessionBase):
             model, data = found
         if environment is not None and not callable(getattr(environment, step, None)):
             raise OwnershipError(f"environment of type {type(environment).__name__} has no method {step!r} to wrap")
+        robots = check_robots(robots)
         session = cls(model, data, config, robots=robots)
         try:
+            session._robot_choice = fix_choice(model, robots, session.config.control)
             session.start()
             loop = session._require_user_loop()
             session._attachment = Attachment(loop, environment, step, session._change_model)
@@ -371,10 +374,9 @@ class Session(SessionBase):
         def prepare(state: bytes) -> NextScene | None:
             if compute_scene_hash(encode_model(model)) == stepper.core.world.scene_hash:
                 return None
-            try:
-                scene = prepare_scene(stepper.core, scenes, model, state, self.robots, self.objects)
-            except (PhysicsError, ControlError):  # other robots or objects
-                scene = prepare_scene(stepper.core, scenes, model, state, None, None)
+            found = choose_again(model, self._robot_choice, self.config.control)
+            scene = prepare_scene(stepper.core, scenes, model, state, found, None)
+            if scene.notices != self._robot_notices:
                 self._robot_notices = scene.notices
                 self._log_robot_notices()
             with scenes.lock:
@@ -517,7 +519,7 @@ class Session(SessionBase):
             )
         done: Future[None] = Future()
         scenes = self._require_started().scenes
-        checked = check_robots(robots), check_objects(objects)
+        chosen, things = check_robots(robots), check_objects(objects)
         state_data = copy.copy(data)  # the caller may continue with theirs
 
         def prepare() -> None:
@@ -525,7 +527,8 @@ class Session(SessionBase):
                 loaded = load_model(model) if isinstance(model, str | Path) else model
                 check_arguments(loaded, state_data, self.config)
                 state = b"" if state_data is None else read_plant_state(loaded, state_data)
-                scene = prepare_scene(stepper.core, scenes, loaded, state, *checked)
+                found = choose_robots(loaded, chosen, self.config.control)
+                scene = prepare_scene(stepper.core, scenes, loaded, state, found, things)
                 with scenes.lock:
                     stepper.queue_scene(scene)
                     scenes.show(scene.shown)

@@ -282,3 +282,18 @@ def test_steps_that_are_not_seen_are_a_warning(attached: Attached) -> None:
 def test_attach_offers_the_robots_that_are_chosen(model: mujoco.MjModel) -> None:
     with Session.attach(model, make_data(model), QUIET, robots="right") as session:
         assert [robot.name for robot in session.robots] == ["right"]
+
+
+@pytest.mark.usefixtures("simulation")
+@pytest.mark.parametrize("choice", ["none", "arm1"])
+def test_the_choice_of_robots_holds_for_the_model_that_is_built_at_a_reset(choice: str) -> None:
+    environment = Environment(arms=3)
+    with Session.attach(environment=environment, config=QUIET, robots=choice) as session:
+        chosen = [robot.name for robot in session.robots]
+        assert chosen == ([] if choice == "none" else [choice])
+        environment.step()
+        environment.arms = 4
+        environment.reset()
+        environment.step()
+        assert session.model is environment.model
+        assert [robot.name for robot in session.robots] == chosen

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import mujoco
 import pytest
 
@@ -11,10 +12,16 @@ from iris_session.control.config import ControlConfig
 from iris_session.physics import RobotsFileError, load_model, load_robots_toml
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError
-from iris_session.session.robots import choose_robots, find_drivable_robots
+from iris_session.session.robots import (
+    choose_again,
+    choose_robots,
+    find_drivable_robots,
+    fix_choice,
+    list_notices_again,
+)
 from iris_session.session.session import Session
 from tests.models import MENAGERIE
-from tests.physics.models import arm, scene
+from tests.physics.models import FINGERS, GRIPPER_TENDON, arm, scene
 
 #: An actuator that control has no law for.
 MUSCLE = 'muscle lengthrange="-1 1"'
@@ -59,6 +66,8 @@ def test_robots_are_chosen_by_a_word_names_or_a_file(tmp_path: Path) -> None:
     file.write_text('[[robot]]\nname = "r"\njoints = ["right/j0", "right/j1"]\ntip_body = "right/link1"\n')
     assert [r.name for r in choose_robots(model, str(file), CTRL).robots] == ["r"]
     assert choose_robots(model, file, CTRL) == choose_robots(model, str(file), CTRL)
+    other_suffix = file.rename(tmp_path / "robots.txt")
+    assert [r.name for r in choose_robots(model, str(other_suffix), CTRL).robots] == ["r"]
     with pytest.raises(ConfigError, match=r"^robots: 'top' does not exist .* Available robots: left, right"):
         choose_robots(model, "top", CTRL)
     with pytest.raises(RobotsFileError, match="cannot be read"):
@@ -69,3 +78,94 @@ def test_legs_are_offered_by_name_only() -> None:
     model = load_model(MENAGERIE / "unitree_go1" / "go1.xml")
     assert find_drivable_robots(model, CTRL).robots == ()
     assert [robot.name for robot in choose_robots(model, "FL_leg", CTRL).robots] == ["FL_leg"]
+
+
+def test_a_name_means_one_robot_whether_or_not_all_limbs_are_listed() -> None:
+    neck, neck_drives = arm("r", joints=3, joint_name="{p}neck{i}")
+    left, drives = arm("r", joints=5, joint_name="{p}elbow{i}")
+    neck, neck_drives = neck.replace('body name="r/', 'body name="n/'), neck_drives.replace('name="r/a', 'name="n/a')
+    model = scene(
+        f'<body name="torso">{neck}{left.replace("r/tcp", "tcp")}</body>'.replace("r/tcp", "n/tcp"),
+        neck_drives + drives,
+    )
+    listed = find_drivable_robots(model, CTRL, all_limbs=True).robots
+    assert [(robot.name, robot.joints[0]) for robot in listed] == [("r_2", "r/neck0"), ("r", "r/elbow0")]
+    for robot in listed:
+        assert choose_robots(model, robot.name, CTRL).robots == (robot,)
+    found = find_drivable_robots(model, CTRL)
+    assert found.robots == listed[1:]
+    assert found.texts == ("1 limb named as a leg or head is not offered: r_2",)
+
+
+def test_one_notice_says_everything_about_a_robot() -> None:
+    """Its actuators have no law, and its gripper is unclear."""
+    body, actuators = arm("a", end=FINGERS, actuator=MUSCLE)
+    model = scene(body, actuators + '<motor name="f1" joint="a/finger_l"/>')
+    (notice,) = find_drivable_robots(model, CTRL).notices
+    assert notice.text.startswith("robot 'a' can only be watched: ")
+    assert notice.text.endswith("; gripper actuator 'f1' has no ctrlrange")
+    assert set(notice.notes) == {"actuators", "gripper_actuator"}
+    (robot,) = load_robots_toml(notice.toml, model)
+    assert (robot.actuators, robot.gripper_actuator) == ((), "")
+
+
+def test_notices_of_robots_that_are_chosen_by_name_or_resumed_are_kept() -> None:
+    body, actuators = arm("a", end=FINGERS)
+    other, others = arm("b")
+    model = scene(body + other, actuators + others + '<motor name="f1" joint="a/finger_l"/>')
+    found = choose_robots(model, "a", CTRL)
+    (text,) = found.texts
+    assert text == "robot 'a' is found without its gripper: gripper actuator 'f1' has no ctrlrange"
+    assert choose_robots(model, "b", CTRL).texts == ()
+    assert list_notices_again(model, found.robots, CTRL) == (text,)
+    assert list_notices_again(model, find_drivable_robots(model, CTRL).robots, CTRL) == (text,)
+    assert list_notices_again(model, (), CTRL) == ()
+
+
+# --- another model ---
+
+
+def gripper_on_a_tendon(conveyor: bool) -> mujoco.MjModel:
+    """Return an arm whose gripper actuator has no name; its number is 4, or that of the actuator of a conveyor."""
+    body, actuators = arm(end=FINGERS)
+    belt = '<body name="belt"><joint name="belt" type="slide"/><geom size=".1"/></body>'
+    drive = '<position name="belt" joint="belt" ctrlrange="0 1"/>' if conveyor else ""
+    return scene(belt + body, f'{actuators}{drive}<position tendon="split" ctrlrange="0 .04"/>', GRIPPER_TENDON)
+
+
+def test_a_number_is_not_carried_over_to_another_model() -> None:
+    first, second = gripper_on_a_tendon(False), gripper_on_a_tendon(True)
+    (found,) = find_drivable_robots(first, CTRL).robots
+    assert found.gripper_actuator == "#4"
+    for choice in (None, found.name, [found]):
+        (robot,) = choose_again(second, fix_choice(first, choice, CTRL), CTRL).robots
+        assert (robot.name, robot.gripper_actuator) == (found.name, "#5")
+    by_hand = msgspec.structs.replace(found, mode="request")
+    again = choose_again(second, fix_choice(first, [by_hand], CTRL), CTRL)
+    assert again.robots == ()
+    (text,) = again.texts
+    assert "can only be watched: it names elements by number" in text
+
+
+def test_a_choice_holds_for_another_model(tmp_path: Path) -> None:
+    both, (body, actuators) = two_arms(), arm("right", joints=5)
+    other = scene(body, actuators)  # without the left arm, and with another right one
+    for choice in ("none", ()):
+        assert choose_again(other, fix_choice(both, choice, CTRL), CTRL) == ((), (), ())
+    (robot,) = choose_again(other, fix_choice(both, "right", CTRL), CTRL).robots
+    assert (robot.name, len(robot.joints)) == ("right", 5)
+    found = choose_again(other, fix_choice(both, "right,left", CTRL), CTRL)
+    assert found.robots == (robot,)
+    assert found.texts == ("robot 'left' can only be watched: the new model has no such robot",)
+    file = tmp_path / "robots.toml"
+    file.write_text(
+        "".join(
+            f'[[robot]]\nname = "{name}"\njoints = ["{side}/j0", "{side}/j1"]\ntip_body = "{side}/link1"\n'
+            for name, side in (("l", "left"), ("r", "right"))
+        )
+    )
+    kept = fix_choice(both, file, CTRL)
+    assert [r.name for r in choose_again(both, kept, CTRL).robots] == ["l", "r"]
+    found = choose_again(other, kept, CTRL)
+    assert [r.name for r in found.robots] == ["r"]
+    assert "robot 'l' can only be watched: " in found.texts[0]

@@ -9,7 +9,7 @@ import pytest
 
 from iris_session import Session, SessionConfig
 from iris_session.demo.scenes import n_arms_scene, scene_path
-from iris_session.physics import Pacer, find_objects, find_robots
+from iris_session.physics import FoundRobots, Pacer, find_objects, find_robots
 from iris_session.physics.load import compute_scene_hash, decode_model, encode_model
 from iris_session.protocol.entries import SceneLoaded
 from iris_session.session.core import SessionCore
@@ -72,7 +72,7 @@ def test_loop_uses_the_timestep_of_a_new_scene_at_once() -> None:
     rig.steps(30)
     pacer = Pacer(TICK_NS, rig.stepper.clock())
     times = TickTimes(TICK_NS, rig.stepper.clock)
-    scene = prepare_scene(rig.stepper.core, SharedScenes(False, "test"), bench_scene(0.001), b"", None, None)
+    scene = prepare_scene(rig.stepper.core, SharedScenes(False, "test"), bench_scene(0.001), b"", FoundRobots(()), None)
     rig.stepper.queue_scene(scene)
     assert not adopt_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
     rig.steps(1)

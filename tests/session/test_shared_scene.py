@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from iris_session.physics import World
+from iris_session.physics import FoundRobots, World
 from iris_session.protocol.scene import AddMesh, Mesh, MeshLevel, SceneError, SetVisual
 from iris_session.scene import AssetStore
 from iris_session.session import shared_scene
@@ -83,7 +83,7 @@ def test_deformables_of_the_next_scene_are_prepared_with_it() -> None:
     """Topologies take long: the loop that swaps scenes only hands them over."""
     model = flexes()
     model.opt.timestep = 0.002
-    scene = prepare_scene(make_core(), SharedScenes(False, "test"), model, b"", None, None)
+    scene = prepare_scene(make_core(), SharedScenes(False, "test"), model, b"", FoundRobots(()), None)
     assert [mesh.stream for mesh in scene.deformables] == ["flex-0", "flex-1", "flex-2"]
     assert all(len(mesh.vertices()) == mesh.topology.n_vertices for mesh in scene.deformables)
 
