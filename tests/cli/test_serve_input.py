@@ -79,14 +79,16 @@ def test_invalid_input_is_one_line_that_names_the_value(
 
 @pytest.mark.e2e
 def test_unclear_robot_is_watched_until_a_robot_file_says_more(folder: Path) -> None:
-    """The file that is printed is accepted as printed; a session starts without it, too, and says what is unclear."""
+    """The file that is printed lists the actuators to choose from; without it a session says what is unclear."""
     options = (*FREE_PORTS, "--no-record", "--seconds", "0.1")
     watched = run_command("serve", "unclear.xml", *options, cwd=folder)
     assert watched.returncode == 0, watched.stderr
     assert "robots: none" in watched.stdout
     assert "robot 'arm' can only be watched: joint 'j2' has 2 actuators (a2, b2)" in watched.stdout
     printed = run_command("robots", "unclear.xml", cwd=folder)
-    (folder / "robots.toml").write_text(printed.stdout)
+    assert "actuators = []  # one per joint; candidates: " in printed.stdout
+    chosen = printed.stdout.replace("actuators = []", 'actuators = ["a1", "a2", "a3"]')
+    (folder / "robots.toml").write_text(chosen)
     served = run_command("serve", "unclear.xml", "--robots", "robots.toml", *options, cwd=folder)
     assert served.returncode == 0, served.stderr
     assert "robots: arm" in served.stdout
