@@ -9,6 +9,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.physics.fingers import Fingers, are_alike, find_fingers
+from iris_session.physics.limbs import HAND_FINGERS
+from iris_session.physics.names import get_reference
 from iris_session.physics.tree import KinematicTree
 
 #: Fingers without a joint range are tried this far from their reference [m or rad].
@@ -17,69 +20,84 @@ _TRIAL = 0.02
 _MIN_CHANGE = 1e-4
 #: Why an actuator of a hand is no member of its gripper, which is clear without it.
 SPREADS: Final = "spreads the fingers"
-#: Two fingers of a gripper have the same mass, to this share.
-_ALIKE = 0.1
 
 
 @dataclass(frozen=True)
 class FoundGripper:
-    """Ids in the model. `members`: actuators with their `ctrl` open and closed. `unclear`: others, with the reason."""
+    """Ids in the model. `members`: actuators with their `ctrl` open and closed. `unclear`: others, with the reason.
+    `others`: actuators of branches on the same link that are no fingers.
+    """
 
     members: tuple[tuple[int, float, float], ...]
     unclear: dict[int, str]
     finger_bodies: tuple[int, ...]
+    others: tuple[int, ...] = ()
 
 
-def find_gripper(tree: KinematicTree, palm: int, finger_roots: list[int]) -> FoundGripper | None:
-    """Return the gripper on the link `palm`, None when nothing drives it. `finger_roots`: the moving bodies right below
-    it.
+def find_gripper(tree: KinematicTree, palm: int, fingers: Fingers) -> FoundGripper | None:
+    """Return the gripper on the link `palm`, None when nothing there is driven.
 
-    An actuator belongs to it when all joints it drives, directly or by a tendon, are below the palm. The fingers of a
-    hand with several joints each close towards the end of their range that is far from zero; joints that spread them
+    An actuator belongs to it when all joints it drives, directly or by a tendon, are joints of fingers. The fingers of
+    a hand with several joints each close towards the end of their range that is far from zero; joints that spread them
     to both sides alike stay where they are.
     """
-    bodies = [b for root in finger_roots for b in tree.list_subtree(root)]
-    actuators = _list_actuators(tree, bodies)
-    if not actuators:
+    bodies = [b for root in fingers.roots for b in tree.list_subtree(root)]
+    everything = _list_actuators(tree, [b for root in tree.list_jointed_below(palm) for b in tree.list_subtree(root)])
+    if not everything:
         return None
+    joints = {j for b in bodies for j in tree.list_joints(b)}
+    actuators = _list_actuators(tree, bodies)
+    others = tuple(a for a in everything if joints.isdisjoint(tree.driven[a]))
     with_geoms = tuple(b for b in bodies if int(tree.model.body_geomnum[b]))
-    is_hand = len(actuators) > max(2, len(finger_roots))
-    members, unclear = [], {}
+    if not fingers.is_clear:
+        return FoundGripper((), dict.fromkeys(everything, "moves one of several parts, which may be no finger"), ())
+    is_hand = len(actuators) > max(2, len(fingers.roots))
+    unclear = {a: "also moves what is no finger" for a in everything if a not in actuators and a not in others}
+    if is_hand and fingers.number < HAND_FINGERS:
+        count = f"{fingers.number} finger{'s' * (fingers.number > 1)}"
+        unclear |= dict.fromkeys(actuators, f"is one of {len(actuators)} that move {count}")
+    unclear |= _find_shared(tree, actuators)
+    members = []
     for actuator in actuators:
+        if actuator in unclear:
+            continue
         ctrl_range = _find_ctrl_range(tree, actuator)
         if ctrl_range is None or ctrl_range[0] >= ctrl_range[1]:
             unclear[actuator] = "has no ctrlrange"
             continue
         low, high = ctrl_range
-        opens = _find_far_end(low, high) if is_hand else _larger_ctrl_opens(tree, actuator, palm, finger_roots)
+        opens = _find_far_end(low, high) if is_hand else _larger_ctrl_opens(tree, actuator, palm, fingers.roots)
         if opens is None:
             unclear[actuator] = SPREADS if is_hand else "has an unknown open end"
         elif is_hand:
             members.append((actuator, min(max(0.0, low), high), low if opens else high))
         else:
             members.append((actuator, high, low) if opens else (actuator, low, high))
-    return FoundGripper(tuple(members), unclear, with_geoms)
+    return FoundGripper(tuple(members), unclear, with_geoms, others)
+
+
+def _find_shared(tree: KinematicTree, actuators: list[int]) -> dict[int, str]:
+    """Return the actuators that drive a joint together with another one, and the reason why that is unclear."""
+    shared = {}
+    for actuator in actuators:
+        for joint in tree.driven[actuator]:
+            count = sum(joint in tree.driven[a] for a in actuators)
+            if count > 1:
+                name = get_reference(tree.model, "joint", joint)
+                shared[actuator] = f"is one of {count} that drive joint {name!r}"
+    return shared
 
 
 def find_partners(tree: KinematicTree, link: int, actuators: list[int]) -> list[int]:
     """Return the actuators that are missing in `actuators`, which move one of the two fingers on a link."""
-    roots = tree.list_jointed_below(link)
-    if len(roots) != 2 or not _are_alike(tree, *roots):
+    roots = find_fingers(tree, link).roots
+    if len(roots) != 2 or not are_alike(tree, *([root] for root in roots)):
         return []
     sides = [_list_actuators(tree, tree.list_subtree(root)) for root in roots]
     everything = _list_actuators(tree, [b for root in roots for b in tree.list_subtree(root)])
     if [len(side) for side in sides] != [1, 1] or len(everything) != 2:
         return []
     return [a for a in everything if a not in actuators] if set(actuators) & set(everything) else []
-
-
-def _are_alike(tree: KinematicTree, a: int, b: int) -> bool:
-    """Return true for branches with the same joints and mass: two fingers, not a jaw and a camera that tilts."""
-    kinds = [
-        [tree.joint_type[j] for body in tree.list_subtree(root) for j in tree.list_joints(body)] for root in (a, b)
-    ]
-    masses = [float(tree.model.body_subtreemass[root]) for root in (a, b)]
-    return kinds[0] == kinds[1] and abs(masses[0] - masses[1]) <= _ALIKE * max(masses)
 
 
 def _list_actuators(tree: KinematicTree, bodies: list[int]) -> list[int]:

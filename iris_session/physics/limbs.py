@@ -23,7 +23,8 @@ from iris_session.physics.tree import KinematicTree
 MIN_JOINTS: Final = 3
 ARM, HAND, LEG, FINGER, HEAD, TORSO, BASE = "arm", "hand", "leg", "finger", "head", "torso", "base"
 #: Actuated joints and fingers of a hand; what has fewer is a gripper.
-_HAND_JOINTS, _HAND_FINGERS = 6, 3
+_HAND_JOINTS: Final = 6
+HAND_FINGERS: Final = 3
 #: A finger has at most so many actuated joints, and is at most so long [m] from its first joint to its end.
 _FINGER_JOINTS, _FINGER_LENGTH, _NAMED_FINGER_LENGTH = 5, 0.2, 0.35
 #: Feet end within this share of the height of their robot from its lowest point.
@@ -38,7 +39,7 @@ _LEG_WORDS = frozenset(
     {"hip", "hips", "leg", "legs", "knee", "ankle", "ank", "foot", "feet", "thigh", "shin", "calf", "shank", "toe"}
 )
 _LEG_ENDINGS = ("leg", "knee", "ankle", "foot", "thigh", "shin")
-_FINGER_WORDS = frozenset(
+FINGER_WORDS: Final = frozenset(
     {"finger", "fngr", "thumb", "pinky", "knuckle", "phalanx", "distal", "proximal", "mcp", "pip", "dip"}
 )
 _HEAD_WORDS = frozenset({"head", "neck", "eye", "eyes"})
@@ -48,7 +49,7 @@ _TORSO_WORDS = frozenset({"torso", "waist", "abdomen", "spine", "lumbar", "chest
 @dataclass
 class Limb:
     """A chain, or a hand. `joints`, `fingers` and `link` are ids; `link`: body that the last joint of a chain moves, or
-    the palm; `fingers`: the moving bodies right below it; `is_by_name`: a leg or head by its names alone.
+    the palm; `fingers`: the first moving bodies of a hand's fingers; `is_by_name`: a leg or head by its names alone.
     """
 
     joints: list[int]
@@ -71,7 +72,6 @@ def find_limbs(tree: KinematicTree) -> list[Limb]:
     for limb in limbs:
         if limb.kind != HAND:
             limb.link = tree.joint_body[limb.joints[-1]]
-            limb.fingers = tree.list_jointed_below(limb.link)
             limb.kind = limb.kind if limb.kind == FINGER else _classify(tree, limb)
             limb.is_by_name = limb.kind in (LEG, HEAD) and not _stands_on(tree, limb)
     return limbs
@@ -103,7 +103,7 @@ def _walk_chain(tree: KinematicTree, root: int, limbs: list[Limb]) -> None:
 
 def _add_hand(tree: KinematicTree, wrist: list[int], fingers: list[int], limbs: list[Limb]) -> bool:
     """Add the hand of these fingers to `limbs`, and its fingers by themselves. Returns false for too few joints."""
-    if len(fingers) < _HAND_FINGERS or sum(tree.reach[b] for b in fingers) < _HAND_JOINTS:
+    if len(fingers) < HAND_FINGERS or sum(tree.reach[b] for b in fingers) < _HAND_JOINTS:
         return False
     joints = wrist + [j for f in fingers for b in tree.list_subtree(f) for j in list_actuated(tree, b)]
     paths = [tree.list_ancestors(tree.parent[finger]) for finger in fingers]
@@ -129,7 +129,7 @@ def _is_finger(tree: KinematicTree, body: int) -> bool:
     if tree.reach[body] > _FINGER_JOINTS:
         return False
     words = list_words(tree, tree.list_subtree(body))
-    named = bool(words & _FINGER_WORDS)
+    named = bool(words & FINGER_WORDS)
     if not named and (words & _ARM_WORDS or has_leg_word(words)):
         return False
     return measure_length(tree, body) < (_NAMED_FINGER_LENGTH if named else _FINGER_LENGTH)

@@ -17,6 +17,7 @@ import msgspec
 import mujoco
 
 from iris_session.physics.end_effector import TIP_WORDS, find_end_effector, list_tip_sites, rank_name
+from iris_session.physics.fingers import Fingers, find_fingers
 from iris_session.physics.gripper import SPREADS, FoundGripper, find_gripper
 from iris_session.physics.limbs import ARM, FINGER, HAND, LEG, MIN_JOINTS, Limb, find_limbs
 from iris_session.physics.names import (
@@ -120,9 +121,8 @@ def find_robots(model: mujoco.MjModel, *, all_limbs: bool = False) -> FoundRobot
         if is_clear:
             robots.append(spec)
         if problems:
-            how = (
-                "can only be watched" if not is_clear else f"is found without {_WITHOUT[min(_WITHOUT.keys() & notes)]}"
-            )
+            without = [text for key, text in _WITHOUT.items() if key in notes]
+            how = f"is found{f' without {without[0]}' if without else ''}" if is_clear else "can only be watched"
             more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
             text = f"robot {name!r} {how}: {'; '.join(problems[:_SHOWN])}{more}"
             notices.append(RobotNotice(text, spec, notes))
@@ -134,7 +134,6 @@ def _split_jaw(tree: KinematicTree, arm: Limb) -> None:
     while len(arm.joints) > MIN_JOINTS and _is_jaw(tree, arm.joints[-1], arm.joints[-2]):
         arm.joints.pop()
     arm.link = tree.joint_body[arm.joints[-1]]
-    arm.fingers = tree.list_jointed_below(arm.link)
 
 
 def _is_jaw(tree: KinematicTree, last: int, before: int) -> bool:
@@ -162,20 +161,21 @@ def _build_spec(
     bodies = list_body_names(model)
     problems: list[str] = []
     notes: dict[str, str] = {}
-    joints = limb.joints
+    joints, is_hand = limb.joints, limb.kind == HAND
     several = [j for j in joints if len(tree.actuators_of_joint[j]) > 1]
     problems += [_describe_actuators(tree, j) for j in several]
-    if limb.kind == HAND and len(several) < len(joints):
+    if is_hand and len(several) < len(joints):
         joints = [j for j in joints if j not in several]
         if several:
             notes["joints"] = f"left out: {'; '.join(problems)}"
     elif several:
         notes["actuators"] = f"one per joint; candidates: {_list_candidates(tree, joints)}"
     actuators = () if "actuators" in notes else tuple(tree.actuators_of_joint[j][0] for j in joints)
-    tip = find_end_effector(tree, limb.joints[-1], limb.link, limb.fingers)
+    fingers = Fingers(limb.fingers, len(limb.fingers), True) if is_hand else find_fingers(tree, limb.link)
+    tip = find_end_effector(tree, limb.joints[-1], limb.link, fingers.roots)
     if tip.note:
         notes["tip_body"] = tip.note
-    gripper = find_gripper(tree, limb.link, limb.fingers) if limb.fingers and limb.kind != HAND else None
+    gripper = None if is_hand else find_gripper(tree, limb.link, fingers)
     members = _choose_gripper(tree, gripper, problems, notes)
     site = "" if tip.site is None else get_element_name(model, "site", tip.site)
     spec = RobotSpec(
@@ -189,7 +189,7 @@ def _build_spec(
         tip_body="" if site else bodies[tip.body],
         T_body_tip=Pose(tip.offset, (1.0, 0.0, 0.0, 0.0)),
         gripper_partners=tuple(members[1:]),
-        kind=HAND if limb.kind == HAND else ARM,
+        kind=HAND if is_hand else ARM,
     )
     if members:
         first = members[0]
@@ -217,9 +217,15 @@ def _choose_gripper(
     """Return the actuators of a gripper; none where one of them is unclear, as half a gripper would move half of it."""
     if gripper is None:
         return []
+    if gripper.others:
+        listed = ", ".join(get_reference(tree.model, "actuator", a) for a in gripper.others)
+        notes["finger_bodies"] = f"not driven, as they move no finger: {listed}"
+        problems.append(f"actuators that move no finger are not driven: {listed}")
     reasons = [
         f"gripper actuator {get_reference(tree.model, 'actuator', a)!r} {why}" for a, why in gripper.unclear.items()
     ]
+    if not gripper.members and not gripper.unclear:
+        return []
     if gripper.members and all(why == SPREADS for why in gripper.unclear.values()):
         return [GripperActuator(get_reference(tree.model, "actuator", a), *ends) for a, *ends in gripper.members]
     problems.extend(reasons)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import mujoco
@@ -22,8 +22,17 @@ AUTO: Final = "auto"
 NONE: Final = "none"
 #: What may be given as the robots of a session: specifications, names, a word, or the path of a robots file.
 RobotChoice = Sequence[RobotSpec] | Sequence[str] | str | Path | None
-#: A choice that can be repeated for another model: all robots found, or these names and specifications.
-FixedChoice = tuple[RobotSpec | str, ...] | None
+
+
+class Chosen(NamedTuple):
+    """A robot as it was chosen. `is_found_again`: another model has it under its name, with elements of its own."""
+
+    spec: RobotSpec
+    is_found_again: bool
+
+
+#: A choice that can be repeated for another model: all robots found, or these.
+FixedChoice = tuple[Chosen, ...] | None
 
 
 def find_drivable_robots(model: mujoco.MjModel, control: ControlConfig, *, all_limbs: bool = False) -> FoundRobots:
@@ -68,24 +77,30 @@ def choose_robots(model: mujoco.MjModel, choice: RobotChoice, control: ControlCo
 
 
 def fix_choice(model: mujoco.MjModel, choice: RobotChoice, control: ControlConfig) -> FixedChoice:
-    """Return a choice for `model` as `choose_again` repeats it for others.
+    """Return a choice for `model`, which `choose_robots` has accepted, as `choose_again` repeats it for others.
 
-    Specifications as they are found in the model become their names, so that they are found again.
+    Robots are found again that are chosen by name, and specifications with numbers as they are found in the model.
     """
     if _is_auto(choice):
         return None
-    given = _read_choice(model, choice)
-    found: list[RobotSpec] = []
-    if any(isinstance(one, RobotSpec) for one in given):
-        found = [robot for every in (False, True) for robot in find_robots(model, all_limbs=every).robots]
-    return tuple(one.name if isinstance(one, RobotSpec) and one in found else one for one in given)
+    every = _read_choice(model, choice)
+    given = [one for index, one in enumerate(every) if one not in every[:index]]
+    if not given:
+        return ()
+    found = [robot for limbs in (False, True) for robot in find_robots(model, all_limbs=limbs).robots]
+    known = {robot.name: robot for robot in reversed(found)}  # those that are offered first
+    return tuple(
+        Chosen(known[one], True) if isinstance(one, str) else Chosen(one, one in found and _has_numbers(model, one))
+        for one in given
+    )
 
 
 def choose_again(model: mujoco.MjModel, choice: FixedChoice, control: ControlConfig) -> FoundRobots:
     """Return the robots of another model by the choice for the first one. Raises nothing for a robot.
 
-    What was chosen and is not there is a notice; nothing else is offered in its place. A specification with a number of
-    an element is not used: the number may mean another element here.
+    What was chosen and is not there is a notice; nothing else is offered in its place: a robot that is found again has
+    the same joints, as far as they have names. A specification of one's own with a number of an element is not used:
+    the number may mean another element here.
     """
     if choice is None:
         return find_drivable_robots(model, control)
@@ -93,20 +108,32 @@ def choose_again(model: mujoco.MjModel, choice: FixedChoice, control: ControlCon
     robots: list[RobotSpec] = []
     said: dict[str, RobotNotice] = {}
     for one in choice:
-        name = one if isinstance(one, str) else one.name
-        spec = known.get(one) if isinstance(one, str) else one
-        if isinstance(one, str) and one in notices:
-            said[name] = notices[one]
-        if spec is None:
-            said.setdefault(name, _make_watched(RobotSpec(name, (), (), "", ""), "the new model has no such robot"))
-            continue
-        why = _find_misfit(model, robots, spec, control, by_hand=not isinstance(one, str))
+        spec, name = one.spec, one.spec.name
+        if one.is_found_again:
+            if name in notices:
+                said[name] = notices[name]
+            again = known.get(name)
+            if again is None:
+                missing = RobotSpec(name, (), (), "", "")
+                said.setdefault(name, _make_watched(missing, "the new model has no such robot"))
+                continue
+            if _list_joint_names(again) != _list_joint_names(spec):
+                listed = ", ".join(again.joints)
+                said[name] = _make_watched(again, f"the new model has another robot of this name, with joints {listed}")
+                continue
+            spec = again
+        why = _find_misfit(model, robots, spec, control, by_hand=not one.is_found_again)
         if why:
             said[name] = _make_watched(spec, why)
         else:
             robots.append(spec)
     found = _split_watched(robots, control)
     return FoundRobots(found.robots, (*said.values(), *found.notices))
+
+
+def _list_joint_names(robot: RobotSpec) -> list[str]:
+    """Return the names of the joints in order, empty for one that has a number only."""
+    return ["" if joint.startswith("#") else joint for joint in robot.joints]
 
 
 def _find_misfit(

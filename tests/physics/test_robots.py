@@ -9,7 +9,9 @@ import pytest
 
 from iris_session.physics import World, find_objects, load_model, load_robots_toml
 from iris_session.physics import find_robots as detect
+from iris_session.physics.fingers import find_fingers
 from iris_session.physics.names import find_element_id, list_body_names, list_element_names
+from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.specs import HAND, GripperActuator, ObjectSpec, RobotSpec
 from tests.models import MENAGERIE
 from tests.physics.models import FINGERS, GRIPPER_TENDON, arm, model, scene
@@ -22,6 +24,9 @@ def find_robots(m: mujoco.MjModel, **how: bool) -> tuple[RobotSpec, ...]:
     return found.robots
 
 
+#: Two fingers without an end-effector site, and an actuator for each.
+TWO_FINGERS = FINGERS.replace('<site name="{p}pinch" pos="0 0 .15"/>', "")
+BOTH = "".join(f'<position name="{s}" joint="finger_{s}" ctrlrange="0 .04"/>' for s in "lr")
 VIPERX = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
 
 
@@ -184,8 +189,9 @@ def test_end_effector_is_a_site_or_the_end_of_the_last_link(end: str, expected: 
 
 
 def test_end_effector_is_the_middle_between_finger_tips() -> None:
-    (robot,) = find_robots(scene(*arm("a", end=FINGERS.replace('<site name="{p}pinch" pos="0 0 .15"/>', ""))))
-    assert (robot.tip_body, robot.T_body_tip.p) == ("a/hand", (0.0, 0.0, 0.06))  # a centimetre before their ends
+    body, actuators = arm(end=TWO_FINGERS)
+    (robot,) = find_robots(scene(body, actuators + BOTH))
+    assert (robot.tip_body, robot.T_body_tip.p) == ("hand", (0.0, 0.0, 0.06))  # a centimetre before their ends
 
 
 def test_sites_of_other_things_that_are_fixed_to_the_world_are_not_taken() -> None:
@@ -254,6 +260,116 @@ def test_joints_of_a_hand_that_are_left_out_are_a_notice() -> None:
     assert len(robot.joints) == 8
     assert notice.text == "robot 'h' is found without some joints: joint 'h_k0' has 2 actuators (h_k0, twice)"
     assert load_robots_toml(found.to_toml(), m) == (robot,)
+
+
+# --- fingers, and what else is on the last link ---
+
+
+CAMERA = """<body name="{name}" pos="0 .05 .1"><joint name="{name}_tilt" axis="1 0 0" range="-1 1"/>
+  <geom type="box" size=".01 .01 .02" pos="0 .02 0"/></body>"""
+CAMERA_DRIVE = '<position name="tilt" joint="{name}_tilt" ctrlrange="-1 1"/>'
+JAW = """<geom type="box" size=".01 .005 .03" pos="0 .02 .12"/><body name="{name}" pos="0 0 .1">
+  <joint name="{name}" axis="1 0 0" range="0 1"/><geom type="box" size=".01 .005 .03" pos="0 0 .03"/></body>"""
+
+
+def plain(text: str) -> str:
+    """Return two fingers whose names do not say that they are fingers."""
+    return re.sub("finger_|left_pad|right_pad", lambda found: {"finger_": "f_"}.get(found[0], found[0][0] + "p"), text)
+
+
+@pytest.mark.parametrize("words", [True, False])
+@pytest.mark.parametrize("tendon", [True, False])
+@pytest.mark.parametrize("name", ["camera", "thing"])
+def test_what_tilts_beside_two_fingers_is_not_driven(words: bool, tendon: bool, name: str) -> None:
+    grip = '<position name="g" tendon="split" ctrlrange="0 .04"/>' if tendon else BOTH
+    texts = (TWO_FINGERS, grip, GRIPPER_TENDON if tendon else "")
+    ends, drives, extra = texts if words else (plain(text) for text in texts)
+    body, actuators = arm(end=ends + CAMERA.format(name=name))
+    m = scene(body, actuators + drives + CAMERA_DRIVE.format(name=name), extra)
+    found = detect(m)
+    (robot,) = found.robots
+    assert [one.actuator for one in robot.gripper_actuators] == (["g"] if tendon else ["l", "r"])
+    assert {(one.open, one.closed) for one in robot.gripper_actuators} == {(0.04, 0.0)}
+    assert (robot.tip_body, robot.T_body_tip.p) == ("hand", (0.0, 0.0, 0.06))
+    assert len(robot.finger_bodies) == 2
+    assert found.texts == (f"robot {robot.name!r} is found: actuators that move no finger are not driven: tilt",)
+    assert load_robots_toml(found.to_toml(), m) == (robot,)
+
+
+@pytest.mark.parametrize(
+    ("jaw", "other", "members"),
+    [("jaw", "camera", ["g"]), ("jaw", "thing", ["g"]), ("part", "camera", ["g"]), ("part", "thing", [])],
+)
+def test_a_jaw_beside_something_else_is_told_by_names(jaw: str, other: str, members: list[str]) -> None:
+    body, actuators = arm(end=JAW.format(name=jaw) + CAMERA.format(name=other))
+    drives = f'<position name="g" joint="{jaw}" ctrlrange="0 1"/>' + CAMERA_DRIVE.format(name=other)
+    m = scene(body, actuators + drives)
+    (robot,), (notice,) = (found := detect(m)).robots, found.notices
+    assert [one.actuator for one in robot.gripper_actuators] == members
+    assert "tilt" in notice.text
+    assert load_robots_toml(notice.toml, m) == (robot,)
+    if jaw == "jaw":
+        (alone,) = find_robots(scene(arm(end=JAW.format(name=jaw))[0], actuators + drives.partition("/>")[0] + "/>"))
+        assert (robot.gripper_actuators, robot.T_body_tip) == (alone.gripper_actuators, alone.T_body_tip)
+    if not members:
+        assert "is found without its gripper: gripper actuator 'g' moves one of several parts" in notice.text
+
+
+def test_a_finger_joint_with_two_actuators_makes_the_gripper_unclear() -> None:
+    more = "".join(f'<velocity name="v{s}" joint="finger_{s}" ctrlrange="-1 1"/>' for s in "lr")
+    body, actuators = arm(end=TWO_FINGERS)
+    (robot,), (notice,) = (found := detect(scene(body, actuators + BOTH + more))).robots, found.notices
+    assert robot.gripper_actuators == ()
+    assert "gripper actuator 'l' is one of 2 that drive joint 'finger_l'" in notice.text
+
+
+def test_two_fingers_with_four_actuators_are_no_hand() -> None:
+    """Closing by the rule of a hand, away from zero, would open their slides."""
+    end = TWO_FINGERS
+    for side in "lr":
+        tip = f'<body pos="0 0 .04"><joint name="t{side}" axis="1 0 0" range="-.5 .5"/><geom size=".01"/></body>'
+        end = end.replace('.02"/></body>', f'.02"/>{tip}</body>', 1)
+    body, actuators = arm(end=end)
+    more = "".join(f'<position name="t{s}" joint="t{s}" ctrlrange="-.5 .5"/>' for s in "lr")
+    (robot,), (notice,) = (found := detect(scene(body, actuators + BOTH + more))).robots, found.notices
+    assert robot.gripper_actuators == ()
+    assert "gripper actuator 'l' is one of 4 that move 2 fingers" in notice.text
+
+
+def test_what_nothing_drives_does_not_move_the_end_effector() -> None:
+    cable = '<body name="cable"><joint name="c" axis="1 0 0"/><geom size=".004" fromto=".05 0 0 .05 0 -.3" '
+    cable += 'type="capsule"/></body>'
+    (without,), (robot,) = (find_robots(scene(*arm(end=end))) for end in ("", cable))
+    assert robot == without
+    (without,), (robot,) = (
+        find_robots(scene((found := arm(end=TWO_FINGERS + end))[0], found[1] + BOTH)) for end in ("", cable)
+    )
+    assert robot == without
+
+
+def test_a_finger_of_a_closed_linkage_is_one_finger() -> None:
+    """Only its crank is driven; the rod is joined to it, and carries the pad."""
+    part = """<body name="{n}" pos="0 {y} .1"><joint name="{n}" axis="1 0 0" range="0 .8"/>
+      <geom type="box" size=".01 .01 .02" pos="0 0 .02"/></body>"""
+    parts = {"cl": 0.02, "rl": 0.04, "cr": -0.02, "rr": -0.04}
+    body, actuators = arm(end="".join(part.format(n=n, y=y) for n, y in parts.items()))
+    loops = "".join(f'<connect body1="c{s}" body2="r{s}" anchor="0 0 .04"/>' for s in "lr")
+    crank = '<position name="{n}" joint="{n}" ctrlrange="0 .8"/>'
+    m = scene(body, actuators + crank.format(n="cl") + crank.format(n="cr"), f"<equality>{loops}</equality>")
+    fingers = find_fingers(KinematicTree(m), find_element_id(m, "body", "link3"))
+    assert (len(fingers.roots), fingers.number, fingers.is_clear) == (4, 2, True)
+
+
+def test_a_hand_on_an_arm_closes_as_before() -> None:
+    """All its fingers take part, the thumb too, which is not like the others."""
+    panda = mujoco.MjSpec.from_file(str(MENAGERIE / "franka_emika_panda" / "panda_nohand.xml"))
+    leap = mujoco.MjSpec.from_file(str(MENAGERIE / "leap_hand" / "right_hand.xml"))
+    leap.option.impratio, leap.option.cone = panda.option.impratio, panda.option.cone
+    panda.attach(leap, prefix="leap/", site=next(s for s in panda.sites if s.name == "attachment_site"))
+    (robot,) = find_robots(panda.compile())
+    assert len(robot.gripper_actuators) == 12
+    assert all(one.open == 0.0 and one.closed > 1.8 for one in robot.gripper_actuators)
+    assert {one.actuator[:7] for one in robot.gripper_actuators} == {"leap/if", "leap/mf", "leap/rf", "leap/th"}
 
 
 # --- real models ---

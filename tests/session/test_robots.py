@@ -13,6 +13,7 @@ from iris_session.physics import RobotsFileError, load_model, load_robots_toml
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError
 from iris_session.session.robots import (
+    RobotChoice,
     choose_again,
     choose_robots,
     find_drivable_robots,
@@ -148,13 +149,13 @@ def test_a_number_is_not_carried_over_to_another_model() -> None:
 
 
 def test_a_choice_holds_for_another_model(tmp_path: Path) -> None:
-    both, (body, actuators) = two_arms(), arm("right", joints=5)
-    other = scene(body, actuators)  # without the left arm, and with another right one
+    both, (body, actuators) = two_arms(), arm("right")
+    other = scene(body, actuators)  # without the left arm
     for choice in ("none", ()):
         assert choose_again(other, fix_choice(both, choice, CTRL), CTRL) == ((), (), ())
     (robot,) = choose_again(other, fix_choice(both, "right", CTRL), CTRL).robots
-    assert (robot.name, len(robot.joints)) == ("right", 5)
-    found = choose_again(other, fix_choice(both, "right,left", CTRL), CTRL)
+    assert robot == choose_robots(both, "right", CTRL).robots[0]
+    found = choose_again(other, fix_choice(both, "right,left,right", CTRL), CTRL)
     assert found.robots == (robot,)
     assert found.texts == ("robot 'left' can only be watched: the new model has no such robot",)
     file = tmp_path / "robots.toml"
@@ -169,3 +170,51 @@ def test_a_choice_holds_for_another_model(tmp_path: Path) -> None:
     found = choose_again(other, kept, CTRL)
     assert [r.name for r in found.robots] == ["r"]
     assert "robot 'l' can only be watched: " in found.texts[0]
+
+
+def unnamed_arm(*arms: str, last: str = "") -> mujoco.MjModel:
+    """Return arms of which the joints are the only names that tell them apart: robots of the same generated name."""
+    drives, bodies = "", ""
+    for index, one in enumerate(arms):
+        body, actuators = arm(joint_name=f"{one}{{i}}", end="")
+        for i in range(4):
+            body = body.replace(f'"link{i}"', f'"{one}link{i}"')
+            actuators = actuators.replace(f'name="a{i}"', f'name="{one}a{i}"')
+        bodies += body.replace('"base"', '"base"' if not index else '"pedestal"')
+        drives += actuators if not last else actuators.replace(f'name="{one}a3"', "")
+    return scene(bodies, drives)
+
+
+@pytest.mark.parametrize("by", ["spec", "file", "name"])
+def test_a_robot_is_never_another_one_of_the_same_name(by: str, tmp_path: Path) -> None:
+    """The name of both is generated: the first of the model has it."""
+    first, both, other = unnamed_arm("x"), unnamed_arm("y", "x"), unnamed_arm("y")
+    (spec,) = choose_robots(first, "auto", CTRL).robots
+    file = tmp_path / "robots.toml"
+    file.write_text(find_drivable_robots(first, CTRL).to_toml())
+    choices: dict[str, RobotChoice] = {"spec": [spec], "file": file, "name": spec.name}
+    fixed = fix_choice(first, choices[by], CTRL)
+    for model in (both, other):
+        assert spec.name in [robot.name for robot in choose_robots(model, "auto", CTRL).robots]
+        found = choose_again(model, fixed, CTRL)
+        if by == "name" or model is other:
+            assert found.robots == ()
+            (text,) = found.texts
+            assert text.startswith(f"robot {spec.name!r} can only be watched: ")
+        else:
+            # Its base may carry another name; its joints and actuators are what was chosen.
+            assert [(r.joints, r.actuators) for r in found.robots] == [(spec.joints, spec.actuators)]
+            assert found.texts == ()
+    (again,) = choose_again(first, fixed, CTRL).robots
+    assert again == spec
+
+
+def test_a_robot_with_a_number_is_found_again_with_the_same_joints_only() -> None:
+    first, second = unnamed_arm("x", last="#"), unnamed_arm("y", last="#")
+    (spec,) = choose_robots(first, "auto", CTRL).robots
+    assert spec.actuators[3] == "#3"
+    fixed = fix_choice(first, [spec], CTRL)
+    assert choose_again(first, fixed, CTRL).robots == (spec,)
+    found = choose_again(second, fixed, CTRL)
+    assert found.robots == ()
+    assert "the new model has another robot of this name, with joints y0, y1, y2, y3" in found.texts[0]
