@@ -91,7 +91,7 @@ def measure_move(model: mujoco.MjModel, robot: RobotSpec) -> float:
 def _measure_axis(model: mujoco.MjModel, robot: RobotSpec, axis: Any) -> float:
     """Return what is left [mm] when a hand moves 5 cm along `axis` from where the arm holds itself.
 
-    What carries the arm, as the pelvis of a humanoid, is held still: nobody drives its legs.
+    What carries the arm, as the pelvis of a humanoid, is held still, as its legs are not driven.
     """
     world = World(model, (robot,), ())
     data, tip, root = world.data, Tip(model, robot), ArmModel(model, robot).root_body

@@ -20,7 +20,7 @@ _SITE, _BODY = int(mujoco.mjtObj.mjOBJ_SITE), int(mujoco.mjtObj.mjOBJ_XBODY)
 
 
 class Tip:
-    """The end effector of `robot` in `model`. Raises `UnknownNameError`, and `SpecError` for a rotation that is
+    """The end effector of `robot` in `model`. Raises `UnknownNameError`, and `SpecError` for a pose that is
     none.
 
     Attributes:
@@ -37,9 +37,9 @@ class Tip:
             self.body = find_element_id(model, "body", robot.tip_body, where)
             w, x, y, z = robot.T_body_tip.q
             length = math.hypot(w, x, y, z)
-            if not _SHORTEST < length < math.inf:
+            if not (_SHORTEST < length < math.inf and all(map(math.isfinite, robot.T_body_tip.p))):
                 raise SpecError(
-                    f"{where}the quaternion of T_body_tip is {robot.T_body_tip.q}: (w, x, y, z) is expected"
+                    f"{where}T_body_tip is {robot.T_body_tip}: expected is p [m] and a quaternion (w, x, y, z)"
                 )
             self.T_body_tip = Pose(robot.T_body_tip.p, (w / length, x / length, y / length, z / length))
         else:

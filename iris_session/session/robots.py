@@ -221,6 +221,7 @@ def _make_watched(robot: RobotSpec, reason: str, earlier: RobotNotice | None = N
     `earlier`: what is unclear about it besides, which becomes part of the one notice.
     """
     spec = msgspec.structs.replace(robot, actuators=())
+    reason = reason.removeprefix(f"robot {robot.name!r}: ")
     text, notes = f"robot {robot.name!r} can only be watched: {reason}", {"actuators": reason}
     if earlier is None:
         return RobotNotice(text, spec, notes)

@@ -349,6 +349,11 @@ def test_rotation_of_an_end_effector_is_normalised_once() -> None:
     turned = msgspec.structs.replace(robot, T_body_tip=Pose(robot.T_body_tip.p, (0.0, 2.0, 0.0, 0.0)))
     assert Tip(m, turned).T_body_tip.q == (0.0, 1.0, 0.0, 0.0)
     assert World(m, (turned,), ()).view().tip_pose(robot.name).q == (0.0, 1.0, 0.0, 0.0)
-    for q in ((0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 0.0)):
-        with pytest.raises(SpecError, match=r"quaternion of T_body_tip"):
-            World(m, (msgspec.structs.replace(robot, T_body_tip=Pose((0.0, 0.0, 0.0), q)),), ())
+    here, straight = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    for pose in (
+        Pose(here, (0.0, 0.0, 0.0, 0.0)),
+        Pose(here, (math.nan, 0.0, 0.0, 0.0)),
+        Pose((math.nan, 0.0, 0.0), straight),
+    ):
+        with pytest.raises(SpecError, match=r"T_body_tip"):
+            World(m, (msgspec.structs.replace(robot, T_body_tip=pose),), ())

@@ -40,7 +40,7 @@ def test_an_actuator_without_a_law_makes_a_robot_that_is_watched() -> None:
     found = find_drivable_robots(model, CTRL)
     assert [robot.name for robot in found.robots] == ["left"]
     (notice,) = found.notices
-    assert notice.text.startswith("robot 'right' can only be watched: robot 'right': actuator 'right/a0' needs")
+    assert notice.text.startswith("robot 'right' can only be watched: actuator 'right/a0' needs")
     assert [robot.name for robot in find_drivable_robots(model, TARGETS).robots] == ["left", "right"]
     left, right = load_robots_toml(found.to_toml(), model)
     assert (len(left.actuators), right.actuators) == (4, ())

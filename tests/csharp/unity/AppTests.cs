@@ -323,7 +323,7 @@ namespace IrisSession.Unity.StandinTests
                 kept.LostNs = 1;
                 int before = session.Count<Hello>();
                 stage.StepUntil(() => session.Count<Hello>() >= before + 4, "it tries again");
-                Assert.AreSame(client, stage.App.Client, "and looks for nothing else while nobody wears it");
+                Assert.AreSame(client, stage.App.Client, "and looks for nothing else in the background");
                 Engine.Pause(false);
                 stage.StepUntil(() => stage.App.Client == null && stage.App.View.Phrase.What.Length > 0, "it is lost, and the panel says why");
                 stage.Press("Look for sessions", () => stage.App.View.Endpoint.Length == 0, "those that announce themselves");

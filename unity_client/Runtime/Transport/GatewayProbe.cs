@@ -16,7 +16,7 @@ namespace IrisSession.Transport
         private volatile bool hasEnded;
 
         /// <param name="endpoint">With a pin, if it has TLS.</param>
-        /// <param name="news">Set when there is an answer; null: nobody waits for it.</param>
+        /// <param name="news">Set when there is an answer; null: it is polled.</param>
         public GatewayProbe(WebEndpoint endpoint, AutoResetEvent news)
         {
             this.endpoint = endpoint;

@@ -89,7 +89,7 @@ namespace IrisSession.Transport
         private int pending; // requests that wait for an answer
 
         /// <param name="client">Its session.</param>
-        /// <param name="cache">Assets that are kept. Whoever else uses it locks it.</param>
+        /// <param name="cache">Assets that are kept. Other users of it lock it.</param>
         /// <param name="budget">What the device can show.</param>
         public SceneFetcher(SessionClient client, AssetCache cache, SceneBudget budget)
         {

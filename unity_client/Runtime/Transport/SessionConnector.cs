@@ -58,7 +58,7 @@ namespace IrisSession.Transport
             return (thread.ThreadState & ThreadState.Unstarted) != 0 || thread.Join(StopMs);
         }
 
-        /// <summary>Nobody wears the headset now, or again: meanwhile no session is joined, and one that is lost is not looked for elsewhere.</summary>
+        /// <summary>The app is in the background, or no longer: meanwhile no session is joined, and one that is lost is not looked for elsewhere.</summary>
         public void SetPaused(bool isPaused)
         {
             this.isPaused = isPaused;

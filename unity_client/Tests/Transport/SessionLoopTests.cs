@@ -56,6 +56,19 @@ namespace IrisSession.Transport.Tests
             Assert.AreEqual(1, rig.Loop.Connection.Counters.Reconnects);
         }
 
+        [TestCase(true)]
+        [TestCase(false)]
+        public void ASessionThatIsLeftWhileItIsLostCanBeResumed(bool isLost)
+        {
+            LoopRig rig = new LoopRig(Cable);
+            rig.Join();
+            rig.Run(2 * Second);
+            if (isLost) rig.Transport.Break(LinkFailure.Unreachable, 0);
+            rig.Loop.Step();
+            rig.Loop.Close();
+            CollectionAssert.AreEqual(isLost ? new byte[] { 1 } : new byte[0], rig.Loop.Connection.Identity.ResumeToken);
+        }
+
         [Test]
         public void SilentSessionIsJoinedAgain()
         {

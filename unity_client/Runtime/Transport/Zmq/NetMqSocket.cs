@@ -17,7 +17,7 @@ namespace IrisSession.Transport
     /// <summary>
     /// A socket with the settings of all sockets to a session. Nothing waits, but <see cref="Wait"/>, and <see cref="TryConnect"/> for a name.
     ///
-    /// With keys NetMQ still speaks in the clear to a peer whose greeting is of ZMTP 2 or older, and tells nobody. So frames that were not
+    /// With keys NetMQ still speaks in the clear to a peer whose greeting is of ZMTP 2 or older, without saying so. So frames that were not
     /// decrypted are refused, and a connection that is watched is open when the answer to a first message was: all before it is a heartbeat.
     /// </summary>
     internal sealed class NetMqSocket : IDisposable

@@ -266,7 +266,7 @@ namespace IrisSession.Unity.App
         private void OnApplicationPause(bool pauseStatus)
         {
             bool isKept = client != null || (connector != null && connector.View.Phase == ConnectorPhase.Pairing); // its code works once: the answer is waited for
-            if (isKept) connector.SetPaused(pauseStatus);
+            connector?.SetPaused(pauseStatus);
             if (isKept || headset == null || Problem.Length > 0) return;
             try
             {
