@@ -2,7 +2,8 @@
 
 The names of this package are the public API; everything below it may change.
 
-- Share a MuJoCo scene: `Session`, `SessionConfig`, with `AuthorityConfig` and `ControlConfig`.
+- Share a MuJoCo program or a model file: `share`, `Session`, `SessionConfig`, with `AuthorityConfig` and
+  `ControlConfig`.
 - Share another world: `SceneBuilder` composes a scene, `ScenePublisher` moves it.
 - Join a session: `Client`, `find_sessions`, `fetch_scene`, `Deformables`.
 - Read a recording: `Recording`.
@@ -78,6 +79,7 @@ if TYPE_CHECKING:
     )
     from iris_session.session.scene_publisher import ScenePublisher
     from iris_session.session.session import Session
+    from iris_session.session.share import share
     from iris_session.session.status import DataFault
     from iris_session.session.stepper import OwnerRequest
     from iris_session.streams.cloud import CloudFrame, decode_cloud, encode_cloud
@@ -86,6 +88,7 @@ if TYPE_CHECKING:
 
 #: Module -> public names that live there.
 _PUBLIC: Final = {
+    "iris_session.session.share": ("share",),
     "iris_session.session.session": ("Session",),
     "iris_session.session.config": ("SessionConfig",),
     "iris_session.session.errors": (
@@ -157,6 +160,7 @@ _PUBLIC: Final = {
 _HOME: Final = {name: module for module, names in _PUBLIC.items() for name in names}
 
 __all__ = [
+    "share",
     "Session",
     "SessionConfig",
     "AuthorityConfig",

@@ -8,8 +8,12 @@ MuJoCo's control callback is not used: it is one per process, it keeps MuJoCo fr
 
 What is not seen: functions bound in other ways before (default arguments, `functools.partial`, C++), `mujoco.rollout`,
 and threads of `mujoco.viewer` that were compiled in. An `environment` is for these: its own `step` is wrapped on the
-instance, and is a tick by itself when no wrapped function was called in it. An environment also tells when it has
-built another model and data, as benchmark suites do at a reset.
+instance, and is a tick by itself when no wrapped function was called in it.
+
+Benchmark suites build another model and data at a reset. An environment tells which ones are its own now. Without one
+the session goes on with other data that the program steps in the same thread while the attached one stands still, when
+nothing but the session holds that any more, or when the other model is another one with mostly the same bodies: a
+planner steps copies of the data with the same model. Where neither is so, a warning says that other data is simulated.
 
 One registry per process: any number of sessions, closed in any order; with the last one the originals come back. A
 child that is forked does not belong to the sessions of its parent.
@@ -19,6 +23,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import os
 import sys
 import threading
@@ -27,26 +32,42 @@ from typing import Any, Final
 
 import mujoco
 
+from iris_session.physics.names import list_element_names
 from iris_session.session.errors import OwnershipError
+from iris_session.session.simulation import find_simulation
 from iris_session.session.user_loop import UserLoop
 
 #: Functions of MuJoCo that advance data by a timestep, and use the `ctrl` that is there when they are called.
 STEP_FUNCTIONS: Final = ("mj_step", "mj_step2")
+#: An environment's step that takes longer is looked at before its end, too [ns].
+LONG_STEP_NS: Final = 20_000_000
+#: Other data of a world with the same bodies is followed when the attached one has stood still for so long, and that
+#: is decided again so often [ns].
+FOLLOW_AFTER_NS: Final = 250_000_000
+ASK_AGAIN_NS: Final = 50_000_000
+#: Other data is simulated for so long before the owner is warned [ns].
+WARN_AFTER_NS: Final = 500_000_000
+ELSEWHERE: Final = (
+    "the shared data stands still while other data is simulated: share the environment itself, as in share(env)"
+)
+#: References to the attached data by its session, its loop, and the call that counts them.
+OWN_REFERENCES: Final = 3
+#: Share of the bodies of two models, by name, that must be the same.
+ALIKE: Final = 0.5
 
+_log = logging.getLogger(__name__)
 
 _lock = threading.RLock()
 _originals: Final[dict[str, Callable[..., None]]] = {name: getattr(mujoco, name) for name in STEP_FUNCTIONS}
 _wrappers: Final[dict[str, Callable[..., None]]] = {}
 #: By the identity of their data, which the loop keeps alive.
 _loops: Final[dict[int, Attachment]] = {}
-#: Loops that may go on with other data.
-_followers: Final[list[Attachment]] = []
 
 
 def _find_loop(model: Any, data: Any) -> Attachment | None:
     loop = _loops.get(id(data))
-    if loop is None and _followers:
-        return next((follower for follower in tuple(_followers) if follower.follow(model, data)), None)
+    if loop is None:
+        return next((other for other in tuple(_loops.values()) if other.follow(model, data)), None)
     return loop
 
 
@@ -55,7 +76,7 @@ def _make_wrappers() -> None:
 
     @functools.wraps(step)
     def mj_step(m: Any, d: Any, nstep: int = 1) -> None:
-        loop = _loops.get(id(d)) if not _followers else _find_loop(m, d)
+        loop = _find_loop(m, d)
         if loop is None:
             return step(m, d, nstep)
         for _ in range(nstep):
@@ -64,7 +85,7 @@ def _make_wrappers() -> None:
 
     @functools.wraps(step2)
     def mj_step2(m: Any, d: Any) -> None:
-        loop = _loops.get(id(d)) if not _followers else _find_loop(m, d)
+        loop = _find_loop(m, d)
         return step2(m, d) if loop is None else loop.step(m, d, step2)
 
     _wrappers.update(mj_step=mj_step, mj_step2=mj_step2)
@@ -73,16 +94,10 @@ def _make_wrappers() -> None:
 _make_wrappers()
 
 
-def add_loop(loop: Attachment, data: Any, *, follows: bool) -> None:
-    """Wrap the steps of `data` from now on.
+def add_loop(loop: Attachment, data: Any) -> None:
+    """Let `loop` take the steps of `data` from now on, and ask it about those of data that no session has.
 
-    Args:
-        loop: Takes the steps.
-        data: The `MjData`.
-        follows: Ask `loop` about steps of other data, too.
-
-    Raises:
-        OwnershipError: A session is attached to this data already.
+    Raises `OwnershipError` when a session is attached to this data already.
     """
     with _lock:
         if id(data) in _loops:
@@ -90,8 +105,6 @@ def add_loop(loop: Attachment, data: Any, *, follows: bool) -> None:
         if not _loops:
             _replace(_originals, _wrappers)
         _loops[id(data)] = loop
-        if follows:
-            _followers.append(loop)
 
 
 def move_loop(loop: Attachment, data: Any) -> None:
@@ -107,8 +120,6 @@ def remove_loop(loop: Attachment) -> None:
     with _lock:
         for key in [key for key, other in _loops.items() if other is loop]:
             del _loops[key]
-        if loop in _followers:
-            _followers.remove(loop)
         if not _loops:
             _replace(_wrappers, _originals)
 
@@ -126,36 +137,13 @@ def _replace(old: dict[str, Callable[..., None]], new: dict[str, Callable[..., N
                     setattr(module, name, by_id[id(value)])
 
 
-def _forget_parent() -> None:
-    _loops.clear()
-    _followers.clear()
+os.register_at_fork(after_in_child=_loops.clear)
 
 
-os.register_at_fork(after_in_child=_forget_parent)
-
-
-def find_simulation(environment: Any) -> tuple[Any, Any] | None:
-    """Return the `MjModel` and `MjData` of an environment now, `None` when it shows none.
-
-    Known are objects with `model` and `data`, and those that wrap them: Gymnasium (`unwrapped`), robosuite (`sim`,
-    whose model and data are wrapped again) and dm_control (`physics`, `model.ptr`).
-    """
-    for path in ("", "unwrapped", "sim", "physics", "unwrapped.sim", "unwrapped.physics", "env.sim", "env.physics"):
-        owner = environment
-        for name in path.split(".") if path else ():
-            owner = getattr(owner, name, None)
-        model = _unwrap(getattr(owner, "model", None), mujoco.MjModel)
-        data = _unwrap(getattr(owner, "data", None), mujoco.MjData)
-        if model is not None and data is not None:
-            return model, data
-    return None
-
-
-def _unwrap(value: Any, kind: Any) -> Any:
-    for found in (value, getattr(value, "ptr", None), getattr(value, "_model", None), getattr(value, "_data", None)):
-        if isinstance(found, kind):
-            return found
-    return None
+def is_alike(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
+    """Return whether two models are of one world: most of their bodies have the same names."""
+    names = [set(list_element_names(model, "body")) - {"", "world"} for model in (a, b)]
+    return len(names[0] & names[1]) > ALIKE * len(names[0] | names[1])
 
 
 class EnvironmentStep:
@@ -194,13 +182,16 @@ class EnvironmentStep:
 
 
 class Attachment:
-    """Takes a session tick around every step of one model and data, and follows its environment to others.
+    """Lets a session see every step of one model and data, and follows the program to others.
+
+    While a participant drives, every step is a tick of the session. Otherwise the session looks at the state after a
+    step when that is due, in an environment at the end of its step.
 
     Args:
         loop: The session in the user's loop.
         environment: Object that owns the simulation, `None` when the script calls MuJoCo itself.
         step: Name of the environment's method.
-        change_model: Called with another model and data that the environment has built.
+        change_model: Called with another model and data that the program has built.
     """
 
     def __init__(self, loop: UserLoop, environment: Any, step: str, change_model: Callable[[Any, Any], None]) -> None:
@@ -209,11 +200,20 @@ class Attachment:
         self._change_model = change_model
         self._is_stepping = False
         self._ticks = 0
+        #: Session time at which the environment's step began, `None` outside of it.
+        self._environment_began_ns: int | None = None
         #: The environment advances its data by functions that are not wrapped: then its step is the tick.
         self._is_opaque = False
         self._environment_step: EnvironmentStep | None = None
+        self._thread: int | None = None  # that steps the data
+        #: Steps of other data since the newest one of ours: session time of the first and of the newest.
+        self._other_since_ns: int | None = None
+        self._other_ns = 0
+        #: Other data that is not followed, by its identity, and when that is decided again.
+        self._refused: tuple[int, int] = (0, 0)
+        self._has_warned = False
         loop.is_attached = True
-        add_loop(self, loop.data, follows=environment is not None)
+        add_loop(self, loop.data)
         if environment is not None:
             try:
                 self._environment_step = EnvironmentStep(environment, step, self._around_step)
@@ -222,47 +222,87 @@ class Attachment:
                 raise
 
     def step(self, model: Any, data: Any, advance: Callable[..., None]) -> None:
-        """Take a tick around `advance(model, data)`."""
+        """Take `advance(model, data)` into the session."""
         if self._is_stepping:  # MuJoCo calls back into Python, which steps: that is no tick of its own
             advance(model, data)
             return
         self._ticks += 1
+        self._thread, self._other_since_ns = threading.get_ident(), None
+        self._take_step(lambda: advance(model, data), 1)
+
+    def _take_step(self, advance: Callable[[], Any], n_ticks: int) -> Any:
+        """Call `advance` as a tick of the session when it drives; else look at what it has done, when that is due."""
+        loop = self._loop
         self._is_stepping = True
         try:
-            self._loop.begin_tick(1)
-            advance(model, data)
-            self._loop.end_tick()
+            if loop.is_driving:
+                loop.begin_tick(n_ticks)
+                result = advance()
+                loop.end_tick()
+                return result
+            began_ns, began_time = loop.read_clock(), float(loop.data.time)
+            result = advance()
+            loop.note_step(began_ns, began_time)
+            since_ns = self._environment_began_ns
+            if since_ns is None or loop.read_clock() - since_ns > LONG_STEP_NS:
+                loop.look()
+            return result
         finally:
             self._is_stepping = False
 
     def follow(self, model: Any, data: Any) -> bool:
-        """Return whether `data` is what the environment simulates; go on with it when it is new."""
-        if data is self._loop.data:
-            return True
-        found = find_simulation(self._environment)
-        if found is None or found[1] is not data:
+        """Return whether the program goes on with `data` instead, which it is about to step; then do so, too."""
+        if self._thread not in (None, threading.get_ident()):
+            return False
+        self._other_ns = now_ns = self._loop.read_clock()
+        if self._other_since_ns is None:
+            self._other_since_ns = now_ns
+        if self._refused[0] == id(data) and now_ns < self._refused[1]:
+            return False
+        if not self._is_successor(model, data, now_ns - self._other_since_ns):
+            self._refused = id(data), now_ns + ASK_AGAIN_NS
+            if self.list_warnings() and not self._has_warned:
+                self._has_warned = True
+                _log.warning("%s", ELSEWHERE)
             return False
         self._change_model(model, data)
         move_loop(self, data)
+        self._other_since_ns = None
         return True
 
+    def _is_successor(self, model: Any, data: Any, stands_ns: int) -> bool:
+        """Return whether the program has replaced the attached data by `data`, having left ours for `stands_ns`."""
+        if self._environment is not None:
+            found = find_simulation(self._environment)
+            return found is not None and found.data is data
+        if sys.getrefcount(self._loop.data) <= OWN_REFERENCES:
+            return True
+        return stands_ns > FOLLOW_AFTER_NS and model is not self._loop.model and is_alike(model, self._loop.model)
+
+    def list_warnings(self) -> tuple[str, ...]:
+        """Return what the owner should know, one line each."""
+        since_ns = self._other_since_ns
+        is_elsewhere = self._environment is None and since_ns is not None and self._other_ns - since_ns > WARN_AFTER_NS
+        return (ELSEWHERE,) if is_elsewhere else ()
+
     def _around_step(self, original: Callable[[], Any]) -> Any:
-        """Take a tick around the environment's step, unless wrapped functions are called in it."""
+        """Take the environment's step into the session, unless wrapped functions are called in it."""
         found = find_simulation(self._environment)
-        if found is not None and found[1] is not self._loop.data:
+        if found is not None and found.data is not None and found.data is not self._loop.data:
             self.follow(*found)
-        if self._is_stepping or not self._is_opaque:
-            ticks, before = self._ticks, self._loop.data.time
-            result = original()
-            self._is_opaque = self._ticks == ticks and self._loop.data.time > before
-            return result
-        self._is_stepping = True
+        if self._is_stepping or self._environment_began_ns is not None:
+            return original()
+        if self._is_opaque:
+            return self._take_step(original, 0)
+        ticks, before = self._ticks, self._loop.data.time
+        self._environment_began_ns = self._loop.read_clock()
         try:
-            self._loop.begin_tick()
             result = original()
-            self._loop.end_tick()
         finally:
-            self._is_stepping = False
+            self._environment_began_ns = None
+        self._is_opaque = self._ticks == ticks and self._loop.data.time > before
+        if not self._loop.is_driving:
+            self._loop.look()
         return result
 
     def close(self) -> None:

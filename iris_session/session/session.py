@@ -9,7 +9,7 @@
             mujoco.mj_step(model, data)
             session.end_tick()
 
-    session = Session.attach(model, data)      # one line in an existing script: every mj_step of data is a tick
+    session = Session.attach(model, data)      # one line in an existing script: its steps of data are the session's
 
 The process that makes the `Session` is the authority. Front and recorder are child processes, which are restarted when
 they die (`session.processes`).
@@ -26,19 +26,20 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import mujoco
 
 from iris_session.journal.environment import use_one_blas_thread
 from iris_session.physics import Pacer, PacerStats, load_model
 from iris_session.physics.load import compute_scene_hash, encode_model
+from iris_session.physics.names import list_body_names
 from iris_session.protocol.client_messages import Assign, Control, EStop, SetScale
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec
-from iris_session.session.attachment import Attachment, find_simulation
+from iris_session.session.attachment import Attachment
 from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots, check_timestep
 from iris_session.session.core import SessionCore, make_session_core, read_plant_state
 from iris_session.session.errors import ConfigError, OwnershipError
@@ -47,6 +48,7 @@ from iris_session.session.resume import prepare_session
 from iris_session.session.robots import FixedChoice, RobotChoice, choose_again, choose_robots, fix_choice
 from iris_session.session.scene_change import adopt_timestep, prepare_scene
 from iris_session.session.session_base import SessionBase
+from iris_session.session.simulation import copy_state, require_simulation, unwrap_data, unwrap_model
 from iris_session.session.status import DataFault
 from iris_session.session.stepper import (
     MAX_HOST_ENTRIES,
@@ -109,6 +111,7 @@ class Session(SessionBase):
         self._past, self.config, scene = prepare_session(config, model, data, robots, objects)
         self.model, self.robots, self.objects, self._robot_notices = scene
         self._robot_choice: FixedChoice = None
+        self._object_choice: tuple[ObjectSpec, ...] | None = None  # of an attached program
         self.data = data
         self.origin_ns = time.monotonic_ns() if self._past is None else self._past.origin_ns
         self.clock = make_session_clock(self.origin_ns)
@@ -310,6 +313,30 @@ class Session(SessionBase):
         with self._hold_steps():
             return {} if self._core is None else dict(self._core.controller.get_targets())
 
+    def sync(self, data: Any) -> None:
+        """Show the state of a simulation that steps outside of Python's MuJoCo: MJX, another process, a real robot.
+
+        Call it after each of its steps. It is copied into `session.data`, where `ctrl` then has what participants
+        command for the robots in `driven_robots()`, and the simulation's own values for all others.
+
+        Args:
+            data: Any object with `qpos`, shape (nq,), and what else it knows of `time` [s], `qvel`, `act`, `ctrl`,
+                `mocap_pos`, `mocap_quat`, as arrays of NumPy or JAX. A state of MuJoCo Playground has it in `.data`.
+
+        Raises:
+            OwnershipError: The session is closed, or has no `data`, or is driven by `run()`.
+            PublishError: The arrays are not those of the model.
+        """
+        loop = self._require_user_loop()
+        began_ns, began_time = loop.read_clock(), float(loop.data.time)
+        copy_state(data, loop.data)
+        if loop.is_driving:
+            loop.begin_tick()
+            loop.end_tick()
+        else:
+            loop.note_step(began_ns, began_time)
+            loop.look()
+
     @classmethod
     def attach(
         cls,
@@ -320,23 +347,27 @@ class Session(SessionBase):
         environment: object = None,
         step: str = "step",
         robots: RobotChoice = None,
+        objects: Sequence[ObjectSpec] | None = None,
     ) -> Self:
-        """Share a script's own simulation: every `mj_step(model, data)` after this line is one tick of the session.
+        """Share a script's own simulation: every `mj_step(model, data)` after this line is seen by the session.
 
         `mujoco.mj_step` and `mj_step2` are wrapped, in every module that uses them, and act as before on all other
-        data. Models and data that the script makes meanwhile are not touched. Time that goes back is a reset. The
-        session ends with `close()`, or with the script.
+        data. Models and data that the script makes meanwhile are not touched. Time that goes back is a reset. While a
+        participant drives, every step is a tick of the session; otherwise the state is looked at as often as it is
+        published. The session ends with `close()`, or with the script.
 
         Args:
-            model: The model that the script simulates; `None` for that of `environment`.
+            model: The model that the script simulates; `None` for that of `environment`. Bindings of dm_control and
+                robosuite are accepted, too.
             data: The data that the script advances; `None` for that of `environment`.
             config: Settings; `None` for the defaults.
             environment: Object that owns the simulation: a Gymnasium, robosuite or dm_control environment or physics,
                 or any object with `model` and `data`. The session follows it to the model and data that it builds at a
                 reset. Its step is a tick by itself where it does not call MuJoCo's functions in Python.
             step: Name of its method that advances the simulation.
-            robots: As of `Session`. The choice holds for models that `environment` builds at a reset, too; what one of
-                them lacks is in `notes`.
+            robots: As of `Session`. The choice holds for models that are built at a reset, too; what one of them lacks
+                is in `notes`.
+            objects: As of `Session`.
 
         Returns:
             The started session.
@@ -346,21 +377,25 @@ class Session(SessionBase):
             ConfigError: No model and data are given, and `environment` shows none.
             StartError: A port is in use, a folder cannot be written, a key is missing.
         """
+        model, data = unwrap_model(model) or model, unwrap_data(data) or data
         if model is None or data is None:
-            found = find_simulation(environment)
-            if found is None:
+            if environment is None:
+                raise ConfigError("attach: no model and data are given: Session.attach(model, data)")
+            model, data = require_simulation(environment)
+            if data is None:
                 kind = type(environment).__name__
-                raise ConfigError(f"attach: no MjModel and MjData in {kind}: give model and data, too")
-            model, data = found
+                raise ConfigError(f"attach: {kind} has no MjData: use share(environment), and sync(data) after steps")
         if environment is not None and not callable(getattr(environment, step, None)):
             raise OwnershipError(f"environment of type {type(environment).__name__} has no method {step!r} to wrap")
         robots = check_robots(robots)
-        session = cls(model, data, config, robots=robots)
+        session = cls(model, data, config, robots=robots, objects=objects)
         try:
             session._robot_choice = fix_choice(model, robots, session.config.control)
+            session._object_choice = None if objects is None else session.objects
             session.start()
             loop = session._require_user_loop()
             session._attachment = Attachment(loop, environment, step, session._change_model)
+            session.processes.reporter.warning_sources.append(session._attachment.list_warnings)
         except BaseException:
             session.close()
             raise
@@ -375,7 +410,11 @@ class Session(SessionBase):
             if compute_scene_hash(encode_model(model)) == stepper.core.world.scene_hash:
                 return None
             found = choose_again(model, self._robot_choice, self.config.control)
-            scene = prepare_scene(stepper.core, scenes, model, state, found, None)
+            objects = self._object_choice
+            if objects is not None:
+                bodies = list_body_names(model)
+                objects = tuple(spec for spec in objects if spec.body in bodies)
+            scene = prepare_scene(stepper.core, scenes, model, state, found, objects)
             if scene.notices != self._robot_notices:
                 self._robot_notices = scene.notices
                 self._log_robot_notices()

@@ -18,6 +18,9 @@ and e-stops go on while a script plots, trains or waits at a prompt.
 
 What one step computes is applied until the next `begin_tick`, however many `mj_step` lie between: control counts the
 ticks of the rounds before, so that robots keep their speed. At the end robots that are driven are left at rest.
+
+While nobody drives, an attached program is only looked at: `note_step` after each of its steps costs a microsecond, and
+`look` takes a session step at the rate of the state, on the state after the program's newest step.
 """
 
 from __future__ import annotations
@@ -165,6 +168,53 @@ class UserLoop:
     def data(self) -> mujoco.MjData:
         """The data that the user advances now."""
         return self._data
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model of `data`."""
+        return self._model
+
+    @property
+    def is_driving(self) -> bool:
+        """Whether the session writes something, so that every step of the program must be a tick."""
+        return bool(self._ctrl.indices.size or self._forces.indices.size or self.driven)
+
+    def read_clock(self) -> int:
+        """Return session time [ns]."""
+        return self._stepper.clock()
+
+    def note_step(self, began_ns: int, began_time: float) -> None:
+        """Note a step of the program during which the session drove nothing.
+
+        Args:
+            began_ns: Session time at which it began.
+            began_time: Time of the data then [s].
+        """
+        time = float(self._data.time)
+        if began_time < self._last_time or time < began_time:
+            self.reset()
+        elif self._last_time >= 0.0:
+            self.unseen_s += began_time - self._last_time
+        self._last_time = time
+        self._last_tick_ns = now_ns = self._stepper.clock()
+        self._usual_ns, self._round_ns = max(self._round_ns, 1), now_ns - began_ns
+
+    def look(self) -> None:
+        """Take a session step on the data as it is, if the state is due. While nothing is driven."""
+        if not (self._was_reset or self._stepper.last is None or self._stepper.is_state_due(self._last_tick_ns)):
+            return
+        with self.lock:
+            self._require_open()
+            if self._read_plant():
+                self._post_reset()
+                self._began_time = None
+                self._left = {}
+                self._stepper.step(1, self._plant)
+                self._write_controls()
+            else:
+                self._stepper.step(0, self._plant)
+            self._processes.supervise(self._stepper)
+            self._last_tick_ns = self._stepper.clock()
 
     def begin_tick(self, n_ticks: int = 0) -> None:
         """One step: writes `ctrl` (and wrenches on hand-held objects) into the user's data. Ends a tick that began.

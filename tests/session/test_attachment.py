@@ -16,10 +16,11 @@ from iris_session import ConfigError, OwnershipError, Session
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import load_model
 from iris_session.protocol.server_messages import SceneChanged
-from iris_session.session.attachment import STEP_FUNCTIONS, Attachment, find_simulation
+from iris_session.session.attachment import STEP_FUNCTIONS, Attachment
 from tests.rig.owned import keep_journal
-from tests.session.loops import Rig
+from tests.session.loops import Agent, Rig
 from tests.session.test_session import QUIET
+from tests.session.test_stepper import MS
 
 ORIGINALS = {name: getattr(mujoco, name) for name in STEP_FUNCTIONS}
 
@@ -38,12 +39,17 @@ def _no_trace() -> Iterator[None]:
 
 
 class Attached:
-    """A loop without processes whose data is attached."""
+    """A loop without processes whose data is attached, and a program so slow that a state is due after every step."""
 
     def __init__(self, model: mujoco.MjModel | None = None) -> None:
         self.rig = Rig(model)
+        self.rig.stepper.clock = self.read_clock
         self.model, self.data = self.rig.model, self.rig.data
         self.attachment = Attachment(self.rig.loop, None, "step", lambda model, data: None)
+
+    def read_clock(self) -> int:
+        self.rig.now_ns += 10 * MS
+        return self.rig.now_ns
 
     @property
     def counts(self) -> list[int]:
@@ -203,15 +209,21 @@ class Environment:
         return "observation"
 
 
+def look_after_every_step(session: Session) -> list[int]:
+    """Makes the state always due, and collects `n_ticks` of the session's steps from here on."""
+    session.stepper.is_state_due = lambda end_ns: True  # type: ignore[method-assign]
+    return count_rounds(session)
+
+
 @pytest.mark.usefixtures("simulation")
 def test_an_environment_is_followed_to_the_model_that_it_builds_at_a_reset() -> None:
     environment = Environment()
     session = Session.attach(environment=environment, config=QUIET)
     try:
         journal = keep_journal(session.stepper)
-        counts = count_rounds(session)
+        counts = look_after_every_step(session)
         assert environment.step() == "observation"
-        assert counts == [1] * 5
+        assert counts == [1], "the state at the end of its step is looked at, not that of the first of many in it"
         environment.reset()  # the same model, compiled again
         environment.step()
         assert [e.body.cause for e in session.recent_events() if isinstance(e.body, SceneChanged)] == ["external"]
@@ -223,47 +235,158 @@ def test_an_environment_is_followed_to_the_model_that_it_builds_at_a_reset() -> 
         assert session.data is environment.data
         for _ in range(10):
             environment.step()
-        assert len(counts) == 65
+        assert len(counts) == 13
         other = mujoco.MjData(environment.model)
         mujoco.mj_step(environment.model, other)
-        assert len(counts) == 65
-        assert session.status().sim_time == pytest.approx(environment.data.time, abs=0.05)
+        assert len(counts) == 13
+        assert session.status().sim_time == pytest.approx(environment.data.time)
     finally:
         session.close()
     assert "step" not in vars(environment)
-    assert journal.verify() >= 65
+    assert journal.verify() >= 13
 
 
 @pytest.mark.usefixtures("simulation")
-def test_the_step_of_an_environment_that_is_not_seen_through_is_the_tick() -> None:
+def test_the_step_of_an_environment_that_is_not_seen_through_is_looked_at() -> None:
     environment = Environment(advance=functools.partial(ORIGINALS["mj_step"]))
     session = Session.attach(environment.model, environment.data, QUIET, environment=environment)
     try:
-        counts = count_rounds(session)
-        environment.step()  # here the session learns it
+        counts = look_after_every_step(session)
         for _ in range(4):
             environment.step()
-        assert counts == [1, 5, 5, 5]
+        assert counts == [1] * 4
+        assert session.status().sim_time == pytest.approx(environment.data.time)
     finally:
         session.close()
     environment.step()
     assert len(counts) == 4
 
 
-def test_shapes_of_known_environments_are_found(model: mujoco.MjModel) -> None:
+def test_while_nobody_drives_the_program_is_looked_at_at_the_rate_of_the_state() -> None:
+    attached = Attached()
+    rig = attached.rig
+    rig.stepper.clock = lambda: rig.now_ns
+    rig.stepper._state_period_ns = 16 * MS
+    try:
+        for _ in range(400):
+            rig.now_ns += 2 * MS
+            mujoco.mj_step(attached.model, attached.data)
+        assert attached.counts == [1] * 51, "the first step, and every 16 ms"
+        assert len(rig.front.states) == 51
+        assert rig.front.states[-1].sim_time == pytest.approx(0.8, abs=0.016)
+        assert rig.loop.list_warnings() == ()
+    finally:
+        attached.close()
+
+
+@pytest.mark.parametrize("is_opaque", [False, True])
+def test_while_someone_drives_every_step_is_a_tick(is_opaque: bool) -> None:
+    """An environment whose steps are not seen through gives as many ticks as its step had."""
+    rig = Rig()
+    rig.stepper._state_period_ns = 16 * MS
+    advance = functools.partial(ORIGINALS["mj_step"]) if is_opaque else mujoco.mj_step
+    environment = types.SimpleNamespace(model=rig.model, data=rig.data)
+    attachment = None
+
+    def step() -> None:
+        for _ in range(5):
+            (advance if is_opaque else mujoco.mj_step)(rig.model, rig.data)
+
+    def round_(steps: int = 1) -> None:
+        rig.now_ns += 10 * MS
+        environment.step()
+
+    environment.step = step
+    try:
+        attachment = Attachment(rig.loop, environment, "step", lambda model, data: None)
+        rig.round = round_  # type: ignore[method-assign]
+        ann = Agent(rig)
+        rig.rounds(4)
+        ann.acquire()
+        ann.engage(0.04)
+        assert rig.loop.is_driving
+        before = len(rig.recorder.rows)
+        rig.rounds(3)
+        counts = [row.n_ticks for row in rig.recorder.rows[before:] if row.n_ticks]
+        assert counts == ([5] * 3 if is_opaque else [1] * 15)
+        assert rig.loop.overwritten == 0
+        ann.release()
+        rig.rounds(60)
+        assert not rig.loop.is_driving
+        before = len(rig.recorder.rows)
+        rig.rounds(16)
+        assert sum(row.n_ticks for row in rig.recorder.rows[before:]) == 10, "16 steps of 10 ms, a look each 16 ms"
+    finally:
+        if attachment is not None:
+            attachment.close()
+        rig.loop.close()
+
+
+# --- other data -------------------------------------------------------------------------------------------------------
+
+
+class Followed(Attached):
+    """A program that is attached without its environment, as the rig's session follows it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rig.stepper.clock = lambda: self.rig.now_ns
+        self.found: list[Any] = []
+        self.attachment._change_model = self.change_model  # type: ignore[method-assign]
+
+    def change_model(self, model: Any, data: Any) -> None:
+        self.found.append(data)
+        self.rig.loop.change_model(model, data, lambda state: None)
+
+    def step(self, model: Any, data: Any, seconds: float) -> None:
+        for _ in range(round(seconds * 100)):
+            self.rig.now_ns += 10 * MS
+            mujoco.mj_step(model, data)
+
+
+@pytest.fixture
+def followed() -> Iterator[Followed]:
+    followed = Followed()
+    yield followed
+    followed.close()
+
+
+def test_data_that_the_program_has_thrown_away_is_followed_by_the_next(followed: Followed) -> None:
+    followed.step(followed.model, followed.data, 0.1)
+    followed.rig.now_ns += 10 * MS
+    del followed.data
+    followed.rig.data = None  # type: ignore[assignment]
+    held = followed.rig.loop.data  # as the session holds it, too
+    anew = make_data(followed.model)
+    mujoco.mj_step(followed.model, anew)
+    assert followed.found == [anew]
+    assert followed.rig.loop.data is anew
+    del held
+
+
+def test_a_world_that_is_built_anew_is_followed_although_the_old_one_is_kept(followed: Followed) -> None:
+    followed.step(followed.model, followed.data, 0.1)
+    model = load_model(scene_path("handover"))
     data = make_data(model)
-    space = types.SimpleNamespace
-    plain = space(model=model, data=data)
-    for environment in (
-        plain,
-        space(unwrapped=plain),
-        space(sim=space(model=space(_model=model), data=space(_data=data))),
-        space(env=space(sim=plain)),
-        space(physics=space(model=space(ptr=model), data=space(ptr=data))),
-    ):
-        assert find_simulation(environment) == (model, data)
-    assert find_simulation(space(model=1, data=2)) is None
-    assert find_simulation(None) is None
+    followed.step(model, data, 0.2)
+    assert followed.found == []
+    followed.step(model, data, 0.2)
+    assert followed.found == [data]
+    assert followed.changes() == 1
+    assert followed.attachment.list_warnings() == ()
+
+
+def test_copies_that_a_planner_steps_are_not_followed_and_a_warning_says_so(followed: Followed) -> None:
+    followed.step(followed.model, followed.data, 0.1)
+    copy_, other = make_data(followed.model), mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
+    followed.step(followed.model, copy_, 0.4)
+    assert followed.attachment.list_warnings() == ()
+    followed.step(other, mujoco.MjData(other), 0.4)
+    assert followed.found == []
+    (warning,) = followed.attachment.list_warnings()
+    assert "share(env)" in warning
+    followed.step(followed.model, followed.data, 0.1)
+    assert followed.attachment.list_warnings() == (), "the attached data goes on"
 
 
 def test_what_cannot_be_attached_is_refused(model: mujoco.MjModel) -> None:

@@ -1,0 +1,96 @@
+"""`share`: a session of whatever a researcher has at hand, in one line."""
+
+from __future__ import annotations
+
+import atexit
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import mujoco
+
+from iris_session.control.config import OUTPUT_CTRL, OUTPUT_TARGETS
+from iris_session.protocol.specs import ObjectSpec
+from iris_session.session.config import SessionConfig
+from iris_session.session.errors import ConfigError
+from iris_session.session.robots import RobotChoice
+from iris_session.session.session import Session
+from iris_session.session.simulation import require_simulation, unwrap_data, unwrap_model
+
+#: How participants drive, and the output of control that this means.
+DRIVES = {"ctrl": OUTPUT_CTRL, "action": OUTPUT_TARGETS}
+
+
+def share(
+    x: Any,
+    data: Any = None,
+    config: SessionConfig | None = None,
+    *,
+    robots: RobotChoice = "auto",
+    objects: Sequence[ObjectSpec] | None = None,
+    drive: str = "ctrl",
+    step: str = "step",
+) -> Session:
+    """Share a MuJoCo program or a model file: participants see it, and drive the robots that are found in it.
+
+    The program stays as it is, and so does its trajectory while nobody drives. A robot about which something is unclear
+    is shown all the same, and `session.notes` has the lines for a robots file with which it can be driven.
+
+        session = iris_session.share("panda.xml");  session.run()    # a model file, or an MjModel: in our loop
+        session = iris_session.share(model, data)                    # your own loop, unchanged
+        session = iris_session.share(env)                            # an environment, unchanged
+
+    Args:
+        x: The path of a model file, an `MjModel`, or an environment that simulates with MuJoCo: of Gymnasium,
+            dm_control (its physics, too), robosuite, LIBERO, Meta-World, OGBench, MyoSuite, gym-aloha, LeRobot. For
+            what steps outside of Python's MuJoCo (MuJoCo Playground, MJX), call `session.sync(data)` after its steps.
+        data: With an `MjModel`: the data that your loop advances. `None`: the session simulates, by `session.run()`.
+        config: Settings; `None` for the defaults.
+        robots: `auto` finds them, `none` offers none; or names of robots found, the path of a robots file, or
+            specifications.
+        objects: Free bodies that robots and hands can take; `None` finds them in the model.
+        drive: `ctrl`: the session writes `data.ctrl` of the robots that participants drive. `action`: it writes
+            nothing; your program asks for the action with `session.action(action)` or for `session.targets()`.
+        step: Name of the environment's method that advances the simulation.
+
+    Returns:
+        The started session, which is a context manager. It ends with `close()`, or with the program.
+
+    Raises:
+        ModelNotFoundError, ModelInvalidError: The file is missing, or MuJoCo does not compile it.
+        ConfigError: `x` has no MuJoCo model, or an argument cannot be used.
+        OwnershipError: A session shares this data already.
+        StartError: A port is in use, a folder cannot be written, a key is missing.
+    """
+    if drive not in DRIVES:
+        raise ConfigError(f"drive is {drive!r}; it must be one of {', '.join(map(repr, DRIVES))}")
+    config = config or SessionConfig()
+    if config.control.output != DRIVES[drive]:
+        config = dataclasses.replace(config, control=msgspec.structs.replace(config.control, output=DRIVES[drive]))
+    if isinstance(x, str | os.PathLike):
+        return _start(Session(Path(x).expanduser(), None, config, robots=robots, objects=objects))
+    model = unwrap_model(x)
+    if model is not None:
+        if data is None:
+            return _start(Session(model, None, config, robots=robots, objects=objects))
+        return Session.attach(model, unwrap_data(data) or data, config, robots=robots, objects=objects)
+    if data is not None:
+        raise ConfigError(f"data is given with {type(x).__name__}: give it with an MjModel, as in share(model, data)")
+    model, found = require_simulation(x)
+    if found is None:
+        found = mujoco.MjData(model)
+        if model.nkey:
+            mujoco.mj_resetDataKeyframe(model, found, 0)
+        session = _start(Session(model, found, config, robots=robots, objects=objects))
+        session.sync(found)  # from here on participants can join
+        return session
+    return Session.attach(model, found, config, environment=x, step=step, robots=robots, objects=objects)
+
+
+def _start(session: Session) -> Session:
+    session.start()
+    atexit.register(session.close)  # a script may simply end
+    return session
