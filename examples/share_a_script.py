@@ -2,7 +2,7 @@
 
     python examples/share_a_script.py            then, elsewhere: iris-session emulate --behaviour wander
 
-Each `mj_step` is one tick of the session. The recording is of class `open`: physics belongs to the script.
+The recording is of class `open`: physics belongs to the script.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import time
 
 import mujoco
 
-from iris_session import Session, scene_path
+import iris_session
 
 
 def main(seconds: float) -> None:
-    model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+    model = mujoco.MjModel.from_xml_path(str(iris_session.scene_path("handover")))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    session = Session.attach(model, data)  # the one line
+    session = iris_session.share(model, data)  # the one line
     print(f"join at {session.address}", flush=True)
     begun = time.monotonic()
     while data.time < seconds:

@@ -26,7 +26,7 @@ _STATE: Final = ("time", "qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat
 
 
 class Simulation(NamedTuple):
-    """What an environment simulates. `data` is `None` where it is advanced outside of Python's MuJoCo (MJX)."""
+    """Model and data of an environment. `data` is `None` where it is advanced outside of Python's MuJoCo (MJX)."""
 
     model: mujoco.MjModel
     data: mujoco.MjData | None

@@ -19,8 +19,8 @@ and e-stops go on while a script plots, trains or waits at a prompt.
 What one step computes is applied until the next `begin_tick`, however many `mj_step` lie between: control counts the
 ticks of the rounds before, so that robots keep their speed. At the end robots that are driven are left at rest.
 
-While nobody drives, an attached program is only looked at: `note_step` after each of its steps costs a microsecond, and
-`look` takes a session step at the rate of the state, on the state after the program's newest step.
+While no participant drives, an attached program is only looked at: `note_step` after each of its steps costs a
+microsecond, and `look` takes a session step at the rate of the state, on the state after the program's newest step.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class UserLoop:
 
     @property
     def is_driving(self) -> bool:
-        """Whether the session writes something, so that every step of the program must be a tick."""
+        """True while the session writes something, so that every step of the program must be a tick."""
         return bool(self._ctrl.indices.size or self._forces.indices.size or self.driven)
 
     def read_clock(self) -> int:
@@ -321,7 +321,7 @@ class UserLoop:
         unseen_s = self.unseen_s + (float(self._data.time) if self._last_time < 0.0 else 0.0)
         if self.is_attached and unseen_s > UNSEEN_S:
             found.append(
-                f"{unseen_s:.1f} s were simulated outside of the session's ticks: give attach() the environment"
+                f"{unseen_s:.1f} s were simulated outside of the session's ticks: share the environment, as share(env)"
             )
         return tuple(found)
 

@@ -20,9 +20,9 @@ from tests.session.test_session import QUIET
 
 Space = types.SimpleNamespace
 UNCLEAR_ARM = """<mujoco><worldbody><body name="arm"><joint name="a"/><geom size=".1"/><body name="b" pos=".3 0 0">
-<joint name="b" axis="0 1 0"/><geom size=".1"/><body name="c" pos=".3 0 0"><joint name="c" axis="0 1 0"/><geom size=".1"/>
-</body></body></body></worldbody><actuator><general joint="a" biastype="user"/><general joint="b" biastype="user"/>
-<general joint="c" biastype="user"/></actuator></mujoco>"""
+<joint name="b" axis="0 1 0"/><geom size=".1"/><body name="c" pos=".3 0 0"><joint name="c" axis="0 1 0"/>
+<geom size=".1"/></body></body></body></worldbody><actuator><general joint="a" biastype="user"/>
+<general joint="b" biastype="user"/><general joint="c" biastype="user"/></actuator></mujoco>"""
 
 
 @pytest.fixture
