@@ -51,6 +51,7 @@ _BENCHMARKS: Final = {
     "join": _Benchmark(
         {**_CLIENTS, "objects": (1, 2000), "assets_mb": (1, 2000)}, _BOTH, "its bars are for plain loopback"
     ),
+    "share": _Benchmark({}, _BOTH, "its bars are for plain loopback"),
     "stop": _Benchmark({}, _BOTH, "it uses no network"),
     "hands": _Benchmark({}, _BOTH, "it uses no network"),
     "csharp": _Benchmark({**_BODIES, "points": (1000, 1_000_000)}, _BOTH, "it uses no network"),

@@ -146,8 +146,8 @@ def is_alike(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
     return len(names[0] & names[1]) > ALIKE * len(names[0] | names[1])
 
 
-class EnvironmentStep:
-    """The step method of one environment, wrapped on the instance: `around` is called with the original.
+class WrappedMethod:
+    """A method of one environment, wrapped on the instance: `around` is called with the original.
 
     Raises `OwnershipError` for an environment whose attributes cannot be set.
     """
@@ -204,7 +204,7 @@ class Attachment:
         self._environment_began_ns: int | None = None
         #: The environment advances its data by functions that are not wrapped: then its step is the tick.
         self._is_opaque = False
-        self._environment_step: EnvironmentStep | None = None
+        self._wrapped: list[WrappedMethod] = []
         self._thread: int | None = None  # that steps the data
         #: Steps of other data since the newest one of ours: session time of the first and of the newest.
         self._other_since_ns: int | None = None
@@ -216,9 +216,11 @@ class Attachment:
         add_loop(self, loop.data)
         if environment is not None:
             try:
-                self._environment_step = EnvironmentStep(environment, step, self._around_step)
+                self._wrapped.append(WrappedMethod(environment, step, self._around_step))
+                if callable(getattr(environment, "reset", None)):
+                    self._wrapped.append(WrappedMethod(environment, "reset", self._around_reset))
             except BaseException:
-                remove_loop(self)
+                self.close()
                 raise
 
     def step(self, model: Any, data: Any, advance: Callable[..., None]) -> None:
@@ -301,13 +303,27 @@ class Attachment:
         finally:
             self._environment_began_ns = None
         self._is_opaque = self._ticks == ticks and self._loop.data.time > before
-        if not self._loop.is_driving:
-            self._loop.look()
+        self._look()
         return result
+
+    def _around_reset(self, original: Callable[[], Any]) -> Any:
+        """Show the environment's reset at once, not only with the step after it."""
+        began_ns, began_time = self._loop.read_clock(), float(self._loop.data.time)
+        result = original()
+        found = find_simulation(self._environment)
+        if found is not None and found.data is not None and found.data is not self._loop.data:
+            self.follow(*found)
+        else:
+            self._loop.note_step(began_ns, began_time)
+        self._look()
+        return result
+
+    def _look(self) -> None:
+        if not self._loop.is_driving and self._environment_began_ns is None and not self._is_stepping:
+            self._loop.look()
 
     def close(self) -> None:
         """Give the step back. May be called twice."""
         remove_loop(self)
-        if self._environment_step is not None:
-            self._environment_step.remove()
-            self._environment_step = None
+        while self._wrapped:
+            self._wrapped.pop().remove()

@@ -162,6 +162,9 @@ class UserLoop:
         self._ctrl, self._forces = _BorrowedArray(data.ctrl), _BorrowedArray(data.xfrc_applied)
         self._ctrl_at = mujoco.mj_stateSize(model, STATE & (_CTRL - 1))
         self._forces_at = mujoco.mj_stateSize(model, STATE & (_XFRC - 1))
+        #: State that was looked at and not due, which the helper thread shows when no other follows.
+        self._noted = np.empty(mujoco.mj_stateSize(model, STATE))
+        self._has_noted = False
         self._left: dict[str, Floats] = {}  # joints of driven robots after the newest round in which time passed
 
     @property
@@ -200,8 +203,14 @@ class UserLoop:
         self._usual_ns, self._round_ns = max(self._round_ns, 1), now_ns - began_ns
 
     def look(self) -> None:
-        """Take a session step on the data as it is, if the state is due. While nothing is driven."""
+        """Take a session step on the data as it is, if the state is due. While nothing is driven.
+
+        If it is not due, the helper thread shows this state should the program fall silent.
+        """
         if not (self._was_reset or self._stepper.last is None or self._stepper.is_state_due(self._last_tick_ns)):
+            with self.lock:
+                mujoco.mj_getState(self._model, self._data, self._noted, STATE)
+                self._has_noted = True
             return
         with self.lock:
             self._require_open()
@@ -400,6 +409,7 @@ class UserLoop:
         """Read the user's state with the owner's inputs; return False, and announce it once, while it is not finite."""
         state = np.empty(mujoco.mj_stateSize(self._model, STATE))
         mujoco.mj_getState(self._model, self._data, state, STATE)
+        self._has_noted = False
         self._ctrl.put_owner(state[self._ctrl_at :][: self._model.nu])
         self._forces.put_owner(state[self._forces_at :][: 6 * self._model.nbody].reshape(-1, 6))
         if not np.isfinite(state).all():
@@ -438,6 +448,8 @@ class UserLoop:
             return
         with self.lock:
             if self._stepper.clock() - self._last_tick_ns > IDLE_AFTER_NS and not self._closed.is_set():
+                if self._has_noted and not self._was_reset and np.isfinite(self._noted).all():
+                    self._plant, self._has_noted = self._noted.tobytes(), False
                 self._stepper.step(0, self._plant)
                 self._processes.supervise(self._stepper)
 

@@ -225,6 +225,7 @@ def test_an_environment_is_followed_to_the_model_that_it_builds_at_a_reset() -> 
         assert environment.step() == "observation"
         assert counts == [1], "the state at the end of its step is looked at, not that of the first of many in it"
         environment.reset()  # the same model, compiled again
+        assert session.data is environment.data, "shown before the step after it"
         environment.step()
         assert [e.body.cause for e in session.recent_events() if isinstance(e.body, SceneChanged)] == ["external"]
         environment.arms = 3
@@ -235,15 +236,15 @@ def test_an_environment_is_followed_to_the_model_that_it_builds_at_a_reset() -> 
         assert session.data is environment.data
         for _ in range(10):
             environment.step()
-        assert len(counts) == 13
+        assert len(counts) == 15, "a reset is looked at, too"
         other = mujoco.MjData(environment.model)
         mujoco.mj_step(environment.model, other)
-        assert len(counts) == 13
+        assert len(counts) == 15, "a reset is looked at, too"
         assert session.status().sim_time == pytest.approx(environment.data.time)
     finally:
         session.close()
     assert "step" not in vars(environment)
-    assert journal.verify() >= 13
+    assert journal.verify() >= 15
 
 
 @pytest.mark.usefixtures("simulation")
