@@ -78,8 +78,8 @@ def find_limbs(tree: KinematicTree) -> list[Limb]:
 
 
 def list_actuated(tree: KinematicTree, body: int) -> list[int]:
-    """Return the hinges and slides of a body that have an actuator of their own."""
-    return [j for j in tree.list_scalar_joints(body) if tree.actuators_of_joint[j]]
+    """Return the hinges and slides of a body that something drives."""
+    return [j for j in tree.list_scalar_joints(body) if tree.is_driven(j)]
 
 
 def _walk_chain(tree: KinematicTree, root: int, limbs: list[Limb]) -> None:

@@ -170,7 +170,8 @@ def _build_spec(
             notes["joints"] = f"left out: {'; '.join(problems)}"
     elif several:
         notes["actuators"] = f"one per joint; candidates: {_list_candidates(tree, joints)}"
-    actuators = () if "actuators" in notes else tuple(tree.actuators_of_joint[j][0] for j in joints)
+    is_pulled = tree.mocap_joints.issuperset(joints)
+    actuators = () if "actuators" in notes or is_pulled else tuple(tree.actuators_of_joint[j][0] for j in joints)
     fingers = Fingers(limb.fingers, len(limb.fingers), True) if is_hand else find_fingers(tree, limb.link)
     tip = find_end_effector(tree, limb.joints[-1], limb.link, fingers.roots)
     if tip.note:

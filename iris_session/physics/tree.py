@@ -15,6 +15,8 @@ _TRN_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPA
 _TRN_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _WRAP_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
 _EQ_JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
+_EQ_WELD = int(mujoco.mjtEq.mjEQ_WELD)
+_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 #: Geoms without a box.
@@ -54,6 +56,34 @@ class KinematicTree:
             if int(model.eq_type[e]) == _EQ_JOINT and int(model.eq_obj2id[e]) >= 0
         )
 
+    @functools.cached_property
+    def mocap_joints(self) -> frozenset[int]:
+        """Joints of arms that a mocap body pulls along by a weld, as of Fetch and Meta-World: those on the way to the
+        welded body, without slides at its base, where none has an actuator.
+        """
+        model, found = self.model, set()
+        for e in range(model.neq):
+            if int(model.eq_type[e]) != _EQ_WELD or self._is_weld_of_sites(e):
+                continue
+            bodies = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+            for mocap, welded in (bodies, bodies[::-1]):
+                if int(model.body_mocapid[mocap]) < 0:
+                    continue
+                path = [j for b in reversed(self.list_ancestors(welded)) for j in self.list_scalar_joints(b)]
+                while path and self.joint_type[path[0]] == _SLIDE:
+                    path.pop(0)
+                if not any(self.actuators_of_joint[j] for j in path):
+                    found.update(path)
+        return frozenset(found)
+
+    def _is_weld_of_sites(self, equality: int) -> bool:
+        types = getattr(self.model, "eq_objtype", None)
+        return types is not None and int(types[equality]) != int(mujoco.mjtObj.mjOBJ_BODY)
+
+    def is_driven(self, joint: int) -> bool:
+        """Return true for a joint with an actuator of its own, and for those of `mocap_joints`."""
+        return bool(self.actuators_of_joint[joint]) or joint in self.mocap_joints
+
     def _driven_joints(self, actuator: int) -> dict[int, float]:
         model = self.model
         kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
@@ -78,10 +108,10 @@ class KinematicTree:
 
     @functools.cached_property
     def reach(self) -> list[int]:
-        """Per body: most hinges and slides with an actuator of their own on any path down from it, its own included."""
+        """Per body: most driven hinges and slides on any path down from it, its own included."""
         reach = [0] * len(self.parent)
         for body in range(len(reach) - 1, 0, -1):  # parents have lower ids
-            own = sum(bool(self.actuators_of_joint[j]) for j in self.list_scalar_joints(body))
+            own = sum(self.is_driven(j) for j in self.list_scalar_joints(body))
             reach[body] = own + max((reach[child] for child in self.children[body]), default=0)
         return reach
 

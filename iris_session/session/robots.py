@@ -47,6 +47,8 @@ def find_drivable_robots(model: mujoco.MjModel, control: ControlConfig, *, all_l
     robots, notices = [], {notice.spec.name: notice for notice in found.notices}
     for robot in found.robots:
         try:
+            if not robot.actuators and control.output == OUTPUT_CTRL:
+                raise ControlError("a mocap body moves it, not actuators: share it with drive='action'")  # noqa: TRY301
             check_robot(model, robot, control)
         except ControlError as error:
             notices[robot.name] = _make_watched(robot, str(error), notices.get(robot.name))

@@ -218,3 +218,26 @@ def test_a_robot_with_a_number_is_found_again_with_the_same_joints_only() -> Non
     found = choose_again(second, fixed, CTRL)
     assert found.robots == ()
     assert "the new model has another robot of this name, with joints y0, y1, y2, y3" in found.texts[0]
+
+
+def test_an_arm_that_a_mocap_body_pulls_is_driven_by_actions_only() -> None:
+    """As those of Fetch and Meta-World: a base on slides, joints without actuators, a hand welded to a mocap body."""
+    links = "".join(
+        f'<body name="link{i}" pos="0 0 .2"><joint name="arm_j{i}" axis="{i % 2} {1 - i % 2} 0"/><geom size=".04"/>'
+        for i in range(5)
+    )
+    finger = '<body pos="0 {0} .1"><joint name="f{1}" type="slide" axis="0 1 0"/><geom size=".01"/></body>'
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body name="mocap" mocap="true"/><body name="base"><joint type="slide"/><geom size=".1"/>'
+        f"{links}{finger.format(0.03, 'l')}{finger.format(-0.03, 'r')}{'</body>' * 6}</worldbody>"
+        '<equality><weld body1="mocap" body2="link4"/></equality><actuator>'
+        '<position joint="fl" kp="9" ctrlrange="0 .05"/><position joint="fr" kp="9" ctrlrange="-.05 0"/></actuator>'
+        "</mujoco>"
+    )
+    (robot,) = find_drivable_robots(model, ControlConfig(output="targets")).robots
+    assert robot.joints == tuple(f"arm_j{i}" for i in range(5))
+    assert robot.actuators == ()
+    assert [one.actuator for one in robot.gripper_actuators] == ["#0", "#1"]
+    found = find_drivable_robots(model, ControlConfig())
+    assert found.robots == ()
+    assert "drive='action'" in found.texts[0]
