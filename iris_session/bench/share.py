@@ -58,7 +58,7 @@ class Observer(Plugin):
         self._client.close()
 
 
-class Environment:
+class SharedProgram:
     """An environment of `substeps` steps of MuJoCo."""
 
     def __init__(self, substeps: int) -> None:
@@ -73,7 +73,7 @@ class Environment:
             mujoco.mj_step(self.model, self.data)
 
 
-def measure_steps(environment: Environment, seconds: float, *, paced: bool) -> list[float]:
+def measure_steps(environment: SharedProgram, seconds: float, *, paced: bool) -> list[float]:
     """Return how long each step took [ms] in `seconds`, `paced`: begun at the times of the simulation."""
     took = []
     period_s = environment.substeps * float(environment.model.opt.timestep)
@@ -102,7 +102,7 @@ def run_share(seconds: float = 20.0, progress: Callable[[str], None] = lambda _:
             for substeps in SUBSTEPS:
                 progress(f"round {index + 1} of {ROUNDS}, {substeps} steps of MuJoCo in one of the environment")
                 config = make_session_config(record=Path(folder) / f"{index}-{substeps}.rrd")
-                environment = Environment(substeps)
+                environment = SharedProgram(substeps)
                 before = {paced: measure_steps(environment, slot_s, paced=paced) for paced in (True, False)}
                 with share(environment, config=config) as session:
                     environment.step()
