@@ -131,13 +131,44 @@ def run_case(suite: str, environment: str, folder: Path) -> dict[str, Any]:
     return row | json.loads(lines[-1])
 
 
+def format_table(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Return the lines of the table of docs/suites.md."""
+    yield (
+        "| suite | environment | MuJoCo | robots | bodies off [mm] | same bits | reset | 5 cm, left [mm] | gripper | "
+        "verified | added per step [ms] |"
+    )
+    yield "|---|---|---|---|---|---|---|---|---|---|---|"
+    words = {True: "yes", False: "**no**", None: "-"}
+    for row in rows:
+        if "error" in row:
+            yield f"| {row['suite']} | {row['env']} | | **{row['error'][:120]}** | | | | | | | |"
+            continue
+        off = "-" if row["driven_mm_off"] is None else str(row["driven_mm_off"])
+        cells = (
+            row["suite"],
+            row["env"],
+            row["mujoco"],
+            ", ".join(row["robots"]) or "-",
+            str(row["poses_mm"]),
+            words[row["identical"]],
+            words[row["follows_reset"]],
+            off,
+            words[row["gripper"]],
+            words[row["verified"]],
+            f"{row['ms_per_step_p50']} (of {row['alone_ms_per_step_p50']})",
+        )
+        yield f"| {' | '.join(cells)} |"
+
+
 def main() -> int:
     """Run the cases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("wanted", nargs="*", metavar="SUITE|ENV")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "iris-suites")
     parser.add_argument("--list", action="store_true", help="print the cases")
-    parser.add_argument("--json", action="store_true", help="end with one JSON object")
+    output = parser.add_mutually_exclusive_group()
+    output.add_argument("--json", action="store_true", help="end with one JSON object")
+    output.add_argument("--markdown", action="store_true", help="end with the table of docs/suites.md")
     arguments = parser.parse_args()
     cases = list(list_cases(arguments.wanted))
     if arguments.list or not cases:
@@ -149,7 +180,9 @@ def main() -> int:
         rows.append(run_case(suite, environment, arguments.folder.absolute()))
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     passed = sum(row["passed"] for row in rows)
-    if arguments.json:
+    if arguments.markdown:
+        print(*format_table(rows), sep="\n")
+    elif arguments.json:
         print(json.dumps({"cases": rows, "passed": passed, "of": len(rows)}))
     else:
         print(f"{passed} of {len(rows)} pass")

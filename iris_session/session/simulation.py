@@ -61,19 +61,18 @@ def find_simulation(environment: Any) -> Simulation | None:
 
 def require_simulation(environment: Any) -> Simulation:
     """Return what an environment simulates. Raises `ConfigError` that says why an object cannot be shared."""
-    kind = type(environment).__name__
-    environments = _read(environment, "envs")
+    found = find_simulation(environment)
+    if found is not None:
+        return found
+    kind, environments = type(environment).__name__, _read(environment, "envs")
     if environments is not None or "vector" in type(environment).__module__.split("."):
         is_local = isinstance(environments, list | tuple)
         what = "one of its environments, as in share(env.envs[0])" if is_local else "an environment made alone"
         raise ConfigError(f"{kind} runs several environments, a session shows one: share {what}")
-    found = find_simulation(environment)
-    if found is None:
-        raise ConfigError(
-            f"no MuJoCo model in {kind}: share the path of a model, an MjModel with its MjData, or an environment that "
-            "simulates with MuJoCo"
-        )
-    return found
+    raise ConfigError(
+        f"no MuJoCo model in {kind}: share the path of a model, an MjModel with its MjData, or an environment that "
+        "simulates with MuJoCo"
+    )
 
 
 def copy_state(source: Any, data: mujoco.MjData) -> None:
