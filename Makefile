@@ -28,7 +28,7 @@ PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 $(VENV)/.installed: pyproject.toml | $(BIN)/python
 	@echo "installing into $(VENV) ..."
-	@$(PIP_INSTALL) -e '.[all]'
+	@$(PIP_INSTALL) -e '.[all,opencv,mink]'
 	@touch $@
 
 # The extra `dev` has what the two others install: pip resolves everything once. Of 10,000 modules a fifth is imported:

@@ -10,11 +10,15 @@ the trajectory without a session, bit for bit. The last line is one JSON object;
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -22,15 +26,20 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 STEPS = 400
 #: Two arms and a ball that falls beside them. Written here, because the demo scenes need a newer MuJoCo than 3.3.0.
-ARM = """<body name="{n}" pos="0 {y} 0.5"><joint name="{n}1" axis="0 0 1" damping="2" armature="0.1"/>
-<geom size="0.05"/>
-<body name="{n}_upper" pos="0.3 0 0"><joint name="{n}2" axis="0 1 0" damping="2" armature="0.1"/><geom size="0.05"/>
-<body name="{n}_lower" pos="0.3 0 0"><joint name="{n}3" axis="0 1 0" damping="2" armature="0.1"/><geom size="0.05"/>
-<site name="{n}_tip"/></body></body></body>"""
-MOTOR = '<position name="{n}{i}" joint="{n}{i}" kp="50"/>'
+JOINT = '<joint name="{n}{i}" axis="{axis}" damping="5" armature="0.1"/>'
+ARM = f"""<body name="{{n}}" pos="0 {{y}} 0.5" gravcomp="1">{JOINT.format(n="{n}", i=1, axis="0 0 1")}
+<geom size="0.05"/><body name="{{n}}_upper" pos="0 0 0.3" gravcomp="1">{JOINT.format(n="{n}", i=2, axis="0 1 0")}
+<geom size="0.05"/><body name="{{n}}_lower" pos="0.3 0 0" gravcomp="1">{JOINT.format(n="{n}", i=3, axis="0 1 0")}
+<geom size="0.05"/><body name="{{n}}_wrist" pos="0 0 -0.2" gravcomp="1">{JOINT.format(n="{n}", i=4, axis="1 0 0")}
+{JOINT.format(n="{n}", i=5, axis="0 1 0")}{JOINT.format(n="{n}", i=6, axis="0 0 1")}
+<geom size="0.04"/><site name="{{n}}_tip" pos="0 0 -0.05"/></body></body></body></body>"""
+MOTOR = '<position name="{n}{i}" joint="{n}{i}" kp="500"/>'
 SCENE = f"""<mujoco><worldbody><geom type="plane" size="2 2 0.1"/>{ARM.format(n="left", y=0.4)}
 {ARM.format(n="right", y=-0.4)}<body name="ball" pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody><actuator>
-{"".join(MOTOR.format(n=n, i=i) for n in ("left", "right") for i in (1, 2, 3))}</actuator></mujoco>"""
+{"".join(MOTOR.format(n=n, i=i) for n in ("left", "right") for i in range(1, 7))}</actuator></mujoco>"""
+#: A policy moves the end effector up by so much [m], in so many seconds, then waits as long.
+MOVE_M, MOVE_S = 0.05, 1.0
+MOST_LEFT_M = 0.005
 
 
 def run_checks() -> dict[str, Any]:
@@ -86,7 +95,65 @@ def run_checks() -> dict[str, Any]:
         results["attach_observed"] = len(session.status().participants) == 1
         results["targets"] = len(session.targets()) == 2
     session.close()
+    results |= drive(model, own_loop=False) | drive(model, own_loop=True)
     results["ok"] = all(value for name, value in results.items() if name != "mujoco")
+    return results
+
+
+def drive(model: Any, own_loop: bool) -> dict[str, Any]:
+    """Return whether a leased robot follows its target in a user's loop, or in the session's; and its recording."""
+    import mujoco
+
+    from iris_session import Client, Session, SessionConfig
+
+    def move(address: str) -> None:
+        with Client(address, role="agent", name="policy", devices=("target",)) as client:
+            client.acquire(["left"])
+            assert client.wait_for(lambda c: c.scene.tip_pose("left") is not None)
+            (x, y, z), q = client.scene.tip_pose("left")
+            steps = round(60 * MOVE_S)
+            for i in range(2 * steps):
+                target = (x, y, z + MOVE_M * min(1.0, i / steps)), q
+                client.send_sample("target", target, robots=["left"], clutch=i > 0)
+                client.sleep(1 / 60)
+            ways.append([b - a for a, b in zip((x, y, z), client.scene.tip_pose("left")[0], strict=True)])
+
+    def tick(session: Session, data: Any) -> None:
+        session.begin_tick()
+        mujoco.mj_step(model, data)
+        session.end_tick()
+
+    ways: list[list[float]] = []
+    data = mujoco.MjData(model)
+    can_record = importlib.util.find_spec("rerun") is not None
+    with tempfile.TemporaryDirectory() as folder:
+        record = Path(folder) / "session.rrd" if can_record else False
+        config = SessionConfig(control_port=0, state_port=0, record=record)
+        with Session(model, None if own_loop else data, config) as session:
+            begin = time.monotonic()
+            if own_loop:
+                session.run(seconds=0.1)
+            else:
+                tick(session, data)
+            policy = threading.Thread(target=move, args=(session.address,))
+            policy.start()
+            if own_loop:
+                session.run(until=lambda: not policy.is_alive())
+            while policy.is_alive():
+                tick(session, data)
+                time.sleep(max(0.0, begin + data.time - time.monotonic()))
+            policy.join()
+        name = "run" if own_loop else "user_loop"
+        left = math.dist(ways[0], (0.0, 0.0, MOVE_M)) if ways else math.inf
+        results: dict[str, Any] = {f"{name}_driven": left < MOST_LEFT_M}
+        if not results[f"{name}_driven"]:
+            print(f"{name}: {1e3 * left:.1f} mm left", file=sys.stderr)
+        if can_record:
+            from iris_session.session.verification import verify_recording
+
+            report = verify_recording(Path(session.recording))
+            results[f"{name}_verified"] = report.ok
+            print(*report.problems[:3], sep="\n", file=sys.stderr)
     return results
 
 

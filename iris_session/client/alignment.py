@@ -326,7 +326,7 @@ class ClientAlignment:
 
 def _missing_package(error: ImportError) -> ClientError:
     return ClientError(
-        f"finding sheets needs OpenCV and SciPy ({error.name} is missing): pip install 'iris-session[anchors]'"
+        f"finding sheets needs OpenCV and SciPy ({error.name} is missing): pip install 'iris-session[anchors,opencv]'"
     )
 
 

@@ -14,6 +14,9 @@ from iris_session.protocol.errors import IrisError
 
 OUTPUT_CTRL: Final = "ctrl"
 OUTPUT_TARGETS: Final = "targets"
+SOLVER_AUTO: Final = "auto"
+SOLVER_MINK: Final = "mink"
+SOLVER_NUMPY: Final = "numpy"
 
 _POSITIVE: Final = (
     "solve_rate_hz",
@@ -55,11 +58,15 @@ class ControlConfig(msgspec.Struct, frozen=True):
     """Bounds of control. Raises `ValueError` for values that cannot work.
 
     `output`: `ctrl` solves inverse kinematics and writes `data.ctrl`; `targets` only moves the end-effector targets
-    (`Controller.get_targets()`), for an environment with its own controller: it needs no mink and writes no `ctrl`.
+    (`Controller.get_targets()`), for an environment with its own controller: it writes no `ctrl`.
+
+    `solver`: of inverse kinematics. `mink` needs the extra of that name, and mujoco >= 3.10; `numpy` needs nothing;
+    `auto` is `mink` where it can be imported, else `numpy`. Both take the robot to the same place.
     """
 
     output: str = OUTPUT_CTRL
     # --- inverse kinematics
+    solver: str = SOLVER_AUTO
     solve_rate_hz: float = 100.0  # per robot, at most
     max_solves_per_tick: int = 3  # of robots in turn, where so many are needed: see `Reach.solves_per_tick`
     sample_rate_min_hz: float = 60.0  # slowest device; longer gaps between samples are not stretched into slow motion
@@ -120,6 +127,9 @@ class ControlConfig(msgspec.Struct, frozen=True):
     def __post_init__(self) -> None:
         if self.output not in (OUTPUT_CTRL, OUTPUT_TARGETS):
             raise ValueError(f"output is {self.output!r}; it must be {OUTPUT_CTRL!r} or {OUTPUT_TARGETS!r}")
+        if self.solver not in (SOLVER_AUTO, SOLVER_MINK, SOLVER_NUMPY):
+            choices = f"{SOLVER_AUTO!r}, {SOLVER_MINK!r} or {SOLVER_NUMPY!r}"
+            raise ValueError(f"solver is {self.solver!r}; it must be {choices}")
         for name in _POSITIVE:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):

@@ -50,7 +50,7 @@ class RobotOutput(NamedTuple):
 
 
 def check_robot(model: mujoco.MjModel, robot: RobotSpec, config: ControlConfig) -> None:
-    """Raise `ControlError` for a robot that cannot be driven as described. Needs no mink, and compiles nothing."""
+    """Raise `ControlError` for a robot that cannot be driven as described. Compiles nothing."""
     find_arm(model, robot)
     if config.output == OUTPUT_CTRL:
         ActuatorLaws(model, [robot], config)
@@ -66,7 +66,9 @@ class Controller:
         objects: Sequence[ObjectSpec] = (),
         config: ControlConfig | None = None,
     ) -> None:
-        """Raise `ControlError` for robots, actuators or objects that cannot be driven, `ImportError` without mink."""
+        """Raise `ControlError` for robots, actuators or objects that cannot be driven, `ImportError` for the solver of
+        a recording that is not installed.
+        """
         self._model = model
         self._config = config or ControlConfig()
         self._robots = tuple(robots)

@@ -4,18 +4,13 @@ A step starts at the last solution (the joint goal), not at the measured joints,
 target is not reached, solving continues without new samples, at the rate of the slowest device so that a refinement
 never delays a new sample, until the target is reached or no more progress is made (`reach`).
 
-One step (`IkSolver`) is mink's frame and posture tasks, joint bounds, daqp. The quadratic program is min |J dq - e|^2 +
-posture + damping over box bounds on `dq`. For hinge and slide joints mink's `ConfigurationLimit` and `VelocityLimit`
-are exactly such boxes, but stated as 4 n general inequalities that become infeasible when a joint stands outside its
-range; given as simple bounds the program always has a solution and costs half. Stateless: the result depends on the
-arguments alone, no warm start.
+The step itself is in `solvers`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +20,7 @@ from iris_session.control import clutch
 from iris_session.control.arm_model import ArmModel, Floats
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig
 from iris_session.control.interpolate import JointInterpolator
+from iris_session.control.solvers import make_solver
 from iris_session.control.state import RobotState
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.specs import HAND, RobotSpec
@@ -34,64 +30,6 @@ _WAYPOINTS, _HALVINGS = 8, 10  # how finely the way to a joint goal is searched 
 _PROGRESS = 0.02  # share of the remaining error that a solve must go to count as progress
 #: Limit of a robot that no pose moves.
 JOINTS_ONLY = "joints_only"
-
-
-class IkStep(NamedTuple):
-    """`q`: new joint positions, shape (n,). `singular`: the Jacobian was near singular where it was evaluated."""
-
-    q: Floats
-    singular: bool
-
-
-def require_solver() -> tuple[Any, Any]:
-    """Return the mink and daqp modules. Raises `ImportError` that names the extra."""
-    try:
-        import daqp
-        import mink
-    except ImportError as error:
-        raise ImportError(
-            f"inverse kinematics needs mink and daqp ({error.name} is missing): pip install 'iris-session[control]'"
-        ) from None
-    return mink, daqp
-
-
-class IkSolver:
-    """Inverse kinematics of one arm."""
-
-    def __init__(self, arm: ArmModel, config: ControlConfig) -> None:
-        self._mink, self._daqp = require_solver()
-        mink = self._mink
-        self._arm = arm
-        self._configuration = mink.Configuration(arm.model)
-        self._frame = mink.FrameTask(
-            "tip", "site", config.position_cost, config.orientation_cost, lm_damping=config.lm_damping
-        )
-        self._posture = mink.PostureTask(arm.model, cost=config.posture_cost, gain=config.posture_gain)
-        n = arm.model.nv
-        self._no_rows = np.zeros((0, n))
-        self._sense = np.zeros(n, dtype=np.int32)
-        self._rank = min(n, 6)
-        self._singular = config.singular_value**2
-
-    def step(self, q: Floats, rest: Floats, T_root_target: PoseTuple, lower: Floats, upper: Floats) -> IkStep:
-        """Take one step from `q` towards the target, with `lower <= dq <= upper` per joint (arrays of shape (n,)).
-
-        `rest`: posture that the null space drifts to, shape (n,).
-        """
-        arm = self._arm
-        (x, y, z), quat = T_root_target
-        self._configuration.update(q[arm.to_chain])
-        self._frame.set_target(self._mink.SE3(np.array((*quat, x, y, z))))
-        self._posture.set_target(rest[arm.to_chain])
-        H, c = self._frame.compute_qp_objective(self._configuration)
-        singular = bool(np.linalg.eigvalsh(H)[-self._rank] < self._singular)
-        H_posture, c_posture = self._posture.compute_qp_objective(self._configuration)
-        dq, _, flag, _ = self._daqp.solve(
-            H + H_posture, c + c_posture, self._no_rows, upper[arm.to_chain], lower[arm.to_chain], self._sense
-        )
-        if flag != 1 or not math.isfinite(float(dq.sum())):
-            return IkStep(q.copy(), True)
-        return IkStep(q + dq[arm.from_chain], singular)
 
 
 class InverseKinematics:
@@ -114,7 +52,7 @@ class InverseKinematics:
         self._lower, self._upper = bounds
         #: By robot that follows poses.
         self._solvers = {
-            i: IkSolver(arm, config)
+            i: make_solver(arm, config)
             for i, (robot, arm) in enumerate(zip(robots, arms, strict=True))
             if config.output == OUTPUT_CTRL and robot.kind != HAND
         }

@@ -185,6 +185,8 @@ class World:
             raise SimulationDivergedError(tick, float(self._state[0]), self.diverged)
         mujoco.mj_setState(model, data, self._state, STATE)
         mujoco.mj_forward(model, data)
+        # MuJoCo 3.3.0 puts its solution into the warm start, which is part of the state.
+        mujoco.mj_setState(model, data, self._state, STATE)
         self._forces = self._tables.gripper_forces(model, data)
         self._set_tick(tick)
         self._shown_state = self._state.tobytes()

@@ -17,6 +17,7 @@ import numpy as np
 
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.control import ControlConfig, ControlError, Controller
+from iris_session.control.solvers import name_solver
 from iris_session.physics import SimulationDivergedError, World
 from iris_session.physics.world import STATE
 from iris_session.protocol.common import Alignment
@@ -131,6 +132,7 @@ class SessionCore:
         models: Callable[[str], mujoco.MjModel] = raise_no_model,
     ) -> None:
         #: Decoded as from a recording: a whole number in a float field would change `round(x / step)` and the digest.
+        config = msgspec.structs.replace(config, control=name_solver(config.control))
         self.config = config = _decode_config(_encoder.encode(config))
         self._models = models
         #: Plants that were made off the loop, for the `SceneLoaded` to come, by `model_hash`.
@@ -354,7 +356,7 @@ def make_session_core(
     """Return the core of a session that begins with `data` as it is now; `known` when it is the same."""
     authority = msgspec.structs.replace(session.authority, user_owned_loop=user_owned, anchors=session.anchor_poses())
     initial = b"" if data is None else read_plant_state(model, data)
-    config = CoreConfig(authority, session.control, robots, objects, initial)
+    config = CoreConfig(authority, name_solver(session.control), robots, objects, initial)
     if known is not None and known.config == config:
         return known
     try:

@@ -29,6 +29,7 @@ import msgspec
 import mujoco
 
 from iris_session.control import ControlError
+from iris_session.control.config import SOLVER_AUTO
 from iris_session.journal.environment import read_boot_id, use_one_blas_thread
 from iris_session.journal.rows import CRASHED, check_keyframe
 from iris_session.journal.verification import Models
@@ -164,7 +165,10 @@ class PastSession:
             raise ConfigError(f"a resumed session goes on in the folder of {self.file}: leave `record` as it is")
         if given.name not in (plain.name, self.header.session_name):
             raise ConfigError(f"a resumed session keeps its name, {self.header.session_name!r}")
-        for name, had in (("authority", authority), ("control", core.control)):
+        control = core.control
+        if given.control.solver == SOLVER_AUTO:
+            control = msgspec.structs.replace(control, solver=SOLVER_AUTO)
+        for name, had in (("authority", authority), ("control", control)):
             if getattr(given, name) not in (getattr(plain, name), had):
                 raise ConfigError(f"a resumed session keeps its settings: leave `{name}` as it is")
         changes: dict[str, Any] = {"name": self.header.session_name, "authority": authority}

@@ -9,6 +9,7 @@ import msgspec
 
 from anchors.ageing import AgeingLaw
 from iris_session.authority import AuthorityConfig, is_same_snapshot
+from iris_session.control.config import SOLVER_AUTO, SOLVER_MINK
 from iris_session.journal.environment import use_one_blas_thread
 from iris_session.journal.rows import SNAPSHOTS
 from iris_session.journal.verification import Models
@@ -37,6 +38,9 @@ class ReplayCore:
     def __init__(self, header: SessionHeader, models: Models) -> None:
         use_one_blas_thread()
         config = msgspec.msgpack.decode(header.config, type=_RecordedConfig)
+        if config.control.solver == SOLVER_AUTO:  # not in the header: there was only one
+            control = msgspec.structs.replace(config.control, solver=SOLVER_MINK)
+            config = msgspec.structs.replace(config, control=control)
         model = decode_model(unpack_model(header.model))
         self.core = SessionCore(model, config, lambda model_hash: decode_model(models(model_hash)))
 

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Final
 
-#: Extra of each importable package outside of the base install. `cv2` is in two: `anchors` brings SciPy as well.
+#: Extra of each importable package outside of the base install.
 EXTRAS: Final[Mapping[str, str]] = {
-    "cv2": "anchors",
+    "cv2": "opencv",
     "scipy": "anchors",
-    "mink": "control",
-    "daqp": "control",
+    "mink": "mink",
+    "daqp": "mink",
     "rerun": "recording",
     "rerun_cli": "recording",
     "pyarrow": "recording",

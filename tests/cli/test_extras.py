@@ -42,8 +42,8 @@ def base_install(tmp_path: Path) -> dict[str, str]:
     [
         (("verify", "session.rrd"), "recording"),
         (("view", "session.rrd"), "recording"),
-        (("demo", "handover"), "control"),
-        (("anchors", "print", "--size", "150mm", "--out", "sheet.pdf"), "anchors"),
+        (("demo", "handover"), "recording"),
+        (("anchors", "print", "--size", "150mm", "--out", "sheet.pdf"), "opencv"),
         (("scene", "inspect", "scene.obj"), "files"),
     ],
 )

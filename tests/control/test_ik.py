@@ -1,15 +1,12 @@
-"""Inverse kinematics of one arm: convergence, bounds, singular postures, and the error without the extra."""
+"""Inverse kinematics at its rates: convergence over several solves, order of robots, limits and their names."""
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 
 from anchors.pose import Vec3, quat_from_rotvec
 from iris_session.control import ControlConfig
-from iris_session.control.arm_model import ArmModel
-from iris_session.control.ik import IkSolver
 from tests.control.rigs import (
     PANDA_HOME,
     Rig,
@@ -22,52 +19,6 @@ from tests.control.rigs import (
     panda_spec,
     pose_command,
 )
-
-FREE = np.full(7, 0.1)
-
-
-def test_reachable_poses_converge_to_within_a_hair() -> None:
-    arm = ArmModel(panda_model(), panda_spec())
-    solver, rng, rest = IkSolver(arm, ControlConfig()), np.random.default_rng(3), np.array(PANDA_HOME)
-    for _ in range(20):
-        goal = arm.forward_kinematics(rest + rng.uniform(-0.3, 0.3, 7))
-        q = rest.copy()
-        for _ in range(25):
-            q = solver.step(q, rest, goal, -FREE, FREE).q
-        distance, angle = apart(arm.forward_kinematics(q), goal)
-        assert distance < 1e-4
-        assert angle < 0.02
-
-
-def test_joints_in_another_order_than_the_chains_give_the_same_motion() -> None:
-    robot = panda_spec()
-    turned = msgspec.structs.replace(robot, joints=robot.joints[3:] + robot.joints[:3])
-    arm, other = ArmModel(panda_model(), robot), ArmModel(panda_model(), turned)
-    home = np.array(PANDA_HOME)
-    q, rest, goal = home + 0.1, home - 0.05, arm.forward_kinematics(home + np.linspace(-0.1, 0.2, 7))
-    lower, upper = np.linspace(-0.01, -0.07, 7), np.linspace(0.08, 0.02, 7)
-    direct = IkSolver(arm, ControlConfig()).step(q, rest, goal, lower, upper).q
-    order = [3, 4, 5, 6, 0, 1, 2]
-    mixed = IkSolver(other, ControlConfig()).step(q[order], rest[order], goal, lower[order], upper[order]).q
-    assert mixed.tobytes() == direct[order].tobytes()
-
-
-def test_a_stretched_arm_is_reported_as_singular() -> None:
-    arm = ArmModel(panda_model(), panda_spec())
-    solver, home = IkSolver(arm, ControlConfig()), np.array(PANDA_HOME)
-    straight = np.zeros(7)
-    assert solver.step(straight, straight, arm.forward_kinematics(straight), -FREE, FREE).singular
-    assert not solver.step(home, home, arm.forward_kinematics(home), -FREE, FREE).singular
-
-
-def test_a_program_without_solution_leaves_the_joints() -> None:
-    arm, home = ArmModel(panda_model(), panda_spec()), np.array(PANDA_HOME)
-    step = IkSolver(arm, ControlConfig()).step(home, home, arm.forward_kinematics(home + 0.1), FREE, -FREE)
-    assert (step.q == home).all()
-    assert step.singular
-
-
-# --- solving at its rates ---
 
 
 def rig(config: ControlConfig | None = None) -> Rig:

@@ -16,6 +16,7 @@ class Journal:
     """What a recorder gets of a session; see `RecorderPort` in `session.stepper`.
 
     Attributes:
+        config: Of the core, as in the header of a recording.
         rows: One per step.
         keyframes: The first is of the state before the first step.
     """
@@ -23,7 +24,7 @@ class Journal:
     wants_keyframe = False
 
     def __init__(self, config: CoreConfig, model: bytes) -> None:
-        self._config = config
+        self.config = config
         self._model = model
         self._models: dict[str, bytes] = {}
         self.rows: list[JournalRow] = []
@@ -60,7 +61,7 @@ class Journal:
         if not self.keyframes:
             assert not self.rows, "steps without the keyframe before the first of them"
             return 0  # the session ended before its first step
-        core = SessionCore(decode_model(self._model), self._config, lambda name: decode_model(self._models[name]))
+        core = SessionCore(decode_model(self._model), self.config, lambda name: decode_model(self._models[name]))
         keyframe = self.keyframes[first_keyframe]
         core.restore(CoreState(keyframe.plant, keyframe.authority, keyframe.controller, keyframe.status))
         rows: Sequence[JournalRow] = [row for row in self.rows if row.step > keyframe.step]

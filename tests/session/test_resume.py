@@ -16,6 +16,8 @@ import pytest
 
 from anchors.pose import IDENTITY_QUAT, PoseTuple
 from iris_session.authority import AuthorityConfig
+from iris_session.control import ControlConfig
+from iris_session.control.config import SOLVER_MINK, SOLVER_NUMPY
 from iris_session.demo.scenes import scene_path
 from iris_session.journal.environment import read_boot_id
 from iris_session.journal.messages import Batch
@@ -214,6 +216,21 @@ def test_settings_fixed_by_the_recording_are_refused(session: Path, change: dict
         prepare_session(SessionConfig(resume=session), None, None, (), None)
 
 
+def test_the_same_control_may_be_given_whatever_solver_it_meant(tmp_path: Path) -> None:
+    core, control = make_core(), ControlConfig(tip_speed=1.0)
+    path = recorded(
+        tmp_path / "session.rrd",
+        core=SessionCore(core.world.model, msgspec.structs.replace(core.config, control=control)),
+    )
+    past, config, _ = prepare_session(SessionConfig(resume=path, control=control), None, None, None, None)
+    assert past is not None
+    past.close()
+    assert config.control == msgspec.structs.replace(control, solver=SOLVER_MINK)
+    for other in (ControlConfig(tip_speed=2.0), msgspec.structs.replace(control, solver=SOLVER_NUMPY)):
+        with pytest.raises(ConfigError, match="resumed session"):
+            prepare_session(SessionConfig(resume=path, control=other), None, None, None, None)
+
+
 def test_address_and_ports_are_those_of_the_recording_by_default(session: Path) -> None:
     listening = Listening("0.0.0.0", control_port=4001, state_port=4002, curve=True, beacon_port=0)
     keeper = ResumeNoteWriter(find_note_path(session))
@@ -222,7 +239,8 @@ def test_address_and_ports_are_those_of_the_recording_by_default(session: Path) 
     past, config, _ = prepare_session(SessionConfig(resume=session, control_port=5001), None, None, None, None)
     assert past is not None
     assert past.notes == []
-    assert dataclasses.replace(config, resume=None) == SessionConfig(
+    assert config.control == past.core.config.control
+    assert dataclasses.replace(config, resume=None, control=ControlConfig()) == SessionConfig(
         "lab", "0.0.0.0", control_port=5001, state_port=4002, curve=True, beacon_port=0
     )
 
