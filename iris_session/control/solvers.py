@@ -99,7 +99,7 @@ class NumpySolver:
         return IkStep(q + dq[arm.from_chain], singular)
 
     def _measure_error(self, q: Floats, T_root_target: PoseTuple) -> Floats:
-        """Return the way from the tip at `q` to the target, in the root frame: 3 lengths [m], a rotation vector [rad]."""
+        """Return the way from the tip at `q` to the target, shape (6,): translation [m], rotation vector [rad]."""
         (x, y, z), quat = self._arm.forward_kinematics(q)
         p_target, quat_target = T_root_target
         error = np.empty(6)
@@ -216,7 +216,7 @@ def _import_mink() -> tuple[Any, Any]:
     try:
         import daqp
         import mink
-    except ImportError as error:  # or mink's own, with an older MuJoCo
+    except (ImportError, AttributeError) as error:  # mink's own, with an older MuJoCo
         raise ImportError(f"{advice} ({' '.join(str(error).split())})") from None
     version = importlib.metadata.version("mink")
     if tuple(map(int, version.split(".")[:2])) < (1, 1):  # robosuite pins 0.0.5
