@@ -300,6 +300,24 @@ def test_shown_state_depends_only_on_its_bytes(handover: mujoco.MjModel) -> None
     assert single.save_state() == source.save_state()
 
 
+def test_a_shown_state_keeps_its_warm_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`mj_forward` of MuJoCo 3.3.0 replaces it, so that states that were shown before would count."""
+    forward = mujoco.mj_forward
+
+    def replace_warm_start(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        forward(model, data)
+        data.qacc_warmstart[:] = data.qacc
+
+    world = World(clutter(), (), ())
+    for _ in range(40):
+        world.tick()
+    state = world.save_state()
+    monkeypatch.setattr("mujoco.mj_forward", replace_warm_start)
+    other = World(clutter(), (), ())
+    other.restore_state(state)
+    assert other.save_state() == state
+
+
 def test_states_are_given_to_mujoco_as_arrays_that_it_may_write(monkeypatch: pytest.MonkeyPatch) -> None:
     """MuJoCo 3.3 refuses others."""
     world = World(clutter(), (), ())
