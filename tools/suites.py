@@ -119,7 +119,7 @@ def run_case(suite: str, environment: str, folder: Path) -> dict[str, Any]:
             capture_output=True,
             text=True,
             check=False,
-            cwd=tempfile.gettempdir(),
+            cwd=folder,  # nothing there shadows a package
             env={**os.environ, **_ENVIRON, "PYTHONPATH": str(ROOT)},
             timeout=CASE_S,
         )
