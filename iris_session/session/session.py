@@ -129,13 +129,14 @@ class Session(SessionBase):
         self._scheduling = "normal"
         self._next_overrun_log_ns = 0
         self.recording_fault = ""
+        self._start_notes: tuple[str, ...] = ()
         self._log_robot_notices()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes for the user, one line each: how the session started (another name, other addresses), which robots can
         only be watched, and which parts of the present scene clients do not see."""
-        return (*self._robot_notices, *super().notes)
+        return (*self._start_notes, *self._robot_notices, *super().notes)
 
     def _log_robot_notices(self) -> None:
         for text in self._robot_notices:

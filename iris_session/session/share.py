@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import atexit
 import dataclasses
+import importlib.util
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 import mujoco
@@ -21,7 +23,10 @@ from iris_session.session.session import Session
 from iris_session.session.simulation import require_simulation, unwrap_data, unwrap_model
 
 #: How participants drive, and the output of control that this means.
-DRIVES = {"ctrl": OUTPUT_CTRL, "action": OUTPUT_TARGETS}
+DRIVES: Final = {"ctrl": OUTPUT_CTRL, "action": OUTPUT_TARGETS}
+NOT_RECORDED: Final = "not recorded, because rerun is not installed: pip install 'iris-session[recording]'"
+
+_log = logging.getLogger(__name__)
 
 
 def share(
@@ -48,7 +53,7 @@ def share(
             dm_control (its physics, too), robosuite, LIBERO, Meta-World, OGBench, MyoSuite, gym-aloha, LeRobot. For
             what steps outside of Python's MuJoCo (MuJoCo Playground, MJX), call `session.sync(data)` after its steps.
         data: With an `MjModel`: the data that your loop advances. `None`: the session simulates, by `session.run()`.
-        config: Settings; `None` for the defaults.
+        config: Settings; `None` for the defaults. Where rerun is not installed, nothing is recorded by default.
         robots: `auto` finds them, `none` offers none; or names of robots found, the path of a robots file, or
             specifications.
         objects: Free bodies that robots and hands can take; `None` finds them in the model.
@@ -70,6 +75,22 @@ def share(
     config = config or SessionConfig()
     if config.control.output != DRIVES[drive]:
         config = dataclasses.replace(config, control=msgspec.structs.replace(config.control, output=DRIVES[drive]))
+    if config.record is True and importlib.util.find_spec("rerun") is None:  # the default, beside a suite
+        session = _share(x, data, dataclasses.replace(config, record=False), robots, objects, step)
+        session._start_notes = (NOT_RECORDED,)
+        _log.warning("%s", NOT_RECORDED)
+        return session
+    return _share(x, data, config, robots, objects, step)
+
+
+def _share(
+    x: Any,
+    data: Any,
+    config: SessionConfig,
+    robots: RobotChoice,
+    objects: Sequence[ObjectSpec] | None,
+    step: str,
+) -> Session:
     if isinstance(x, str | os.PathLike):
         return _start(Session(Path(x).expanduser(), None, config, robots=robots, objects=objects))
     model = unwrap_model(x)

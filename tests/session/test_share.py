@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib.util
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 import iris_session
-from iris_session import ConfigError, OwnershipError, PublishError, Session
+from iris_session import ConfigError, OwnershipError, PublishError, Session, StartError
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import ModelInvalidError, ModelNotFoundError, load_model
 from iris_session.session.simulation import find_simulation
@@ -145,6 +147,21 @@ def test_what_steps_elsewhere_is_synced(shared: list[Session], model: mujoco.MjM
         with pytest.raises(PublishError):
             session.sync(wrong)
     assert np.array_equal(session.data.qpos, before)
+
+
+@pytest.mark.usefixtures("simulation")
+def test_without_rerun_a_program_is_shared_all_the_same(
+    shared: list[Session], model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in the base install, beside a suite. A recording that is asked for by its path is an error."""
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "rerun" else find(name, *more))
+    default = dataclasses.replace(QUIET, record=True)
+    shared.append(iris_session.share(model, mujoco.MjData(model), default))
+    assert shared[0].recording is None
+    assert any("iris-session[recording]" in note for note in shared[0].notes)
+    with pytest.raises(StartError, match="recording"):
+        iris_session.share(model, config=dataclasses.replace(QUIET, record="here.rrd"))
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
