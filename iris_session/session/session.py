@@ -45,7 +45,14 @@ from iris_session.session.core import SessionCore, make_session_core, read_plant
 from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.resume import prepare_session
-from iris_session.session.robots import FixedChoice, RobotChoice, choose_again, choose_robots, fix_choice
+from iris_session.session.robots import (
+    FixedChoice,
+    RobotChoice,
+    choose_again,
+    choose_robots,
+    find_drivable_robots,
+    fix_choice,
+)
 from iris_session.session.scene_change import adopt_timestep, prepare_scene
 from iris_session.session.session_base import SessionBase
 from iris_session.session.simulation import copy_state, require_simulation, unwrap_data, unwrap_model
@@ -337,6 +344,14 @@ class Session(SessionBase):
         else:
             loop.note_step(began_ns, began_time)
             loop.look()
+
+    def describe_robots(self) -> str:
+        """Return the lines of a robots file of the present model, for you to complete and give as `robots=`.
+
+        Returns:
+            TOML: the robots that are found, and those about which something is unclear, with comments that say what.
+        """
+        return find_drivable_robots(self.model, self.config.control).to_toml()
 
     @classmethod
     def attach(

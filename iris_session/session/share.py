@@ -42,7 +42,8 @@ def share(
     """Share a MuJoCo program or a model file: participants see it, and drive the robots that are found in it.
 
     The program stays as it is, and so does its trajectory while no participant drives. A robot about which something
-    is unclear is shown all the same, and `session.notes` has the lines for a robots file with which it can be driven.
+    is unclear is shown all the same: `session.notes` says what, and `session.describe_robots()` has lines for a robots
+    file with which it can be driven.
 
         session = iris_session.share("panda.xml");  session.run()    # a model file, or an MjModel: in our loop
         session = iris_session.share(model, data)                    # your own loop, unchanged

@@ -123,10 +123,15 @@ def test_data_and_environments_go_on_in_the_loop_of_the_program(shared: list[Ses
 
 
 @pytest.mark.usefixtures("simulation")
-def test_a_robot_never_keeps_a_scene_from_being_shown(shared: list[Session]) -> None:
+def test_a_robot_never_keeps_a_scene_from_being_shown(shared: list[Session], tmp_path: Path) -> None:
     shared.append(iris_session.share(mujoco.MjModel.from_xml_string(UNCLEAR_ARM), config=QUIET))
     assert shared[0].robots == ()
     assert any("arm" in note for note in shared[0].notes)
+    lines = shared[0].describe_robots()
+    file = tmp_path / "robots.toml"
+    file.write_text(lines, encoding="utf-8")
+    with iris_session.share(shared[0].model, config=QUIET, robots=file) as session:
+        assert session.robots == (), "the lines are accepted as they are printed"
 
 
 @pytest.mark.usefixtures("simulation")
