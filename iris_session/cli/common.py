@@ -326,10 +326,35 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--no-record", action="store_true", help="record nothing")
     group.add_argument("--view", action="store_true", help="show the recording in Rerun's viewer while it is written")
     group.add_argument("--no-web", action="store_true", help="serve no page for browsers")
-    group.add_argument("--sites", action="store_true", help="send the model's sites to clients")
-    group.add_argument("--tendons", action="store_true", help="send the model's spatial tendons to clients")
+    group.add_argument(
+        "--groups",
+        type=parse_groups,
+        metavar="GROUPS",
+        help="geom groups that clients show, such as 0,1,2 (default: as the model's own viewer)",
+    )
+    group.add_argument(
+        "--sites",
+        nargs="?",
+        const=True,
+        type=parse_sites,
+        metavar="GROUPS",
+        help="show all sites, those of these groups, or `none` (default: groups 0 to 2, as MuJoCo's viewer)",
+    )
     group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), help="how robots are assigned")
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), help="lease mode of every robot")
+
+
+def parse_groups(text: str) -> tuple[int, ...]:
+    """Parse numbers of groups, separated by commas."""
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r}: must be numbers of groups, such as 0,1,2")
+    return tuple(int(part) for part in parts)
+
+
+def parse_sites(text: str) -> bool | tuple[int, ...]:
+    """Parse groups of sites, `all` or `none`."""
+    return text == "all" if text in ("all", "none") else parse_groups(text)
 
 
 def add_page_options(group: argparse._ActionsContainer) -> None:

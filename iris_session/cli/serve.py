@@ -153,8 +153,8 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
         web_cert=arguments.web_cert,
         web_key=arguments.web_key,
         cameras=tuple(getattr(arguments, "camera", ())),
+        groups=arguments.groups,
         sites=arguments.sites,
-        tendons=arguments.tendons,
         authority=authority,
         **{name: value for name, value in given.items() if value is not None},
     )

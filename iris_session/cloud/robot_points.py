@@ -18,7 +18,7 @@ from anchors.camera import pose_to_matrix
 from iris_session.cloud.pipeline import BodyPose
 from iris_session.cloud.voxels import Positions
 from iris_session.protocol.names import GeometryKind
-from iris_session.protocol.scene import Body, SceneSpec, Visual
+from iris_session.protocol.scene import FIRST_SITE_VISUAL, Body, SceneSpec, Visual
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
 from iris_session.scene.meshes import MeshArrays
 from iris_session.scene.nodes import to_matrix
@@ -185,7 +185,8 @@ def _sample_bodies(
     """Yield the bodies that have a surface, with points of it (n, 3), body frame, no further apart than a cell."""
     visuals: dict[int, list[Visual]] = {}
     for visual in spec.visuals:
-        visuals.setdefault(visual.body, []).append(visual)
+        if visual.id < FIRST_SITE_VISUAL:  # sites mark places, they have no surface
+            visuals.setdefault(visual.body, []).append(visual)
     for body in bodies:
         every = visuals.get(body.id, [])
         drawn = [one for one in every if one.rgba[3] > 0 and one.group in spec.groups_shown]

@@ -171,9 +171,14 @@ class Geometry(msgspec.Struct, frozen=True):
     hfield: Ref = -1
 
 
+#: `Visual.id` of the site 0 of a MuJoCo model: above all geoms.
+FIRST_SITE_VISUAL: Final = 1 << 20
+
+
 class Visual(msgspec.Struct, frozen=True):
-    """A shape on a body. `id`: the simulator's number of it (MuJoCo geom). `rgba` is the colour to draw: a colour of
-    its own, or the material's; with alpha 0 it is not drawn. `group`: see `SceneSpec.groups_shown`.
+    """A shape on a body. `id`: the simulator's number of it (MuJoCo geom; of a site 1,048,576 more than its number).
+    `rgba` is the colour to draw: a colour of its own, or the material's; with alpha 0 it is not drawn. `group`: see
+    `SceneSpec.groups_shown`.
     """
 
     id: Count
@@ -235,7 +240,7 @@ class Camera(msgspec.Struct, frozen=True):
 
 
 class Site(msgspec.Struct, frozen=True):
-    """A marked place on a body, drawn as a shape on request."""
+    """A place on a body that a tendon runs through, drawn as a shape. Marked places of a MuJoCo model are visuals."""
 
     id: Count
     body: Count
@@ -248,7 +253,9 @@ class Site(msgspec.Struct, frozen=True):
 
 
 class Tendon(msgspec.Struct, frozen=True):
-    """A cable, drawn on request as straight pieces of radius `width` [m] through `sites`, ids; wrapping is left out."""
+    """A cable, drawn as straight pieces of radius `width` [m] through `sites`, ids. Tendons of a MuJoCo model, which go
+    around shapes, are deformables.
+    """
 
     name: Text
     group: Int32

@@ -12,6 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
+from itertools import product
 from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
 
@@ -21,11 +22,21 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import Device
-from iris_session.protocol.scene import AddMaterial, AddVisual, Material, PatchOp, RemoveVisual, SetVisual, Visual
+from iris_session.protocol.scene import (
+    FIRST_SITE_VISUAL,
+    AddMaterial,
+    AddVisual,
+    Material,
+    PatchOp,
+    RemoveVisual,
+    SetVisual,
+    Visual,
+)
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem, SceneChanged
 from iris_session.recording import Recording, RecordingError
 from iris_session.replay.simulation import Replay
 from iris_session.rrd.batches import RowTimes
+from iris_session.scene.mujoco_visuals import VIEWER_GROUPS, find_viewer_groups
 from iris_session.session.core import SessionCore
 from iris_session.viewer.narration import find_colour
 
@@ -50,7 +61,7 @@ PRESENCE_NS: Final = 250_000_000
 #: A group of geoms that MuJoCo does not show by default.
 HIDDEN_GROUP: Final = mujoco.mjNGROUP - 1
 
-_GEOM: Final = int(mujoco.mjtObj.mjOBJ_GEOM)
+_KINDS: Final = {"geom": int(mujoco.mjtObj.mjOBJ_GEOM), "site": int(mujoco.mjtObj.mjOBJ_SITE)}
 _SHAPES: Final = {
     kind: getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
     for kind in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
@@ -356,6 +367,8 @@ class _Renderer:
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = self._size
         self._look = _ScenePatches(model, self._model)
         self._option = mujoco.MjvOption()
+        for group in set(VIEWER_GROUPS) - set(find_viewer_groups(model)):
+            self._option.geomgroup[group] = 0
         self._scene = mujoco.MjvScene(self._model, MORE_GEOMS + model.ngeom)
         try:
             self._context = mujoco.MjrContext(self._model, int(mujoco.mjtFontScale.mjFONTSCALE_150))
@@ -396,7 +409,7 @@ class _ScenePatches:
     def __init__(self, original: mujoco.MjModel, drawn: mujoco.MjModel) -> None:
         self._original, self._drawn = original, drawn
         self._patches: tuple[PatchOp, ...] = ()
-        self._moved: dict[int, Pose] = {}
+        self._moved: dict[tuple[int, int], Pose] = {}  # by kind and number
         self._added: list[tuple[Visual, Material | None]] = []
 
     def apply(self, patches: Sequence[PatchOp]) -> list[str]:
@@ -405,8 +418,8 @@ class _ScenePatches:
             return []
         self._patches = tuple(patches)
         drawn, original = self._drawn, self._original
-        for field in ("geom_rgba", "geom_group", "geom_matid"):
-            getattr(drawn, field)[:] = getattr(original, field)
+        for kind, field in product(_KINDS, ("rgba", "group", "matid")):
+            getattr(drawn, f"{kind}_{field}")[:] = getattr(original, f"{kind}_{field}")
         self._moved, self._added, notes = {}, [], []
         materials: list[Material] = []
         for op in patches:
@@ -419,29 +432,36 @@ class _ScenePatches:
                     continue
                 new = visual.material - original.nmat
                 self._added.append((visual, materials[new] if 0 <= new < len(materials) else None))
-            elif isinstance(op, RemoveVisual) and op.visual < original.ngeom:
-                drawn.geom_group[op.visual] = HIDDEN_GROUP
-            elif isinstance(op, SetVisual) and op.visual < original.ngeom:
-                self._set(op)
+            elif isinstance(op, RemoveVisual) and (found := self._find(op.visual)):
+                getattr(drawn, f"{found[0]}_group")[found[1]] = HIDDEN_GROUP
+            elif isinstance(op, SetVisual) and (found := self._find(op.visual)):
+                self._set(op, *found)
         return notes
 
-    def _set(self, op: SetVisual) -> None:
+    def _find(self, visual: int) -> tuple[str, int] | None:
+        """Return whether a visual is a geom or a site of the model, and its number; `None` for decoration."""
+        if visual < self._original.ngeom:
+            return "geom", visual
+        site = visual - FIRST_SITE_VISUAL
+        return ("site", site) if 0 <= site < self._original.nsite else None
+
+    def _set(self, op: SetVisual, kind: str, index: int) -> None:
         drawn = self._drawn
         if op.rgba is not None:
-            drawn.geom_rgba[op.visual] = op.rgba
+            getattr(drawn, f"{kind}_rgba")[index] = op.rgba
         if op.group is not None:
-            drawn.geom_group[op.visual] = min(max(op.group, 0), HIDDEN_GROUP)
+            getattr(drawn, f"{kind}_group")[index] = min(max(op.group, 0), HIDDEN_GROUP)
         if op.material is not None:
-            drawn.geom_matid[op.visual] = op.material if op.material < drawn.nmat else -1
+            getattr(drawn, f"{kind}_matid")[index] = op.material if op.material < drawn.nmat else -1
         if op.T_body_visual is not None:
-            self._moved[op.visual] = op.T_body_visual
+            self._moved[_KINDS[kind], index] = op.T_body_visual
 
     def decorate(self, scene: mujoco.MjvScene, data: Any) -> None:
         """Move and add geoms of a scene that shows `data`."""
         for geom in scene.geoms[: scene.ngeom] if self._moved else ():
-            if geom.objtype == _GEOM and geom.objid in self._moved:
-                body = int(self._original.geom_bodyid[geom.objid])
-                p_world, R_world = _to_world(data, body, self._moved[geom.objid])
+            if (pose := self._moved.get((geom.objtype, geom.objid))) is not None:
+                bodies = self._original.geom_bodyid if geom.objtype == _KINDS["geom"] else self._original.site_bodyid
+                p_world, R_world = _to_world(data, int(bodies[geom.objid]), pose)
                 geom.pos[:], geom.mat[:] = p_world, R_world.reshape(3, 3)
         for visual, material in self._added:
             if visual.body >= self._original.nbody or not 0 <= visual.group < 3 or visual.rgba[3] == 0.0:

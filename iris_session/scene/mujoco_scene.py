@@ -1,17 +1,16 @@
 """`parse_mujoco`: convert a compiled MuJoCo model to a scene specification and its assets. For MuJoCo 3.3 to 4.
 
-The model is not changed. Left out: collision settings, actuators, sensors, contacts, and skins (see `skipped`): MuJoCo
-moves their vertices by weighted bodies, on the drawing side. Everything else is as MuJoCo's own renderer draws it:
-meshes without texture coordinates get creases (`meshes.CREASE`), with them the normals of the file; a texture
-coordinate (0, 0) is the upper left corner of the image.
+The model is not changed. Left out: collision settings, actuators, sensors and contacts. Everything else is as MuJoCo's
+own renderer draws it: sites are visuals, skins and spatial tendons are deformables beside the flexes; meshes without
+texture coordinates get creases (`meshes.CREASE`), with them the normals of the file; a texture coordinate (0, 0) is the
+upper left corner of the image.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -30,44 +29,39 @@ from iris_session.protocol.names import (
     AssetEncoding,
     ColorSpace,
     Follow,
-    GeometryKind,
     LightKind,
     TextureKind,
 )
 from iris_session.protocol.scene import (
     Body,
     Camera,
-    Deformable,
     Environment,
-    Geometry,
     Headlight,
     HeightField,
     Light,
     Material,
     Mesh,
-    Rgba,
     SceneSpec,
-    Site,
-    Tendon,
     Texture,
     TextureUse,
-    Visual,
     encode_scene,
 )
 from iris_session.scene.arrays import StoredArray, encode_arrays
 from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions, MeshNote, Work
 from iris_session.scene.budget import add_totals
-from iris_session.scene.meshes import CREASE, MeshArrays, encode_deformable, index_corners, normalise
+from iris_session.scene.meshes import CREASE, MeshArrays, index_corners, normalise
+from iris_session.scene.mujoco_deformables import read_deformables, read_drawn_meshes
+from iris_session.scene.mujoco_visuals import (
+    VIEWER_GROUPS,
+    Shown,
+    make_shown,
+    read_name,
+    read_visuals,
+    to_floats,
+    to_pose,
+)
 from iris_session.scene.result import ParsedScene
-from iris_session.streams.deformable_topology import DeformableTopology, used_vertices
 
-_KINDS: Final = {
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind
-    for kind in ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
-}
-_WRAP_SITE: Final = int(mujoco.mjtWrap.mjWRAP_SITE)
-#: MuJoCo's default colour: a geom with it has the colour of its material.
-_DEFAULT_RGBA: Final = (0.5, 0.5, 0.5, 1.0)
 _ROLES: Final = {
     int(value): name.removeprefix("mjTEXROLE_").lower()
     for name, value in mujoco.mjtTextureRole.__members__.items()
@@ -86,10 +80,6 @@ _ORTHOGRAPHIC: Final = 1
 _TRACKING: Final = frozenset({1, 2})
 #: Smaller differences [m, components of unit vectors] are ignored: the values of the model are used unchanged.
 _SAME: Final = 1e-6
-_TYPES: Final = {
-    kind: int(getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"))
-    for kind in ("body", "geom", "site", "mesh", "texture", "material", "hfield", "light", "camera", "flex", "tendon")
-}
 _TEXTURES: Final = {
     int(mujoco.mjtTexture.mjTEXTURE_2D): TextureKind.IMAGE,
     int(mujoco.mjtTexture.mjTEXTURE_CUBE): TextureKind.CUBE,
@@ -106,8 +96,8 @@ def parse_mujoco(
     data: Any = None,
     name: str = "",
     options: EncodeOptions | None = None,
-    sites: bool = False,
-    tendons: bool = False,
+    groups: Iterable[int] | None = None,
+    sites: bool | Iterable[int] | None = None,
     threads: int = 0,
 ) -> ParsedScene:
     """Convert a compiled MuJoCo model to a scene specification, and put its assets into `store`.
@@ -118,42 +108,43 @@ def parse_mujoco(
         data: Initial state with kinematics computed; by default that of the model.
         name: Name of the scene.
         options: Encoding of meshes and textures; see `EncodeOptions`.
-        sites: Include sites.
-        tendons: Include spatial tendons, and the sites that they run through.
+        groups: Groups of geoms that clients show; `None` for those that the model's own viewer shows: 0, 1 and 2, but
+            not 0 where that has the collision shapes (robosuite).
+        sites: Groups of sites to include, True for all sites, False for none; `None` for those that MuJoCo's viewer
+            shows, 0 to 2.
         threads: Number of threads that encode; 0: one per CPU core, at most 8.
 
     Returns:
         The scene, and a line for each thing that was left out.
+
+    Raises:
+        ValueError: `groups` or `sites` are no groups.
     """
+    shown = make_shown(groups, sites)
+    chosen = shown.choose_groups(model)
     at = compute_tracked(model, data)
     if data is None:
         data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        if model.nflex:
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_flex(model, data)
+        mujoco.mj_fwdPosition(model, data)
     builder = AssetBuilder(store, options, threads)
     found_textures = read_textures(model, builder)
-    cables = _read_tendons(model) if tendons else ()
-    needed = {site for cable in cables for site in cable.sites}
     spec = SceneSpec(
         name=name[:MAX_TEXT],
         source=f"MuJoCo {mujoco.__version__}",
         bodies=_read_bodies(model, data),
-        visuals=tuple(_read_visual(model, i) for i in range(model.ngeom)),
+        visuals=read_visuals(model, shown, chosen),
         materials=read_materials(model),
         textures=found_textures,
         meshes=read_meshes(model, builder),
         hfields=read_hfields(model, builder),
         lights=read_lights(model, at),
         cameras=read_cameras(model, at),
-        sites=tuple(_read_site(model, i) for i in range(model.nsite) if sites or i in needed),
-        tendons=cables,
-        deformables=read_deformables(model, data, builder),
+        deformables=read_deformables(read_drawn_meshes(model), data, builder, chosen),
         environment=read_environment(model, found_textures),
+        groups_shown=chosen,
     )
     spec = add_totals(spec)
-    skipped = tuple(_list_skipped(model, spec, sites=sites, tendons=tendons))
+    skipped = tuple(_list_skipped(model, spec, shown))
     return ParsedScene(spec, store.put(encode_scene(spec)), skipped, builder.built, builder.recalled)
 
 
@@ -202,106 +193,18 @@ def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
     )
 
 
-def _read_visual(model: mujoco.MjModel, index: int) -> Visual:
-    return Visual(
-        T_body_visual=to_pose(model.geom_pos[index], model.geom_quat[index]), **_read_shape(model, "geom", index)
-    )
-
-
-def _read_site(model: mujoco.MjModel, index: int) -> Site:
-    return Site(T_body_site=to_pose(model.site_pos[index], model.site_quat[index]), **_read_shape(model, "site", index))
-
-
-def _read_shape(model: mujoco.MjModel, kind: str, index: int) -> dict[str, Any]:
-    """Return what geoms and sites have in common, all but the pose."""
-    body, group, shape, size, material, rgba = (
-        getattr(model, f"{kind}_{field}")[index] for field in ("bodyid", "group", "type", "size", "matid", "rgba")
-    )
-    meshes = getattr(model, f"{kind}_dataid", None)  # older versions have no meshes of sites
-    return {
-        "id": index,
-        "body": int(body),
-        "name": read_name(model, kind, index),
-        "group": int(group),
-        "geometry": _read_geometry(model, int(shape), size, -1 if meshes is None else int(meshes[index])),
-        "material": int(material),
-        "rgba": resolve_rgba(model, rgba, int(material)),
-    }
-
-
-def _read_geometry(model: mujoco.MjModel, kind: int, size: Any, asset: int) -> Geometry:
-    shape = _KINDS.get(kind, GeometryKind.BOX)
-    full = a, b, _ = to_floats(size)
-    mesh = hfield = -1
-    match shape:
-        case GeometryKind.SPHERE:
-            full = (a, a, a)
-        case GeometryKind.CAPSULE | GeometryKind.CYLINDER:
-            full = (a, a, b)
-        case GeometryKind.MESH | GeometryKind.SDF:
-            mesh = asset
-        case GeometryKind.HFIELD:
-            hfield = asset
-            full = to_floats(model.hfield_size[asset][:3])
-    return Geometry(shape, full, mesh, hfield)
-
-
-def _read_tendons(model: mujoco.MjModel) -> tuple[Tendon, ...]:
-    """Return the spatial tendons that run through at least two sites."""
-    found = []
-    for i in range(model.ntendon):
-        wraps = range(int(model.tendon_adr[i]), int(model.tendon_adr[i]) + int(model.tendon_num[i]))
-        through = tuple(int(model.wrap_objid[w]) for w in wraps if int(model.wrap_type[w]) == _WRAP_SITE)
-        material = int(model.tendon_matid[i])
-        if len(through) >= 2:
-            found.append(
-                Tendon(
-                    name=read_name(model, "tendon", i),
-                    group=int(model.tendon_group[i]),
-                    width=float(model.tendon_width[i]),
-                    sites=through,
-                    material=material,
-                    rgba=resolve_rgba(model, model.tendon_rgba[i], material),
-                )
-            )
-    return tuple(found)
-
-
-def _list_skipped(model: mujoco.MjModel, spec: SceneSpec, *, sites: bool, tendons: bool) -> Iterator[str]:
-    """Yield lines on content that clients will not see: also sites and tendons that were not requested."""
-    shown = spec.groups_shown
-    if model.nskin:
-        yield f"{model.nskin} skins: only bodies, shapes and flexes are shared; use a flex"
-    if model.nflex > MAX_STREAMS:
-        yield f"motion of {model.nflex - MAX_STREAMS} of {model.nflex} flexes: {MAX_STREAMS} are streamed"
-    if not sites:
-        marks = (_read_site(model, i) for i in range(model.nsite))
-        if n := sum(mark.group in shown and mark.rgba[3] > 0 for mark in marks):
-            yield f"{n} sites: serve --sites, or SessionConfig(sites=True), shares them"
-    if not tendons:
-        cables = (cable for cable in _read_tendons(model) if cable.group in shown)
-        if n := sum(cable.width > 0 and cable.rgba[3] > 0 for cable in cables):
-            yield f"{n} tendons: serve --tendons, or SessionConfig(tendons=True), shares them"
+def _list_skipped(model: mujoco.MjModel, spec: SceneSpec, shown: Shown) -> Iterator[str]:
+    """Yield lines on content that clients will not see."""
+    if shown.groups is None and (hidden := set(VIEWER_GROUPS) - set(spec.groups_shown)):
+        n = sum(visual.group in hidden and visual.rgba[3] > 0 for visual in spec.visuals)
+        yield f"{n} collision shapes in group {', '.join(map(str, sorted(hidden)))}: --groups 0,1,2 shows them"
+    if (n := len(spec.deformables)) > MAX_STREAMS:
+        yield f"motion of {n - MAX_STREAMS} of {n} flexes, skins and tendons: {MAX_STREAMS} are streamed"
     if n := sum(texture.levels[0].encoding == AssetEncoding.OPAQUE for texture in spec.textures):
         yield f"{n} textures in a form of their own (KTX) where that is not read: PNG is everywhere"
 
 
-# --- names, materials, lights, cameras and environment; fields that older versions lack keep their defaults -----------
-
-
-def to_floats(values: Any) -> Any:
-    """Return an array as a tuple of floats: a vector or a colour."""
-    return tuple(np.asarray(values, np.float64).tolist())
-
-
-def to_pose(position: Any, quaternion: Any) -> Pose:
-    return Pose(to_floats(position), to_floats(quaternion))
-
-
-def resolve_rgba(model: mujoco.MjModel, own: Any, material: int) -> Rgba:
-    """Return the colour that MuJoCo draws: the own colour, unless that is the default and there is a material."""
-    color: Rgba = to_floats(own)
-    return to_floats(model.mat_rgba[material]) if material >= 0 and color == _DEFAULT_RGBA else color
+# --- materials, lights, cameras and environment; fields that older versions lack keep their defaults -----------
 
 
 def read_materials(model: mujoco.MjModel) -> tuple[Material, ...]:
@@ -459,15 +362,7 @@ def _read_optional(model: mujoco.MjModel, field: str, index: int, default: float
     return float(getattr(model, field)[index]) if hasattr(model, field) else default
 
 
-# --- names ------------------------------------------------------------------------------------------------------------
-
-
-def read_name(model: mujoco.MjModel, kind: str, index: int) -> str:
-    """Return the name, or an empty text."""
-    return (mujoco.mj_id2name(model, _TYPES[kind], index) or "")[:MAX_TEXT]
-
-
-# --- meshes, textures, height fields and deformables ------------------------------------------------------------------
+# --- meshes, textures and height fields -------------------------------------------------------------------------------
 
 
 def read_meshes(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[Mesh, ...]:
@@ -564,107 +459,3 @@ def read_hfields(model: mujoco.MjModel, builder: AssetBuilder) -> tuple[HeightFi
 
 def _encode_grid(grid: NDArray[np.float32]) -> bytes:
     return encode_arrays(ArrayKind.GRID, [StoredArray(ArrayName.ELEVATION, grid, ArrayFilter.SHUFFLE)])
-
-
-# --- deformables ------------------------------------------------------------------------------------------------------
-
-
-def stream_name(index: int) -> str:
-    """Return the name of a flex's media stream, by its id."""
-    return f"flex-{index}"
-
-
-def read_deformables(model: mujoco.MjModel, data: Any, builder: AssetBuilder) -> tuple[Deformable, ...]:
-    """Return all flexes, by id; `data` has the initial state, with kinematics."""
-    parts = [read_flex_mesh(model, i) for i in range(model.nflex)]
-    rest = [np.array(data.flexvert_xpos[part.vertices], np.float32) for part in parts]
-    notes = builder.run(
-        [
-            builder.blob_work([b"flex", *part.raw, vertices], partial(part.encode, vertices))
-            for part, vertices in zip(parts, rest, strict=True)
-        ]
-    )
-    return tuple(
-        Deformable(
-            name=read_name(model, "flex", i),
-            dim=int(model.flex_dim[i]),
-            group=int(model.flex_group[i]),
-            vertices=len(rest[i]),
-            elements=len(parts[i].elements),
-            radius=float(model.flex_radius[i]),
-            flat=bool(model.flex_flatskin[i]),
-            material=_find_flex_material(model, i),
-            rgba=resolve_rgba(model, model.flex_rgba[i], _find_flex_material(model, i)),
-            stream=stream_name(i),
-            address=note.address,
-            bytes=note.bytes,
-        )
-        for i, note in enumerate(notes)
-    )
-
-
-def _find_flex_material(model: mujoco.MjModel, index: int) -> int:
-    """Return the material of a flex. Since MuJoCo 4 every element has one; models give all the same, so the first is
-    used.
-    """
-    by_element = len(model.flex_matid) == model.nflexelem
-    return int(model.flex_matid[int(model.flex_elemadr[index]) if by_element else index])
-
-
-@dataclass(frozen=True)
-class FlexMesh:
-    """Drawn mesh of a flex.
-
-    `elements`: edges (n, 2) of a rope, triangles (n, 3) of a cloth or of the surface of a soft body; `uv`: texture
-    coordinates at the corners of each element, if any. `vertices`: rows of `flexvert_xpos`, without those inside of a
-    solid; `numbers`: their numbers in the flex. `topology`: the plan of the stream.
-    """
-
-    elements: NDArray[np.uint32]
-    uv: NDArray[np.float32] | None
-    vertices: NDArray[np.int64]
-    numbers: NDArray[np.int64]
-    topology: DeformableTopology
-
-    @property
-    def raw(self) -> list[NDArray[Any]]:
-        """Return the content that the asset depends on, besides the vertices at rest."""
-        return [self.elements, self.numbers, *([] if self.uv is None else [self.uv])]
-
-    def encode(self, rest: NDArray[np.float32]) -> bytes:
-        """Return the asset, for vertices at rest (n, 3) [m], world frame."""
-        numbers = self.numbers if len(self.numbers) <= int(self.numbers.max()) else None  # the inside is left out
-        return encode_deformable(self.elements, self.uv, rest, self.topology, numbers)
-
-
-def read_flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:
-    """Return the mesh of one flex, by its id."""
-    dim = int(model.flex_dim[index])
-    if dim == 3:
-        start, count = int(model.flex_shelldataadr[index]), int(model.flex_shellnum[index])
-        corners = model.flex_shell[start : start + 3 * count].reshape(-1, 3)
-    else:
-        start, count = int(model.flex_elemdataadr[index]), int(model.flex_elemnum[index])
-        corners = model.flex_elem[start : start + (dim + 1) * count].reshape(-1, dim + 1)
-    n = int(model.flex_vertnum[index])
-    used, elements = used_vertices(n, corners) if dim == 3 else (np.arange(n), corners)
-    ends = {"edges": elements} if dim == 1 else {"faces": elements}
-    return FlexMesh(
-        np.ascontiguousarray(elements, np.uint32),
-        _read_texture_coordinates(model, index, start, corners),
-        int(model.flex_vertadr[index]) + used,
-        used,
-        DeformableTopology(len(used), **ends).without_faces(),
-    )
-
-
-def _read_texture_coordinates(
-    model: mujoco.MjModel, index: int, start: int, corners: NDArray[np.int32]
-) -> NDArray[np.float32] | None:
-    at, dim = int(model.flex_texcoordadr[index]), int(model.flex_dim[index])
-    if at < 0 or dim == 1:
-        return None
-    which = corners
-    if dim == 2 and hasattr(model, "flex_elemtexcoord"):
-        which = model.flex_elemtexcoord[start : start + 3 * len(corners)].reshape(-1, 3)
-    return np.ascontiguousarray(model.flex_texcoord[at + which], np.float32)

@@ -29,6 +29,7 @@ from iris_session.protocol.server_messages import MAX_MARKS
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording.budget import MIN_BUDGET_BYTES
 from iris_session.rrd.assets import RECORD_ASSETS, SCENE
+from iris_session.scene.mujoco_visuals import Shown, make_shown
 from iris_session.session.errors import ConfigError, short_repr
 from iris_session.session.robots import RobotChoice
 
@@ -79,8 +80,10 @@ class SessionConfig:
         web_key: Its key (PEM).
         assets: Offer meshes and textures to clients: True keeps them in the user's cache, a path in that folder.
         cameras: Camera files, each with a process that publishes its point cloud; see `iris-session cloud example`.
-        sites: Include the sites of a MuJoCo model in what clients draw.
-        tendons: Include its tendons, with the sites they run through.
+        groups: Groups of geoms of a MuJoCo model that clients show; `None` for those that its own viewer shows: 0, 1
+            and 2, but not 0 where that has the collision shapes (robosuite).
+        sites: Groups of its sites that clients show, True for all sites, False for none; `None` for those that MuJoCo's
+            viewer shows, 0 to 2.
         adapt_media: Send fewer media to clients on slow links, so that their state stays fresh.
         realtime: `run()` asks for real-time priority, and continues without it when it is refused.
         resume: A recording of `run()`, or its folder, to continue. Scene, robots, name, authority and control come from
@@ -118,8 +121,8 @@ class SessionConfig:
     web_key: str = ""
     assets: bool | str | Path = True
     cameras: tuple[str | Path, ...] = ()
-    sites: bool = False
-    tendons: bool = False
+    groups: tuple[int, ...] | None = None
+    sites: bool | tuple[int, ...] | None = None
     adapt_media: bool = True
     realtime: bool = True
     resume: str | Path | None = None
@@ -151,6 +154,10 @@ class SessionConfig:
                 f"record_clouds_hz {self.record_clouds_hz} is out of range: {MIN_CLOUDS_HZ:g} to {MAX_CLOUDS_HZ:g}, "
                 "or 0 to record no clouds and pictures"
             )
+        try:
+            make_shown(self.groups, self.sites)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
         if self.record_assets not in RECORD_ASSETS:
             raise ConfigError(f"record_assets {self.record_assets!r:.80} is none of {', '.join(RECORD_ASSETS)}")
         if self.record_budget_bytes and self.record_budget_bytes < MIN_BUDGET_BYTES:
@@ -183,6 +190,15 @@ class SessionConfig:
             stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S.%fZ")
             return Path("sessions") / f"{stamp}-{self.name}" / "session.rrd"
         return Path(self.record)
+
+
+def choose_shown(config: SessionConfig, groups: object, sites: object) -> Shown:
+    """Return what clients see of a model: as given, `None` for what the configuration says. Raises `ConfigError`."""
+    try:
+        given: Any = config.groups if groups is None else groups, config.sites if sites is None else sites
+        return make_shown(*given)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 _Spec = TypeVar("_Spec", RobotSpec, ObjectSpec)

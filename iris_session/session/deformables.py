@@ -7,14 +7,16 @@ about a millisecond.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.physics import World
+from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.names import MediaEncoding
-from iris_session.scene.mujoco_scene import read_flex_mesh, stream_name
+from iris_session.scene.mujoco_deformables import read_drawn_meshes
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -81,14 +83,9 @@ class DeformableStreams:
                 stream.encoder.reset()  # it was dropped: the next frame must be complete
 
 
-def list_flexes(world: World) -> list[DeformableSourceMesh]:
-    """Return the flexes of a MuJoCo world."""
-    meshes = [read_flex_mesh(world.model, index) for index in range(world.model.nflex)]
+def list_deformables(world: World) -> list[DeformableSourceMesh]:
+    """Return the meshes of a MuJoCo world whose vertices move: flexes, skins and tendons that are streamed."""
+    meshes = read_drawn_meshes(world.model)[:MAX_STREAMS]
     return [
-        DeformableSourceMesh(stream_name(index), mesh.topology, _make_reader(world, mesh.vertices))
-        for index, mesh in enumerate(meshes)
+        DeformableSourceMesh(mesh.stream, mesh.topology, partial(mesh.read_vertices, world.data)) for mesh in meshes
     ]
-
-
-def _make_reader(world: World, rows: NDArray[np.int64]) -> Callable[[], NDArray[np.floating]]:
-    return lambda: world.data.flexvert_xpos[rows]

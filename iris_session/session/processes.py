@@ -39,11 +39,12 @@ from iris_session.recording import (
     pack_model,
 )
 from iris_session.recording.folders import check_new_recording
+from iris_session.scene.mujoco_visuals import Shown
 from iris_session.scene.result import ComposedScene
 from iris_session.session.cameras import SessionCameras
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import SessionCore
-from iris_session.session.deformables import DeformableSourceMesh, DeformableStreams, list_flexes
+from iris_session.session.deformables import DeformableSourceMesh, DeformableStreams, list_deformables
 from iris_session.session.errors import StartError
 from iris_session.session.resume import (
     Listening,
@@ -117,7 +118,7 @@ class SessionProcesses:
         self._core = core
         self._published_deformables = None if published is None else published.deformables
         scene = None if published is None else published.scene
-        self.scenes = SharedScenes(config.assets, config.name, scene, sites=config.sites, tendons=config.tendons)
+        self.scenes = SharedScenes(config.assets, config.name, scene, Shown(config.groups, config.sites))
         self.state_period_ns = round(1e9 / config.state_hz)
         self.recorder: RecorderProcess | None = None
         self.feed: RecorderFeed | None = None
@@ -262,7 +263,7 @@ class SessionProcesses:
         front, feed = self.front.link, self.feed
         stepper = Stepper(core, front, feed, clock, self.state_period_ns, keyframe_ns, chain, after)
         stepper.on_scene.append(self._follow_scene)
-        meshes = list_flexes(core.world) if self._published_deformables is None else self._published_deformables
+        meshes = list_deformables(core.world) if self._published_deformables is None else self._published_deformables
         self._deformables = DeformableStreams(meshes, self._publish_vertices)
         stepper.on_publish.append(self._deformables.publish)
         return stepper

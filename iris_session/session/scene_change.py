@@ -22,9 +22,10 @@ from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import MAX_OPS, AddVisual, PatchOp, SceneError, SetVisual
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.recording import pack_model
+from iris_session.scene.mujoco_visuals import Shown
 from iris_session.session.config import check_timestep
 from iris_session.session.core import SessionCore, make_plant
-from iris_session.session.deformables import list_flexes
+from iris_session.session.deformables import list_deformables
 from iris_session.session.errors import ConfigError
 from iris_session.session.shared_scene import SharedScenes
 from iris_session.session.stepper import NextScene, Stepper
@@ -55,6 +56,7 @@ def prepare_scene(
     state: bytes,
     found: FoundRobots,
     objects: tuple[ObjectSpec, ...] | None,
+    shown: Shown | None = None,
 ) -> NextScene:
     """Make everything of a scene that takes long, without touching the session of `core`.
 
@@ -65,6 +67,7 @@ def prepare_scene(
         state: `mjSTATE_INTEGRATION` to begin with; empty for the model's own.
         found: The robots to offer, and what is unclear about them.
         objects: `None` to find them in the model.
+        shown: What clients see of the model; `None` for what they see of every one.
 
     Raises:
         ConfigError: A robot, object or timestep that the session cannot use.
@@ -83,8 +86,10 @@ def prepare_scene(
         raise ConfigError(str(error)) from error
     check_timestep(model)
     plant = make_plant(model, scene, core.config.control)
-    shown = scenes.make(plant.world, state)
-    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)), shown, list_flexes(plant.world), found.texts)
+    made = scenes.make(plant.world, state, shown=shown)
+    return NextScene(
+        plant, scene.model_hash, pack_model(bytes(binary)), made, list_deformables(plant.world), found.texts
+    )
 
 
 def _to_plain(value: object) -> object:

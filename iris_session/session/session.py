@@ -19,10 +19,11 @@ from __future__ import annotations
 
 import atexit
 import copy
+import dataclasses
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -39,10 +40,18 @@ from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec
-from iris_session.session.attachment import Attachment
-from iris_session.session.config import SessionConfig, check_arguments, check_objects, check_robots, check_timestep
+from iris_session.session.attachment import Attachment, WrappedMethod
+from iris_session.session.config import (
+    SessionConfig,
+    check_arguments,
+    check_objects,
+    check_robots,
+    check_timestep,
+    choose_shown,
+)
 from iris_session.session.core import SessionCore, make_session_core, read_plant_state
 from iris_session.session.errors import ConfigError, OwnershipError
+from iris_session.session.model_follower import ModelFollower
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.resume import prepare_session
 from iris_session.session.robots import (
@@ -93,6 +102,8 @@ class Session(SessionBase):
         robots: Robots that can be driven: `None` or `auto` finds them in the model, `none` offers none; or names of
             robots found (legs and fingers, too), the path of a robots file, or specifications.
         objects: Free bodies that robots and hands can take; `None` finds them in the model.
+        groups: Groups of geoms that clients show, instead of those of `config`; see `SessionConfig`.
+        sites: Groups of sites that clients show; see `SessionConfig`.
 
     Attributes:
         model, data, robots, objects: Of the present scene.
@@ -114,7 +125,12 @@ class Session(SessionBase):
         *,
         robots: RobotChoice = None,
         objects: Sequence[ObjectSpec] | None = None,
+        groups: Iterable[int] | None = None,
+        sites: bool | Iterable[int] | None = None,
     ) -> None:
+        if (groups is not None or sites is not None) and isinstance(config, SessionConfig | None):
+            config = SessionConfig() if config is None else config
+            config = dataclasses.replace(config, **choose_shown(config, groups, sites)._asdict())
         self._past, self.config, scene = prepare_session(config, model, data, robots, objects)
         self.model, self.robots, self.objects, self._robot_notices = scene
         self._robot_choice: FixedChoice = None
@@ -132,6 +148,8 @@ class Session(SessionBase):
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
         self._attachment: Attachment | None = None
+        self._environment_steps: list[WrappedMethod] = []
+        self._follower: ModelFollower | None = None
         self._requested_ticks = 0  # by a director, while paused
         self._scheduling = "normal"
         self._next_overrun_log_ns = 0
@@ -185,6 +203,8 @@ class Session(SessionBase):
         """
         self._stop.set()
         self._is_closed = True
+        while self._environment_steps:
+            self._environment_steps.pop().remove()
         if self._attachment is not None:
             self._attachment.close()
             atexit.unregister(self.close)
@@ -364,6 +384,8 @@ class Session(SessionBase):
         step: str = "step",
         robots: RobotChoice = None,
         objects: Sequence[ObjectSpec] | None = None,
+        groups: Iterable[int] | None = None,
+        sites: bool | Iterable[int] | None = None,
     ) -> Self:
         """Share a script's own simulation: every `mj_step(model, data)` after this line is seen by the session.
 
@@ -384,6 +406,8 @@ class Session(SessionBase):
             robots: As of `Session`. The choice holds for models that are built at a reset, too; what one of them lacks
                 is in `notes`.
             objects: As of `Session`.
+            groups: As of `Session`.
+            sites: As of `Session`.
 
         Returns:
             The started session.
@@ -404,7 +428,7 @@ class Session(SessionBase):
         if environment is not None and not callable(getattr(environment, step, None)):
             raise OwnershipError(f"environment of type {type(environment).__name__} has no method {step!r} to wrap")
         robots = check_robots(robots)
-        session = cls(model, data, config, robots=robots, objects=objects)
+        session = cls(model, data, config, robots=robots, objects=objects, groups=groups, sites=sites)
         try:
             session._robot_choice = fix_choice(model, robots, session.config.control)
             session._object_choice = None if objects is None else session.objects
@@ -412,11 +436,26 @@ class Session(SessionBase):
             loop = session._require_user_loop()
             session._attachment = Attachment(loop, environment, step, session._change_model)
             session.processes.reporter.warning_sources.append(session._attachment.list_warnings)
+            session._follow_environment(environment, step)
         except BaseException:
             session.close()
             raise
         atexit.register(session.close)  # a script may simply end
         return session
+
+    def _follow_environment(self, environment: object, step: str) -> None:
+        """Look at goals after every step and reset of the environment, where they are as it draws them."""
+        for name in (step, "reset") if environment is not None else ():
+            if callable(getattr(environment, name, None)):
+
+                def around(original: Callable[[], Any], is_reset: bool = name != step) -> Any:
+                    result = original()
+                    if self._follower is not None and self.data is not None and not self._is_closed:
+                        with self._hold_steps():
+                            self._follower.follow_environment(environment, self.data, is_reset=is_reset)
+                    return result
+
+                self._environment_steps.append(WrappedMethod(environment, name, around))
 
     def _change_model(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Go on with another model and data of the attached environment."""
@@ -537,6 +576,8 @@ class Session(SessionBase):
         *,
         robots: RobotChoice = None,
         objects: Sequence[ObjectSpec] | None = None,
+        groups: Iterable[int] | None = None,
+        sites: bool | Iterable[int] | None = None,
     ) -> Future[None]:
         """Load another scene into the running session: a new `scene_epoch` with the same participants.
 
@@ -552,6 +593,8 @@ class Session(SessionBase):
             data: The state to begin with; `None` for keyframe `home`, else the model's default.
             robots: As of `Session`.
             objects: `None` finds them in the model.
+            groups: As of `Session`, for this scene.
+            sites: As of `Session`, for this scene.
 
         Returns:
             A future that is done when the scene is ready for the next step. It raises `ModelNotFoundError`,
@@ -560,7 +603,7 @@ class Session(SessionBase):
         Raises:
             OwnershipError: In a user loop, whose model is not ours, and before the first `run()`.
             TypeError: `model` is no model.
-            ConfigError: `robots` or `objects` are none.
+            ConfigError: `robots` or `objects` are none, or `groups` or `sites` no groups.
         """
         if self._user_loop is not None:
             raise OwnershipError("load_scene: your own loop owns the model; end this session and begin another with it")
@@ -575,6 +618,7 @@ class Session(SessionBase):
         done: Future[None] = Future()
         scenes = self._require_started().scenes
         chosen, things = check_robots(robots), check_objects(objects)
+        shown = choose_shown(self.config, groups, sites)
         state_data = copy.copy(data)  # the caller may continue with theirs
 
         def prepare() -> None:
@@ -583,7 +627,7 @@ class Session(SessionBase):
                 check_arguments(loaded, state_data, self.config)
                 state = b"" if state_data is None else read_plant_state(loaded, state_data)
                 found = choose_robots(loaded, chosen, self.config.control)
-                scene = prepare_scene(stepper.core, scenes, loaded, state, found, things)
+                scene = prepare_scene(stepper.core, scenes, loaded, state, found, things, shown)
                 with scenes.lock:
                     stepper.queue_scene(scene)
                     scenes.show(scene.shown)
@@ -616,6 +660,8 @@ class Session(SessionBase):
             if not user_owned:
                 self.data = core.world.data
                 stepper.on_scene.append(self._follow_scene)
+            self._follower = ModelFollower(live.scenes, stepper, self.patch_scene)
+            stepper.on_publish.append(self._follower.follow_publish)
             with live.scenes.lock, self._early_lock:  # against other threads
                 self._stepper = stepper  # first: what a signal handler posts meanwhile goes there
                 for patch in self._early_patches:

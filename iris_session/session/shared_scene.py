@@ -28,7 +28,9 @@ from iris_session.protocol.scene import (
     merge_patches,
 )
 from iris_session.scene import AssetStore, Hold, SceneBuildError
+from iris_session.scene.mujoco_looks import ModelLooks
 from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene.mujoco_visuals import Shown
 from iris_session.scene.result import ComposedScene
 
 #: Specifications of patches that are kept: more than can be pending for the loop, and as long as a slow disk may need
@@ -41,13 +43,15 @@ NO_SPECIFICATION: Final = "clients get no meshes and textures"
 class SharedScene(NamedTuple):
     """One scene as clients get it.
 
-    `spec`: `None` where only bodies and poses are shared. `notes`: what is left out, a line each.
+    `spec`: `None` where only bodies and poses are shared. `notes`: what is left out, a line each. `looks`: of the model
+    that the specification was read off.
     """
 
     info: SceneInfo
     spec: SceneSpec | None = None
     patches: tuple[PatchOp, ...] = ()
     notes: tuple[str, ...] = ()
+    looks: ModelLooks | None = None
 
 
 class SharedScenes:
@@ -58,8 +62,7 @@ class SharedScenes:
             poses, and nothing to draw them with.
         name: Name of the scenes.
         composed: The scene of every world, where it is not read off its model.
-        sites: Include the sites of a model.
-        tendons: Include the tendons of a model.
+        shown: What clients see of a model.
 
     Attributes:
         lock: Held for the moment in which a scene or patch becomes the newest.
@@ -71,16 +74,14 @@ class SharedScenes:
         where: bool | str | Path,
         name: str,
         composed: ComposedScene | None = None,
-        *,
-        sites: bool = False,
-        tendons: bool = False,
+        shown: Shown | None = None,
     ) -> None:
         self._store_notes: list[str] = []
         self.lock = threading.RLock()
         self.newest: SharedScene | None = None
         self._name = name
         self._composed = composed
-        self._sites, self._tendons = sites, tendons
+        self._shown = Shown() if shown is None else shown
         self._holds: list[Hold] = []
         self._patched: deque[_PatchedSpec] = deque()  # oldest first
         self._closed = False
@@ -92,7 +93,7 @@ class SharedScenes:
                 store.trim()  # a scan of the folder takes a while, and is not to happen in a running session
                 self._store = store
             except OSError as error:
-                self._add_note(f"{NO_SPECIFICATION}: {error.filename or where}: {error.strerror or error}")
+                self.add_note(f"{NO_SPECIFICATION}: {error.filename or where}: {error.strerror or error}")
 
     @property
     def asset_root(self) -> str:
@@ -105,13 +106,20 @@ class SharedScenes:
         newest = self.newest
         return list(dict.fromkeys((*(() if newest is None else newest.notes), *self._store_notes)))
 
-    def make(self, world: World, initial_state: bytes = b"", patches: Sequence[PatchOp] = ()) -> SharedScene:
+    def make(
+        self,
+        world: World,
+        initial_state: bytes = b"",
+        patches: Sequence[PatchOp] = (),
+        shown: Shown | None = None,
+    ) -> SharedScene:
         """Make specification and assets of a scene. Slow for a model that was never shared before. From any thread.
 
         Args:
             world: The world of the scene.
             initial_state: `mjSTATE_INTEGRATION` of its first state; empty for the model's own.
             patches: Patches since then, so that a resumed session shows what it showed.
+            shown: What clients see of the model; `None` for what they see of every one.
         """
         poses = np.zeros((len(world.bodies), 7))
         world.read_poses(poses)
@@ -121,19 +129,21 @@ class SharedScenes:
         store = self._store
         if store is None:
             return SharedScene(plain)
+        shown = self._shown if shown is None else shown
+        looks = None if self._composed else ModelLooks(world.model, shown)
         try:
             parsed = self._composed or parse_mujoco(
                 world.model,
                 store,
                 data=world.make_initial_data(initial_state),
                 name=self._name,
-                sites=self._sites,
-                tendons=self._tendons,
+                groups=shown.groups,
+                sites=shown.sites,
             )
-            shown = _store_spec(store, apply_patch(parsed.spec, patches), plain, tuple(patches))
+            made = _store_spec(store, apply_patch(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session works without its picture
             return SharedScene(plain, notes=(f"{NO_SPECIFICATION}: {error}",))
-        return shown._replace(notes=tuple(f"left out for clients: {what}" for what in parsed.skipped))
+        return made._replace(notes=tuple(f"left out for clients: {what}" for what in parsed.skipped), looks=looks)
 
     def patch(self, ops: Sequence[PatchOp]) -> SharedScene:
         """Return the newest scene with `ops` applied. Raises `SceneError`, `OSError`. Hold `lock` until `show`."""
@@ -149,7 +159,8 @@ class SharedScenes:
                 "visual count once: load the scene anew"
             )
         info = msgspec.structs.replace(newest.info, patches=newest.info.patches + 1)
-        return _store_spec(self._store, apply_patch(newest.spec, ops), info, merging)._replace(notes=newest.notes)
+        patched = _store_spec(self._store, apply_patch(newest.spec, ops), info, merging)
+        return patched._replace(notes=newest.notes, looks=newest.looks)
 
     def show(self, shown: SharedScene) -> SceneInfo:
         """Make a scene the newest. Its files are held, and those of the one before, which the front still serves.
@@ -182,7 +193,7 @@ class SharedScenes:
             self._holds.append(store.hold(addresses))
         except OSError as error:
             why = error.strerror or error
-            self._add_note(f"scene files in {store.root} cannot be held, so other processes may remove them: {why}")
+            self.add_note(f"scene files in {store.root} cannot be held, so other processes may remove them: {why}")
 
     def _discard_replaced(self, store: AssetStore) -> None:
         """Discard specifications that later patches have replaced for all clients."""
@@ -191,8 +202,8 @@ class SharedScenes:
             old = patched_specs.popleft()
             store.discard(old.address, old.used_at)
 
-    def _add_note(self, text: str) -> None:
-        """Add a note about the store once: a session may load and patch scenes for days."""
+    def add_note(self, text: str) -> None:
+        """Add a note about the store or about changes, once: a session may load and patch scenes for days."""
         if text not in self._store_notes:
             self._store_notes.append(text)
 

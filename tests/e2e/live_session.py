@@ -32,7 +32,7 @@ from iris_session.link import front_process
 from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import AddVisual, Geometry, SetVisual, Visual
 from iris_session.protocol.server_messages import StateHeader
-from iris_session.session.deformables import list_flexes
+from iris_session.session.deformables import list_deformables
 
 LONG_NS: Final = 60 * 1_000_000_000
 #: A participant that is silent for so long has left, as far as others can see [ns].
@@ -186,7 +186,7 @@ class Served:
     def _keep_media(self, scene_epoch: int, end_ns: int, shown_ns: int) -> None:
         """Keep the published vertices, publish a cloud, and let gravity turn, so that nothing comes to rest."""
         world = self.session.stepper.core.world
-        self._vertices[shown_ns] = np.array(list_flexes(world)[0].vertices())
+        self._vertices[shown_ns] = np.array(list_deformables(world)[0].vertices())
         number = len(self._clouds)
         info = StreamInfo("Room", "remote", None, HZ)
         cloud = self._encoded[number % CLOUDS]

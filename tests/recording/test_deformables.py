@@ -15,7 +15,8 @@ from iris_session.physics.load import encode_model
 from iris_session.recording import SessionHeader, pack_model
 from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
-from iris_session.scene.mujoco_scene import parse_mujoco, read_flex_mesh
+from iris_session.scene.mujoco_deformables import read_drawn_meshes
+from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from iris_session.viewer.deformables import DrawnDeformable
 from tests.recording.support import column, read
@@ -33,7 +34,7 @@ class World:
         self.model = flexes()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)
-        self.meshes = [read_flex_mesh(self.model, i) for i in range(self.model.nflex)]
+        self.meshes = read_drawn_meshes(self.model)
         self.encoders = [DeformableEncoder(mesh.topology, BOUND_M) for mesh in self.meshes]
         self.store = AssetStore(folder / "assets")
         self.parsed = parse_mujoco(self.model, self.store)
@@ -45,7 +46,7 @@ class World:
         self.writer.add(Batch(assets=[self.assets]))
 
     def vertices(self, index: int) -> np.ndarray:
-        return self.data.flexvert_xpos[self.meshes[index].vertices].copy()
+        return np.array(self.meshes[index].read_vertices(self.data))
 
     def publish(self, step: int, index: int, vertices: np.ndarray) -> None:
         self.encoders[index].reset()

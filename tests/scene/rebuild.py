@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from iris_session.protocol.common import Pose
-from iris_session.protocol.scene import Geometry, Material, SceneSpec, decode_scene
+from iris_session.protocol.scene import FIRST_SITE_VISUAL, Geometry, Material, SceneSpec, decode_scene
 from iris_session.scene import AssetStore, decode_arrays, decode_image, decode_mesh
 
 FACES = ("right", "left", "up", "down", "front", "back")
@@ -107,9 +107,10 @@ def _content(spec: SceneSpec, body: int) -> str:
     for visual in spec.visuals:
         if visual.body == body:
             material = f'material="a{visual.material}"' if visual.material >= 0 else ""
+            kind, rest = ("geom", 'contype="0" conaffinity="0"') if visual.id < FIRST_SITE_VISUAL else ("site", "")
             parts.append(
-                f'<geom {_shape(visual.geometry)} {_pose(visual.T_body_visual)} group="{visual.group}" '
-                f'rgba="{text(visual.rgba)}" {material} contype="0" conaffinity="0"/>'
+                f'<{kind} {_shape(visual.geometry)} {_pose(visual.T_body_visual)} group="{visual.group}" '
+                f'rgba="{text(visual.rgba)}" {material} {rest}/>'
             )
     for light in spec.lights:
         if light.body == body:

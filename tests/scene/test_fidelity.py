@@ -22,7 +22,7 @@ PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 
 def check(model: mujoco.MjModel, store: AssetStore, views: slice) -> None:
-    parsed = parse_mujoco(model, store, options=EncodeOptions(levels=False), sites=True)
+    parsed = parse_mujoco(model, store, options=EncodeOptions(levels=False))
     assert parsed.skipped == ()
     copy = rebuild(encode_scene(parsed.spec), store)
     pictures = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import pytest
@@ -14,6 +15,7 @@ from iris_session.protocol.scene import AddMesh, Mesh, MeshLevel, SceneError, Se
 from iris_session.scene import AssetStore
 from iris_session.session import shared_scene
 from iris_session.session.config import SessionConfig
+from iris_session.session.errors import ConfigError
 from iris_session.session.scene_change import prepare_scene
 from iris_session.session.session import Session
 from iris_session.session.shared_scene import SharedScenes
@@ -89,23 +91,19 @@ def test_deformables_of_the_next_scene_are_prepared_with_it() -> None:
 
 
 @pytest.mark.usefixtures("simulation")
-def test_sites_and_tendons_are_shared_on_request_or_noted(tmp_path: Path) -> None:
-    xml = """<mujoco><worldbody><body name="arm"><joint/><geom size=".1"/><site name="end" pos="0 0 .2"/></body>
-    <site name="hook" pos="0 0 1"/></worldbody>
-    <tendon><spatial name="rope" width=".01"><site site="end"/><site site="hook"/></spatial></tendon></mujoco>"""
+@pytest.mark.parametrize("way", ["config", "arguments"])
+def test_groups_and_sites_of_a_session_are_chosen(tmp_path: Path, way: str) -> None:
+    xml = """<mujoco><worldbody><body name="arm"><joint/><geom size=".1" group="3"/><site name="end" group="4"/></body>
+        <site name="goal"/></worldbody></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
     plain = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, web=False, assets=tmp_path)
     with Session(model, config=plain) as session:
-        newest = session.processes.scenes.newest
-        assert newest is not None
-        assert newest.spec is not None
-        assert (newest.spec.sites, newest.spec.tendons) == ((), ())
-        assert any("2 sites: serve --sites" in note for note in session.notes)
-        assert any("--tendons" in note for note in session.notes)
-    with Session(model, config=replace(plain, sites=True, tendons=True)) as session:
-        newest = session.processes.scenes.newest
-        assert newest is not None
-        assert newest.spec is not None
-        assert {site.name for site in newest.spec.sites} == {"end", "hook"}
-        assert [tendon.name for tendon in newest.spec.tendons] == ["rope"]
-        assert not any("sites" in note or "tendons" in note for note in session.notes)
+        assert session.scene is not None
+        assert ([one.name for one in session.scene.visuals], session.scene.groups_shown) == (["", "goal"], (0, 1, 2))
+    config = replace(plain, groups=(3,), sites=(4,)) if way == "config" else plain
+    given: dict[str, Any] = {} if way == "config" else {"groups": [3], "sites": [4]}
+    with Session(model, config=config, **given) as session:
+        assert session.scene is not None
+        assert ([one.name for one in session.scene.visuals], session.scene.groups_shown) == (["", "end"], (3,))
+    with pytest.raises(ConfigError, match="groups"):
+        Session(model, config=plain, groups=["visual"])

@@ -3049,7 +3049,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>A marked place on a body, drawn as a shape on request.</summary>
+    /// <summary>A place on a body that a tendon runs through, drawn as a shape.</summary>
     public sealed class Site : WireValue
     {
         public long Id;
@@ -3077,7 +3077,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>A cable, drawn on request as straight pieces of radius width [m] through sites, ids; ...</summary>
+    /// <summary>A cable, drawn as straight pieces of radius width [m] through sites, ids.</summary>
     public sealed class Tendon : WireValue
     {
         public string Name = "";

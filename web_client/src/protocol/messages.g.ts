@@ -1945,8 +1945,9 @@ export interface Body {
 }
 
 /**
- * A shape on a body. `id`: the simulator's number of it (MuJoCo geom). `rgba` is the colour to draw: a colour of
- * its own, or the material's; with alpha 0 it is not drawn. `group`: see `SceneSpec.groups_shown`.
+ * A shape on a body. `id`: the simulator's number of it (MuJoCo geom; of a site 1,048,576 more than its number).
+ * `rgba` is the colour to draw: a colour of its own, or the material's; with alpha 0 it is not drawn. `group`: see
+ * `SceneSpec.groups_shown`.
  */
 export interface Visual {
   id: number;
@@ -2110,7 +2111,7 @@ export interface Camera {
   target?: number;
 }
 
-/** A marked place on a body, drawn as a shape on request. */
+/** A place on a body that a tendon runs through, drawn as a shape. Marked places of a MuJoCo model are visuals. */
 export interface Site {
   id: number;
   body: number;
@@ -2122,7 +2123,10 @@ export interface Site {
   rgba: [number, number, number, number];
 }
 
-/** A cable, drawn on request as straight pieces of radius `width` [m] through `sites`, ids; wrapping is left out. */
+/**
+ * A cable, drawn as straight pieces of radius `width` [m] through `sites`, ids. Tendons of a MuJoCo model, which go
+ * around shapes, are deformables.
+ */
 export interface Tendon {
   name: string;
   group: number;
