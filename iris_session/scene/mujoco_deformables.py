@@ -1,8 +1,7 @@
 """Meshes of a compiled MuJoCo model whose vertices move: flexes, skins, and spatial tendons.
 
 They become deformables of the scene; `DrawnMesh.read_vertices` reads the vertices of a state. A skin follows its bones
-as in MuJoCo's renderer, but is not inflated. Tendons that look the same are one deformable: a rope along their paths,
-around shapes too.
+as in MuJoCo's renderer. Tendons that look the same are one deformable: a rope along their paths, around shapes too.
 """
 
 from __future__ import annotations
@@ -24,6 +23,8 @@ _SITE: Final = int(mujoco.mjtWrap.mjWRAP_SITE)
 _PULLEY: Final = int(mujoco.mjtWrap.mjWRAP_PULLEY)
 _CYLINDER: Final = int(mujoco.mjtWrap.mjWRAP_CYLINDER)
 _AROUND: Final = frozenset({int(mujoco.mjtWrap.mjWRAP_SPHERE), _CYLINDER})
+#: Categories of geoms for `mjv_updateScene`.
+_NO_GEOMS: Final = 0
 #: Points of a tendon around a shape, at equal distances on the chord.
 _ARC: Final = np.linspace(0.0, 1.0, 6)[:, None]
 
@@ -159,45 +160,17 @@ def _read_texture_coordinates(
 # --- skins ------------------------------------------------------------------------------------------------------------
 
 
-class _Bone:
-    """Part of a skin that follows one body, vertex by vertex with a weight.
-
-    Args:
-        model: The model.
-        index: Number of the bone.
-        rest: Vertices of the skin in its bind pose (n, 3) [m], world frame.
-    """
-
-    def __init__(self, model: mujoco.MjModel, index: int, rest: Vertices) -> None:
-        first = int(model.skin_bonevertadr[index])
-        entries = slice(first, first + int(model.skin_bonevertnum[index]))
-        self._body = int(model.skin_bonebodyid[index])
-        self._vertices = np.array(model.skin_bonevertid[entries])
-        self._weights = model.skin_bonevertweight[entries].astype(np.float64)[:, None]
-        R_world_bind = np.empty(9)
-        mujoco.mju_quat2Mat(R_world_bind, model.skin_bonebindquat[index].astype(np.float64))
-        p_bind = (rest[self._vertices] - model.skin_bonebindpos[index]) @ R_world_bind.reshape(3, 3)
-        self._p_bind = self._weights * p_bind
-
-    def add_to(self, out: Vertices, data: Any) -> None:
-        """Add the weighted places of the vertices in a state to `out`, each vertex once."""
-        body = self._body
-        out[self._vertices] += self._p_bind @ data.xmat[body].reshape(3, 3).T + self._weights * data.xpos[body]
-
-
 def _read_skin(model: mujoco.MjModel, index: int) -> DrawnMesh:
     at, count = int(model.skin_vertadr[index]), int(model.skin_vertnum[index])
     first = int(model.skin_faceadr[index])
     faces = np.ascontiguousarray(model.skin_face[first : first + int(model.skin_facenum[index])], np.uint32)
     texcoord, material = int(model.skin_texcoordadr[index]), int(model.skin_matid[index])
-    rest = model.skin_vert[at : at + count].astype(np.float64)
-    bones = [_Bone(model, int(model.skin_boneadr[index]) + k, rest) for k in range(int(model.skin_bonenum[index]))]
+    # Skins are computed on MuJoCo's drawing side, which needs no graphics for that.
+    scene, option, camera = mujoco.MjvScene(model, 1), mujoco.MjvOption(), mujoco.MjvCamera()
 
     def read(data: Any) -> Vertices:
-        out = np.zeros((count, 3))
-        for bone in bones:
-            bone.add_to(out, data)
-        return out
+        mujoco.mjv_updateScene(model, data, option, None, camera, _NO_GEOMS, scene)
+        return np.array(scene.skinvert, np.float32).reshape(-1, 3)[at : at + count]
 
     return DrawnMesh(
         stream=f"skin-{index}",
