@@ -68,8 +68,12 @@ class Played:
 
 
 def make_drawn_core(scene: str = "handover", **authority: object) -> SessionCore:
-    """Make a core of a scene that is drawn quickly in software: with coarse shadows, without smooth edges."""
+    """Make a core of a scene that is drawn quickly in software: with coarse shadows, without smooth edges.
+
+    Its sites, which are hidden at first, are large enough to be seen.
+    """
     model = load_model(scene_path(scene))
+    model.site_size[:] = 0.05
     model.vis.quality.shadowsize, model.vis.quality.offsamples = 64, 0
     return make_core(model, **authority)
 

@@ -21,7 +21,7 @@ from iris_session.physics.kinematic_model import KinematicModel
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, SceneLoaded, ScenePatched
-from iris_session.protocol.scene import AddVisual, Geometry, RemoveVisual, SetVisual, Visual
+from iris_session.protocol.scene import FIRST_SITE_VISUAL, AddVisual, Geometry, RemoveVisual, SetVisual, Visual
 from iris_session.protocol.server_messages import PresenceItem
 from iris_session.recording import OPEN, RecordedState, Recording
 from iris_session.replay import pictures
@@ -164,12 +164,14 @@ def ball(number: int, kind: str = "sphere", mesh: int = -1, group: int = 0) -> V
 def test_patched_visuals_are_drawn(tmp_path: Path, reference: Reference) -> None:
     model = copy.copy(make_drawn_core().world.model)
     grip, board, table = (model.geom(name).id for name in ("hammer_grip", "board", "table_top"))
+    goal = 0  # a site
     moved = Pose((0.0, 0.0, 0.1), (0.0, 1.0, 0.0, 0.0))
     played = patched(
         tmp_path,
         SetVisual(grip, rgba=(0.0, 0.0, 1.0, 1.0)),
         SetVisual(board, T_body_visual=moved),
         RemoveVisual(table),
+        SetVisual(FIRST_SITE_VISUAL + goal, rgba=(1.0, 0.0, 1.0, 1.0), group=0, T_body_visual=moved),
     )
     found = draw(played.path, [9, 29])
     assert_same(found[:1], [reference(model, played.qpos[9])])
@@ -177,6 +179,8 @@ def test_patched_visuals_are_drawn(tmp_path: Path, reference: Reference) -> None
     model.geom_pos[board], model.geom_quat[board] = moved.p, moved.q
     model.geom_sameframe[board] = 0  # MuJoCo takes the pose of the body for it otherwise
     model.geom_group[table] = 5
+    model.site_rgba[goal], model.site_group[goal] = (1.0, 0.0, 1.0, 1.0), 0
+    model.site_pos[goal], model.site_quat[goal], model.site_sameframe[goal] = moved.p, moved.q, 0
     assert_same(found[1:], [reference(model, played.qpos[29])])
 
 
