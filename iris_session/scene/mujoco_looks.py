@@ -43,10 +43,14 @@ class ModelLooks:
     Args:
         model: The model, as it is when the scene is made.
         shown: What clients see of it.
+
+    Attributes:
+        model: The model of the scene.
+        source: The model that the program changes: the same, or one that it has built anew and that was equal.
     """
 
     def __init__(self, model: mujoco.MjModel, shown: Shown) -> None:
-        self.model = model
+        self.model = self.source = model
         self._shown, self._groups = shown, shown.choose_groups(model)
         self._visuals = {visual.id: visual for visual in read_visuals(model, shown, self._groups)}
         self._arrays = {name: np.array(getattr(model, name)) for name in _list_arrays(model)}
@@ -103,7 +107,7 @@ class ModelLooks:
 
     def _find_changed(self) -> Iterator[int]:
         """Yield ids of visuals whose arrays have changed since the last call."""
-        model = self.model
+        model = self.source
         changed: dict[str, NDArray[np.bool_]] = {}
         for name, before in self._arrays.items():
             now = getattr(model, name)
@@ -124,7 +128,7 @@ class ModelLooks:
 
     def _place_sites(self, data: Any, goals: Mapping[int, NDArray[np.floating]]) -> None:
         """Note where sites are that the program has moved in its data, without its model."""
-        model, sites = self.model, self._fixed_sites
+        model, sites = self.source, self._fixed_sites
         bodies = model.site_bodyid[sites]
         R_world_body = data.xmat[bodies].reshape(-1, 3, 3)
         offset = data.site_xpos[sites] - data.xpos[bodies]
@@ -141,7 +145,9 @@ class ModelLooks:
     def _read(self, number: int) -> Visual | None:
         """Return a visual as it is now, with values that an operation may have."""
         index = number - FIRST_SITE_VISUAL
-        visual = read_geom(self.model, number) if index < 0 else read_site(self.model, index, self._shown, self._groups)
+        visual = (
+            read_geom(self.source, number) if index < 0 else read_site(self.source, index, self._shown, self._groups)
+        )
         if visual is None:
             return None
         pose = visual.T_body_visual

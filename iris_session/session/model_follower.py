@@ -59,6 +59,12 @@ class ModelFollower:
         if is_reset or now_ns >= self._next_ns:
             self._look(now_ns, data, environment)
 
+    def follow_model(self, model: mujoco.MjModel) -> None:
+        """Look at another model from now on, which the program has built and which is that of the present scene."""
+        with self._scenes.lock:
+            if self._scenes.newest is not None and self._scenes.newest.looks is not None:
+                self._scenes.newest.looks.source = model
+
     def _look(self, now_ns: int, data: Any = None, environment: Any = None) -> None:
         self._next_ns = now_ns + PERIOD_NS
         with self._scenes.lock:
@@ -67,7 +73,7 @@ class ModelFollower:
             # A scene that is about to be loaded is followed once it is there.
             if looks is None or looks is self._failed or looks.model is not self._stepper.core.world.model:
                 return
-            goals = {} if environment is None else _list_goals(environment, looks.model)
+            goals = {} if environment is None else _list_goals(environment, looks.source)
             changes = looks.find_changes(data, goals)
             if not changes or not self._take_turn(now_ns):
                 return

@@ -479,6 +479,8 @@ class Session(SessionBase):
 
         loop.change_model(model, data, prepare)
         self.model, self.data = model, data
+        if self._follower is not None:
+            self._follower.follow_model(model)
         self.robots, self.objects = stepper.core.scene.robots, stepper.core.scene.objects
 
     def _hold_steps(self) -> AbstractContextManager[object]:

@@ -89,6 +89,18 @@ def test_rate_of_recorded_clouds() -> None:
             options("--record-clouds", text)
 
 
+def test_groups_and_sites_that_clients_show() -> None:
+    for text, groups in (("0,1,2", (0, 1, 2)), ("3", (3,)), ("1, 4", (1, 4))):
+        assert make_session_config(options("--groups", text), "x").groups == groups
+    for given, sites in ((["--sites"], True), (["--sites", "none"], False), (["--sites", "0,3"], (0, 3))):
+        assert make_session_config(options(*given), "x").sites == sites
+    config = make_session_config(options(), "x")
+    assert (config.groups, config.sites) == (None, None)
+    for wrong in (["--groups", "visual"], ["--groups", ""], ["--sites", "scene.xml"]):
+        with pytest.raises(SystemExit):
+            options(*wrong)
+
+
 def test_assets_of_recordings() -> None:
     assert make_session_config(options("--record-assets", "all"), "x").record_assets == "all"
     assert make_session_config(options(), "x").record_assets == "scene"

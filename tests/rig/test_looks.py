@@ -166,6 +166,33 @@ def test_owner_removes_a_visual_for_good(program: Task) -> None:
     assert "goal" not in {visual.name for visual in program.spec.visuals}
 
 
+def test_equal_model_that_a_reset_builds_is_followed(program: Task) -> None:
+    program.model.site("goal").rgba[:] = (1.0, 0.0, 0.0, 1.0)
+    program.wait(1)
+    model = mujoco.MjSpec.from_string(TASK).compile()
+    program.rig.session._change_model(model, mujoco.MjData(model))
+    program.wait(2)
+    assert program.see("goal").rgba == (0.0, 1.0, 0.0, 1.0)
+    model.site("goal").rgba[:] = (0.0, 0.0, 1.0, 1.0)
+    program.wait(3)
+    assert program.see("goal").rgba == (0.0, 0.0, 1.0, 1.0)
+
+
+def test_scene_that_is_loaded_is_followed(tmp_path: Path) -> None:
+    with Rig(mujoco.MjSpec.from_string(TASK), assets=tmp_path) as rig:
+        task = Task(rig, tmp_path)
+        model = mujoco.MjSpec.from_string(TASK.replace('pos="0 0 1"', 'pos="0 0 2"')).compile()
+        rig.session.load_scene(model, groups=[0, 3], sites=[4]).result(60.0)
+        rig.run_until(lambda: task.client.mirror.scene_epoch == 2, "the scene is there", 1.0)
+        task.model.site("spare").rgba[:] = (0.0, 0.0, 1.0, 1.0)  # of the scene before
+        rig.run(0.3)
+        assert (task.client.mirror.scene_revision, task.spec.groups_shown) == (0, (0, 3))
+        assert {visual.name for visual in task.spec.visuals} == {"floor", "top", "puck", "spare"}
+        rig.session.model.site("spare").rgba[:] = (1.0, 0.0, 0.0, 1.0)
+        task.wait(1)
+        assert task.see("spare").rgba == (1.0, 0.0, 0.0, 1.0)
+
+
 # --- environments -----------------------------------------------------------------------------------------------------
 
 
