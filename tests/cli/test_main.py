@@ -125,13 +125,12 @@ def test_options_of_a_session_reach_its_configuration() -> None:
 
     plain = make()
     assert (plain.authority.policy, plain.authority.assignments) == ("join-order", {})
-    assert (plain.authority.unaligned, plain.sites, plain.tendons) == (UNALIGNED, False, False)
+    assert plain.authority.unaligned == UNALIGNED
     config = make("--assign", "ann=left", "--assign", "bob=right,third", "--assign", "ann=right,left")
     assert config.authority.policy == "config"
     assert config.authority.assignments == {"ann": ("left", "right"), "bob": ("right", "third")}
-    config = make("--unaligned", "operator", "--unaligned", "key:abc", "--sites", "--tendons")
+    config = make("--unaligned", "operator", "--unaligned", "key:abc")
     assert config.authority.unaligned == (*UNALIGNED, "operator", "key:abc")
-    assert (config.sites, config.tendons) == (True, True)
 
 
 def test_verify_names_every_file_that_is_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
