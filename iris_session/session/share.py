@@ -7,7 +7,7 @@ import dataclasses
 import importlib.util
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,6 +36,8 @@ def share(
     *,
     robots: RobotChoice = "auto",
     objects: Sequence[ObjectSpec] | None = None,
+    groups: Iterable[int] | None = None,
+    sites: bool | Iterable[int] | None = None,
     drive: str = "ctrl",
     step: str = "step",
 ) -> Session:
@@ -58,6 +60,10 @@ def share(
         robots: `auto` finds them, `none` offers none; or names of robots found, the path of a robots file, or
             specifications.
         objects: Free bodies that robots and hands can take; `None` finds them in the model.
+        groups: Groups of geoms that participants see; `None` for those that the viewer of the suite shows: 0, 1 and 2,
+            but not 0 where that has the collision shapes (robosuite).
+        sites: Groups of sites that participants see, True for all sites, False for none; `None` for those that MuJoCo's
+            viewer shows, 0 to 2.
         drive: `ctrl`: the session writes `data.ctrl` of the robots that participants drive. `action`: it writes
             nothing; your program asks for the action with `session.action(action)` or for `session.targets()`.
         step: Name of the environment's method that advances the simulation.
@@ -76,29 +82,23 @@ def share(
     config = config or SessionConfig()
     if config.control.output != DRIVES[drive]:
         config = dataclasses.replace(config, control=msgspec.structs.replace(config.control, output=DRIVES[drive]))
+    given: dict[str, Any] = {"robots": robots, "objects": objects, "groups": groups, "sites": sites}
     if config.record is True and importlib.util.find_spec("rerun") is None:  # the default, beside a suite
-        session = _share(x, data, dataclasses.replace(config, record=False), robots, objects, step)
+        session = _share(x, data, dataclasses.replace(config, record=False), given, step)
         session._start_notes = (NOT_RECORDED,)
         _log.warning("%s", NOT_RECORDED)
         return session
-    return _share(x, data, config, robots, objects, step)
+    return _share(x, data, config, given, step)
 
 
-def _share(
-    x: Any,
-    data: Any,
-    config: SessionConfig,
-    robots: RobotChoice,
-    objects: Sequence[ObjectSpec] | None,
-    step: str,
-) -> Session:
+def _share(x: Any, data: Any, config: SessionConfig, given: Mapping[str, Any], step: str) -> Session:
     if isinstance(x, str | os.PathLike):
-        return _start(Session(Path(x).expanduser(), None, config, robots=robots, objects=objects))
+        return _start(Session(Path(x).expanduser(), None, config, **given))
     model = unwrap_model(x)
     if model is not None:
         if data is None:
-            return _start(Session(model, None, config, robots=robots, objects=objects))
-        return Session.attach(model, unwrap_data(data) or data, config, robots=robots, objects=objects)
+            return _start(Session(model, None, config, **given))
+        return Session.attach(model, unwrap_data(data) or data, config, **given)
     if data is not None:
         raise ConfigError(f"data is given with {type(x).__name__}: give it with an MjModel, as in share(model, data)")
     model, found = require_simulation(x)
@@ -106,10 +106,10 @@ def _share(
         found = mujoco.MjData(model)
         if model.nkey:
             mujoco.mj_resetDataKeyframe(model, found, 0)
-        session = _start(Session(model, found, config, robots=robots, objects=objects))
+        session = _start(Session(model, found, config, **given))
         session.sync(found)  # from here on participants can join
         return session
-    return Session.attach(model, found, config, environment=x, step=step, robots=robots, objects=objects)
+    return Session.attach(model, found, config, environment=x, step=step, **given)
 
 
 def _start(session: Session) -> Session:
