@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene import MAX_OPS
-from iris_session.scene.mujoco_visuals import VIEWER_GROUPS
 from iris_session.session.errors import ConfigError
 from iris_session.session.shared_scene import SharedScenes
 from iris_session.session.stepper import Stepper
@@ -114,6 +113,6 @@ def _list_goals(environment: Any, model: mujoco.MjModel) -> dict[int, NDArray[np
     found = {}
     for k, p_world in enumerate(goal.reshape(-1, 3)):
         site = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_SITE), f"target{k}")
-        if site >= 0 and model.site_group[site] in VIEWER_GROUPS and np.isfinite(p_world).all():
+        if site >= 0 and np.isfinite(p_world).all():
             found[site] = np.array(p_world, np.float64)
     return found

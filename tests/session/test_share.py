@@ -192,3 +192,40 @@ def test_what_cannot_be_shared_is_one_line(model: mujoco.MjModel, tmp_path: Path
         iris_session.share(model, config=QUIET, drive="joints")
     with pytest.raises(ConfigError, match="share\\(model, data\\)"):
         iris_session.share(Space(model=model), mujoco.MjData(model), QUIET)
+
+
+class GoalEnvironment:
+    """As Gymnasium-Robotics' Fetch: the goal is in its model only where it is rendered."""
+
+    def __init__(self) -> None:
+        self.model = mujoco.MjModel.from_xml_string(
+            """<mujoco><worldbody><site name="target0" group="4"/><body><freejoint/><geom size=".1" group="3"/></body>
+            </worldbody></mujoco>"""
+        )
+        self.data = mujoco.MjData(self.model)
+        self.goal = np.zeros(3)
+
+    def reset(self) -> None:
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
+        self.goal = self.goal + 0.25
+
+    def step(self) -> None:
+        mujoco.mj_step(self.model, self.data)
+
+    def _render_callback(self) -> None: ...
+
+
+def test_groups_sites_and_goals_of_an_environment_are_shown(shared: list[Session], tmp_path: Path) -> None:
+    environment = GoalEnvironment()
+    config = dataclasses.replace(QUIET, assets=tmp_path)
+    session = iris_session.share(environment, config=config, groups=[3], sites=True)
+    shared.append(session)
+    assert session.scene is not None
+    assert session.scene.groups_shown == (3,)
+    environment.step()
+    environment.reset()
+    assert [one.T_body_visual.p for one in session.scene.visuals if one.name == "target0"] == [(0.25, 0.25, 0.25)]
+    assert np.array_equal(environment.model.site_pos, np.zeros((1, 3)))
+    session.close()
+    assert not {"step", "reset"} & vars(environment).keys()
