@@ -9,6 +9,7 @@ import msgspec
 
 from anchors.ageing import AgeingLaw
 from iris_session.authority import AuthorityConfig, is_same_snapshot
+from iris_session.control import ControlConfig
 from iris_session.control.config import SOLVER_AUTO, SOLVER_MINK
 from iris_session.journal.environment import use_one_blas_thread
 from iris_session.journal.rows import SNAPSHOTS
@@ -28,8 +29,13 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
     min_change_share: float = 1e9
 
 
+class _RecordedControlConfig(ControlConfig, frozen=True):
+    compensate_sag: bool = False
+
+
 class _RecordedConfig(CoreConfig, frozen=True):
     authority: _RecordedAuthorityConfig
+    control: _RecordedControlConfig
 
 
 class ReplayCore:
