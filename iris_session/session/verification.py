@@ -31,6 +31,7 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
 
 class _RecordedControlConfig(ControlConfig, frozen=True):
     compensate_sag: bool = False
+    few_joints_orientation_cost: float | None = None
 
 
 class _RecordedConfig(CoreConfig, frozen=True):

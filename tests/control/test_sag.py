@@ -199,3 +199,22 @@ def test_a_restored_controller_goes_on_bit_for_bit_while_it_learns() -> None:
         seen.append(rig.data.qpos.tobytes() + rig.data.ctrl.tobytes() + rig.controller.snapshot())
         rig.seq, rig.steps = seq, steps
     assert seen[0] == seen[1]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_arm_with_few_joints_gives_up_its_orientation_not_its_position(axis: int) -> None:
+    left = {}
+    for cost in (0.01, None):
+        rig = Rig(make_wall_model("position"), [make_wall_robot("position")], few_joints(cost))
+        remove_wall(rig.data)
+        rig.hold(100)
+        start, goal = rig.tip()[0], 0.05 * np.eye(3)[axis]
+        for k in range(700):
+            p = goal * min(1.0, k / 200)
+            rig.step(decision([pose_command("arm", rig.source(tuple(p.tolist())))]))
+        left[cost] = 1e3 * float(np.linalg.norm(np.subtract(rig.tip()[0], start) - goal))
+    assert left[0.01] <= 5.0 < left[None]
+
+
+def few_joints(cost: float | None) -> ControlConfig:
+    return ControlConfig(few_joints_orientation_cost=cost)
