@@ -39,15 +39,20 @@ class _RecordedConfig(CoreConfig, frozen=True):
     control: _RecordedControlConfig
 
 
+def decode_recorded_config(header_config: bytes) -> CoreConfig:
+    """Return the configuration in the header of a recording. Raises `msgspec.DecodeError` for other bytes."""
+    config = msgspec.msgpack.decode(header_config, type=_RecordedConfig)
+    if config.control.solver == SOLVER_AUTO:  # not in the header: there was only one
+        config = msgspec.structs.replace(config, control=msgspec.structs.replace(config.control, solver=SOLVER_MINK))
+    return config
+
+
 class ReplayCore:
     """A `SessionCore` as `recording.verify` drives it."""
 
     def __init__(self, header: SessionHeader, models: Models) -> None:
         use_one_blas_thread()
-        config = msgspec.msgpack.decode(header.config, type=_RecordedConfig)
-        if config.control.solver == SOLVER_AUTO:  # not in the header: there was only one
-            control = msgspec.structs.replace(config.control, solver=SOLVER_MINK)
-            config = msgspec.structs.replace(config, control=control)
+        config = decode_recorded_config(header.config)
         model = decode_model(unpack_model(header.model))
         self.core = SessionCore(model, config, lambda model_hash: decode_model(models(model_hash)))
 
