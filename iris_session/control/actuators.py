@@ -93,7 +93,9 @@ class ActuatorLaws:
         self._act = np.asarray(model.actuator_actadr, dtype=np.intp)[self._velocity.actuators[self._integrators]]
         stiffness, lag, reach, slack, droops = np.array(servos, dtype=np.float64).reshape(-1, 5).T
         integrators = self._velocity.columns[self._integrators]
-        self.servos = Servos(stiffness, lag, reach, slack, droops, integrators)
+        supports = np.isin(np.arange(len(rows)), self._position.columns)
+        low, high = _find_command_ranges(model, self._position, len(rows))
+        self.servos = Servos(stiffness, lag, reach, slack, droops, integrators, supports, low, high)
         self._dt = float(model.opt.timestep)
         self._acceleration = np.zeros(model.nv)
         self._force = np.zeros(model.nv)
@@ -160,6 +162,16 @@ def _make_group(model: mujoco.MjModel, rows: list[tuple[str, int, int, float, fl
     scale, offset = (np.array([row[k] for row in own], dtype=np.float64) for k in (3, 4))
     qpos, dof = (np.asarray(one, dtype=np.intp)[joints] for one in (model.jnt_qposadr, model.jnt_dofadr))
     return _Group(columns, actuators, scale, offset, qpos, dof)
+
+
+def _find_command_ranges(model: mujoco.MjModel, g: _Group, n: int) -> tuple[Floats, Floats]:
+    """Return the joint positions that position actuators can be commanded to, shape (n,) each; infinite for others."""
+    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    ends = (np.asarray(model.actuator_ctrlrange)[g.actuators] - g.offset[:, None]) / g.scale[:, None]
+    limited = np.asarray(model.actuator_ctrllimited)[g.actuators].astype(bool)
+    low[g.columns] = np.where(limited, ends.min(axis=1), -np.inf)
+    high[g.columns] = np.where(limited, ends.max(axis=1), np.inf)
+    return low, high
 
 
 def _find_law(model: mujoco.MjModel, robot: RobotSpec, actuator: int, joint: int) -> tuple[str, float, float]:

@@ -72,6 +72,7 @@ class ControlConfig(msgspec.Struct, frozen=True):
     sample_rate_min_hz: float = 60.0  # slowest device; longer gaps between samples are not stretched into slow motion
     position_cost: float = 1.0  # [1/m]
     orientation_cost: float = 0.3  # [1/rad]: 1 mm counts as much as 3.3 mrad
+    few_joints_orientation_cost: float | None = 0.01  # instead, of arms with under six: they cannot reach every pose
     posture_cost: float = 1e-2  # [1/rad]: also the damping near singularities
     posture_gain: float = 0.005  # share of the way to the rest posture per solve: an elbow 1 rad off moves at 0.4 rad/s
     lm_damping: float = 1e-2
@@ -118,6 +119,7 @@ class ControlConfig(msgspec.Struct, frozen=True):
     proximity_stop: float = 0.02  # [m]: at this distance it is zero
     proximity_gain: float = 4.0  # [1/s]: closing speed <= gain * (distance - stop)
     proximity_period_s: float = 0.01
+    compensate_sag: bool = True  # position servos carry gravity, payloads and friction: see `sag`
     tracking_error: float = 0.3  # [rad or m]: joints further than this from where they are commanded are reported
     # --- objects held by hands without a robot
     grasp_frequency: float = 25.0  # [rad/s]
@@ -134,6 +136,9 @@ class ControlConfig(msgspec.Struct, frozen=True):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} is {value}; it must be finite and positive")
+        few = self.few_joints_orientation_cost
+        if few is not None and not (math.isfinite(few) and few > 0.0):
+            raise ValueError(f"few_joints_orientation_cost is {few}; it must be finite and positive, or None")
         if self.solve_rate_hz > 100.0:
             raise ValueError(f"solve_rate_hz is {self.solve_rate_hz}; it must be at most 100 Hz per robot")
         if not 1 <= self.max_solves_per_tick <= 3:

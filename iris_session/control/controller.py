@@ -27,11 +27,12 @@ from iris_session.control.hold import HoldLaw
 from iris_session.control.ik import InverseKinematics
 from iris_session.control.interpolate import JointInterpolator, read_speed_limits
 from iris_session.control.proximity import ProximityLimiter
+from iris_session.control.sag import SAG, SagCompensation
 from iris_session.control.state import ControllerState, RobotState, decode_state, encode_state
 from iris_session.physics.tip import Tip
 from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.names import CommandKind
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.specs import HAND, ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, ControlStatus, Decision, WorldView
 
 #: Share of the bounds of an end-effector target that is no push when a hold begins; a lead that is as good as none.
@@ -89,6 +90,9 @@ class Controller:
         self._hold: HoldLaw | None = None
         if self._writes_ctrl:
             self._hold = HoldLaw(self._joints, self._laws.servos, self._qpos, dof, self._config)
+        self._sag: SagCompensation | None = None
+        if self._hold is not None and self._config.compensate_sag:
+            self._sag = SagCompensation(self._joints, self._hold, self._columns)
         self._ik = InverseKinematics(self._robots, self._arms, self._columns, self._joints, self._bounds, self._config)
         self._grippers = Grippers(model, driven, self._config, self._dt)
         self._grasps = Grasps(model, objects, self._config)
@@ -97,6 +101,7 @@ class Controller:
         self._solves = self._ik.solves_per_tick(self._check_ticks)
         self._states = [RobotState() for _ in self._robots]
         self._status = [ControlStatus(robot.name) for robot in self._robots]
+        self._latched, self._driven = np.zeros((2, len(self._qpos)), dtype=bool)
         self._now_ns = 0
         self._tick = 0
         self._cursor = 0
@@ -110,6 +115,8 @@ class Controller:
         self._joints.place(self._measure_joints(data))
         if self._hold is not None:
             self._hold.reset()
+        if self._sag is not None:
+            self._sag.reset()
         self._ik.rest[:] = self._joints.q
         self._grippers.reset(data)
         self._grasps.reset(data)
@@ -122,6 +129,7 @@ class Controller:
             r.T_world_root = _require_finite(_read_body_pose(data, arm.root_body)) or before[i].T_world_root
             tip = None if self._writes_ctrl else _require_finite(arm.tip.read_pose(data))
             r.commanded = tip or self._ik.compute_tip(i, r)
+        self._mark_driven()
 
     def follow_robots(self, data: mujoco.MjData, robots: Sequence[int]) -> None:
         """Let robots without a command that the owner drives stand, for control, where they are measured."""
@@ -142,16 +150,22 @@ class Controller:
         the first tick leaves `ctrl` of position actuators as it is.
 
         Where `ctrl` leads the measured joints by more than `tracking_error`, the robot stands that far ahead of them.
+        What carries gravity is not counted.
         """
         columns, measured = self._columns[i], self._measure_joints(data)
-        q = measured
-        if self._writes_ctrl:
-            lead = self._config.tracking_error
-            q = np.clip(self._laws.find_commanded(ctrl, measured), measured - lead, measured + lead)
-            self._grippers.place(i, ctrl)
-        self._joints.place_part(columns, q[columns])
+        q, droop = measured, np.zeros_like(measured)
         if self._hold is not None:
             self._hold.forget(columns)
+            if self._sag is not None:
+                _, _, droop = self._hold.measure(data)
+            lead = self._config.tracking_error
+            low, high = measured + np.minimum(droop, 0.0) - lead, measured + np.maximum(droop, 0.0) + lead
+            q = np.clip(self._laws.find_commanded(ctrl, measured), low, high)
+            self._grippers.place(i, ctrl)
+        self._joints.place_part(columns, q[columns])
+        if self._sag is not None:
+            self._sag.begin_support(columns, measured, droop)
+            self._sag.forget(i)
         self._ik.rest[columns] = q[columns]
         r = self._states[i] = RobotState(T_world_root=self._states[i].T_world_root)
         tip = None if self._writes_ctrl else _require_finite(self._arms[i].tip.read_pose(data))
@@ -200,6 +214,7 @@ class Controller:
                 if r.latch is None:  # held already, but maybe pressed against something since
                     self._enter_hold(i)
         self._estop = decision.estop
+        self._mark_driven()
         self._grasps.set_goals(decision.objects)
 
     def tick(self, data: mujoco.MjData, crowded: bool = False) -> None:
@@ -217,6 +232,8 @@ class Controller:
                 self._check_tracking(data)
                 if self._proximity.active:
                     self._slow_near_contact(data)
+            if self._sag is not None:
+                self._compensate_sag(data, self._sag)
             self._joints.advance()
             self._follow_measured(data)
             self._grippers.tick(data)
@@ -239,7 +256,7 @@ class Controller:
     def get_status(self) -> tuple[ControlStatus, ...]:
         """Return the active limits per robot, and the newest sample behind the `ctrl` in use."""
         for i, r in enumerate(self._states):
-            limits = self._list_limits(r)
+            limits = self._list_limits(i, r)
             old = self._status[i]
             if old.applied is not r.applied or old.limits != limits:
                 self._status[i] = ControlStatus(old.robot, limits, r.applied)
@@ -269,7 +286,10 @@ class Controller:
                 self._grippers.save_state(),
                 list(self._grasps.commanded.items()),
                 self._grasps.written,
-                [] if self._hold is None else self._hold.save_state(),
+                [
+                    *([] if self._hold is None else self._hold.save_state()),
+                    *([] if self._sag is None else self._sag.save_state()),
+                ],
                 0 if self._hold is None else self._hold.stale,
                 0.0 if self._hold is None else self._hold.seen_time,
                 self._estop,
@@ -292,8 +312,12 @@ class Controller:
         self._grasps.commanded = dict(state.grasp_poses)
         self._grasps.written = state.grasp_written
         if self._hold is not None:
-            self._hold.restore_state(state.hold, state.stale, state.seen_time)
+            n = len(self._hold.save_state())
+            self._hold.restore_state(state.hold[:n], state.stale, state.seen_time)
+            if self._sag is not None:
+                self._sag.restore_state(state.hold[n:])
         self._estop = state.estop
+        self._mark_driven()
         self._ready = True
 
     # --- once a step --------------------------------------------------------------------------------------------------
@@ -316,6 +340,12 @@ class Controller:
             r.commanded = self._ik.compute_tip(i, r)
         self._enter_hold(i)
         self._set_cap(i)
+
+    def _mark_driven(self) -> None:
+        """Note which joints are of robots whose clutch is closed, and which of them may move."""
+        for r, columns in zip(self._states, self._columns, strict=True):
+            self._latched[columns] = r.latch is not None
+            self._driven[columns] = r.latch is not None and not r.fresh
 
     def _enter_hold(self, i: int) -> None:
         if self._hold is None:
@@ -362,10 +392,10 @@ class Controller:
 
     def _follow_joints(self, i: int, state: clutch.Latch, command: Command) -> None:
         r, columns, (lower, upper) = self._states[i], self._columns[i], self._bounds
-        goal = compute_leader_goal(state, command.sources, self._joints.goal[columns], self._config)
+        goal = compute_leader_goal(state, command.sources, self._joints.get_goal(columns), self._config)
         goal = np.minimum(np.maximum(goal, lower[columns]), upper[columns])
         goal, state.clamped = self._ik.clip_to_workspace(i, r, state.base, goal, self._get_workspace(i))
-        r.ramping = is_ramping(r.ramping, float(np.abs(goal - self._joints.q[columns]).max()), self._config)
+        r.ramping = is_ramping(r.ramping, float(np.abs(goal - self._joints.get_position(columns)).max()), self._config)
         self._set_cap(i)
         self._joints.set_goal(columns, goal, self._ik.get_interval(r, self._tick))
         r.last_solve = self._tick
@@ -407,12 +437,36 @@ class Controller:
         self._hold.apply(data, self._laws.read_activations(data))
         self._laws.write(data, joints.q, joints.v, joints.velocity, self._hold.act_range)
 
+    def _compensate_sag(self, data: mujoco.MjData, sag: SagCompensation) -> None:
+        """Move the goals by what the servos sag by; note what is left."""
+        assert self._hold is not None
+        x, v, droop = self._hold.measure(data)
+        sag.update(x, v, droop, self._latched, self._driven)
+        if self._tick % self._check_ticks:
+            return
+        for i, r in enumerate(self._states):
+            if r.latch is None:
+                sag.forget(i)
+            elif sag.is_near(i):
+                sag.note(i, 0.0, 0.0, 0.0)
+            elif sag.is_standing(i, v):
+                sag.note(i, *self._measure_sag(i, r, data), self._check_ticks * self._dt)
+
+    def _measure_sag(self, i: int, r: RobotState, data: mujoco.MjData) -> tuple[float, float]:
+        """Return how far a robot stands from its aim [m, rad]: its tip; of a hand the joint that is farthest."""
+        assert self._sag is not None
+        if self._robots[i].kind == HAND:
+            return 0.0, float(np.abs(self._sag.error[self._columns[i]]).max())
+        tip = _require_finite(self._arms[i].tip.read_pose(data))
+        return (0.0, 0.0) if tip is None else clutch.measure_separation(tip, self._ik.compute_tip(i, r))
+
     def _follow_bases(self, data: mujoco.MjData) -> None:
         """Update the bases. A robot whose base is not finite (physics that diverged) holds at its last finite place."""
         for i in self._moving_bases:
             T = _require_finite(_read_body_pose(data, self._arms[i].root_body))
             if T is None:
                 self._hold_robot(i)
+                self._mark_driven()
             else:
                 self._states[i].T_world_root = T
 
@@ -431,7 +485,7 @@ class Controller:
     def _check_tracking(self, data: mujoco.MjData) -> None:
         """Flag robots whose joints are far from where they are commanded: blocked, overloaded, or far too slow."""
         assert self._hold is not None
-        far = np.abs(data.qpos[self._qpos] - self._joints.q) > self._config.tracking_error
+        far = np.abs(data.qpos[self._qpos] - self._joints.get_position(slice(None))) > self._config.tracking_error
         far |= self._hold.take_strained()
         some = bool(far.any())
         for r, columns in zip(self._states, self._columns, strict=True):
@@ -523,7 +577,7 @@ class Controller:
         cap = joints.velocity[columns]
         joints.cap[columns] = np.minimum(cap, self._config.leader_ramp_speed) if self._states[i].ramping else cap
 
-    def _list_limits(self, r: RobotState) -> tuple[str, ...]:
+    def _list_limits(self, i: int, r: RobotState) -> tuple[str, ...]:
         extra: tuple[str, ...] = ("workspace",) if r.latch is not None and r.latch.clamped else ()
         if r.proximity < 1.0:
             extra += ("proximity",)
@@ -531,6 +585,8 @@ class Controller:
             extra += ("leader_apart",)
         if r.lagging:
             extra += ("tracking",)
+        if self._sag is not None and self._sag.said[i]:
+            extra += (SAG,)
         return r.solver_limits + extra
 
 

@@ -47,6 +47,8 @@ class Servos(NamedTuple):
     `stiffness`: N m/rad (N/m) of the lead. `lag`: lead of steady motion per speed [s]. `reach`: lead at which the force
     limit is met. `slack`: lead that friction and dead bands can hold. `droops`: 1 where gravity needs a lead.
     `integrators`: columns whose actuator integrates: its force comes from the activation, not from the command.
+    `supports`: position servos, whose command can carry a load by a lead (`sag`); `low`, `high`: their range of
+    commands, as joint positions.
     """
 
     stiffness: Floats
@@ -55,6 +57,9 @@ class Servos(NamedTuple):
     slack: Floats
     droops: Floats
     integrators: NDArray[np.intp]
+    supports: NDArray[np.bool_]
+    low: Floats
+    high: Floats
 
 
 class HoldLaw:
@@ -74,12 +79,12 @@ class HoldLaw:
         dof: NDArray[np.intp],
         config: ControlConfig,
     ) -> None:
-        self._joints, self._servos, self._qpos, self._dof = joints, servos, qpos, dof
+        self._joints, self.servos, self._qpos, self._dof = joints, servos, qpos, dof
         speed = joints.velocity
         self.static: Floats = np.minimum(
             np.maximum(servos.reach, config.lead_bound_min_s * speed), config.lead_bound_max_s * speed
         )
-        self._dead: Floats = _DEAD_BAND * self.static + servos.slack
+        self.dead: Floats = _DEAD_BAND * self.static + servos.slack
         #: Of the command: integrators are fed with the speed, and only their activation leads.
         self._feed: Floats = servos.lag.copy()
         self._feed[servos.integrators] = 0.0
@@ -156,13 +161,13 @@ class HoldLaw:
         x = np.where(np.isfinite(x), x, joints.q)
         v = _require_finite(data.qvel[self._dof])
         load_lead = self._compute_load_lead(data)
-        droop = load_lead * self._servos.droops
+        droop = load_lead * self.servos.droops
         window = self._speed * min(self.stale * self._dt, _STALE_S)
         if settling:
             self._begin_holds(x, v, droop, load_lead, act)
             self._settle(x, v, window)
             joints.moving = True
-        bound = self.static + self._servos.lag * np.abs(v) + window
+        bound = self.static + self.servos.lag * np.abs(v) + window
         self._bound(x + np.minimum(droop, 0.0) - bound, x + np.maximum(droop, 0.0) + bound)
         if act.size:
             self._bound_activations(x, bound, load_lead)
@@ -173,15 +178,25 @@ class HoldLaw:
         x = data.qpos[self._qpos]
         x = np.where(np.isfinite(x), x, self._joints.q)
         load_lead = self._compute_load_lead(data)
-        droop = load_lead * self._servos.droops
+        droop = load_lead * self.servos.droops
         _, excess = self._find_excess(x, np.zeros_like(x), droop, load_lead, act)
         return np.where(excess != 0.0, x + droop, self._joints.q)
+
+    def measure(self, data: mujoco.MjData) -> tuple[Floats, Floats, Floats]:
+        """Return measured positions, velocities and droops, finite, shape (n,) each."""
+        x = data.qpos[self._qpos]
+        x = np.where(np.isfinite(x), x, self._joints.q)
+        return x, _require_finite(data.qvel[self._dof]), self._compute_load_lead(data) * self.servos.droops
+
+    def find_band(self, droop: Floats) -> tuple[Floats, Floats]:
+        """Return the leads between which a joint at rest does not push, by its droop and its load."""
+        return self._band(droop, self.load * self._carries)
 
     def _compute_load_lead(self, data: mujoco.MjData) -> Floats:
         """Return the lead at which each servo carries gravity, Coriolis forces and springs of the model."""
         dof = self._dof
         force = data.qfrc_bias[dof] - data.qfrc_gravcomp[dof] - data.qfrc_spring[dof]
-        return _require_finite(force) / self._servos.stiffness
+        return _require_finite(force) / self.servos.stiffness
 
     def _find_excess(
         self, x: Floats, speed: Floats, droop: Floats, load_lead: Floats, act: Floats
@@ -189,9 +204,9 @@ class HoldLaw:
         """Return the lead beyond the lag of `speed`, and by how much it exceeds what droop and load explain."""
         offset = self._joints.q - x - self._feed * speed
         excess = offset - _clip(offset, *self._band(droop, self.load * self._carries))
-        columns = self._servos.integrators
+        columns = self.servos.integrators
         if columns.size:  # their force is in the activation
-            lead = act - x[columns] - (self._servos.lag * speed)[columns]
+            lead = act - x[columns] - (self.servos.lag * speed)[columns]
             low, high = self._band(load_lead, self.load)
             pushed = lead - _clip(lead, low[columns], high[columns])
             excess[columns] = np.where(pushed != 0.0, pushed, excess[columns])
@@ -199,8 +214,8 @@ class HoldLaw:
 
     def _band(self, droop: Floats, load: Floats) -> tuple[Floats, Floats]:
         """Return the leads between which a joint at rest does not push."""
-        low = np.minimum(np.minimum(droop, droop + load), 0.0) - self._dead
-        return low, np.maximum(np.maximum(droop, droop + load), 0.0) + self._dead
+        low = np.minimum(np.minimum(droop, droop + load), 0.0) - self.dead
+        return low, np.maximum(np.maximum(droop, droop + load), 0.0) + self.dead
 
     def _begin_holds(self, x: Floats, v: Floats, droop: Floats, load_lead: Floats, act: Floats) -> None:
         """Decide where the joints stop whose hold begins in this tick."""
@@ -218,7 +233,7 @@ class HoldLaw:
         moving = new & ((speed != 0.0) | blocked)
         still = new & ~moving
         self.heading[new], self.brake[new], self.offset[new] = heading[new], speed[new], offset[new]
-        self.slack[new] = np.where(blocked, 0.0, self._dead)[new]
+        self.slack[new] = np.where(blocked, 0.0, self.dead)[new]
         self.left[moving] = (np.abs(speed) / joints.acceleration + self._release_s)[moving]
         joints.goal[moving] = (x + offset + np.sign(speed) * joints.find_stop_distance(speed))[moving]
         joints.goal[still], joints.v[still] = joints.q[still], 0.0
@@ -268,12 +283,12 @@ class HoldLaw:
 
     def _bound_activations(self, x: Floats, bound: Floats, load_lead: Floats) -> None:
         """Set `act_range`: about the measured joint while engaged, the command in hold, the droop when let go."""
-        columns = self._servos.integrators
+        columns = self.servos.integrators
         low = x + np.minimum(load_lead, 0.0) - bound
         high = x + np.maximum(load_lead, 0.0) + bound
         band_low, band_high = self._band(load_lead, self.load)
         held = self.held > 0.0
-        ahead = self._joints.q + self._servos.lag * self.brake
+        ahead = self._joints.q + self.servos.lag * self.brake
         low = np.where(held, np.maximum(low, ahead + band_low), low)
         high = np.where(held, np.minimum(high, ahead + band_high), high)
         gives = (self.left > 0.0) & (self.slack == 0.0)
@@ -287,7 +302,7 @@ class HoldLaw:
         if not stays.any():
             return
         carried = self._joints.q - x - droop
-        columns = self._servos.integrators
+        columns = self.servos.integrators
         if columns.size:
             carried[columns] = act - x[columns] - load_lead[columns]
         learned = _clip(carried, -self.static, self.static)

@@ -88,7 +88,7 @@ class InverseKinematics:
 
     def compute_tip(self, i: int, r: RobotState) -> PoseTuple:
         """Return `T_world_tip` of the joint goal: where the robot will stand without further commands."""
-        return compose(r.T_world_root, self._arms[i].forward_kinematics(self._joints.goal[self._columns[i]]))
+        return compose(r.T_world_root, self._arms[i].forward_kinematics(self._joints.get_goal(self._columns[i])))
 
     def clip_to_workspace(
         self, i: int, r: RobotState, base: PoseTuple, goal: Floats, box: clutch.Box | None
@@ -100,7 +100,7 @@ class InverseKinematics:
         """
         if box is None:
             return goal, False
-        start = self._joints.goal[self._columns[i]].copy()
+        start = self._joints.get_goal(self._columns[i]).copy()
         low, high = 0.0, 0.0
         for k in range(1, _WAYPOINTS + 1):
             high = k / _WAYPOINTS
@@ -132,7 +132,7 @@ class InverseKinematics:
             return
         columns, joints, config = self._columns[i], self._joints, self._config
         interval = self.get_interval(r, tick)
-        goal, commanded, speed = joints.goal[columns], joints.q[columns], joints.velocity[columns]
+        goal, commanded, speed = joints.get_goal(columns), joints.get_position(columns), joints.velocity[columns]
         T_world_now = self.compute_tip(i, r)
         r.commanded = clutch.step_toward(
             T_world_now, state.target, config.tip_speed * interval, config.tip_angular_speed * interval
@@ -160,7 +160,7 @@ class InverseKinematics:
         singular: bool,
     ) -> None:
         """Decide whether solving continues without new samples, and name the active limits."""
-        goal, T_world_now = self._joints.goal[self._columns[i]], self.compute_tip(i, r)
+        goal, T_world_now = self._joints.get_goal(self._columns[i]), self.compute_tip(i, r)
         error = self._count_tolerances(T_world_now, T_world_target)
         progress = self._count_tolerances(T_world_before, T_world_now)
         reached = error <= 1.0

@@ -26,7 +26,8 @@ class JointInterpolator:
 
     `cap`: velocity limit in force now (ramps lower it); `near`: the one that proximity sets, apart from `cap` so that
     neither undoes the other; the lower of both counts. `remaining`: time to arrive in [s].
-    `before`, `before_v`: `q` and `v` before this tick.
+    `before`, `before_v`: `q` and `v` before this tick. `support`: the part of `q` and `goal` that carries loads: the
+    joints shall stand at `goal - support` (`sag`). `None` without compensation.
     """
 
     def __init__(self, velocity: Floats, acceleration: Floats, dt: float) -> None:
@@ -39,6 +40,7 @@ class JointInterpolator:
         self._dv = acceleration * dt
         self._unit = acceleration * dt * dt
         self.moving = False
+        self.support: Floats | None = None
 
     def place(self, q: Floats) -> None:
         """Stand still at `q`."""
@@ -48,6 +50,8 @@ class JointInterpolator:
         self.remaining[:] = self.dt
         self.cap[:] = self.near[:] = self.velocity
         self.moving = False
+        if self.support is not None:
+            self.support[:] = 0.0
 
     def place_part(self, joints: slice | NDArray[np.intp], q: Floats) -> None:
         """Let some joints stand still at `q`, their positions; the others go on."""
@@ -56,10 +60,20 @@ class JointInterpolator:
         self.v[joints] = 0.0
         self.remaining[joints] = self.dt
         self.cap[joints] = self.near[joints] = self.velocity[joints]
+        if self.support is not None:
+            self.support[joints] = 0.0
+
+    def get_goal(self, joints: slice) -> Floats:
+        """Return where some joints shall stand once they have arrived."""
+        return self.goal[joints] if self.support is None else self.goal[joints] - self.support[joints]
+
+    def get_position(self, joints: slice) -> Floats:
+        """Return where some joints shall stand now."""
+        return self.q[joints] if self.support is None else self.q[joints] - self.support[joints]
 
     def set_goal(self, joints: slice, goal: Floats, interval: float) -> None:
-        """Set a new goal for some joints, to arrive `ARRIVAL_INTERVALS` times `interval` [s] from now."""
-        self.goal[joints] = goal
+        """Set where some joints shall stand, to arrive `ARRIVAL_INTERVALS` times `interval` [s] from now."""
+        self.goal[joints] = goal if self.support is None else goal + self.support[joints]
         self.remaining[joints] = ARRIVAL_INTERVALS * interval
         self.moving = True
 

@@ -67,16 +67,26 @@ def make_solver(arm: ArmModel, config: ControlConfig) -> IkSolver:
     return solver(arm, config)
 
 
+def _weigh_orientation(n: int, config: ControlConfig) -> tuple[float, int]:
+    """Return the orientation cost of an arm with `n` joints, and the rank below which it is near singular.
+
+    An arm with fewer than six joints does not give up its position for a turn that it cannot make.
+    """
+    if n < 6 and config.few_joints_orientation_cost is not None:
+        return config.few_joints_orientation_cost, min(n, 3)
+    return config.orientation_cost, min(n, 6)
+
+
 class NumpySolver:
     """Inverse kinematics of one arm with numpy alone. See `IkSolver`."""
 
     def __init__(self, arm: ArmModel, config: ControlConfig) -> None:
         n = arm.model.nv
         self._arm = arm
-        self._weights = np.repeat((config.position_cost, config.orientation_cost), 3)
+        orientation_cost, self._rank = _weigh_orientation(n, config)
+        self._weights = np.repeat((config.position_cost, orientation_cost), 3)
         self._lm_damping = config.lm_damping
         self._posture, self._posture_gain = config.posture_cost**2, config.posture_gain
-        self._rank = min(n, 6)
         self._singular = config.singular_value**2
         self._J = np.zeros((6, n))
         self._diagonal = np.arange(n)
@@ -182,14 +192,14 @@ class MinkSolver:
         self._mink = mink
         self._arm = arm
         self._configuration = mink.Configuration(arm.model)
+        n = arm.model.nv
+        orientation_cost, self._rank = _weigh_orientation(n, config)
         self._frame = mink.FrameTask(
-            "tip", "site", config.position_cost, config.orientation_cost, lm_damping=config.lm_damping
+            "tip", "site", config.position_cost, orientation_cost, lm_damping=config.lm_damping
         )
         self._posture = mink.PostureTask(arm.model, cost=config.posture_cost, gain=config.posture_gain)
-        n = arm.model.nv
         self._no_rows = np.zeros((0, n))
         self._sense = np.zeros(n, dtype=np.int32)
-        self._rank = min(n, 6)
         self._singular = config.singular_value**2
 
     def step(self, q: Floats, rest: Floats, T_root_target: PoseTuple, lower: Floats, upper: Floats) -> IkStep:

@@ -9,6 +9,7 @@ import msgspec
 
 from anchors.ageing import AgeingLaw
 from iris_session.authority import AuthorityConfig, is_same_snapshot
+from iris_session.control import ControlConfig
 from iris_session.control.config import SOLVER_AUTO, SOLVER_MINK
 from iris_session.journal.environment import use_one_blas_thread
 from iris_session.journal.rows import SNAPSHOTS
@@ -28,8 +29,22 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
     min_change_share: float = 1e9
 
 
+class _RecordedControlConfig(ControlConfig, frozen=True):
+    compensate_sag: bool = False
+    few_joints_orientation_cost: float | None = None
+
+
 class _RecordedConfig(CoreConfig, frozen=True):
     authority: _RecordedAuthorityConfig
+    control: _RecordedControlConfig
+
+
+def decode_recorded_config(header_config: bytes) -> CoreConfig:
+    """Return the configuration in the header of a recording. Raises `msgspec.DecodeError` for other bytes."""
+    config = msgspec.msgpack.decode(header_config, type=_RecordedConfig)
+    if config.control.solver == SOLVER_AUTO:  # not in the header: there was only one
+        config = msgspec.structs.replace(config, control=msgspec.structs.replace(config.control, solver=SOLVER_MINK))
+    return config
 
 
 class ReplayCore:
@@ -37,10 +52,7 @@ class ReplayCore:
 
     def __init__(self, header: SessionHeader, models: Models) -> None:
         use_one_blas_thread()
-        config = msgspec.msgpack.decode(header.config, type=_RecordedConfig)
-        if config.control.solver == SOLVER_AUTO:  # not in the header: there was only one
-            control = msgspec.structs.replace(config.control, solver=SOLVER_MINK)
-            config = msgspec.structs.replace(config, control=control)
+        config = decode_recorded_config(header.config)
         model = decode_model(unpack_model(header.model))
         self.core = SessionCore(model, config, lambda model_hash: decode_model(models(model_hash)))
 

@@ -113,21 +113,21 @@ def lead(made: Rig, q: np.ndarray, qd: np.ndarray | None = None, **more: object)
     return Command("panda", "joints", sources=(source,))
 
 
-def test_the_first_engaged_step_changes_nothing_then_the_follower_arrives_exactly() -> None:
+def test_the_first_engaged_step_changes_nothing_then_the_follower_arrives() -> None:
     made, goal = rig(), HOME + 0.1
     before = made.data.ctrl.copy()
     made.step(decision([lead(made, goal)]))
     assert (made.data.ctrl == before).all()
-    for _ in range(200):
+    for _ in range(500):
         made.step(decision([lead(made, goal, new=False)]))  # the one sample, taken in the second step
-    assert (made.data.ctrl == goal).all()
+    assert made.data.qpos == pytest.approx(goal, abs=1e-3)
     assert made.controller.get_status()[0].limits == ()
 
 
 def test_a_leader_that_is_far_is_caught_up_with_slowly() -> None:
     made, goal = rig(), HOME + 0.5
     ramped, previous, limits = 0.0, made.data.ctrl.copy(), []
-    for k in range(700):
+    for k in range(1000):
         made.step(decision([lead(made, goal, new=k % 7 == 0)]))
         limits.append(made.controller.get_status()[0].limits)
         if limits[-1]:
@@ -136,7 +136,7 @@ def test_a_leader_that_is_far_is_caught_up_with_slowly() -> None:
     assert ramped == pytest.approx(0.5, abs=1e-3)
     assert limits[5] == limits[400] == ("leader_apart",)
     assert limits[-1] == ()
-    assert made.data.ctrl == pytest.approx(goal)
+    assert made.data.qpos == pytest.approx(goal, abs=1e-3)
 
 
 def test_joint_limits_bound_the_leader() -> None:
@@ -168,5 +168,5 @@ def test_a_leader_does_not_take_the_follower_out_of_its_workspace() -> None:
     assert "workspace" in made.controller.get_status()[0].limits
     for k in range(400):
         made.step(decision([lead(made, HOME, new=k % 7 == 0)]))
-    assert made.data.ctrl == pytest.approx(HOME, abs=1e-6)
+    assert made.data.qpos == pytest.approx(HOME, abs=1e-3)
     assert made.controller.get_status()[0].limits == ()

@@ -128,7 +128,7 @@ def test_a_twist_moves_at_its_speed_and_stops_with_hold() -> None:
     rig.hold(100)
     stopped = rig.target()
     rig.hold(100)
-    assert rig.target() == stopped
+    assert apart(rig.target(), stopped)[0] < 2e-4  # it is where the arm stands, which comes to rest
     assert not rig.controller._joints.moving
 
 
@@ -299,15 +299,16 @@ def test_a_hand_follows_joints_and_no_pose() -> None:
     model = load_model(MENAGERIE / "leap_hand" / "scene_right.xml")
     (hand,) = find_robots(model).robots
     made = Rig(model, [hand])
-    made.hold(5)
+    made.hold(500)
     before = made.data.ctrl.copy()
     for k in range(20):
         made.step(decision([pose_command(hand.name, made.source((0.01 * k, 0.0, 0.0)))]))
-    assert (made.data.ctrl == before).all()
+    assert made.data.ctrl == pytest.approx(before, abs=1e-5)
     assert made.controller.get_status()[0].limits == ("joints_only",)
     made.hold(5)
     goal = tuple(0.1 for _ in hand.joints)
     for k in range(300):
         source = made.source((0.0, 0.0, 0.0), engagement=2, pose_world=None, q=goal, device="joints", new=k < 2)
         made.step(decision([Command(hand.name, "joints", sources=(source,))]))
-    assert made.data.ctrl == pytest.approx(np.full(16, 0.1))
+    joints = [int(model.joint(name).qposadr[0]) for name in hand.joints]
+    assert made.data.qpos[joints] == pytest.approx(np.full(16, 0.1), abs=2e-3)

@@ -94,8 +94,9 @@ def test_no_sag_on_repeated_engage(make: str) -> None:
             rig.step(decision(pose_command(r.name, s) for r, s in zip(rig.robots, source, strict=True)))
         rig.hold(10)
     for i in range(len(rig.robots)):
-        assert apart(targets[i], rig.target(i))[0] < 1e-6
-        assert apart(start[i], rig.tip(i))[0] < 2e-4  # aloha creeps in its own joint friction
+        # Aloha creeps in its own joint friction, and the target of an arm that holds is where it stands.
+        assert apart(targets[i], rig.target(i))[0] < (2e-4 if make == "aloha" else 1e-6)
+        assert apart(start[i], rig.tip(i))[0] < 2e-4
 
 
 @pytest.mark.parametrize(("make", "bound"), [("position", 1e-6), ("velocity", 1e-4), ("torque", 1e-6), ("aloha", 1e-3)])

@@ -81,7 +81,7 @@ def test_a_commanded_joint_does_not_wind_up_against_an_obstacle(kind: str) -> No
     rig, _ = pressed(kind)
     worst = np.abs(rig.controller._joints.q - rig.data.qpos[:3]).max()
     assert worst <= 0.15 + 0.08  # 60 ms at 2.5 rad/s, and the weakest servo's droop
-    assert rig.controller.get_status()[0].limits[-1] == "tracking"
+    assert "tracking" in rig.controller.get_status()[0].limits
 
 
 def test_the_activation_of_a_blocked_integrator_does_not_wind_up_either() -> None:

@@ -158,7 +158,8 @@ def test_both_solvers_take_a_robot_to_the_same_place(
 ) -> None:
     ends = []
     for name in (SOLVER_MINK, SOLVER_NUMPY):
-        rig = Rig(panda_model(), [panda_spec()], ControlConfig(solver=name), home=PANDA_HOME)
+        config = ControlConfig(solver=name, compensate_sag=False)  # the range of joint6 is met by a hair
+        rig = Rig(panda_model(), [panda_spec()], config, home=PANDA_HOME)
         rig.hold(5)
         rig.step(decision([pose_command("panda", rig.source((0.0, 0.0, 0.0)))]))
         far = rig.source(aim, quat_from_rotvec(turn))

@@ -9,13 +9,18 @@ from __future__ import annotations
 import lzma
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
+from iris_session.authority import AuthorityConfig
+from iris_session.bench.stop import make_wall_robot
+from iris_session.control import ControlConfig
 from iris_session.protocol.client_messages import Sample
 from iris_session.recording import CLOSED, OPEN, Recording, summarise
 from iris_session.recording.records import iterate_samples
-from iris_session.session.verification import verify_recording
+from iris_session.session.core import CoreConfig
+from iris_session.session.verification import decode_recorded_config, verify_recording
 
 DATA = Path(__file__).parent / "data"
 #: Parts of the environment in which two machines may differ without another result of a step.
@@ -56,3 +61,14 @@ def test_kept_recording_reads(name: str, tmp_path: Path) -> None:
         assert all(np.isfinite(state.poses).all() for state in states)
         assert {type(one.sample) for one in iterate_samples(recording)} == {Sample}
         assert any(one.participant for one in iterate_samples(recording))
+
+
+def test_what_a_header_does_not_name_was_not_in_force() -> None:
+    """Recordings of before have no such fields; what a later header says counts."""
+    robot = make_wall_robot("position_weak")
+    config = CoreConfig(AuthorityConfig(), ControlConfig(), (robot,), ())
+    fields = msgspec.msgpack.decode(msgspec.msgpack.encode(config))
+    assert decode_recorded_config(msgspec.msgpack.encode(fields)).control.compensate_sag
+    del fields["control"]["compensate_sag"], fields["control"]["few_joints_orientation_cost"]
+    control = decode_recorded_config(msgspec.msgpack.encode(fields)).control
+    assert (control.compensate_sag, control.few_joints_orientation_cost) == (False, None)
