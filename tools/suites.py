@@ -46,12 +46,16 @@ _META_WORLD: Final = ("reach-v3", "push-v3", "pick-place-v3", "drawer-open-v3", 
 _DM_CONTROL: Final = ("cartpole:swingup", "reacher:easy", "finger:turn_easy", "walker:walk", "humanoid:run")
 SUITES: Final = {
     "gymnasium": Suite(
-        ("gymnasium>=1.0", "mujoco==3.3.7"),
+        ("gymnasium>=1.0", "imageio", "packaging", "mujoco==3.3.7"),
         "make_gymnasium",
         ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Pusher-v5", "Reacher-v5", "Hopper-v5", "InvertedPendulum-v5"),
     ),
-    "gymnasium-3.3.0": Suite(("gymnasium>=1.0", "mujoco==3.3.0"), "make_gymnasium", ("Ant-v5", "Pusher-v5")),
-    "gymnasium-4.0": Suite(("gymnasium>=1.0", "mujoco==4.0.0"), "make_gymnasium", ("Ant-v5", "Pusher-v5")),
+    "gymnasium-3.3.0": Suite(
+        ("gymnasium>=1.0", "imageio", "packaging", "mujoco==3.3.0"), "make_gymnasium", ("Ant-v5", "Pusher-v5")
+    ),
+    "gymnasium-4.0": Suite(
+        ("gymnasium>=1.0", "imageio", "packaging", "mujoco==4.0.0"), "make_gymnasium", ("Ant-v5", "Pusher-v5")
+    ),
     "fetch": Suite(("gymnasium-robotics>=1.3", "mujoco==3.3.7"), "make_robotics", _FETCH, "action"),
     "robotics": Suite(
         ("gymnasium-robotics>=1.3", "mujoco==3.3.7"),

@@ -7,7 +7,7 @@ python -m tools.suites_worker MAKER ENVIRONMENT DRIVE       prints one JSON obje
 - `poses_mm`: farthest distance of a body at the observer from where the simulation has it, after the last step.
 - `follows_reset`: after a reset and a few steps the observer is at the world's time and bodies.
 - `driven_mm_off`: what is left of 5 cm when an agent has driven the first arm, in the best of six directions; `null`
-  without an arm. `gripper`: the fingers moved when it closed, `null` without one.
+  without an arm, and for arms of a body that nothing holds. `gripper`: the fingers moved when it closed, `null` without one.
 - `verified`: the recording verifies.
 - `ms_per_step_p50`: what sharing adds to a step, and `alone_ms_per_step_p50`.
 """
@@ -29,7 +29,7 @@ import mujoco
 import numpy as np
 
 import iris_session
-from iris_session import AuthorityConfig, Client, SessionConfig
+from iris_session import AuthorityConfig, Client, HoldReason, SessionConfig
 from iris_session.physics.names import list_body_names
 from iris_session.physics.tip import Tip
 from iris_session.session.simulation import require_simulation
@@ -55,6 +55,10 @@ with Client(sys.argv[1], role="observer", name="watcher") as client:
     while not select.select([sys.stdin], [], [], 0)[0]:
         client.sleep(0.01)
 """
+#: Holds that end only when the clutch is opened and closed again.
+OPEN_CLUTCH: Final = frozenset(
+    {HoldReason.REARM, HoldReason.REJECTED, HoldReason.STALE, HoldReason.GAP, HoldReason.SCENE_CHANGED}
+)
 AXES: Final = ((0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0))
 
 
@@ -258,6 +262,8 @@ def drive(case: Case, session: Any, is_action: bool) -> dict[str, Any]:
     if not arms:
         return {"driven_mm_off": None, "gripper": None}
     robot = arms[0]
+    if has_free_base(case, robot):
+        return {"driven_mm_off": None, "gripper": None}
     best, fingers = 1e6, None
     with Client(session.address, role="agent", name="agent", devices=("target",)) as client:
         acquire(case, session, is_action, client, robot.name)
@@ -270,6 +276,18 @@ def drive(case: Case, session: Any, is_action: bool) -> dict[str, Any]:
     return {"driven_mm_off": round(best, 2), "gripper": fingers}
 
 
+def has_free_base(case: Case, robot: Any) -> bool:
+    """Return true for an arm of a body that falls or walks, where a place in the world cannot be kept."""
+    model, _ = require_simulation(case.environment)
+    body = list_body_names(model).index(robot.base_body)
+    while body:
+        joints = range(int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body]))
+        if int(model.body_jntnum[body]) and any(int(model.jnt_type[j]) == 0 for j in joints):
+            return True
+        body = int(model.body_parentid[body])
+    return False
+
+
 def step_case(case: Case, session: Any, is_action: bool, client: Client) -> None:
     """Take a step of the environment, paced, and receive."""
     began = time.perf_counter()
@@ -277,6 +295,12 @@ def step_case(case: Case, session: Any, is_action: bool, client: Client) -> None
     case.step(session.action(action) if is_action else action)
     client.poll()
     client.sleep(max(0.0, began + DRIVEN_STEP_S - time.perf_counter()))
+
+
+def may_close(client: Client, robot: str) -> bool:
+    """Return whether to close the clutch: after a disturbance it must be opened first, see the guide."""
+    feedback = client.feedback.get(robot)
+    return feedback is not None and feedback.hold_reason not in OPEN_CLUTCH
 
 
 def acquire(case: Case, session: Any, is_action: bool, client: Client, robot: str) -> None:
@@ -311,7 +335,8 @@ def move(case: Case, session: Any, is_action: bool, client: Client, robot: Any, 
     for _ in range(2000):
         share = min(1.0, (float(data.time) - begun) / MOVE_S)
         target = np.array(p) + share * DISTANCE_M * axis
-        client.send_sample("target", (tuple(target.tolist()), q), robots=robot.name, clutch=True)
+        closed = may_close(client, robot.name)
+        client.send_sample("target", (tuple(target.tolist()), q), robots=robot.name, clutch=closed)
         step_case(case, session, is_action, client)
         if data.time - begun > MOVE_S + REST_S:
             break
@@ -328,7 +353,8 @@ def close_gripper(case: Case, session: Any, is_action: bool, client: Client, rob
     seen = []
     for gripper in (0.0, 1.0):
         for _ in range(60):
-            client.send_sample("target", (p, q), robots=robot.name, clutch=True, gripper=gripper)
+            closed = may_close(client, robot.name)
+            client.send_sample("target", (p, q), robots=robot.name, clutch=closed, gripper=gripper)
             step_case(case, session, is_action, client)
         seen.append(np.array([data.xpos[i] - np.array(read_tip(case, robot)[0]) for i in fingers] or [data.qpos]))
     return bool(np.abs(seen[1] - seen[0]).max() > 2e-3)
