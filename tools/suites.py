@@ -41,12 +41,13 @@ class Suite(NamedTuple):
     drive: str = "ctrl"
 
 
+_GYMNASIUM: Final = ("gymnasium>=1.0", "imageio", "packaging")
 _FETCH: Final = ("FetchReach-v4", "FetchPush-v4", "FetchSlide-v4", "FetchPickAndPlace-v4")
 _META_WORLD: Final = ("reach-v3", "push-v3", "pick-place-v3", "drawer-open-v3", "door-open-v3", "button-press-v3")
 _DM_CONTROL: Final = ("cartpole:swingup", "reacher:easy", "finger:turn_easy", "walker:walk", "humanoid:run")
 SUITES: Final = {
     "gymnasium": Suite(
-        ("gymnasium>=1.0", "imageio", "packaging", "mujoco==3.3.7"),
+        (*_GYMNASIUM, "mujoco==3.3.7"),
         "make_gymnasium",
         ("Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Pusher-v5", "Reacher-v5", "Hopper-v5", "InvertedPendulum-v5"),
     ),

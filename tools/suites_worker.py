@@ -7,7 +7,8 @@ python -m tools.suites_worker MAKER ENVIRONMENT DRIVE       prints one JSON obje
 - `poses_mm`: farthest distance of a body at the observer from where the simulation has it, after the last step.
 - `follows_reset`: after a reset and a few steps the observer is at the world's time and bodies.
 - `driven_mm_off`: what is left of 5 cm when an agent has driven the first arm, in the best of six directions; `null`
-  without an arm, and for arms of a body that nothing holds. `gripper`: the fingers moved when it closed, `null` without one.
+  without an arm, and for arms of a body that nothing holds. `gripper`: the fingers moved when it closed, `null`
+  without one.
 - `verified`: the recording verifies.
 - `ms_per_step_p50`: what sharing adds to a step, and `alone_ms_per_step_p50`.
 """
