@@ -29,6 +29,7 @@ SLIVERS = {
     "iris_session.front.uplink": "the counterpart of downlink",
     "iris_session.security.key_home": "where keys are is looked for by this name",
     "iris_session.session.unique_name": "a listener with a socket of its own",
+    "iris_session.simulators.find": "the table of simulators, beside the adapters",
     "iris_session.streams.quantise": "number formats that clients port",
     "iris_session.system.backoff": "the one back-off",
 }
@@ -58,6 +59,7 @@ FORBIDDEN = {
     "physics": {"zmq", "rerun"} | RANDOM,
     "streams": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
     "scene": SOCKETS | RANDOM | {"rerun"},
+    "simulators": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
     "assets": SOCKETS | {"mujoco", "rerun", "scipy", "cv2", "mink", "open3d"},
     "cloud": SOCKETS | RANDOM,
     "security": (SOCKETS - {"zmq"}) | RANDOM | HEAVY,

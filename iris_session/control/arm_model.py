@@ -122,7 +122,9 @@ def _find_chain(scene: mujoco.MjModel, robot: RobotSpec, joint_ids: list[int], t
         if int(scene.jnt_type[joint]) not in _JOINT_TYPES:
             raise ControlError(f"robot {robot.name!r}: joint {name!r} must be a hinge or a slide joint")
     extra = [mujoco.mj_id2name(scene, int(mujoco.mjtObj.mjOBJ_JOINT), j) or f"#{j}" for j in found if j not in wanted]
-    if extra or (not found and robot.kind != HAND):
+    # The model of a published world has no joints: its program moves the tip.
+    is_tip_alone = not robot.joints and not any(_list_joints(scene, b) for b in path)
+    if extra or (not found and robot.kind != HAND and not is_tip_alone):
         raise ControlError(
             f"robot {robot.name!r}: joints {', '.join(extra) or '(none)'} lie between its joints and {tip_name}; "
             "the chain must consist of the robot's own joints"

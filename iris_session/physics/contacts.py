@@ -175,8 +175,9 @@ class ContactTables:
         return tuple(forces)
 
 
-def _find_roots(model: mujoco.MjModel, tree: KinematicTree, spec: RobotSpec) -> tuple[int, int]:
+def _find_roots(model: mujoco.MjModel, tree: KinematicTree, spec: RobotSpec) -> tuple[int, ...]:
     """Return the base body of a robot, and the highest body that one of its joints moves."""
     where = f"robot {spec.name!r}: "
     moved = [tree.joint_body[find_element_id(model, "joint", j, where)] for j in spec.joints]
-    return find_element_id(model, "body", spec.base_body, where), min(moved, key=lambda b: len(tree.list_ancestors(b)))
+    highest = [min(moved, key=lambda b: len(tree.list_ancestors(b)))] if moved else []
+    return find_element_id(model, "body", spec.base_body, where), *highest

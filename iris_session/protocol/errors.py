@@ -8,6 +8,7 @@ IrisError
 |-- PhysicsError             a model or robots file that cannot be used (`physics.errors`)
 |-- ControlError             robots that cannot be driven (`control.config`)
 |-- SceneBuildError          a scene or file that cannot be composed (`scene.errors`)
+|-- SimulatorError           a simulation of another simulator that cannot be shown (`simulators.adapter`)
 |-- SceneError               an operation that does not fit a scene (`protocol.scene`)
 |-- AssetStoreError          the store of assets (`assets.errors`)
 |-- RecordingError           a recording that cannot be read or written (`journal.errors`)

@@ -40,6 +40,7 @@ from iris_session.scene.nodes import (
     Matrix,
     TextureImage,
     color_images,
+    is_solid,
     to_matrix,
     to_vec3,
     truncate_name,
@@ -132,6 +133,21 @@ class SceneBuilder:
     def names(self) -> frozenset[str]:
         """Names of movable bodies, articulations with their links, and deformables so far."""
         return frozenset(self._content.names)
+
+    # --- bodies -------------------------------------------------------------------------------------------------------
+
+    def add_body(
+        self, name: str, *, position: Sequence[float] = IDENTITY.p, quaternion: Sequence[float] = IDENTITY.q
+    ) -> str:
+        """Add a movable body without a shape: what is drawn is added `on` it.
+
+        Args:
+            name: Unique name.
+            position: Position in the world [m].
+            quaternion: Orientation in the world, `(w, x, y, z)`.
+        """
+        self._place(name, {"position": position, "quaternion": quaternion, "movable": True})
+        return name
 
     # --- shapes -------------------------------------------------------------------------------------------------------
 
@@ -234,8 +250,24 @@ class SceneBuilder:
             **options: Placement and appearance; see the class.
         """
         mesh = check_mesh(f"mesh {reprlib.repr(name)}", vertices, triangles, normals, uvs, colors)
-        appearance = parse_appearance(options) or Appearance(rgba=GREY if colors is None else (1.0, 1.0, 1.0, 1.0))
+        return self.add_mesh_arrays(name, mesh, **options)
+
+    def add_mesh_arrays(
+        self, name: str, mesh: MeshArrays, *, transform: Matrix | None = None, **options: Unpack[DrawingOptions]
+    ) -> str:
+        """Add a mesh that `check_mesh` has made, which may be added any number of times and is sent once per scale.
+
+        Args:
+            name: Name; a movable body needs a unique one.
+            mesh: The mesh.
+            transform: Shape (4, 4), applied to the mesh before its placement: rotation, position [m], scale and shear.
+            **options: Placement and appearance; see the class.
+        """
+        appearance = parse_appearance(options) or Appearance(rgba=GREY if mesh.color is None else (1.0, 1.0, 1.0, 1.0))
+        if transform is not None and not is_solid(transform):
+            raise SceneBuildError(f"mesh {reprlib.repr(name)} is scaled to nothing: give every axis a scale")
         body, matrix = self._place(name, options)
+        matrix = matrix if transform is None else matrix @ transform
         self._content.items.append(DrawnItem(body, truncate_name(name), matrix, appearance, mesh))
         return name
 

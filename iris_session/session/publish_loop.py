@@ -18,7 +18,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.physics.kinematic_model import KinematicModel
+from iris_session.physics.kinematic_model import TICK_S, KinematicModel
+from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import ExternalReset
 from iris_session.protocol.status import NOT_PUBLISHED
 from iris_session.scene.result import ComposedScene
@@ -34,6 +35,8 @@ IDLE_PERIOD_S: Final = 0.01
 #: Silence after which the state is sent again, and again after as long; two periods of the state at least. Longer
 #: than the distance of the frames of any source that moves: a repeated pose between two would be seen as a halt.
 REPEAT_NS: Final = 250_000_000
+#: Most milliseconds of the world for which targets of robots move with one frame: a larger jump of time is no motion.
+MAX_TICKS: Final = 100
 
 _log = logging.getLogger(__name__)
 
@@ -55,6 +58,7 @@ class PublishLoop:
     Attributes:
         superseded: Frames that a newer one replaced before they were published.
         lock: Held while a step is taken; hold it to read what steps change.
+        grippers: How far participants have closed grippers, 0 to 1, by robot.
     """
 
     def __init__(
@@ -72,6 +76,7 @@ class PublishLoop:
         self._period_ns = period_ns
         self._repeat_ns = max(REPEAT_NS, 2 * period_ns)
         self.superseded = 0
+        self.grippers: dict[str, float] = {}
         self.lock = threading.RLock()
         self._pending_lock = threading.Lock()
         self._pending: Frame | None = None
@@ -83,6 +88,7 @@ class PublishLoop:
         self._sent_ns = 0
         # Age of the newest frame when it was published, -1 before the first.
         self._delay_ns = -1
+        self._time_s = 0.0  # of the newest frame
         self._arrivals = ArrivalMonitor()
         self._closed = threading.Event()
         self._wake = threading.Event()
@@ -131,6 +137,15 @@ class PublishLoop:
             return ()
         return (f"{NOT_PUBLISHED} {silent_ns * 1e-9:.1f} s: the program that publishes stands still",)
 
+    def list_driven(self) -> tuple[str, ...]:
+        """Return the robots that a participant drives. With the lock held."""
+        sharing = self._stepper.core.sharing
+        return () if sharing is None else sharing.driven
+
+    def read_targets(self) -> dict[str, Pose]:
+        """Return the end-effector targets by robot. With the lock held."""
+        return dict(self._stepper.core.controller.get_targets())
+
     def raise_if_ended(self) -> None:
         """Raise what stopped the helper, or `OwnershipError` after `close`."""
         self._stepper.raise_if_ended()
@@ -160,7 +175,8 @@ class PublishLoop:
             self._due_ns = now_ns + self._period_ns
         if frame.anew:
             self._stepper.post_own(ExternalReset())
-        self._step(1, self._kinematic_model.encode_state(frame.time_s, frame.poses))
+        ticks = self._count_ticks(frame)
+        self._step(ticks, self._kinematic_model.encode_state(frame.time_s, frame.poses))
         self._vertices.newest = frame.vertices
         self._delay_ns = max(0, now_ns - frame.capture_ns)
         self._publish_state(frame.capture_ns)
@@ -172,8 +188,18 @@ class PublishLoop:
             # Before the first frame the scene is as it was composed, and is so now.
             self._publish_state(now_ns - max(0, self._delay_ns), is_repeat=self._delay_ns >= 0)
 
+    def _count_ticks(self, frame: Frame) -> int:
+        """Return the ticks since the frame before, in which targets of robots move; without robots one will do."""
+        before, self._time_s = self._time_s, frame.time_s
+        if not self._stepper.core.scene.robots or frame.anew:
+            return 1
+        return min(MAX_TICKS, max(1, round((frame.time_s - before) / TICK_S)))
+
     def _step(self, n_ticks: int, plant: bytes = b"") -> None:
-        self._stepper.step(n_ticks, plant, publish=False)
+        outcome = self._stepper.step(n_ticks, plant, publish=False)
+        for command in outcome.decision.commands:
+            if command.gripper is not None:
+                self.grippers[command.robot] = command.gripper
         self._processes.supervise(self._stepper)
         self._step_ns = self._stepper.clock()
 

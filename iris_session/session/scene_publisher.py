@@ -8,8 +8,9 @@
             session.publish()
 
 The process that creates it is the authority, as with `Session`. Participants see the scene, point, talk and set
-markers, but cannot drive robots or grasp objects: for that use `Session(model, data)` with `begin_tick()` and
-`end_tick()`.
+markers. They lease the robots that are given, of which only the end effectors are known here: `targets()` has where
+they want them, for the controller of the program. Objects cannot be grasped: for that use `Session(model, data)` with
+`begin_tick()` and `end_tick()`.
 """
 
 from __future__ import annotations
@@ -19,13 +20,18 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any, Final
 
+import msgspec
 from numpy.typing import ArrayLike
 
+from iris_session.control.config import OUTPUT_TARGETS, ControlError
 from iris_session.physics import PhysicsError
 from iris_session.physics.kinematic_model import KinematicModel
+from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import EntryMessage
+from iris_session.protocol.specs import RobotSpec
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.builder import SceneBuilder
 from iris_session.session.config import SessionConfig
@@ -54,9 +60,12 @@ class ScenePublisher(SessionBase):
     Args:
         scene: The scene. What is added to it after `start` is not shown.
         config: Settings; `None` for the defaults. `resume` is not possible, and `assets` cannot be False.
+        robots: Robots that participants can lease: `RobotSpec(name, (), (), "", base_body, tip_body=...)` with movable
+            bodies of the scene, without joints, actuators and site. `targets()` has where they want them.
 
     Attributes:
         config: The settings.
+        robots: Robots that participants can lease.
         origin_ns: `time.monotonic_ns()` at session time 0.
         clock: Returns session time [ns].
         recording_fault: After `close()`, why the recording is incomplete; empty when it is complete.
@@ -65,8 +74,14 @@ class ScenePublisher(SessionBase):
         ConfigError: An argument cannot be used.
     """
 
-    def __init__(self, scene: SceneBuilder, config: SessionConfig | None = None) -> None:
+    def __init__(
+        self, scene: SceneBuilder, config: SessionConfig | None = None, *, robots: Sequence[RobotSpec] = ()
+    ) -> None:
         self.config = _check_arguments(scene, SessionConfig() if config is None else config)
+        self.robots = tuple(robots)
+        if self.robots:
+            control = msgspec.structs.replace(self.config.control, output=OUTPUT_TARGETS)
+            self.config = replace(self.config, control=control)
         self.origin_ns = time.monotonic_ns()
         self.clock = make_session_clock(self.origin_ns)
         self._builder = scene
@@ -104,7 +119,10 @@ class ScenePublisher(SessionBase):
             raise ConfigError(f"the scene cannot be built: {error}") from None
         except OSError as error:
             raise StartError(f"assets: {error.filename or where}: {error.strerror or error}") from None
-        core = make_session_core(self.config, kinematic_model.model, None, (), (), user_owned=True)
+        try:
+            core = make_session_core(self.config, kinematic_model.model, None, self.robots, (), user_owned=True)
+        except (PhysicsError, ControlError) as error:
+            raise ConfigError(f"these robots cannot be offered: {error}") from None
         vertices = PublishedVertices(composed)
         published = PublishedScene(composed, vertices.meshes)
         processes = SessionProcesses(self.config, core, self.origin_ns, published=published)
@@ -271,6 +289,42 @@ class ScenePublisher(SessionBase):
     def superseded(self) -> int:
         """Number of published states that were not sent because a newer one replaced them before they were due."""
         return 0 if self._loop is None else self._loop.superseded
+
+    # --- robots ------------------------------------------------------------------------------------------------------
+
+    def driven_robots(self) -> tuple[str, ...]:
+        """Return the robots that a participant holds and has engaged: your program moves them to their `targets()`.
+
+        Raises:
+            OwnershipError: The session is not started, or closed.
+        """
+        loop = self._require_parts()[1]
+        with loop.lock:
+            return loop.list_driven()
+
+    def targets(self) -> dict[str, Pose]:
+        """Return the end-effector targets `T_world_tip` by robot, for your program's own controller [m].
+
+        Use those of `driven_robots()`; for other robots they are where the robot was when it was published last. They
+        move with `publish`, at bounded speed, and lead the published tip by at most 5 cm and 0.25 rad.
+
+        Raises:
+            OwnershipError: The session is not started, or closed.
+        """
+        loop = self._require_parts()[1]
+        with loop.lock:
+            return loop.read_targets()
+
+    def grippers(self) -> dict[str, float]:
+        """Return how far participants want grippers closed, 0 open to 1 closed, by robot. Those are missing that no
+        participant has moved yet.
+
+        Raises:
+            OwnershipError: The session is not started, or closed.
+        """
+        loop = self._require_parts()[1]
+        with loop.lock:
+            return dict(loop.grippers)
 
     # --- inputs of the owner -----------------------------------------------------------------------------------------
 

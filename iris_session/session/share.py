@@ -9,7 +9,7 @@ import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import msgspec
 import mujoco
@@ -20,7 +20,12 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError
 from iris_session.session.robots import RobotChoice
 from iris_session.session.session import Session
+from iris_session.session.session_base import SessionBase
 from iris_session.session.simulation import require_simulation, unwrap_data, unwrap_model
+from iris_session.session.simulator_session import SimulatorSession
+from iris_session.simulators import find_adapter
+
+S = TypeVar("S", bound=SessionBase)
 
 #: How participants drive, and the output of control that this means.
 DRIVES: Final = {"ctrl": OUTPUT_CTRL, "action": OUTPUT_TARGETS}
@@ -40,8 +45,8 @@ def share(
     sites: bool | Iterable[int] | None = None,
     drive: str = "ctrl",
     step: str = "step",
-) -> Session:
-    """Share a MuJoCo program or a model file: participants see it, and drive the robots that are found in it.
+) -> Session | SimulatorSession:
+    """Share a simulation or a model file: participants see it, and drive the robots that are found in it.
 
     The program stays as it is, and so does its trajectory while no participant drives. A robot about which something
     is unclear is shown all the same: `session.notes` says what, and `session.describe_robots()` has lines for a robots
@@ -50,11 +55,14 @@ def share(
         session = iris_session.share("panda.xml");  session.run()    # a model file, or an MjModel: in our loop
         session = iris_session.share(model, data)                    # your own loop, unchanged
         session = iris_session.share(env)                            # an environment, unchanged
+        session = iris_session.share(scene)                          # of Genesis, SAPIEN, ...: docs/simulators.md
 
     Args:
         x: The path of a model file, an `MjModel`, or an environment that simulates with MuJoCo: of Gymnasium,
             dm_control (its physics, too), robosuite, LIBERO, Meta-World, OGBench, MyoSuite, gym-aloha, LeRobot. For
             what steps outside of Python's MuJoCo (MuJoCo Playground, MJX), call `session.sync(data)` after its steps.
+            Or a simulation of another simulator: a Genesis or SAPIEN scene, a ManiSkill environment, `pybullet` or one
+            of its clients, a solver of Newton, a USD stage or file, the `RemoteAPIClient` of CoppeliaSim.
         data: With an `MjModel`: the data that your loop advances. `None`: the session simulates, by `session.run()`.
         config: Settings; `None` for the defaults. Where rerun is not installed, nothing is recorded by default.
         robots: `auto` finds them, `none` offers none; or names of robots found, the path of a robots file, or
@@ -64,8 +72,9 @@ def share(
             but not 0 where that has the collision shapes (robosuite).
         sites: Groups of sites that participants see, True for all sites, False for none; `None` for those that MuJoCo's
             viewer shows, 0 to 2.
-        drive: `ctrl`: the session writes `data.ctrl` of the robots that participants drive. `action`: it writes
-            nothing; your program asks for the action with `session.action(action)` or for `session.targets()`.
+        drive: `ctrl`: the session writes `data.ctrl` of the robots that participants drive, or moves them by their
+            simulator's own control. `action`: it writes nothing; your program asks for the action with
+            `session.action(action)` or for `session.targets()`.
         step: Name of the environment's method that advances the simulation.
 
     Returns:
@@ -73,7 +82,8 @@ def share(
 
     Raises:
         ModelNotFoundError, ModelInvalidError: The file is missing, or MuJoCo does not compile it.
-        ConfigError: `x` has no MuJoCo model, or an argument cannot be used.
+        ConfigError: `x` is nothing that can be shared, or an argument cannot be used.
+        SimulatorError: A simulation cannot be shown as it is: not built yet, for example.
         OwnershipError: A session shares this data already.
         StartError: A port is in use, a folder cannot be written, a key is missing.
     """
@@ -82,13 +92,22 @@ def share(
     config = config or SessionConfig()
     if config.control.output != DRIVES[drive]:
         config = dataclasses.replace(config, control=msgspec.structs.replace(config.control, output=DRIVES[drive]))
-    given: dict[str, Any] = {"robots": robots, "objects": objects, "groups": groups, "sites": sites}
-    if config.record is True and importlib.util.find_spec("rerun") is None:  # the default, beside a suite
-        session = _share(x, data, dataclasses.replace(config, record=False), given, step)
+    is_unrecorded = config.record is True and importlib.util.find_spec("rerun") is None  # the default, beside a suite
+    if is_unrecorded:
+        config = dataclasses.replace(config, record=False)
+    given: dict[str, Any] = {"objects": objects, "groups": groups, "sites": sites}
+    session: Session | SimulatorSession
+    adapter = find_adapter(x)
+    if adapter is None:
+        session = _share(x, data, config, {"robots": robots, **given}, step)
+    elif wrong := [name for name, value in {"data": data, **given}.items() if value is not None]:
+        raise ConfigError(f"{wrong[0]} is given with {type(x).__name__}: only worlds of MuJoCo have it, leave it out")
+    else:
+        session = _start(SimulatorSession(adapter, config, robots=robots, drives=drive == "ctrl"))
+    if is_unrecorded:
         session._start_notes = (NOT_RECORDED,)
         _log.warning("%s", NOT_RECORDED)
-        return session
-    return _share(x, data, config, given, step)
+    return session
 
 
 def _share(x: Any, data: Any, config: SessionConfig, given: Mapping[str, Any], step: str) -> Session:
@@ -112,7 +131,7 @@ def _share(x: Any, data: Any, config: SessionConfig, given: Mapping[str, Any], s
     return Session.attach(model, found, config, environment=x, step=step, **given)
 
 
-def _start(session: Session) -> Session:
+def _start(session: S) -> S:
     session.start()
     atexit.register(session.close)  # a script may simply end
     return session

@@ -70,8 +70,8 @@ def require_simulation(environment: Any) -> Simulation:
         what = "one of its environments, as in share(env.envs[0])" if is_local else "an environment made alone"
         raise ConfigError(f"{kind} runs several environments, a session shows one: share {what}")
     raise ConfigError(
-        f"no MuJoCo model in {kind}: share the path of a model, an MjModel with its MjData, or an environment that "
-        "simulates with MuJoCo"
+        f"no MuJoCo model in {kind}: share the path of a model, an MjModel with its MjData, an environment that "
+        "simulates with MuJoCo, or a simulation of Genesis, SAPIEN, PyBullet, Newton, USD or CoppeliaSim"
     )
 
 

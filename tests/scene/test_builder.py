@@ -15,7 +15,7 @@ from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.scene import Environment, decode_scene
 from iris_session.scene import AssetStore, SceneBuildError, decode_arrays, decode_mesh
-from iris_session.scene.builder import SceneBuilder
+from iris_session.scene.builder import SceneBuilder, check_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from tests.scene.arm import write_arm
@@ -247,3 +247,20 @@ def test_number_of_deformables_is_bounded_by_the_streams(store: AssetStore) -> N
     with pytest.raises(SceneBuildError, match="16 are streamed"):
         scene.add_deformable("one more", SQUARE, TRIANGLES)
     assert len(scene.build(store).deformables) == MAX_STREAMS
+
+
+def test_a_mesh_that_is_added_often_is_sent_once_per_scale(tmp_path: Path) -> None:
+    scene = SceneBuilder()
+    scene.add_body("part", position=(1, 0, 0))
+    mesh = check_mesh("square", SQUARE, TRIANGLES, None, None, None)
+    scene.add_mesh_arrays("a", mesh, on="part")
+    scene.add_mesh_arrays("b", mesh, transform=np.diag([1.0, 1.0, 1.0, 1.0]), position=(0, 0, 2), rgba=(1, 0, 0))
+    scene.add_mesh_arrays("c", mesh, transform=np.diag([2.0, 1.0, 1.0, 1.0]))
+    made = scene.build(AssetStore(tmp_path))
+    assert made.moving == ("part",)
+    assert len(made.spec.meshes) == 2
+    assert [visual.rgba[:3] for visual in made.spec.visuals] == [(0.5, 0.5, 0.5), (1.0, 0.0, 0.0), (0.5, 0.5, 0.5)]
+    with pytest.raises(SceneBuildError, match="scaled to nothing"):
+        scene.add_mesh_arrays("flat", mesh, transform=np.diag([1.0, 1.0, 0.0, 1.0]))
+    with pytest.raises(SceneBuildError, match="another name"):
+        scene.add_body("part")

@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iris_session import ConfigError, OwnershipError, PublishError, SceneBuilder, ScenePublisher, SessionConfig
+from iris_session import (
+    ConfigError,
+    OwnershipError,
+    PublishError,
+    RobotSpec,
+    SceneBuilder,
+    ScenePublisher,
+    SessionConfig,
+)
 from iris_session.protocol.scene import Environment, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from tests.rig.owned import simulate_sessions
@@ -156,3 +164,9 @@ def test_invalid_scene_or_configuration_raises(tmp_path: Path) -> None:
             ScenePublisher(builder, config)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="scene"):
         ScenePublisher(broken, CONFIG).start()
+
+
+def test_robots_that_the_scene_does_not_have_are_refused_in_one_line(simulation: Simulation) -> None:
+    with pytest.raises(ConfigError, match="'nowhere'") as caught:
+        ScenePublisher(scene(), CONFIG, robots=[RobotSpec("arm", (), (), "", "box", tip_body="nowhere")]).start()
+    assert "\n" not in str(caught.value)

@@ -15,6 +15,7 @@ import iris_session
 #: Classes that are reached through a public one, and stand behind it in the reference.
 REACHED: Final = {
     "Session": ("iris_session.session.status.SessionStatus",),
+    "ScenePublisher": ("iris_session.session.simulator_session.SimulatorSession",),
     "Client": (
         "iris_session.client.scene.ClientScene",
         "iris_session.client.media.ClientMedia",
