@@ -33,7 +33,7 @@ import iris_session
 from iris_session import AuthorityConfig, Client, HoldReason, SessionConfig
 from iris_session.physics.names import list_body_names
 from iris_session.physics.tip import Tip
-from iris_session.session.simulation import require_simulation
+from iris_session.session.simulation import copy_state, require_simulation
 from iris_session.session.verification import verify_recording
 
 STEPS: Final = 60
@@ -66,6 +66,8 @@ AXES: Final = ((0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 
 class Case:
     """An environment by one interface: `reset(seed)`, `step(action)`, and actions."""
 
+    drives = True
+
     def __init__(self, environment: Any, actions: Any, *, seeds: bool = True) -> None:
         self.environment, self._actions, self._seeds = environment, actions, seeds
         self.rng = np.random.default_rng(0)
@@ -93,10 +95,16 @@ class Case:
         """Take a step."""
         self.environment.step(action)
 
+    def find_simulation(self) -> Any:
+        """Return the model and the data now."""
+        return require_simulation(self.environment)
+
+    def follow(self, session: Any) -> None:
+        """Note the session that shares the environment."""
+
     def read(self) -> Any:
         """Return the bits of the state."""
-        _, data = require_simulation(self.environment)
-        assert data is not None
+        _, data = self.find_simulation()
         return np.concatenate(([data.time], data.qpos, data.qvel))
 
 
@@ -204,6 +212,58 @@ def make_manipulation(name: str) -> Case:
     return DmCase(manipulation.load(name, seed=0))
 
 
+class PlaygroundCase(Case):
+    """An environment of MuJoCo Playground, which steps in JAX: its states are given to `session.sync`."""
+
+    drives = False  # by `session.targets()`, for a controller of one's own
+
+    def __init__(self, environment: Any) -> None:
+        import jax
+
+        ones = np.ones(environment.action_size)
+        super().__init__(environment, (-ones, ones))
+        self._key, self._reset, self._step = (
+            jax.random.PRNGKey(0),
+            jax.jit(environment.reset),
+            jax.jit(environment.step),
+        )
+        self._state: Any = None
+        self._session: Any = None
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.rng = np.random.default_rng(0)
+        self._state = self._reset(self._key)
+        self._sync()
+
+    def step(self, action: Any) -> None:
+        """Take a step."""
+        self._state = self._step(self._state, action)
+        self._sync()
+
+    def _sync(self) -> None:
+        np.asarray(self._state.data.qpos)  # JAX computes when it is asked
+        if self._session is not None:
+            self._session.sync(self._state)
+
+    def follow(self, session: Any) -> None:
+        """Give the states to a session."""
+        self._session = session
+
+    def find_simulation(self) -> Any:
+        """Return the model and a copy of the data."""
+        data = mujoco.MjData(self.environment.mj_model)
+        copy_state(self._state, data)
+        return self.environment.mj_model, data
+
+
+def make_playground(name: str) -> Case:
+    """MuJoCo Playground."""
+    from mujoco_playground import registry
+
+    return PlaygroundCase(registry.load(name))
+
+
 # --- measuring --------------------------------------------------------------------------------------------------------
 
 
@@ -240,8 +300,7 @@ def find_pose_error_mm(client: Client, case: Case, timeout_s: float = 5.0) -> fl
     """Return the largest distance [mm] between bodies at the observer and in the simulation, which stands still; a
     large number when its time does not come.
     """
-    model, data = require_simulation(case.environment)
-    assert data is not None
+    model, data = case.find_simulation()
     names = list_body_names(model)[1:]  # without the world
 
     def is_there(client: Client) -> bool:
@@ -260,11 +319,9 @@ def find_pose_error_mm(client: Client, case: Case, timeout_s: float = 5.0) -> fl
 def drive(case: Case, session: Any, is_action: bool) -> dict[str, Any]:
     """Move the first arm by 5 cm, then close its gripper."""
     arms = [robot for robot in session.robots if robot.kind != "hand"]
-    if not arms:
+    if not arms or not case.drives or has_free_base(case, arms[0]):
         return {"driven_mm_off": None, "gripper": None}
     robot = arms[0]
-    if has_free_base(case, robot):
-        return {"driven_mm_off": None, "gripper": None}
     best, fingers = 1e6, None
     with Client(session.address, role="agent", name="agent", devices=("target",)) as client:
         acquire(case, session, is_action, client, robot.name)
@@ -279,7 +336,7 @@ def drive(case: Case, session: Any, is_action: bool) -> dict[str, Any]:
 
 def has_free_base(case: Case, robot: Any) -> bool:
     """Return true for an arm of a body that falls or walks, where a place in the world cannot be kept."""
-    model, _ = require_simulation(case.environment)
+    model, _ = case.find_simulation()
     body = list_body_names(model).index(robot.base_body)
     while body:
         joints = range(int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body]))
@@ -318,14 +375,13 @@ def acquire(case: Case, session: Any, is_action: bool, client: Client, robot: st
 
 def read_tip(case: Case, robot: Any) -> Any:
     """Return where the tip is [m], and its orientation."""
-    model, data = require_simulation(case.environment)
+    model, data = case.find_simulation()
     return Tip(model, robot).read_pose(data)
 
 
 def move(case: Case, session: Any, is_action: bool, client: Client, robot: Any, axis: Any) -> float:
     """Return what is left [mm] of 5 cm along `axis`, from where the tip is at engagement."""
-    _, data = require_simulation(case.environment)
-    assert data is not None
+    _, data = case.find_simulation()
     for _ in range(20):
         p, q = read_tip(case, robot)
         client.send_sample("target", (p, q), robots=robot.name, clutch=False)
@@ -346,8 +402,7 @@ def move(case: Case, session: Any, is_action: bool, client: Client, robot: Any, 
 
 def close_gripper(case: Case, session: Any, is_action: bool, client: Client, robot: Any) -> bool:
     """Return whether the fingers came nearer to each other, or moved, between open and closed."""
-    model, data = require_simulation(case.environment)
-    assert data is not None
+    model, data = case.find_simulation()
     names = list_body_names(model)
     fingers = [names.index(name) for name in robot.finger_bodies if name in names]
     p, q = read_tip(case, robot)
@@ -381,6 +436,7 @@ def run_case(maker: str, name: str, drive_by: str) -> dict[str, Any]:
         )
         case.reset()
         session = iris_session.share(case.environment, config=config, drive=drive_by)
+        case.follow(session)
         row |= {"shared": True, "robots": [robot.name for robot in session.robots], "notes": list(session.notes)[:3]}
         try:
             with watch_from_elsewhere(session.address):
