@@ -54,6 +54,7 @@ SUITES: Final = {
     "gymnasium-3.3.0": Suite(
         ("gymnasium>=1.0", "imageio", "packaging", "mujoco==3.3.0"), "make_gymnasium", ("Ant-v5", "Pusher-v5")
     ),
+    "gymnasium-3.17": Suite((*_GYMNASIUM, "mujoco==3.17.*"), "make_gymnasium", ("Ant-v5", "Pusher-v5")),
     "gymnasium-4.0": Suite(
         ("gymnasium>=1.0", "imageio", "packaging", "mujoco==4.0.0"), "make_gymnasium", ("Ant-v5", "Pusher-v5")
     ),
