@@ -100,6 +100,14 @@ class ActuatorLaws:
         self._acceleration = np.zeros(model.nv)
         self._force = np.zeros(model.nv)
 
+    def find_position_laws(self) -> tuple[Floats, Floats]:
+        """Return scale and offset of joints with position actuators: `ctrl = q * scale + offset`. NaN for all others,
+        shape (n,) each.
+        """
+        scale, offset = np.full((2, len(self.actuators)), np.nan)
+        scale[self._position.columns], offset[self._position.columns] = self._position.scale, self._position.offset
+        return scale, offset
+
     def read_activations(self, data: mujoco.MjData) -> Floats:
         """Return the activations of integrated velocity actuators as joint positions, shape (n_integrators,)."""
         act = data.act[self._act] / self._velocity.scale[self._integrators]
@@ -246,6 +254,8 @@ def _find_bounds(
 class Grippers:
     """Gripper `ctrl` of all robots that have one. `ctrl`, `goal`: shape (n_actuators,), in actuator units.
 
+    With output `targets` nothing is written: the environment asks for `read_share`.
+
     The closing share 0..1 follows its goal at a bounded speed; it is unchanged in hold and in the first engaged step.
     """
 
@@ -287,14 +297,28 @@ class Grippers:
         for row in self._rows.get(robot, ()):
             self.goal[row] = self.ctrl[row]
 
+    def read_share(self, robot: int) -> float | None:
+        """Return how far the gripper of a robot is closed: 0 (open) to 1 (closed), `None` without one."""
+        rows = self._rows.get(robot)
+        if not rows or self._closed[rows[0]] == self._open[rows[0]]:
+            return None
+        first = rows[0]
+        share = (float(self.ctrl[first]) - self._open[first]) / (self._closed[first] - self._open[first])
+        return min(max(share, 0.0), 1.0) + 0.0 if math.isfinite(share) else None
+
     def tick(self, data: mujoco.MjData) -> None:
+        """Move the grippers by a tick and write `data.ctrl`."""
+        self.advance()
+        data.ctrl[self._actuators] = self.ctrl
+
+    def advance(self) -> None:
+        """Move the grippers towards their goals by a tick."""
         if not self._actuators.size:
             return
         error = self.goal - self.ctrl
         near = np.abs(error) <= self._step
         self.ctrl += np.minimum(np.maximum(error, -self._step), self._step)
         self.ctrl[near] = self.goal[near]
-        data.ctrl[self._actuators] = self.ctrl
 
     def save_state(self) -> list[bytes]:
         return [self.ctrl.tobytes(), self.goal.tobytes()]

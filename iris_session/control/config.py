@@ -94,6 +94,7 @@ class ControlConfig(msgspec.Struct, frozen=True):
     target_lead_m: float = 0.05  # output `targets`: the target may lead the measured tip by so much at rest,
     target_lead_rad: float = 0.25
     target_lag_s: float = 0.2  # and by so much time at the tip's measured speed
+    target_grippers: bool = True  # output `targets`: grippers are commanded, too
     # --- end-effector target
     tip_speed: float = 1.5  # [m/s]
     tip_angular_speed: float = 5.0  # [rad/s]

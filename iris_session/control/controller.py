@@ -94,7 +94,8 @@ class Controller:
         if self._hold is not None and self._config.compensate_sag:
             self._sag = SagCompensation(self._joints, self._hold, self._columns)
         self._ik = InverseKinematics(self._robots, self._arms, self._columns, self._joints, self._bounds, self._config)
-        self._grippers = Grippers(model, driven, self._config, self._dt)
+        commanded = self._robots if self._writes_ctrl or self._config.target_grippers else ()
+        self._grippers = Grippers(model, commanded, self._config, self._dt)
         self._grasps = Grasps(model, objects, self._config)
         self._proximity = ProximityLimiter(model, self._robots, self._config)
         self._check_ticks = max(1, round(self._config.proximity_period_s / self._dt))
@@ -144,6 +145,7 @@ class Controller:
             r.lagging = False
             if not self._writes_ctrl:
                 r.commanded = _require_finite(self._arms[i].tip.read_pose(data)) or r.commanded
+                self._grippers.place(i, data.ctrl)
 
     def place_robot(self, i: int, data: mujoco.MjData, ctrl: Floats) -> None:
         """Take a robot over from the owner, whose `ctrl` is given, shape (nu,): it stands where that commands it, and
@@ -161,7 +163,7 @@ class Controller:
             lead = self._config.tracking_error
             low, high = measured + np.minimum(droop, 0.0) - lead, measured + np.maximum(droop, 0.0) + lead
             q = np.clip(self._laws.find_commanded(ctrl, measured), low, high)
-            self._grippers.place(i, ctrl)
+        self._grippers.place(i, ctrl)
         self._joints.place_part(columns, q[columns])
         if self._sag is not None:
             self._sag.begin_support(columns, measured, droop)
@@ -239,6 +241,7 @@ class Controller:
             self._grippers.tick(data)
         else:
             self._move_targets(data)
+            self._grippers.advance()
         self._grasps.tick(data)
         self._tick += 1
 
@@ -271,6 +274,11 @@ class Controller:
             stands = self._writes_ctrl and r.latch is None
             targets[robot.name] = Pose(*(self._ik.compute_tip(i, r) if stands else r.commanded))
         return targets
+
+    def get_grippers(self) -> dict[str, float]:
+        """Return how far each gripper is commanded to close, 0 (open) to 1 (closed), of the robots that have one."""
+        shares = ((robot.name, self._grippers.read_share(i)) for i, robot in enumerate(self._robots))
+        return {name: share for name, share in shares if share is not None}
 
     def snapshot(self) -> bytes:
         """Return the whole memory. `restore` of it in a controller made alike continues bit for bit."""

@@ -55,6 +55,9 @@ OWN_REFERENCES: Final = 3
 #: Share of the bodies of two models, by name, that must be the same.
 ALIKE: Final = 0.5
 
+#: Results of an environment's step that end with `info`: of Gymnasium, and of Gym and robosuite.
+INFO_LENGTHS: Final = (5, 4)
+
 _log = logging.getLogger(__name__)
 
 _lock = threading.RLock()
@@ -192,10 +195,20 @@ class Attachment:
         environment: Object that owns the simulation, `None` when the script calls MuJoCo itself.
         step: Name of the environment's method.
         change_model: Called with another model and data that the program has built.
+        list_replaced: Returns the robots in whose part of the newest action participants came in. Given for an
+            environment that is driven by its action: its steps then say in `info` who was driven.
     """
 
-    def __init__(self, loop: UserLoop, environment: Any, step: str, change_model: Callable[[Any, Any], None]) -> None:
+    def __init__(
+        self,
+        loop: UserLoop,
+        environment: Any,
+        step: str,
+        change_model: Callable[[Any, Any], None],
+        list_replaced: Callable[[], tuple[str, ...]] | None = None,
+    ) -> None:
         self._loop = loop
+        self._list_replaced = list_replaced
         self._environment = environment
         self._change_model = change_model
         self._is_stepping = False
@@ -287,13 +300,31 @@ class Attachment:
         is_elsewhere = self._environment is None and since_ns is not None and self._other_ns - since_ns > WARN_AFTER_NS
         return (ELSEWHERE,) if is_elsewhere else ()
 
-    def _around_step(self, original: Callable[[], Any]) -> Any:
-        """Take the environment's step into the session, unless wrapped functions are called in it."""
+    def follow_environment(self) -> bool:
+        """Go on with the model and data that the environment has now; return whether they are others."""
         found = find_simulation(self._environment)
-        if found is not None and found.data is not None and found.data is not self._loop.data:
-            self.follow(*found)
+        if found is None or found.data is None or found.data is self._loop.data:
+            return False
+        self.follow(*found)
+        return True
+
+    def _around_step(self, original: Callable[[], Any]) -> Any:
+        """Take the environment's step into the session; say in its `info` which robots people drove."""
+        self.follow_environment()
         if self._is_stepping or self._environment_began_ns is not None:
             return original()
+        if self._list_replaced is None:
+            return self._take_environment_step(original)
+        driven = (*self._loop.driven, *self._list_replaced())
+        result = self._take_environment_step(original)
+        driven += self._loop.driven
+        if type(result) is tuple and len(result) in INFO_LENGTHS and isinstance(result[-1], dict):
+            info = {**result[-1], "intervention": tuple(sorted(set(driven)))}
+            result = (*result[:-1], info)
+        return result
+
+    def _take_environment_step(self, original: Callable[[], Any]) -> Any:
+        """Take the environment's step into the session, unless wrapped functions are called in it."""
         if self._is_opaque:
             return self._take_step(original, 0)
         ticks, before = self._ticks, self._loop.data.time
@@ -310,10 +341,7 @@ class Attachment:
         """Show the environment's reset at once, not only with the step after it."""
         began_ns, began_time = self._loop.read_clock(), float(self._loop.data.time)
         result = original()
-        found = find_simulation(self._environment)
-        if found is not None and found.data is not None and found.data is not self._loop.data:
-            self.follow(*found)
-        else:
+        if not self.follow_environment():
             self._loop.note_step(began_ns, began_time)
         self._look()
         return result

@@ -31,6 +31,7 @@ from typing import Any, Final, Self
 
 import mujoco
 
+from iris_session.control.config import OUTPUT_TARGETS
 from iris_session.journal.environment import use_one_blas_thread
 from iris_session.physics import Pacer, PacerStats, load_model
 from iris_session.physics.load import compute_scene_hash, encode_model
@@ -40,6 +41,7 @@ from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec
+from iris_session.session.actions import ActionDrive
 from iris_session.session.attachment import Attachment, WrappedMethod
 from iris_session.session.config import (
     SessionConfig,
@@ -150,6 +152,7 @@ class Session(SessionBase):
         self._attachment: Attachment | None = None
         self._environment_steps: list[WrappedMethod] = []
         self._follower: ModelFollower | None = None
+        self._actions: ActionDrive | None = None  # of an environment that is driven by its action
         self._requested_ticks = 0  # by a director, while paused
         self._scheduling = "normal"
         self._next_overrun_log_ns = 0
@@ -341,6 +344,47 @@ class Session(SessionBase):
         with self._hold_steps():
             return {} if self._core is None else dict(self._core.controller.get_targets())
 
+    def grippers(self) -> dict[str, float]:
+        """Return how far the gripper of each robot that has one is to be closed: 0 open to 1 closed.
+
+        In your own loop, use those of `driven_robots()`; for other robots they are what your `ctrl` commands.
+        """
+        self._require_started()
+        with self._hold_steps():
+            return {} if self._core is None else self._core.controller.get_grippers()
+
+    def action(self, action: Any) -> Any:
+        """Return the action of a policy with the part of the participants in it, for an environment that was shared by
+        `share(env, drive="action")`.
+
+        Call it before each `env.step`: `env.step(session.action(action))`. It replaces the entries of the robots in
+        `driven_robots()`; their end effectors follow `targets()`, their grippers `grippers()`. No entry jumps by more
+        than one step of the environment allows, also when a robot is given back.
+
+        Args:
+            action: Array of one environment, shape (n,), or a list or tuple of numbers.
+
+        Returns:
+            A copy of the same type, shape and dtype. The very same object while no participant drives.
+
+        Raises:
+            ConfigError: No adapter fits this environment and action, or the session was not shared in this way.
+            OwnershipError: The session is closed.
+        """
+        self._require_started()
+        if self._actions is None or self._attachment is None:
+            raise ConfigError(
+                'action() needs an environment that steps MuJoCo in Python, shared by share(env, drive="action"); '
+                "targets() and grippers() say where the robots of any other are to go"
+            )
+        loop = self._require_user_loop()
+        self._attachment.follow_environment()
+        with loop.lock:
+            driven, scene = loop.driven, (loop.model, loop.data, self.robots)
+            return self._actions.apply(
+                action, scene, driven, self.targets() if driven else {}, self.grippers() if driven else {}
+            )
+
     def sync(self, data: Any) -> None:
         """Show the state of a simulation that steps outside of Python's MuJoCo: MJX, another process, a real robot.
 
@@ -434,7 +478,10 @@ class Session(SessionBase):
             session._object_choice = None if objects is None else session.objects
             session.start()
             loop = session._require_user_loop()
-            session._attachment = Attachment(loop, environment, step, session._change_model)
+            if environment is not None and session.config.control.output == OUTPUT_TARGETS:
+                session._actions = ActionDrive(environment, session.config.control)
+            list_replaced = None if session._actions is None else session._actions.list_replaced
+            session._attachment = Attachment(loop, environment, step, session._change_model, list_replaced)
             session.processes.reporter.warning_sources.append(session._attachment.list_warnings)
             session._follow_environment(environment, step)
         except BaseException:

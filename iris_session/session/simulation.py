@@ -48,7 +48,7 @@ def find_simulation(environment: Any) -> Simulation | None:
     Looked at are its own attributes and those of what it wraps, nearest first.
     """
     without_data = None
-    for owner in _list_owners(environment):
+    for owner in list_owners(environment):
         model = _find_attribute(owner, _MODELS, mujoco.MjModel)
         if model is None:
             continue
@@ -64,7 +64,7 @@ def require_simulation(environment: Any) -> Simulation:
     found = find_simulation(environment)
     if found is not None:
         return found
-    kind, environments = type(environment).__name__, _read(environment, "envs")
+    kind, environments = type(environment).__name__, read_attribute(environment, "envs")
     if environments is not None or "vector" in type(environment).__module__.split("."):
         is_local = isinstance(environments, list | tuple)
         what = "one of its environments, as in share(env.envs[0])" if is_local else "an environment made alone"
@@ -81,12 +81,12 @@ def copy_state(source: Any, data: mujoco.MjData) -> None:
 
     Raises `PublishError`, with `data` as it was, for arrays of another shape: a batch of worlds, or another model.
     """
-    inner = source if _read(source, "qpos") is not None else _read(source, "data")
-    if _read(inner, "qpos") is None:
+    inner = source if read_attribute(source, "qpos") is not None else read_attribute(source, "data")
+    if read_attribute(inner, "qpos") is None:
         raise PublishError(f"{type(source).__name__} has no qpos: give the data of the simulation, as sync(mjx_data)")
     values = {}
     for name in _STATE:
-        value = _read(inner, name)
+        value = read_attribute(inner, name)
         if value is None:
             continue
         array, shape = np.asarray(value, dtype=np.float64), np.shape(getattr(data, name))
@@ -102,13 +102,13 @@ def copy_state(source: Any, data: mujoco.MjData) -> None:
             getattr(data, name)[:] = array
 
 
-def _list_owners(environment: Any) -> Iterator[Any]:
+def list_owners(environment: Any) -> Iterator[Any]:
     """Return the environment and what it wraps, breadth first. A wrapper comes after what it stands for."""
     level, seen = [environment], {id(environment)}
     for _ in range(_MAX_DEPTH):
         deeper = []
         for owner in level:
-            inner = [_read(owner, name) for name in _OWNERS]
+            inner = [read_attribute(owner, name) for name in _OWNERS]
             if inner[0] is None or inner[0] is owner:
                 yield owner
             for one in inner:
@@ -119,17 +119,17 @@ def _list_owners(environment: Any) -> Iterator[Any]:
 
 
 def _find_attribute(owner: Any, names: tuple[str, ...], kind: Any) -> Any:
-    return next((found for name in names if (found := _unwrap(_read(owner, name), kind)) is not None), None)
+    return next((found for name in names if (found := _unwrap(read_attribute(owner, name), kind)) is not None), None)
 
 
 def _unwrap(value: Any, kind: Any) -> Any:
     if value is None or isinstance(value, kind):
         return value
-    inner = (_read(value, name) for name in _BINDINGS)
+    inner = (read_attribute(value, name) for name in _BINDINGS)
     return next((one for one in inner if isinstance(one, kind)), None)
 
 
-def _read(owner: Any, name: str) -> Any:
+def read_attribute(owner: Any, name: str) -> Any:
     """Return an attribute, `None` where there is none or reading it fails."""
     if inspect.ismodule(owner) or isinstance(owner, str | bytes | int | float):
         return None

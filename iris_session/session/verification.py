@@ -32,6 +32,7 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
 class _RecordedControlConfig(ControlConfig, frozen=True):
     compensate_sag: bool = False
     few_joints_orientation_cost: float | None = None
+    target_grippers: bool = False
 
 
 class _RecordedConfig(CoreConfig, frozen=True):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from iris_session.control import ControlConfig
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import load_model
 from iris_session.protocol.client_messages import Acquire, EStop, Release, Sample
@@ -46,14 +47,14 @@ class Rig:
     `policy`: writes the owner's `ctrl` before every tick. `applied`: the `ctrl` of every tick, as physics had it.
     """
 
-    def __init__(self, model: mujoco.MjModel | None = None) -> None:
+    def __init__(self, model: mujoco.MjModel | None = None, control: ControlConfig | None = None) -> None:
         self.now_ns = 0
         self.model = model or load_model(scene_path("handover"))
         self.data = mujoco.MjData(self.model)
         if self.model.nkey:
             mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         self.front, self.recorder = Front(), Recorder()
-        core = make_core(self.model, user_owned_loop=True)
+        core = make_core(self.model, control, user_owned_loop=True)
         self.stepper = Stepper(core, self.front, self.recorder, lambda: self.now_ns, MS, 1000 * MS, b"root")
         self.read: list[tuple[int, Entry, bytes]] = []  # step, entry and the plant of that step
         self.stepper.on_entries = self._note
@@ -106,6 +107,7 @@ class Agent:
     def __init__(self, rig: Rig, connection: int = 1, robot: str = "left", role: str = Role.AGENT) -> None:
         self.rig, self.connection, self.robot = rig, connection, robot
         self.version = self.seq = 0
+        self.gripper: float | None = None
         self.say(Join(f"key{connection}", role, f"p{connection}", devices=("target",), alignment="not_needed"))
 
     def say(self, message: EntryMessage) -> None:
@@ -139,6 +141,7 @@ class Agent:
                 targets=(Target(self.robot, self.version),),
                 clutch=clutch,
                 pose=pose,
+                gripper=self.gripper,
             )
         )
 

