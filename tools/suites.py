@@ -64,7 +64,9 @@ SUITES: Final = {
         "make_robotics",
         ("HandReach-v3", "HandManipulateBlock-v1", "FrankaKitchen-v1", "AdroitHandDoor-v1", "PointMaze_UMaze-v3"),
     ),
-    "metaworld": Suite(("metaworld>=3.0", "mujoco==3.3.7"), "make_metaworld", _META_WORLD, "action"),
+    "metaworld": Suite(
+        ("metaworld>=3.0", "imageio", "packaging", "mujoco==3.3.7"), "make_metaworld", _META_WORLD, "action"
+    ),
     "robosuite": Suite(
         ("robosuite>=1.5", "mujoco==3.3.0"),
         "make_robosuite",

@@ -12,8 +12,9 @@ instance, and is a tick by itself when no wrapped function was called in it.
 
 Benchmark suites build another model and data at a reset. An environment tells which ones are its own now. Without one
 the session goes on with other data that the program steps in the same thread while the attached one stands still, when
-nothing but the session holds that any more, or when the other model is another one with mostly the same bodies: a
-planner steps copies of the data with the same model. Where neither is so, a warning says that other data is simulated.
+nothing but the session holds that any more (of the same model after a second: a program may step `session.data`, and
+its planner copies), or when the other model is another one with mostly the same bodies. Where neither is so, a warning
+says that other data is simulated.
 
 One registry per process: any number of sessions, closed in any order; with the last one the originals come back. A
 child that is forked does not belong to the sessions of its parent.
@@ -27,12 +28,14 @@ import logging
 import os
 import sys
 import threading
+import types
 from collections.abc import Callable
 from typing import Any, Final
 
 import mujoco
 
 from iris_session.physics.names import list_element_names
+from iris_session.protocol.errors import IrisError
 from iris_session.session.errors import OwnershipError
 from iris_session.session.simulation import find_simulation
 from iris_session.session.user_loop import UserLoop
@@ -44,6 +47,8 @@ LONG_STEP_NS: Final = 20_000_000
 #: Other data of a world with the same bodies is followed when the attached one has stood still for so long, and that
 #: is decided again so often [ns].
 FOLLOW_AFTER_NS: Final = 250_000_000
+#: The same for other data of the same model, when nothing but the session holds the attached one [ns].
+FOLLOW_SAME_AFTER_NS: Final = 1_000_000_000
 ASK_AGAIN_NS: Final = 50_000_000
 #: Other data is simulated for so long before the owner is warned [ns].
 WARN_AFTER_NS: Final = 500_000_000
@@ -149,27 +154,46 @@ def is_alike(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
     return len(names[0] & names[1]) > ALIKE * len(names[0] | names[1])
 
 
+class MethodWrapper:
+    """Stands for a method on the instance of an environment. A copy or a pickle of the environment has its own method
+    instead: a planner that steps a copy does not step the original.
+    """
+
+    def __init__(self, owner: Any, name: str, original: Callable[..., Any], call: Callable[..., Any]) -> None:
+        self._owner, self._name, self._call = owner, name, call
+        functools.update_wrapper(self, original)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._call(*args, **kwargs)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        return getattr(type(self._owner), self._name).__get__(memo.get(id(self._owner), self._owner))
+
+    def __reduce__(self) -> Any:
+        return types.MethodType, (getattr(type(self._owner), self._name), self._owner)
+
+
 class WrappedMethod:
     """A method of one environment, wrapped on the instance: `around` is called with the original.
 
-    Raises `OwnershipError` for an environment whose attributes cannot be set.
+    A child that was forked calls the original. Raises `OwnershipError` for an environment whose attributes cannot be
+    set.
     """
 
     def __init__(self, environment: Any, name: str, around: Callable[[Callable[[], Any]], Any]) -> None:
-        original = getattr(environment, name)
+        original, process = getattr(environment, name), os.getpid()
         self._environment, self._name = environment, name
         self._before = vars(environment).get(name) if hasattr(environment, "__dict__") else None
         self._active = True
 
-        @functools.wraps(original)
-        def step(*args: Any, **kwargs: Any) -> Any:
-            if not self._active:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if not self._active or os.getpid() != process:
                 return original(*args, **kwargs)
             return around(lambda: original(*args, **kwargs))
 
-        self._wrapper = step
+        self._wrapper = MethodWrapper(environment, name, original, call)
         try:
-            setattr(environment, name, step)
+            setattr(environment, name, self._wrapper)
         except (AttributeError, TypeError) as error:
             raise OwnershipError(f"{name!r} of {type(environment).__name__} cannot be wrapped: {error}") from error
 
@@ -209,7 +233,7 @@ class Attachment:
     ) -> None:
         self._loop = loop
         self._list_replaced = list_replaced
-        self._environment = environment
+        self.environment = environment
         self._change_model = change_model
         self._is_stepping = False
         self._ticks = 0
@@ -224,7 +248,10 @@ class Attachment:
         self._other_ns = 0
         #: Other data that is not followed, by its identity, and when that is decided again.
         self._refused: tuple[int, int] = (0, 0)
+        self._fault = ""  # why the newest model of the program is not followed
         self._has_warned = False
+        #: Called after every step and reset of the environment, with true for a reset.
+        self.on_environment: Callable[[bool], None] = lambda is_reset: None
         loop.is_attached = True
         add_loop(self, loop.data)
         if environment is not None:
@@ -250,24 +277,33 @@ class Attachment:
         loop = self._loop
         self._is_stepping = True
         try:
-            if loop.is_driving:
-                loop.begin_tick(n_ticks)
+            if loop.is_driving and self._unless_closed(lambda: loop.begin_tick(n_ticks)):
                 result = advance()
-                loop.end_tick()
+                self._unless_closed(loop.end_tick)
                 return result
             began_ns, began_time = loop.read_clock(), float(loop.data.time)
             result = advance()
             loop.note_step(began_ns, began_time)
             since_ns = self._environment_began_ns
             if since_ns is None or loop.read_clock() - since_ns > LONG_STEP_NS:
-                loop.look()
+                self._unless_closed(loop.look)
             return result
         finally:
             self._is_stepping = False
 
+    def _unless_closed(self, act: Callable[[], None]) -> bool:
+        """Let the session act, and return true; false when another thread has closed it, which is no error here."""
+        try:
+            act()
+        except OwnershipError:
+            if not self._loop.is_closed:
+                raise
+            return False
+        return True
+
     def follow(self, model: Any, data: Any) -> bool:
         """Return whether the program goes on with `data` instead, which it is about to step; then do so, too."""
-        if self._thread not in (None, threading.get_ident()):
+        if self.environment is None and self._thread not in (None, threading.get_ident()):
             return False
         self._other_ns = now_ns = self._loop.read_clock()
         if self._other_since_ns is None:
@@ -280,39 +316,57 @@ class Attachment:
                 self._has_warned = True
                 _log.warning("%s", ELSEWHERE)
             return False
-        self._change_model(model, data)
+        return self._go_on_with(model, data)
+
+    def _go_on_with(self, model: Any, data: Any) -> bool:
+        """Go on with other data; return false, with a warning, when the session cannot."""
+        if self._fault and self._refused[0] == id(data):
+            return False
+        try:
+            self._change_model(model, data)
+        except IrisError as error:
+            self._refused = id(data), self._loop.read_clock() + ASK_AGAIN_NS
+            self._fault = f"the new model is not shared, the old one stands still: {error}"
+            _log.warning("%s", self._fault)
+            return False
         move_loop(self, data)
-        self._other_since_ns = None
+        self._other_since_ns, self._fault = None, ""
         return True
 
     def _is_successor(self, model: Any, data: Any, stands_ns: int) -> bool:
         """Return whether the program has replaced the attached data by `data`, having left ours for `stands_ns`."""
-        if self._environment is not None:
-            found = find_simulation(self._environment)
+        if self.environment is not None:
+            found = find_simulation(self.environment)
             return found is not None and found.data is data
+        is_same_model = model is self._loop.model
         if sys.getrefcount(self._loop.data) <= OWN_REFERENCES:
-            return True
-        return stands_ns > FOLLOW_AFTER_NS and model is not self._loop.model and is_alike(model, self._loop.model)
+            # A program that steps `session.data` holds it no other way, and its planner steps copies meanwhile.
+            return not is_same_model or stands_ns > FOLLOW_SAME_AFTER_NS
+        return stands_ns > FOLLOW_AFTER_NS and not is_same_model and is_alike(model, self._loop.model)
 
     def list_warnings(self) -> tuple[str, ...]:
         """Return what the owner should know, one line each."""
         since_ns = self._other_since_ns
-        is_elsewhere = self._environment is None and since_ns is not None and self._other_ns - since_ns > WARN_AFTER_NS
-        return (ELSEWHERE,) if is_elsewhere else ()
+        is_elsewhere = self.environment is None and since_ns is not None and self._other_ns - since_ns > WARN_AFTER_NS
+        return (*((self._fault,) if self._fault else ()), *((ELSEWHERE,) if is_elsewhere else ()))
 
     def follow_environment(self) -> bool:
         """Go on with the model and data that the environment has now; return whether they are others."""
-        found = find_simulation(self._environment)
+        found = find_simulation(self.environment)
         if found is None or found.data is None or found.data is self._loop.data:
             return False
-        self.follow(*found)
-        return True
+        return self._go_on_with(*found)
 
     def _around_step(self, original: Callable[[], Any]) -> Any:
         """Take the environment's step into the session; say in its `info` which robots people drove."""
         self.follow_environment()
         if self._is_stepping or self._environment_began_ns is not None:
             return original()
+        result = self._take_reported_step(original)
+        self.on_environment(False)
+        return result
+
+    def _take_reported_step(self, original: Callable[[], Any]) -> Any:
         if self._list_replaced is None:
             return self._take_environment_step(original)
         driven = (*self._loop.driven, *self._list_replaced())
@@ -339,16 +393,16 @@ class Attachment:
 
     def _around_reset(self, original: Callable[[], Any]) -> Any:
         """Show the environment's reset at once, not only with the step after it."""
-        began_ns, began_time = self._loop.read_clock(), float(self._loop.data.time)
         result = original()
         if not self.follow_environment():
-            self._loop.note_step(began_ns, began_time)
+            self._loop.note_time()
         self._look()
+        self.on_environment(True)
         return result
 
     def _look(self) -> None:
         if not self._loop.is_driving and self._environment_began_ns is None and not self._is_stepping:
-            self._loop.look()
+            self._unless_closed(self._loop.look)
 
     def close(self) -> None:
         """Give the step back. May be called twice."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from iris_session.protocol.scene import MAX_OPS
 from iris_session.session.errors import ConfigError
 from iris_session.session.shared_scene import SharedScenes
+from iris_session.session.simulation import read_attribute
 from iris_session.session.stepper import Stepper
 
 #: Distance of looks at the model; a reset is looked at when its first state is published.
@@ -106,9 +107,10 @@ def _list_goals(environment: Any, model: mujoco.MjModel) -> dict[int, NDArray[np
 
     Gymnasium-Robotics' Fetch and HandReach: the sites `target0`, `target1`, ... are at `goal`.
     """
-    owner = getattr(environment, "unwrapped", environment)
-    goal = getattr(owner, "goal", None)
-    if not hasattr(owner, "_render_callback") or not isinstance(goal, np.ndarray) or goal.size % 3:
+    owner = read_attribute(environment, "unwrapped")
+    owner = environment if owner is None else owner
+    goal = read_attribute(owner, "goal")
+    if read_attribute(owner, "_render_callback") is None or not isinstance(goal, np.ndarray) or goal.size % 3:
         return {}
     found = {}
     for k, p_world in enumerate(goal.reshape(-1, 3)):

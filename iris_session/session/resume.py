@@ -29,7 +29,6 @@ import msgspec
 import mujoco
 
 from iris_session.control import ControlError
-from iris_session.control.config import SOLVER_AUTO
 from iris_session.journal.environment import read_boot_id, use_one_blas_thread
 from iris_session.journal.rows import CRASHED, check_keyframe
 from iris_session.journal.verification import Models
@@ -165,9 +164,11 @@ class PastSession:
             raise ConfigError(f"a resumed session goes on in the folder of {self.file}: leave `record` as it is")
         if given.name not in (plain.name, self.header.session_name):
             raise ConfigError(f"a resumed session keeps its name, {self.header.session_name!r}")
-        control = core.control
-        if given.control.solver == SOLVER_AUTO:
-            control = msgspec.structs.replace(control, solver=SOLVER_AUTO)
+        # What a recording made before does not name is off there, and on in the default of a script that is the same.
+        newer = ("solver", "compensate_sag", "few_joints_orientation_cost", "target_grippers")
+        default = {name: getattr(plain.control, name) for name in newer}
+        same = {name: value for name, value in default.items() if getattr(given.control, name) == value}
+        control = msgspec.structs.replace(core.control, **same)
         for name, had in (("authority", authority), ("control", control)):
             if getattr(given, name) not in (getattr(plain, name), had):
                 raise ConfigError(f"a resumed session keeps its settings: leave `{name}` as it is")

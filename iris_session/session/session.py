@@ -21,6 +21,7 @@ import atexit
 import copy
 import dataclasses
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -42,7 +43,7 @@ from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.session.actions import ActionDrive
-from iris_session.session.attachment import Attachment, WrappedMethod
+from iris_session.session.attachment import Attachment
 from iris_session.session.config import (
     SessionConfig,
     check_arguments,
@@ -150,7 +151,6 @@ class Session(SessionBase):
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
         self._attachment: Attachment | None = None
-        self._environment_steps: list[WrappedMethod] = []
         self._follower: ModelFollower | None = None
         self._actions: ActionDrive | None = None  # of an environment that is driven by its action
         self._requested_ticks = 0  # by a director, while paused
@@ -158,6 +158,7 @@ class Session(SessionBase):
         self._next_overrun_log_ns = 0
         self.recording_fault = ""
         self._start_notes: tuple[str, ...] = ()
+        self._process = os.getpid()
         self._log_robot_notices()
 
     @property
@@ -204,13 +205,13 @@ class Session(SessionBase):
         Returns:
             False when the recording is incomplete; `recording_fault` says why.
         """
+        if os.getpid() != self._process:  # a child that was forked has none of it
+            return True
         self._stop.set()
         self._is_closed = True
-        while self._environment_steps:
-            self._environment_steps.pop().remove()
+        atexit.unregister(self.close)
         if self._attachment is not None:
             self._attachment.close()
-            atexit.unregister(self.close)
             self._attachment = None
         try:
             if self._user_loop is not None:
@@ -483,26 +484,19 @@ class Session(SessionBase):
             list_replaced = None if session._actions is None else session._actions.list_replaced
             session._attachment = Attachment(loop, environment, step, session._change_model, list_replaced)
             session.processes.reporter.warning_sources.append(session._attachment.list_warnings)
-            session._follow_environment(environment, step)
+            session._attachment.on_environment = session._look_at_goals
         except BaseException:
             session.close()
             raise
         atexit.register(session.close)  # a script may simply end
         return session
 
-    def _follow_environment(self, environment: object, step: str) -> None:
+    def _look_at_goals(self, is_reset: bool) -> None:
         """Look at goals after every step and reset of the environment, where they are as it draws them."""
-        for name in (step, "reset") if environment is not None else ():
-            if callable(getattr(environment, name, None)):
-
-                def around(original: Callable[[], Any], is_reset: bool = name != step) -> Any:
-                    result = original()
-                    if self._follower is not None and self.data is not None and not self._is_closed:
-                        with self._hold_steps():
-                            self._follower.follow_environment(environment, self.data, is_reset=is_reset)
-                    return result
-
-                self._environment_steps.append(WrappedMethod(environment, name, around))
+        attachment = self._attachment
+        if self._follower is not None and self.data is not None and attachment is not None and not self._is_closed:
+            with self._hold_steps():
+                self._follower.follow_environment(attachment.environment, self.data, is_reset=is_reset)
 
     def _change_model(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Go on with another model and data of the attached environment."""

@@ -91,7 +91,9 @@ class _BorrowedArray:
         """Take over what the owner has written since `write`."""
         if self.indices.size:
             now = array[self.indices]
-            self._owner = np.where(now == self._written, self._owner, now)
+            # Arrays of JAX come back rounded (`Session.sync`).
+            is_ours = (now == self._written) | (now == self._written.astype(np.float32))
+            self._owner = np.where(is_ours, self._owner, now)
 
     def is_overwritten(self, array: Floats) -> bool:
         """Return whether the array holds other values than those that were written last."""
@@ -181,6 +183,16 @@ class UserLoop:
     def is_driving(self) -> bool:
         """True while the session writes something, so that every step of the program must be a tick."""
         return bool(self._ctrl.indices.size or self._forces.indices.size or self.driven)
+
+    @property
+    def is_closed(self) -> bool:
+        """True from `close` on."""
+        return self._closed.is_set()
+
+    def note_time(self) -> None:
+        """Note the time of the data after the program has done something else than a step: back is a reset."""
+        self._detect_reset()
+        self._last_tick_ns = self._stepper.clock()
 
     def read_clock(self) -> int:
         """Return session time [ns]."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import os
 import sys
+import threading
 import types
 from collections.abc import Iterator
 from typing import Any
@@ -12,7 +14,7 @@ from typing import Any
 import mujoco
 import pytest
 
-from iris_session import ConfigError, OwnershipError, Session
+from iris_session import ConfigError, IrisError, OwnershipError, Session
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import load_model
 from iris_session.protocol.server_messages import SceneChanged
@@ -352,14 +354,22 @@ def followed() -> Iterator[Followed]:
     followed.close()
 
 
-def test_data_that_the_program_has_thrown_away_is_followed_by_the_next(followed: Followed) -> None:
+@pytest.mark.parametrize("is_same_model", [False, True])
+def test_data_that_the_program_has_thrown_away_is_followed_by_the_next(followed: Followed, is_same_model: bool) -> None:
+    """Of the same model after a second: a planner may step copies of `session.data`, which only the session holds."""
     followed.step(followed.model, followed.data, 0.1)
     followed.rig.now_ns += 10 * MS
     del followed.data
     followed.rig.data = None  # type: ignore[assignment]
     held = followed.rig.loop.data  # as the session holds it, too
-    anew = make_data(followed.model)
-    mujoco.mj_step(followed.model, anew)
+    model = followed.model if is_same_model else load_model(scene_path("handover"))
+    anew = make_data(model)
+    if is_same_model:
+        followed.step(model, anew, 0.9)
+        assert followed.found == []
+        followed.step(model, anew, 0.2)
+    else:
+        mujoco.mj_step(model, anew)
     assert followed.found == [anew]
     assert followed.rig.loop.data is anew
     del held
@@ -388,6 +398,111 @@ def test_copies_that_a_planner_steps_are_not_followed_and_a_warning_says_so(foll
     assert "share(env)" in warning
     followed.step(followed.model, followed.data, 0.1)
     assert followed.attachment.list_warnings() == (), "the attached data goes on"
+
+
+class Owner(Environment):
+    """An environment in the rig. `count`: its own calls of `step`."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.model, self.data, self.count, self.advance = rig.model, rig.data, 0, None
+
+    def reset(self) -> None:
+        mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        mujoco.mj_step(self.model, self.data)
+
+    def step(self, frames: int = 5) -> str:
+        self.count += 1
+        return super().step(frames)
+
+
+class Owned(Attached):
+    """A loop without processes whose environment is attached."""
+
+    def __init__(self) -> None:
+        self.rig = Rig()
+        self.rig.stepper.clock = self.read_clock
+        self.model, self.data = self.rig.model, self.rig.data
+        self.environment = Owner(self.rig)
+        self.error: IrisError | None = None
+        self.attachment = Attachment(self.rig.loop, self.environment, "step", self.change_model)
+
+    def change_model(self, model: Any, data: Any) -> None:
+        if self.error is not None:
+            raise self.error
+        self.rig.loop.change_model(model, data, lambda state: None)
+
+
+@pytest.fixture
+def owned() -> Iterator[Owned]:
+    owned = Owned()
+    yield owned
+    owned.close()
+
+
+def test_a_copy_or_pickle_of_the_environment_steps_itself(owned: Owned) -> None:
+    twin = copy.deepcopy(owned.environment)
+    before = owned.data.time
+    twin.step()
+    assert (owned.environment.count, twin.count) == (0, 1)
+    assert owned.data.time == before < twin.data.time
+    assert twin.step.__self__ is twin  # type: ignore[attr-defined]
+    wrapper = vars(owned.environment)["step"]
+    function, arguments = wrapper.__reduce__()
+    assert function(*arguments).__func__ is Owner.step
+
+
+def test_a_reset_that_steps_is_one_new_epoch(owned: Owned) -> None:
+    owned.environment.step()
+    for _ in range(3):
+        owned.environment.reset()
+        owned.environment.step()
+    assert owned.changes() == 3
+
+
+def test_a_forked_child_steps_without_the_session(owned: Owned) -> None:
+    rows = len(owned.rig.recorder.rows)
+    child = os.fork()
+    if child == 0:
+        owned.environment.step()
+        os._exit(0 if owned.environment.count == 1 and len(owned.rig.recorder.rows) == rows else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_a_session_that_ends_meanwhile_raises_nothing_into_the_step(owned: Owned) -> None:
+    def advance(model: Any, data: Any) -> None:
+        mujoco.mj_step(model, data)
+        owned.rig.loop.close()
+
+    owned.environment.advance = advance
+    assert owned.environment.step() == "observation"
+    owned.environment.advance = None
+    mujoco.mj_step(owned.model, owned.data)
+    assert owned.environment.step() == "observation"
+
+
+def test_a_model_that_the_session_cannot_take_is_a_warning(owned: Owned) -> None:
+    owned.environment.step()
+    owned.error = ConfigError("its timestep is out of range")
+    owned.environment.model = load_model(scene_path("handover"))
+    owned.environment.data = make_data(owned.environment.model)
+    for _ in range(3):
+        owned.environment.step()
+    (warning,) = owned.attachment.list_warnings()
+    assert "out of range" in warning
+    owned.error = None
+    owned.environment.data = make_data(owned.environment.model)
+    owned.environment.step()
+    assert owned.rig.loop.data is owned.environment.data
+    assert owned.attachment.list_warnings() == ()
+
+
+def test_an_environment_is_followed_in_whatever_thread_it_steps(owned: Owned) -> None:
+    owned.environment.step()
+    owned.environment.data = make_data(owned.model)
+    thread = threading.Thread(target=owned.environment.step)
+    thread.start()
+    thread.join()
+    assert owned.rig.loop.data is owned.environment.data
 
 
 def test_what_cannot_be_attached_is_refused(model: mujoco.MjModel) -> None:
