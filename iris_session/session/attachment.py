@@ -102,14 +102,19 @@ def _make_wrappers() -> None:
 _make_wrappers()
 
 
+def require_free(data: Any) -> None:
+    """Raise `OwnershipError` when a session is attached to this data already."""
+    if id(data) in _loops:
+        raise OwnershipError("a session is attached to this data already: close it first")
+
+
 def add_loop(loop: Attachment, data: Any) -> None:
     """Let `loop` take the steps of `data` from now on, and ask it about those of data that no session has.
 
     Raises `OwnershipError` when a session is attached to this data already.
     """
     with _lock:
-        if id(data) in _loops:
-            raise OwnershipError("a session is attached to this data already: close it first")
+        require_free(data)
         if not _loops:
             _replace(_originals, _wrappers)
         _loops[id(data)] = loop
@@ -292,10 +297,15 @@ class Attachment:
             self._is_stepping = False
 
     def _unless_closed(self, act: Callable[[], None]) -> bool:
-        """Let the session act, and return true; false when another thread has closed it, which is no error here."""
+        """Let the session act, and return true; false when it has ended, which is no error of the program: another
+        thread has closed it, or Ctrl-C has broken a step off.
+        """
         try:
             act()
-        except OwnershipError:
+        except OwnershipError as error:
+            if self._loop.has_ended and not self._loop.is_closed:
+                _log.error("the program goes on without its session: %s", error)
+                self._loop.close()  # robots that were driven are left at rest
             if not self._loop.is_closed:
                 raise
             return False

@@ -140,7 +140,10 @@ class SessionProcesses:
             StartError: A process did not come up; one line says why.
         """
         if self.recording is not None and importlib.util.find_spec("rerun") is None:
-            raise StartError("recording needs rerun: pip install 'iris-session[recording]', or record nothing")
+            raise StartError(
+                "recording needs rerun: pip install 'iris-session[recording]', or record nothing (--no-record, "
+                "SessionConfig(record=False))"
+            )
         self.cameras = SessionCameras(self._config)
         others = NameFinder(self._config.beacon_port)
         try:

@@ -292,11 +292,12 @@ def wait_for_free_ports(config: SessionConfig, patience_s: float = PORTS_S) -> N
     """Wait for the front of a killed session to free its ports; if they stay in use, our front reports it."""
     ports = [port for port in (config.control_port - 1, config.control_port, config.state_port) if port > 0]
     until = time.monotonic() + patience_s
-    while time.monotonic() < until and not all(_is_port_free(config.host, port) for port in ports):
+    while time.monotonic() < until and not all(is_port_free(config.host, port) for port in ports):
         time.sleep(0.05)
 
 
-def _is_port_free(host: str, port: int) -> bool:
+def is_port_free(host: str, port: int) -> bool:
+    """Return whether a TCP port can be listened on."""
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as test:
         test.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -43,7 +43,7 @@ from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.session.actions import ActionDrive
-from iris_session.session.attachment import Attachment
+from iris_session.session.attachment import Attachment, require_free
 from iris_session.session.config import (
     SessionConfig,
     check_arguments,
@@ -472,6 +472,7 @@ class Session(SessionBase):
                 raise ConfigError(f"attach: {kind} has no MjData: use share(environment), and sync(data) after steps")
         if environment is not None and not callable(getattr(environment, step, None)):
             raise OwnershipError(f"environment of type {type(environment).__name__} has no method {step!r} to wrap")
+        require_free(data)
         robots = check_robots(robots)
         session = cls(model, data, config, robots=robots, objects=objects, groups=groups, sites=sites)
         try:

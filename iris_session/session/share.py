@@ -18,6 +18,7 @@ from iris_session.control.config import OUTPUT_CTRL, OUTPUT_TARGETS
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError
+from iris_session.session.resume import is_port_free
 from iris_session.session.robots import RobotChoice
 from iris_session.session.session import Session
 from iris_session.session.session_base import SessionBase
@@ -29,6 +30,11 @@ S = TypeVar("S", bound=SessionBase)
 
 #: How participants drive, and the output of control that this means.
 DRIVES: Final = {"ctrl": OUTPUT_CTRL, "action": OUTPUT_TARGETS}
+NO_ROBOTS: Final = (
+    "no robots found, so participants can only watch and take objects: a robot is an arm of at least three actuated "
+    "joints or a hand; robots= takes others, legs and fingers by their names"
+)
+OTHER_PORTS: Final = "the usual ports are in use, by another session perhaps: this one is at session.address"
 NOT_RECORDED: Final = "not recorded, because rerun is not installed: pip install 'iris-session[recording]'"
 
 _log = logging.getLogger(__name__)
@@ -58,13 +64,15 @@ def share(
         session = iris_session.share(scene)                          # of Genesis, SAPIEN, ...: docs/simulators.md
 
     Args:
-        x: The path of a model file, an `MjModel`, or an environment that simulates with MuJoCo: of Gymnasium,
-            dm_control (its physics, too), robosuite, LIBERO, Meta-World, OGBench, MyoSuite, gym-aloha, LeRobot. For
-            what steps outside of Python's MuJoCo (MuJoCo Playground, MJX), call `session.sync(data)` after its steps.
+        x: The path of a model file, an `MjModel` or `MjSpec`, or an environment that simulates with MuJoCo: of
+            Gymnasium, dm_control (its physics, too), robosuite, LIBERO, Meta-World, OGBench, MyoSuite, gym-aloha,
+            LeRobot. For what steps outside of Python's MuJoCo (MuJoCo Playground, MJX), call `session.sync(data)` after
+            its steps.
             Or a simulation of another simulator: a Genesis or SAPIEN scene, a ManiSkill environment, `pybullet` or one
             of its clients, a solver of Newton, a USD stage or file, the `RemoteAPIClient` of CoppeliaSim.
         data: With an `MjModel`: the data that your loop advances. `None`: the session simulates, by `session.run()`.
-        config: Settings; `None` for the defaults. Where rerun is not installed, nothing is recorded by default.
+        config: Settings; `None` for the defaults, on other ports where those are in use. Where rerun is not installed,
+            nothing is recorded by default.
         robots: `auto` finds them, `none` offers none; or names of robots found, the path of a robots file, or
             specifications.
         objects: Free bodies that robots and hands can take; `None` finds them in the model.
@@ -89,12 +97,9 @@ def share(
     """
     if drive not in DRIVES:
         raise ConfigError(f"drive is {drive!r}; it must be one of {', '.join(map(repr, DRIVES))}")
-    config = config or SessionConfig()
-    if config.control.output != DRIVES[drive]:
-        config = dataclasses.replace(config, control=msgspec.structs.replace(config.control, output=DRIVES[drive]))
-    is_unrecorded = config.record is True and importlib.util.find_spec("rerun") is None  # the default, beside a suite
-    if is_unrecorded:
-        config = dataclasses.replace(config, record=False)
+    config, notes = _complete_config(config, DRIVES[drive])
+    if type(x).__name__ == "MjSpec":
+        x = x.compile()
     given: dict[str, Any] = {"objects": objects, "groups": groups, "sites": sites}
     session: Session | SimulatorSession
     adapter = find_adapter(x)
@@ -104,10 +109,33 @@ def share(
         raise ConfigError(f"{wrong[0]} is given with {type(x).__name__}: only worlds of MuJoCo have it, leave it out")
     else:
         session = _start(SimulatorSession(adapter, config, robots=robots, drives=drive == "ctrl"))
-    if is_unrecorded:
-        session._start_notes = (NOT_RECORDED,)
-        _log.warning("%s", NOT_RECORDED)
+    if isinstance(session, Session) and robots in (None, "auto") and not session.robots and not session._robot_notices:
+        notes.append(NO_ROBOTS)
+    session._start_notes = tuple(notes)
+    for note in notes:
+        _log.warning("%s", note)
     return session
+
+
+def _complete_config(config: SessionConfig | None, output: str) -> tuple[SessionConfig, list[str]]:
+    """Return the configuration with what a machine does not have left out, and notes that say so."""
+    notes = []
+    if config is None:
+        config = SessionConfig()
+        ports = (config.control_port - 1, config.control_port, config.state_port)
+        if not all(is_port_free(config.host, port) for port in ports):  # of another session on this machine
+            config = dataclasses.replace(config, control_port=0, state_port=0)
+            notes.append(OTHER_PORTS)
+    elif not isinstance(config, SessionConfig):
+        raise TypeError(
+            f"config must be a SessionConfig, not {type(config).__name__}: share(x, config=SessionConfig())"
+        )
+    if config.control.output != output:
+        config = dataclasses.replace(config, control=msgspec.structs.replace(config.control, output=output))
+    if config.record is True and importlib.util.find_spec("rerun") is None:  # the default, beside a suite
+        config = dataclasses.replace(config, record=False)
+        notes.append(NOT_RECORDED)
+    return config, notes
 
 
 def _share(x: Any, data: Any, config: SessionConfig, given: Mapping[str, Any], step: str) -> Session:

@@ -64,7 +64,9 @@ def require_simulation(environment: Any) -> Simulation:
     found = find_simulation(environment)
     if found is not None:
         return found
-    kind, environments = type(environment).__name__, read_attribute(environment, "envs")
+    inner = read_attribute(environment, "unwrapped")
+    kind = type(environment if inner is None else inner).__name__
+    environments = read_attribute(environment, "envs")
     if environments is not None or "vector" in type(environment).__module__.split("."):
         is_local = isinstance(environments, list | tuple)
         what = "one of its environments, as in share(env.envs[0])" if is_local else "an environment made alone"

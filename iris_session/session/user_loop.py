@@ -189,6 +189,11 @@ class UserLoop:
         """True from `close` on."""
         return self._closed.is_set()
 
+    @property
+    def has_ended(self) -> bool:
+        """True once a step of the session was broken off."""
+        return self._stepper.has_ended
+
     def note_time(self) -> None:
         """Note the time of the data after the program has done something else than a step: back is a reset."""
         self._detect_reset()

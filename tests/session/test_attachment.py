@@ -480,6 +480,25 @@ def test_a_session_that_ends_meanwhile_raises_nothing_into_the_step(owned: Owned
     assert owned.environment.step() == "observation"
 
 
+def test_ctrl_c_in_a_step_of_the_session_ends_the_session_and_not_the_program(
+    owned: Owned, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owned.environment.step()
+    with monkeypatch.context() as patch:
+
+        def interrupt(*_: Any, **__: Any) -> None:
+            raise KeyboardInterrupt
+
+        patch.setattr(owned.rig.stepper.core, "step", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            owned.environment.step()
+    before = owned.data.time
+    assert owned.environment.step() == "observation"
+    mujoco.mj_step(owned.model, owned.data)
+    assert owned.data.time == pytest.approx(before + 6 * 0.002)
+    assert owned.rig.loop.is_closed
+
+
 def test_a_model_that_the_session_cannot_take_is_a_warning(owned: Owned) -> None:
     owned.environment.step()
     owned.error = ConfigError("its timestep is out of range")

@@ -17,6 +17,7 @@ import iris_session
 from iris_session import ConfigError, OwnershipError, PublishError, Session, StartError
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import ModelInvalidError, ModelNotFoundError, load_model
+from iris_session.session.share import _complete_config
 from iris_session.session.simulation import find_simulation
 from tests.session.test_session import QUIET
 
@@ -169,6 +170,20 @@ def test_without_rerun_a_program_is_shared_all_the_same(
         iris_session.share(model, config=dataclasses.replace(QUIET, record="here.rrd"))
 
 
+@pytest.mark.usefixtures("simulation")
+def test_a_specification_is_compiled_and_a_scene_without_robots_is_a_note(shared: list[Session]) -> None:
+    shared.append(iris_session.share(mujoco.MjSpec.from_string("<mujoco><worldbody/></mujoco>"), config=QUIET))
+    assert any("no robots found" in note for note in shared[0].notes)
+
+
+def test_a_second_program_on_a_machine_takes_other_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("iris_session.session.share.is_port_free", lambda host, port: port != 7722)
+    config, notes = _complete_config(None, "ctrl")
+    assert (config.control_port, config.state_port) == (0, 0)
+    assert any("session.address" in note for note in notes)
+    assert _complete_config(QUIET, QUIET.control.output) == (QUIET, [])
+
+
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
@@ -188,6 +203,8 @@ def test_what_cannot_be_shared_is_one_line(model: mujoco.MjModel, tmp_path: Path
         with pytest.raises(error, match=text) as caught:
             iris_session.share(x, config=QUIET)
         assert "\n" not in str(caught.value)
+    with pytest.raises(TypeError, match="SessionConfig"):
+        iris_session.share(model, config={"name": "lab"})  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="'ctrl', 'action'"):
         iris_session.share(model, config=QUIET, drive="joints")
     with pytest.raises(ConfigError, match="share\\(model, data\\)"):
