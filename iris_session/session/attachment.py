@@ -28,7 +28,6 @@ import logging
 import os
 import sys
 import threading
-import types
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -175,7 +174,7 @@ class MethodWrapper:
         return getattr(type(self._owner), self._name).__get__(memo.get(id(self._owner), self._owner))
 
     def __reduce__(self) -> Any:
-        return types.MethodType, (getattr(type(self._owner), self._name), self._owner)
+        return getattr, (self._owner, self._name)  # of the copy, which has no attribute of its own yet
 
 
 class WrappedMethod:

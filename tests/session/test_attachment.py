@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import os
+import pickle
 import sys
 import threading
 import types
@@ -18,7 +19,7 @@ from iris_session import ConfigError, IrisError, OwnershipError, Session
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import load_model
 from iris_session.protocol.server_messages import SceneChanged
-from iris_session.session.attachment import STEP_FUNCTIONS, Attachment
+from iris_session.session.attachment import STEP_FUNCTIONS, Attachment, WrappedMethod
 from tests.rig.owned import keep_journal
 from tests.session.loops import Agent, Rig
 from tests.session.test_session import QUIET
@@ -415,6 +416,16 @@ class Owner(Environment):
         return super().step(frames)
 
 
+class PlainEnvironment:
+    """An environment that can be pickled."""
+
+    count = 0
+
+    def step(self) -> int:
+        self.count += 1
+        return self.count
+
+
 class Owned(Attached):
     """A loop without processes whose environment is attached."""
 
@@ -446,9 +457,11 @@ def test_a_copy_or_pickle_of_the_environment_steps_itself(owned: Owned) -> None:
     assert (owned.environment.count, twin.count) == (0, 1)
     assert owned.data.time == before < twin.data.time
     assert twin.step.__self__ is twin  # type: ignore[attr-defined]
-    wrapper = vars(owned.environment)["step"]
-    function, arguments = wrapper.__reduce__()
-    assert function(*arguments).__func__ is Owner.step
+    plain = PlainEnvironment()
+    wrapped = WrappedMethod(plain, "step", lambda original: original())
+    twin_of_plain = pickle.loads(pickle.dumps(plain))
+    assert (plain.step(), twin_of_plain.step(), twin_of_plain.step()) == (1, 1, 2)
+    wrapped.remove()
 
 
 def test_a_reset_that_steps_is_one_new_epoch(owned: Owned) -> None:
