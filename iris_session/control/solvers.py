@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import math
+import re
 from typing import Any, Final, NamedTuple, Protocol
 
 import msgspec
@@ -226,9 +227,11 @@ def _import_mink() -> tuple[Any, Any]:
     try:
         import daqp
         import mink
-    except (ImportError, AttributeError) as error:  # mink's own, with an older MuJoCo
+
+        version = importlib.metadata.version("mink")
+        release = tuple(map(int, re.findall(r"\d+", version)[:2]))  # (1, 1) of "1.1rc1"
+    except Exception as error:  # also mink's own, with an older MuJoCo, and libraries built for another numpy
         raise ImportError(f"{advice} ({' '.join(str(error).split())})") from None
-    version = importlib.metadata.version("mink")
-    if tuple(map(int, version.split(".")[:2])) < (1, 1):  # robosuite pins 0.0.5
+    if release < (1, 1):  # robosuite pins 0.0.5
         raise ImportError(f"{advice} (mink {version} is installed)")
     return mink, daqp

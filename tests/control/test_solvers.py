@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -174,6 +175,33 @@ def test_both_solvers_take_a_robot_to_the_same_place(
     assert np.abs(mink_q - q).max() < 0.01
     assert limits == mink_limits
     assert ("reach" not in limits) == reached
+
+
+@pytest.mark.parametrize(
+    ("version", "solver"),
+    [
+        ("1.1rc1", SOLVER_MINK),
+        ("1.10.dev0+g1a2b", SOLVER_MINK),
+        ("2", SOLVER_MINK),
+        ("1.0b2", SOLVER_NUMPY),
+        ("unknown", SOLVER_NUMPY),
+    ],
+)
+def test_versions_of_mink_may_have_any_form(monkeypatch: pytest.MonkeyPatch, version: str, solver: str) -> None:
+    monkeypatch.setattr("importlib.metadata.version", lambda _: version)
+    assert name_solver(ControlConfig()).solver == solver
+
+
+@pytest.mark.parametrize("error", [ValueError, RuntimeError])
+def test_auto_does_without_a_library_that_fails_when_imported(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: type[Exception]
+) -> None:
+    (tmp_path / "daqp.py").write_text(f"raise {error.__name__}('numpy.dtype size changed,\\nmay indicate ...')")
+    monkeypatch.delitem(sys.modules, "daqp", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert name_solver(ControlConfig()).solver == SOLVER_NUMPY
+    with pytest.raises(ImportError, match=r"^solver 'mink' needs .*numpy\.dtype size changed, may"):
+        make_solver(make_arm(), ControlConfig(solver=SOLVER_MINK))
 
 
 def test_auto_is_the_solver_that_can_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:
