@@ -230,12 +230,12 @@ class Controller:
         if self._writes_ctrl:
             checks = self._tick % self._check_ticks == 0
             self._solve_due(data, checks, crowded)
+            if self._sag is not None:
+                self._compensate_sag(data, self._sag)  # before the checks, which forget what was strained
             if checks:
                 self._check_tracking(data)
                 if self._proximity.active:
                     self._slow_near_contact(data)
-            if self._sag is not None:
-                self._compensate_sag(data, self._sag)
             self._joints.advance()
             self._follow_measured(data)
             self._grippers.tick(data)
@@ -392,6 +392,8 @@ class Controller:
             if self._hold.is_settling(self._columns[i]):
                 self._joints.stop(self._columns[i])
             self._hold.leave(self._columns[i])
+            if self._sag is not None:
+                self._sag.engage(self._columns[i])
             r.commanded = self._ik.compute_tip(i, r)
         r.settle, r.learning = 0, False
         r.latch = clutch.latch_sources(command, scale, r.commanded)

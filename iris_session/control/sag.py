@@ -13,11 +13,13 @@ Per joint, in rad (m for slides), with `droop`, lag and static bound as in `hold
 
 A load and a hand that presses against the robot look alike. What tells them apart:
 
-* It is learned at rest only, and for `_WINDOW_S` after a motion of the aim: who presses against a robot that stands is
-  not learned, who presses for long neither.
+* It is learned at rest only, and for `_WINDOW_S` after a motion of the aim since the engagement began: who presses
+  against a robot that stands, before or after it is engaged, is not learned, who presses for long neither.
 * A joint that is pushed further from its aim than it stood ends its window.
 * Once a joint meets its bound (`hold`), its robot is blocked: windows end, and what was learned in them is forgotten.
 * Nothing is learned where the actuator can give no more.
+* At any time at rest, less is learned: a joint that has stood for `_SHED_S` beyond its aim, in the direction in which
+  it is supported, loses of that support what it does not need. A payload was put down, or a hand let go.
 
 In every case the command stays within the bound of `hold`, with or without compensation: a blocked joint pushes with no
 more than the static bound, at most the actuator's force limit.
@@ -47,6 +49,8 @@ _LEARN_S: Final = 0.25
 _SETTLE_S: Final = 0.2
 _SETTLE_LAGS: Final = 3.0
 _WINDOW_S: Final = 2.0
+#: A joint that stands beyond its aim for so long outside a window is supported too much [s].
+_SHED_S: Final = 0.5
 #: Shares of the speed limit: a joint is at rest below the first; a load is learned by at most the second.
 _REST_SPEED: Final = 0.1
 _LEARN_SPEED: Final = 0.05
@@ -69,9 +73,10 @@ class SagCompensation:
 
     Arrays of shape (n,), part of the snapshot, besides `support` of the interpolator and `load` of the hold law:
     `window`: time left to learn [s], `mark`: the aim for which it began, `known`: load at its beginning, `nearest`:
-    smallest error in it, `error`: how far the joint stands from its aim, `trim`: the part of `support` that neither
-    droop nor load explain when an engagement begins. Of each robot: `standing`: time for which it
-    has been at rest too far from its target [s], `said`: 1 when it is said to sag.
+    smallest error in it, `beyond`: time for which it has been supported too much, at rest and outside windows [s],
+    `error`: how far the joint stands from its aim, `trim`: the part of `support` that neither droop nor load explain
+    when an engagement begins. Of each robot: `standing`: time for which it has been at rest too far from its target
+    [s], `said`: 1 when it is said to sag.
     """
 
     def __init__(self, joints: JointInterpolator, hold: HoldLaw, columns: Sequence[slice]) -> None:
@@ -83,7 +88,8 @@ class SagCompensation:
         self._follow, self._fade = min(1.0, joints.dt / _FOLLOW_S), min(1.0, joints.dt / _FADE_S)
         self._wait = _WINDOW_S + _SETTLE_S + _SETTLE_LAGS * servos.lag
         joints.support = self.support = np.zeros(n)
-        self.window, self.mark, self.known, self.nearest, self.error, self.trim = (np.zeros(n) for _ in range(6))
+        self.window, self.mark, self.known, self.nearest, self.beyond = (np.zeros(n) for _ in range(5))
+        self.error, self.trim = np.zeros(n), np.zeros(n)
         self.standing, self.said = np.zeros(len(columns)), np.zeros(len(columns))
 
     def reset(self) -> None:
@@ -97,6 +103,11 @@ class SagCompensation:
         support = _clip(self._joints.q - x, low, high) * self._servos.supports
         self.support[columns] = support[columns]
         self.trim[columns] = (support - droop * self._servos.supports)[columns]
+
+    def engage(self, columns: slice) -> None:
+        """Begin an engagement of some joints: their aim is as it is, no motion of it is to be learned from."""
+        self.mark[columns] = self._joints.get_goal(columns)
+        self.window[columns] = self.beyond[columns] = 0.0
 
     def update(
         self, x: Floats, v: Floats, droop: Floats, latched: NDArray[np.bool_], driven: NDArray[np.bool_]
@@ -139,28 +150,44 @@ class SagCompensation:
         if moved.any():
             self.window[moved], self.nearest[moved] = self._wait[moved], np.inf
             self.mark[moved], self.known[moved] = aim[moved], hold.load[moved]
-        window = driven & (self.window > 0.0)
-        if window.any():
-            self._learn(v, wanted - possible, window)
-
-    def _learn(self, v: Floats, surplus: Floats, window: NDArray[np.bool_]) -> None:
-        """Learn loads in the windows. `surplus`: of the support that is wanted, what the actuator cannot give."""
-        hold, joints = self._hold, self._joints
         if hold.strained.any():
-            blocked = window & self._find_blocked()
-            self.window[blocked], hold.load[blocked] = 0.0, self.known[blocked]
-        self.window[window] = np.maximum(self.window - self._dt, 0.0)[window]
-        learning = window & (self.window <= _WINDOW_S)
-        if not learning.any():
+            blocked = driven & self._find_blocked()
+            ended = blocked & (self.window > 0.0)
+            self.window[ended], hold.load[ended] = 0.0, self.known[ended]
+            driven &= ~blocked
+        self._learn(v, wanted - possible, driven)
+
+    def _learn(self, v: Floats, surplus: Floats, free: NDArray[np.bool_]) -> None:
+        """Learn the loads of driven joints that are not blocked.
+
+        `surplus`: of the support that is wanted, what the actuator cannot give.
+        """
+        hold, joints = self._hold, self._joints
+        window = free & (self.window > 0.0)
+        if not (window.any() or (np.abs(self.error) > self._dead).any()):
+            self.beyond[:] = 0.0
             return
-        learning &= (np.abs(v) <= self._rest_speed) & (np.abs(joints.goal - joints.q) <= self._moved)
+        self.window[window] = np.maximum(self.window - self._dt, 0.0)[window]
         error = self.error - self._servos.lag * v
         size = np.abs(error)
+        change = _clip(error * min(1.0, self._dt / _LEARN_S), -self._step, self._step)
+        rests = free & (np.abs(v) <= self._rest_speed) & (np.abs(joints.goal - joints.q) <= self._moved)
+        wrong = rests & (size > self._dead) & (surplus * error <= 0.0)
+
+        learning = window & rests & (self.window <= _WINDOW_S)
         self.window[learning & (size > self.nearest + 6.0 * self._dead)] = 0.0
         self.nearest[learning] = np.minimum(self.nearest, size)[learning]
-        learning &= (size > self._dead) & (surplus * error <= 0.0) & (self.window > 0.0)
-        load = hold.load + _clip(error * min(1.0, self._dt / _LEARN_S), -self._step, self._step)
-        hold.load[learning] = _clip(load, -hold.static, hold.static)[learning]
+        learning &= wrong & (self.window > 0.0)
+        hold.load[learning] = _clip(hold.load + change, -hold.static, hold.static)[learning]
+
+        wrong &= ~window & ((error * hold.load < 0.0) | (error * self.trim < 0.0))
+        self.beyond[:] = np.where(wrong, self.beyond + self._dt, 0.0)
+        shedding = self.beyond > _SHED_S
+        if shedding.any():
+            for part in (self.trim, hold.load):
+                shed = _clip(change, -np.maximum(part, 0.0), -np.minimum(part, 0.0))  # towards zero
+                part[shedding] += shed[shedding]
+                change -= shed
 
     def _find_blocked(self) -> NDArray[np.bool_]:
         """Return the joints of robots of which one met its bound: all of them carry what it presses against."""
@@ -208,7 +235,8 @@ class SagCompensation:
 
     def _arrays(self) -> tuple[Floats, ...]:
         robots = (self.standing, self.said)
-        return (self.support, self.window, self.mark, self.known, self.nearest, self.error, self.trim, *robots)
+        learned = (self.support, self.window, self.mark, self.known, self.nearest, self.beyond)
+        return (*learned, self.error, self.trim, *robots)
 
 
 def _clip(a: Floats, low: Floats, high: Floats) -> Floats:

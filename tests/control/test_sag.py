@@ -102,8 +102,10 @@ def test_no_joint_is_commanded_faster_than_its_limit() -> None:
         before, before_v = rig.data.ctrl.copy(), v
 
 
-def weak_rig(kind: str = "position_weak") -> Rig:
-    rig = Rig(make_wall_model(kind), [make_wall_robot(kind)])
+def weak_rig(kind: str = "position_weak", timestep: float = 0.002) -> Rig:
+    model = make_wall_model(kind)
+    model.opt.timestep = timestep
+    rig = Rig(model, [make_wall_robot(kind)])
     rig.hold(100)
     return rig
 
@@ -152,11 +154,54 @@ def test_who_presses_against_an_arm_that_stands_is_pressed_back_no_harder_as_tim
     assert apart(start, rig.tip())[0] < 1e-3
 
 
-def test_what_an_arm_learned_while_it_pressed_is_forgotten() -> None:
-    rig = weak_rig()
-    for y in np.linspace(0.0, 0.5, 400):
+@pytest.mark.parametrize("moved_before", [False, True])
+def test_who_leans_on_an_arm_before_it_is_engaged_is_not_pressed_back_harder(moved_before: bool) -> None:
+    rig = soft_arm()
+    if moved_before:
+        drive(rig, 0.02, 350)  # let go while it would still learn
+    load(rig, 20.0)
+    rig.hold(500)
+    leant_on = rig.tip()
+    drive(rig, 0.0, 1500, engagement=2)
+    assert apart(rig.tip(), leant_on)[0] < 1e-3
+    load(rig, 0.0)
+    drive(rig, 0.0, 1500, engagement=2)
+    assert apart(rig.tip(), rig.target())[0] < 3e-3
+
+
+def test_an_arm_that_stands_comes_back_when_its_payload_is_put_down() -> None:
+    rig = soft_arm()
+    drive(rig, 0.01, 300)
+    load(rig, 20.0)
+    drive(rig, 0.03, 1500, begin=0.01)
+    load(rig, 0.0)
+    drive(rig, 0.03, 200, begin=0.03)
+    assert apart(rig.tip(), rig.target())[0] > 0.02
+    drive(rig, 0.03, 1000, begin=0.03)
+    assert apart(rig.tip(), rig.target())[0] < 3e-3
+    assert limits(rig) == ()
+
+
+def test_who_lifts_an_arm_shortly_does_not_take_its_payload() -> None:
+    rig = soft_arm()
+    drive(rig, 0.01, 300)
+    load(rig, 20.0)
+    drive(rig, 0.03, 1500, begin=0.01)
+    for _ in range(5):
+        load(rig, 0.0)
+        drive(rig, 0.03, 150, begin=0.03)
+        load(rig, 20.0)
+        drive(rig, 0.03, 150, begin=0.03)
+    drive(rig, 0.03, 300, begin=0.03)
+    assert apart(rig.tip(), rig.target())[0] < 3e-3
+
+
+@pytest.mark.parametrize("timestep", [0.002, 0.01])
+def test_what_an_arm_learned_while_it_pressed_is_forgotten(timestep: float) -> None:
+    rig = weak_rig(timestep=timestep)
+    for y in np.linspace(0.0, 0.5, round(0.8 / timestep)):
         rig.step(decision([pose_command("arm", rig.source((0.0, float(y), 0.0)))]))
-    for _ in range(1500):
+    for _ in range(round(3.0 / timestep)):
         rig.step(decision([pose_command("arm", rig.source((0.0, 0.5, 0.0)))]))
     assert rig.data.ncon > 0
     assert "tracking" in limits(rig)
@@ -178,23 +223,29 @@ def test_what_an_actuator_cannot_give_is_said_as_sag() -> None:
     assert limits(rig) == ()
 
 
-def test_a_restored_controller_goes_on_bit_for_bit_while_it_learns() -> None:
+@pytest.mark.parametrize("put_down", [False, True])
+def test_a_restored_controller_goes_on_bit_for_bit_while_it_learns(put_down: bool) -> None:
     rig = soft_arm()
     load(rig, 10.0)
     drive(rig, 0.05, 550)
+    if put_down:
+        drive(rig, 0.05, 1200, begin=0.05)
+        load(rig, 0.0)
+        drive(rig, 0.05, 200, begin=0.05)  # not yet certain of it
     assert rig.controller._hold is not None
     assert rig.controller._hold.load.any()
     state = np.empty(mujoco.mj_stateSize(rig.model, mujoco.mjtState.mjSTATE_INTEGRATION))
     mujoco.mj_getState(rig.model, rig.data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
     snapshot, seen = rig.controller.snapshot(), []
-    for _ in range(2):
+    for restored in (False, True):
         mujoco.mj_setState(rig.model, rig.data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_step1(rig.model, rig.data)
-        rig.controller = Controller(rig.model, rig.robots)
-        rig.controller.restore(snapshot)
+        if restored:
+            rig.controller = Controller(rig.model, rig.robots)
+            rig.controller.restore(snapshot)
         assert rig.controller.snapshot() == snapshot
         seq, steps = rig.seq, rig.steps
-        drive(rig, 0.05, 300, begin=0.05)
+        drive(rig, 0.05, 400, begin=0.05)
         rig.hold(100)
         seen.append(rig.data.qpos.tobytes() + rig.data.ctrl.tobytes() + rig.controller.snapshot())
         rig.seq, rig.steps = seq, steps
