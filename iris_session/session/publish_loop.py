@@ -58,7 +58,7 @@ class PublishLoop:
     Attributes:
         superseded: Frames that a newer one replaced before they were published.
         lock: Held while a step is taken; hold it to read what steps change.
-        grippers: How far participants have closed grippers, 0 to 1, by robot.
+        grippers: How far the participants who drive have closed grippers, 0 to 1, by robot.
     """
 
     def __init__(
@@ -146,6 +146,11 @@ class PublishLoop:
         """Return the end-effector targets by robot. With the lock held."""
         return dict(self._stepper.core.controller.get_targets())
 
+    @property
+    def has_ended(self) -> bool:
+        """True after an error in a step, and after `close`."""
+        return self._closed.is_set() or self._stepper.has_ended
+
     def raise_if_ended(self) -> None:
         """Raise what stopped the helper, or `OwnershipError` after `close`."""
         self._stepper.raise_if_ended()
@@ -200,6 +205,8 @@ class PublishLoop:
         for command in outcome.decision.commands:
             if command.gripper is not None:
                 self.grippers[command.robot] = command.gripper
+        driven = self.list_driven()  # the next participant begins without the gripper of the one before
+        self.grippers = {name: closed for name, closed in self.grippers.items() if name in driven}
         self._processes.supervise(self._stepper)
         self._step_ns = self._stepper.clock()
 

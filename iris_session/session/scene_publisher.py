@@ -317,7 +317,7 @@ class ScenePublisher(SessionBase):
 
     def grippers(self) -> dict[str, float]:
         """Return how far participants want grippers closed, 0 open to 1 closed, by robot. Those are missing that no
-        participant has moved yet.
+        participant has moved since the robot is driven.
 
         Raises:
             OwnershipError: The session is not started, or closed.

@@ -5,22 +5,27 @@
         scene.step()  # is seen by participants
 
 Every step of the simulation is followed: its poses are read and published at the rate of the state, and robots that
-participants drive are moved to their targets by the simulator's own control before the next step.
+participants drive are moved to their targets by the simulator's own control before the next step. A robot that is no
+longer driven gets one more target, where it is: the drives of a simulator would hold the last one, which lies ahead.
 """
 
 from __future__ import annotations
 
+import atexit
 import logging
+import os
+from collections.abc import Sequence
 from typing import Any
 
+from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import RobotSpec
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.errors import SceneBuildError
 from iris_session.session.config import SessionConfig
-from iris_session.session.errors import ConfigError, PublishError
+from iris_session.session.errors import ConfigError, OwnershipError, PublishError
 from iris_session.session.robots import AUTO, NONE
 from iris_session.session.scene_publisher import ScenePublisher
-from iris_session.simulators.adapter import Adapter, SimulationState, TipTarget
+from iris_session.simulators.adapter import Adapter, AlreadyWrappedError, SimulationState, TipTarget
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +55,8 @@ class SimulatorSession(ScenePublisher):
         self._adapter = adapter
         self._drives = drives and adapter.drives
         self._unwrap: Any = None
+        self._driven: tuple[str, ...] = ()  # by the newest step
+        self._process = 0  # that has started it
         self._due_ns = 0
         self._fault = ""
         self._start_notes: tuple[str, ...] = ()
@@ -60,24 +67,46 @@ class SimulatorSession(ScenePublisher):
         return tuple(dict.fromkeys((*self._start_notes, *self._adapter.notes, *super().notes)))
 
     def start(self) -> None:
-        """Start the session, publish the present state, and follow the simulation from here on."""
+        """Start the session, publish the present state, and follow the simulation from here on.
+
+        Raises:
+            OwnershipError: A session follows this simulation already, or this one is closed.
+            ConfigError, StartError, SimulatorError, PublishError: As of `ScenePublisher.start` and `sync`.
+        """
         if self._processes is not None:
             return
-        super().start()
+        self._process = os.getpid()
+        try:  # first: nothing is opened for a simulation that another session follows
+            self._unwrap = self._adapter.wrap_step(self._before_step, self._after_step)
+        except AlreadyWrappedError as error:
+            raise OwnershipError(str(error)) from None
         try:
+            super().start()
             self._require_started().reporter.warning_sources.append(self._list_faults)
             self.sync()
-            self._unwrap = self._adapter.wrap_step(self._before_step, self._after_step)
         except BaseException:
-            self.close()
+            self._end_steps()
+            if self._loop is not None:
+                self.close()
             raise
 
     def close(self) -> bool:
-        """End the session; the step of the simulation is its own again. As `ScenePublisher.close`."""
+        """End the session; the step of the simulation is its own again. As `ScenePublisher.close`.
+
+        Robots that participants drive stop where they are. In a process that was forked from that of the session it
+        does nothing.
+        """
+        if self._process not in (0, os.getpid()):
+            return True
+        atexit.unregister(self.close)
+        self._end_steps()
+        return super().close()
+
+    def _end_steps(self) -> None:
         if self._unwrap is not None:
             self._unwrap()
             self._unwrap = None
-        return super().close()
+        self._drive(())
 
     def sync(self, *at: Any) -> None:
         """Publish the state of the simulation as it is now.
@@ -105,20 +134,33 @@ class SimulatorSession(ScenePublisher):
     # --- the step of the simulation -----------------------------------------------------------------------------------
 
     def _before_step(self) -> None:
-        if not self._drives or not self.robots or self.stopping:
+        if self._drives and self.robots and self._loop is not None:
+            self._drive(() if self.stopping or self._loop.has_ended else self.driven_robots())
+
+    def _drive(self, driven: tuple[str, ...]) -> None:
+        """Move robots to their targets, and stop those that were driven until now."""
+        left, self._driven = [name for name in self._driven if name not in driven], driven
+        if not driven and not left:
             return
-        driven = self.driven_robots()
-        if not driven:
-            return
-        targets, grippers = self.targets(), self.grippers()
         try:
-            self._adapter.apply_targets({name: TipTarget(targets[name], grippers.get(name)) for name in driven})
-        except Exception as error:
+            poses, grippers = (self.targets(), self.grippers()) if driven else ({}, {})
+            targets = {name: TipTarget(poses[name], grippers.get(name)) for name in driven}
+            self._adapter.apply_targets((self._measure_tips(left) if left else {}) | targets)
+        except Exception as error:  # of the simulator: its program goes on as without a session
             self._note_fault(error)
+
+    def _measure_tips(self, names: Sequence[str]) -> dict[str, TipTarget]:
+        """Return targets at which robots stay where they are."""
+        state, rows = self._adapter.read_state(), {name: row for row, name in enumerate(self._adapter.bodies)}
+        at = {robot.name: rows[robot.tip_body] for robot in self.robots if robot.name in names}
+        return {
+            name: TipTarget(Pose(tuple(state.positions[row].tolist()), tuple(state.quaternions[row].tolist())))
+            for name, row in at.items()
+        }
 
     def _after_step(self) -> None:
         now_ns = self.clock()
-        if now_ns < self._due_ns or self._is_closed:
+        if now_ns < self._due_ns or self._is_closed or self._loop is None:
             return
         self._due_ns = max(self._due_ns + int(1e9 / self.config.state_hz), now_ns)
         try:

@@ -7,6 +7,7 @@ looking for the right adapter costs nothing.
 from __future__ import annotations
 
 import functools
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,6 +30,10 @@ _FINGERS: Final = range(2, 6)
 
 class SimulatorError(IrisError, ValueError):
     """A simulation that cannot be shown; the message says what would be right."""
+
+
+class AlreadyWrappedError(SimulatorError):
+    """A method that is wrapped already, by another session over the same simulation."""
 
 
 class TipTarget(NamedTuple):
@@ -93,27 +98,41 @@ class Adapter(ABC):
         return None
 
 
-def wrap_method(owner: Any, name: str, before: Callable[..., None], after: Callable[..., None]) -> Callable[[], None]:
+#: What is wrapped, by process, object and method. The objects are kept, so that no other gets their number.
+_wrapped: dict[tuple[Any, ...], Any] = {}
+
+
+def wrap_method(
+    owner: Any, name: str, before: Callable[..., None], after: Callable[..., None], key: tuple[Any, ...] = ()
+) -> Callable[[], None]:
     """Replace a method on one object, or a function of a module, by one that calls `before` and `after` around it.
+
+    In a process that is forked afterwards it calls the original alone.
 
     Args:
         owner: The object or module.
         name: Name of the method.
         before: Called with the arguments of every call.
         after: Likewise.
+        key: What no two sessions may wrap at once, where it is not the object.
 
     Returns:
         A function that puts the original back.
 
     Raises:
+        AlreadyWrappedError: It is wrapped already.
         SimulatorError: The object does not allow it.
     """
+    process = os.getpid()
+    key = (process, *(key or (id(owner),)), name)
+    if key in _wrapped:
+        raise AlreadyWrappedError("a session is attached to this simulation already: close it first")
     original, own = getattr(owner, name), getattr(owner, "__dict__", {}).get(name)
     active = True
 
     @functools.wraps(original)
     def step(*args: Any, **kwargs: Any) -> Any:
-        if not active:
+        if not active or os.getpid() != process:
             return original(*args, **kwargs)
         before(*args, **kwargs)
         result = original(*args, **kwargs)
@@ -123,6 +142,7 @@ def wrap_method(owner: Any, name: str, before: Callable[..., None], after: Calla
     def remove() -> None:
         nonlocal active
         active = False  # what has wrapped ours passes through
+        _wrapped.pop(key, None)
         if owner.__dict__.get(name) is step:
             if own is None:
                 delattr(owner, name)
@@ -133,6 +153,7 @@ def wrap_method(owner: Any, name: str, before: Callable[..., None], after: Calla
         setattr(owner, name, step)
     except (AttributeError, TypeError) as error:
         raise SimulatorError(f"{name!r} of {type(owner).__name__} cannot be wrapped ({error}): call sync()") from error
+    _wrapped[key] = owner
     return remove
 
 
@@ -215,19 +236,6 @@ def make_robot(name: str, bodies: Sequence[str], gripper: tuple[int, tuple[int, 
         tip_body=bodies[tip],
         finger_bodies=tuple(bodies[finger] for finger in fingers),
     )
-
-
-def place_finger(low: float, high: float, slides: bool, closed: float) -> float:
-    """Return the position of a finger's joint: fingers that slide close towards 0, others by turning up.
-
-    Args:
-        low: Lower limit of the joint [m or rad].
-        high: Upper limit.
-        slides: Whether it is prismatic.
-        closed: From 0, open, to 1, closed.
-    """
-    a, b = (high, low) if slides and abs(low) <= abs(high) else (low, high)
-    return a + closed * (b - a)
 
 
 def from_xyzw(quaternions: Any) -> Floats:

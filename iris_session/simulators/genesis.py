@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -23,26 +24,14 @@ from iris_session.simulators.adapter import (
     SimulationState,
     SimulatorError,
     TipTarget,
-    find_gripper,
-    make_robot,
-    place_finger,
     wrap_method,
 )
+from iris_session.simulators.genesis_robots import GenesisRobots
 
 #: End of the name that Genesis gives to an entity without one.
 _OWN_NAME: Final = re.compile(r"_[0-9a-f]{7}$")
 #: Pictures of ground planes repeat so often per metre.
 _TILE_M: Final = 1.0
-
-
-class _Arm(NamedTuple):
-    """A robot: entity, link of the tip, degrees of freedom of its arm, and those of its fingers."""
-
-    entity: Any
-    tip: Any
-    dofs: list[int]
-    qs: list[int]
-    fingers: list[tuple[int, bool]]
 
 
 class _Soft(NamedTuple):
@@ -65,7 +54,7 @@ class GenesisAdapter(Adapter):
             raise SimulatorError("this Genesis scene is not built yet: call scene.build() before")
         self._scene = scene
         self._rows: list[tuple[Any, list[int]]] = []  # solvers, and the links of them that move
-        self._arms: dict[str, _Arm] = {}
+        self._robots = GenesisRobots(scene)
         self._soft: dict[str, _Soft] = {}
         self._notes: list[str] = []
 
@@ -84,7 +73,7 @@ class GenesisAdapter(Adapter):
                 own = self._add_entity(scene, solver, entity, label, names)
                 rows += [link.idx for link in entity.links]
                 bodies += own
-                robot = self._find_robot(entity, own, label if label not in self._arms else own[0])
+                robot = self._robots.find(entity, own, label)
                 robots += [robot] if robot is not None else []
             self._rows.append((solver, rows))
         for name, entity, part, solver in self._list_soft():
@@ -147,9 +136,11 @@ class GenesisAdapter(Adapter):
         poses = [(*_read_links(solver), rows) for solver, rows in self._rows if rows]
         positions = np.concatenate([np.zeros((0, 3)), *(p[rows] for p, _, rows in poses)])
         quaternions = np.concatenate([np.zeros((0, 4)), *(q[rows] for _, q, rows in poses)])
-        time = np.asarray(self._scene.get_time().cpu(), np.float64).reshape(-1)
         vertices = {name: self._read_vertices(soft) for name, soft in self._soft.items()}
-        return SimulationState(float(time[0]), positions, quaternions, vertices)
+        return SimulationState(self._read_time(), positions, quaternions, vertices)
+
+    def _read_time(self) -> float:
+        return float(np.asarray(self._scene.get_time().cpu(), np.float64).reshape(-1)[0])
 
     def _read_vertices(self, soft: _Soft) -> Floats:
         from genesis.utils.misc import qd_to_numpy
@@ -164,54 +155,14 @@ class GenesisAdapter(Adapter):
 
     def wrap_step(self, before: Callable[[], None], after: Callable[[], None]) -> Callable[[], None]:
         """Follow `scene.step` and `scene.reset`."""
-
-        end_step = wrap_method(self._scene, "step", lambda *_, **__: before(), lambda *_, **__: after())
-        end_reset = wrap_method(self._scene, "reset", lambda *_, **__: None, lambda *_, **__: after())
-
-        def end() -> None:
-            end_step()
-            end_reset()
-
-        return end
-
-    # --- robots -------------------------------------------------------------------------------------------------------
-
-    def _find_robot(self, entity: Any, own: list[str], name: str) -> Any:
-        first = entity.link_start
-        parents = [link.parent_idx - first if link.parent_idx >= first else -1 for link in entity.links]
-        moves = [any(_is_single(joint) for joint in link.joints) for link in entity.links]
-        gripper = find_gripper(parents, moves)
-        if gripper is None:
-            return None
-        tip, fingers = gripper
-        chain, at = [], tip
-        while at > 0:
-            chain += [joint for joint in entity.links[at].joints if _is_single(joint)]
-            at = parents[at]
-        of_fingers = [(joint.dofs_idx_local[0], _slides(joint)) for f in fingers for joint in entity.links[f].joints]
-        dofs = [joint.dofs_idx_local[0] for joint in chain[::-1]]
-        qs = [joint.qs_idx_local[0] for joint in chain[::-1]]
-        self._arms[name] = _Arm(entity, entity.links[tip], dofs, qs, of_fingers)
-        return make_robot(name, own, gripper)
+        with ExitStack() as ends:
+            ends.callback(wrap_method(self._scene, "step", lambda *_, **__: before(), lambda *_, **__: after()))
+            ends.callback(wrap_method(self._scene, "reset", lambda *_, **__: None, lambda *_, **__: after()))
+            return ends.pop_all().close
 
     def apply_targets(self, targets: Mapping[str, TipTarget]) -> None:
         """Move the robots by the inverse kinematics of their entities and position control of their joints."""
-        where: dict[str, Any] = {"envs_idx": [0]} if self._scene.n_envs else {}
-        for name, target in targets.items():
-            arm, entity = self._arms[name], self._arms[name].entity
-            p, q = np.array(target.pose.p), np.array(target.pose.q)
-            found = entity.inverse_kinematics(
-                link=arm.tip, pos=p, quat=q, max_samples=1, dofs_idx_local=arm.dofs, **where
-            )
-            entity.control_dofs_position(found[..., arm.qs], arm.dofs, **where)
-            if target.gripper is not None and arm.fingers:
-                dofs = [dof for dof, _ in arm.fingers]
-                limits = [np.asarray(one.cpu()).reshape(-1, len(dofs))[0] for one in entity.get_dofs_limit(dofs)]
-                goal = [
-                    place_finger(float(low), float(high), slides, target.gripper)
-                    for low, high, (_, slides) in zip(*limits, arm.fingers, strict=True)
-                ]
-                entity.control_dofs_position(np.array(goal), dofs, **where)
+        self._robots.apply_targets(targets, self._read_time())
 
 
 def _read_links(solver: Any) -> tuple[Floats, Floats]:
@@ -221,14 +172,6 @@ def _read_links(solver: Any) -> tuple[Floats, Floats]:
         np.asarray(p.cpu(), np.float64).reshape(-1, solver.n_links, 3)[0],
         np.asarray(q.cpu(), np.float64).reshape(-1, solver.n_links, 4)[0],
     )
-
-
-def _is_single(joint: Any) -> bool:
-    return joint.type.name in ("REVOLUTE", "PRISMATIC")
-
-
-def _slides(joint: Any) -> bool:
-    return bool(joint.type.name == "PRISMATIC")
 
 
 def _read_look(surface: Any, has_uvs: bool) -> AppearanceOptions:

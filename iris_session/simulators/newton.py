@@ -37,6 +37,9 @@ _TO_Z_UP: Final = {
 }
 
 
+_CAPTURED: Final = "steps in a captured graph are not followed: call session.sync() after each launch"
+
+
 class NewtonAdapter(Adapter):
     """A solver with its model."""
 
@@ -145,10 +148,15 @@ class NewtonAdapter(Adapter):
         children = _read(model.joint_child, model.joint_count, -1)
         types = _read(model.joint_type, model.joint_count, 0)
         single, names = (int(kinds.REVOLUTE), int(kinds.PRISMATIC)), Names()
-        for root in [int(c) for c, parent in zip(children, parents, strict=True) if parent < 0 and int(c) in of_row]:
+        roots = [int(c) for c, parent in zip(children, parents, strict=True) if parent < 0 and int(c) in of_row]
+        seen = set(roots)
+        for root in dict.fromkeys(roots):
             links, above, moves = [root], [-1], [False]
             for at, link in enumerate(links):  # grows
                 for joint in np.nonzero(parents == link)[0]:
+                    if int(children[joint]) in seen:  # a joint that closes a loop
+                        continue
+                    seen.add(int(children[joint]))
                     links.append(int(children[joint]))
                     above.append(at)
                     moves.append(int(types[joint]) in single)
@@ -182,10 +190,13 @@ class NewtonAdapter(Adapter):
         return p
 
     def wrap_step(self, before: Callable[[], None], after: Callable[[], None]) -> Callable[[], None]:
-        """Follow `solver.step(state_in, state_out, control, contacts, dt)`."""
+        """Follow `solver.step(state_in, state_out, control, contacts, dt)`, but not while a graph is captured."""
 
         def on_after(state_in: Any, state_out: Any, control: Any, contacts: Any, dt: float, **_: Any) -> None:
             self._state = state_out
+            if self._model.device.is_capturing:  # nothing is computed yet, and reading would break the capture
+                self.notes = tuple(dict.fromkeys((*self.notes, _CAPTURED)))
+                return
             self._time_s += float(dt)
             after()
 

@@ -8,6 +8,7 @@ Bodies that are loaded later are not shown. PyBullet has no clock: time is the n
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from types import ModuleType
 from typing import Any, Final, NamedTuple
 
@@ -25,12 +26,26 @@ from iris_session.simulators.adapter import (
     find_gripper,
     from_xyzw,
     make_robot,
-    place_finger,
     wrap_method,
 )
+from iris_session.simulators.joint_targets import JointTargets, place_fingers
 
 #: Clients that one process can have.
 _MAX_CLIENTS: Final = 1024
+#: Most force of a motor whose joint has no limit of it, PyBullet's default [N or Nm].
+_UNLIMITED_FORCE: Final = 100_000.0
+#: Clients of which a session needs `_keep_clients_apart`.
+_apart: list[int] = []
+
+
+class _Joint(NamedTuple):
+    """Limits of a joint: position, force and speed, of which 0 is none; and whether it slides."""
+
+    low: float
+    high: float
+    force: float
+    speed: float
+    slides: bool
 
 
 class _Arm(NamedTuple):
@@ -38,7 +53,7 @@ class _Arm(NamedTuple):
 
     body: int
     tip: int
-    movable: list[int]
+    movable: dict[int, _Joint]
     driven: list[int]
     fingers: list[int]
 
@@ -57,6 +72,7 @@ class PyBulletAdapter(Adapter):
         self._p = pybullet
         self._links: dict[int, int] = {}  # number of links by body
         self._arms: dict[str, _Arm] = {}
+        self._targets = JointTargets()
         self._T_com_base: dict[int, PoseTuple] = {}
         self._time_s = 0.0
 
@@ -90,7 +106,8 @@ class PyBulletAdapter(Adapter):
             moves = [False, *(joint[2] != self._p.JOINT_FIXED for joint in joints)]
             if (gripper := find_gripper(parents, moves)) is not None:
                 robots.append(make_robot(label if label not in self._arms else own[0], own, gripper))
-                self._arms[robots[-1].name] = _make_arm(body, parents, moves, gripper)
+                kinds = {j[0]: _Joint(j[8], j[9], j[10], j[11], j[2] == self._p.JOINT_PRISMATIC) for j in joints}
+                self._arms[robots[-1].name] = _make_arm(body, parents, moves, gripper, kinds)
             bodies += own
         self.bodies, self.robots, self.notes = bodies, tuple(robots), tuple(dict.fromkeys(notes))
         if not bodies:
@@ -148,9 +165,12 @@ class PyBulletAdapter(Adapter):
                 self._time_s += self._call("getPhysicsEngineParameters")["fixedTimeStep"]
                 after()
 
-        if self._owner is self._p:
-            _keep_clients_apart(self._p)
-        return wrap_method(self._owner, "stepSimulation", on_before, on_after)
+        with ExitStack() as ends:
+            key = ("pybullet", self._client)  # a client, whether by the module or by a BulletClient
+            ends.callback(wrap_method(self._owner, "stepSimulation", on_before, on_after, key))
+            if self._owner is self._p:
+                ends.callback(_keep_clients_apart(self._p, self._client))
+            return ends.pop_all().close
 
     # --- robots -------------------------------------------------------------------------------------------------------
 
@@ -159,30 +179,33 @@ class PyBulletAdapter(Adapter):
         for name, target in targets.items():
             arm = self._arms[name]
             w, x, y, z = target.pose.q
-            q = self._call("calculateInverseKinematics", arm.body, arm.tip, target.pose.p, (x, y, z, w))
-            goal = dict(zip(arm.movable, q, strict=True))
-            goals = {joint: goal[joint] for joint in arm.driven}
+            now = np.array([state[0] for state in self._call("getJointStates", arm.body, list(arm.movable))])
+            low, high, _, speeds, _ = np.array(list(arm.movable.values()), np.float64).T
+            lowest, highest = np.where(low < high, low, now - np.pi), np.where(low < high, high, now + np.pi)
+            spans = {"lowerLimits": lowest, "upperLimits": highest, "jointRanges": highest - lowest, "restPoses": now}
+            near = {key: value.tolist() for key, value in spans.items()}
+            found = self._call("calculateInverseKinematics", arm.body, arm.tip, target.pose.p, (x, y, z, w), **near)
+            at = (self._time_s, self._call("getPhysicsEngineParameters")["fixedTimeStep"])
+            goal = self._targets.limit(name, at, now, found, (low, high), speeds)
+            goals = {joint: q for joint, q in zip(arm.movable, goal.tolist(), strict=True) if joint in arm.driven}
             if target.gripper is not None:
-                for joint in arm.fingers:
-                    info = self._call("getJointInfo", arm.body, joint)
-                    goals[joint] = place_finger(info[8], info[9], info[2] == self._p.JOINT_PRISMATIC, target.gripper)
-            self._call(
-                "setJointMotorControlArray",
-                arm.body,
-                list(goals),
-                self._p.POSITION_CONTROL,
-                targetPositions=list(goals.values()),
-            )
+                fingers = [(i, arm.movable[i].low, arm.movable[i].high, arm.movable[i].slides) for i in arm.fingers]
+                goals |= place_fingers(fingers, target.gripper)
+            forces = [arm.movable[joint].force or _UNLIMITED_FORCE for joint in goals]
+            how = {"targetPositions": list(goals.values()), "forces": forces}
+            self._call("setJointMotorControlArray", arm.body, list(goals), self._p.POSITION_CONTROL, **how)
 
 
-def _make_arm(body: int, parents: list[int], moves: list[bool], gripper: tuple[int, tuple[int, ...]]) -> _Arm:
+def _make_arm(
+    body: int, parents: list[int], moves: list[bool], gripper: tuple[int, tuple[int, ...]], joints: dict[int, _Joint]
+) -> _Arm:
     """Return a robot; links are counted from the base, joints of PyBullet from the first link."""
     chain, at = [], gripper[0]
     while at > 0:
         if moves[at]:
             chain.append(at - 1)
         at = parents[at]
-    movable = [i - 1 for i, is_moving in enumerate(moves) if is_moving]
+    movable = {i - 1: joints[i - 1] for i, is_moving in enumerate(moves) if is_moving}
     return _Arm(body, gripper[0] - 1, movable, chain[::-1], [finger - 1 for finger in gripper[1]])
 
 
@@ -203,11 +226,23 @@ def _find_client(pybullet: Any, simulation: Any) -> int:
     raise SimulatorError("pybullet is not connected: call pybullet.connect(pybullet.DIRECT) before")
 
 
-def _keep_clients_apart(pybullet: Any) -> None:
-    """Let `BulletClient` give its number to our `stepSimulation` too, which it does for compiled functions only."""
+def _keep_clients_apart(pybullet: Any, number: int) -> Callable[[], None]:
+    """Let `BulletClient` give its number to our `stepSimulation` too, which it does for compiled functions only.
+
+    Returns:
+        A function that ends this, with the last session that needs it.
+    """
     from pybullet_utils.bullet_client import BulletClient
 
     def step(client: Any, *args: Any, **kwargs: Any) -> None:
         pybullet.stepSimulation(*args, physicsClientId=client._client, **kwargs)
 
-    BulletClient.stepSimulation = step
+    def end() -> None:
+        _apart.remove(number)
+        if not _apart:
+            del BulletClient.stepSimulation
+
+    if not _apart:
+        BulletClient.stepSimulation = step
+    _apart.append(number)
+    return end

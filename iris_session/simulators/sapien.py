@@ -27,9 +27,9 @@ from iris_session.simulators.adapter import (
     TipTarget,
     find_gripper,
     make_robot,
-    place_finger,
     wrap_method,
 )
+from iris_session.simulators.joint_targets import JointTargets, place_fingers
 
 #: Rotation from z, along which our shapes lie, to x, along which those of PhysX do.
 _Z_TO_X: Final[PoseTuple] = ((0.0, 0.0, 0.0), (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0))
@@ -59,6 +59,7 @@ class SapienAdapter(Adapter):
         self._owner, self._scene = owner, scene
         self._entities: list[Any] = []
         self._arms: dict[str, _Arm] = {}
+        self._targets = JointTargets()
         self._time_s = 0.0
 
     # --- the scene ----------------------------------------------------------------------------------------------------
@@ -144,16 +145,20 @@ class SapienAdapter(Adapter):
             mask = np.zeros(arm.articulation.dof, np.int32)
             mask[arm.joints] = 1
             now = np.asarray(arm.articulation.qpos)
-            found, _, _ = arm.model.compute_inverse_kinematics(
+            found, is_solved, _ = arm.model.compute_inverse_kinematics(
                 arm.tip, sapien.Pose(list(p), list(q)), initial_qpos=now, active_qmask=mask, max_iterations=100
             )
-            joints = arm.articulation.active_joints
-            for joint in arm.joints:
-                joints[joint].set_drive_target(float(found[joint]))
-            for finger in arm.fingers if target.gripper is not None else ():
-                low, high = np.asarray(joints[finger].limits).reshape(-1, 2)[0]
-                slides = str(joints[finger].type) == "prismatic"
-                joints[finger].set_drive_target(place_finger(float(low), float(high), slides, target.gripper or 0.0))
+            joints, own = arm.articulation.active_joints, arm.joints
+            limits = np.array([np.asarray(joint.limits).reshape(-1, 2)[0] for joint in joints], np.float64)
+            if is_solved:
+                at, speeds = (self._time_s, float(self._scene.timestep)), [joints[i].max_velocity for i in own]
+                goal = self._targets.limit(name, at, now[own], np.asarray(found)[own], tuple(limits[own].T), speeds)
+                for joint, place in zip(own, goal.tolist(), strict=True):
+                    joints[joint].set_drive_target(place)
+            if target.gripper is not None:
+                fingers = [(i, *limits[i].tolist(), str(joints[i].type) == "prismatic") for i in arm.fingers]
+                for joint, place in place_fingers(fingers, target.gripper).items():
+                    joints[joint].set_drive_target(place)
 
 
 def _list_shapes(entity: Any) -> Iterator[Any]:

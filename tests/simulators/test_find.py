@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from iris_session.simulators import SimulatorError, find_adapter
-from iris_session.simulators.adapter import Names, find_gripper, place_finger, wrap_method
+from iris_session.simulators.adapter import Names, find_gripper, wrap_method
 
 
 def of_package(package: str, **values: Any) -> Any:
@@ -82,12 +82,6 @@ def test_grippers_of_arms_and_what_is_no_arm() -> None:
     assert find_gripper([-1, 0, 0, 1, 2], [False, True, True, True, True]) is None, "legs"
     assert find_gripper([-1, 0], [False, True]) is None, "a door"
     assert find_gripper([], []) is None
-
-
-def test_fingers_that_slide_close_to_zero_and_others_by_turning_up() -> None:
-    assert [place_finger(0.0, 0.04, True, c) for c in (0.0, 1.0)] == [0.04, 0.0]
-    assert [place_finger(-0.04, 0.0, True, c) for c in (0.0, 1.0)] == [-0.04, 0.0]
-    assert [place_finger(0.0, 0.8, False, c) for c in (0.0, 0.5)] == [0.0, 0.4]
 
 
 def test_a_wrapped_method_keeps_what_was_there() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
+import os
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 import pytest
 
 import iris_session
-from iris_session import Client, ConfigError, SceneBuilder, SessionConfig
+from iris_session import Client, ConfigError, OwnershipError, SceneBuilder, SessionConfig
 from iris_session.protocol.client_messages import Acquire
 from iris_session.protocol.names import Role
 from iris_session.session import share as share_module
@@ -24,9 +26,10 @@ CLOTH = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)])
 
 
 class Gantry:
-    """A simulator: a gripper that goes to its goal within a step, and a cloth that falls."""
+    """A simulator: a gripper that goes to its goal at a limited speed [m/s], and a cloth that falls."""
 
-    def __init__(self) -> None:
+    def __init__(self, speed: float = 100.0) -> None:
+        self.speed = speed
         self.time = 0.0
         self.tip = np.array([0.0, 0.0, 0.5])
         self.goal = self.tip.copy()
@@ -38,7 +41,8 @@ class Gantry:
         if self.breaks:
             self.tip[:] = np.nan
         self.time += DT
-        self.tip = self.tip + 0.5 * (self.goal - self.tip)
+        away = self.goal - self.tip
+        self.tip = self.tip + min(0.5, self.speed * DT / max(1e-9, float(np.linalg.norm(away)))) * away
         self.height -= 0.001
         return substeps
 
@@ -50,6 +54,7 @@ class GantryAdapter(Adapter):
     def __init__(self, gantry: Gantry) -> None:
         self.gantry = gantry
         self.reads = 0
+        self.applied: list[TipTarget] = []
 
     def build(self, scene: SceneBuilder) -> None:
         scene.add_box("base", half_size=(0.1, 0.1, 0.1), movable=True)
@@ -67,6 +72,7 @@ class GantryAdapter(Adapter):
         )
 
     def apply_targets(self, targets: Mapping[str, TipTarget]) -> None:
+        self.applied.append(targets["gantry"])
         self.gantry.goal[:] = targets["gantry"].pose.p
         self.gantry.gripper = targets["gantry"].gripper or 0.0
 
@@ -86,6 +92,33 @@ def run(session: SimulatorSession, gantry: Gantry, seconds: float, each: Callabl
         gantry.step()
         each()
         session.run(seconds=DT)
+
+
+def connect(session: SimulatorSession, name: str = "policy") -> Client:
+    return Client(session.address, role=Role.AGENT, name=name, devices=("target",)).connect()
+
+
+def acquire(session: SimulatorSession, gantry: Gantry, client: Client) -> None:
+    run(session, gantry, 0.2, lambda: client.poll(0.0))
+    request = client.submit(Acquire(request_id=0, robots=("gantry",)))
+    run(session, gantry, 0.2, lambda: client.poll(0.0))
+    answer = client.answer(request)
+    assert answer is not None
+    assert answer.denial is None
+
+
+def drive(session: SimulatorSession, gantry: Gantry, client: Client, gripper: float | None = None) -> None:
+    """Drive for half a second towards a goal that is far away."""
+    acquire(session, gantry, client)
+    sent = iter(range(1000))
+
+    def send() -> None:
+        goal = ((0.5, 0.0, 0.5), UNIT)
+        client.send_sample("target", goal, robots=["gantry"], clutch=next(sent) > 2, gripper=gripper)
+        client.poll(0.0)
+
+    run(session, gantry, 0.5, send)
+    assert session.driven_robots() == ("gantry",)
 
 
 def test_steps_of_the_simulation_are_published_and_its_method_comes_back(simulation: Simulation) -> None:
@@ -123,13 +156,8 @@ def test_a_participant_drives_the_robot_and_the_journal_verifies(simulation: Sim
     with session:
         assert session._stepper is not None
         journal = keep_journal(session._stepper)
-        client = Client(session.address, role=Role.AGENT, name="policy", devices=("target",)).connect()
-        run(session, gantry, 0.2, lambda: client.poll(0.0))
-        request = client.submit(Acquire(request_id=0, robots=("gantry",)))
-        run(session, gantry, 0.2, lambda: client.poll(0.0))
-        answer = client.answer(request)
-        assert answer is not None
-        assert answer.denial is None
+        client = connect(session)
+        acquire(session, gantry, client)
         goal, steps = ((0.1, 0.05, 0.4), UNIT), []
 
         def send() -> None:
@@ -152,6 +180,100 @@ def test_a_participant_drives_the_robot_and_the_journal_verifies(simulation: Sim
         assert gantry.tip == pytest.approx((0.0, 0.0, 0.5), abs=1e-3), "the program has its robot again"
         client.close()
     journal.verify()
+
+
+def test_a_robot_stands_still_after_its_release(simulation: Simulation) -> None:
+    gantry = Gantry(speed=0.25)
+    with SimulatorSession(GantryAdapter(gantry), CONFIG) as session:
+        client = connect(session)
+        drive(session, gantry, client)
+        assert np.linalg.norm(gantry.goal - gantry.tip) > 0.04, "the target leads"
+        client.release("gantry")
+        while session.driven_robots():
+            run(session, gantry, DT, lambda: client.poll(0.0))
+        gantry.step()
+        assert gantry.goal == pytest.approx(gantry.tip, abs=0.25 * DT)
+        gantry.goal[:] = (0.0, 0.0, 0.5)
+        run(session, gantry, 2.0, lambda: client.poll(0.0))
+        assert gantry.tip == pytest.approx((0.0, 0.0, 0.5), abs=1e-3), "targets of the program count again"
+        client.close()
+
+
+@pytest.mark.parametrize("ends", ["close", "stop", "error"])
+def test_a_driven_robot_stands_still_when_the_session_ends(simulation: Simulation, ends: str) -> None:
+    gantry = Gantry(speed=0.25)
+    with SimulatorSession(GantryAdapter(gantry), CONFIG) as session:
+        drive(session, gantry, connect(session))
+        assert np.linalg.norm(gantry.goal - gantry.tip) > 0.04
+        if ends == "close":
+            session.close()
+        elif ends == "stop":
+            session.stop()
+        else:
+            assert session._stepper is not None
+            session._stepper.end(RuntimeError("internal"))
+        before = gantry.tip.copy()
+        for _ in range(50):
+            gantry.step()
+        assert gantry.tip == pytest.approx(before, abs=1e-9)
+
+
+def test_the_next_participant_does_not_command_the_gripper_of_the_one_before(simulation: Simulation) -> None:
+    gantry = Gantry(speed=0.25)
+    adapter = GantryAdapter(gantry)
+    with SimulatorSession(adapter, CONFIG) as session:
+        for name, gripper in (("ann", 0.9), ("bob", None)):
+            client = connect(session, name)
+            drive(session, gantry, client, gripper)
+            client.release("gantry")
+            run(session, gantry, 0.3, lambda client=client: client.poll(0.0))  # type: ignore[misc]
+            client.close()
+            assert session.grippers() == {}
+            given = {target.gripper for target in adapter.applied}
+            assert given == {None, gripper}
+            adapter.applied.clear()
+
+
+def test_a_reset_forgets_grippers(simulation: Simulation) -> None:
+    gantry = Gantry()
+    with SimulatorSession(GantryAdapter(gantry), CONFIG) as session:
+        drive(session, gantry, connect(session), 0.9)
+        run(session, gantry, DT)
+        assert session.grippers() == {"gantry": 0.9}
+        gantry.time = 0.0
+        run(session, gantry, DT)
+        assert session.grippers() == {}
+
+
+def test_a_simulation_has_one_session(simulation: Simulation) -> None:
+    gantry, other = Gantry(), Gantry()
+    with SimulatorSession(GantryAdapter(gantry), CONFIG) as session:
+        with pytest.raises(OwnershipError, match="close it first"):
+            SimulatorSession(GantryAdapter(gantry), CONFIG).start()
+        gantry.step()
+        assert not session._list_faults()
+        with SimulatorSession(GantryAdapter(other), CONFIG):
+            pass
+    with SimulatorSession(GantryAdapter(gantry), CONFIG):
+        pass
+
+
+def test_a_forked_process_leaves_the_session_alone(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    gantry = Gantry()
+    adapter = GantryAdapter(gantry)
+    with SimulatorSession(adapter, CONFIG) as session:
+        run(session, gantry, 0.1)
+        reads, parent = adapter.reads, os.getpid()
+        with monkeypatch.context() as child:
+            child.setattr(os, "getpid", lambda: parent + 1)
+            for _ in range(20):
+                assert gantry.step(3) == 3
+                simulation.sleep(DT)
+            assert adapter.reads == reads
+            assert session.close()
+        assert not session.stopping
+        run(session, gantry, 0.1)
+        assert adapter.reads > reads
 
 
 def test_a_program_that_drives_by_itself_gets_the_targets(simulation: Simulation) -> None:
@@ -196,6 +318,16 @@ def test_share_takes_a_simulation_and_gives_its_step_back(
     for wrong in ({"data": object()}, {"objects": ()}):
         with pytest.raises(ConfigError, match="MuJoCo"):
             iris_session.share(gantry, config=CONFIG, **wrong)  # type: ignore[arg-type]
+
+
+def test_a_closed_session_is_not_kept(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    callbacks: list[Callable[[], object]] = []
+    monkeypatch.setattr(atexit, "register", callbacks.append)
+    monkeypatch.setattr(atexit, "unregister", lambda one: callbacks.remove(one) if one in callbacks else None)
+    monkeypatch.setattr(share_module, "find_adapter", GantryAdapter)
+    with iris_session.share(Gantry(), config=CONFIG) as session:
+        assert session.close in callbacks
+    assert not callbacks
 
 
 def test_what_is_no_simulation_is_refused_in_one_line() -> None:
