@@ -275,6 +275,10 @@ class Controller:
             targets[robot.name] = Pose(*(self._ik.compute_tip(i, r) if stands else r.commanded))
         return targets
 
+    def list_held(self) -> list[str]:
+        """Return the robots that hold: nobody drives them, or the clutch is open."""
+        return [robot.name for robot, r in zip(self._robots, self._states, strict=True) if r.latch is None]
+
     def get_grippers(self) -> dict[str, float]:
         """Return how far each gripper is commanded to close, 0 (open) to 1 (closed), of the robots that have one."""
         shares = ((robot.name, self._grippers.read_share(i)) for i, robot in enumerate(self._robots))

@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import msgspec
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from anchors.pose import (
     IDENTITY_POSE,
@@ -46,9 +47,20 @@ from iris_session.session.simulation import Simulation
 #: moves at such a speed [m/s],
 SETTLE_S: Final = 0.4
 REST_SPEED: Final = 0.03
-#: where it is not more than that [m, rad], up to this lead.
+#: where it is not more than that [m, rad], up to this lead,
 NEAR: Final = (0.05, 0.3)
 MAX_LEAD: Final = (0.05, 0.3)
+#: of which so much is added while the end effector stands still, as against an obstacle.
+MAX_PUSH: Final = (0.01, 0.06)
+#: The end effector has moved when it is so far from where it was [m, rad], and is at a target that is so near.
+MOVED: Final = (0.003, 0.02)
+ARRIVED: Final = (0.001, 0.01)
+#: Time constant with which a hold gives up what was added against an obstacle [s].
+RELEASE_S: Final = 0.3
+#: `ctrl` is what an action means when it is no farther from that, as a share of the value or of one: rounding to
+#: 32 bits, with a margin. An entry that commands less than `TELLING` says nothing.
+ROUNDING: Final = 1e-5
+TELLING: Final = 0.01
 #: Share of a stroke that a gripper which only opens and closes may be off.
 GRIPPER_DEAD_BAND: Final = 0.15
 #: Passes of inverse kinematics per step.
@@ -119,11 +131,41 @@ class GripperEntry(NamedTuple):
         return bool(action[self.at] == theirs)
 
 
+class CtrlReading(NamedTuple):
+    """What entries of a robot are taken for: `ctrl[at] = action[at] * scale + offset`, within `low` and `high`.
+
+    All but `n_joints` have shape (n,); joints come first, then grippers.
+    """
+
+    at: NDArray[np.intp]
+    n_joints: int
+    scale: Floats
+    offset: Floats
+    low: Floats
+    high: Floats
+
+    def compare(self, action: Floats, ctrl: Floats) -> bool | None:
+        """Return whether `ctrl` after a step is what `action` was taken for; `None` if it is, but proves nothing.
+
+        An action of about zero fits other meanings, too, such as ways from where the joints are, and so does one
+        that is out of range.
+        """
+        way = action[self.at] * self.scale
+        meant, value = way + self.offset, ctrl[self.at]
+        bounded = np.clip(meant, self.low, self.high)
+        off = np.minimum(np.abs(value - meant), np.abs(value - bounded))
+        if not (off <= ROUNDING * np.maximum(1.0, np.maximum(np.abs(meant), np.abs(self.offset)))).all():
+            return False
+        is_telling = (np.abs(way) > TELLING) & (meant == bounded)
+        return True if is_telling[: self.n_joints].any() else None
+
+
 class RobotEntries(NamedTuple):
-    """Entries of one robot in the action."""
+    """Entries of one robot in the action. `reading`: a guess, which steps of the environment have to prove."""
 
     arm: ArmEntries
     grippers: tuple[GripperEntry, ...] = ()
+    reading: CtrlReading | None = None
 
 
 class TipEntries:
@@ -216,6 +258,7 @@ class JointEntries:
         scale, offset: Shape (n,) or one number.
         limits: Joint positions, or entries that are ways, lower and upper.
         is_way: Entries are ways from the measured positions.
+        arm: The robot's kinematic chain, where it was compiled before.
     """
 
     turns = 3
@@ -231,12 +274,13 @@ class JointEntries:
         limits: tuple[Any, Any] = (-math.inf, math.inf),
         *,
         is_way: bool = False,
+        arm: ArmModel | None = None,
     ) -> None:
         model, data = simulation
         self._data: Any = data
         self.at = np.array(at, np.intp)
         self._scale, self._offset = np.broadcast_to(scale, len(at)), np.broadcast_to(offset, len(at))
-        self._arm, self._tip = ArmModel(model, robot), Tip(model, robot)
+        self._arm, self._tip = arm or ArmModel(model, robot), Tip(model, robot)
         self._qpos = np.array([model.jnt_qposadr[j] for j in self._arm.joint_ids], np.intp)
         ids = np.array(self._arm.joint_ids, np.intp)
         limited, ranges = model.jnt_limited[ids].astype(bool), model.jnt_range[ids]
@@ -303,27 +347,57 @@ class RobotDrive:
     """One robot: from the target of its end effector to its entries in the action, and back to the owner's.
 
     Attributes:
+        reading: What has to be proved of the entries, `None` where they are known.
         is_returning: No participant drives it any more, but its entries are not the owner's yet.
     """
 
     def __init__(self, entries: RobotEntries, tip: Tip, data: mujoco.MjData, config: ControlConfig) -> None:
         self._entries, self._tip, self._data = entries, tip, data
         self._stroke = config.gripper_speed
-        #: Lead of what is commanded over where the frame is to go [m, rad], None while the owner drives.
+        self.reading = entries.reading
+        self.forget()
+
+    def forget(self) -> None:
+        """Let the entries be the owner's at once, as after a reset."""
+        #: Lead of what is commanded over where the frame is to go [m, rad], None while the owner drives; how much of
+        #: it is not a push against something, and where the end effector was when that was found.
         self._lead: Floats | None = None
+        self._carry: Floats = np.zeros(6)
+        self._stood: PoseTuple = IDENTITY_POSE
         self._target: PoseTuple = IDENTITY_POSE
+        self._misses = [True, True]  # the target, before a hold: in place, in turn
         self.is_returning = False
 
-    def drive(self, action: Floats, before: Floats | None, target: Pose, share: float | None, period: float) -> None:
-        """Replace the robot's entries by those that follow `target`, `T_world_tip`, with the gripper at `share`."""
+    def has_pose(self) -> bool:
+        """Return whether the data says where the robot is: not after a reset until MuJoCo has computed it."""
+        p, q = self._data.xpos[self._tip.body], self._data.xquat[self._tip.body]
+        return bool(np.isfinite(p).all() and np.isfinite(q).all() and q.any())
+
+    def is_near(self, target: Pose) -> bool:
+        """Return whether the end effector is where a target would hardly move it."""
+        return _is_within(measure_way(self._tip.read_pose(self._data), (target.p, target.q)), MAX_PUSH)
+
+    def drive(
+        self,
+        action: Floats,
+        before: Floats | None,
+        target: Pose,
+        share: float | None,
+        period: float,
+        *,
+        is_held: bool = False,
+    ) -> None:
+        """Replace the robot's entries by those that follow `target`, `T_world_tip`, with the gripper at `share`.
+
+        `is_held`: nobody moves the target, because the clutch is open.
+        """
         arm, T_tip, T_target = self._entries.arm, self._tip.read_pose(self._data), (target.p, target.q)
         T_frame, way = arm.read_pose(), measure_way(T_tip, T_target)
         if self._lead is None:  # what is commanded now goes on
-            self._lead, self._target = _limit(measure_way(T_frame, arm.read_commanded(before)), MAX_LEAD), T_target
-        speed = distance(T_target[0], self._target[0]) / period
-        share_s = period / SETTLE_S / (1.0 + (speed / REST_SPEED) ** 2)
-        near = [float(np.linalg.norm(part)) < most for part, most in zip((way[:3], way[3:]), NEAR, strict=True)]
-        self._lead = _limit(self._lead + way * np.repeat(near, 3) * share_s, MAX_LEAD)
+            lead = _limit(measure_way(T_frame, arm.read_commanded(before)), MAX_LEAD)
+            self._lead = self._carry = lead
+            self._target, self._stood = T_target, T_tip
+        self._lead = self._settle(self._lead, T_tip, T_target, way, period, is_held)
         self._target, self.is_returning = T_target, True
         if arm.turns == 3:
             T_goal = compose(compose(T_target, inverse(T_tip)), T_frame)
@@ -332,6 +406,24 @@ class RobotDrive:
         arm.write(action, before, move(T_goal, self._lead), period)
         for gripper in self._entries.grippers:
             gripper.write(action, before, share, self._stroke * period)
+
+    def _settle(
+        self, lead: Floats, T_tip: PoseTuple, T_target: PoseTuple, way: Floats, period: float, is_held: bool
+    ) -> Floats:
+        """Return the lead with what is missing of `way` added to it, and without a push that a hold gives up."""
+        moved = measure_way(self._stood, T_tip)
+        if not _is_within(moved, MOVED):
+            self._stood = T_tip
+            self._carry = self._carry + _limit(lead - self._carry, _measure_parts(moved))
+        if is_held:
+            lead = lead + (self._carry - lead) * np.repeat(self._misses, 3) * min(1.0, period / RELEASE_S)
+        else:
+            self._misses = [part > most for part, most in zip(_measure_parts(way), ARRIVED, strict=True)]
+        speed = distance(T_target[0], self._target[0]) / period
+        share_s = period / SETTLE_S / (1.0 + (speed / REST_SPEED) ** 2)
+        near = [part < most for part, most in zip(_measure_parts(way), NEAR, strict=True)]
+        lead = lead + way * np.repeat(near, 3) * share_s
+        return _limit(self._carry + _limit(lead - self._carry, MAX_PUSH), MAX_LEAD)
 
     def give_back(self, action: Floats, before: Floats, period: float) -> None:
         """Let the entries become the owner's, no faster than the robot may move."""
@@ -366,8 +458,16 @@ def _turn(q: Quat, vector: Floats) -> tuple[float, float, float]:
     return quat_rotate(q, (x, y, z))
 
 
+def _measure_parts(way: Floats) -> tuple[float, float]:
+    """Return how far a way leads [m] and turns [rad]."""
+    return float(np.linalg.norm(way[:3])), float(np.linalg.norm(way[3:]))
+
+
+def _is_within(way: Floats, most: tuple[float, float]) -> bool:
+    return all(part <= limit for part, limit in zip(_measure_parts(way), most, strict=True))
+
+
 def _limit(way: Floats, most: tuple[float, float]) -> Floats:
-    lengths = [max(float(np.linalg.norm(part)), 1e-12) for part in (way[:3], way[3:])]
-    shares = [min(1.0, limit / length) for limit, length in zip(most, lengths, strict=True)]
+    shares = [min(1.0, limit / max(part, 1e-12)) for limit, part in zip(most, _measure_parts(way), strict=True)]
     limited: Floats = way * np.repeat(shares, 3)
     return limited

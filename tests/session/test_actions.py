@@ -16,6 +16,7 @@ import iris_session
 from anchors.pose import quat_angle, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
 from iris_session import ConfigError, ControlConfig
 from iris_session.control import Controller
+from iris_session.control.arm_model import ArmModel
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import find_robots, load_model
 from iris_session.physics.tip import Tip
@@ -132,6 +133,68 @@ class Normalised(World):
 
     def policy(self, t: float) -> np.ndarray:
         return (super().policy(t) - self.middle) / self.half
+
+
+class Ways(World):
+    """As many entries as actuators, and none is what it commands: ways of the joints, from what is commanded.
+
+    After nineteen steps of a constant action `ctrl` is the action, in the next one.
+    """
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        return super().step(self.data.ctrl + 0.05 * np.asarray(action))
+
+    def policy(self, t: float) -> np.ndarray:
+        return np.full(16, 0.02)
+
+
+class WaysAndOpening(World):
+    """Ways of the joints, and what the grippers are to be."""
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        ctrl = self.data.ctrl + 0.05 * np.asarray(action)
+        ctrl[[7, 15]] = np.asarray(action)[[7, 15]]
+        return super().step(ctrl)
+
+    def policy(self, t: float) -> np.ndarray:
+        action = np.zeros(16)
+        action[[7, 15]] = 0.03
+        return action
+
+
+class AboutHome(Normalised):
+    """Half a radian about a home position, as usual in reinforcement learning."""
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        return World.step(self, self.home + 0.5 * np.asarray(action))
+
+    def policy(self, t: float) -> np.ndarray:
+        return np.full(16, 0.1)
+
+
+class Blocked(World):
+    """A robot that something stops, as far as the lock is closed."""
+
+    is_blocked = False
+
+    def advance(self, steps: int = 1) -> None:
+        before = self.data.qpos.copy()
+        super().advance(steps)
+        if self.is_blocked:
+            self.data.qpos[:], self.data.qvel[:] = before, 0.0
+            mujoco.mj_forward(self.model, self.data)
+
+    def measure_push(self, action: Any) -> np.ndarray:
+        """Way from the tip to where `action` commands it [m]."""
+        data = mujoco.MjData(self.model)
+        data.qpos[:] = self.data.qpos
+        for name, entry in zip(self.robots[0].joints, action, strict=False):
+            data.joint(name).qpos[0] = entry
+        mujoco.mj_kinematics(self.model, data)
+        return np.subtract(self.tip.read_pose(data)[0], self.tip.read_pose(self.data)[0])
+
+    def policy(self, t: float) -> np.ndarray:
+        return self.home
 
 
 class Osc(World):
@@ -358,6 +421,7 @@ class Person:
         self.robot = world.robots[0].name
         self.target: Pose | None = None
         self.share: float | None = None
+        self.is_held = False
         self.mine: list[np.ndarray] = []
         self.theirs: list[np.ndarray] = []
 
@@ -367,7 +431,8 @@ class Person:
         driven = () if self.target is None else (self.robot,)
         targets = {} if self.target is None else {self.robot: self.target}
         shares = {} if self.share is None else {self.robot: self.share}
-        mine = self.drive.apply(theirs, (world.model, world.data, world.robots), driven, targets, shares)
+        held = driven if self.is_held else ()
+        mine = self.drive.apply(theirs, (world.model, world.data, world.robots), driven, targets, shares, held)
         self.theirs.append(theirs.copy())
         self.mine.append(np.array(mine))
         world.step(mine)
@@ -531,12 +596,195 @@ def test_a_reset_forgets_the_way_back() -> None:
 @pytest.mark.parametrize("make", [list, tuple, lambda a: a.astype(np.float32)])
 def test_the_action_keeps_its_type(make: Callable[[Any], Any]) -> None:
     world = World()
-    drive, tip = ActionDrive(world, CONFIG), Pose(*world.tip.read_pose(world.data))
-    action = make(world.home)
-    mine = drive.apply(action, (world.model, world.data, world.robots), ("left",), {"left": tip}, {"left": 1.0})
+    person = Person(world)
+    person.run(0.1)
+    tip, action = Pose(*world.tip.read_pose(world.data)), make(world.home)
+    scene = (world.model, world.data, world.robots)
+    mine = person.drive.apply(action, scene, ("left",), {"left": tip}, {"left": 1.0})
     assert type(mine) is type(action)
     assert np.asarray(mine).dtype == np.asarray(action).dtype
     assert not np.array_equal(mine, action)
+
+
+# --- what an action means is proved -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [Ways, WaysAndOpening, AboutHome])
+@pytest.mark.parametrize("seconds", [0.0, 0.4, 1.0])
+def test_nobody_drives_by_entries_that_mean_something_else(kind: Callable[[], World], seconds: float) -> None:
+    person = Person(kind())
+    person.run(seconds)
+    assert person.drive.list_warnings() == ()
+    person.lead()
+    person.run(1.0)
+    assert np.array_equal(person.mine, person.theirs)
+    assert person.drive.list_replaced() == ()
+    (warning,) = person.drive.list_warnings()
+    assert "'left'" in warning
+    assert "\n" not in warning
+    person.target = None
+    person.step()
+    assert person.drive.list_warnings() == ()
+
+
+def test_a_chance_match_proves_nothing() -> None:
+    """Twenty steps of a constant way: `ctrl` is the action, once."""
+    world = Ways()
+    world.data.ctrl[:] = 0.0
+    person = Person(world)
+    person.run(20 * PERIOD)
+    assert np.allclose(world.data.ctrl, 0.02, rtol=0.0, atol=1e-12)
+    person.target = Pose(*world.tip.read_pose(world.data))
+    assert np.array_equal(person.step(), person.theirs[-1])
+
+
+def test_a_robot_is_driven_once_the_action_says_something() -> None:
+    """Zeros fit all meanings. The robot does not leap to a target that has gone ahead meanwhile."""
+    world = World()
+    home, world.home = world.home, np.zeros(16)
+    world.policy = lambda t: world.home  # type: ignore[method-assign]
+    person = Person(world)
+    person.run(3.0)
+    person.lead()
+    person.run(0.5)
+    assert np.array_equal(person.mine, person.theirs)
+    world.home = home
+    person.run(3.0)
+    assert np.array_equal(person.mine, person.theirs)
+    person.target = Pose(*world.tip.read_pose(world.data))
+    person.run(0.1)
+    assert person.drive.list_replaced() == ("left",)
+    assert person.drive.list_warnings() == ()
+
+
+def test_a_proof_holds_for_the_next_episode_and_not_for_ever() -> None:
+    world = World()
+    person = Person(world)
+    person.run(0.2)
+    mujoco.mj_resetDataKeyframe(world.model, world.data, 0)
+    mujoco.mj_forward(world.model, world.data)
+    person.target = Pose(*world.tip.read_pose(world.data))
+    person.step()
+    assert person.drive.list_replaced() == ("left",)
+    person.target = None
+    person.run(2.0)
+    world.step = lambda action: World.step(world, 0.5 * np.asarray(action))  # type: ignore[method-assign]
+    person.run(1.0)
+    person.target = Pose(*world.tip.read_pose(world.data))
+    assert np.array_equal(person.step(), person.theirs[-1])
+
+
+def test_actions_beyond_the_range_of_ctrl() -> None:
+    """Environments clip them; where nothing else is said, this proves nothing."""
+    world = World()
+    low, high = world.model.actuator_ctrlrange.T
+    world.step = lambda action: World.step(world, np.clip(action, low, high))  # type: ignore[method-assign]
+    beyond, home = high + 1.0, world.home
+    person, world.home = Person(world), beyond
+    world.policy = lambda t: world.home  # type: ignore[method-assign]
+    person.run(0.4)
+    person.target = Pose(*world.tip.read_pose(world.data))
+    assert np.array_equal(person.step(), person.theirs[-1])
+    person.target, world.home = None, np.where(np.arange(16) % 8 < 3, home, beyond)
+    person.run(0.4)
+    person.target = Pose(*world.tip.read_pose(world.data))
+    person.step()
+    assert person.drive.list_replaced() == ("left",)
+
+
+# --- against an obstacle ----------------------------------------------------------------------------------------------
+
+
+def test_a_push_is_bounded_and_a_hold_gives_it_up() -> None:
+    world = Blocked()
+    person = Person(world)
+    person.run(3.0)
+    person.target = Pose(*world.tip.read_pose(world.data))
+    person.run(2.0)
+    rest = world.measure_push(person.mine[-1])
+    world.is_blocked = True
+    (x, y, z), q = world.tip.read_pose(world.data)
+    person.target = Pose((x, y, z + 0.04), q)
+    person.run(3.0)
+    push = world.measure_push(person.mine[-1]) - rest
+    assert 0.03 < push[2] < 0.04 + 0.011
+    person.target, person.is_held = Pose((x, y, z), q), True
+    person.run(2.0)
+    assert np.linalg.norm(world.measure_push(person.mine[-1]) - rest) < 1e-3
+    world.is_blocked = False
+    person.run(0.5)
+    assert math.dist(world.tip.read_pose(world.data)[0], (x, y, z)) < 1e-3
+
+
+@pytest.mark.parametrize("kind", [World, Osc, MetaWorld, Fetch, OgBench])
+def test_a_robot_that_has_arrived_stays_in_a_hold(kind: Callable[[], World]) -> None:
+    person = Person(kind())
+    person.run(0.4)
+    person.lead()
+    person.run(3.0)
+    person.is_held = True
+    for _ in range(100):
+        person.step()
+        assert person.measure_miss()[0] < 1e-3
+
+
+# --- resets -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [World, Osc, MetaWorld])
+@pytest.mark.parametrize("is_reset", [True, False])
+def test_a_robot_whose_place_is_not_known_is_the_owners(kind: Callable[[], World], *, is_reset: bool) -> None:
+    """After a reset without `mj_forward`, and where physics diverged."""
+    person = Person(kind())
+    world = person.world
+    person.run(0.1)
+    person.lead()
+    data = world.data
+    if is_reset:
+        mujoco.mj_resetData(world.model, data)
+    else:
+        data.xpos[:] = math.nan
+    theirs = world.policy(0.0)
+    robots = world.robots
+    mine = person.drive.apply(theirs, (world.model, data, robots), (person.robot,), {person.robot: person.target}, {})
+    assert mine is theirs
+    assert person.drive.list_replaced() == ()
+
+
+def test_arms_are_compiled_once_for_a_model(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    compiled: list[str] = []
+
+    def compile_arm(model: mujoco.MjModel, robot: RobotSpec) -> ArmModel:
+        compiled.append(robot.name)
+        return ArmModel(model, robot)
+
+    monkeypatch.setattr("iris_session.session.actions.ArmModel", compile_arm)
+    world = World()
+    world.model.actuator_biasprm[8, 1] = 0.0  # the second arm has no position servo
+    person = Person(world)
+    for i in range(4):
+        person.run(0.1)
+        if i == 2:
+            world.data = mujoco.MjData(world.model)
+        mujoco.mj_resetDataKeyframe(world.model, world.data, 0)
+    assert compiled == ["left"]
+    assert [record.getMessage() for record in caplog.records] == ["not moved by the action of World: right"]
+
+
+def test_another_model_that_no_adapter_fits_does_not_end_the_loop(caplog: pytest.LogCaptureFixture) -> None:
+    """A participant may have asked for the reset."""
+    person = Person(World())
+    person.run(0.1)
+    person.lead()
+    person.world = MetaWorld()
+    person.world.size = 16
+    theirs = np.zeros(16)
+    scene = (person.world.model, person.world.data, person.world.robots)
+    target = {"arm": Pose(*person.world.tip.read_pose(person.world.data))}
+    for _ in range(2):
+        assert person.drive.apply(theirs, scene, ("arm",), target, {}) is theirs
+    assert len(person.drive.list_warnings()) == 1
+    assert sum("no adapter fits" in record.getMessage() for record in caplog.records) == 1
 
 
 def test_an_action_that_no_adapter_fits() -> None:
@@ -650,3 +898,56 @@ def test_a_session_without_participants_returns_the_action_itself() -> None:
             session.action(np.zeros(3))
     with iris_session.share(world, config=QUIET) as session, pytest.raises(ConfigError, match='drive="action"'):
         session.action(action)
+
+
+def test_a_hold_is_known() -> None:
+    rig = Rig(control=CONFIG)
+    try:
+        controller = rig.stepper.core.controller
+        ann = Agent(rig)
+        ann.acquire()
+        ann.engage()
+        assert controller.list_held() == ["right"]
+        here = ann.tip()
+        ann.drive(lambda t: here, 0.02, clutch=False)
+        assert rig.loop.driven == ("left",)
+        assert controller.list_held() == ["left", "right"]
+    finally:
+        rig.loop.close()
+
+
+class Simulated:
+    """As MuJoCo Playground: a model, and states that JAX has."""
+
+    def __init__(self) -> None:
+        self.mj_model = load_model(scene_path("handover"))
+
+
+@pytest.mark.usefixtures("simulation")
+def test_a_simulation_that_sync_shows_keeps_its_action(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    action = np.zeros((4, 16))
+    with iris_session.share(Simulated(), config=QUIET, drive="action") as session:
+        assert session.action(action) is action
+        sources = session.processes.reporter.warning_sources
+        before = len(caplog.records), [text for source in sources for text in source()]
+        monkeypatch.setattr(UserLoop, "driven", ("left",))
+        for _ in range(2):
+            assert session.action(action) is action
+        assert len(caplog.records) == before[0] + 1
+        assert len([text for source in sources for text in source()]) == len(before[1]) + 1
+        monkeypatch.setattr(UserLoop, "driven", ())
+        assert [text for source in sources for text in source()] == before[1]
+
+
+@pytest.mark.usefixtures("simulation")
+def test_a_person_who_engages_does_not_break_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody has seen yet what this action means; then the session says so."""
+    world = World()
+    with iris_session.share(world, config=QUIET, drive="action") as session:
+        sources = session.processes.reporter.warning_sources
+        monkeypatch.setattr(UserLoop, "driven", ("left",))
+        action = world.policy(0.0)
+        assert session.action(action) is action
+        assert [text for source in sources for text in source() if "'left'" in text]
