@@ -276,7 +276,7 @@ class Controller:
         return targets
 
     def list_held(self) -> list[str]:
-        """Return the robots that hold: nobody drives them, or the clutch is open."""
+        """Return the robots that hold: without a command, or with an open clutch."""
         return [robot.name for robot, r in zip(self._robots, self._states, strict=True) if r.latch is None]
 
     def get_grippers(self) -> dict[str, float]:

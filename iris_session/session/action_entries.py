@@ -132,7 +132,7 @@ class GripperEntry(NamedTuple):
 
 
 class CtrlReading(NamedTuple):
-    """What entries of a robot are taken for: `ctrl[at] = action[at] * scale + offset`, within `low` and `high`.
+    """Meaning that entries of a robot are taken for: `ctrl[at] = action[at] * scale + offset`, within `low` and `high`.
 
     All but `n_joints` have shape (n,); joints come first, then grippers.
     """
@@ -255,7 +255,7 @@ class JointEntries:
         robot, simulation: Whose joints they are.
         config: Bounds of control.
         at: Places of the joints, in their order.
-        scale, offset: Shape (n,) or one number.
+        law: Scale and offset, shape (n,) or one number each.
         limits: Joint positions, or entries that are ways, lower and upper.
         is_way: Entries are ways from the measured positions.
         arm: The robot's kinematic chain, where it was compiled before.
@@ -269,8 +269,7 @@ class JointEntries:
         simulation: Simulation,
         config: ControlConfig,
         at: Sequence[int],
-        scale: Any = 1.0,
-        offset: Any = 0.0,
+        law: tuple[Any, Any] = (1.0, 0.0),
         limits: tuple[Any, Any] = (-math.inf, math.inf),
         *,
         is_way: bool = False,
@@ -279,7 +278,7 @@ class JointEntries:
         model, data = simulation
         self._data: Any = data
         self.at = np.array(at, np.intp)
-        self._scale, self._offset = np.broadcast_to(scale, len(at)), np.broadcast_to(offset, len(at))
+        self._scale, self._offset = (np.broadcast_to(part, len(at)) for part in law)
         self._arm, self._tip = arm or ArmModel(model, robot), Tip(model, robot)
         self._qpos = np.array([model.jnt_qposadr[j] for j in self._arm.joint_ids], np.intp)
         ids = np.array(self._arm.joint_ids, np.intp)
@@ -389,7 +388,7 @@ class RobotDrive:
     ) -> None:
         """Replace the robot's entries by those that follow `target`, `T_world_tip`, with the gripper at `share`.
 
-        `is_held`: nobody moves the target, because the clutch is open.
+        `is_held`: the clutch is open.
         """
         arm, T_tip, T_target = self._entries.arm, self._tip.read_pose(self._data), (target.p, target.q)
         T_frame, way = arm.read_pose(), measure_way(T_tip, T_target)

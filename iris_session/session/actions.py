@@ -7,8 +7,8 @@ Each step measures the end effector again. What is missing when its target rests
 the robot arrives although its controller is soft. Nothing jumps: ways stay within the action space, and positions
 change by at most what the speed limits allow, also when a robot is given back.
 
-Where only the shape says what an action means, it is a guess: nobody drives by it until steps of the environment have
-proved it. Nothing that a participant does raises an error in the program's loop.
+Where only the shape says what an action means, it is a guess: participants drive by it once steps of the environment
+have proved it. Nothing that a participant does raises an error in the program's loop.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ class ActionDrive:
         return min(max(period, float(model.opt.timestep)), MAX_PERIOD_S)
 
     def _prove(self, before: Floats, data: mujoco.MjData) -> None:
-        """Compare `ctrl` after a step with the action before it, for the robots that nobody drove in it."""
+        """Compare `ctrl` after a step with the action before it, for robots that were the owner's in it."""
         for name, drive in self._drives.items():
             if drive.reading is not None and name not in self._replaced:
                 fits = drive.reading.compare(before, data.ctrl)
@@ -295,7 +295,7 @@ def _find_part(
         if not is_way:
             return view.make_joints(robot, places)
         ends = controller.input_min, controller.input_max
-        return view.make_joints(robot, places, 1.0 / _read_unit(controller), 0.0, ends, is_way=True)
+        return view.make_joints(robot, places, (1.0 / _read_unit(controller), 0.0), ends, is_way=True)
     site = read_attribute(controller, "ref_name") or read_attribute(controller, "eef_name")
     if not kind.startswith(("OSC", "IK")) or not isinstance(site, str):
         return None
@@ -423,7 +423,7 @@ def _find_ctrl(view: EnvironmentView) -> Entries:
         if robot.kind == HAND or not np.isfinite(slope).all():
             continue
         arm = view.make_joints(
-            robot, at.tolist(), slope / scale[at], (shift - offset[at]) / scale[at], (laws.lower, laws.upper)
+            robot, at.tolist(), (slope / scale[at], (shift - offset[at]) / scale[at]), (laws.lower, laws.upper)
         )
         grippers = []
         for one in robot.gripper_actuators:

@@ -88,7 +88,7 @@ PAUSED_STEP_S: Final = 0.01
 PAUSED_STEP_TICKS: Final = 10
 #: The log names an overrun at most so often.
 OVERRUN_LOG_PERIOD_NS: Final = 10_000_000_000
-#: What `action()` says, once somebody drives a simulation that `sync` shows.
+#: What `action()` says once participants drive a simulation that `sync` shows.
 NO_ACTION: Final = (
     "no adapter fits the action of a simulation that sync() shows, so action() returns it as it is: read "
     "session.targets() and session.grippers(), and write the action of the robots in session.driven_robots() yourself"
@@ -401,7 +401,7 @@ class Session(SessionBase):
             return self._actions.apply(action, scene, driven, self.targets(), self.grippers(), held)
 
     def _warn_of_action(self, loop: UserLoop) -> None:
-        """Warn, once somebody drives, that `action()` has no part in a simulation that `sync` shows."""
+        """Warn once participants drive that `action()` has no part in a simulation that `sync` shows."""
         if self._warns_of_action or not loop.driven:
             return
         self._warns_of_action = True

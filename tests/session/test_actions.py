@@ -151,6 +151,10 @@ class Ways(World):
 class WaysAndOpening(World):
     """Ways of the joints, and what the grippers are to be."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.data.ctrl[:] = 0.0
+
     def step(self, action: Any) -> tuple[Any, ...]:
         ctrl = self.data.ctrl + 0.05 * np.asarray(action)
         ctrl[[7, 15]] = np.asarray(action)[[7, 15]]
