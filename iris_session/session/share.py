@@ -123,7 +123,7 @@ def _complete_config(config: SessionConfig | None, output: str) -> tuple[Session
     if config is None:
         config = SessionConfig()
         ports = (config.control_port - 1, config.control_port, config.state_port)
-        if not all(is_port_free(config.host, port) for port in ports):  # of another session on this machine
+        if not all(is_port_free(config.host, port) for port in ports if port > 0):  # of another session on this machine
             config = dataclasses.replace(config, control_port=0, state_port=0)
             notes.append(OTHER_PORTS)
     elif not isinstance(config, SessionConfig):
