@@ -134,21 +134,24 @@ class GripperEntry(NamedTuple):
 class CtrlReading(NamedTuple):
     """Meaning that entries of a robot are taken for: `ctrl[at] = action[at] * scale + offset`, within `low` and `high`.
 
-    All but `n_joints` have shape (n,); joints come first, then grippers.
+    Joints come first, then grippers: shape (n,). `qpos`: addresses of the joints, `slope` and `shift` of the `ctrl`
+    that holds each where it is, shape (n_joints,).
     """
 
     at: NDArray[np.intp]
-    n_joints: int
+    qpos: NDArray[np.intp]
+    slope: Floats
+    shift: Floats
     scale: Floats
     offset: Floats
     low: Floats
     high: Floats
 
-    def compare(self, action: Floats, ctrl: Floats) -> bool | None:
+    def compare(self, action: Floats, ctrl: Floats, qpos_before: Floats, ctrl_before: Floats) -> bool | None:
         """Return whether `ctrl` after a step is what `action` was taken for; `None` if it is, but proves nothing.
 
-        An action of about zero fits other meanings, too, such as ways from where the joints are, and so does one
-        that is out of range.
+        Other meanings are ways from where the joints were, or from their command before: what an action says counts
+        only where it differs from these, is not about zero, and within the range.
         """
         way = action[self.at] * self.scale
         meant, value = way + self.offset, ctrl[self.at]
@@ -156,8 +159,11 @@ class CtrlReading(NamedTuple):
         off = np.minimum(np.abs(value - meant), np.abs(value - bounded))
         if not (off <= ROUNDING * np.maximum(1.0, np.maximum(np.abs(meant), np.abs(self.offset)))).all():
             return False
-        is_telling = (np.abs(way) > TELLING) & (meant == bounded)
-        return True if is_telling[: self.n_joints].any() else None
+        n = len(self.qpos)
+        is_telling = ((np.abs(way) > TELLING) & (meant > self.low) & (meant < self.high))[:n]
+        for other in (qpos_before[self.qpos] * self.slope + self.shift, ctrl_before[self.at][:n]):
+            is_telling &= np.abs(self.offset[:n] - other) > TELLING
+        return True if is_telling.any() else None
 
 
 class RobotEntries(NamedTuple):

@@ -70,6 +70,7 @@ class ActionDrive:
         self._before: Floats | None = None
         self._time = -math.inf
         self._replaced: tuple[str, ...] = ()
+        self._state_before: tuple[Floats, Floats] = (np.zeros(0), np.zeros(0))  # qpos and ctrl at the newest action
         self._proofs: dict[str, int] = {}  # steps in a row that have proved a guess
         self._refused: dict[str, str] = {}  # why robots that participants drive are the owner's
         self._logged: set[str] = set()
@@ -112,6 +113,7 @@ class ActionDrive:
             if drive.is_returning:
                 replaced.append(name)
         self._before, self._replaced = mine, tuple(replaced)
+        self._state_before = scene[1].qpos.copy(), scene[1].ctrl.copy()
         if not replaced and np.array_equal(mine, theirs):
             return action
         return _convert(mine, action)
@@ -144,24 +146,29 @@ class ActionDrive:
         return min(max(period, float(model.opt.timestep)), MAX_PERIOD_S)
 
     def _prove(self, before: Floats, data: mujoco.MjData) -> None:
-        """Compare `ctrl` after a step with the action before it, for robots that were the owner's in it."""
+        """Compare `ctrl` after a step with the action before it."""
         for name, drive in self._drives.items():
-            if drive.reading is not None and name not in self._replaced:
-                fits = drive.reading.compare(before, data.ctrl)
+            if drive.reading is not None:
+                fits = drive.reading.compare(before, data.ctrl, *self._state_before)
                 self._proofs[name] = 0 if fits is False else self._proofs.get(name, 0) + (fits is True)
+                if fits is False:  # of what was commanded for a participant, too
+                    drive.forget()
 
     def _refuse(self, name: str, targets: Mapping[str, Pose]) -> str:
         """Return why a participant cannot drive a robot, empty if that is possible."""
         drive, kind = self._drives.get(name), type(self._environment).__name__
         if drive is None:
             return self._log(f"{name!r} cannot be driven: the action of {kind} does not move it, as far as is known")
-        if drive.reading is None or drive.is_returning or name not in targets:
+        if drive.reading is None or name not in targets:
             return ""
         if self._proofs.get(name, 0) < PROOFS:
             return self._log(
                 f"{name!r} cannot be driven yet: no adapter fits the action of {kind} until two steps in a row have "
-                "set ctrl to the joint positions in it, some not zero; if it means others, read session.targets()"
+                "set ctrl to the joint positions in it (zeros prove nothing: step with some of 0.1, for example); if "
+                "it means others, read session.targets()"
             )
+        if drive.is_returning:
+            return ""
         # The robot must not leap to a target that has gone ahead meanwhile.
         return self._refused.get(name, "") if not drive.is_near(targets[name]) else ""
 
@@ -431,7 +438,10 @@ def _find_ctrl(view: EnvironmentView) -> Entries:
             opened, closed = ((value - offset[k]) / scale[k] for value in (one.open, one.closed))
             grippers.append(GripperEntry(k, opened, closed, paces=True))
         every = np.array([*at.tolist(), *(gripper.at for gripper in grippers)], np.intp)
-        reading = CtrlReading(every, len(at), scale[every], offset[every], least[every], most[every])
+        qpos = np.array(
+            [view.model.jnt_qposadr[find_id(view.model, "joint", joint)] for joint in robot.joints], np.intp
+        )
+        reading = CtrlReading(every, qpos, slope, shift, scale[every], offset[every], least[every], most[every])
         found[robot.name] = RobotEntries(arm, tuple(grippers), reading)
     return found
 

@@ -23,6 +23,7 @@ child that is forked does not belong to the sessions of its parent.
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import logging
 import os
@@ -158,23 +159,27 @@ def is_alike(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
     return len(names[0] & names[1]) > ALIKE * len(names[0] | names[1])
 
 
+def _get_same(value: Any) -> Any:
+    return value
+
+
 class MethodWrapper:
     """Stands for a method on the instance of an environment. A copy or a pickle of the environment has its own method
     instead: a planner that steps a copy does not step the original.
     """
 
-    def __init__(self, owner: Any, name: str, original: Callable[..., Any], call: Callable[..., Any]) -> None:
-        self._owner, self._name, self._call = owner, name, call
-        functools.update_wrapper(self, original)
+    def __init__(self, original: Callable[..., Any], call: Callable[..., Any]) -> None:
+        self._original, self._call = original, call
+        functools.update_wrapper(self, original, updated=())  # not its attributes: it may be a wrapper of ours, too
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         return self._call(*args, **kwargs)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
-        return getattr(type(self._owner), self._name).__get__(memo.get(id(self._owner), self._owner))
+        return copy.deepcopy(self._original, memo)  # a bound method is bound to the copy
 
     def __reduce__(self) -> Any:
-        return getattr, (self._owner, self._name)  # of the copy, which has no attribute of its own yet
+        return _get_same, (self._original,)
 
 
 class WrappedMethod:
@@ -195,7 +200,7 @@ class WrappedMethod:
                 return original(*args, **kwargs)
             return around(lambda: original(*args, **kwargs))
 
-        self._wrapper = MethodWrapper(environment, name, original, call)
+        self._wrapper = MethodWrapper(original, call)
         try:
             setattr(environment, name, self._wrapper)
         except (AttributeError, TypeError) as error:
@@ -252,7 +257,9 @@ class Attachment:
         self._other_ns = 0
         #: Other data that is not followed, by its identity, and when that is decided again.
         self._refused: tuple[int, int] = (0, 0)
-        self._fault = ""  # why the newest model of the program is not followed
+        #: Data of the program that the session could not go on with, and why.
+        self._failed: Any = None
+        self.fault = ""
         self._has_warned = False
         #: Called after every step and reset of the environment, with true for a reset.
         self.on_environment: Callable[[bool], None] = lambda is_reset: None
@@ -329,17 +336,18 @@ class Attachment:
 
     def _go_on_with(self, model: Any, data: Any) -> bool:
         """Go on with other data; return false, with a warning, when the session cannot."""
-        if self._fault and self._refused[0] == id(data):
+        if data is self._failed:
             return False
         try:
             self._change_model(model, data)
         except IrisError as error:
-            self._refused = id(data), self._loop.read_clock() + ASK_AGAIN_NS
-            self._fault = f"the new model is not shared, the old one stands still: {error}"
-            _log.warning("%s", self._fault)
+            fault = f"the new model is not shared, the old one stands still: {error}"
+            if fault != self.fault:
+                _log.warning("%s", fault)
+            self._failed, self.fault = data, fault
             return False
         move_loop(self, data)
-        self._other_since_ns, self._fault = None, ""
+        self._other_since_ns, self._failed, self.fault = None, None, ""
         return True
 
     def _is_successor(self, model: Any, data: Any, stands_ns: int) -> bool:
@@ -357,7 +365,7 @@ class Attachment:
         """Return what the owner should know, one line each."""
         since_ns = self._other_since_ns
         is_elsewhere = self.environment is None and since_ns is not None and self._other_ns - since_ns > WARN_AFTER_NS
-        return (*((self._fault,) if self._fault else ()), *((ELSEWHERE,) if is_elsewhere else ()))
+        return (*((self.fault,) if self.fault else ()), *((ELSEWHERE,) if is_elsewhere else ()))
 
     def follow_environment(self) -> bool:
         """Go on with the model and data that the environment has now; return whether they are others."""

@@ -164,7 +164,7 @@ class Session(SessionBase):
         self._next_overrun_log_ns = 0
         self.recording_fault = ""
         self._start_notes: tuple[str, ...] = ()
-        self._process = os.getpid()
+        self._process = 0  # in which it was started
         self._log_robot_notices()
 
     @property
@@ -200,7 +200,7 @@ class Session(SessionBase):
                     self._past.close()  # else no other process could resume it until this one ends
                 raise
             processes.reporter.warning_sources.append(lambda: [text[:MAX_TEXT] for text in self._robot_notices])
-            self._processes = processes
+            self._processes, self._process = processes, os.getpid()
 
     def close(self) -> bool:
         """Notify clients, finish the recording, end every child process. May be called twice.
@@ -211,7 +211,7 @@ class Session(SessionBase):
         Returns:
             False when the recording is incomplete; `recording_fault` says why.
         """
-        if os.getpid() != self._process:  # a child that was forked has none of it
+        if self._process not in (0, os.getpid()):  # a child that was forked has none of it
             return True
         self._stop.set()
         self._is_closed = True
@@ -380,8 +380,10 @@ class Session(SessionBase):
 
         Raises:
             ConfigError: No adapter fits this environment and action, or the session was not shared in this way.
-            OwnershipError: The session is closed.
+            OwnershipError: The session was not started.
         """
+        if self._is_closed or os.getpid() != self._process:  # by another thread; or the parent has the session
+            return action
         self._require_started()
         if self._attachment is None and self._user_loop is not None and self.config.control.output == OUTPUT_TARGETS:
             self._warn_of_action(self._user_loop)
@@ -394,7 +396,9 @@ class Session(SessionBase):
         loop = self._require_user_loop()
         self._attachment.follow_environment()
         with loop.lock:
-            driven, scene = loop.driven, (loop.model, loop.data, self.robots)
+            # The data of a model that is not followed says nothing about where robots are.
+            driven = () if self._attachment.fault else loop.driven
+            scene = loop.model, loop.data, self.robots
             if not driven or self._core is None:
                 return self._actions.apply(action, scene, (), {}, {})
             held = self._core.controller.list_held()

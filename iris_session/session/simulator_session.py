@@ -147,6 +147,7 @@ class SimulatorSession(ScenePublisher):
             targets = {name: TipTarget(poses[name], grippers.get(name)) for name in driven}
             self._adapter.apply_targets((self._measure_tips(left) if left else {}) | targets)
         except Exception as error:  # of the simulator: its program goes on as without a session
+            self._driven = (*driven, *left)  # the next step stops them
             self._note_fault(error)
 
     def _measure_tips(self, names: Sequence[str]) -> dict[str, TipTarget]:

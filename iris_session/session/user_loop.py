@@ -289,7 +289,7 @@ class UserLoop:
     def driven(self) -> tuple[str, ...]:
         """Robots that the session drives: a participant holds them and has engaged, or they are being given back."""
         sharing = self._stepper.core.sharing
-        return () if sharing is None else sharing.driven
+        return () if sharing is None or self.is_closed or self.has_ended else sharing.driven
 
     def change_model(
         self, model: mujoco.MjModel, data: mujoco.MjData, prepare: Callable[[bytes], NextScene | None]
@@ -333,7 +333,7 @@ class UserLoop:
             if (self._ctrl.indices.size or self._forces.indices.size) and self._read_plant():
                 self._stepper.core.write_rest_controls(self._plant)
                 self._write_controls()
-            self._ctrl = _BorrowedArray(self._data.ctrl)
+            self._ctrl, self._forces = _BorrowedArray(self._data.ctrl), _BorrowedArray(self._data.xfrc_applied)
 
     def list_warnings(self) -> tuple[str, ...]:
         """Return what the owner should know, one line each."""
