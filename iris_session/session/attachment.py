@@ -175,7 +175,11 @@ class MethodWrapper:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         return self._call(*args, **kwargs)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+    def __deepcopy__(self, memo: dict[Any, Any]) -> Any:
+        marker = "MethodWrapper", id(self)
+        if marker in memo:  # an environment that copies itself, and does not note its copy
+            return self._original
+        memo[marker] = True
         return copy.deepcopy(self._original, memo)  # a bound method is bound to the copy
 
     def __reduce__(self) -> Any:
