@@ -170,7 +170,9 @@ def make_aloha(name: str) -> Case:
     import gymnasium
     from gym_aloha.constants import START_ARM_POSE
 
-    environment = gymnasium.make(f"gym_aloha/{name}", obs_type="pixels_agent_pos")
+    environment = gymnasium.make(
+        f"gym_aloha/{name}", obs_type="pixels_agent_pos", observation_width=64, observation_height=48
+    )
     start = np.array([*START_ARM_POSE[:6], 0.0, *START_ARM_POSE[8:14], 0.0])
     return Case(environment, (start - 0.02, start + 0.02))
 
