@@ -68,7 +68,7 @@ class Case:
 
 @dataclass
 class Watch:
-    """What the simulator said, by session time, and how far from it what was received is."""
+    """States of the simulator by session time, and the distance of received states from them."""
 
     begun: list[int] = field(default_factory=list)
     truth: list[tuple[Mapping[str, Pose], Mapping[str, Any]]] = field(default_factory=list)

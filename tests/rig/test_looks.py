@@ -39,7 +39,7 @@ class Task:
 
     @property
     def spec(self) -> SceneSpec:
-        """The scene that the client is told to draw."""
+        """The scene specification of the client."""
         return decode_scene(self.store.get(self.client.mirror.scene_hash))
 
     def see(self, name: str) -> Visual:

@@ -147,7 +147,7 @@ def test_collision_shapes_beside_visuals_are_hidden_as_in_robosuite(tmp_path: Pa
     [
         ('size=".09" group="1" contype="0" conaffinity="0"', 'size=".09" group="1"'),  # all collides
         ('<geom name="pad" size=".05" group="0"/>', '<geom size=".05" group="0" contype="0" conaffinity="0"/>'),
-        ('group="1" contype', 'group="3" contype'),  # the visuals are where nobody looks
+        ('group="1" contype', 'group="3" contype'),  # the visuals are in a group that is not shown
         ('<body name="tip">', '<geom size=".1"/><body name="tip">'),  # most bodies have no visual
     ],
 )

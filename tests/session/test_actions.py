@@ -300,7 +300,7 @@ class OscAbsolute(Osc):
 
 
 class Suite:
-    """What a suite shows: the robots of an environment are not those of a session."""
+    """An environment has a `robots` of its own, which are not those of a session."""
 
     def __init__(self, world: Osc) -> None:
         self.robots, self.sim, self.control_timestep = world.robots_of_suite, world.sim, PERIOD
@@ -947,7 +947,7 @@ def test_a_simulation_that_sync_shows_keeps_its_action(
 
 @pytest.mark.usefixtures("simulation")
 def test_a_person_who_engages_does_not_break_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody has seen yet what this action means; then the session says so."""
+    """The meaning of this action is not proved yet, and the session says so."""
     world = World()
     with iris_session.share(world, config=QUIET, drive="action") as session:
         sources = session.processes.reporter.warning_sources
