@@ -22,8 +22,6 @@ from iris_session.protocol.names import AlignmentKind, AssignmentPolicy, LeaseMo
 from iris_session.system.files import write_output
 
 if TYPE_CHECKING:
-    import mujoco
-
     from anchors.pose import PoseTuple
     from iris_session.client import Client
     from iris_session.demo.named_scenes import NamedScene
@@ -383,17 +381,6 @@ def format_scene_names() -> str:
 
     width = max(map(len, SCENE_NAMES))
     return "\n".join(f"  {name:<{width}}  {what}" for name, what in SCENE_NAMES.items())
-
-
-def explain_no_robots(model: mujoco.MjModel) -> str:
-    """Return one line that says why no robot was found in a model, and what a robot needs."""
-    from iris_session.physics.limbs import MIN_JOINTS
-
-    has = f"the model has {model.nu} actuators and {model.njnt} joints" if model.nu else "the model has no actuators"
-    return (
-        f"no robots found, so participants can only watch and take objects: a robot is an arm of at least "
-        f"{MIN_JOINTS} actuated joints or a hand, no leg, and {has}"
-    )
 
 
 def to_printable(text: str) -> str:

@@ -18,7 +18,6 @@ from iris_session.cli.common import (
     CommandError,
     add_command,
     add_json_option,
-    explain_no_robots,
     make_number_type,
     open_scene,
     print_json,
@@ -108,7 +107,7 @@ def run_robots(arguments: argparse.Namespace) -> int:
     """Print the robots that a session offers, and those that can only be watched."""
     from iris_session.control.config import ControlConfig
     from iris_session.physics import find_objects
-    from iris_session.session.robots import find_drivable_robots
+    from iris_session.session.robots import explain_no_robots, find_drivable_robots
 
     model = open_scene(arguments.scene).model
     found = find_drivable_robots(model, ControlConfig(), all_limbs=arguments.all)

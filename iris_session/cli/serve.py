@@ -16,7 +16,6 @@ from iris_session.cli.common import (
     add_command,
     add_json_option,
     add_session_options,
-    explain_no_robots,
     format_scene_names,
     open_scene,
     parse_seconds,
@@ -248,6 +247,8 @@ def run(arguments: argparse.Namespace) -> int:
     session = resume_session(arguments) if arguments.resume is not None else create_session(arguments)
     hint = ""
     if not session.robots and arguments.robots != "none":
+        from iris_session.session.robots import explain_no_robots
+
         tip = f"see `iris-session robots {arguments.scene} --all`, or give them with --robots FILE"
         hint = f"{explain_no_robots(session.model)}; {tip}"
     return _serve(arguments, session, lambda _: hint, ", ".join(robot.name for robot in session.robots))

@@ -1,10 +1,10 @@
 """`Attachment`: a session in a script that stays as it is, by the step of its data or of its environment.
 
 While a session is attached, `mujoco.mj_step` and `mj_step2` are Python functions that ask for the data they are given
-whether it is attached: a session tick around every step of that data, the original for all others (some 0.1 us). They
-replace the originals in every module that holds them under any name, so `from mujoco import mj_step` is wrapped, too.
-MuJoCo's control callback is not used: it is one per process, it keeps MuJoCo from compiling any model, and it fires in
-`mj_forward` and four times a step under RK4.
+whether it is attached: a session tick around every step of that data, the original for all others (some microseconds).
+They replace the originals in every module that holds them under any name, so `from mujoco import mj_step` is wrapped,
+too. MuJoCo's control callback is not used: it is one per process, it keeps MuJoCo from compiling any model, and it
+fires in `mj_forward` and four times a step under RK4.
 
 What is not seen: functions bound in other ways before (default arguments, `functools.partial`, C++), `mujoco.rollout`,
 and threads of `mujoco.viewer` that were compiled in. An `environment` is for these: its own `step` is wrapped on the
@@ -164,8 +164,8 @@ def _get_same(value: Any) -> Any:
 
 
 class MethodWrapper:
-    """Stands for a method on the instance of an environment. A copy or a pickle of the environment has its own method
-    instead: a planner that steps a copy does not step the original.
+    """Stands for a method on the instance of an environment. A deep copy or a pickle of the environment has its own
+    method instead: a planner that steps it does not step the original.
     """
 
     def __init__(self, original: Callable[..., Any], call: Callable[..., Any]) -> None:
@@ -374,7 +374,10 @@ class Attachment:
     def follow_environment(self) -> bool:
         """Go on with the model and data that the environment has now; return whether they are others."""
         found = find_simulation(self.environment)
-        if found is None or found.data is None or found.data is self._loop.data:
+        if found is None or found.data is None:
+            return False
+        if found.data is self._loop.data:  # perhaps again
+            self._failed, self.fault = None, ""
             return False
         return self._go_on_with(*found)
 

@@ -63,7 +63,7 @@ from iris_session.session.config import SessionConfig, check_arguments, check_ob
 from iris_session.session.core import SessionCore
 from iris_session.session.errors import ConfigError, ResumeError
 from iris_session.session.robots import RobotChoice, choose_robots, list_notices_again
-from iris_session.session.verification import ReplayCore
+from iris_session.session.verification import NEWER_CONTROL, ReplayCore
 from iris_session.system.files import Replacement
 
 NOTE_FILE: Final = "resume.tokens"
@@ -165,8 +165,7 @@ class PastSession:
         if given.name not in (plain.name, self.header.session_name):
             raise ConfigError(f"a resumed session keeps its name, {self.header.session_name!r}")
         # What a recording made before does not name is off there, and on in the default of a script that is the same.
-        newer = ("solver", "compensate_sag", "few_joints_orientation_cost", "target_grippers")
-        default = {name: getattr(plain.control, name) for name in newer}
+        default = {name: getattr(plain.control, name) for name in NEWER_CONTROL}
         same = {name: value for name, value in default.items() if getattr(given.control, name) == value}
         control = msgspec.structs.replace(core.control, **same)
         for name, had in (("authority", authority), ("control", control)):

@@ -13,6 +13,7 @@ import mujoco
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig, ControlError
 from iris_session.control.controller import check_robot
 from iris_session.physics import FoundRobots, PhysicsError, RobotNotice, World, find_robots, load_robots_toml
+from iris_session.physics.limbs import MIN_JOINTS
 from iris_session.physics.names import list_body_names, list_element_names
 from iris_session.protocol.specs import RobotSpec
 from iris_session.session.errors import ConfigError
@@ -55,6 +56,15 @@ def find_drivable_robots(model: mujoco.MjModel, control: ControlConfig, *, all_l
         else:
             robots.append(robot)
     return FoundRobots(tuple(robots), tuple(notices.values()), found.hidden)
+
+
+def explain_no_robots(model: mujoco.MjModel) -> str:
+    """Return one line that says why no robot was found in a model, and what a robot needs."""
+    has = f"the model has {model.nu} actuators and {model.njnt} joints" if model.nu else "the model has no actuators"
+    return (
+        f"no robots found, so participants can only watch and take objects: a robot is an arm of at least "
+        f"{MIN_JOINTS} actuated joints or a hand, no leg, and {has}"
+    )
 
 
 def choose_robots(model: mujoco.MjModel, choice: RobotChoice, control: ControlConfig) -> FoundRobots:

@@ -382,7 +382,7 @@ class Session(SessionBase):
             ConfigError: No adapter fits this environment and action, or the session was not shared in this way.
             OwnershipError: The session was not started.
         """
-        if self._is_closed or os.getpid() != self._process:  # by another thread; or the parent has the session
+        if self._is_closed or self._process not in (0, os.getpid()):  # by another thread; or the parent has the session
             return action
         self._require_started()
         if self._attachment is None and self._user_loop is not None and self.config.control.output == OUTPUT_TARGETS:

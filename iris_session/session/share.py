@@ -19,7 +19,7 @@ from iris_session.protocol.specs import ObjectSpec
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError
 from iris_session.session.resume import is_port_free
-from iris_session.session.robots import RobotChoice
+from iris_session.session.robots import RobotChoice, explain_no_robots
 from iris_session.session.session import Session
 from iris_session.session.session_base import SessionBase
 from iris_session.session.simulation import require_simulation, unwrap_data, unwrap_model
@@ -30,10 +30,6 @@ S = TypeVar("S", bound=SessionBase)
 
 #: How participants drive, and the output of control that this means.
 DRIVES: Final = {"ctrl": OUTPUT_CTRL, "action": OUTPUT_TARGETS}
-NO_ROBOTS: Final = (
-    "no robots found, so participants can only watch and take objects: a robot is an arm of at least three actuated "
-    "joints or a hand; robots= takes others, legs and fingers by their names"
-)
 OTHER_PORTS: Final = "the usual ports are in use, by another session perhaps: this one is at session.address"
 NOT_RECORDED: Final = "not recorded, because rerun is not installed: pip install 'iris-session[recording]'"
 
@@ -110,7 +106,7 @@ def share(
     else:
         session = _start(SimulatorSession(adapter, config, robots=robots, drives=drive == "ctrl"))
     if isinstance(session, Session) and robots in (None, "auto") and not session.robots and not session._robot_notices:
-        notes.append(NO_ROBOTS)
+        notes.append(explain_no_robots(session.model))
     session._start_notes = tuple(notes)
     for note in notes:
         _log.warning("%s", note)

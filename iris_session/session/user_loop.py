@@ -19,8 +19,8 @@ and e-stops go on while a script plots, trains or waits at a prompt.
 What one step computes is applied until the next `begin_tick`, however many `mj_step` lie between: control counts the
 ticks of the rounds before, so that robots keep their speed. At the end robots that are driven are left at rest.
 
-While no participant drives, an attached program is only looked at: `note_step` after each of its steps costs a
-microsecond, and `look` takes a session step at the rate of the state, on the state after the program's newest step.
+While no participant drives, an attached program is only looked at: `note_step` after each of its steps costs some
+microseconds, and `look` takes a session step at the rate of the state, on the state after the program's newest step.
 """
 
 from __future__ import annotations

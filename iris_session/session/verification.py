@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
@@ -33,6 +34,10 @@ class _RecordedControlConfig(ControlConfig, frozen=True):
     compensate_sag: bool = False
     few_joints_orientation_cost: float | None = None
     target_grippers: bool = False
+
+
+#: Settings of control that recordings got later; what one of them does not name was off when it was made.
+NEWER_CONTROL: Final = ("solver", *_RecordedControlConfig.__annotations__)
 
 
 class _RecordedConfig(CoreConfig, frozen=True):

@@ -521,6 +521,12 @@ def test_a_model_that_the_session_cannot_take_is_a_warning(owned: Owned) -> None
         owned.environment.step()
     (warning,) = owned.attachment.list_warnings()
     assert "out of range" in warning
+    refused, owned.environment.data = owned.environment.data, owned.data
+    owned.environment.step()
+    assert owned.attachment.list_warnings() == (), "the program is at the old data again"
+    owned.environment.data = refused
+    owned.environment.step()
+    assert owned.attachment.list_warnings() != ()
     owned.error = None
     owned.environment.data = make_data(owned.environment.model)
     owned.environment.step()

@@ -203,6 +203,8 @@ def test_what_cannot_be_shared_is_one_line(model: mujoco.MjModel, tmp_path: Path
         with pytest.raises(error, match=text) as caught:
             iris_session.share(x, config=QUIET)
         assert "\n" not in str(caught.value)
+    with pytest.raises(OwnershipError, match="not started"):
+        Session(model, config=QUIET).action([0.0])
     with pytest.raises(TypeError, match="SessionConfig"):
         iris_session.share(model, config={"name": "lab"})  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="'ctrl', 'action'"):
