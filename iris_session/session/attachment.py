@@ -312,7 +312,7 @@ class Attachment:
         """
         try:
             act()
-        except OwnershipError as error:
+        except Exception as error:
             if self._loop.has_ended and not self._loop.is_closed:
                 _log.error("the program goes on without its session: %s", error)
                 self._loop.close()  # robots that were driven are left at rest

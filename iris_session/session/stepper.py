@@ -351,6 +351,10 @@ class Stepper:
         """Return whether `publish` would publish now."""
         return self.last is not None and end_ns >= self._next_state_ns
 
+    def make_state_due(self) -> None:
+        """Publish the state after the next step, whenever the newest one was published."""
+        self._next_state_ns = min(self._next_state_ns, self.clock())
+
     def publish(self, end_ns: int) -> None:
         """Publish the rigid state if it is due. `end_ns`: session time of the end of the tick it belongs to."""
         if not self.is_state_due(end_ns):

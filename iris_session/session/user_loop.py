@@ -13,20 +13,22 @@ the session gives the robot back, and at once after a reset.
 The state passed to the core is always finite. While the user's is not, the last finite one replaces it and no tick is
 taken: robots hold, participants are notified, and must clutch again afterwards.
 
-A helper thread takes zero-tick steps, on the twin alone, when the user's loop is silent for 20 ms: leases, heartbeats
+While no participant drives, an attached program is only looked at: `look` copies the state after a step, which takes
+some microseconds, and a helper thread takes the session's step on the newest copy at the rate of the state. It writes
+nothing into the user's data: what it has begun to drive is written by the program's next step, which is a tick.
+
+The helper also takes zero-tick steps, on the twin alone, when the user's loop is silent for 20 ms: leases, heartbeats
 and e-stops go on while a script plots, trains or waits at a prompt.
 
 What one step computes is applied until the next `begin_tick`, however many `mj_step` lie between: control counts the
 ticks of the rounds before, so that robots keep their speed. At the end robots that are driven are left at rest.
-
-While no participant drives, an attached program is only looked at: `note_step` after each of its steps costs some
-microseconds, and `look` takes a session step at the rate of the state, on the state after the program's newest step.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from typing import Final
 
@@ -140,6 +142,11 @@ class UserLoop:
         self.overwritten = 0
         self.is_attached = False
         self.unseen_s = 0.0
+        self._wake = threading.Event()
+        #: State of the newest look, until a step is taken on it or on a newer one.
+        self._noted: deque[Floats] = deque(maxlen=1)
+        self._has_idled = False  # since the newest look
+        self._drives = False
         self._use(model, data)
         #: The newest finite state of the user's data.
         self._plant = read_plant_state(model, data)
@@ -162,11 +169,10 @@ class UserLoop:
             for spec in scene.robots
         }
         self._ctrl, self._forces = _BorrowedArray(data.ctrl), _BorrowedArray(data.xfrc_applied)
+        self._state_size = mujoco.mj_stateSize(model, STATE)
         self._ctrl_at = mujoco.mj_stateSize(model, STATE & (_CTRL - 1))
         self._forces_at = mujoco.mj_stateSize(model, STATE & (_XFRC - 1))
-        #: State that was looked at and not due, which the helper thread shows when no other follows.
-        self._noted = np.empty(mujoco.mj_stateSize(model, STATE))
-        self._has_noted = False
+        self._noted.clear()
         self._left: dict[str, Floats] = {}  # joints of driven robots after the newest round in which time passed
 
     @property
@@ -182,7 +188,7 @@ class UserLoop:
     @property
     def is_driving(self) -> bool:
         """True while the session writes something, so that every step of the program must be a tick."""
-        return bool(self._ctrl.indices.size or self._forces.indices.size or self.driven)
+        return bool(self._drives or self._ctrl.indices.size or self._forces.indices.size)
 
     @property
     def is_closed(self) -> bool:
@@ -220,27 +226,35 @@ class UserLoop:
         self._usual_ns, self._round_ns = max(self._round_ns, 1), now_ns - began_ns
 
     def look(self) -> None:
-        """Take a session step on the data as it is, if the state is due. While nothing is driven.
+        """Show the data as it is, if the state is due. While nothing is driven.
 
-        If it is not due, the helper thread shows this state should the program fall silent.
+        The helper thread takes the step, and shows a state that is not due should the program fall silent. A reset is
+        shown at once.
         """
-        if not (self._was_reset or self._stepper.last is None or self._stepper.is_state_due(self._last_tick_ns)):
+        self._require_open()
+        self._began_time = None
+        self._left = {}
+        if self._was_reset or self._stepper.last is None:
             with self.lock:
-                mujoco.mj_getState(self._model, self._data, self._noted, STATE)
-                self._has_noted = True
+                self._show_reset()
             return
-        with self.lock:
-            self._require_open()
-            if self._read_plant():
-                self._post_reset()
-                self._began_time = None
-                self._left = {}
-                self._stepper.step(1, self._plant)
-                self._write_controls()
-            else:
-                self._stepper.step(0, self._plant)
-            self._processes.supervise(self._stepper)
-            self._last_tick_ns = self._stepper.clock()
+        state = np.empty(self._state_size)
+        mujoco.mj_getState(self._model, self._data, state, STATE)
+        self._noted.append(state)
+        # A step of the idle helper has shown the state before this one once more: this one does not wait for its turn.
+        if self._has_idled or self._stepper.is_state_due(self._last_tick_ns):
+            self._wake_helper()
+
+    def _show_reset(self) -> None:
+        """Take a step on the data after a reset."""
+        if self._read_plant():
+            self._post_reset()
+            self._step(1, self._plant)
+            self._write_controls()
+        else:
+            self._step(0, self._plant)
+        self._processes.supervise(self._stepper)
+        self._last_tick_ns = self._stepper.clock()
 
     def begin_tick(self, n_ticks: int = 0) -> None:
         """One step: writes `ctrl` (and wrenches on hand-held objects) into the user's data. Ends a tick that began.
@@ -262,12 +276,12 @@ class UserLoop:
             self._ctrl.read(self._data.ctrl)
             self._forces.read(self._data.xfrc_applied)
             if not self._read_plant():
-                self._stepper.step(0, self._plant)
+                self._step(0, self._plant)
                 self._ctrl.put_written(self._data.ctrl)
                 return
             self._post_reset()
             counted = self._count_ticks()
-            self._stepper.step(n_ticks or counted, self._plant, publish=False)
+            self._step(n_ticks or counted, self._plant, publish=False)
             self._write_controls()
 
     def end_tick(self) -> None:
@@ -314,10 +328,10 @@ class UserLoop:
                 self._use(model, data)
             else:
                 while self._stepper.has_pending_scenes:  # patches of the present scene
-                    self._stepper.step(0, self._plant)
+                    self._step(0, self._plant)
                 self._stepper.queue_scene(scene)
                 self._plant = plant
-                self._stepper.step(0, plant, publish=False)
+                self._step(0, plant, publish=False)
                 self._use(model, data)
                 self._began_time = None
             self._last_time = float(data.time)
@@ -325,6 +339,7 @@ class UserLoop:
     def close(self) -> None:
         """End the helper thread and leave driven robots of the user's data at rest, without our forces on objects."""
         self._closed.set()
+        self._wake.set()
         if self._helper is not threading.current_thread():
             self._helper.join(timeout=2.0)
         with self.lock:
@@ -371,6 +386,12 @@ class UserLoop:
             self._stepper.publish(self._stepper.clock())
         self._processes.supervise(self._stepper)
         return good and went_back
+
+    def _step(self, n_ticks: int, plant: bytes, *, publish: bool = True) -> None:
+        self._stepper.step(n_ticks, plant, publish=publish)
+        core = self._stepper.core
+        assert core.sharing is not None
+        self._drives = bool(core.sharing.driven or core.controller.list_held_objects())
 
     def _write_controls(self) -> None:
         """Write `ctrl` of driven robots and wrenches on held objects; give back what is neither any more."""
@@ -424,15 +445,19 @@ class UserLoop:
 
     def _read_plant(self) -> bool:
         """Read the user's state with the owner's inputs; return False, and announce it once, while it is not finite."""
-        state = np.empty(mujoco.mj_stateSize(self._model, STATE))
+        state = np.empty(self._state_size)
         mujoco.mj_getState(self._model, self._data, state, STATE)
-        self._has_noted = False
+        self._noted.clear()
         self._ctrl.put_owner(state[self._ctrl_at :][: self._model.nu])
         self._forces.put_owner(state[self._forces_at :][: 6 * self._model.nbody].reshape(-1, 6))
+        return self._accept(state)
+
+    def _accept(self, state: Floats) -> bool:
+        """Make a state that of the plant; return False, and announce it once, while it is not finite."""
         if not np.isfinite(state).all():
             if self.fault is None:
                 self._fault_ns = self._stepper.clock()
-                self.fault = DataFault(self._find_bad_arrays(), self._fault_ns * 1e-9)
+                self.fault = DataFault(self._find_bad_arrays(state), self._fault_ns * 1e-9)
                 text = f"the user's simulation has numbers that are not finite: {self.fault.text}"
                 self._stepper.post_own(Marker(request_id=0, text=text))
             return False
@@ -442,12 +467,12 @@ class UserLoop:
         self._plant = state.tobytes()
         return True
 
-    def _find_bad_arrays(self) -> tuple[str, ...]:
+    def _find_bad_arrays(self, state: Floats) -> tuple[str, ...]:
+        """Return the arrays of a state that are not finite."""
         found = []
         for name, part in _FIELDS.items():
-            values = np.empty(mujoco.mj_stateSize(self._model, part))
-            mujoco.mj_getState(self._model, self._data, values, part)
-            if not np.isfinite(values).all():
+            begin = mujoco.mj_stateSize(self._model, STATE & (part - 1))
+            if not np.isfinite(state[begin:][: mujoco.mj_stateSize(self._model, part)]).all():
                 found.append(name)
         return tuple(found) or ("plugin_state",)
 
@@ -459,21 +484,37 @@ class UserLoop:
             self._left = {}
             self._stepper.post_own(ExternalReset())
 
-    def _step_if_idle(self) -> None:
-        """Take a step without ticks if the user's loop is silent."""
-        if self._stepper.clock() - self._last_tick_ns <= IDLE_AFTER_NS:
+    def _wake_helper(self) -> None:
+        self._wake.set()
+
+    def _is_silent(self) -> bool:
+        return self._stepper.clock() - self._last_tick_ns > IDLE_AFTER_NS
+
+    def _take_helper_step(self) -> None:
+        """Take a step on the newest look when it is due, or on any look, or without one, when the loop is silent."""
+        is_due = bool(self._noted) and (self._has_idled or self._stepper.is_state_due(self._stepper.clock()))
+        if not (is_due or self._is_silent()):
             return
         with self.lock:
-            if self._stepper.clock() - self._last_tick_ns > IDLE_AFTER_NS and not self._closed.is_set():
-                if self._has_noted and not self._was_reset and np.isfinite(self._noted).all():
-                    self._plant, self._has_noted = self._noted.tobytes(), False
-                self._stepper.step(0, self._plant)
-                self._processes.supervise(self._stepper)
+            if self._closed.is_set():
+                return
+            if self._noted:
+                is_good = self._accept(self._noted.popleft())
+                self._stepper.make_state_due()
+                self._has_idled = False
+                # The program takes the ticks once a robot is driven.
+                self._step(1 if is_good and not self.is_driving else 0, self._plant)
+            elif self._is_silent():
+                self._has_idled = True
+                self._step(0, self._plant)
+            self._processes.supervise(self._stepper)
 
     def _run_helper(self) -> None:
         try:
-            while not self._closed.wait(IDLE_PERIOD_S):
-                self._step_if_idle()
+            while not self._closed.is_set():
+                self._wake.wait(IDLE_PERIOD_S)
+                self._wake.clear()
+                self._take_helper_step()
         except BaseException as error:
             self._stepper.end(error)  # raised at the user's next tick, where it is seen
             _log.error("the session stands still after an error: %s", error)

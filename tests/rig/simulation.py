@@ -112,7 +112,9 @@ class SimulatedThreading:
                 if getattr(self._target, "__name__", "") != "_run_helper":
                     self._target()
                     return
-                step = getattr(owner, "_step_if_idle", None) or owner.poll  # type: ignore[union-attr]
+                step = getattr(owner, "_take_helper_step", None) or owner.poll  # type: ignore[union-attr]
+                if hasattr(owner, "_wake_helper"):
+                    owner._wake_helper = step
 
                 def poll() -> None:
                     if owner._closed.is_set():  # type: ignore[union-attr]

@@ -61,6 +61,7 @@ class Rig:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(threading, "Thread", IdleThread)
             self.loop = UserLoop(self.model, self.data, self.stepper, Watch())  # type: ignore[arg-type]
+        self.loop._wake_helper = self.loop._take_helper_step  # type: ignore[method-assign]
         self.policy: Callable[[mujoco.MjData], None] = lambda data: None
         self.applied: list[NDArray[np.float64]] = []
 
@@ -95,7 +96,7 @@ class Rig:
         """The user's loop is silent until the helper takes a step."""
         steps = self.stepper.step_count
         self.now_ns += 40 * MS
-        self.loop._step_if_idle()
+        self.loop._take_helper_step()
         assert self.stepper.step_count == steps + 1
 
 
