@@ -86,7 +86,7 @@ def measure_steps(environment: SharedProgram, seconds: float, *, paced: bool) ->
     return took
 
 
-def run_share(seconds: float = 20.0, progress: Callable[[str], None] = lambda _: None) -> BenchReport:
+def run_share(seconds: float = 100.0, progress: Callable[[str], None] = lambda _: None) -> BenchReport:
     """Measure what sharing adds to a step.
 
     Args:

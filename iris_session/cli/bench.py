@@ -137,7 +137,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             "seconds",
             parse_seconds,
             None,
-            "measured part (default: 20; slow-client: 50; record: 60; web: 65; stop: 1; "
+            "measured part (default: 20; slow-client: 50; record: 60; web: 65; share: 100; stop: 1; "
             "hands: 300, simulated, of every device and rate)",
         ),
         ("kills", int, 21, "record: kills of recorder, authority and both (default: %(default)s)"),

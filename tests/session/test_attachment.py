@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import mujoco
+import numpy as np
 import pytest
 
 from iris_session import ConfigError, IrisError, OwnershipError, Session
@@ -279,6 +280,50 @@ def test_while_nobody_drives_the_program_is_looked_at_at_the_rate_of_the_state()
         assert len(rig.front.states) == 51
         assert rig.front.states[-1].sim_time == pytest.approx(0.8, abs=0.016)
         assert rig.loop.list_warnings() == ()
+    finally:
+        attached.close()
+
+
+def test_the_newest_state_of_a_slow_program_is_shown_at_once_although_the_old_one_was_just_shown_again() -> None:
+    attached = Attached()
+    rig = attached.rig
+    rig.stepper.clock = lambda: rig.now_ns
+    rig.stepper._state_period_ns = 16 * MS
+    try:
+        for _ in range(10):
+            mujoco.mj_step(attached.model, attached.data)
+            assert rig.front.states[-1].sim_time == pytest.approx(attached.data.time, abs=1e-9)
+            for _ in range(5):
+                rig.now_ns += 10 * MS
+                rig.loop._take_helper_step()
+            assert rig.stepper.step_count > len(attached.counts), "steps without ticks in between"
+            assert not rig.stepper.is_state_due(rig.now_ns)
+    finally:
+        attached.close()
+
+
+def test_the_helper_thread_writes_nothing_into_the_data_of_a_program() -> None:
+    """What it has begun to drive is written by the program's next step."""
+    attached = Attached()
+    rig = attached.rig
+    try:
+        ann = Agent(rig)
+        rig.rounds(4)
+        ann.acquire()
+        mujoco.mj_step(attached.model, attached.data)
+        ctrl = attached.data.ctrl.copy()
+        here = ann.tip()
+        ann.sample(here, clutch=False)
+        rig.loop._take_helper_step()
+        ann.sample(here, clutch=True)
+        attached.data.ctrl[:] = ctrl + 0.1
+        rig.now_ns += 100 * MS
+        rig.loop._take_helper_step()
+        assert rig.loop.is_driving
+        np.testing.assert_array_equal(attached.data.ctrl, ctrl + 0.1)
+        mujoco.mj_step(attached.model, attached.data)
+        assert rig.recorder.rows[-1].n_ticks == 1
+        assert np.any(attached.data.ctrl != ctrl + 0.1)
     finally:
         attached.close()
 
