@@ -302,8 +302,7 @@ def test_the_newest_state_of_a_slow_program_is_shown_at_once_although_the_old_on
         attached.close()
 
 
-def test_the_helper_thread_writes_nothing_into_the_data_of_a_program() -> None:
-    """What it has begun to drive is written by the program's next step."""
+def test_a_robot_that_is_engaged_in_a_step_of_the_helper_is_driven_from_the_next_step_of_the_program_on() -> None:
     attached = Attached()
     rig = attached.rig
     try:
