@@ -73,6 +73,10 @@ SUITES: Final = {
         ("Lift:Panda", "Stack:Panda", "Lift:Sawyer", "Lift:UR5e", "Lift:IIWA", "TwoArmLift:Panda+Panda"),
         "action",
     ),
+    # The version that LIBERO builds on, with its controller; LIBERO's own assets are on no package index.
+    "robosuite-1.4": Suite(
+        ("robosuite==1.4.1", "mujoco==3.3.0"), "make_robosuite", ("Lift:Panda", "TwoArmLift:Panda+Panda"), "action"
+    ),
     "ogbench": Suite(
         ("ogbench>=1.1", "mujoco==3.3.7"), "make_ogbench", ("cube-single-v0", "scene-v0", "puzzle-3x3-v0"), "action"
     ),

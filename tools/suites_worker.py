@@ -139,10 +139,13 @@ def make_metaworld(name: str) -> Case:
 
 
 def make_robosuite(name: str) -> Case:
-    """robosuite, `TASK:ROBOT+ROBOT`."""
+    """robosuite, `TASK:ROBOT+ROBOT`; before 1.5 its default are joint velocities."""
     import robosuite
 
     task, _, robots = name.partition(":")
+    chosen: dict[str, Any] = {"seed": 0}
+    if robosuite.__version__.startswith("1.4"):
+        chosen = {"controller_configs": robosuite.load_controller_config(default_controller="OSC_POSE")}
     environment = robosuite.make(
         task,
         robots=robots.split("+"),
@@ -150,7 +153,7 @@ def make_robosuite(name: str) -> Case:
         has_offscreen_renderer=False,
         use_camera_obs=False,
         ignore_done=True,
-        seed=0,
+        **chosen,
     )
     return Case(environment, environment.action_spec, seeds=False)
 

@@ -189,6 +189,11 @@ class Controller:
         """Return the objects whose `xfrc_applied` was written by the newest tick."""
         return list(self._grasps.written)
 
+    @property
+    def holds_objects(self) -> bool:
+        """True while a hand holds an object, until a tick has written its last wrench."""
+        return bool(self._grasps.commanded or self._grasps.written)
+
     def begin(self, now_ns: int, n_ticks: int, decision: Decision, view: WorldView) -> None:
         """Read the commands of one step at session time `now_ns`. A robot without a command holds.
 

@@ -100,7 +100,8 @@ class CtrlSharing:
             r.drivers = [p for p in r.drivers if p in held]
             r.drivers += [p for p in engaged.get(name, ()) if p not in r.drivers]
             is_stopped = decision.estop and r.share < 1.0 and not was_driven
-            if (r.drivers and not was_driven) or is_stopped:
+            # Anew until the first tick: the owner's `ctrl` has gone on since a step without ticks.
+            if (r.drivers and (not was_driven or r.start)) or is_stopped:
                 self._take_over(i, r, data, owner)
         self._controller.follow_robots(data, [i for i, r in enumerate(self._robots) if not r.share])
 

@@ -26,7 +26,9 @@ ticks of the rounds before, so that robots keep their speed. At the end robots t
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -142,7 +144,8 @@ class UserLoop:
         self.overwritten = 0
         self.is_attached = False
         self.unseen_s = 0.0
-        self._wake = threading.Event()
+        #: Wakes the helper thread. In C, so that Ctrl-C in the program leaves no lock behind, as in `Event`.
+        self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         #: State of the newest look, until a step is taken on it or on a newer one.
         self._noted: deque[Floats] = deque(maxlen=1)
         self._has_idled = False  # since the newest look
@@ -203,7 +206,8 @@ class UserLoop:
     def note_time(self) -> None:
         """Note the time of the data after the program has done something else than a step: back is a reset."""
         self._detect_reset()
-        self._last_tick_ns = self._stepper.clock()
+        if not self.is_driving:  # else it is a gap
+            self._last_tick_ns = self._stepper.clock()
 
     def read_clock(self) -> int:
         """Return session time [ns]."""
@@ -246,13 +250,13 @@ class UserLoop:
             self._wake_helper()
 
     def _show_reset(self) -> None:
-        """Take a step on the data after a reset."""
+        """Take a step on the data after a reset. Not while it is not finite, but for one step that says so."""
+        is_known = self.fault is not None
         if self._read_plant():
             self._post_reset()
-            self._step(1, self._plant)
-            self._write_controls()
-        else:
-            self._step(0, self._plant)
+        elif is_known:
+            return
+        self._step(0, self._plant)
         self._processes.supervise(self._stepper)
         self._last_tick_ns = self._stepper.clock()
 
@@ -323,6 +327,8 @@ class UserLoop:
                 self._in_tick = False
             self._ctrl.read(self._data.ctrl)
             self._ctrl.put_owner(self._data.ctrl)
+            self._forces.read(self._data.xfrc_applied)
+            self._forces.put_owner(self._data.xfrc_applied)
             if scene is None:
                 self.reset()
                 self._use(model, data)
@@ -339,7 +345,7 @@ class UserLoop:
     def close(self) -> None:
         """End the helper thread and leave driven robots of the user's data at rest, without our forces on objects."""
         self._closed.set()
-        self._wake.set()
+        self._wake_helper()
         if self._helper is not threading.current_thread():
             self._helper.join(timeout=2.0)
         with self.lock:
@@ -349,6 +355,12 @@ class UserLoop:
                 self._stepper.core.write_rest_controls(self._plant)
                 self._write_controls()
             self._ctrl, self._forces = _BorrowedArray(self._data.ctrl), _BorrowedArray(self._data.xfrc_applied)
+            self._drives = False
+
+    def end(self, error: Exception) -> None:
+        """End the session by an error beside its steps: nothing is driven any more."""
+        self._stepper.end(error)
+        self.close()
 
     def list_warnings(self) -> tuple[str, ...]:
         """Return what the owner should know, one line each."""
@@ -391,7 +403,7 @@ class UserLoop:
         self._stepper.step(n_ticks, plant, publish=publish)
         core = self._stepper.core
         assert core.sharing is not None
-        self._drives = bool(core.sharing.driven or core.controller.list_held_objects())
+        self._drives = bool(core.sharing.driven or core.controller.holds_objects)
 
     def _write_controls(self) -> None:
         """Write `ctrl` of driven robots and wrenches on held objects; give back what is neither any more."""
@@ -479,19 +491,23 @@ class UserLoop:
     def _post_reset(self) -> None:
         """Queue a pending reset for the next step, which must be on the state after it."""
         if self._was_reset:
-            self._was_reset = False
             self._began_time = None
             self._left = {}
             self._stepper.post_own(ExternalReset())
+            self._was_reset = False  # at last: Ctrl-C must not lose it
 
     def _wake_helper(self) -> None:
-        self._wake.set()
+        if self._wake.empty():
+            self._wake.put(None)
 
     def _is_silent(self) -> bool:
         return self._stepper.clock() - self._last_tick_ns > IDLE_AFTER_NS
 
     def _take_helper_step(self) -> None:
-        """Take a step on the newest look when it is due, or on any look, or without one, when the loop is silent."""
+        """Take a step on the newest look when it is due, or on any look, or without one, when the loop is silent.
+
+        It has no ticks: ticks are for the `ctrl` that the program's next step applies.
+        """
         is_due = bool(self._noted) and (self._has_idled or self._stepper.is_state_due(self._stepper.clock()))
         if not (is_due or self._is_silent()):
             return
@@ -499,11 +515,10 @@ class UserLoop:
             if self._closed.is_set():
                 return
             if self._noted:
-                is_good = self._accept(self._noted.popleft())
+                self._accept(self._noted.popleft())
                 self._stepper.make_state_due()
                 self._has_idled = False
-                # The program takes the ticks once a robot is driven.
-                self._step(1 if is_good and not self.is_driving else 0, self._plant)
+                self._step(0, self._plant)
             elif self._is_silent():
                 self._has_idled = True
                 self._step(0, self._plant)
@@ -512,8 +527,8 @@ class UserLoop:
     def _run_helper(self) -> None:
         try:
             while not self._closed.is_set():
-                self._wake.wait(IDLE_PERIOD_S)
-                self._wake.clear()
+                with contextlib.suppress(queue.Empty):
+                    self._wake.get(timeout=IDLE_PERIOD_S)
                 self._take_helper_step()
         except BaseException as error:
             self._stepper.end(error)  # raised at the user's next tick, where it is seen

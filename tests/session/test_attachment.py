@@ -57,8 +57,8 @@ class Attached:
 
     @property
     def counts(self) -> list[int]:
-        """Ticks of every round."""
-        return [row.n_ticks for row in self.rig.recorder.rows if row.n_ticks]
+        """Ticks of every step of the session: none in those that only look."""
+        return [row.n_ticks for row in self.rig.recorder.rows]
 
     def changes(self) -> int:
         """New epochs so far."""
@@ -89,8 +89,7 @@ def count_rounds(session: Session) -> list[int]:
     step = session.stepper.core.step
 
     def counting(now_ns: int, entries: Any, n_ticks: int, *args: Any, **kwargs: Any) -> Any:
-        if n_ticks:
-            counts.append(n_ticks)
+        counts.append(n_ticks)
         return step(now_ns, entries, n_ticks, *args, **kwargs)
 
     session.stepper.core.step = counting  # type: ignore[method-assign]
@@ -108,10 +107,10 @@ def test_models_can_be_compiled_and_forward_is_no_tick(attached: Attached) -> No
     assert attached.counts == []
     mujoco.mj_step(model, data)
     mujoco.mj_step(m=model, d=data, nstep=3)
-    assert attached.counts == [1] * 4
+    assert attached.counts == [0] * 4
     mujoco.mj_step1(model, data)
     mujoco.mj_step2(model, data)
-    assert attached.counts == [1] * 5
+    assert attached.counts == [0] * 5
     assert data.time == pytest.approx(5 * 0.002)
 
 
@@ -127,7 +126,7 @@ def test_names_bound_before_are_wrapped_in_every_module_and_restored() -> None:
         exec("from mujoco import mj_step", late.__dict__)
         sys.modules["imported_later"] = late
         late.mj_step(model, data)
-        assert attached.counts == [1, 1, 1]
+        assert attached.counts == [0, 0, 0]
         attached.close()
         assert script.mj_step is script.advance is late.mj_step is ORIGINALS["mj_step"]
         assert script.mj_step2 is ORIGINALS["mj_step2"]
@@ -145,7 +144,7 @@ def test_two_sessions_in_one_process_close_in_any_order(first: int) -> None:
             Attachment(both[0].rig.loop, None, "step", lambda model, data: None)
         for one in both:
             mujoco.mj_step(one.model, one.data)
-        assert [one.counts for one in both] == [[1], [1]]
+        assert [one.counts for one in both] == [[0], [0]]
         both[first].close()
         for one in both:
             mujoco.mj_step(one.model, one.data)
@@ -227,7 +226,7 @@ def test_an_environment_is_followed_to_the_model_that_it_builds_at_a_reset() -> 
         journal = keep_journal(session.stepper)
         counts = look_after_every_step(session)
         assert environment.step() == "observation"
-        assert counts == [1], "the state at the end of its step is looked at, not that of the first of many in it"
+        assert counts == [0], "the state at the end of its step is looked at, not that of the first of many in it"
         environment.reset()  # the same model, compiled again
         assert session.data is environment.data, "shown before the step after it"
         environment.step()
@@ -240,10 +239,10 @@ def test_an_environment_is_followed_to_the_model_that_it_builds_at_a_reset() -> 
         assert session.data is environment.data
         for _ in range(10):
             environment.step()
-        assert len(counts) == 15, "a reset is looked at, too"
+        assert len(counts) == 16, "a reset is looked at, too, and a new model is loaded by a step"
         other = mujoco.MjData(environment.model)
         mujoco.mj_step(environment.model, other)
-        assert len(counts) == 15, "a reset is looked at, too"
+        assert len(counts) == 16, "a reset is looked at, too, and a new model is loaded by a step"
         assert session.status().sim_time == pytest.approx(environment.data.time)
     finally:
         session.close()
@@ -259,7 +258,7 @@ def test_the_step_of_an_environment_that_is_not_seen_through_is_looked_at() -> N
         counts = look_after_every_step(session)
         for _ in range(4):
             environment.step()
-        assert counts == [1] * 4
+        assert counts == [0] * 4
         assert session.status().sim_time == pytest.approx(environment.data.time)
     finally:
         session.close()
@@ -276,7 +275,7 @@ def test_while_nobody_drives_the_program_is_looked_at_at_the_rate_of_the_state()
         for _ in range(400):
             rig.now_ns += 2 * MS
             mujoco.mj_step(attached.model, attached.data)
-        assert attached.counts == [1] * 51, "the first step, and every 16 ms"
+        assert attached.counts == [0] * 51, "the first step, and every 16 ms"
         assert len(rig.front.states) == 51
         assert rig.front.states[-1].sim_time == pytest.approx(0.8, abs=0.016)
         assert rig.loop.list_warnings() == ()
@@ -293,10 +292,11 @@ def test_the_newest_state_of_a_slow_program_is_shown_at_once_although_the_old_on
         for _ in range(10):
             mujoco.mj_step(attached.model, attached.data)
             assert rig.front.states[-1].sim_time == pytest.approx(attached.data.time, abs=1e-9)
+            shown = len(rig.front.states)
             for _ in range(5):
                 rig.now_ns += 10 * MS
                 rig.loop._take_helper_step()
-            assert rig.stepper.step_count > len(attached.counts), "steps without ticks in between"
+            assert len(rig.front.states) > shown
             assert not rig.stepper.is_state_due(rig.now_ns)
     finally:
         attached.close()
@@ -315,14 +315,13 @@ def test_a_robot_that_is_engaged_in_a_step_of_the_helper_is_driven_from_the_next
         ann.sample(here, clutch=False)
         rig.loop._take_helper_step()
         ann.sample(here, clutch=True)
-        attached.data.ctrl[:] = ctrl + 0.1
         rig.now_ns += 100 * MS
         rig.loop._take_helper_step()
         assert rig.loop.is_driving
-        np.testing.assert_array_equal(attached.data.ctrl, ctrl + 0.1)
+        attached.data.ctrl[:] = ctrl + 0.1  # the program goes on
         mujoco.mj_step(attached.model, attached.data)
         assert rig.recorder.rows[-1].n_ticks == 1
-        assert np.any(attached.data.ctrl != ctrl + 0.1)
+        np.testing.assert_allclose(attached.data.ctrl, ctrl + 0.1, atol=0.01)
     finally:
         attached.close()
 
@@ -363,7 +362,7 @@ def test_while_someone_drives_every_step_is_a_tick(is_opaque: bool) -> None:
         assert not rig.loop.is_driving
         before = len(rig.recorder.rows)
         rig.rounds(16)
-        assert sum(row.n_ticks for row in rig.recorder.rows[before:]) == 10, "16 steps of 10 ms, a look each 16 ms"
+        assert len(rig.recorder.rows) - before == 10, "16 steps of 10 ms, a look each 16 ms"
     finally:
         if attachment is not None:
             attachment.close()
