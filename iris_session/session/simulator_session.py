@@ -154,8 +154,9 @@ class SimulatorSession(ScenePublisher):
         """Return targets at which robots stay where they are."""
         state, rows = self._adapter.read_state(), {name: row for row, name in enumerate(self._adapter.bodies)}
         at = {robot.name: rows[robot.tip_body] for robot in self.robots if robot.name in names}
+        p, q = state.positions, state.quaternions
         return {
-            name: TipTarget(Pose(tuple(state.positions[row].tolist()), tuple(state.quaternions[row].tolist())))
+            name: TipTarget(Pose(tuple(p[row].tolist()), tuple(q[row].tolist())), stops=True)
             for name, row in at.items()
         }
 

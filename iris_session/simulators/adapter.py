@@ -37,10 +37,14 @@ class AlreadyWrappedError(SimulatorError):
 
 
 class TipTarget(NamedTuple):
-    """Target of an end effector: `T_world_tip` [m], and of its gripper, 0 open to 1 closed, or `None`."""
+    """Target of an end effector: `T_world_tip` [m], and of its gripper, 0 open to 1 closed, or `None`.
+
+    `stops`: the robot is driven no longer, and stays where it is: `pose` is measured.
+    """
 
     pose: Pose
     gripper: float | None = None
+    stops: bool = False
 
 
 @dataclass

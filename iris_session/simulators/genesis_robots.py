@@ -9,7 +9,7 @@ import numpy as np
 
 from iris_session.protocol.specs import RobotSpec
 from iris_session.simulators.adapter import Floats, TipTarget, find_gripper, make_robot
-from iris_session.simulators.joint_targets import JointTargets, place_fingers
+from iris_session.simulators.joint_targets import Joints, JointTargets, place_fingers
 
 
 class _Arm(NamedTuple):
@@ -67,13 +67,13 @@ class GenesisRobots:
         at = (time_s, float(self._scene.dt))
         for name, target in targets.items():
             arm, entity = self._arms[name], self._arms[name].entity
-            p, q = np.array(target.pose.p), np.array(target.pose.q)
-            found = entity.inverse_kinematics(
-                link=arm.tip, pos=p, quat=q, max_samples=1, dofs_idx_local=arm.dofs, **where
-            )
-            now, found = _read(entity.get_dofs_position(arm.dofs, **where)), _read(found[..., arm.qs])
-            low, high = (_read(limit) for limit in entity.get_dofs_limit(arm.dofs))
-            goal = self._targets.limit(name, at, now, found, (low, high))
+            p, q, found = np.array(target.pose.p), np.array(target.pose.q), None
+            if not target.stops:
+                solved = entity.inverse_kinematics(
+                    link=arm.tip, pos=p, quat=q, max_samples=1, dofs_idx_local=arm.dofs, **where
+                )
+                found = _read(solved[..., arm.qs])
+            goal = self._targets.limit(name, at, _read_joints(arm, where), found)
             entity.control_dofs_position(goal, arm.dofs, **where)
             if target.gripper is not None and arm.fingers:
                 dofs = [dof for dof, _ in arm.fingers]
@@ -81,6 +81,18 @@ class GenesisRobots:
                 fingers = zip(dofs, *limits, [slides for _, slides in arm.fingers], strict=True)
                 if places := place_fingers(fingers, target.gripper):
                     entity.control_dofs_position(np.array(list(places.values())), list(places), **where)
+
+
+def _read_joints(arm: _Arm, where: Mapping[str, Any]) -> Joints:
+    """Return the joints of an arm. Genesis does not say what its drives aim at: force / gain ahead at rest."""
+    entity, dofs = arm.entity, arm.dofs
+    q, v, force = (
+        _read(read(dofs, **where))
+        for read in (entity.get_dofs_position, entity.get_dofs_velocity, entity.get_dofs_control_force)
+    )
+    gain = _read(entity.get_dofs_kp(dofs))
+    lead = np.divide(force, gain, out=np.zeros_like(q), where=gain > 0.0)
+    return Joints(q, v, q + lead, *(_read(limit) for limit in entity.get_dofs_limit(dofs)))
 
 
 def _read(values: Any) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,23 +15,40 @@ from iris_session.simulators.adapter import Floats
 MAX_SPEED: Final = 3.0
 #: Steps after which a robot counts as not driven in between: its target then begins where it stands.
 _FRESH_STEPS: Final = 2.5
+#: A joint that is slower stands [rad/s or m/s]; PhysX says 0.05 of an arm at rest.
+_REST_SPEED: Final = 0.2
+#: Most that a load takes as a lead of a drive's target [rad or m].
+_MAX_LOAD_LEAD: Final = 0.2
+
+
+class Joints(NamedTuple):
+    """Joints of a robot, shape (n,) each [rad or m, and per second].
+
+    `q`, `v`: measured positions and speeds. `targets`: of their drives, as they are in force; `q` where a simulator
+    does not say. `low`, `high`: limits; those without low < high are none. `speeds`: largest speeds; 0 and more than
+    `MAX_SPEED` mean `MAX_SPEED`.
+    """
+
+    q: ArrayLike
+    v: ArrayLike
+    targets: ArrayLike
+    low: ArrayLike
+    high: ArrayLike
+    speeds: ArrayLike = MAX_SPEED
 
 
 class JointTargets:
-    """Bounds the targets of the joints of robots, from step to step. Pure."""
+    """Bounds the targets of the joints of robots, from step to step. Pure.
+
+    A drive that is a spring carries the weight of an arm by the lead of its target. That lead is measured when a robot
+    that stands is taken, and belongs to all targets: else the arm would sag by it, once when it is taken, and again
+    when it is given back.
+    """
 
     def __init__(self) -> None:
-        self._given: dict[str, tuple[float, Floats]] = {}  # time and targets of the newest step, by robot
+        self._given: dict[str, tuple[float, Floats, Floats]] = {}  # time, targets and leads of the newest step
 
-    def limit(
-        self,
-        robot: str,
-        at: tuple[float, float],
-        now: ArrayLike,
-        found: ArrayLike,
-        limits: tuple[ArrayLike, ArrayLike],
-        speeds: ArrayLike = MAX_SPEED,
-    ) -> Floats:
+    def limit(self, robot: str, at: tuple[float, float], joints: Joints, found: ArrayLike | None) -> Floats:
         """Return the targets for the drives of a robot.
 
         They may always return to where the joints are, and lead further than in the step before by speed x time.
@@ -39,23 +56,24 @@ class JointTargets:
         Args:
             robot: Its name.
             at: Time of the simulation, and that of a step [s].
-            now: Positions of its joints, shape (n,) [rad or m].
-            found: Positions that inverse kinematics found, shape (n,).
-            limits: Lower and upper limits, shape (n,) each; those without low < high are none.
-            speeds: Largest speeds [rad/s or m/s]; 0 and more than `MAX_SPEED` mean `MAX_SPEED`.
+            joints: Its joints.
+            found: Positions that inverse kinematics found, shape (n,); `None`: the robot stays where it is.
         """
-        (time_s, dt_s), now = at, np.asarray(now, np.float64)
-        then_s, before = self._given.get(robot, (-math.inf, now))
+        (time_s, dt_s), now = at, np.asarray(joints.q, np.float64)
+        then_s, before, lead = self._given.get(robot, (-math.inf, now, np.zeros_like(now)))
         if not 0.0 <= time_s - then_s <= _FRESH_STEPS * dt_s:
-            before = now
-        goal = np.where(np.isfinite(found), found, before)
-        low, high = (np.asarray(limit, np.float64) for limit in limits)
+            load = np.asarray(joints.targets, np.float64) - now
+            carries = (np.abs(joints.v) < _REST_SPEED) & (np.abs(load) <= _MAX_LOAD_LEAD)
+            lead = np.where(carries, load, lead)
+            before = now + lead
+        rest = now + lead
+        goal = rest if found is None else np.where(np.isfinite(found), np.asarray(found) + lead, before)
+        low, high, speeds = (np.asarray(given, np.float64) for given in (joints.low, joints.high, joints.speeds))
         is_limited = low < high
         goal = np.clip(goal, np.where(is_limited, low, -np.inf), np.where(is_limited, high, np.inf))
-        speeds = np.asarray(speeds, np.float64)
         step = np.where(speeds > 0.0, np.minimum(speeds, MAX_SPEED), MAX_SPEED) * dt_s
-        goal = np.clip(goal, np.minimum(before, now) - step, np.maximum(before, now) + step)
-        self._given[robot] = time_s, goal
+        goal = np.clip(goal, np.minimum(before, rest) - step, np.maximum(before, rest) + step)
+        self._given[robot] = time_s, goal, lead
         return goal
 
 

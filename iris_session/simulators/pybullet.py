@@ -28,7 +28,7 @@ from iris_session.simulators.adapter import (
     make_robot,
     wrap_method,
 )
-from iris_session.simulators.joint_targets import JointTargets, place_fingers
+from iris_session.simulators.joint_targets import Joints, JointTargets, place_fingers
 
 #: Clients that one process can have.
 _MAX_CLIENTS: Final = 1024
@@ -179,14 +179,17 @@ class PyBulletAdapter(Adapter):
         for name, target in targets.items():
             arm = self._arms[name]
             w, x, y, z = target.pose.q
-            now = np.array([state[0] for state in self._call("getJointStates", arm.body, list(arm.movable))])
+            now, v = np.array([state[:2] for state in self._call("getJointStates", arm.body, list(arm.movable))]).T
             low, high, _, speeds, _ = np.array(list(arm.movable.values()), np.float64).T
             lowest, highest = np.where(low < high, low, now - np.pi), np.where(low < high, high, now + np.pi)
             spans = {"lowerLimits": lowest, "upperLimits": highest, "jointRanges": highest - lowest, "restPoses": now}
             near = {key: value.tolist() for key, value in spans.items()}
-            found = self._call("calculateInverseKinematics", arm.body, arm.tip, target.pose.p, (x, y, z, w), **near)
+            found = None  # stays
+            if not target.stops:
+                found = self._call("calculateInverseKinematics", arm.body, arm.tip, target.pose.p, (x, y, z, w), **near)
             at = (self._time_s, self._call("getPhysicsEngineParameters")["fixedTimeStep"])
-            goal = self._targets.limit(name, at, now, found, (low, high), speeds)
+            joints = Joints(now, v, now, low, high, speeds)  # motors of PyBullet hold without a lead
+            goal = self._targets.limit(name, at, joints, found)
             goals = {joint: q for joint, q in zip(arm.movable, goal.tolist(), strict=True) if joint in arm.driven}
             if target.gripper is not None:
                 fingers = [(i, arm.movable[i].low, arm.movable[i].high, arm.movable[i].slides) for i in arm.fingers]

@@ -21,6 +21,7 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.nodes import to_matrix
 from iris_session.simulators.adapter import (
     Adapter,
+    Floats,
     Names,
     SimulationState,
     SimulatorError,
@@ -29,7 +30,7 @@ from iris_session.simulators.adapter import (
     make_robot,
     wrap_method,
 )
-from iris_session.simulators.joint_targets import JointTargets, place_fingers
+from iris_session.simulators.joint_targets import Joints, JointTargets, place_fingers
 
 #: Rotation from z, along which our shapes lie, to x, along which those of PhysX do.
 _Z_TO_X: Final[PoseTuple] = ((0.0, 0.0, 0.0), (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0))
@@ -135,30 +136,37 @@ class SapienAdapter(Adapter):
 
     def apply_targets(self, targets: Mapping[str, TipTarget]) -> None:
         """Set the drive targets of the robots' joints."""
-        import sapien
-
         for name, target in targets.items():
             arm = self._arms[name]
-            root = arm.articulation.root_pose
-            T_world_root = (tuple(root.p.tolist()), tuple(root.q.tolist()))
-            p, q = compose(inverse(T_world_root), (target.pose.p, target.pose.q))
-            mask = np.zeros(arm.articulation.dof, np.int32)
-            mask[arm.joints] = 1
-            now = np.asarray(arm.articulation.qpos)
-            found, is_solved, _ = arm.model.compute_inverse_kinematics(
-                arm.tip, sapien.Pose(list(p), list(q)), initial_qpos=now, active_qmask=mask, max_iterations=100
-            )
             joints, own = arm.articulation.active_joints, arm.joints
             limits = np.array([np.asarray(joint.limits).reshape(-1, 2)[0] for joint in joints], np.float64)
-            if is_solved:
-                at, speeds = (self._time_s, float(self._scene.timestep)), [joints[i].max_velocity for i in own]
-                goal = self._targets.limit(name, at, now[own], np.asarray(found)[own], tuple(limits[own].T), speeds)
+            found = None if target.stops else _solve(arm, target.pose)
+            if target.stops or found is not None:
+                q, v = np.asarray(arm.articulation.qpos)[own], np.asarray(arm.articulation.qvel)[own]
+                in_force = [float(np.ravel(joints[i].drive_target)[0]) for i in own]
+                moved = Joints(q, v, in_force, *limits[own].T, [joints[i].max_velocity for i in own])
+                goal = self._targets.limit(name, (self._time_s, float(self._scene.timestep)), moved, found)
                 for joint, place in zip(own, goal.tolist(), strict=True):
                     joints[joint].set_drive_target(place)
             if target.gripper is not None:
                 fingers = [(i, *limits[i].tolist(), str(joints[i].type) == "prismatic") for i in arm.fingers]
                 for joint, place in place_fingers(fingers, target.gripper).items():
                     joints[joint].set_drive_target(place)
+
+
+def _solve(arm: _Arm, pose: Pose) -> Floats | None:
+    """Return positions of an arm's joints at which its tip has a pose, `None` when none are found."""
+    import sapien
+
+    root = arm.articulation.root_pose
+    p, q = compose(inverse((tuple(root.p.tolist()), tuple(root.q.tolist()))), (pose.p, pose.q))
+    mask = np.zeros(arm.articulation.dof, np.int32)
+    mask[arm.joints] = 1
+    now = np.asarray(arm.articulation.qpos)
+    found, is_solved, _ = arm.model.compute_inverse_kinematics(
+        arm.tip, sapien.Pose(list(p), list(q)), initial_qpos=now, active_qmask=mask, max_iterations=100
+    )
+    return np.asarray(found, np.float64)[arm.joints] if is_solved else None
 
 
 def _list_shapes(entity: Any) -> Iterator[Any]:

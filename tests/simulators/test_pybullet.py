@@ -27,8 +27,8 @@ class Bullet:
         self.asked: dict[str, Any] = {}
         self.motors: dict[int, tuple[float, float]] = {}  # position and force, by joint
 
-    def getJointStates(self, body: int, joints: list[int], physicsClientId: int) -> list[tuple[float]]:
-        return [(0.5,) for _ in joints]
+    def getJointStates(self, body: int, joints: list[int], physicsClientId: int) -> list[tuple[float, float]]:
+        return [(0.5, 0.0) for _ in joints]
 
     def getPhysicsEngineParameters(self, physicsClientId: int) -> dict[str, float]:
         return {"fixedTimeStep": DT}
@@ -79,6 +79,8 @@ def test_motors_have_the_limits_of_their_joints(adapter: Any, bullet: Bullet) ->
     assert [places[joint] for joint in range(4)] == pytest.approx([0.501, *[0.5 + MAX_SPEED * DT] * 2, 0.0])
     assert (forces[0], forces[2], forces[3]) == (87.0, 12.0, 20.0)
     assert set(bullet.motors) == {0, 1, 2, 3}, "a finger without limits is left out"
+    adapter.apply_targets({"arm": TipTarget(TARGET.pose, stops=True)})
+    assert {joint: motor[0] for joint, motor in bullet.motors.items()} == {0: 0.5, 1: 0.5, 2: 0.5}
 
 
 def test_bullet_client_gets_its_step_back_with_the_last_session(monkeypatch: pytest.MonkeyPatch) -> None:

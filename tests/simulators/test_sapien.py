@@ -23,6 +23,7 @@ class Joint:
     def __init__(self, low: float, high: float, kind: str = "revolute", max_velocity: float = 100.0) -> None:
         self.limits, self.type, self.max_velocity = [[low, high]], kind, max_velocity
         self.target: float | None = None
+        self.drive_target = np.zeros(1)  # of the program
 
     def set_drive_target(self, value: float) -> None:
         self.target = value
@@ -54,7 +55,7 @@ def adapter(joints: list[Joint], monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setitem(sys.modules, "sapien", SimpleNamespace(Pose=lambda p, q: (p, q)))
     adapter: Any = object.__new__(SapienAdapter)
     root = SimpleNamespace(p=np.zeros(3), q=np.array([1.0, 0.0, 0.0, 0.0]))
-    articulation = SimpleNamespace(root_pose=root, dof=5, qpos=np.zeros(5), active_joints=joints)
+    articulation = SimpleNamespace(root_pose=root, dof=5, qpos=np.zeros(5), qvel=np.zeros(5), active_joints=joints)
     adapter._arms = {"arm": _Arm(articulation, Model(), 3, [0, 1, 2], [3, 4])}
     adapter._scene, adapter._time_s, adapter._targets = SimpleNamespace(timestep=DT), 0.0, JointTargets()
     return adapter
@@ -69,3 +70,6 @@ def test_a_failed_solution_is_skipped(adapter: Any, joints: list[Joint], monkeyp
     monkeypatch.setattr(Model, "is_solved", False)
     adapter.apply_targets({"arm": TARGET})
     assert [joint.target for joint in joints] == [None, None, None, 0.0, None]
+    joints[1].drive_target[:] = 0.1  # carries the arm
+    adapter.apply_targets({"arm": TipTarget(TARGET.pose, stops=True)})
+    assert [joint.target for joint in joints] == [0.0, 0.1, 0.0, 0.0, None], "a robot that stops needs no solution"
