@@ -23,7 +23,6 @@ child that is forked does not belong to the sessions of its parent.
 from __future__ import annotations
 
 import contextlib
-import copy
 import functools
 import logging
 import os
@@ -39,6 +38,7 @@ from iris_session.protocol.errors import IrisError
 from iris_session.session.errors import OwnershipError
 from iris_session.session.simulation import find_simulation
 from iris_session.session.user_loop import UserLoop
+from iris_session.simulators.wrapping import SimulatorError, wrap_calls
 
 #: Functions of MuJoCo that advance data by a timestep, and use the `ctrl` that is there when they are called.
 STEP_FUNCTIONS: Final = ("mj_step", "mj_step2")
@@ -159,68 +159,6 @@ def is_alike(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
     return len(names[0] & names[1]) > ALIKE * len(names[0] | names[1])
 
 
-def _get_same(value: Any) -> Any:
-    return value
-
-
-class MethodWrapper:
-    """Stands for a method on the instance of an environment. A deep copy or a pickle of the environment has its own
-    method instead: a planner that steps it does not step the original.
-    """
-
-    def __init__(self, original: Callable[..., Any], call: Callable[..., Any]) -> None:
-        self._original, self._call = original, call
-        functools.update_wrapper(self, original, updated=())  # not its attributes: it may be a wrapper of ours, too
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return self._call(*args, **kwargs)
-
-    def __deepcopy__(self, memo: dict[Any, Any]) -> Any:
-        marker = "MethodWrapper", id(self)
-        if marker in memo:  # an environment that copies itself, and does not note its copy
-            return self._original
-        memo[marker] = True
-        return copy.deepcopy(self._original, memo)  # a bound method is bound to the copy
-
-    def __reduce__(self) -> Any:
-        return _get_same, (self._original,)
-
-
-class WrappedMethod:
-    """A method of one environment, wrapped on the instance: `around` is called with the original.
-
-    A child that was forked calls the original. Raises `OwnershipError` for an environment whose attributes cannot be
-    set.
-    """
-
-    def __init__(self, environment: Any, name: str, around: Callable[[Callable[[], Any]], Any]) -> None:
-        original, process = getattr(environment, name), os.getpid()
-        self._environment, self._name = environment, name
-        self._before = vars(environment).get(name) if hasattr(environment, "__dict__") else None
-        self._active = True
-
-        def call(*args: Any, **kwargs: Any) -> Any:
-            if not self._active or os.getpid() != process:
-                return original(*args, **kwargs)
-            return around(lambda: original(*args, **kwargs))
-
-        self._wrapper = MethodWrapper(original, call)
-        try:
-            setattr(environment, name, self._wrapper)
-        except (AttributeError, TypeError) as error:
-            raise OwnershipError(f"{name!r} of {type(environment).__name__} cannot be wrapped: {error}") from error
-
-    def remove(self) -> None:
-        """Put the original back; another function around ours stays, and passes through."""
-        self._active = False
-        if vars(self._environment).get(self._name) is not self._wrapper:
-            return
-        if self._before is None:
-            delattr(self._environment, self._name)
-        else:
-            setattr(self._environment, self._name, self._before)
-
-
 class Attachment:
     """Lets a session see every step of one model and data, and follows the program to others.
 
@@ -254,7 +192,7 @@ class Attachment:
         self._environment_began_ns: int | None = None
         #: The environment advances its data by functions that are not wrapped: then its step is the tick.
         self._is_opaque = False
-        self._wrapped: list[WrappedMethod] = []
+        self._unwrap = contextlib.ExitStack()
         self._thread: int | None = None  # that steps the data
         #: Steps of other data since the newest one of ours: session time of the first and of the newest.
         self._other_since_ns: int | None = None
@@ -271,12 +209,12 @@ class Attachment:
         add_loop(self, loop.data)
         if environment is not None:
             try:
-                self._wrapped.append(WrappedMethod(environment, step, self._around_step))
+                self._unwrap.callback(wrap_calls(environment, step, lambda call, *_: self._around_step(call)))
                 if callable(getattr(environment, "reset", None)):
-                    self._wrapped.append(WrappedMethod(environment, "reset", self._around_reset))
-            except BaseException:
+                    self._unwrap.callback(wrap_calls(environment, "reset", lambda call, *_: self._around_reset(call)))
+            except SimulatorError as error:
                 self.close()
-                raise
+                raise OwnershipError(str(error)) from None
 
     def step(self, model: Any, data: Any, advance: Callable[..., None]) -> None:
         """Take `advance(model, data)` into the session."""
@@ -431,5 +369,4 @@ class Attachment:
     def close(self) -> None:
         """Give the step back. May be called twice."""
         remove_loop(self)
-        while self._wrapped:
-            self._wrapped.pop().remove()
+        self._unwrap.close()

@@ -25,7 +25,8 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError, OwnershipError, PublishError
 from iris_session.session.robots import AUTO, NONE
 from iris_session.session.scene_publisher import ScenePublisher
-from iris_session.simulators.adapter import Adapter, AlreadyWrappedError, SimulationState, TipTarget
+from iris_session.simulators.adapter import Adapter, SimulationState, TipTarget
+from iris_session.simulators.wrapping import AlreadyWrappedError
 
 _log = logging.getLogger(__name__)
 

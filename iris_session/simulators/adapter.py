@@ -6,8 +6,6 @@ looking for the right adapter costs nothing.
 
 from __future__ import annotations
 
-import functools
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import Pose
-from iris_session.protocol.errors import IrisError
 from iris_session.protocol.specs import RobotSpec
 from iris_session.scene.builder import SceneBuilder
 
@@ -26,14 +23,6 @@ Floats = NDArray[np.float64]
 MAX_NAME: Final = 64
 #: Links that slide or turn at the end of an arm, beside one another: fewer are an arm, more a hand.
 _FINGERS: Final = range(2, 6)
-
-
-class SimulatorError(IrisError, ValueError):
-    """A simulation that cannot be shown; the message says what would be right."""
-
-
-class AlreadyWrappedError(SimulatorError):
-    """A method that is wrapped already, by another session over the same simulation."""
 
 
 class TipTarget(NamedTuple):
@@ -100,65 +89,6 @@ class Adapter(ABC):
             A function that ends this; `None` where the simulation has no step, and the program calls `sync()`.
         """
         return None
-
-
-#: What is wrapped, by process, object and method. The objects are kept, so that no other gets their number.
-_wrapped: dict[tuple[Any, ...], Any] = {}
-
-
-def wrap_method(
-    owner: Any, name: str, before: Callable[..., None], after: Callable[..., None], key: tuple[Any, ...] = ()
-) -> Callable[[], None]:
-    """Replace a method on one object, or a function of a module, by one that calls `before` and `after` around it.
-
-    In a process that is forked afterwards it calls the original alone.
-
-    Args:
-        owner: The object or module.
-        name: Name of the method.
-        before: Called with the arguments of every call.
-        after: Likewise.
-        key: What no two sessions may wrap at once, where it is not the object.
-
-    Returns:
-        A function that puts the original back.
-
-    Raises:
-        AlreadyWrappedError: It is wrapped already.
-        SimulatorError: The object does not allow it.
-    """
-    process = os.getpid()
-    key = (process, *(key or (id(owner),)), name)
-    if key in _wrapped:
-        raise AlreadyWrappedError("a session is attached to this simulation already: close it first")
-    original, own = getattr(owner, name), getattr(owner, "__dict__", {}).get(name)
-    active = True
-
-    @functools.wraps(original)
-    def step(*args: Any, **kwargs: Any) -> Any:
-        if not active or os.getpid() != process:
-            return original(*args, **kwargs)
-        before(*args, **kwargs)
-        result = original(*args, **kwargs)
-        after(*args, **kwargs)
-        return result
-
-    def remove() -> None:
-        nonlocal active
-        active = False  # what has wrapped ours passes through
-        _wrapped.pop(key, None)
-        if owner.__dict__.get(name) is step:
-            if own is None:
-                delattr(owner, name)
-            else:
-                setattr(owner, name, own)
-
-    try:
-        setattr(owner, name, step)
-    except (AttributeError, TypeError) as error:
-        raise SimulatorError(f"{name!r} of {type(owner).__name__} cannot be wrapped ({error}): call sync()") from error
-    _wrapped[key] = owner
-    return remove
 
 
 class Names:

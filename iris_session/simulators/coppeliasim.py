@@ -17,15 +17,8 @@ import numpy as np
 from iris_session.protocol.specs import RobotSpec
 from iris_session.scene.builder import AppearanceOptions, SceneBuilder
 from iris_session.scene.errors import SceneBuildError
-from iris_session.simulators.adapter import (
-    Adapter,
-    Names,
-    SimulationState,
-    SimulatorError,
-    TipTarget,
-    from_xyzw,
-    wrap_method,
-)
+from iris_session.simulators.adapter import Adapter, Names, SimulationState, TipTarget, from_xyzw
+from iris_session.simulators.wrapping import SimulatorError, wrap_method
 
 #: Most parts of a compound shape.
 _MAX_PARTS: Final = 1000

@@ -17,16 +17,9 @@ from iris_session.protocol.common import Pose
 from iris_session.scene.builder import AppearanceOptions, SceneBuilder, check_mesh
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.nodes import to_matrix
-from iris_session.simulators.adapter import (
-    Adapter,
-    Floats,
-    Names,
-    SimulationState,
-    SimulatorError,
-    TipTarget,
-    wrap_method,
-)
+from iris_session.simulators.adapter import Adapter, Floats, Names, SimulationState, TipTarget
 from iris_session.simulators.genesis_robots import GenesisRobots
+from iris_session.simulators.wrapping import SimulatorError, wrap_method
 
 #: End of the name that Genesis gives to an entity without one.
 _OWN_NAME: Final = re.compile(r"_[0-9a-f]{7}$")

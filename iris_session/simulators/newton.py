@@ -17,17 +17,8 @@ from iris_session.protocol.specs import RobotSpec
 from iris_session.scene.builder import AppearanceOptions, SceneBuilder, check_mesh
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.nodes import to_matrix, to_pose
-from iris_session.simulators.adapter import (
-    Adapter,
-    Floats,
-    Names,
-    SimulationState,
-    SimulatorError,
-    find_gripper,
-    from_xyzw,
-    make_robot,
-    wrap_method,
-)
+from iris_session.simulators.adapter import Adapter, Floats, Names, SimulationState, find_gripper, from_xyzw, make_robot
+from iris_session.simulators.wrapping import SimulatorError, wrap_method
 
 #: Rotation of a world whose x or y axis points up, to z.
 _TO_Z_UP: Final = {

@@ -21,14 +21,13 @@ from iris_session.simulators.adapter import (
     Adapter,
     Names,
     SimulationState,
-    SimulatorError,
     TipTarget,
     find_gripper,
     from_xyzw,
     make_robot,
-    wrap_method,
 )
 from iris_session.simulators.joint_targets import Joints, JointTargets, place_fingers
+from iris_session.simulators.wrapping import SimulatorError, wrap_method
 
 #: Clients that one process can have.
 _MAX_CLIENTS: Final = 1024
@@ -150,7 +149,7 @@ class PyBulletAdapter(Adapter):
         return poses
 
     def wrap_step(self, before: Callable[[], None], after: Callable[[], None]) -> Callable[[], None]:
-        """Follow `stepSimulation` of this client."""
+        """Follow `stepSimulation` of this client until it is disconnected: the next one may have its number."""
 
         def is_ours(args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
             given = args[0] if args else kwargs.get("physicsClientId", 0 if self._owner is self._p else self._client)
@@ -165,12 +164,18 @@ class PyBulletAdapter(Adapter):
                 self._time_s += self._call("getPhysicsEngineParameters")["fixedTimeStep"]
                 after()
 
+        def on_disconnect(*args: Any, **kwargs: Any) -> None:
+            if is_ours(args, kwargs):
+                wraps.close()
+
         with ExitStack() as ends:
             key = ("pybullet", self._client)  # a client, whether by the module or by a BulletClient
             ends.callback(wrap_method(self._owner, "stepSimulation", on_before, on_after, key))
+            ends.callback(wrap_method(self._owner, "disconnect", lambda *_, **__: None, on_disconnect, key))
             if self._owner is self._p:
                 ends.callback(_keep_clients_apart(self._p, self._client))
-            return ends.pop_all().close
+            wraps = ends.pop_all()
+            return wraps.close
 
     # --- robots -------------------------------------------------------------------------------------------------------
 
@@ -230,7 +235,7 @@ def _find_client(pybullet: Any, simulation: Any) -> int:
 
 
 def _keep_clients_apart(pybullet: Any, number: int) -> Callable[[], None]:
-    """Let `BulletClient` give its number to our `stepSimulation` too, which it does for compiled functions only.
+    """Let `BulletClient` give its number to our functions too, which it does for compiled functions only.
 
     Returns:
         A function that ends this, with the last session that needs it.
@@ -240,12 +245,15 @@ def _keep_clients_apart(pybullet: Any, number: int) -> Callable[[], None]:
     def step(client: Any, *args: Any, **kwargs: Any) -> None:
         pybullet.stepSimulation(*args, physicsClientId=client._client, **kwargs)
 
+    def disconnect(client: Any) -> None:
+        pybullet.disconnect(physicsClientId=client._client)
+
     def end() -> None:
         _apart.remove(number)
         if not _apart:
-            del BulletClient.stepSimulation
+            del BulletClient.stepSimulation, BulletClient.disconnect
 
     if not _apart:
-        BulletClient.stepSimulation = step
+        BulletClient.stepSimulation, BulletClient.disconnect = step, disconnect
     _apart.append(number)
     return end

@@ -19,18 +19,9 @@ from iris_session.protocol.specs import RobotSpec
 from iris_session.scene.builder import AppearanceOptions, SceneBuilder, check_mesh
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.nodes import to_matrix
-from iris_session.simulators.adapter import (
-    Adapter,
-    Floats,
-    Names,
-    SimulationState,
-    SimulatorError,
-    TipTarget,
-    find_gripper,
-    make_robot,
-    wrap_method,
-)
+from iris_session.simulators.adapter import Adapter, Floats, Names, SimulationState, TipTarget, find_gripper, make_robot
 from iris_session.simulators.joint_targets import Joints, JointTargets, place_fingers
+from iris_session.simulators.wrapping import SimulatorError, wrap_method
 
 #: Rotation from z, along which our shapes lie, to x, along which those of PhysX do.
 _Z_TO_X: Final[PoseTuple] = ((0.0, 0.0, 0.0), (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0))
@@ -144,7 +135,8 @@ class SapienAdapter(Adapter):
             if target.stops or found is not None:
                 q, v = np.asarray(arm.articulation.qpos)[own], np.asarray(arm.articulation.qvel)[own]
                 in_force = [float(np.ravel(joints[i].drive_target)[0]) for i in own]
-                moved = Joints(q, v, in_force, *limits[own].T, [joints[i].max_velocity for i in own])
+                speeds = [joints[i].max_velocity for i in own]
+                moved = Joints(q, v, in_force, limits[own, 0], limits[own, 1], speeds)
                 goal = self._targets.limit(name, (self._time_s, float(self._scene.timestep)), moved, found)
                 for joint, place in zip(own, goal.tolist(), strict=True):
                     joints[joint].set_drive_target(place)

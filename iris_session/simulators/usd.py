@@ -20,16 +20,9 @@ from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.nodes import split_rigid, to_matrix
 from iris_session.simulators import usd_content as content
-from iris_session.simulators.adapter import (
-    Adapter,
-    Floats,
-    Names,
-    SimulationState,
-    SimulatorError,
-    find_gripper,
-    make_robot,
-)
+from iris_session.simulators.adapter import Adapter, Floats, Names, SimulationState, find_gripper, make_robot
 from iris_session.simulators.usd_looks import read_look
+from iris_session.simulators.wrapping import SimulatorError
 
 SUFFIXES: Final = (".usd", ".usda", ".usdc", ".usdz")
 #: Rotation of a stage with y up: 90 degrees around x.

@@ -20,7 +20,8 @@ from iris_session import ConfigError, IrisError, OwnershipError, Session
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import load_model
 from iris_session.protocol.server_messages import SceneChanged
-from iris_session.session.attachment import STEP_FUNCTIONS, Attachment, WrappedMethod
+from iris_session.session.attachment import STEP_FUNCTIONS, Attachment
+from iris_session.simulators.wrapping import wrap_calls
 from tests.rig.owned import keep_journal
 from tests.session.loops import Agent, Rig
 from tests.session.test_session import QUIET
@@ -501,10 +502,10 @@ def test_a_copy_or_pickle_of_the_environment_steps_itself(owned: Owned) -> None:
     assert owned.data.time == before < twin.data.time
     assert twin.step.__self__ is twin  # type: ignore[attr-defined]
     plain = PlainEnvironment()
-    wrapped = WrappedMethod(plain, "step", lambda original: original())
+    remove = wrap_calls(plain, "step", lambda call, *_: call())
     twin_of_plain = pickle.loads(pickle.dumps(plain))
     assert (plain.step(), twin_of_plain.step(), twin_of_plain.step()) == (1, 1, 2)
-    wrapped.remove()
+    remove()
 
 
 def test_a_reset_that_steps_is_one_new_epoch(owned: Owned) -> None:

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from iris_session.simulators import SimulatorError, find_adapter
-from iris_session.simulators.adapter import Names, find_gripper, wrap_method
+from iris_session.simulators.adapter import Names, find_gripper
+from iris_session.simulators.wrapping import wrap_method
 
 
 def of_package(package: str, **values: Any) -> Any:
@@ -103,5 +104,5 @@ def test_a_wrapped_method_keeps_what_was_there() -> None:
     end = wrap_method(owner2 := SimpleNamespace(step=original), "step", lambda n: None, lambda n: None)
     end()
     assert owner2.step is original
-    with pytest.raises(SimulatorError, match="sync"):
+    with pytest.raises(SimulatorError, match="cannot be wrapped"):
         wrap_method(type("Fixed", (), {"__slots__": (), "step": lambda self: 0})(), "step", print, print)

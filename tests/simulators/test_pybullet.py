@@ -12,6 +12,7 @@ from iris_session.protocol.common import Pose
 from iris_session.simulators import TipTarget
 from iris_session.simulators.joint_targets import MAX_SPEED, JointTargets
 from iris_session.simulators.pybullet import PyBulletAdapter, _Arm, _Joint
+from iris_session.simulators.wrapping import AlreadyWrappedError
 
 DT = 0.005
 TARGET = TipTarget(Pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0)), 1.0)
@@ -83,28 +84,64 @@ def test_motors_have_the_limits_of_their_joints(adapter: Any, bullet: Bullet) ->
     assert {joint: motor[0] for joint, motor in bullet.motors.items()} == {0: 0.5, 1: 0.5, 2: 0.5}
 
 
-def test_bullet_client_gets_its_step_back_with_the_last_session(monkeypatch: pytest.MonkeyPatch) -> None:
-    class BulletClient:
-        stepSimulation: Any
+class BulletClient:
+    stepSimulation: Any
 
+
+class Clients:
+    """The module with several clients: the stand-in of `pybullet`, whose session `i` notes the steps of client `i`."""
+
+    def __init__(self) -> None:
+        self.steps: list[int] = []
+        self.seen: list[int] = []
+        self.module = SimpleNamespace(stepSimulation=lambda physicsClientId=0: self.steps.append(physicsClientId))
+        self.module.disconnect = lambda physicsClientId=0: None
+        self.module.getPhysicsEngineParameters = lambda physicsClientId: {"fixedTimeStep": DT}
+        self.originals = dict(vars(self.module))
+
+    def follow(self, client: int) -> Any:
+        adapter: Any = object.__new__(PyBulletAdapter)
+        adapter._p = adapter._owner = self.module
+        adapter._client, adapter._time_s = client, 0.0
+        return adapter.wrap_step(lambda: None, lambda: self.seen.append(client))
+
+
+@pytest.fixture
+def clients(monkeypatch: pytest.MonkeyPatch) -> Clients:
     for name in ("pybullet_utils", "pybullet_utils.bullet_client"):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
     monkeypatch.setattr(sys.modules["pybullet_utils.bullet_client"], "BulletClient", BulletClient, raising=False)
-    steps: list[int] = []
-    module = SimpleNamespace(stepSimulation=lambda physicsClientId=0: steps.append(physicsClientId))
-    module.getPhysicsEngineParameters = lambda physicsClientId: {"fixedTimeStep": DT}
-    adapters, seen = [], []
-    for client in (0, 1):
-        adapter: Any = object.__new__(PyBulletAdapter)
-        adapter._p = adapter._owner = module
-        adapter._client, adapter._time_s = client, 0.0
-        adapters.append(adapter)
-    ends = [a.wrap_step(lambda: None, lambda a=a: seen.append(a._client)) for a in adapters]
+    return Clients()
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_functions_come_back_with_the_last_session(clients: Clients, first: int) -> None:
+    ends = [clients.follow(client) for client in (0, 1)]
     wrapped: Any = BulletClient()
     wrapped._client = 1
     wrapped.stepSimulation()
-    ends[0]()
+    ends[first]()
     wrapped.stepSimulation()
-    assert (steps, seen) == ([1, 1], [1, 1])
-    ends[1]()
+    clients.module.stepSimulation()
+    assert clients.steps == [1, 1, 0]
+    assert clients.seen == ([1, 1] if first == 0 else [1, 0])
+    ends[1 - first]()
     assert "stepSimulation" not in vars(BulletClient)
+    assert "disconnect" not in vars(BulletClient)
+    assert vars(clients.module) == clients.originals
+
+
+def test_a_client_with_the_number_of_one_that_was_disconnected_is_another_simulation(clients: Clients) -> None:
+    end = clients.follow(0)
+    with pytest.raises(AlreadyWrappedError):
+        clients.follow(0)
+    clients.module.disconnect(physicsClientId=1)
+    with pytest.raises(AlreadyWrappedError):
+        clients.follow(0)
+    clients.module.disconnect()
+    end_second = clients.follow(0)
+    end()  # of the first session, later
+    clients.module.stepSimulation()
+    assert clients.seen == [0]
+    end_second()
+    assert vars(clients.module) == clients.originals

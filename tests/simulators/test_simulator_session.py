@@ -15,7 +15,8 @@ from iris_session.protocol.client_messages import Acquire
 from iris_session.protocol.names import Role
 from iris_session.session import share as share_module
 from iris_session.session.simulator_session import SimulatorSession
-from iris_session.simulators.adapter import Adapter, SimulationState, TipTarget, make_robot, wrap_method
+from iris_session.simulators.adapter import Adapter, SimulationState, TipTarget, make_robot
+from iris_session.simulators.wrapping import wrap_method
 from tests.rig.owned import keep_journal, simulate_sessions
 from tests.rig.simulation import Simulation
 
