@@ -21,6 +21,7 @@ from iris_session.demo.scenes.deformables import cloth_scene, soft_scene
 from iris_session.demo.scenes.panda import panda_scene
 from iris_session.demo.scenes.parts import add_sheet, get_sheet_position
 from iris_session.physics import load_model
+from iris_session.protocol.errors import IrisError
 from iris_session.session.config import DEFAULT_ANCHORS, DEFAULT_SHEET_M
 from iris_session.session.errors import ConfigError
 
@@ -92,16 +93,19 @@ def scene_by_name(name: str) -> NamedScene:
         The scene.
 
     Raises:
-        ConfigError: Unknown name, or number out of range; the message lists the names.
+        ConfigError: Unknown name, or number out of range; the message lists the names. Or this version of MuJoCo is too
+            old for the scene.
         ModelNotFoundError: The model of a real robot is not installed.
     """
-    if name in SCENES:
-        return SCENES[name]()
     match = re.fullmatch(r"([a-z]+)([0-9]{1,3})", name)
-    if match is None or match[1] not in NUMBERED:
+    if name not in SCENES and (match is None or match[1] not in NUMBERED):
         names = ", ".join(SCENE_NAMES)
         raise ConfigError(f"unknown scene '{name}'; expected one of {names}, or a file ({FILES})")
     try:
-        return NUMBERED[match[1]](int(match[2]))
-    except ValueError as error:  # out of range
-        raise ConfigError(f"scene '{name}': {error}") from error
+        return SCENES[name]() if match is None else NUMBERED[match[1]](int(match[2]))
+    except IrisError:
+        raise
+    except (AttributeError, ValueError) as error:
+        is_range = match is not None and isinstance(error, ValueError)
+        advice = "" if is_range else f"; it needs a newer MuJoCo than {mujoco.__version__}"
+        raise ConfigError(f"scene '{name}': {' '.join(str(error).split())}{advice}") from error

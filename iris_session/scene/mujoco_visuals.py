@@ -68,6 +68,8 @@ def _check_groups(what: str, groups: object) -> tuple[int, ...]:
     found = tuple(groups) if isinstance(groups, Iterable) and not isinstance(groups, str | bytes) else None
     if found is None or not all(isinstance(one, int | np.integer) and not isinstance(one, bool) for one in found):
         raise ValueError(f"{what} is {groups!r:.60}: numbers of groups are expected, such as (0, 1, 2)")
+    if wrong := [one for one in found if not 0 <= one < mujoco.mjNGROUP]:
+        raise ValueError(f"{what} has {wrong[0]}: MuJoCo has groups 0 to {mujoco.mjNGROUP - 1}")
     return tuple(dict.fromkeys(int(one) for one in found))
 
 

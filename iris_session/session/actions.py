@@ -79,6 +79,12 @@ class ActionDrive:
         """Return the robots whose entries in the newest action are not the owner's."""
         return self._replaced
 
+    def list_interventions(self, driven: Sequence[str]) -> tuple[str, ...]:
+        """Return the robots in whose part of the newest step participants came in: of those that they drive, the ones
+        that the action can move, and those on their way back to the owner.
+        """
+        return tuple(sorted({name for name in driven if name not in self._refused} | {*self._replaced}))
+
     def list_warnings(self) -> tuple[str, ...]:
         """Return which robots participants cannot drive now, one line each."""
         return tuple(self._refused.values())

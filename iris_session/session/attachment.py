@@ -28,7 +28,7 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import mujoco
@@ -170,8 +170,8 @@ class Attachment:
         environment: Object that owns the simulation, `None` when the script calls MuJoCo itself.
         step: Name of the environment's method.
         change_model: Called with another model and data that the program has built.
-        list_replaced: Returns the robots in whose part of the newest action participants came in. Given for an
-            environment that is driven by its action: its steps then say in `info` who was driven.
+        list_interventions: Returns the robots in whose part of a step participants came in, of those that they
+            drive. Given for an environment that is driven by its action: its steps then say in `info` which they are.
     """
 
     def __init__(
@@ -180,10 +180,10 @@ class Attachment:
         environment: Any,
         step: str,
         change_model: Callable[[Any, Any], None],
-        list_replaced: Callable[[], tuple[str, ...]] | None = None,
+        list_interventions: Callable[[Sequence[str]], tuple[str, ...]] | None = None,
     ) -> None:
         self._loop = loop
-        self._list_replaced = list_replaced
+        self._list_interventions = list_interventions
         self.environment = environment
         self._change_model = change_model
         self._is_stepping = False
@@ -329,13 +329,13 @@ class Attachment:
         return result
 
     def _take_reported_step(self, original: Callable[[], Any]) -> Any:
-        if self._list_replaced is None:
+        if self._list_interventions is None:
             return self._take_environment_step(original)
-        driven = (*self._loop.driven, *self._list_replaced())
+        driven = self._loop.driven
         result = self._take_environment_step(original)
-        driven += self._loop.driven
+        driven = self._list_interventions((*driven, *self._loop.driven))
         if type(result) is tuple and len(result) in INFO_LENGTHS and isinstance(result[-1], dict):
-            info = {**result[-1], "intervention": tuple(sorted(set(driven)))}
+            info = {**result[-1], "intervention": driven}
             result = (*result[:-1], info)
         return result
 

@@ -508,8 +508,8 @@ class Session(SessionBase):
             loop = session._require_user_loop()
             if environment is not None and session.config.control.output == OUTPUT_TARGETS:
                 session._actions = ActionDrive(environment, session.config.control)
-            list_replaced = None if session._actions is None else session._actions.list_replaced
-            session._attachment = Attachment(loop, environment, step, session._change_model, list_replaced)
+            interventions = None if session._actions is None else session._actions.list_interventions
+            session._attachment = Attachment(loop, environment, step, session._change_model, interventions)
             session.processes.reporter.warning_sources.append(session._attachment.list_warnings)
             session._attachment.on_environment = session._look_at_goals
             if session._actions is not None:
@@ -729,6 +729,7 @@ class Session(SessionBase):
         else:
             live, core = self._require_started(), self._make_core(user_owned=user_owned)
             stepper = live.make_stepper(core, self.clock, user_owned=user_owned)
+            stepper.list_notices = lambda: self._robot_notices
             if not user_owned:
                 self.data = core.world.data
                 stepper.on_scene.append(self._follow_scene)

@@ -17,12 +17,12 @@ import mujoco
 from iris_session.control.config import OUTPUT_CTRL, OUTPUT_TARGETS
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.session.config import SessionConfig
-from iris_session.session.errors import ConfigError
+from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.resume import is_port_free
 from iris_session.session.robots import RobotChoice, explain_no_robots
 from iris_session.session.session import Session
 from iris_session.session.session_base import SessionBase
-from iris_session.session.simulation import require_simulation, unwrap_data, unwrap_model
+from iris_session.session.simulation import list_owners, require_simulation, unwrap_data, unwrap_model
 from iris_session.session.simulator_session import SimulatorSession
 from iris_session.simulators import find_adapter
 
@@ -34,6 +34,8 @@ OTHER_PORTS: Final = "the usual ports are in use, by another session perhaps: th
 NOT_RECORDED: Final = "not recorded, because rerun is not installed: pip install 'iris-session[recording]'"
 
 _log = logging.getLogger(__name__)
+#: Environments that are shown by `sync`, with their sessions, whose data is their own.
+_synced: list[tuple[Any, Session]] = []
 
 
 def share(
@@ -88,7 +90,7 @@ def share(
         ModelNotFoundError, ModelInvalidError: The file is missing, or MuJoCo does not compile it.
         ConfigError: `x` is nothing that can be shared, or an argument cannot be used.
         SimulatorError: A simulation cannot be shown as it is: not built yet, for example.
-        OwnershipError: A session shares this data already.
+        OwnershipError: A session shares this data, or this environment, already.
         StartError: A port is in use, a folder cannot be written, a key is missing.
     """
     if drive not in DRIVES:
@@ -146,11 +148,16 @@ def _share(x: Any, data: Any, config: SessionConfig, given: Mapping[str, Any], s
         raise ConfigError(f"data is given with {type(x).__name__}: give it with an MjModel, as in share(model, data)")
     model, found = require_simulation(x)
     if found is None:
+        environment = next(list_owners(x), x)
+        _synced[:] = [(one, session) for one, session in _synced if not session._is_closed]
+        if any(one is environment for one, _ in _synced):
+            raise OwnershipError(f"a session shares this {type(environment).__name__} already: close it first")
         found = mujoco.MjData(model)
         if model.nkey:
             mujoco.mj_resetDataKeyframe(model, found, 0)
         session = _start(Session(model, found, config, **given))
         session.sync(found)  # from here on participants can join
+        _synced.append((environment, session))
         return session
     return Session.attach(model, found, config, environment=x, step=step, **given)
 

@@ -131,6 +131,7 @@ class Stepper:
         on_publish: Called after a state was published, with scene epoch and the times of `publish_now`.
         on_state: Called with what was published; for measurements and tests.
         on_entries: Called with the entries of every step; for measurements and tests.
+        list_notices: Returns what is said of robots that can only be watched; a denial to take one says it, too.
         on_lap: Called after each part of a step with the `LateCause` that its time counts as. The pacing loop sets it.
     """
 
@@ -169,6 +170,7 @@ class Stepper:
         self.on_publish: list[Callable[[int, int, int], None]] = []
         self.on_state: Callable[[StateHeader, NDArray[np.float64]], None] | None = None
         self.on_entries: Callable[[Sequence[Entry]], None] | None = None
+        self.list_notices: Callable[[], Sequence[str]] = tuple
         self.on_lap: Callable[[str], None] = ignore_lap
         self._resumed_from = resumed_from
         self._last_now_ns = -1 if resumed_from is None else resumed_from.now_ns
@@ -267,6 +269,7 @@ class Stepper:
         if outcome.diverged and (self.last is None or not self.last.diverged):
             self.post_own(PhysicsDiverged(outcome.decision.scene_epoch, outcome.diverged[:MAX_TEXT]))
             self.post_own(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
+        outcome = self._explain_denials(outcome)
         self.last = outcome
         self.front.send_decision(self.step_count, outcome.decision)
         self._newest_step = self.step_count
@@ -389,6 +392,21 @@ class Stepper:
             self.recorder.add_state(self._newest_step, tick, sim_time, end_ns, self._poses, applied, robots)
             self.recorder.add_metric(self._newest_step, end_ns, "lateness_ms", self.lateness_ns * 1e-6)
             self.lateness_ns = 0
+
+    def _explain_denials(self, outcome: StepOutcome) -> StepOutcome:
+        """Say in denials why a robot can only be watched: the authority knows those that can be driven."""
+        outgoing = list(outcome.decision.outgoing)
+        for i, one in enumerate(outgoing):
+            denial = one.message.denial if isinstance(one.message, Reply) else None
+            if denial is not None and denial.reason == DenialReason.UNKNOWN_TARGET:
+                start = f"robot {denial.target!r} "
+                text = next((notice for notice in self.list_notices() if notice.startswith(start)), denial.message)
+                denial = msgspec.structs.replace(denial, message=text[:MAX_TEXT])
+                outgoing[i] = msgspec.structs.replace(one, message=msgspec.structs.replace(one.message, denial=denial))
+        if not outgoing:
+            return outcome
+        decision = msgspec.structs.replace(outcome.decision, outgoing=tuple(outgoing))
+        return msgspec.structs.replace(outcome, decision=decision)
 
     def _record(
         self, recorder: RecorderFeed, now_ns: int, n_ticks: int, entries: Sequence[Entry], plant: bytes

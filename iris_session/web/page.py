@@ -26,8 +26,9 @@ MISSING_PAGE: Final = b"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>iris-session</title>
 <h1>iris-session: the page is not built</h1>
 <p>The session runs, and this gateway answers. Only the page is missing in this installation.</p>
-<p>In a checkout of the repository, run <code>make web</code> on the machine of the session, then load this address
-again. An installed package (<code>pip install 'iris-session[web]'</code>) contains the page.</p>
+<p>It was installed from a checkout in which the page was not built. Run <code>make web</code> there, then
+<code>pip install '.[web]'</code> again (not needed if you run it from the checkout, or installed it with
+<code>-e</code>), and load this address again. A released wheel contains the page.</p>
 </html>
 """
 
@@ -43,7 +44,10 @@ class PageFile(NamedTuple):
 
 def describe_missing_page(folder: Path = PAGE_FOLDER) -> str:
     """Return a remark for people where the page is not built, to follow its address; else nothing."""
-    return "" if (folder / INDEX).exists() else " (the page is not built yet: run `make web`)"
+    missing = (
+        " (the page is missing: run `make web` in the checkout; if it was not installed with -e, install it again)"
+    )
+    return "" if (folder / INDEX).exists() else missing
 
 
 class PageFiles:

@@ -6,7 +6,7 @@ import mujoco
 import pytest
 
 from iris_session.cloud.camera_file import load_camera_file
-from iris_session.demo.named_scenes import SCENES, scene_by_name
+from iris_session.demo.named_scenes import SCENES, NamedScene, scene_by_name
 from iris_session.demo.scene_names import SCENE_NAMES
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_SHEET_M
 from iris_session.physics import find_robots
@@ -42,6 +42,17 @@ def test_cameras_of_the_cloud_draw_every_body_of_the_session_and_more() -> None:
     bodies = [scene.model.body(k).name for k in range(scene.model.nbody)]
     assert bodies == [drawn.body(k).name for k in range(drawn.nbody)]  # what is more is fixed to the world
     assert drawn.ngeom > scene.model.ngeom
+
+
+def test_a_scene_for_a_newer_mujoco_is_an_error_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def make() -> NamedScene:
+        mujoco.MjSpec.from_string("<mujoco>\n<option integrator='newest'/></mujoco>")
+        raise AssertionError
+
+    monkeypatch.setitem(SCENES, "cloth", make)
+    with pytest.raises(ConfigError, match=mujoco.__version__) as caught:
+        scene_by_name("cloth")
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

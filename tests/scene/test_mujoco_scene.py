@@ -122,7 +122,10 @@ def test_groups_of_geoms_and_sites_are_chosen(tmp_path: Path, options: dict[str,
     assert {"floor", "link"} <= {one.name for one in parsed.spec.visuals}, "clients can show every geom"
 
 
-@pytest.mark.parametrize("options", [{"groups": []}, {"groups": "012"}, {"sites": [True]}, {"groups": [0.5]}])
+@pytest.mark.parametrize(
+    "options",
+    [{"groups": []}, {"groups": "012"}, {"sites": [True]}, {"groups": [0.5]}, {"groups": [0, 6]}, {"sites": [-1]}],
+)
 def test_other_groups_than_numbers_are_refused(tmp_path: Path, options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"groups|sites"):
         parse(MARKED, tmp_path, **options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -622,7 +622,7 @@ def test_nobody_drives_by_entries_that_mean_something_else(kind: Callable[[], Wo
     person.lead()
     person.run(1.0)
     assert np.array_equal(person.mine, person.theirs)
-    assert person.drive.list_replaced() == ()
+    assert person.drive.list_replaced() == person.drive.list_interventions(("left",)) == ()
     (warning,) = person.drive.list_warnings()
     assert "'left'" in warning
     assert "\n" not in warning
@@ -657,7 +657,7 @@ def test_a_robot_is_driven_once_the_action_says_something() -> None:
     assert np.array_equal(person.mine, person.theirs)
     person.target = Pose(*world.tip.read_pose(world.data))
     person.run(0.1)
-    assert person.drive.list_replaced() == ("left",)
+    assert person.drive.list_replaced() == person.drive.list_interventions(("left",)) == ("left",)
     assert person.drive.list_warnings() == ()
 
 
@@ -815,7 +815,10 @@ class Program:
         self.attach()
 
     def attach(self) -> None:
-        self.attachment = Attachment(self.rig.loop, self, "step", lambda model, data: None, lambda: self.replaced)
+        self.attachment = Attachment(self.rig.loop, self, "step", lambda model, data: None, self.list_interventions)
+
+    def list_interventions(self, driven: Sequence[str]) -> tuple[str, ...]:
+        return tuple({*driven, *self.replaced})
 
     def step(self) -> Any:
         mujoco.mj_step(self.model, self.data)

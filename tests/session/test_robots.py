@@ -8,7 +8,9 @@ import msgspec
 import mujoco
 import pytest
 
+from iris_session.client import DeniedError
 from iris_session.control.config import ControlConfig
+from iris_session.demo.scenes import scene_path
 from iris_session.physics import RobotsFileError, load_model, load_robots_toml
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError
@@ -23,6 +25,7 @@ from iris_session.session.robots import (
 from iris_session.session.session import Session
 from tests.models import MENAGERIE
 from tests.physics.models import FINGERS, GRIPPER_TENDON, arm, scene
+from tests.rig.session import Rig
 
 #: An actuator that control has no law for.
 MUSCLE = 'muscle lengthrange="-1 1"'
@@ -241,3 +244,18 @@ def test_an_arm_that_a_mocap_body_pulls_is_driven_by_actions_only() -> None:
     found = find_drivable_robots(model, ControlConfig())
     assert found.robots == ()
     assert "drive='action'" in found.texts[0]
+
+
+def test_a_denial_says_why_a_robot_can_only_be_watched() -> None:
+    spec = mujoco.MjSpec.from_file(str(scene_path("handover")))
+    for actuator in spec.actuators:
+        if actuator.name.startswith("right/"):
+            actuator.biastype = mujoco.mjtBias.mjBIAS_USER
+    with Rig(spec) as rig:
+        (notice,) = rig.session._robot_notices
+        ann = rig.join("ann")
+        for name, is_said in (("right", True), ("none", False)):
+            with pytest.raises(DeniedError) as caught:
+                ann.acquire([name])
+            assert (caught.value.denial.message == notice) == is_said
+            assert caught.value.denial.target == name

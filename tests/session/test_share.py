@@ -156,6 +156,18 @@ def test_what_steps_elsewhere_is_synced(shared: list[Session], model: mujoco.MjM
 
 
 @pytest.mark.usefixtures("simulation")
+def test_what_steps_elsewhere_has_one_session(shared: list[Session], model: mujoco.MjModel) -> None:
+    environment = Space(mj_model=model)
+    shared.append(iris_session.share(environment, config=QUIET))
+    for again in (environment, Wrapper(environment)):
+        with pytest.raises(OwnershipError, match="close it first"):
+            iris_session.share(again, config=QUIET)
+    shared.append(iris_session.share(Space(mj_model=model), config=QUIET))
+    shared[0].close()
+    shared.append(iris_session.share(environment, config=QUIET))
+
+
+@pytest.mark.usefixtures("simulation")
 def test_without_rerun_a_program_is_shared_all_the_same(
     shared: list[Session], model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
