@@ -67,11 +67,16 @@ class ActionDrive:
         self._drives: dict[str, RobotDrive] = {}
         self._arms: dict[str, ArmModel] = {}  # compiled for the model
         self._found_for: tuple[Any, Any, int] = (None, None, 0)
+        self._bounds: tuple[Floats, Floats] = (np.zeros(0), np.zeros(0))  # of the action space
         self._before: Floats | None = None
         self._time = -math.inf
         self._replaced: tuple[str, ...] = ()
         self._state_before: tuple[Floats, Floats] = (np.zeros(0), np.zeros(0))  # qpos and ctrl at the newest action
         self._proofs: dict[str, int] = {}  # steps in a row that have proved a guess
+        #: Robots for which a driven step has proved the guess, and those for which one has disproved it. Equal values
+        #: of an owner whose arms stand alike prove any order of the arms; a driven step tells.
+        self._tried: set[str] = set()
+        self._disproved: set[str] = set()
         self._refused: dict[str, str] = {}  # why robots that participants drive are the owner's
         self._logged: set[str] = set()
 
@@ -113,11 +118,17 @@ class ActionDrive:
             if not drive.has_pose():
                 drive.forget()
             elif name in driven and name in targets and name not in self._refused:
-                drive.drive(mine, self._before, targets[name], shares.get(name), period, is_held=name in held)
+                is_tried = drive.reading is None or name in self._tried
+                most = period if is_tried else min(period, float(scene[0].opt.timestep))  # no more than a trial
+                drive.drive(mine, self._before, targets[name], shares.get(name), most, is_held=name in held)
             elif drive.is_returning and self._before is not None:
                 drive.give_back(mine, self._before, period)
             if drive.is_returning:
                 replaced.append(name)
+        if replaced and self._before is not None:  # not beyond the space, if the owner has not been there
+            bounds = zip((np.minimum, np.maximum), self._bounds, strict=True)
+            low, high = (choose(bound, self._before) for choose, bound in bounds)
+            mine = np.where(mine == theirs, theirs, np.clip(mine, low, high))
         self._before, self._replaced = mine, tuple(replaced)
         self._state_before = scene[1].qpos.copy(), scene[1].ctrl.copy()
         if not replaced and np.array_equal(mine, theirs):
@@ -131,10 +142,11 @@ class ActionDrive:
         period = time - self._time
         if known_model is not model or known_data is not data or known_size != size:
             self._arms = self._arms if known_model is model else {}
-            self._proofs = self._proofs if known_size == size else {}
+            if known_size != size:
+                self._proofs, self._tried, self._disproved = {}, set(), set()
             view = EnvironmentView(self._environment, model, data, robots, size, self._config, self._arms)
             try:
-                self._drives = find_drives(view)
+                self._drives, self._bounds = find_drives(view), _read_bounds(view)
             except ConfigError as error:
                 if known_model is None or known_size != size:
                     raise
@@ -157,6 +169,8 @@ class ActionDrive:
             if drive.reading is not None:
                 fits = drive.reading.compare(before, data.ctrl, *self._state_before)
                 self._proofs[name] = 0 if fits is False else self._proofs.get(name, 0) + (fits is True)
+                if name in self._replaced and fits is not None:
+                    (self._tried if fits else self._disproved).add(name)
                 if fits is False:  # of what was commanded for a participant, too
                     drive.forget()
 
@@ -167,10 +181,15 @@ class ActionDrive:
             return self._log(f"{name!r} cannot be driven: the action of {kind} does not move it, as far as is known")
         if drive.reading is None or name not in targets:
             return ""
+        if name in self._disproved:
+            return self._log(
+                f"{name!r} cannot be driven: a step has not set ctrl to its joint positions in the action of {kind}; "
+                "read session.targets() and write the action yourself"
+            )
         if self._proofs.get(name, 0) < PROOFS:
             return self._log(
                 f"{name!r} cannot be driven yet: no adapter fits the action of {kind} until two steps in a row have "
-                "set ctrl to the joint positions in it (zeros prove nothing: step with some of 0.1, for example); if "
+                "set ctrl to the joint positions in it (zeros prove nothing: step with values like 0.1, 0.2, 0.3); if "
                 "it means others, read session.targets()"
             )
         if drive.is_returning:
@@ -454,24 +473,32 @@ def _find_ctrl(view: EnvironmentView) -> Entries:
 
 def _is_normalised(view: EnvironmentView) -> bool:
     """Return whether the action space is -1 to 1 everywhere and the range of `ctrl` is another one."""
+    low, high = _read_bounds(view)
+    if not all(view.model.actuator_ctrllimited):
+        return False
+    return bool(np.all(low == -1.0) and np.all(high == 1.0)) and not np.allclose(
+        view.model.actuator_ctrlrange, (-1.0, 1.0)
+    )
+
+
+def _read_bounds(view: EnvironmentView) -> tuple[Floats, Floats]:
+    """Return the bounds of the action space, shape (n,) each; infinite where the environment does not say."""
     space = read_attribute(view.environment, "action_space")
     if space is None:
         specification = read_attribute(view.environment, "action_spec")
         space = specification() if callable(specification) else None
-    bounds = [
-        read_attribute(space, one) for one in (("low", "high") if hasattr(space, "low") else ("minimum", "maximum"))
-    ]
-    if any(bound is None for bound in bounds) or not all(view.model.actuator_ctrllimited):
-        return False
-    is_unit = all(np.all(np.asarray(bound) == end) for bound, end in zip(bounds, (-1.0, 1.0), strict=True))
-    return is_unit and not np.allclose(view.model.actuator_ctrlrange, (-1.0, 1.0))
+    names = ("low", "high") if hasattr(space, "low") else ("minimum", "maximum")
+    low, high = (read_attribute(space, name) for name in names)
+    if low is None or high is None:
+        low, high = -np.inf, np.inf
+    return np.broadcast_to(np.float64(low), view.size), np.broadcast_to(np.float64(high), view.size)
 
 
 def _convert(values: Any, like: Any) -> Any:
-    """Return the values as the type of `like`."""
+    """Return the values as the type of `like`, but never rounded to whole numbers."""
     if isinstance(like, np.ndarray):
-        return values.astype(like.dtype)
-    return type(like)(values.tolist()) if isinstance(like, list | tuple) else values
+        return values.astype(like.dtype) if np.issubdtype(like.dtype, np.floating) else values
+    return type(like)(values.tolist()) if type(like) in (list, tuple) else values
 
 
 #: Adapters, asked in this order. Each returns the entries of robots, none when the environment is of another family.

@@ -176,6 +176,16 @@ class AboutHome(Normalised):
         return np.full(16, 0.1)
 
 
+class Swapped(World):
+    """Lists the other arm first; while both stand alike, equal values fit any order."""
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        return super().step(np.roll(np.asarray(action), 8))
+
+    def policy(self, t: float) -> np.ndarray:
+        return self.home
+
+
 class Blocked(World):
     """A robot that something stops, as far as the lock is closed."""
 
@@ -629,6 +639,44 @@ def test_nobody_drives_by_entries_that_mean_something_else(kind: Callable[[], Wo
     person.target = None
     person.step()
     assert person.drive.list_warnings() == ()
+
+
+def test_a_driven_step_disproves_what_equal_values_had_proved() -> None:
+    person = Person(Swapped())
+    world = person.world
+    other = [int(world.model.joint(name).qposadr[0]) for name in world.robots[1].joints]
+    person.run(0.4)
+    stood = world.data.qpos[other].copy()
+    person.lead((0.0, 0.15, 0.1))
+    assert person.drive.list_interventions(("left",)) == ()
+    person.target = None
+    person.run(1.0)
+    person.lead((0.0, 0.15, 0.1))
+    moved = np.abs(world.data.qpos[other] - stood).max()
+    assert moved < 2.0 * CONFIG.joint_velocity * world.model.opt.timestep
+    (warning,) = person.drive.list_warnings()
+    assert "'left'" in warning
+
+
+def test_a_person_does_not_leave_the_action_space() -> None:
+    world = World()
+    person = Person(world)
+    world.action_space = Space(low=world.home - 0.05, high=world.home + 0.05)  # type: ignore[attr-defined]
+    world.policy = lambda t: world.home  # type: ignore[method-assign]
+    person.run(0.2)
+    person.lead((0.0, 0.2, 0.2))
+    ways = np.array(person.mine) - world.home
+    assert np.abs(ways).max() == pytest.approx(0.05)
+
+
+def test_an_action_of_whole_numbers_is_not_rounded() -> None:
+    world = ByRobot()
+    person = Person(world)
+    world.policy = lambda t: np.zeros(16, int)  # type: ignore[method-assign]
+    person.run(0.4)
+    person.lead((0.0, 0.02, 0.02))
+    ways = person.largest_steps()
+    assert 0.0 < ways.max() <= 1.01 * max(JOINT_STEP, GRIPPER_STEP)
 
 
 def test_a_chance_match_proves_nothing() -> None:
