@@ -32,9 +32,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import mujoco
+import numpy as np
 
 from iris_session.physics.names import list_element_names
-from iris_session.protocol.errors import IrisError
 from iris_session.session.errors import OwnershipError
 from iris_session.session.simulation import find_simulation
 from iris_session.session.user_loop import UserLoop
@@ -50,6 +50,8 @@ FOLLOW_AFTER_NS: Final = 250_000_000
 #: The same for other data of the same model, when nothing but the session holds the attached one [ns].
 FOLLOW_SAME_AFTER_NS: Final = 1_000_000_000
 ASK_AGAIN_NS: Final = 50_000_000
+#: Other data that is remembered as not followed.
+MAX_REFUSED: Final = 64
 #: Other data is simulated for so long before the owner is warned [ns].
 WARN_AFTER_NS: Final = 500_000_000
 ELSEWHERE: Final = (
@@ -197,8 +199,8 @@ class Attachment:
         #: Steps of other data since the newest one of ours: session time of the first and of the newest.
         self._other_since_ns: int | None = None
         self._other_ns = 0
-        #: Other data that is not followed, by its identity, and when that is decided again.
-        self._refused: tuple[int, int] = (0, 0)
+        #: When it is decided again about other data that is not followed, by its identity.
+        self._refused: dict[int, int] = {}
         #: Data of the program that the session could not go on with, and why.
         self._failed: Any = None
         self.fault = ""
@@ -230,32 +232,28 @@ class Attachment:
         loop = self._loop
         self._is_stepping = True
         try:
-            if loop.is_driving and self._unless_closed(lambda: loop.begin_tick(n_ticks)):
+            if loop.is_driving and self._unless_ended(lambda: loop.begin_tick(n_ticks)):
                 result = advance()
-                self._unless_closed(loop.end_tick)
+                self._unless_ended(loop.end_tick)
                 return result
             began_ns, began_time = loop.read_clock(), float(loop.data.time)
             result = advance()
             loop.note_step(began_ns, began_time)
             since_ns = self._environment_began_ns
             if since_ns is None or loop.read_clock() - since_ns > LONG_STEP_NS:
-                self._unless_closed(loop.look)
+                self._unless_ended(loop.look)
             return result
         finally:
             self._is_stepping = False
 
-    def _unless_closed(self, act: Callable[[], None]) -> bool:
-        """Let the session act, and return true; false when it has ended, which is no error of the program: another
-        thread has closed it, or Ctrl-C has broken a step off.
-        """
+    def _unless_ended(self, act: Callable[[], Any]) -> bool:
+        """Let the session act, and return true; false when it has ended. No error of it is one of the program."""
         try:
             act()
         except Exception as error:
-            if self._loop.has_ended and not self._loop.is_closed:
-                _log.error("the program goes on without its session: %s", error)
-                self._loop.close()  # robots that were driven are left at rest
             if not self._loop.is_closed:
-                raise
+                _log.error("the program goes on without its session: %s", error)
+                self._loop.end(error)
             return False
         return True
 
@@ -266,10 +264,12 @@ class Attachment:
         self._other_ns = now_ns = self._loop.read_clock()
         if self._other_since_ns is None:
             self._other_since_ns = now_ns
-        if self._refused[0] == id(data) and now_ns < self._refused[1]:
+        if now_ns < self._refused.get(id(data), 0):
             return False
         if not self._is_successor(model, data, now_ns - self._other_since_ns):
-            self._refused = id(data), now_ns + ASK_AGAIN_NS
+            if len(self._refused) >= MAX_REFUSED:
+                self._refused.clear()
+            self._refused[id(data)] = now_ns + ASK_AGAIN_NS
             if self.list_warnings() and not self._has_warned:
                 self._has_warned = True
                 _log.warning("%s", ELSEWHERE)
@@ -278,11 +278,11 @@ class Attachment:
 
     def _go_on_with(self, model: Any, data: Any) -> bool:
         """Go on with other data; return false, with a warning, when the session cannot."""
-        if data is self._failed:
+        if data is self._failed or self._loop.is_closed or self._loop.has_ended:
             return False
         try:
             self._change_model(model, data)
-        except IrisError as error:
+        except Exception as error:  # of the disk, for example
             fault = f"the new model is not shared, the old one stands still: {error}"
             if fault != self.fault:
                 _log.warning("%s", fault)
@@ -325,7 +325,7 @@ class Attachment:
         if self._is_stepping or self._environment_began_ns is not None:
             return original()
         result = self._take_reported_step(original)
-        self.on_environment(False)
+        self._unless_ended(lambda: self.on_environment(False))
         return result
 
     def _take_reported_step(self, original: Callable[[], Any]) -> Any:
@@ -355,16 +355,21 @@ class Attachment:
 
     def _around_reset(self, original: Callable[[], Any]) -> Any:
         """Show the environment's reset at once, not only with the step after it."""
+        data, resets = self._loop.data, self._loop.reset_count
+        before = data.qpos.copy()
         result = original()
         if not self.follow_environment():
             self._loop.note_time()
+            # Time may have been zero before, too.
+            if resets == self._loop.reset_count and not np.array_equal(before, data.qpos):
+                self._loop.reset()
         self._look()
-        self.on_environment(True)
+        self._unless_ended(lambda: self.on_environment(True))
         return result
 
     def _look(self) -> None:
         if not self._loop.is_driving and self._environment_began_ns is None and not self._is_stepping:
-            self._unless_closed(self._loop.look)
+            self._unless_ended(self._loop.look)
 
     def close(self) -> None:
         """Give the step back. May be called twice."""

@@ -112,6 +112,8 @@ def _list_goals(environment: Any, model: mujoco.MjModel) -> dict[int, NDArray[np
     goal = read_attribute(owner, "goal")
     if read_attribute(owner, "_render_callback") is None or not isinstance(goal, np.ndarray) or goal.size % 3:
         return {}
+    if not np.issubdtype(goal.dtype, np.number):
+        return {}
     found = {}
     for k, p_world in enumerate(goal.reshape(-1, 3)):
         site = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_SITE), f"target{k}")

@@ -543,11 +543,9 @@ class Session(SessionBase):
             if scene.notices != self._robot_notices:
                 self._robot_notices = scene.notices
                 self._log_robot_notices()
-            with scenes.lock:
-                scenes.show(scene.shown)
             return scene
 
-        loop.change_model(model, data, prepare)
+        loop.change_model(model, data, prepare, scenes)
         self.model, self.data = model, data
         if self._follower is not None:
             self._follower.follow_model(model)
@@ -555,7 +553,9 @@ class Session(SessionBase):
 
     def _hold_steps(self) -> AbstractContextManager[object]:
         """Return a context in which the helper thread of a user loop takes no step."""
-        return nullcontext() if self._user_loop is None else self._user_loop.lock
+        # In a child that was forked the helper thread does not go on, and may have held the lock.
+        is_forked = self._process not in (0, os.getpid())
+        return nullcontext() if self._user_loop is None or is_forked else self._user_loop.lock
 
     def _find_data_fault(self) -> DataFault | None:
         return None if self._user_loop is None else self._user_loop.fault

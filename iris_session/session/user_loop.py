@@ -44,6 +44,7 @@ from iris_session.protocol.entries import ExternalReset, StalledGap
 from iris_session.session.core import read_plant_state
 from iris_session.session.errors import OwnershipError
 from iris_session.session.processes import SessionProcesses
+from iris_session.session.shared_scene import SharedScenes
 from iris_session.session.status import DataFault
 from iris_session.session.stepper import NextScene, Stepper
 
@@ -130,6 +131,7 @@ class UserLoop:
         overwritten: Rounds in which the owner has changed what the session had written, between the two ends of it.
         is_attached: The loop is driven by the wrapped step of its data, so no time should pass outside of rounds.
         unseen_s: Time of the simulation [s] that did.
+        reset_count: Resets so far.
     """
 
     def __init__(
@@ -144,6 +146,7 @@ class UserLoop:
         self.overwritten = 0
         self.is_attached = False
         self.unseen_s = 0.0
+        self.reset_count = 0
         #: Wakes the helper thread. In C, so that Ctrl-C in the program leaves no lock behind, as in `Event`.
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         #: State of the newest look, until a step is taken on it or on a newer one.
@@ -302,6 +305,7 @@ class UserLoop:
     def reset(self) -> None:
         """Note that the user resets the data before the next tick: robots are then where that tick finds them."""
         self._was_reset = True
+        self.reset_count += 1
 
     @property
     def driven(self) -> tuple[str, ...]:
@@ -310,7 +314,11 @@ class UserLoop:
         return () if sharing is None or self.is_closed or self.has_ended else sharing.driven
 
     def change_model(
-        self, model: mujoco.MjModel, data: mujoco.MjData, prepare: Callable[[bytes], NextScene | None]
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        prepare: Callable[[bytes], NextScene | None],
+        scenes: SharedScenes | None = None,
     ) -> None:
         """Go on with another model and data, which is a reset: the owner's program has built its world anew.
 
@@ -319,6 +327,7 @@ class UserLoop:
             data: The data from now on.
             prepare: Makes the new scene from the state of `data`, and `None` when it is the present one. It takes long,
                 and steps without ticks go on meanwhile.
+            scenes: Where the new scene is shown.
         """
         plant = read_plant_state(model, data)
         scene = prepare(plant)
@@ -333,9 +342,12 @@ class UserLoop:
                 self.reset()
                 self._use(model, data)
             else:
-                while self._stepper.has_pending_scenes:  # patches of the present scene
-                    self._step(0, self._plant)
-                self._stepper.queue_scene(scene)
+                assert scenes is not None
+                with scenes.lock:  # no patch comes between
+                    while self._stepper.has_pending_scenes:  # patches of the present scene
+                        self._step(0, self._plant)
+                    scenes.show(scene.shown)
+                    self._stepper.queue_scene(scene)
                 self._plant = plant
                 self._step(0, plant, publish=False)
                 self._use(model, data)

@@ -370,6 +370,55 @@ def test_while_someone_drives_every_step_is_a_tick(is_opaque: bool) -> None:
         rig.loop.close()
 
 
+def test_another_pose_at_the_same_time_is_a_reset() -> None:
+    """Somebody may have engaged while the program was silent: the robot does not go back to where it stood."""
+    rig = Rig()
+
+    class Placed(Owner):
+        def reset(self) -> None:
+            self.data.qpos[rig.joints()] += 0.3
+
+    owner = Placed(rig)
+    attachment = Attachment(rig.loop, owner, "step", lambda model, data: None)
+    try:
+        for count in (1, 2):
+            owner.reset()
+            assert len(rig.resets()) == count
+    finally:
+        attachment.close()
+        rig.loop.close()
+
+
+def test_errors_of_the_session_end_it_and_not_the_program() -> None:
+    """Beside its steps, too: a full disk, a process that cannot be started."""
+    rig = Rig()
+    owner = Owner(rig)
+
+    def change_model(model: Any, data: Any) -> None:
+        raise OSError("no space left on device")
+
+    attachment = Attachment(rig.loop, owner, "step", change_model)
+
+    def fail(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    try:
+        owner.step()
+        owner.data = make_data(rig.model)
+        owner.step()
+        assert "no space" in attachment.fault
+        owner.data = rig.data
+        rig.loop._processes.supervise = fail  # type: ignore[method-assign]
+        rig.loop.reset()
+        owner.step()
+        assert rig.loop.is_closed
+        owner.step()
+        assert owner.count == 4
+    finally:
+        attachment.close()
+        rig.loop.close()
+
+
 # --- other data -------------------------------------------------------------------------------------------------------
 
 
