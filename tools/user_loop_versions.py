@@ -5,9 +5,9 @@ python tools/user_loop_versions.py --borrow 3.3.0       the same with all other 
 python tools/user_loop_versions.py --here               checks the MuJoCo of this environment
 
 Each check runs a loop with `begin_tick()/end_tick()` and one that is attached, with an observer, and compares both with
-the trajectory without a session, bit for bit. Then a policy moves an arm by 5 cm in a user's loop and in the session's,
-and where rerun is installed both recordings, with a contact in them, are verified. The last line is one JSON object;
-the exit status is 1 if a check fails.
+the trajectory without a session, bit for bit. Arms that are near one another are slowed. Then a policy moves an arm by
+5 cm in a user's loop and in the session's, and where rerun is installed both recordings, with a contact in them, are
+verified. The last line is one JSON object; the exit status is 1 if a check fails.
 """
 
 from __future__ import annotations
@@ -102,9 +102,28 @@ def run_checks() -> dict[str, Any]:
         results["attach_observed"] = len(session.status().participants) == 1
         results["targets"] = len(session.targets()) == 2
     session.close()
+    results["proximity_slows"] = is_slowed(model)
     results |= drive(model, own_loop=False) | drive(model, own_loop=True)
     results["ok"] = all(value for name, value in results.items() if name != "mujoco")
     return results
+
+
+def is_slowed(model: Any) -> bool:
+    """Return whether arms whose wrists swing towards each other, 5 cm apart, are slowed, and not on the way back."""
+    import mujoco
+    import numpy as np
+
+    from iris_session import ControlConfig
+    from iris_session.control.proximity import ProximityLimiter
+    from iris_session.physics import find_robots
+
+    data = mujoco.MjData(model)
+    for name, turned in (("left", -0.5), ("right", 0.5)):
+        data.joint(f"{name}1").qpos[0], data.joint(f"{name}3").qpos[0] = turned * math.pi, math.radians(-10.0)
+    mujoco.mj_forward(model, data)
+    limiter, swing = ProximityLimiter(model, find_robots(model).robots, ControlConfig()), np.eye(6)[2]
+    closing, opening = (limiter.compute_speed_factors(data, [way * swing, way * swing]) for way in (-1.0, 1.0))
+    return max(closing) < 1.0 == min(opening)
 
 
 def drive(model: Any, own_loop: bool) -> dict[str, Any]:
