@@ -341,7 +341,8 @@ class SessionJoiner:
         if self._connection.retryable_refusal is not None and self._resolver is None:
             return f"{self.address} {when}: {RefusedError(self._connection.retryable_refusal)}"
         note = self._note if self._resolver is None else self._resolver.note or self._note
-        return f"{self.address} {when}: is `iris-session serve` running there?{f' ({note})' if note else ''}"
+        question = "is `iris-session serve`, or `session.run()` in a program, running there?"
+        return f"{self.address} {when}: {question}{f' ({note})' if note else ''}"
 
     def _may_pair(self) -> bool:
         failure = self._connection.failure

@@ -84,7 +84,8 @@ def share(
         step: Name of the environment's method that advances the simulation.
 
     Returns:
-        The started session, which is a context manager. It ends with `close()`, or with the program.
+        The started session, which is a context manager. It ends with `close()`, or with the program. Of a model
+        without data it lets participants in from `session.run()` on, or from the first `session.sync(data)`.
 
     Raises:
         ModelNotFoundError, ModelInvalidError: The file is missing, or MuJoCo does not compile it.
