@@ -44,9 +44,7 @@ class PageFile(NamedTuple):
 
 def describe_missing_page(folder: Path = PAGE_FOLDER) -> str:
     """Return a remark for people where the page is not built, to follow its address; else nothing."""
-    missing = (
-        " (the page is missing: run `make web` in the checkout; if not installed with -e, install it again)"
-    )
+    missing = " (the page is missing: run `make web` in the checkout; if not installed with -e, install it again)"
     return "" if (folder / INDEX).exists() else missing
 
 
