@@ -90,7 +90,10 @@ def _read_joints(arm: _Arm, where: Mapping[str, Any]) -> Joints:
         _read(read(dofs, **where))
         for read in (entity.get_dofs_position, entity.get_dofs_velocity, entity.get_dofs_control_force)
     )
-    gain = _read(entity.get_dofs_kp(dofs))
+    try:
+        gain = _read(entity.get_dofs_kp(dofs))
+    except Exception:  # of Genesis, for actuators that are no springs: these need no lead
+        gain = np.zeros_like(q)
     lead = np.divide(force, gain, out=np.zeros_like(q), where=gain > 0.0)
     return Joints(q, v, q + lead, *(_read(limit) for limit in entity.get_dofs_limit(dofs)))
 
