@@ -11,7 +11,6 @@ from __future__ import annotations
 import datetime
 import importlib.util
 import logging
-import math
 import secrets
 import time
 from collections.abc import Callable
@@ -65,8 +64,10 @@ MEDIA_OFFSET: Final = 1
 INGEST_OFFSET: Final = 4
 ASSETS_OFFSET: Final = 2
 SUPERVISE_PERIOD_NS: Final = 50_000_000
-#: Time for the recorder to accept the last rows; for one that was just started.
-ACCEPT_S: Final = 5.0
+#: Longest time for the recorder to accept the last rows; for one that was just started. Busy machines are slow: one
+#: that does not work at all has `SILENCE_S`, or `STARTING_S` until it is up.
+ACCEPT_S: Final = 30.0
+START_S: Final = 60.0
 STARTING_S: Final = 15.0
 #: Time for the front to notify its clients, for the recorder to finish its file, for one that did not accept its rows.
 NOTIFY_S: Final = 0.6
@@ -421,7 +422,7 @@ class SessionProcesses:
         fault, is_accepted = "", True
         if feed is not None and recorder is not None:
             has_reported = feed.stats.recorders >= recorder.starts  # a new one is silent until it is up
-            wait_s, silence_s = (ACCEPT_S, SILENCE_S) if has_reported else (STARTING_S, math.inf)
+            wait_s, silence_s = (ACCEPT_S, SILENCE_S) if has_reported else (START_S, STARTING_S)
             is_accepted = feed.close(wait_s, lambda: recorder.alive, silence_s, lambda: recorder.cpu_s)
             if not is_accepted:
                 fault = recorder.failure or "the recorder did not write all of it in time"

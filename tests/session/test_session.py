@@ -203,7 +203,7 @@ def test_incomplete_recording_is_reported(tmp_path: Path, monkeypatch: pytest.Mo
     session.start()
     session.run(seconds=0.1)
     os.kill(session.processes.recorder_pid, signal.SIGKILL)
-    for waiting in ("ACCEPT_S", "STARTING_S", "SILENCE_S"):
+    for waiting in ("ACCEPT_S", "START_S", "STARTING_S", "SILENCE_S"):
         monkeypatch.setattr(processes, waiting, 60.0)
     before = time.monotonic()
     assert not session.close()
