@@ -22,6 +22,7 @@ export interface Situation {
   /** The connection is there, with everything known. */
   isReady: boolean;
   isStopped: boolean;
+  isPaused: boolean;
   isHolder: boolean;
 }
 
@@ -82,7 +83,8 @@ export class DesktopDevice {
     }
     if (!situation.isReady) this.release("the connection is lost", now_ms);
     else if (situation.isStopped) this.release("e-stop", now_ms);
-    const isBlocked = !situation.isReady || situation.isStopped;
+    else if (situation.isPaused) this.release("the session was paused", now_ms);
+    const isBlocked = !situation.isReady || situation.isStopped || situation.isPaused;
     const isHeld = this.readDeadMen(inputs);
     const motion = merge(inputs.values());
     const isFlipped = motion.toggle && !this.wasToggled;

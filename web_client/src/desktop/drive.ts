@@ -6,7 +6,7 @@ import type { WorkerClient } from "../core/page_client.ts";
 import { button, h, setOptions, setText } from "../ui/dom.ts";
 import type { PageState } from "../ui/state.ts";
 import { recall, remember } from "../ui/storage.ts";
-import { holdReasonWords } from "../ui/words.ts";
+import { holdReasonWords, pauseWords } from "../ui/words.ts";
 import { DesktopDevice, type Heading, SPEED_RANGE, toHeading } from "./device.ts";
 import { DesktopInputs } from "./inputs.ts";
 import { KEY_WORDS, type Vec3 } from "./intent.ts";
@@ -113,6 +113,7 @@ export function makeDrive(
     const situation = {
       isReady: state.isReady && (session?.synced ?? false),
       isStopped: session?.estop ?? false,
+      isPaused: state.pause !== null,
       isHolder: state.heldBy(state.selfId).includes(device.robot),
     };
     const { isEngaged: wasEngaged, mustLetGo } = device;
@@ -158,7 +159,7 @@ export function makeDrive(
     setText(mark, isHeld ? "held" : "engaged");
     mark.classList.toggle("good", !isHeld);
     element.classList.toggle("engaged", !isHeld);
-    setText(why, state.isReady ? describe(device, state.session?.estop ?? false, reason, isHeld) : "Held: not connected.");
+    setText(why, describe(device, state, reason, isHeld));
     setText(connected, inputs.listConnected().join(", "));
     connect.hidden = !inputs.spaceMouse.isSupported || inputs.spaceMouse.name !== "";
   }
@@ -179,8 +180,11 @@ export function makeDrive(
 }
 
 /** Return in words why the robot holds, or that it follows. */
-function describe(device: DesktopDevice, isStopped: boolean, reason: string, isHeld: boolean): string {
-  if (isStopped) return "Held: e-stop. A director clears it.";
+function describe(device: DesktopDevice, state: PageState, reason: string, isHeld: boolean): string {
+  if (!state.isReady) return "Held: not connected.";
+  const who = state.isDirector ? "Press" : "A director presses";
+  if (state.session?.estop) return `Held: e-stop. ${who} Clear, above.`;
+  if (state.pause) return `${pauseWords(state.pause.by, "")}. ${who} Resume, above.`;
   if (!isHeld) return "The robot follows you.";
   if (device.isEngaged) return `Held by the session: ${holdReasonWords(reason)}.`;
   const how = device.mustLetGo ? "Let go of it, then hold it again." : "Hold left Shift, the right shoulder button or the handle to move it.";

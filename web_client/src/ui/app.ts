@@ -8,7 +8,7 @@ import { Actions } from "./actions.ts";
 import { makeAlignmentPanel, makeAnchorsPanel } from "./alignment.ts";
 import { makeCameras } from "./cameras.ts";
 import { h, setText } from "./dom.ts";
-import { makeBadge, makeEstop, makeSelf } from "./header.ts";
+import { makeBadge, makeEstop, makePauseBanner, makeSelf } from "./header.ts";
 import {
   makeAdvicePanel,
   makeEpisodesPanel,
@@ -126,6 +126,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   stage.tools.append(handle.headset.element);
   const badge = makeBadge(state, () => view?.delay_ms ?? 0);
   const estop = makeEstop(state, actions, () => drive.robot !== "");
+  const pause = makePauseBanner(state, actions);
   const self = makeSelf(state, listRoles, joinAs);
   const title = h("h1", {}, "iris-session");
   const header = h("header", { class: "bar" }, title, badge.element, self.element, estop.stop);
@@ -150,6 +151,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     h("a", { class: "skip", attributes: { href: "#dashboard" } }, "Skip to the dashboard"),
     header,
     estop.banner,
+    pause.element,
     h("main", {}, stage.element, dashboard),
     notices,
     pairing.dialog,
@@ -158,9 +160,11 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   state.onChange(() => {
     const name = state.welcome?.session_name || state.info?.session_name || "";
     setText(title, name || "iris-session");
-    document.title = `${state.session?.estop ? "STOPPED, " : ""}${name ? `${name}, ` : ""}iris-session`;
+    document.title = `${state.session?.estop ? "STOPPED, " : state.pause ? "PAUSED, " : ""}${name ? `${name}, ` : ""}iris-session`;
     document.body.classList.toggle("is-stopped", state.session?.estop ?? false);
+    document.body.classList.toggle("is-paused", state.pause !== null);
     estop.update();
+    pause.update();
     badge.update(state);
     self.update(state);
     stage.update();

@@ -4,7 +4,7 @@ import type { Actions } from "./actions.ts";
 import { button, h, setOptions, setText, setValue, takesText } from "./dom.ts";
 import type { Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
-import { formatMilliseconds, roleWords } from "./words.ts";
+import { formatMilliseconds, pauseWords, roleWords } from "./words.ts";
 
 /** Ages above which the badge warns [ms]: of the picture that is shown. */
 const GOOD_AGE_MS = 120;
@@ -31,9 +31,9 @@ export function makeBadge(state: PageState, getDelay: () => number): Panel {
       const isFresh = state.isReady && stats !== null;
       const shown = isFresh ? Math.max(stats.age_ms_p50, getDelay()) : Number.NaN;
       setText(age, formatMilliseconds(shown));
-      setText(rate, isFresh ? `${stats.state_hz.toFixed(0)} Hz` : "–");
+      setText(rate, !isFresh ? "–" : state.pause ? "paused" : `${stats.state_hz.toFixed(0)} Hz`);
       setText(trip, isFresh ? formatMilliseconds(stats.rtt_ms > 0 ? stats.rtt_ms : state.rtt_ms) : "–");
-      const quality = !isFresh || stats.state_hz < 1 || shown > BAD_AGE_MS ? "bad" : shown > GOOD_AGE_MS ? "fair" : "good";
+      const quality = !isFresh || stats.state_hz < 1 || shown > BAD_AGE_MS ? "bad" : shown > GOOD_AGE_MS || state.pause ? "fair" : "good";
       dot.className = `signal ${quality}`;
     },
   };
@@ -70,7 +70,7 @@ export function makeEstop(state: PageState, actions: Actions, isDriving: () => b
     { class: "clear", id: "clear-estop" },
   );
   const note = h("span", { class: "note" });
-  const banner = h("div", { class: "stopped", role: "alert", hidden: true }, text, note, clear);
+  const banner = h("div", { class: "banner stopped", role: "alert", hidden: true }, text, note, clear);
   return {
     stop,
     banner,
@@ -90,6 +90,27 @@ export function makeEstop(state: PageState, actions: Actions, isDriving: () => b
       setText(text, `Stopped${who}${newest?.reason ? `: ${newest.reason}` : ""}`);
       setText(note, !state.isReady ? "Before the connection was lost." : state.isDirector ? "All robots hold." : "All robots hold. A director can clear it.");
       clear.hidden = !state.isDirector || !state.isReady;
+    },
+  };
+}
+
+/** The banner of a pause: who paused, why, and what ends it. */
+export function makePauseBanner(state: PageState, actions: Actions): { element: HTMLElement; update: () => void } {
+  const text = h("strong");
+  const note = h("span", { class: "note" });
+  const resume = button("Resume", () => void actions.request({ type: "control", action: "resume" }), { id: "resume" });
+  const element = h("div", { class: "banner paused", role: "alert", hidden: true }, text, note, resume);
+  return {
+    element,
+    update: () => {
+      const { pause } = state;
+      element.hidden = pause === null;
+      if (pause === null) return;
+      setText(text, pauseWords(pause.by, pause.reason));
+      const next = pause.reason ? "It goes on from the beginning of the scene." : "Then let go and hold again to drive.";
+      setText(note, `Robots and objects stand still until ${state.isDirector ? "you resume" : "a director resumes"}. ${next}`);
+      setText(resume, pause.reason ? "Reset and resume" : "Resume");
+      resume.hidden = !state.isDirector || !state.isReady;
     },
   };
 }

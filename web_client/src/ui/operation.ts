@@ -111,7 +111,7 @@ export function makeAdvicePanel(state: PageState): Panel {
     update: () => {
       const { status } = state;
       const found = [...(status?.warnings ?? [])];
-      if (status?.pause_reason) found.unshift(status.pause_reason);
+      if (status?.pause_reason && !status.paused) found.unshift(status.pause_reason); // else the banner says it
       if (state.progress?.refusal) found.push(`Loading the scene waits: ${state.progress.refusal}`);
       rows.update(found, (text) => text);
       section.element.hidden = found.length === 0;

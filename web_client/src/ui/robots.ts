@@ -7,7 +7,7 @@ import type { Actions } from "./actions.ts";
 import { button, h, KeyedList, type Row, setOptions, setText, setValue } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
 import type { ConsentAsked, PageState } from "./state.ts";
-import { holdReasonWords, leaseModeWords } from "./words.ts";
+import { holdReasonWords, leaseModeWords, limitWords } from "./words.ts";
 
 const MODES = ["exclusive", "request", "takeover", "priority", "shared"] as const;
 const SCALES = [0.1, 0.25, 0.5, 1, 2] as const;
@@ -139,12 +139,13 @@ function describe(
   const reason = feedback?.hold_reason || report?.hold_reason || "";
   const parts: string[] = [];
   if (state.session?.estop) parts.push("stopped");
+  else if (state.pause) parts.push("paused");
   else if (reason && lease?.holder) parts.push(`holds: ${holdReasonWords(reason)}`);
   else if (report?.state && report.state !== "hold") parts.push("driven");
   if (lease && lease.expires_ns > 0) parts.push("its holder is disconnected, the lease is kept for a while");
   if (lease && lease.sub_holders.length > 1) parts.push(`shared by ${lease.sub_holders.map((id) => state.nameOf(id)).join(", ")}`);
   if (lease && lease.queue.length > 0) parts.push(`waiting: ${lease.queue.map((id) => state.nameOf(id)).join(", ")}`);
-  if (feedback && feedback.limits.length > 0) parts.push(`at its limit: ${feedback.limits.join(", ")}`);
+  if (feedback && feedback.limits.length > 0) parts.push(...feedback.limits.map(limitWords));
   return parts.join(" · ");
 }
 

@@ -43,6 +43,9 @@ export interface ConsentAsked {
   until_ms: number;
 }
 
+/** Id of the session's own program among those who do something. */
+const HOST = "host";
+
 /** What a page says it is when it joins. */
 export interface Entry {
   devices: wire.Device[];
@@ -83,6 +86,8 @@ export class PageState {
   readonly log: LogEntry[] = [];
   consents: ConsentAsked[] = [];
   rtt_ms = Number.NaN;
+  /** Who paused the session and why; null where this page has not seen it. */
+  private seenPause: { participant: string; reason: string } | null = null;
   private sessionOffset_ms = Number.NaN;
   /** The alignment is void if it is to this tracking frame or one before. */
   private voidEpoch = Number.NaN;
@@ -110,6 +115,7 @@ export class PageState {
     client.on("session", (update) => {
       for (const { id, name } of update.participants) this.formerNames.set(id, name);
       this.session = update;
+      if (!update.paused) this.seenPause = null;
       if (!this.self?.alignment) this.voidEpoch = Number.NaN; // the numbers may begin again
       this.touch();
     });
@@ -195,12 +201,20 @@ export class PageState {
     return this.phase.phase === "ready";
   }
 
+  /** Who paused the session, empty where that is not known, and why; null while it runs. */
+  get pause(): { by: string; reason: string } | null {
+    if (!this.session?.paused) return null;
+    const { participant = "", reason = "" } = this.seenPause ?? {};
+    return { by: participant && this.nameOf(participant), reason: reason || (this.status?.pause_reason ?? "") };
+  }
+
   participant(id: string): ParticipantInfo | undefined {
     return this.session?.participants.find((participant) => participant.id === id);
   }
 
   /** Return the name of a participant, with the id where another present one has the same. */
   nameOf(id: string): string {
+    if (id === HOST) return "the session";
     const name = this.participant(id)?.name ?? this.formerNames.get(id) ?? id;
     const isShared = this.session?.participants.some((other) => other.id !== id && other.name === name) ?? false;
     return isShared ? `${name} (${id})` : name;
@@ -251,6 +265,7 @@ export class PageState {
 
   private takeEvent({ session_time, body }: Filled<wire.Event>): void {
     if (body.event === "participant_joined") this.formerNames.set(body.participant.id, body.participant.name);
+    if (body.event === "pause_changed") this.seenPause = body.paused ? body : null;
     if (body.event === "consent_requested" && body.holder === this.selfId) {
       const timeout_ms = (this.session?.consent_timeout_ns ?? 0) / 1e6 || 15_000;
       this.consents.push({ ...body, until_ms: performance.now() + timeout_ms });

@@ -7,24 +7,37 @@ import { AlarmKind, AlignmentDoubt, BudgetClass, type HoldReason, StreamFault } 
 const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string> = {
   no_lease: "no participant has its lease",
   no_sample: "its holder sends nothing yet",
-  clutch_open: "clutch open",
+  clutch_open: "the operator has let go",
   stale: "samples come too late or not at all",
   not_worn: "headset taken off",
   untracked: "tracking lost",
   unaligned: "its holder is not aligned",
   view_only: "its holder is aligned well enough to look, not to drive",
   unconfirmed: "the alignment of its holder is doubted: glance at a sheet, or touch three marks",
-  rejected: "a sample was rejected: open and close the clutch",
+  rejected: "a sample was rejected: let go, then hold again",
   estop: "e-stop",
   disconnected: "its holder is disconnected",
-  gap: "the session stood still: open and close the clutch",
-  scene_changed: "the scene changed: open and close the clutch",
+  gap: "the session stood still: let go, then hold again",
+  scene_changed: "the scene changed: let go, then hold again",
   intervention: "a person took over",
-  rearm: "open and close the clutch",
-  emulated: "out of sight, its position is a guess: bring the hand into view, open and close the clutch",
-  zero_pose: "the device has no pose yet: wait until it is tracked, open and close the clutch",
-  frozen: "the pose of the device is frozen: move or wake it, open and close the clutch",
-  jump: "tracking jumped: open and close the clutch",
+  rearm: "let go, then hold again",
+  emulated: "out of sight, its position is a guess: bring the hand into view, let go, then hold again",
+  zero_pose: "the device has no pose yet: wait until it is tracked, let go, then hold again",
+  frozen: "the pose of the device is frozen: move or wake it, let go, then hold again",
+  jump: "tracking jumped: let go, then hold again",
+};
+
+/** Limits of control, but for names of joints (docs/guide.md). */
+const LIMITS: Record<string, string> = {
+  speed: "as fast as it may move",
+  reach: "arm at full reach",
+  singular: "arm stretched out or folded: it cannot move every way",
+  workspace: "at the edge of its workspace",
+  proximity: "slowed down: another robot is near",
+  leader_apart: "catching up with its leader",
+  tracking: "pushing against something, or the load is too heavy",
+  sag: "hanging lower than it should: the load is heavy",
+  joints_only: "moves by its joints only, not by a pose",
 };
 
 const LEASE_MODES: Record<string, string> = {
@@ -88,6 +101,15 @@ const STREAM_FAULTS: Record<string, string> = {
 const look = (table: Record<string, string>, value: string): string => table[value] ?? value.replaceAll("_", " ");
 
 export const holdReasonWords = (reason: string): string => look(HOLD_REASONS, reason);
+/** Return what stops a robot from going on: one of `LIMITS`, or the joint of that name at the end of its range. */
+export function limitWords(limit: string): string {
+  const number = /(?:^|[^a-z])joint[ _-]?(\d+)$/i.exec(limit)?.[1];
+  const name = limit.slice(limit.lastIndexOf("/") + 1).replace(/^joint_|_joint$/i, "").replaceAll("_", " ");
+  return LIMITS[limit] ?? `joint ${number ?? name} at its end`;
+}
+
+/** Return the headline about a pause: who paused and why. `by`: name, empty where it is not known. */
+export const pauseWords = (by: string, reason: string): string => `Paused${by ? ` by ${by}` : ""}${reason ? `: ${reason}` : ""}`;
 export const leaseModeWords = (mode: string): string => look(LEASE_MODES, mode);
 export const roleWords = (role: string): string => look(ROLES, role);
 export const alignmentWords = (kind: string): string => look(ALIGNMENTS, kind);

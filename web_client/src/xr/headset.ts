@@ -9,7 +9,7 @@ import { HoldReason } from "../protocol/messages.g.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import type { Actions } from "../ui/actions.ts";
 import { DESKTOP, type Entry, type PageState } from "../ui/state.ts";
-import { doubtWords } from "../ui/words.ts";
+import { doubtWords, pauseWords } from "../ui/words.ts";
 import type { Mode as PageMode, StreamChoices } from "../ui/stream_choices.ts";
 import { participantColor } from "../view/avatars.ts";
 import { Label } from "../view/labels.ts";
@@ -319,6 +319,7 @@ export class Headset {
     const steps = this.marks.describe(reading.capture_ms);
     const urgent = describeUrgent({
       isStopped: session?.estop ?? false,
+      pause: state.pause ? pauseWords(state.pause.by, state.pause.reason) : "",
       connection: state.isReady ? "" : phase.text || "joining the session again",
       isAligned: this.isAligned || steps.length > 0,
       hasMarks: this.marks.hasMarks,
@@ -354,6 +355,7 @@ export class Headset {
       holdReason,
       selfId: state.selfId,
       isStopped: state.session?.estop ?? false,
+      isPaused: state.pause !== null,
       nameOf: (id) => state.nameOf(id),
       isPointedAt: sides.length > 0,
       isOwn,

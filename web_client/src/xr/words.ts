@@ -14,6 +14,7 @@ export interface RobotFacts {
   holdReason: string;
   selfId: string;
   isStopped: boolean;
+  isPaused: boolean;
   nameOf: (participant: string) => string;
   isPointedAt: boolean;
   isOwn: boolean;
@@ -22,11 +23,12 @@ export interface RobotFacts {
 }
 
 /** Return the lines of the panel at a robot: who holds it, why it stands still, what the trigger does. */
-export function describeRobot({ name, lease, holdReason, selfId, isStopped, nameOf, isPointedAt, isOwn, isRequested }: RobotFacts): string[] {
+export function describeRobot({ name, lease, holdReason, selfId, isStopped, isPaused, nameOf, isPointedAt, isOwn, isRequested }: RobotFacts): string[] {
   const holder = lease?.holder ?? "";
   const who = isOwn ? "you" : holder === "" ? "free" : nameOf(holder);
   const lines = [`${name}: ${who}`];
   if (isStopped) lines.push("stopped by the e-stop");
+  else if (isPaused) lines.push("paused");
   else if (holder !== "" && holdReason !== "") lines.push(...wrap(`holds: ${holdReasonWords(holdReason)}`));
   const place = lease?.queue.indexOf(selfId) ?? -1;
   if (lease && place >= 0) lines.push(`you wait for it, place ${place + 1} of ${lease.queue.length}`);
@@ -81,6 +83,8 @@ export function describeAlignment(alignment: OwnAlignment): string {
 /** What a person has to know before anything else. */
 export interface Urgent {
   isStopped: boolean;
+  /** Who paused and why, empty: the session runs. */
+  pause: string;
   /** Empty while the connection stands, else why it does not. */
   connection: string;
   isAligned: boolean;
@@ -97,9 +101,10 @@ export interface Urgent {
 }
 
 /** Return the lines before the eyes, none when all is well. */
-export function describeUrgent({ isStopped, connection, isAligned, isTransparent, canPlace, hasMarks, doubt, advice, notice }: Urgent): string[] {
+export function describeUrgent({ isStopped, pause, connection, isAligned, isTransparent, canPlace, hasMarks, doubt, advice, notice }: Urgent): string[] {
   const lines: string[] = [];
   if (isStopped) lines.push("STOPPED: all robots hold");
+  else if (pause !== "") lines.push(...wrap(pause), "robots stand still until a director resumes");
   if (connection !== "") lines.push(...wrap(connection));
   else if (!isAligned) {
     lines.push("This headset is not aligned");

@@ -4,7 +4,7 @@ import type { SampleInput } from "../../src/core/api.ts";
 import { DesktopDevice, SPEED_RANGE, type Situation, toHeading, toTwist } from "../../src/desktop/device.ts";
 import { type Intent, makeIdle, readKeys } from "../../src/desktop/intent.ts";
 
-const HOLDER: Situation = { isReady: true, isStopped: false, isHolder: true };
+const HOLDER: Situation = { isReady: true, isStopped: false, isPaused: false, isHolder: true };
 const STILL = [0, 0, 0, 0, 0, 0];
 /** Looking along +Y of the world: right is +X. */
 const NORTH = [0, 1] as const;
@@ -85,6 +85,7 @@ describe("an armed device", () => {
 
   it.each([
     ["e-stop", { ...HOLDER, isStopped: true }],
+    ["the session was paused", { ...HOLDER, isPaused: true }],
     ["the connection is lost", { ...HOLDER, isReady: false, isHolder: false }],
   ])("is released by: %s", (reason, situation) => {
     tick(FORWARD);

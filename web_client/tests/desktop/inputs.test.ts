@@ -9,7 +9,7 @@ class Target extends EventTarget {
 }
 
 const NONE = { shiftKey: false, ctrlKey: false, metaKey: false, altKey: false };
-const SITUATION = { isReady: true, isStopped: false, isHolder: true };
+const SITUATION = { isReady: true, isStopped: false, isPaused: false, isHolder: true };
 
 let page: EventTarget;
 let hid: EventTarget & { getDevices: () => Promise<EventTarget[]> };

@@ -82,3 +82,18 @@ test("an alignment is void once the tracking frame has jumped, until the session
   state.voidAlignment();
   expect([align(next), align(null), align(old)]).toEqual([null, null, old]); // the last one is of another session
 });
+
+test("a pause says who and why, and who is not known to a page that joined later", () => {
+  const saySession = (paused: boolean): unknown => say({ type: "session", participants: [{ id: "p2", name: "ben" }], paused });
+  const sayPause = (body: object): unknown => say({ type: "inbox", messages: [{ type: "event", session_time: 0, body: { event: "pause_changed", paused: true, ...body } }] });
+  saySession(false);
+  expect(state.pause).toBeNull();
+  sayPause({ participant: "p2", reason: "" });
+  saySession(true);
+  expect(state.pause).toEqual({ by: "ben", reason: "" });
+  saySession(false);
+  saySession(true);
+  expect(state.pause).toEqual({ by: "", reason: "" });
+  sayPause({ participant: "host", reason: "numbers that are not finite" });
+  expect(state.pause).toEqual({ by: "the session", reason: "numbers that are not finite" });
+});

@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
 
-import { denialWords, doubtWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, isDoubtful, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
+import { denialWords, doubtWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, isDoubtful, limitWords, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
 
 const nameOf = (id: string): string => ({ p1: "ann", p2: "ben" })[id] ?? "";
 type Body = Parameters<typeof eventWords>[0];
@@ -68,4 +68,15 @@ test("a cloud of a slow source is drawn as it is, one that is stale or wrong is 
 test("ages of streams grow from milliseconds to hours", () => {
   expect([45, 4200, 600_000, Number.NaN, -3].map(streamAgeWords)).toEqual(["45 ms old", "4 s old", "10 min old", "", "0.0 ms old"]);
   expect(formatCount(50_000)).toBe("50,000");
+});
+
+test("every limit on the wire has words, and a joint its number or name", () => {
+  const known = ["speed", "reach", "singular", "workspace", "proximity", "leader_apart", "tracking", "sag", "joints_only"];
+  for (const limit of known) expect(limitWords(limit)).not.toMatch(/_|joint .* at its end/);
+  expect(["panda_joint4", "left/joint_2", "left/elbow", "shoulder_pan_joint"].map(limitWords)).toEqual([
+    "joint 4 at its end",
+    "joint 2 at its end",
+    "joint elbow at its end",
+    "joint shoulder pan at its end",
+  ]);
 });

@@ -6,17 +6,18 @@ import type { Lease, ParticipantInfo } from "../../src/core/api.ts";
 import { describeMissing } from "../../src/xr/controls.ts";
 import { describeAlignment, describeConsent, describeHand, describeRobot, describeUrgent, findPulse, isPlaced, wrap } from "../../src/xr/words.ts";
 
-const facts = { name: "left", lease: undefined, holdReason: "", selfId: "p1", isStopped: false, nameOf: () => "ben", isPointedAt: false, isOwn: false, isRequested: false };
+const facts = { name: "left", lease: undefined, holdReason: "", selfId: "p1", isStopped: false, isPaused: false, nameOf: () => "ben", isPointedAt: false, isOwn: false, isRequested: false };
 const lease = { target: "left", holder: "p2", queue: [] as string[] } as unknown as Lease;
 
 describe("panels", () => {
   test("at a robot: holder, why it holds, what the trigger does", () => {
     expect(describeRobot(facts)).toEqual(["left: free"]);
     expect(describeRobot({ ...facts, isPointedAt: true })).toEqual(["left: free", "press the trigger to take it"]);
-    expect(describeRobot({ ...facts, lease, holdReason: "clutch_open" })).toEqual(["left: ben", "holds: clutch open"]);
+    expect(describeRobot({ ...facts, lease, holdReason: "clutch_open" })).toEqual(["left: ben", "holds: the operator has let go"]);
     const own = { ...facts, lease, isOwn: true, isPointedAt: true, holdReason: "untracked" };
     expect(describeRobot(own)).toEqual(["left: you", "holds: tracking lost", "hold the trigger to release it"]);
     expect(describeRobot({ ...own, isStopped: true })[1]).toBe("stopped by the e-stop");
+    expect(describeRobot({ ...own, isPaused: true })[1]).toBe("paused");
   });
 
   test("a robot whose holder has to consent, and one that one waits for", () => {
@@ -41,7 +42,7 @@ describe("panels", () => {
   });
 
   test("before the eyes: nothing while all is well, else what matters most first", () => {
-    const well = { isStopped: false, connection: "", isAligned: true, isTransparent: true, canPlace: false, hasMarks: false, doubt: "", advice: "", notice: "" };
+    const well = { isStopped: false, pause: "", connection: "", isAligned: true, isTransparent: true, canPlace: false, hasMarks: false, doubt: "", advice: "", notice: "" };
     expect(describeUrgent(well)).toEqual([]);
     const old = { ...well, doubt: "the alignment is 6 min old" };
     expect(describeUrgent(old).join(" ")).toMatch(/^The alignment is 6 min old: .*director/);
@@ -51,6 +52,7 @@ describe("panels", () => {
     expect(describeUrgent({ ...well, isAligned: false, hasMarks: true }).join(" ")).toMatch(/hold a trigger for two seconds/);
     expect(describeUrgent({ ...well, isAligned: false, isTransparent: false }).join(" ")).toMatch(/a place of this headset's own/);
     expect(describeUrgent({ ...well, isAligned: false, isTransparent: false, canPlace: true }).join(" ")).toMatch(/To stay here: point at no robot/);
+    expect(describeUrgent({ ...well, pause: "Paused by ann" })[0]).toBe("Paused by ann");
     expect(describeUrgent({ ...well, isStopped: true, connection: "lost", isAligned: false })).toEqual(["STOPPED: all robots hold", "lost"]);
   });
 
