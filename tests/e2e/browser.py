@@ -90,6 +90,14 @@ class Page:
         step_ms = 1e3 * seconds / steps
         self._browser.call("drag", self.name, selector=selector, x=x, y=y, steps=steps, step_ms=step_ms)
 
+    def point(self, x: float, y: float, action: str = "") -> None:
+        """Move the mouse to a place of the page [pixels]; `action`: "down" or "up" there."""
+        self._browser.call("point", self.name, x=x, y=y, action=action)
+
+    def touch(self, x: float, y: float, action: str) -> None:
+        """Put a finger at a place of the page [pixels]: "touchStart", "touchMove" or "touchEnd"."""
+        self._browser.call("touch", self.name, x=x, y=y, action=action)
+
     def screenshot(self, path: Path, *, full: bool = False) -> None:
         """Write a PNG of the page."""
         path.parent.mkdir(parents=True, exist_ok=True)

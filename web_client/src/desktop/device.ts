@@ -6,12 +6,12 @@
 // after it was seen let go on the same source, so that one that comes back pressed moves nothing.
 
 import type { SampleInput } from "../core/api.ts";
-import { type Intent, merge, type Motion, type Vec3 } from "./intent.ts";
+import { type Intent, limitLength, merge, type Motion, type Vec3 } from "./intent.ts";
 
 /** Least and greatest speed of the tip [m/s]. */
 export const SPEED_RANGE = [0.01, 0.3] as const;
 /** Angular speed that goes with a speed [rad/m]: 10 cm/s and 0.5 rad/s. */
-const TURN_PER_METRE = 5;
+export const TURN_PER_METRE = 5;
 
 export type Twist = [number, number, number, number, number, number];
 /** Horizontal direction of "forward" in the world: a unit vector (x, y). */
@@ -38,7 +38,8 @@ export class DesktopDevice {
   /** Sources whose dead-man was seen let go since dead-men were void. */
   private readonly ready = new Set<string>();
   private gripper: number | null = null;
-  private lastGripper = 0;
+  /** What the gripper was told last: 0 open, 1 closed. */
+  lastGripper = 0;
   private wasToggled = false;
 
   constructor(private readonly send: (sample: SampleInput) => void) {}
@@ -114,8 +115,9 @@ export class DesktopDevice {
     return isHeld;
   }
 
-  private readGripper({ close, open }: Motion, isFlipped: boolean): void {
-    if (close !== open) this.gripper = close ? 1 : 0;
+  private readGripper({ close, open, gripper }: Motion, isFlipped: boolean): void {
+    if (gripper !== null) this.gripper = gripper;
+    else if (close !== open) this.gripper = close ? 1 : 0;
     else if (isFlipped) this.gripper = 1 - this.lastGripper;
     this.lastGripper = this.gripper ?? this.lastGripper;
   }
@@ -156,9 +158,4 @@ export function toHeading(forward: Readonly<Vec3>, up: Readonly<Vec3>): Heading 
 /** Return a vector (right, forward, up) of a view in the world, times `scale`. */
 function toWorld([right, forward, up]: Vec3, [x, y]: Heading, scale: number): Vec3 {
   return [scale * (right * y + forward * x), scale * (forward * y - right * x), scale * up];
-}
-
-function limitLength(vector: Vec3): Vec3 {
-  const length = Math.hypot(...vector);
-  return length > 1 ? (vector.map((part) => part / length) as Vec3) : vector;
 }

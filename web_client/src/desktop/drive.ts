@@ -6,10 +6,11 @@ import type { WorkerClient } from "../core/page_client.ts";
 import { button, h, setOptions, setText } from "../ui/dom.ts";
 import type { PageState } from "../ui/state.ts";
 import { recall, remember } from "../ui/storage.ts";
-import { holdReasonWords, pauseWords } from "../ui/words.ts";
+import { holdReasonWords, limitWords, pauseWords } from "../ui/words.ts";
 import { DesktopDevice, type Heading, SPEED_RANGE, toHeading } from "./device.ts";
 import { DesktopInputs } from "./inputs.ts";
 import { KEY_WORDS, type Vec3 } from "./intent.ts";
+import type { Handles } from "./pull.ts";
 
 /** Time between samples [ms]: 59 a second. */
 const PERIOD_MS = 17;
@@ -18,6 +19,10 @@ const MAX_DT_S = 0.1;
 /** The session's answer to an engagement takes this long at most [ms]; before, its hold reason is the one before. */
 const ANSWER_MS = 400;
 const STORAGE_KEY = "iris-session.desktop";
+/** What moves the robot. */
+const HOW = matchMedia("(pointer: coarse)").matches
+  ? "Drag the arrows and rings at the gripper."
+  : "Drag the arrows and rings at the gripper, or hold left Shift and press W A S D, R F.";
 const DEFAULTS = { speed_cm_s: 10, relativeTo: "view" };
 
 /** Axes of the camera in the session's world. */
@@ -30,6 +35,8 @@ export interface Drive {
   element: HTMLElement;
   /** The robot that is driven, empty for none. */
   readonly robot: string;
+  /** Drive a robot from now on. */
+  begin(robot: string): void;
   /** Drive a robot, or stop when it is the one that is driven. */
   toggle(robot: string): void;
   update(): void;
@@ -37,7 +44,7 @@ export interface Drive {
 
 /**
  * Make the panel. `getCamera`: from where the person looks, null without a picture. `warn`: shows a line for a while.
- * `scene`: gets the focus, so that keys press no button meanwhile.
+ * `scene`: gets the focus, so that keys press no button meanwhile. `handles`: at the gripper in the picture.
  */
 export function makeDrive(
   state: PageState,
@@ -45,6 +52,7 @@ export function makeDrive(
   getCamera: () => CameraAxes | null,
   warn: (text: string) => void,
   scene: HTMLElement,
+  handles: Handles | null,
 ): Drive {
   const device = new DesktopDevice((sample) => client.post({ type: "samples", samples: [sample] }));
   const chosen = recall(STORAGE_KEY, DEFAULTS);
@@ -55,7 +63,7 @@ export function makeDrive(
   const robot = h("strong");
   const mark = h("span", { class: "tag" });
   const why = h("p", { class: "why", role: "status" });
-  const handle = h("div", { class: "handle", role: "img", aria: { label: "Handle: press and drag with the mouse or a finger" } }, "Press and drag: along the table. Wheel: height");
+  const handle = h("div", { class: "handle", role: "img", aria: { label: "Handle: press and drag with the mouse or a finger" } }, "Mouse pad: drag along the table, wheel for the height");
   const speedText = h("output");
   const speed = h("input", {
     type: "range",
@@ -64,7 +72,8 @@ export function makeDrive(
   });
   const relativeTo = h("select", { class: "small", on: { change: () => keep({ relativeTo: relativeTo.value }) } });
   setOptions(relativeTo, [["view", "the view"], ["world", "the world"]]);
-  const inputs = new DesktopInputs(handle, {
+  const slider = h("input", { type: "range", aria: { label: "Gripper: left is open, right is closed" }, attributes: { min: "0", max: "100", step: "1", value: "0" } });
+  const inputs = new DesktopInputs({ handle, slider, handles }, {
     onRelease: (reason) => {
       device.release(reason, nowMs());
       show();
@@ -76,15 +85,15 @@ export function makeDrive(
   const connected = h("p", { class: "note" });
   const keys = h("dl", { class: "facts keys" }, ...KEY_WORDS.map(([key, action]) => h("div", {}, h("dt", {}, key), h("dd", {}, action))));
   const pads = h("p", { class: "note" }, "Gamepad: hold the right shoulder button; sticks, cross, A closes, B opens.");
+  const more = h("details", { class: "more" }, h("summary", {}, "Speed, keys, other devices"), h("label", { class: "field" }, h("span", {}, "Speed"), speed, speedText), keys, handle, h("label", { class: "field" }, h("span", {}, "Relative to"), relativeTo), pads, connected, connect);
+  const gripper = h("label", { class: "field" }, h("span", {}, "Gripper"), h("small", {}, "open"), slider, h("small", {}, "closed"));
   const element = h(
     "section",
     { class: "drive card", hidden: true, aria: { label: "Driving from the desk" } },
     h("div", { class: "line" }, robot, mark, button("Stop driving", () => stop(), { class: "small" })),
     why,
-    handle,
-    h("label", { class: "field" }, h("span", {}, "Speed"), speed, speedText),
-    h("label", { class: "field" }, h("span", {}, "Relative to"), relativeTo),
-    h("details", { class: "more", attributes: { open: "" } }, h("summary", {}, "Keys and other devices"), keys, pads, connected, connect),
+    gripper,
+    more,
   );
 
   function keep(changed: Partial<typeof DEFAULTS>): void {
@@ -107,7 +116,8 @@ export function makeDrive(
   function tick(): void {
     const now = nowMs();
     const metresPerSecond = chosen.speed_cm_s / 100;
-    const intents = inputs.read(metresPerSecond, Math.min(MAX_DT_S, (now - ticked_ms) / 1000), now);
+    const heading = findHeading();
+    const intents = inputs.read(metresPerSecond, Math.min(MAX_DT_S, (now - ticked_ms) / 1000), now, heading);
     ticked_ms = now;
     const { session } = state;
     const situation = {
@@ -117,7 +127,7 @@ export function makeDrive(
       isHolder: state.heldBy(state.selfId).includes(device.robot),
     };
     const { isEngaged: wasEngaged, mustLetGo } = device;
-    if (!device.tick(intents, findHeading(), metresPerSecond, situation, now)) {
+    if (!device.tick(intents, heading, metresPerSecond, situation, now)) {
       warn("Driving has ended: you do not hold the robot any more.");
       stop();
     } else if (device.isEngaged !== wasEngaged) {
@@ -126,6 +136,7 @@ export function makeDrive(
     } else if (device.mustLetGo !== mustLetGo) {
       show();
     }
+    if (!inputs.isSliding) slider.value = String(100 * device.lastGripper);
   }
 
   function start(name: string): void {
@@ -154,12 +165,13 @@ export function makeDrive(
     element.hidden = device.robot === "";
     if (device.robot === "") return;
     setText(robot, `Driving ${device.robot}`);
-    const reason = state.feedback.get(device.robot)?.hold_reason ?? "";
+    const { hold_reason: reason = "", limits = [] } = state.feedback.get(device.robot) ?? {};
+    gripper.hidden = state.session?.robots.find(({ name }) => name === device.robot)?.gripper === false;
     const isHeld = !device.isEngaged || (reason !== "" && nowMs() - engaged_ms > ANSWER_MS);
     setText(mark, isHeld ? "held" : "engaged");
     mark.classList.toggle("good", !isHeld);
     element.classList.toggle("engaged", !isHeld);
-    setText(why, describe(device, state, reason, isHeld));
+    setText(why, describe(device, state, reason, limits, isHeld));
     setText(connected, inputs.listConnected().join(", "));
     connect.hidden = !inputs.spaceMouse.isSupported || inputs.spaceMouse.name !== "";
   }
@@ -171,6 +183,9 @@ export function makeDrive(
     get robot() {
       return device.robot;
     },
+    begin: (name) => {
+      if (device.robot !== name) start(name);
+    },
     toggle: (name) => {
       if (device.robot === name) stop();
       else start(name);
@@ -179,14 +194,14 @@ export function makeDrive(
   };
 }
 
-/** Return in words why the robot holds, or that it follows. */
-function describe(device: DesktopDevice, state: PageState, reason: string, isHeld: boolean): string {
+/** Return in words why the robot holds, or that it follows, and what keeps it from going on. */
+function describe(device: DesktopDevice, state: PageState, reason: string, limits: readonly string[], isHeld: boolean): string {
   if (!state.isReady) return "Held: not connected.";
   const who = state.isDirector ? "Press" : "A director presses";
   if (state.session?.estop) return `Held: e-stop. ${who} Clear, above.`;
   if (state.pause) return `${pauseWords(state.pause.by, "")}. ${who} Resume, above.`;
-  if (!isHeld) return "The robot follows you.";
+  if (!isHeld) return limits.length > 0 ? `It follows you: ${limitWords(limits)}.` : "The robot follows you.";
   if (device.isEngaged) return `Held by the session: ${holdReasonWords(reason)}.`;
-  const how = device.mustLetGo ? "Let go of it, then hold it again." : "Hold left Shift, the right shoulder button or the handle to move it.";
+  const how = device.mustLetGo ? "Let go, then hold again." : HOW;
   return device.released ? `Held: ${device.released}. ${how}` : `Held. ${how}`;
 }

@@ -3,7 +3,9 @@
 
 import { nowMs } from "../core/api.ts";
 import { takesText } from "../ui/dom.ts";
+import type { Heading } from "./device.ts";
 import { ClutchKey, DRIVE_KEYS, DragPath, type Intent, makeIdle, readKeys, readPad, readSpaceMouse } from "./intent.ts";
+import { type Handles, Pull } from "./pull.ts";
 import { SpaceMouse } from "./spacemouse.ts";
 
 /** Way of the tip for a pixel of the mouse at 1 m/s [m]: at 10 cm/s half a millimetre. */
@@ -12,6 +14,8 @@ const METRES_PER_PIXEL = 0.005;
 const WHEEL_PIXELS = [1, 30, 300] as const;
 /** After the focus came back, or a gamepad, the browser may tell an old state of it for this long [ms]. */
 const SETTLE_MS = 200;
+/** An arrow key at the slider of the gripper holds the dead-man for this long [ms]. */
+const SLIDE_MS = 500;
 
 export interface InputEvents {
   /** The dead-man is void: `reason` in words for people. */
@@ -20,7 +24,17 @@ export interface InputEvents {
   onQuit: () => void;
 }
 
-/** The inputs of one page. `handle`: what mouse and fingers drag. */
+/**
+ * What a page drives with beside its devices. `handle`: what mouse and fingers drag. `slider`: of the gripper, 0 to 100.
+ * `handles`: those at the gripper in the picture, null without one.
+ */
+export interface Surfaces {
+  handle: HTMLElement;
+  slider: HTMLInputElement;
+  handles: Handles | null;
+}
+
+/** The inputs of one page. */
 export class DesktopInputs {
   readonly spaceMouse: SpaceMouse;
   private readonly clutchKey = new ClutchKey();
@@ -34,10 +48,21 @@ export class DesktopInputs {
   private speed = 0;
   private listening: AbortController | null = null;
 
+  private readonly handle: HTMLElement;
+  private readonly slider: HTMLInputElement;
+  private readonly pull: Pull | null;
+  /** A pointer holds the slider. */
+  isSliding = false;
+  /** An arrow key has moved the slider: it counts as held until then [ms]. */
+  private slidUntil_ms = 0;
+
   constructor(
-    private readonly handle: HTMLElement,
+    { handle, slider, handles }: Surfaces,
     private readonly events: InputEvents,
   ) {
+    this.handle = handle;
+    this.slider = slider;
+    this.pull = handles && new Pull(handles);
     this.spaceMouse = new SpaceMouse(() => this.release("the SpaceMouse was disconnected"));
     // Also while nothing is driven: the click that begins it tells that no Shift key is held.
     for (const type of ["keydown", "keyup", "pointerdown", "pointermove"] as const) {
@@ -72,6 +97,9 @@ export class DesktopInputs {
     handle.addEventListener("pointerup", (event) => this.endDrag(event), options);
     handle.addEventListener("pointercancel", (event) => this.endDrag(event), options);
     handle.addEventListener("wheel", (event) => this.turnWheel(event), { ...options, passive: false });
+    this.slider.addEventListener("pointerdown", () => (this.isSliding = true), options);
+    for (const type of ["pointerup", "pointercancel"] as const) window.addEventListener(type, () => (this.isSliding = false), options);
+    this.slider.addEventListener("input", () => !this.isSliding && (this.slidUntil_ms = nowMs() + SLIDE_MS), options);
     void this.spaceMouse.reopen().catch(() => undefined); // taken away meanwhile, or in use by another program
   }
 
@@ -81,15 +109,22 @@ export class DesktopInputs {
     this.forget();
   }
 
-  /** Return what each source asks for at a time. `speed`: of the tip [m/s]; `dt`: since the last call [s]. */
-  read(speed: number, dt: number, now_ms: number): ReadonlyMap<string, Intent> {
+  /**
+   * Return what each source asks for at a time. `speed`: of the tip [m/s]; `dt`: since the last call [s]; `heading`: where
+   * "forward" is.
+   */
+  read(speed: number, dt: number, now_ms: number, heading: Heading): ReadonlyMap<string, Intent> {
     this.speed = speed;
+    const slides = this.isSliding || now_ms < this.slidUntil_ms;
+    const slid = { ...makeIdle(), clutch: slides, gripper: slides ? Number(this.slider.value) / 100 : null };
     const dragged = { ...makeIdle(), clutch: this.dragging !== null, move: this.drag.take(speed, dt) };
     const inputs = new Map<string, Intent>([
       ["keyboard", readKeys(this.pressed, this.clutchKey.isHeld)],
       ["SpaceMouse", readSpaceMouse(this.spaceMouse.state, now_ms)],
       ["handle", dragged],
+      ["slider", slid],
     ]);
+    if (this.pull) inputs.set("gizmo", this.pull.read(heading, speed));
     for (const pad of listPads()) inputs.set(`gamepad ${pad.index} ${pad.id}`, readPad(pad));
     const isKnown = !this.isAway && !document.hidden && now_ms - this.back_ms > SETTLE_MS;
     return isKnown ? inputs : new Map();
@@ -103,6 +138,9 @@ export class DesktopInputs {
   private forget(): void {
     this.pressed.clear();
     this.drag.clear();
+    this.isSliding = false;
+    this.slidUntil_ms = 0;
+    this.pull?.letGo();
     this.dragging = null;
     this.handle.classList.remove("held");
     if (document.pointerLockElement === this.handle) document.exitPointerLock();

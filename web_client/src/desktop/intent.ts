@@ -13,6 +13,8 @@ export interface Motion {
   turn: Vec3;
   close: boolean;
   open: boolean;
+  /** How far the gripper is to be closed, 0 to 1; null: nothing of this kind. */
+  gripper: number | null;
   /** Closes a gripper that was opened last, and the other way round; counts when it begins. */
   toggle: boolean;
 }
@@ -84,7 +86,7 @@ const BUTTON_SILENT_MS = 10_000;
 
 /** Return the intent of nothing pressed. */
 export function makeIdle(): Intent {
-  return { clutch: false, move: [0, 0, 0], turn: [0, 0, 0], close: false, open: false, toggle: false };
+  return { clutch: false, move: [0, 0, 0], turn: [0, 0, 0], close: false, open: false, gripper: null, toggle: false };
 }
 
 /** Return what the pressed keys ask for. `pressed`: values of `KeyboardEvent.code`. `clutch`: of the dead-man key. */
@@ -138,6 +140,7 @@ export function merge(intents: Iterable<Motion>): Motion {
     }
     merged.close ||= intent.close;
     merged.open ||= intent.open;
+    merged.gripper ??= intent.gripper;
     merged.toggle ||= intent.toggle;
   }
   merged.move = merged.move.map(clipShare) as Vec3;
@@ -212,6 +215,12 @@ const MAX_AHEAD_S = 0.1;
 function cutRest(value: number, rest: number): number {
   const size = Math.abs(value);
   return size > rest ? clipShare((Math.sign(value) * (size - rest)) / (1 - rest)) : 0;
+}
+
+/** Return a vector that is no longer than 1. */
+export function limitLength(vector: Vec3): Vec3 {
+  const length = Math.hypot(...vector);
+  return length > 1 ? (vector.map((part) => part / length) as Vec3) : vector;
 }
 
 function clipShare(value: number): number {

@@ -3,6 +3,7 @@
 import type { WorkerClient } from "../core/page_client.ts";
 import { makeDrive } from "../desktop/drive.ts";
 import { type AvatarInfo, participantColor } from "../view/avatars.ts";
+import { Gizmo } from "../view/gizmo.ts";
 import { View } from "../view/view.ts";
 import { Actions } from "./actions.ts";
 import { makeAlignmentPanel, makeAnchorsPanel } from "./alignment.ts";
@@ -19,6 +20,7 @@ import {
 import { makePairing } from "./pairing.ts";
 import { makePictures } from "./pictures.ts";
 import { makeParticipantsPanel } from "./participants.ts";
+import { makeRobotOverlay } from "./robot_overlay.ts";
 import { makeRobotsPanel } from "./robots.ts";
 import { makeStage } from "./stage.ts";
 import { PageState } from "./state.ts";
@@ -26,12 +28,14 @@ import { recall, remember } from "./storage.ts";
 import { StreamChoices } from "./stream_choices.ts";
 import { makeStreamsPanel } from "./streams.ts";
 import { type EventLevel, formatMillimetres } from "./words.ts";
+import { makeWelcome } from "./welcome.ts";
 import { type HeadsetControls, makeHeadsetControls } from "../xr/controls.ts";
 
 /** Roles in the order in which they are tried when the person has not chosen one. */
 const ROLES = ["director", "operator", "observer"] as const;
 const STATUS_PERIOD_MS = 1000;
 const NOTICE_MS = 8000;
+const DEFAULT_NAME = "Web";
 const SOFTWARE = "iris-session web client";
 /** What is remembered of this browser: choices of the person, no secrets. */
 const STORAGE_KEY = "iris-session.page";
@@ -40,12 +44,15 @@ interface Remembered {
   name: string;
   role: string;
   roles: string[];
+  /** This person has been asked for a name. */
+  isAsked: boolean;
 }
 
 /** What tests and the console may look at. */
 export interface PageHandle {
   state: PageState;
   view: View | null;
+  gizmo: Gizmo | null;
   headset: HeadsetControls | null;
 }
 
@@ -53,7 +60,7 @@ export interface PageHandle {
 export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const state = new PageState(client);
   const baseUrl = location.origin;
-  const remembered = recall<Remembered>(STORAGE_KEY, { name: "Web", role: "", roles: [] });
+  const remembered = recall<Remembered>(STORAGE_KEY, { name: DEFAULT_NAME, role: "", roles: [], isAsked: false });
   const notices = h("div", { class: "notices", role: "status", aria: { live: "polite" } });
   const show = (text: string, level: EventLevel): void => {
     const notice = h("div", { class: `notice ${level}` }, text);
@@ -96,7 +103,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   };
 
   const stage = makeStage(state, { pair: () => pairing.open("", ""), retry: joinByChoice });
-  const handle: PageHandle = { state, view: null, headset: null };
+  const handle: PageHandle = { state, view: null, gizmo: null, headset: null };
   try {
     handle.view = new View(stage.canvas, client, {
       onScene: (spec) => {
@@ -114,11 +121,14 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   }
   const { view } = handle;
 
-  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"), stage.canvas);
+  const gizmo = view && new Gizmo(view.viewpoint.camera, () => view.touchOverlay());
+  handle.gizmo = gizmo;
+  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"), stage.canvas, gizmo);
+  const robots = view && gizmo && makeRobotOverlay(state, actions, drive, view, gizmo, stage.element, stage.canvas);
   const choices = new StreamChoices(() => state.spec?.deformables.map((part) => part.stream) ?? [], () => view !== null);
   const cameras = makeCameras(state, view, makePictures(state, client, choices));
   stage.tools.append(cameras.menu);
-  stage.element.append(cameras.element, drive.element);
+  stage.element.append(...(robots ? [robots.element] : []), cameras.element);
   handle.headset = makeHeadsetControls(view, state, client, choices, (showInside) => new Actions(client, (text, level) => {
     show(text, level);
     showInside(text);
@@ -128,6 +138,12 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const estop = makeEstop(state, actions, () => drive.robot !== "");
   const pause = makePauseBanner(state, actions);
   const self = makeSelf(state, listRoles, joinAs);
+  const welcome = makeWelcome(state, () => !remembered.isAsked && remembered.name === DEFAULT_NAME, listRoles, (name, role) => {
+    remembered.isAsked = true;
+    remember(STORAGE_KEY, remembered);
+    if (name) joinAs(name, role);
+    else state.touch();
+  });
   const title = h("h1", {}, "iris-session");
   const header = h("header", { class: "bar" }, title, badge.element, self.element, estop.stop);
   const panels = [
@@ -152,7 +168,8 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     header,
     estop.banner,
     pause.element,
-    h("main", {}, stage.element, dashboard),
+    welcome.element,
+    h("main", {}, stage.element, drive.element, dashboard),
     notices,
     pairing.dialog,
   );
@@ -167,8 +184,10 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     pause.update();
     badge.update(state);
     self.update(state);
+    welcome.update();
     stage.update();
     drive.update();
+    robots?.update();
     cameras.update();
     for (const panel of panels) panel.update(state);
     if (view) updateOverlay(view, state);

@@ -107,8 +107,8 @@ export function makePauseBanner(state: PageState, actions: Actions): { element: 
       element.hidden = pause === null;
       if (pause === null) return;
       setText(text, pauseWords(pause.by, pause.reason));
-      const next = pause.reason ? "It goes on from the beginning of the scene." : "Then let go and hold again to drive.";
-      setText(note, `Robots and objects stand still until ${state.isDirector ? "you resume" : "a director resumes"}. ${next}`);
+      const who = state.isDirector ? "you resume" : "a director resumes";
+      setText(note, `Robots and objects stand still until ${who}${pause.reason ? ", from the beginning of the scene" : ""}.`);
       setText(resume, pause.reason ? "Reset and resume" : "Resume");
       resume.hidden = !state.isDirector || !state.isReady;
     },

@@ -1,19 +1,18 @@
 // Robots and their leases: who drives, why a robot holds; take, release, assign, hand over, mode, scale, consent.
 
 import type { RobotInfo } from "../core/api.ts";
+import { HoldReason } from "../protocol/messages.g.ts";
 import { participantColor } from "../view/avatars.ts";
 import type { Drive } from "../desktop/drive.ts";
 import type { Actions } from "./actions.ts";
 import { button, h, KeyedList, type Row, setOptions, setText, setValue } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
+import { makeRobotControls } from "./robot_controls.ts";
 import type { ConsentAsked, PageState } from "./state.ts";
 import { holdReasonWords, leaseModeWords, limitWords } from "./words.ts";
 
 const MODES = ["exclusive", "request", "takeover", "priority", "shared"] as const;
 const SCALES = [0.1, 0.25, 0.5, 1, 2] as const;
-const FREE = "";
-/** Roles that drive robots. */
-const DRIVERS = ["operator", "agent", "leader", "director"];
 
 export function makeRobotsPanel(state: PageState, actions: Actions, drive: Drive): Panel {
   const list = h("ul", { class: "rows" });
@@ -40,31 +39,7 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
   const title = h("strong", { class: "name" }, name);
   const holder = h("span", { class: "holder" });
   const why = h("div", { class: "note" });
-  const take = button("Take", () => void actions.request({ type: "acquire", robots: [name] }, `The robot ${name} is yours.`), {
-    class: "small primary",
-  });
-  const wait = button(
-    "Wait for it",
-    () => void actions.request({ type: "acquire", robots: [name], wait: true }, `The robot ${name} is yours.`),
-    { class: "small" },
-  );
-  const release = button(
-    "Release",
-    () => {
-      const lease = state.lease(name);
-      if (lease) actions.release([[name, lease.lease_version, "robot"]]);
-    },
-    { class: "small" },
-  );
-  const steer = button("Drive", () => drive.toggle(name), { class: "small primary" });
-  const assign = h("select", { class: "small", aria: { label: `Assign ${name} to` } });
-  assign.addEventListener("change", () => {
-    const participant = assign.value;
-    const done = participant === FREE ? `The robot ${name} is free.` : `${state.nameOf(participant)} has the robot ${name}.`;
-    void actions.request({ type: "assign", robots: [name], participant }, done).then((granted) => {
-      if (!granted) assign.value = state.lease(name)?.holder ?? FREE;
-    });
-  });
+  const controls = makeRobotControls(() => name, state, actions, drive);
   const mode = h("select", { class: "small", aria: { label: `Lease mode of ${name}` } });
   setOptions(mode, MODES.map((one) => [one, leaseModeWords(one)] as const));
   mode.addEventListener("change", () => {
@@ -78,16 +53,15 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
       if (!granted) scale.value = String(state.lease(name)?.scale ?? 1);
     });
   });
-  const assignLabel = h("label", { class: "field" }, h("span", {}, "Assign"), assign);
   const modeLabel = h("label", { class: "field" }, h("span", {}, "Mode"), mode);
   const scaleLabel = h("label", { class: "field" }, h("span", {}, "Scale"), scale);
-  const fields = h("div", { class: "fields" }, assignLabel, modeLabel, scaleLabel);
+  const fields = h("div", { class: "fields" }, controls.assign, modeLabel, scaleLabel);
   const element = h(
     "li",
     { class: "row", data: { robot: name } },
     h("div", { class: "line" }, dot, title, holder),
     why,
-    h("div", { class: "controls" }, take, wait, steer, release),
+    h("div", { class: "controls" }, ...controls.buttons),
     fields,
   );
   return {
@@ -95,31 +69,17 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
     update: () => {
       const lease = state.lease(name);
       const report = state.status?.robots.find((robot) => robot.name === name);
-      const participants = state.session?.participants ?? [];
-      const isMine = lease !== undefined && (lease.holder === state.selfId || lease.sub_holders.includes(state.selfId));
+      const isMine = state.heldBy(state.selfId).includes(name);
       const isFree = !lease || lease.holder === "";
       dot.style.background = isFree ? "transparent" : participantColor(lease.holder);
       dot.classList.toggle("hollow", isFree);
       setText(holder, isFree ? "free" : isMine ? "you" : state.nameOf(lease.holder));
       holder.classList.toggle("free", isFree);
       setText(why, describe(state, name, lease, report));
-      const canTake = state.isReady && DRIVERS.includes(state.role) && !isMine;
-      take.hidden = !canTake;
-      setText(take, isFree ? "Take" : lease.mode === "takeover" ? "Take over" : lease.mode === "request" ? "Ask for it" : "Take");
-      take.setAttribute("aria-label", `${take.textContent ?? ""}: ${name}`);
-      wait.hidden = !canTake || isFree || lease.queue.includes(state.selfId) || lease.mode === "takeover";
-      wait.setAttribute("aria-label", `Wait for it: ${name}`);
-      steer.hidden = !isMine || !state.isReady;
-      setText(steer, drive.robot === name ? "Stop driving" : "Drive");
-      steer.setAttribute("aria-label", `${steer.textContent ?? ""}: ${name}`);
-      release.hidden = !isMine || !state.isReady;
-      release.setAttribute("aria-label", `Release: ${name}`);
-      assignLabel.hidden = modeLabel.hidden = !state.isDirector;
+      controls.update();
+      modeLabel.hidden = !state.isDirector;
       scaleLabel.hidden = !(state.isDirector || isMine) || isFree;
-      fields.hidden = assignLabel.hidden && scaleLabel.hidden;
-      const drivers = participants.filter((one) => DRIVERS.includes(one.role) || one.id === lease?.holder);
-      setOptions(assign, [[FREE, "free"], ...drivers.map((one) => [one.id, one.name] as const)]);
-      setValue(assign, lease?.holder ?? FREE);
+      fields.hidden = modeLabel.hidden && scaleLabel.hidden;
       setValue(mode, lease?.mode ?? "exclusive");
       const scales = [...new Set([...SCALES, lease?.scale ?? 1])].sort((a, b) => a - b);
       setOptions(scale, scales.map((one) => [String(one), `${one} ×`] as const));
@@ -140,12 +100,13 @@ function describe(
   const parts: string[] = [];
   if (state.session?.estop) parts.push("stopped");
   else if (state.pause) parts.push("paused");
+  else if (reason === HoldReason.NO_SAMPLE && state.heldBy(state.selfId).includes(robot)) parts.push("ready: drag the arrows at its gripper, or press Drive");
   else if (reason && lease?.holder) parts.push(`holds: ${holdReasonWords(reason)}`);
   else if (report?.state && report.state !== "hold") parts.push("driven");
   if (lease && lease.expires_ns > 0) parts.push("its holder is disconnected, the lease is kept for a while");
   if (lease && lease.sub_holders.length > 1) parts.push(`shared by ${lease.sub_holders.map((id) => state.nameOf(id)).join(", ")}`);
   if (lease && lease.queue.length > 0) parts.push(`waiting: ${lease.queue.map((id) => state.nameOf(id)).join(", ")}`);
-  if (feedback && feedback.limits.length > 0) parts.push(...feedback.limits.map(limitWords));
+  if (feedback && feedback.limits.length > 0) parts.push(limitWords(feedback.limits));
   return parts.join(" · ");
 }
 

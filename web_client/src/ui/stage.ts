@@ -43,9 +43,12 @@ export function makeStage(state: PageState, actions: { pair: () => void; retry: 
   names.addEventListener("change", () => {
     if (!view) return;
     view.anchors.group.visible = view.avatars.group.visible = names.checked;
+    element.classList.toggle("no-names", !names.checked);
     view.touch();
   });
-  const tools = h("div", { class: "tools" }, camera, home, h("label", { class: "check" }, names, h("span", {}, "People and anchors")));
+  // On phones the tools lie behind one button, so that the picture is seen.
+  const more = button("View", () => more.setAttribute("aria-expanded", String(tools.classList.toggle("open"))), { class: "small more-tools", aria: { expanded: "false" } });
+  const tools = h("div", { class: "tools" }, more, camera, home, h("label", { class: "check" }, names, h("span", {}, "Labels and people")));
   const bar = h("progress", { attributes: { max: "1" }, aria: { label: "Loading the scene" } });
   const loaded = h("span");
   const progress = h("div", { class: "loading", hidden: true }, bar, loaded);

@@ -27,17 +27,17 @@ const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string>
   jump: "tracking jumped: let go, then hold again",
 };
 
-/** Limits of control, but for names of joints (docs/guide.md). */
+/** Limits of control, but for names of joints (docs/guide.md): what an operator has to know first comes first. */
 const LIMITS: Record<string, string> = {
-  speed: "as fast as it may move",
+  tracking: "pushing against something, or the load is too heavy",
+  joints_only: "moves by its joints only, not by a pose",
+  workspace: "at the edge of its workspace",
   reach: "arm at full reach",
   singular: "arm stretched out or folded: it cannot move every way",
-  workspace: "at the edge of its workspace",
   proximity: "slowed down: another robot is near",
   leader_apart: "catching up with its leader",
-  tracking: "pushing against something, or the load is too heavy",
   sag: "hanging lower than it should: the load is heavy",
-  joints_only: "moves by its joints only, not by a pose",
+  speed: "as fast as it may move",
 };
 
 const LEASE_MODES: Record<string, string> = {
@@ -101,8 +101,15 @@ const STREAM_FAULTS: Record<string, string> = {
 const look = (table: Record<string, string>, value: string): string => table[value] ?? value.replaceAll("_", " ");
 
 export const holdReasonWords = (reason: string): string => look(HOLD_REASONS, reason);
-/** Return what stops a robot from going on: one of `LIMITS`, or the joint of that name at the end of its range. */
-export function limitWords(limit: string): string {
+/** Return in words what keeps a robot from going on: the first two things. */
+export function limitWords(limits: readonly string[]): string {
+  const known = Object.keys(LIMITS);
+  const rank = (limit: string): number => (limit in LIMITS ? known.indexOf(limit) : 0.5); // joints come after `tracking`
+  return [...limits].sort((a, b) => rank(a) - rank(b)).slice(0, 2).map(nameLimit).join(", ");
+}
+
+/** Return the words of one of `LIMITS`, or of the joint of that name at the end of its range. */
+function nameLimit(limit: string): string {
   const number = /(?:^|[^a-z])joint[ _-]?(\d+)$/i.exec(limit)?.[1];
   const name = limit.slice(limit.lastIndexOf("/") + 1).replace(/^joint_|_joint$/i, "").replaceAll("_", " ");
   return LIMITS[limit] ?? `joint ${number ?? name} at its end`;

@@ -13,7 +13,7 @@ export class Label {
   private readonly canvas = document.createElement("canvas");
   private shown = "";
 
-  constructor(private readonly height_m: number) {
+  constructor(private height_m: number) {
     this.sprite = new Sprite(new SpriteMaterial({ transparent: true, depthWrite: false, toneMapped: false }));
     this.sprite.renderOrder = 10;
     this.sprite.visible = false;
@@ -53,7 +53,13 @@ export class Label {
     this.sprite.material.map?.dispose();
     this.sprite.material.map = texture;
     this.sprite.material.needsUpdate = true;
-    const scale = this.height_m / LINE_PX;
+    this.setHeight(this.height_m);
+  }
+
+  /** Set the height of a line in the scene [m]. */
+  setHeight(height_m: number): void {
+    this.height_m = height_m;
+    const scale = height_m / LINE_PX;
     this.sprite.scale.set(this.canvas.width * scale, this.canvas.height * scale, 1);
   }
 

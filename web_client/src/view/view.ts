@@ -89,6 +89,8 @@ export class View {
   readonly clouds: CloudViews;
   /** What is in the picture. */
   scene: SceneView | null = null;
+  /** Called before each drawn frame, when everything else is where it is drawn. */
+  onDraw: () => void = () => undefined;
   /** Frames drawn since the page began. */
   drawn = 0;
   /** Age of what is drawn: delay of the interpolation behind session time [ms]. */
@@ -150,6 +152,16 @@ export class View {
   touch(): void {
     this.framesToDraw = FRAMES_AFTER_CHANGE;
     this.pictures.markOutdated();
+  }
+
+  /** Draw again: something changed that pictures of cameras do not show. */
+  touchOverlay(): void {
+    this.framesToDraw = FRAMES_AFTER_CHANGE;
+  }
+
+  /** Add something to the session's world that pictures of cameras do not show. */
+  addToWorld(object: Object3D): void {
+    this.overlay.add(object);
   }
 
   /** Draw in a headset until its session ends. Rejects when the session cannot be drawn. */
@@ -330,7 +342,7 @@ export class View {
       this.viewpoint.update(this.scene),
     ].some(Boolean);
     const now = nowMs();
-    if (this.clouds.popChanged()) this.framesToDraw = FRAMES_AFTER_CHANGE; // pictures are without them
+    if (this.clouds.popChanged()) this.touchOverlay();
     if (isChanged) this.touch();
     const isOnScreen = !this.renderer.xr.isPresenting;
     const hidden = [this.overlay, this.clouds.group];
@@ -340,6 +352,7 @@ export class View {
     this.framesToDraw -= 1;
     this.lastDrawn_ms = now;
     this.scene?.lighting.update(this.scene.rest);
+    this.onDraw();
     if (isPresenting) this.showFor(headset.showsScene, headset.isTransparent);
     this.renderer.render(this.root, isPresenting ? headset.camera : this.viewpoint.camera);
     if (isOnScreen) this.pictures.show();

@@ -1,7 +1,7 @@
 // An immersive session: reads frames, sends samples, asks for what the hands mean, and shows panels and props. Everything
 // that it decides is in the pure files of this folder.
 
-import { Group } from "three";
+import { Group, Vector3 } from "three";
 
 import { type FromWorker, nowMs, type RobotInfo, type SceneSpec } from "../core/api.ts";
 import type { WorkerClient } from "../core/page_client.ts";
@@ -29,8 +29,9 @@ import { awaitsConsent, describeAlignment, describeHand, describeRobot, describe
 export type Mode = Exclude<PageMode, "screen">;
 
 const ENTRY: Entry = { devices: ["head", "controller/left", "controller/right", "hand/left", "hand/right"], alignment: "measured" };
-/** Height of a robot's panel above its highest link [m]. */
-const PANEL_ABOVE_M = 0.18;
+/** A robot's panel: its lower edge above the highest link [m]; height of its lines as a share of their distance: 2 degrees. */
+const PANEL_ABOVE_M = 0.06;
+const PANEL_LINE_SHARE = 0.035;
 /** Time that a denial is shown [ms], and between two updates of the panels. */
 const NOTICE_MS = 5000;
 const PANEL_PERIOD_MS = 100;
@@ -353,6 +354,7 @@ export class Headset {
       name,
       lease,
       holdReason,
+      limits: state.feedback.get(name)?.limits ?? [],
       selfId: state.selfId,
       isStopped: state.session?.estop ?? false,
       isPaused: state.pause !== null,
@@ -368,11 +370,15 @@ export class Headset {
     const points = (this.chains.get(name) ?? []).map((body) => this.positionOf(body)).filter((point) => point !== null);
     label.sprite.visible = points.length > 0;
     const base = points.at(-1);
-    if (base) label.sprite.position.set(base[0], base[1], Math.max(...points.map(([, , z]) => z)) + PANEL_ABOVE_M);
+    if (!base) return;
+    label.sprite.position.set(base[0], base[1], Math.max(...points.map(([, , z]) => z)) + PANEL_ABOVE_M);
+    const [at, eyes] = [label.sprite.getWorldPosition(new Vector3()), this.camera.getWorldPosition(new Vector3())];
+    label.setHeight(PANEL_LINE_SHARE * at.distanceTo(eyes));
   }
 
   private addPanel(name: string): Label {
-    const label = new Label(0.03);
+    const label = new Label(PANEL_LINE_SHARE);
+    label.sprite.center.set(0.5, 0); // it grows upwards
     this.labels.set(name, label);
     this.panels.add(label.sprite);
     return label;

@@ -44,7 +44,7 @@ export class Props {
   /** Before the eyes: what cannot wait. */
   readonly urgent = new Label(0.03);
   /** Above a hand: who one is, alignment, what the buttons do. */
-  readonly status = new Label(0.012);
+  readonly status = new Label(0.016);
   /** The urgent panel is above what the eyes look at. */
   isRaised = false;
   /** The ball at the wrist that stops. */

@@ -2,7 +2,7 @@
 
 import type { Filled, Lease, ParticipantInfo } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { capitalize, formatMillimetres, holdReasonWords } from "../ui/words.ts";
+import { capitalize, formatMillimetres, holdReasonWords, limitWords } from "../ui/words.ts";
 
 /** Characters of a line. */
 const LINE = 44;
@@ -12,6 +12,8 @@ export interface RobotFacts {
   lease: Lease | undefined;
   /** Why it holds, empty: it does not, or it is not known. */
   holdReason: string;
+  /** What keeps it from going on, while it follows this person. */
+  limits: readonly string[];
   selfId: string;
   isStopped: boolean;
   isPaused: boolean;
@@ -23,13 +25,14 @@ export interface RobotFacts {
 }
 
 /** Return the lines of the panel at a robot: who holds it, why it stands still, what the trigger does. */
-export function describeRobot({ name, lease, holdReason, selfId, isStopped, isPaused, nameOf, isPointedAt, isOwn, isRequested }: RobotFacts): string[] {
+export function describeRobot({ name, lease, holdReason, limits, selfId, isStopped, isPaused, nameOf, isPointedAt, isOwn, isRequested }: RobotFacts): string[] {
   const holder = lease?.holder ?? "";
   const who = isOwn ? "you" : holder === "" ? "free" : nameOf(holder);
   const lines = [`${name}: ${who}`];
   if (isStopped) lines.push("stopped by the e-stop");
   else if (isPaused) lines.push("paused");
   else if (holder !== "" && holdReason !== "") lines.push(...wrap(`holds: ${holdReasonWords(holdReason)}`));
+  else if (isOwn && holdReason === "" && limits.length > 0) lines.push(...wrap(limitWords(limits)));
   const place = lease?.queue.indexOf(selfId) ?? -1;
   if (lease && place >= 0) lines.push(`you wait for it, place ${place + 1} of ${lease.queue.length}`);
   if (isRequested && awaitsConsent(lease)) lines.push(`waiting for ${who}'s consent`);

@@ -11,6 +11,8 @@ const browser = await chromium.launch({
   args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
 });
 const pages = new Map();
+/** Sessions that hold a finger on a page: it is taken away when they end. */
+const fingers = new Map();
 
 /** The messages of a page that tests look at: errors of the page itself, and refused requests. */
 const logs = new Map();
@@ -63,6 +65,17 @@ const commands = {
       await new Promise((resolve) => setTimeout(resolve, step_ms));
     }
     await mouse.up();
+  },
+  /** Moves the mouse to a place of the page [pixels], and presses or lets go its button there. */
+  async point({ page, x, y, action = "" }) {
+    const { mouse } = pages.get(page);
+    await mouse.move(x, y);
+    if (action !== "") await mouse[action]();
+  },
+  /** Puts a finger at a place of the page ("touchStart"), moves it there, or takes it away ("touchEnd"). */
+  async touch({ page, x, y, action }) {
+    if (!fingers.has(page)) fingers.set(page, await pages.get(page).context().newCDPSession(pages.get(page)));
+    await fingers.get(page).send("Input.dispatchTouchEvent", { type: action, touchPoints: action === "touchEnd" ? [] : [{ x, y }] });
   },
   type: ({ page, text }) => pages.get(page).keyboard.type(text),
   screenshot: ({ page, path, full = false }) => pages.get(page).screenshot({ path, fullPage: full }).then(() => path),

@@ -46,7 +46,7 @@ function tick(for_ms = 34): SampleInput {
   for (let t_ms = 0; t_ms < for_ms; t_ms += 17) {
     vi.advanceTimersByTime(17);
     const now_ms = performance.timeOrigin + performance.now();
-    device.tick(inputs.read(0.1, 0.017, now_ms), [0, 1], 0.1, SITUATION, now_ms);
+    device.tick(inputs.read(0.1, 0.017, now_ms, [0, 1]), [0, 1], 0.1, SITUATION, now_ms);
   }
   return sent.at(-1)!;
 }
@@ -63,7 +63,7 @@ beforeEach(async () => {
   vi.stubGlobal("navigator", { getGamepads: () => pads, hid });
   vi.stubGlobal("HTMLElement", class {});
   device = new DesktopDevice((sample) => sent.push(sample));
-  inputs = new DesktopInputs(new Target() as unknown as HTMLElement, {
+  inputs = new DesktopInputs({ handle: new Target() as unknown as HTMLElement, slider: new EventTarget() as HTMLInputElement, handles: null }, {
     onRelease: (reason) => device.release(reason, 0),
     onQuit: () => undefined,
   });

@@ -72,11 +72,12 @@ test("ages of streams grow from milliseconds to hours", () => {
 
 test("every limit on the wire has words, and a joint its number or name", () => {
   const known = ["speed", "reach", "singular", "workspace", "proximity", "leader_apart", "tracking", "sag", "joints_only"];
-  for (const limit of known) expect(limitWords(limit)).not.toMatch(/_|joint .* at its end/);
-  expect(["panda_joint4", "left/joint_2", "left/elbow", "shoulder_pan_joint"].map(limitWords)).toEqual([
+  for (const limit of known) expect(limitWords([limit])).not.toMatch(/_|joint .* at its end/);
+  expect(["panda_joint4", "left/joint_2", "left/elbow", "shoulder_pan_joint"].map((joint) => limitWords([joint]))).toEqual([
     "joint 4 at its end",
     "joint 2 at its end",
     "joint elbow at its end",
     "joint shoulder pan at its end",
   ]);
+  expect(limitWords(["speed", "joint1", "singular", "tracking"])).toBe(limitWords(["tracking", "joint1"])); // the two that count
 });

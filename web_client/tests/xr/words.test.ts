@@ -6,7 +6,7 @@ import type { Lease, ParticipantInfo } from "../../src/core/api.ts";
 import { describeMissing } from "../../src/xr/controls.ts";
 import { describeAlignment, describeConsent, describeHand, describeRobot, describeUrgent, findPulse, isPlaced, wrap } from "../../src/xr/words.ts";
 
-const facts = { name: "left", lease: undefined, holdReason: "", selfId: "p1", isStopped: false, isPaused: false, nameOf: () => "ben", isPointedAt: false, isOwn: false, isRequested: false };
+const facts = { name: "left", lease: undefined, holdReason: "", limits: [], selfId: "p1", isStopped: false, isPaused: false, nameOf: () => "ben", isPointedAt: false, isOwn: false, isRequested: false };
 const lease = { target: "left", holder: "p2", queue: [] as string[] } as unknown as Lease;
 
 describe("panels", () => {
@@ -18,6 +18,7 @@ describe("panels", () => {
     expect(describeRobot(own)).toEqual(["left: you", "holds: tracking lost", "hold the trigger to release it"]);
     expect(describeRobot({ ...own, isStopped: true })[1]).toBe("stopped by the e-stop");
     expect(describeRobot({ ...own, isPaused: true })[1]).toBe("paused");
+    expect(describeRobot({ ...own, holdReason: "", limits: ["joint4"] })[1]).toBe("joint 4 at its end");
   });
 
   test("a robot whose holder has to consent, and one that one waits for", () => {

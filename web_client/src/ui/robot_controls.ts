@@ -1,0 +1,67 @@
+// What this person may do with one robot: take, wait, drive, release, assign. For the list and for the menu in the picture.
+
+import type { Drive } from "../desktop/drive.ts";
+import type { Actions } from "./actions.ts";
+import { button, h, setOptions, setText, setValue } from "./dom.ts";
+import type { PageState } from "./state.ts";
+
+const FREE = "";
+/** Roles that drive robots. */
+const DRIVERS = ["operator", "agent", "leader", "director"];
+
+export interface RobotControls {
+  /** Take, wait, drive, release. */
+  buttons: HTMLButtonElement[];
+  /** The choice of a holder, for directors. */
+  assign: HTMLElement;
+  update(): void;
+}
+
+/** Make the controls of a robot. `name` gives its name: it may change. */
+export function makeRobotControls(robot: () => string, state: PageState, actions: Actions, drive: Drive): RobotControls {
+  const acquire = (wait: boolean): void =>
+    void actions.request({ type: "acquire", robots: [robot()], wait }, `The robot ${robot()} is yours.`);
+  const take = button("Take", () => acquire(false), { class: "small primary" });
+  const wait = button("Wait for it", () => acquire(true), { class: "small" });
+  const steer = button("Drive", () => drive.toggle(robot()), { class: "small primary" });
+  const release = button(
+    "Release",
+    () => {
+      const lease = state.lease(robot());
+      if (lease) actions.release([[robot(), lease.lease_version, "robot"]]);
+    },
+    { class: "small" },
+  );
+  const select = h("select", { class: "small" });
+  select.addEventListener("change", () => {
+    const [name, participant] = [robot(), select.value];
+    const done = participant === FREE ? `The robot ${name} is free.` : `${state.nameOf(participant)} has the robot ${name}.`;
+    void actions.request({ type: "assign", robots: [name], participant }, done).then((granted) => {
+      if (!granted) select.value = state.lease(name)?.holder ?? FREE;
+    });
+  });
+  const assign = h("label", { class: "field" }, h("span", {}, "Assign"), select);
+  return {
+    buttons: [take, wait, steer, release],
+    assign,
+    update: () => {
+      const name = robot();
+      const lease = state.lease(name);
+      const isMine = state.heldBy(state.selfId).includes(name);
+      const isFree = !lease || lease.holder === "";
+      const canTake = state.isReady && DRIVERS.includes(state.role) && !isMine;
+      take.hidden = !canTake;
+      setText(take, isFree ? "Take" : lease.mode === "takeover" ? "Take over" : lease.mode === "request" ? "Ask for it" : "Take");
+      wait.hidden = !canTake || isFree || lease.queue.includes(state.selfId) || lease.mode === "takeover";
+      steer.hidden = !isMine || !state.isReady;
+      setText(steer, drive.robot === name ? "Stop driving" : "Drive");
+      release.hidden = !isMine || !state.isReady;
+      for (const one of [take, wait, steer, release]) one.setAttribute("aria-label", `${one.textContent ?? ""}: ${name}`);
+      assign.hidden = !state.isDirector;
+      select.setAttribute("aria-label", `Assign ${name} to`);
+      const drivers = (state.session?.participants ?? []).filter((one) => DRIVERS.includes(one.role) || one.id === lease?.holder);
+      setOptions(select, [[FREE, "free"], ...drivers.map((one) => [one.id, state.nameOf(one.id)] as const)]);
+      setValue(select, lease?.holder ?? FREE);
+    },
+  };
+}

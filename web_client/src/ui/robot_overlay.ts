@@ -1,0 +1,205 @@
+// Robots in the picture: a label at each, a menu where one is clicked, and the handles at the gripper of the one that this
+// person may drive.
+
+import { Quaternion, Vector3 } from "three";
+
+import type { RobotInfo } from "../core/api.ts";
+import type { Drive } from "../desktop/drive.ts";
+import { participantColor } from "../view/avatars.ts";
+import { T_THREE_WORLD } from "../view/axes.ts";
+import type { Gizmo, PicturePlace } from "../view/gizmo.ts";
+import { RobotPlaces } from "../view/robot_places.ts";
+import type { View } from "../view/view.ts";
+import type { Actions } from "./actions.ts";
+import { h, KeyedList, type Row, setText } from "./dom.ts";
+import { makeRobotControls } from "./robot_controls.ts";
+import type { PageState } from "./state.ts";
+
+/** A press is a click up to this way [pixels]; else it turns the view. */
+const CLICK_PX = 6;
+/** Between two samples, and until the arm has moved [s]. */
+const STEP_S = 0.05;
+/** A label that is nearer to where it was is not moved [pixels]. */
+const STILL_PX = 0.5;
+
+interface LabelRow {
+  element: HTMLElement;
+  x: number;
+  y: number;
+}
+
+export interface RobotOverlay {
+  /** Labels and menu, over the picture. */
+  element: HTMLElement;
+  update(): void;
+}
+
+/** Make labels, menu and handles over `canvas`, which is in `stage`. */
+export function makeRobotOverlay(
+  state: PageState,
+  actions: Actions,
+  drive: Drive,
+  view: View,
+  gizmo: Gizmo,
+  stage: HTMLElement,
+  canvas: HTMLCanvasElement,
+): RobotOverlay {
+  const places = new RobotPlaces(view);
+  const menu = makeMenu(state, actions, drive, stage);
+  const labels = new Map<string, LabelRow>();
+  const list = h("div", { class: "robot-labels" });
+  const rows = new KeyedList<RobotInfo>(list, ({ name }) => makeLabel(name));
+  const [p_world, q_world] = [new Vector3(), new Quaternion()];
+  /** The robot with the handles, empty for none. */
+  let chosen = "";
+  let holding: number | null = null;
+  let pressed = { pointer: -1, x: 0, y: 0 };
+  let [width, height] = [1, 1];
+  view.addToWorld(gizmo.object);
+  new ResizeObserver(() => ([width, height] = [canvas.clientWidth, canvas.clientHeight])).observe(canvas);
+
+  function makeLabel(name: string): Row<RobotInfo> {
+    const dot = h("span", { class: "dot", aria: { hidden: "true" } });
+    const who = h("span");
+    const element = h("button", { type: "button", class: "robot-label", data: { label: name } }, dot, h("strong", {}, name), who);
+    element.addEventListener("click", () => menu.open(name, labels.get(name)!));
+    labels.set(name, { element, x: Number.NaN, y: Number.NaN });
+    const update = (): void => {
+      const holder = state.lease(name)?.holder ?? "";
+      const isMine = state.heldBy(state.selfId).includes(name);
+      dot.style.background = holder === "" ? "transparent" : participantColor(holder);
+      dot.classList.toggle("hollow", holder === "");
+      setText(who, drive.robot === name ? "you drive" : isMine ? "you" : holder === "" ? "free" : state.nameOf(holder));
+      element.classList.toggle("driven", drive.robot === name);
+    };
+    return { element, update };
+  }
+
+  function toPlace(event: PointerEvent): PicturePlace {
+    const box = canvas.getBoundingClientRect();
+    return { x: (2 * (event.clientX - box.x)) / box.width - 1, y: 1 - (2 * (event.clientY - box.y)) / box.height };
+  }
+
+  /** Move labels and handles to where the robots are drawn. */
+  function place(): void {
+    const { camera } = view.viewpoint;
+    const isOnScreen = state.mode === "screen";
+    gizmo.object.visible = isOnScreen && chosen !== "" && places.readTip(chosen, p_world, q_world);
+    gizmo.lag_s = (view.delay_ms + (state.rtt_ms || 0)) / 1000 + STEP_S;
+    if (gizmo.object.visible) gizmo.place(p_world, q_world, camera);
+    if (!isOnScreen) return;
+    for (const [name, label] of labels) {
+      const isKnown = places.readLabel(name, p_world);
+      p_world.applyMatrix4(T_THREE_WORLD).project(camera);
+      const isSeen = isKnown && Math.abs(p_world.z) < 1;
+      label.element.hidden = !isSeen;
+      const [x, y] = [((1 + p_world.x) / 2) * width, ((1 - p_world.y) / 2) * height];
+      if (!isSeen || (Math.abs(x - label.x) < STILL_PX && Math.abs(y - label.y) < STILL_PX)) continue;
+      [label.x, label.y] = [x, y];
+      label.element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -100%)`;
+    }
+  }
+  view.onDraw = place;
+
+  function onDown(event: PointerEvent): void {
+    if (event.target !== canvas) return;
+    menu.close();
+    pressed = { pointer: event.isPrimary ? event.pointerId : -1, x: event.clientX, y: event.clientY };
+    if (event.button !== 0 || !event.isPrimary || !gizmo.hover(toPlace(event))) return;
+    drive.begin(chosen); // before the handles are held: it lets go of everything
+    if (!gizmo.grab(toPlace(event))) return;
+    holding = event.pointerId;
+    pressed.pointer = -1;
+    canvas.setPointerCapture(event.pointerId);
+    event.preventDefault();
+    event.stopPropagation(); // the view does not turn
+  }
+
+  function onMove(event: PointerEvent): void {
+    if (event.pointerId === holding) gizmo.drag(toPlace(event));
+    else if (event.target === canvas && event.buttons === 0) {
+      const at = toPlace(event);
+      canvas.style.cursor = gizmo.hover(at) ? "grab" : places.pick(at, view.viewpoint.camera) === null ? "" : "pointer";
+    } else return;
+    view.touchOverlay();
+  }
+
+  function onUp(event: PointerEvent): void {
+    if (event.pointerId === holding) {
+      holding = null;
+      gizmo.letGo();
+      view.touchOverlay();
+      return;
+    }
+    const { pointer, x, y } = pressed;
+    const isClick = event.pointerId === pointer && Math.hypot(event.clientX - x, event.clientY - y) <= CLICK_PX;
+    pressed.pointer = -1;
+    if (!isClick || event.type !== "pointerup") return;
+    const robot = places.pick(toPlace(event), view.viewpoint.camera);
+    const box = canvas.getBoundingClientRect();
+    if (robot) menu.open(robot, { x: event.clientX - box.x, y: event.clientY - box.y });
+  }
+  stage.addEventListener("pointerdown", onDown, { capture: true });
+  stage.addEventListener("pointermove", onMove, { capture: true });
+  for (const type of ["pointerup", "pointercancel"] as const) stage.addEventListener(type, onUp, { capture: true });
+
+  return {
+    element: h("div", { class: "robots" }, list, menu.element),
+    update: () => {
+      const robots = state.session?.robots ?? [];
+      if (state.spec) places.set(robots, state.spec);
+      for (const name of labels.keys()) if (!robots.some((robot) => robot.name === name)) labels.delete(name);
+      rows.update(robots, ({ name }) => name);
+      menu.update();
+      const mine = state.isReady ? state.heldBy(state.selfId).filter((name) => labels.has(name)) : [];
+      const before = chosen;
+      chosen = mine.includes(drive.robot) ? drive.robot : mine.includes(chosen) ? chosen : (mine[0] ?? "");
+      if (chosen !== before) gizmo.letGo();
+      if (chosen !== before || [...labels.values()].some(({ x }) => Number.isNaN(x))) view.touchOverlay();
+    },
+  };
+}
+
+/** What may be done with a robot, where it was clicked. */
+function makeMenu(state: PageState, actions: Actions, drive: Drive, stage: HTMLElement) {
+  let robot = "";
+  const name = h("strong", { class: "name" });
+  const holder = h("span", { class: "note" });
+  const controls = makeRobotControls(() => robot, state, actions, drive);
+  const none = h("p", { class: "note" }, "Your role does not drive robots.");
+  const element = h("div", { class: "robot-menu card", role: "dialog", hidden: true, aria: { label: "Robot" } }, h("div", { class: "line" }, name, holder), h("div", { class: "controls" }, ...controls.buttons), none, controls.assign);
+  const close = (): void => {
+    element.hidden = true;
+  };
+  const update = (): void => {
+    if (element.hidden) return;
+    controls.update();
+    setText(name, robot);
+    const lease = state.lease(robot);
+    setText(holder, !lease?.holder ? "free" : `held by ${lease.holder === state.selfId ? "you" : state.nameOf(lease.holder)}`);
+    none.hidden = !controls.assign.hidden || controls.buttons.some((one) => !one.hidden);
+  };
+  for (const type of ["click", "change"] as const) {
+    element.addEventListener(type, (event) => {
+      const isDone = event.target instanceof HTMLButtonElement || type === "change";
+      if (isDone) close();
+    });
+  }
+  element.addEventListener("keydown", (event) => event.key === "Escape" && close());
+  return {
+    element,
+    close,
+    update,
+    /** Open at a point of the picture [pixels]. */
+    open: (which: string, { x, y }: { x: number; y: number }) => {
+      robot = which;
+      element.hidden = false;
+      update();
+      const left = Math.min(x, stage.clientWidth - element.offsetWidth - 8);
+      const top = Math.min(y, stage.clientHeight - element.offsetHeight - 8);
+      element.style.left = `${Math.max(8, left)}px`;
+      element.style.top = `${Math.max(8, top)}px`;
+      element.querySelector<HTMLElement>("button:not([hidden]), select")?.focus({ preventScroll: true });
+    },
+  };
+}

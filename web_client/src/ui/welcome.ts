@@ -1,0 +1,64 @@
+// Asked once in each browser: what others call this person, and as what they are here.
+
+import { button, h, setOptions, setText, setValue } from "./dom.ts";
+import type { PageState } from "./state.ts";
+import { roleWords } from "./words.ts";
+
+const ROLE_NOTES: Record<string, string> = {
+  director: "Directors drive, assign robots, pause, and clear stops.",
+  operator: "Operators drive robots.",
+  observer: "Observers look, press the e-stop and add notes.",
+};
+
+export interface Welcome {
+  element: HTMLElement;
+  update(): void;
+}
+
+/**
+ * Make the row that asks. `isAsking`: whether it still has to. `listRoles`: those that this browser may have. `onAnswer`
+ * gets name and role, or an empty name: this person wants none.
+ */
+export function makeWelcome(
+  state: PageState,
+  isAsking: () => boolean,
+  listRoles: () => readonly string[],
+  onAnswer: (name: string, role: string) => void,
+): Welcome {
+  const why = h("p", { class: "note" });
+  const name = h("input", { type: "text", id: "welcome-name", attributes: { maxlength: "64", spellcheck: "false", autocomplete: "nickname", placeholder: "Your name", required: "" } });
+  const role = h("select", { id: "welcome-role", aria: { label: "Your role" } });
+  const note = h("span", { class: "note" });
+  role.addEventListener("change", () => setText(note, ROLE_NOTES[role.value] ?? ""));
+  const element = h(
+    "form",
+    { class: "welcome", hidden: true, aria: { label: "Who are you?" } },
+    why,
+    h("label", { class: "hidden-text", for: "welcome-name" }, "Name for others"),
+    name,
+    role,
+    h("button", { class: "primary" }, "OK"),
+    button("Not now", () => onAnswer("", ""), { class: "quiet" }),
+    note,
+  );
+  element.addEventListener("submit", (event) => {
+    event.preventDefault();
+    if (name.value.trim()) onAnswer(name.value.trim(), role.value);
+  });
+  return {
+    element,
+    update: () => {
+      const isShown = isAsking() && state.isReady && state.self !== undefined;
+      element.hidden = !isShown;
+      if (!isShown) return;
+      const isOpen = state.info?.pairing === false && state.role === "director";
+      setText(why, isOpen ? `You are “${state.self?.name}”, a director, as everyone is who opens this page on this machine.` : `You are “${state.self?.name}”, ${roleWords(state.role)}.`);
+      setOptions(role, listRoles().map((one) => [one, roleWords(one)] as const));
+      if (!role.dataset.isSet) {
+        role.dataset.isSet = "yes";
+        setValue(role, state.role);
+        setText(note, ROLE_NOTES[role.value] ?? "");
+      }
+    },
+  };
+}
