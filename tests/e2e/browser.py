@@ -17,6 +17,19 @@ from iris_session.bench.web_tab import BrowserError, BrowserTools, Chromium, Mis
 from tests.e2e.session_process import DEADLINE_S, END_WITH_PARENT, SessionProcess, skip_unless_ci, wait_until
 
 
+#: Returns the middle of an arrow of the handles [pixels]: their size in the picture does not depend on the distance.
+FIND_ARROW = """(axis) => {
+  const { gizmo, view } = irisSession;
+  const { camera } = view.viewpoint;
+  const at = gizmo.pivot.getWorldPosition(gizmo.pivot.position.clone());
+  const length = 0.8 * at.distanceTo(camera.position) * 1.9 * Math.tan((camera.fov * Math.PI) / 360) / 8 * gizmo.mover.size;
+  const direction = { x: [0, 0, -1], y: [-1, 0, 0], z: [0, 1, 0] }[axis];
+  const { x, y } = at.add(at.clone().set(...direction).multiplyScalar(length)).project(camera);
+  const box = document.querySelector("#scene").getBoundingClientRect();
+  return [box.x + ((1 + x) / 2) * box.width, box.y + ((1 - y) / 2) * box.height];
+}"""
+
+
 def require_browser() -> BrowserTools:
     """Return the paths of Node and Chromium; skip the test, or fail in CI, without them and the built page."""
     try:
@@ -89,6 +102,11 @@ class Page:
         steps = max(1, round(20 * seconds))
         step_ms = 1e3 * seconds / steps
         self._browser.call("drag", self.name, selector=selector, x=x, y=y, steps=steps, step_ms=step_ms)
+
+    def find_arrow(self, axis: str) -> tuple[float, float]:
+        """Return where the arrow of an axis of the world is [pixels] that stands at the gripper of the own robot."""
+        x, y = self.evaluate(f"({FIND_ARROW})({json.dumps(axis)})")
+        return x, y
 
     def point(self, x: float, y: float, action: str = "") -> None:
         """Move the mouse to a place of the page [pixels]; `action`: "down" or "up" there."""

@@ -140,9 +140,15 @@ def test_two_browsers_share_robots(scenario: Scenario, open_page: Callable[..., 
     assert second.errors == []
 
 
-def test_space_and_the_button_stop(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+def test_stops_and_pauses_are_seen_on_every_screen(scenario: Scenario, open_page: Callable[..., Page]) -> None:
     page = open_page(scenario.server, "stopper")
-    watcher = scenario.join("watcher", "observer")
+    watcher = scenario.join("watcher", "director")
+    watcher.control("pause")
+    page.wait("/watcher/.test(document.querySelector('.banner.paused:not([hidden])')?.textContent)")
+    assert page.evaluate("document.title").startswith("PAUSED")
+    page.evaluate("document.querySelector('#resume').click()")
+    scenario.run_until(lambda: not watcher.mirror.paused, "the session goes on")
+    page.wait("document.querySelector('.banner.paused').hidden && document.title.startsWith('handover')")
     page.evaluate("document.activeElement.blur()")
     page.press("Space")
     scenario.run_until(lambda: watcher.mirror.estop, "the e-stop is in force")
@@ -255,13 +261,19 @@ def test_a_browser_pairs_by_the_printed_link(
 
 
 def test_a_reload_resumes_with_the_lease(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    """The person is asked for name and role once, in place."""
     page = open_page(scenario.server, "reload")
-    join_as(page, "dan", "operator")
+    page.wait("!document.querySelector('.welcome').hidden && irisSession.state.role === 'director'")
+    page.select("Your role", "operator")
+    page.fill("Name for others", "dan")
+    page.click("button", "OK")
+    page.wait("irisSession.state.role === 'operator' && document.querySelector('.welcome').hidden")
     page.click("button", "Take: left")
     page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
     page.reload()
     page.wait_until_ready()
     assert page.evaluate("[irisSession.state.self.name, irisSession.state.role]") == ["dan", "operator"]
+    assert page.evaluate("document.querySelector('.welcome').hidden")
     page.wait("document.querySelector('[data-robot=left] .holder').textContent === 'you'")
 
 

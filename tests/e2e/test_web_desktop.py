@@ -36,6 +36,14 @@ CLOSE = '<camera name="close" pos="-0.2 -0.5 0.28" xyaxes="1 0 0 0 0 1" fovy="20
 
 #: What the session says of the left robot to its holder.
 FEEDBACK = "irisSession.state.feedback.get('left') ?? { hold_reason: '', rejected: {} }"
+#: Returns where the base of the left robot is in the picture [pixels].
+FIND_BASE = """() => {
+  const { state, view } = irisSession;
+  const { position } = view.scene.bodies.get(state.session.robots.find(({ name }) => name === "left").base_body);
+  const at = position.clone().set(-position.y, position.z + 0.05, -position.x).project(view.viewpoint.camera);
+  const box = document.querySelector("#scene").getBoundingClientRect();
+  return [box.x + ((1 + at.x) / 2) * box.width, box.y + ((1 - at.y) / 2) * box.height];
+}"""
 #: Notes in `window.at` when keys change and the focus is lost, in session time [ms].
 NOTE_KEYS = """void (window.at = {}, ["keydown", "keyup", "blur"].forEach((type) => {
   const note = (event) => { window.at[`${type} ${event.code ?? ""}`.trim()] = irisSession.view.sessionTime(); };
@@ -96,7 +104,7 @@ class Tip:
 @pytest.fixture
 def driver(scenario: Scenario, open_page: Callable[..., Page]) -> Page:
     """A page that drives the left robot, which it holds. It notes when keys change, in session time [ms]."""
-    page = open_page(scenario.server, "driver", width=400, height=320)  # small, because software draws it
+    page = open_page(scenario.server, "driver", width=400, height=480)  # small, because software draws it
     join_as(page, "dora", "operator")
     start_driving(page)
     return page
@@ -106,8 +114,13 @@ def start_driving(page: Page) -> None:
     page.click("button", "Take: left")
     page.click("button", "Drive: left")
     page.wait("!document.querySelector('.drive').hidden")
-    page.evaluate(f"irisSession.view.viewpoint.setFree({json.dumps(VIEW)})")
+    set_view(page)
     page.evaluate(NOTE_KEYS)
+
+
+def set_view(page: Page) -> None:
+    drawn = page.evaluate(f"(irisSession.view.viewpoint.setFree({json.dumps(VIEW)}), irisSession.view.drawn)")
+    page.wait(f"irisSession.view.drawn > {drawn} + 1")
 
 
 def words(page: Page) -> str:
@@ -168,13 +181,13 @@ def test_keys_drive_the_robot_while_the_dead_man_is_pressed(scenario: Scenario, 
     driver.hold("w")
     tip.watch_for(0.5)
     assert np.linalg.norm(tip.place - begin) < REST_M
-    assert words(driver).startswith("Held. Hold left Shift")
+    assert words(driver).startswith("Held. ")
     driver.let_go("w")
     begin = drive_forward(driver, tip, 0.03)
     assert tip.place[1] - begin[1] > 0.02
     driver.let_go("w")
     driver.let_go("Shift")
-    driver.wait("document.querySelector('.drive .why').textContent.startsWith('Held. Hold left Shift')")
+    driver.wait("document.querySelector('.drive .why').textContent.startsWith('Held. ')")
     assert driver.errors == []
 
 
@@ -225,7 +238,40 @@ def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> N
         is_late = bool(held & LATE) or driver.evaluate(FEEDBACK)["rejected"] != rejected
         assert is_late or driver.evaluate("irisSession.view.drawn") - drawn < 10 * DRAG_S, held
     assert tip.place[0] - first[0] > 0.02
-    assert words(driver).startswith("Held. Hold left Shift")
+    assert words(driver).startswith("Held. ")
+
+
+def drag_up(page: Page, tip: Tip, action: Callable[[float, float, str], None], names: tuple[str, str, str]) -> None:
+    """Drag the arrow that points up by 30 pixels, until the tip is 3 cm higher. `names`: of pressing, moving, letting go."""
+    begin, (x, y) = tip.place, page.find_arrow("z")
+    action(x, y, names[0])
+    action(x, y - 30, names[1])
+    tip.watch(lambda: tip.place[2] - begin[2] > 0.03, "the gripper follows the handle up")
+    assert np.linalg.norm(tip.place[:2] - begin[:2]) < 0.005
+    assert page.evaluate("irisSession.gizmo.isHeld && irisSession.state.feedback.get('left').hold_reason === ''")
+    action(x, y - 30, names[2])
+    page.wait("irisSession.state.feedback.get('left').hold_reason === 'clutch_open'")
+    goal, reached = page.evaluate("[irisSession.gizmo.pivot, irisSession.gizmo].map((one, i) => (i ? one.p_world : one.position).toArray())")
+    assert goal == reached  # it snaps back
+
+
+def test_a_robot_is_taken_in_the_picture_and_driven_by_its_handles(
+    scenario: Scenario, open_page: Callable[..., Page]
+) -> None:
+    page = open_page(scenario.server, "handles", width=400, height=480)
+    join_as(page, "dora", "operator")
+    set_view(page)
+    tip = Tip(scenario)
+    assert page.evaluate("irisSession.gizmo.object.visible") is False
+    x, y = page.evaluate(f"({FIND_BASE})()")
+    page.point(x, y, "down")
+    page.point(x, y, "up")
+    page.wait("document.querySelector('.robot-menu .name').textContent === 'left'")
+    page.evaluate("document.querySelector('.robot-menu button.primary').click()")
+    page.wait("irisSession.gizmo.object.visible && document.querySelector('.robot-menu').hidden")
+    page.wait("/you/.test(document.querySelector('[data-label=left]').textContent)")
+    drag_up(page, tip, page.point, ("down", "", "up"))
+    assert page.errors == []
 
 
 # --- recording cameras ------------------------------------------------------------------------------------------------

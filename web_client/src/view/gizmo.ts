@@ -83,6 +83,7 @@ export class Gizmo {
   /** Hold the handle at a place. Returns whether there is one. */
   grab(at: PicturePlace): boolean {
     if (this.isHeld || !this.hover(at)) return false;
+    this.held.getHelper().updateMatrixWorld(); // the plane of the drag is that of the handle, also without a frame since
     this.held.pointerDown(asPointer(at, LEFT_BUTTON));
     this.isHeld = this.held.dragging;
     this.other.getHelper().visible = !this.isHeld;

@@ -90,7 +90,7 @@ export class View {
   /** What is in the picture. */
   scene: SceneView | null = null;
   /** Called before each drawn frame, when everything else is where it is drawn. */
-  onDraw: () => void = () => undefined;
+  onDraw?: () => void;
   /** Frames drawn since the page began. */
   drawn = 0;
   /** Age of what is drawn: delay of the interpolation behind session time [ms]. */
@@ -352,7 +352,7 @@ export class View {
     this.framesToDraw -= 1;
     this.lastDrawn_ms = now;
     this.scene?.lighting.update(this.scene.rest);
-    this.onDraw();
+    this.onDraw?.();
     if (isPresenting) this.showFor(headset.showsScene, headset.isTransparent);
     this.renderer.render(this.root, isPresenting ? headset.camera : this.viewpoint.camera);
     if (isOnScreen) this.pictures.show();

@@ -29,9 +29,9 @@ import { awaitsConsent, describeAlignment, describeHand, describeRobot, describe
 export type Mode = Exclude<PageMode, "screen">;
 
 const ENTRY: Entry = { devices: ["head", "controller/left", "controller/right", "hand/left", "hand/right"], alignment: "measured" };
-/** A robot's panel: its lower edge above the highest link [m]; height of its lines as a share of their distance: 2 degrees. */
+/** A robot's panel: its lower edge above the highest link [m]; height of its lines as a share of their distance: 2.6 degrees. */
 const PANEL_ABOVE_M = 0.06;
-const PANEL_LINE_SHARE = 0.035;
+const PANEL_LINE_SHARE = 0.045;
 /** Time that a denial is shown [ms], and between two updates of the panels. */
 const NOTICE_MS = 5000;
 const PANEL_PERIOD_MS = 100;

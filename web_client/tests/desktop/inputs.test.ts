@@ -3,6 +3,7 @@ import { afterEach, beforeEach, expect, it, vi } from "vitest";
 import type { SampleInput } from "../../src/core/api.ts";
 import { DesktopDevice } from "../../src/desktop/device.ts";
 import { DesktopInputs } from "../../src/desktop/inputs.ts";
+import type { Vec3 } from "../../src/desktop/intent.ts";
 
 class Target extends EventTarget {
   readonly classList = { remove: (): void => undefined };
@@ -18,6 +19,8 @@ let pads: object[];
 let inputs: DesktopInputs;
 let device: DesktopDevice;
 let sent: SampleInput[];
+let slider: HTMLInputElement;
+let handles: { isHeld: boolean; lag_s: number; readWay: (move: Vec3) => void; letGo: () => void };
 
 const makePad = (isHeld: boolean): object => ({
   connected: true,
@@ -62,8 +65,10 @@ beforeEach(async () => {
   vi.stubGlobal("document", Object.assign(new EventTarget(), { hidden: false, pointerLockElement: null }));
   vi.stubGlobal("navigator", { getGamepads: () => pads, hid });
   vi.stubGlobal("HTMLElement", class {});
+  slider = Object.assign(new EventTarget(), { value: "0" }) as HTMLInputElement;
+  handles = { isHeld: false, lag_s: 0, readWay: (move) => (move[2] = 1), letGo: () => (handles.isHeld = false) };
   device = new DesktopDevice((sample) => sent.push(sample));
-  inputs = new DesktopInputs({ handle: new Target() as unknown as HTMLElement, slider: new EventTarget() as HTMLInputElement, handles: null }, {
+  inputs = new DesktopInputs({ handle: new Target() as unknown as HTMLElement, slider, handles }, {
     onRelease: (reason) => device.release(reason, 0),
     onQuit: () => undefined,
   });
@@ -186,4 +191,26 @@ it("a SpaceMouse that comes back with its button held has to be let go", async (
   await inputs.spaceMouse.reopen();
   reportButtons(1);
   expect(tick().clutch).toBe(false);
+});
+
+it("the slider moves the gripper alone, while it is held", () => {
+  slider.value = "60";
+  expect(tick()).toMatchObject({ clutch: false });
+  slider.dispatchEvent(new Event("pointerdown"));
+  expect(tick()).toMatchObject({ clutch: true, gripper: 0.6, twist: [0, 0, 0, 0, 0, 0] });
+  dispatch("pointerup", NONE);
+  expect(tick().clutch).toBe(false);
+  slider.dispatchEvent(new Event("input")); // an arrow key
+  expect(tick(400).clutch).toBe(true);
+  expect(tick(200).clutch).toBe(false);
+});
+
+it("handles that are held when the focus is lost are let go, and do not count when it is back", () => {
+  handles.isHeld = true;
+  expect(tick()).toMatchObject({ clutch: true, gripper: null, twist: [0, 0, expect.closeTo(0.1), 0, 0, 0] });
+  dispatch("blur");
+  expect(handles.isHeld).toBe(false);
+  expect(tick().clutch).toBe(false);
+  dispatch("focus");
+  expect(tick(500).clutch).toBe(false);
 });
