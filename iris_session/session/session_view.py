@@ -23,6 +23,7 @@ from iris_session.protocol.server_messages import (
     ParticipantInfo,
     ParticipantJoined,
     ParticipantLeft,
+    PauseChanged,
     Reply,
     SamplesRejected,
     Snapshot,
@@ -58,6 +59,7 @@ class SessionView:
         mirror: Participants and leases, as a client keeps them.
         handovers: The newest handovers, at most `MAX_HANDOVERS`.
         recent: The newest events, at most `RECENT_EVENTS`.
+        paused_by: Name of who paused the session, empty while it runs.
         applied: By robot, the newest sample that moved it.
         connections: The newest connection number by participant id, until the participant has left.
         rejected: Rejected samples by (participant, device, reason), at most a second old.
@@ -68,6 +70,7 @@ class SessionView:
         self.mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "", 0, 0.0, 0, participants=(), leases=()))
         self.handovers: deque[HandoverStatus] = deque(maxlen=MAX_HANDOVERS)
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
+        self.paused_by = ""
         self.applied: dict[str, Applied] = {}
         self.connections: dict[str, int] = {}
         self.rejected: dict[tuple[str, str, str], int] = {}
@@ -91,6 +94,9 @@ class SessionView:
                 _log.info("%r joined as %s%s", body.participant.name, body.participant.role, again)
             elif isinstance(body, ParticipantLeft):
                 _log.info("participant %s left: %r", body.participant, body.reason)
+            elif isinstance(body, PauseChanged):
+                person = self.mirror.participants.get(body.participant)
+                self.paused_by = (person.name if person else "the session") if body.paused else ""
             elif isinstance(body, SamplesRejected):
                 self.rejected[body.participant, body.device, body.reason] = body.count
             elif isinstance(body, Handover):

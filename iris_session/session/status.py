@@ -117,6 +117,7 @@ def make_report(
         restarts=restarts or {},
         stops=core.authority.build_stop_reports(),
         pause_reason=core.authority.pause_reason,
+        paused_by=stepper.view.paused_by,
     )
 
 

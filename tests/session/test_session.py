@@ -236,9 +236,11 @@ def test_one_command_mends_a_diverged_session(session: Session, command: str) ->
     session.run(until=lambda: session.status().paused, seconds=30.0)
     assert "NaN" in session.status().pause_reason
     assert "NaN" in _make_report(session).pause_reason
+    assert _make_report(session).paused_by == "the session"
     getattr(session, command)()
     session.run(until=lambda: not session.status().paused and session.status().tick > 5, seconds=30.0)
     assert (session.status().paused, session.status().pause_reason) == (False, "")
+    assert _make_report(session).paused_by == ""
 
 
 @pytest.mark.e2e

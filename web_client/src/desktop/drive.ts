@@ -200,6 +200,7 @@ function describe(device: DesktopDevice, state: PageState, reason: string, limit
   const who = state.isDirector ? "Press" : "A director presses";
   if (state.session?.estop) return `Held: e-stop. ${who} Clear, above.`;
   if (state.pause) return `${pauseWords(state.pause.by, "")}. ${who} Resume, above.`;
+  if (state.phase.stalled) return "Held: the session stands still. Let go, and hold again when it goes on.";
   if (!isHeld) return limits.length > 0 ? `It follows you: ${limitWords(limits)}.` : "The robot follows you.";
   if (device.isEngaged) return `Held by the session: ${holdReasonWords(reason)}.`;
   const how = device.mustLetGo ? "Let go, then hold again." : HOW;

@@ -1413,6 +1413,7 @@ export interface Paired {
  * robots, recorder) is as old. -1: it has sent none yet. `cpu_share`: of one processor, by the authority's process;
  * `load`: of the machine, over a minute. `stops`: the e-stops in force, newest first, the newest of each participant.
  * `pause_reason`: why physics stands still until a reset, empty otherwise. `unverified`: pairs of headsets.
+ * `paused_by`: name of who paused, empty where nobody did, or where that was before a restart.
  */
 export interface StatusReport {
   type: "status_report";
@@ -1451,6 +1452,7 @@ export interface StatusReport {
   stops?: StopReport[];
   pause_reason?: string;
   unverified?: UnverifiedReport[];
+  paused_by?: string;
 }
 
 /**
@@ -2382,7 +2384,7 @@ export const DEFAULTS = {
   event: {},
   snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0, tick_period_ns: 0, stop_seq: 0, consent_timeout_ns: 0, anchors: [] },
   paired: { roles: [] },
-  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [], assets: null, stops: [], pause_reason: "", unverified: [] },
+  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [], assets: null, stops: [], pause_reason: "", unverified: [], paused_by: "" },
   delivery_budget: { mbit_per_s: 0.0, reason: "", streams: [] },
   participant_joined: { resumed: false },
   participant_changed: {},

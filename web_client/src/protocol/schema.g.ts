@@ -867,6 +867,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["stops", ["array", ["struct", "StopReport"], 0, 0], [[]]],
       ["pause_reason", ["str", 512, ""], [""]],
       ["unverified", ["array", ["struct", "UnverifiedReport"], 0, 0], [[]]],
+      ["paused_by", ["str", 512, ""], [""]],
     ],
   },
   DeliveryBudget: {

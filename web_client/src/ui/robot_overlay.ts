@@ -154,6 +154,7 @@ export function makeRobotOverlay(
       const mine = state.isReady ? state.heldBy(state.selfId).filter((name) => labels.has(name)) : [];
       const before = chosen;
       chosen = mine.includes(drive.robot) ? drive.robot : mine.includes(chosen) ? chosen : (mine[0] ?? "");
+      for (const [name, { element }] of labels) element.classList.toggle("beside-handles", name === chosen);
       if (chosen !== before) gizmo.letGo();
       if (chosen !== before || [...labels.values()].some(({ x }) => Number.isNaN(x))) view.touchOverlay();
     },

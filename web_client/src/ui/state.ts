@@ -205,7 +205,7 @@ export class PageState {
   get pause(): { by: string; reason: string } | null {
     if (!this.session?.paused) return null;
     const { participant = "", reason = "" } = this.seenPause ?? {};
-    return { by: participant && this.nameOf(participant), reason: reason || (this.status?.pause_reason ?? "") };
+    return { by: participant ? this.nameOf(participant) : (this.status?.paused_by ?? ""), reason: reason || (this.status?.pause_reason ?? "") };
   }
 
   participant(id: string): ParticipantInfo | undefined {

@@ -94,6 +94,8 @@ test("a pause says who and why, and who is not known to a page that joined later
   saySession(false);
   saySession(true);
   expect(state.pause).toEqual({ by: "", reason: "" });
+  say({ type: "status", status: { paused_by: "ann", pause_reason: "", media: [] } });
+  expect(state.pause).toEqual({ by: "ann", reason: "" });
   sayPause({ participant: "host", reason: "numbers that are not finite" });
   expect(state.pause).toEqual({ by: "the session", reason: "numbers that are not finite" });
 });
