@@ -4,8 +4,9 @@
 
 Starts `iris-session demo handover`, opens its page in Chromium, waits until the operators hold their robots, and writes
 `dashboard.png` and `dashboard-phone.png`. Then a session in which a person with an emulated Quest 3 and one at a desk
-hold a robot each: `ar.png` is what the headset shows; a real one shows the room behind it. Needs the built page
-(`make web`) and Chromium (Debian: `chromium`).
+hold a robot each: `ar.png` and `vr.png` are what the headset shows; with `ar.png` a real one shows the room behind it.
+Then a person at a desk and one with a phone, in every state that people meet: those of the documentation beside the
+others, which are in `states`, to be looked at. Needs the built page (`make web`) and Chromium (Debian: `chromium`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import re
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
@@ -80,13 +83,14 @@ def shoot_demo(browser: Browser, scratch: Path, picture: Path, **size: Any) -> N
         process.wait()
 
 
-def shoot_ar(browser: Browser, scratch: Path, picture: Path) -> None:
-    """Write a picture of what an operator in AR sees: her robot, and another person at work."""
-    session = SessionProcess(scratch, scratch / "ar.rrd", make_serve_command("handover", scratch / "ar.rrd"))
+def shoot_headset(browser: Browser, scratch: Path, picture: Path, mode: str) -> None:
+    """Write a picture of what an operator in AR or VR sees: her robot, and another person at work."""
+    recording = scratch / f"{picture.stem}.rrd"
+    session = SessionProcess(scratch, recording, make_serve_command("handover", recording))
     scenario = Scenario(session)
     try:
         page = browser.open(
-            "quest", printed_address(session), width=1280, height=720, before=[IWER.read_text(), INSTALL]
+            picture.stem, printed_address(session), width=1280, height=720, before=[IWER.read_text(), INSTALL]
         )
         page.wait_until_ready()
         join_as(page, "eve", "operator")
@@ -94,7 +98,7 @@ def shoot_ar(browser: Browser, scratch: Path, picture: Path) -> None:
         ben = scenario.drive("ben", "right")
         eve = quest.person.id
         quest.host.assign(["left"], eve)
-        quest.enter("Enter AR")
+        quest.enter(f"Enter {mode}")
         quest.place("quest", look_at(HEAD_WORLD, LOOKED_AT_WORLD))
         tip = quest.host.scene.tip_pose("left")
         assert tip
@@ -114,6 +118,63 @@ def shoot_ar(browser: Browser, scratch: Path, picture: Path) -> None:
         kill_all([session])
 
 
+#: How far an arrow is dragged on the desk, and on the phone [pixels].
+DRAG_PX, PHONE_DRAG_PX = 50.0, 25.0
+OPEN_MENU: Final = "document.querySelector('[data-label=left]').click()"
+TAKE: Final = "document.querySelector('.robot-menu button.primary').click()"
+
+
+def shoot_states(browser: Browser, scratch: Path, folder: Path) -> None:
+    """Write pictures of a desk and of a phone: first view, menu, driving by the handles, paused, stopped."""
+    session = SessionProcess(scratch, scratch / "states.rrd", make_serve_command("handover", scratch / "states.rrd"))
+    scenario = Scenario(session)
+    states = folder / "states"
+    with ThreadPoolExecutor(1) as thread:
+
+        def do(*actions: Callable[[], object]) -> None:
+            """Do something in a page while the other participant is polled; then let the page settle."""
+            for action in actions:
+                job = thread.submit(action)
+                scenario.run_until(job.done, "the page has done it")
+                job.result()
+                scenario.run_for(1.0)
+
+        try:
+            url = printed_address(session)
+            ann = scenario.join("ann", "director")
+            ann.acquire(["right"])
+            desk = browser.open("desk", url, width=1280, height=800)
+            do(desk.wait_until_ready, lambda: desk.screenshot(states / "first.png"))
+            do(lambda: join_as(desk, "ben", "director"), lambda: desk.evaluate(OPEN_MENU))
+            do(lambda: desk.screenshot(states / "menu.png"), lambda: desk.evaluate(TAKE))
+            do(lambda: desk.wait("irisSession.gizmo.object.visible"), lambda: desk.screenshot(states / "taken.png"))
+            x, y = desk.find_arrow("z")
+            do(lambda: desk.point(x, y, "down"), lambda: desk.point(x, y - DRAG_PX))
+            do(lambda: desk.screenshot(folder / "driving.png"), lambda: desk.point(x, y - DRAG_PX, "up"))
+            ann.control("pause")
+            scenario.run_for(1.0)
+            do(lambda: desk.screenshot(states / "paused.png"))
+            ann.control("resume")
+            ann.estop("a hand is near the gripper")
+            scenario.run_for(1.0)
+            do(lambda: desk.screenshot(states / "stopped.png"))
+            ann.clear_estop()
+            ann.assign(["left"])  # a closed tab keeps its robot for a while
+            desk.close()
+            phone = browser.open("phone", url, width=390, height=844, phone=True)
+            do(phone.wait_until_ready, lambda: phone.screenshot(states / "phone-first.png"))
+            do(lambda: join_as(phone, "eve", "operator"), lambda: phone.evaluate(OPEN_MENU))
+            do(lambda: phone.screenshot(states / "phone-menu.png"), lambda: phone.evaluate(TAKE))
+            do(lambda: phone.wait("irisSession.gizmo.object.visible"))
+            px, py = phone.find_arrow("z")
+            do(lambda: phone.touch(px, py, "touchStart"), lambda: phone.touch(px, py - PHONE_DRAG_PX, "touchMove"))
+            do(lambda: phone.screenshot(folder / "phone-driving.png"), lambda: phone.touch(px, py, "touchEnd"))
+            phone.close()
+        finally:
+            scenario.close()
+            kill_all([session])
+
+
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -124,7 +185,9 @@ def main() -> None:
         try:
             shoot_demo(browser, Path(scratch), folder / "dashboard.png", width=1280, height=800)
             shoot_demo(browser, Path(scratch), folder / "dashboard-phone.png", width=390, height=844, phone=True)
-            shoot_ar(browser, Path(scratch), folder / "ar.png")
+            shoot_headset(browser, Path(scratch), folder / "ar.png", "AR")
+            shoot_headset(browser, Path(scratch), folder / "vr.png", "VR")
+            shoot_states(browser, Path(scratch), folder)
         finally:
             browser.close()
 

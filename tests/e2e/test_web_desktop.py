@@ -274,6 +274,22 @@ def test_a_robot_is_taken_in_the_picture_and_driven_by_its_handles(
     assert page.errors == []
 
 
+@pytest.mark.long
+def test_one_finger_drives_on_a_phone(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    page = open_page(scenario.server, "phone", width=390, height=844, phone=True)
+    join_as(page, "dora", "operator")
+    page.click("button", "Take: left")
+    page.wait("irisSession.gizmo.object.visible")
+    set_view(page)
+    drag_up(page, Tip(scenario), page.touch, ("touchStart", "touchMove", "touchEnd"))
+    bottom, top = page.evaluate(
+        "['.drive', '#panel-robots'].map((one) => document.querySelector(one).getBoundingClientRect())"
+        ".map(({ top, bottom }, i) => (i ? top : bottom))"
+    )
+    assert bottom <= top  # the panel does not cover the lists
+    assert page.errors == []
+
+
 # --- recording cameras ------------------------------------------------------------------------------------------------
 
 

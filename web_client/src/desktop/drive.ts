@@ -202,7 +202,7 @@ function describe(device: DesktopDevice, state: PageState, reason: string, limit
   if (state.pause) return `${pauseWords(state.pause.by, "")}. ${who} Resume, above.`;
   if (state.phase.stalled) return "Held: the session stands still. Let go, and hold again when it goes on.";
   if (!isHeld) return limits.length > 0 ? `It follows you: ${limitWords(limits)}.` : "The robot follows you.";
-  if (device.isEngaged) return `Held by the session: ${holdReasonWords(reason)}.`;
+  if (device.isEngaged) return `Held by the session: ${holdReasonWords(reason, true)}.`;
   const how = device.mustLetGo ? "Let go, then hold again." : HOW;
   return device.released ? `Held: ${device.released}. ${how}` : `Held. ${how}`;
 }

@@ -101,7 +101,7 @@ function describe(
   if (state.session?.estop) parts.push("stopped");
   else if (state.pause) parts.push("paused");
   else if (reason === HoldReason.NO_SAMPLE && state.heldBy(state.selfId).includes(robot)) parts.push("ready: drag the arrows at its gripper, or press Drive");
-  else if (reason && lease?.holder) parts.push(`holds: ${holdReasonWords(reason)}`);
+  else if (reason && lease?.holder) parts.push(`holds: ${holdReasonWords(reason, state.heldBy(state.selfId).includes(robot))}`);
   else if (report?.state && report.state !== "hold") parts.push("driven");
   if (lease && lease.expires_ns > 0) parts.push("its holder is disconnected, the lease is kept for a while");
   if (lease && lease.sub_holders.length > 1) parts.push(`shared by ${lease.sub_holders.map((id) => state.nameOf(id)).join(", ")}`);

@@ -4,6 +4,9 @@ import type { Filled } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import { AlarmKind, AlignmentDoubt, BudgetClass, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
 
+/** What helps when the clutch has to be opened and closed, whatever the clutch is: a key, a handle, a squeeze. */
+const AGAIN = "let go, then hold again";
+
 const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string> = {
   no_lease: "no participant has its lease",
   no_sample: "its holder sends nothing yet",
@@ -14,17 +17,17 @@ const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string>
   unaligned: "its holder is not aligned",
   view_only: "its holder is aligned well enough to look, not to drive",
   unconfirmed: "the alignment of its holder is doubted: glance at a sheet, or touch three marks",
-  rejected: "a sample was rejected: let go, then hold again",
+  rejected: `a sample was rejected: ${AGAIN}`,
   estop: "e-stop",
   disconnected: "its holder is disconnected",
-  gap: "the session stood still: let go, then hold again",
-  scene_changed: "the scene changed: let go, then hold again",
+  gap: `the session stood still: ${AGAIN}`,
+  scene_changed: `the scene changed: ${AGAIN}`,
   intervention: "a person took over",
-  rearm: "let go, then hold again",
-  emulated: "out of sight, its position is a guess: bring the hand into view, let go, then hold again",
-  zero_pose: "the device has no pose yet: wait until it is tracked, let go, then hold again",
-  frozen: "the pose of the device is frozen: move or wake it, let go, then hold again",
-  jump: "tracking jumped: let go, then hold again",
+  rearm: AGAIN,
+  emulated: `out of sight, its position is a guess: bring the hand into view, ${AGAIN}`,
+  zero_pose: `the device has no pose yet: wait until it is tracked, ${AGAIN}`,
+  frozen: `the pose of the device is frozen: move or wake it, ${AGAIN}`,
+  jump: `tracking jumped: ${AGAIN}`,
 };
 
 /** Limits of control, but for names of joints (docs/guide.md): what an operator has to know first comes first. */
@@ -100,7 +103,11 @@ const STREAM_FAULTS: Record<string, string> = {
 /** Return the words of a value, or the value itself for one that this page does not know. */
 const look = (table: Record<string, string>, value: string): string => table[value] ?? value.replaceAll("_", " ");
 
-export const holdReasonWords = (reason: string): string => look(HOLD_REASONS, reason);
+/** Return why a robot holds. `isOwn`: to the person who drives it. */
+export function holdReasonWords(reason: string, isOwn = false): string {
+  const words = look(HOLD_REASONS, reason);
+  return isOwn ? words : words.replace(AGAIN, "its operator has to let go and hold again");
+}
 /** Return in words what keeps a robot from going on: the first two things. */
 export function limitWords(limits: readonly string[]): string {
   const known = Object.keys(LIMITS);

@@ -31,7 +31,7 @@ export function describeRobot({ name, lease, holdReason, limits, selfId, isStopp
   const lines = [`${name}: ${who}`];
   if (isStopped) lines.push("stopped by the e-stop");
   else if (isPaused) lines.push("paused");
-  else if (holder !== "" && holdReason !== "") lines.push(...wrap(`holds: ${holdReasonWords(holdReason)}`));
+  else if (holder !== "" && holdReason !== "") lines.push(...wrap(`holds: ${holdReasonWords(holdReason, isOwn)}`));
   else if (isOwn && holdReason === "" && limits.length > 0) lines.push(...wrap(limitWords(limits)));
   const place = lease?.queue.indexOf(selfId) ?? -1;
   if (lease && place >= 0) lines.push(`you wait for it, place ${place + 1} of ${lease.queue.length}`);
