@@ -251,7 +251,9 @@ def drag_up(page: Page, tip: Tip, action: Callable[[float, float, str], None], n
     assert page.evaluate("irisSession.gizmo.isHeld && irisSession.state.feedback.get('left').hold_reason === ''")
     action(x, y - 30, names[2])
     page.wait("irisSession.state.feedback.get('left').hold_reason === 'clutch_open'")
-    goal, reached = page.evaluate("[irisSession.gizmo.pivot, irisSession.gizmo].map((one, i) => (i ? one.p_world : one.position).toArray())")
+    goal, reached = page.evaluate(
+        "[irisSession.gizmo.pivot, irisSession.gizmo].map((one, i) => (i ? one.p_world : one.position).toArray())"
+    )
     assert goal == reached  # it snaps back
 
 

@@ -1413,7 +1413,7 @@ export interface Paired {
  * robots, recorder) is as old. -1: it has sent none yet. `cpu_share`: of one processor, by the authority's process;
  * `load`: of the machine, over a minute. `stops`: the e-stops in force, newest first, the newest of each participant.
  * `pause_reason`: why physics stands still until a reset, empty otherwise. `unverified`: pairs of headsets.
- * `paused_by`: name of who paused, empty where nobody did, or where that was before a restart.
+ * `paused_by`: name of who paused, empty while it runs, or where that was before a restart.
  */
 export interface StatusReport {
   type: "status_report";

@@ -1,5 +1,5 @@
 // The handles at the gripper of a robot that this person holds: arrows move it, rings turn it (TransformControls of
-// three.js). Whoever drags them pulls a pivot away from the gripper; `desktop/pull.ts` makes a motion of the way between.
+// three.js). A drag pulls a pivot away from the gripper; `desktop/pull.ts` makes a motion of the way between.
 
 import { type Camera, Group, Matrix4, Object3D, Quaternion, Vector3 } from "three";
 import { TransformControls } from "three/examples/jsm/controls/TransformControls.js";
