@@ -16,13 +16,13 @@ from PIL import Image
 from iris_session.bench.web_tab import BrowserError, BrowserTools, Chromium, MissingToolError, find_tools
 from tests.e2e.session_process import DEADLINE_S, END_WITH_PARENT, SessionProcess, skip_unless_ci, wait_until
 
-
 #: Returns the middle of an arrow of the handles [pixels]: their size in the picture does not depend on the distance.
 FIND_ARROW = """(axis) => {
   const { gizmo, view } = irisSession;
   const { camera } = view.viewpoint;
   const at = gizmo.pivot.getWorldPosition(gizmo.pivot.position.clone());
-  const length = 0.8 * at.distanceTo(camera.position) * 1.9 * Math.tan((camera.fov * Math.PI) / 360) / 8 * gizmo.mover.size;
+  const height = at.distanceTo(camera.position) * Math.tan((camera.fov * Math.PI) / 360);
+  const length = 0.8 * 1.9 / 8 * gizmo.mover.size * height;
   const direction = { x: [0, 0, -1], y: [-1, 0, 0], z: [0, 1, 0] }[axis];
   const { x, y } = at.add(at.clone().set(...direction).multiplyScalar(length)).project(camera);
   const box = document.querySelector("#scene").getBoundingClientRect();

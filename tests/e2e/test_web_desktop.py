@@ -242,7 +242,10 @@ def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> N
 
 
 def drag_up(page: Page, tip: Tip, action: Callable[[float, float, str], None], names: tuple[str, str, str]) -> None:
-    """Drag the arrow that points up by 30 pixels, until the tip is 3 cm higher. `names`: of pressing, moving, letting go."""
+    """Drag the arrow that points up by 30 pixels, until the tip is 3 cm higher.
+
+    `names`: what `action` calls pressing, moving and letting go.
+    """
     begin, (x, y) = tip.place, page.find_arrow("z")
     action(x, y, names[0])
     action(x, y - 30, names[1])
