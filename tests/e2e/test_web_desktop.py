@@ -104,7 +104,7 @@ class Tip:
 @pytest.fixture
 def driver(scenario: Scenario, open_page: Callable[..., Page]) -> Page:
     """A page that drives the left robot, which it holds. It notes when keys change, in session time [ms]."""
-    page = open_page(scenario.server, "driver", width=400, height=480)  # small, because software draws it
+    page = open_page(scenario.server, "driver", width=840, height=480)  # small, because software draws it
     join_as(page, "dora", "operator")
     start_driving(page)
     return page
@@ -217,6 +217,8 @@ def test_the_mouse_drags_the_end_effector(scenario: Scenario, driver: Page) -> N
     A page that draws slowly misses a part of the way, and so does one whose samples come too late; then, and only then,
     it is dragged on.
     """
+    driver.evaluate("document.querySelector('.drive .more').open = true")
+    driver.evaluate("document.querySelector('.drive .handle').scrollIntoView()")
     tip = Tip(scenario)
     first = tip.place
     for _ in range(20):
