@@ -23,6 +23,7 @@ const STEP_S = 0.05;
 const STILL_PX = 0.5;
 
 interface LabelRow {
+  robot: string;
   element: HTMLElement;
   x: number;
   y: number;
@@ -46,7 +47,7 @@ export function makeRobotOverlay(
 ): RobotOverlay {
   const places = new RobotPlaces(view);
   const menu = makeMenu(state, actions, drive, stage);
-  const labels = new Map<string, LabelRow>();
+  let labels: LabelRow[] = [];
   const list = h("div", { class: "robot-labels" });
   const rows = new KeyedList<RobotInfo>(list, ({ name }) => makeLabel(name));
   const [p_world, q_world] = [new Vector3(), new Quaternion()];
@@ -62,8 +63,9 @@ export function makeRobotOverlay(
     const dot = h("span", { class: "dot", aria: { hidden: "true" } });
     const who = h("span");
     const element = h("button", { type: "button", class: "robot-label", data: { label: name } }, dot, h("strong", {}, name), who);
-    element.addEventListener("click", () => menu.open(name, labels.get(name)!));
-    labels.set(name, { element, x: Number.NaN, y: Number.NaN });
+    const label: LabelRow = { robot: name, element, x: Number.NEGATIVE_INFINITY, y: 0 };
+    element.addEventListener("click", () => menu.open(name, label));
+    labels.push(label);
     const update = (): void => {
       const holder = state.lease(name)?.holder ?? "";
       const isMine = state.heldBy(state.selfId).includes(name);
@@ -71,6 +73,7 @@ export function makeRobotOverlay(
       dot.classList.toggle("hollow", holder === "");
       setText(who, drive.robot === name ? "you drive" : isMine ? "you" : holder === "" ? "free" : state.nameOf(holder));
       element.classList.toggle("driven", drive.robot === name);
+      element.classList.toggle("beside-handles", chosen === name);
     };
     return { element, update };
   }
@@ -88,14 +91,16 @@ export function makeRobotOverlay(
     gizmo.lag_s = (view.delay_ms + (state.rtt_ms || 0)) / 1000 + STEP_S;
     if (gizmo.object.visible) gizmo.place(p_world, q_world, camera);
     if (!isOnScreen) return;
-    for (const [name, label] of labels) {
-      const isKnown = places.readLabel(name, p_world);
+    for (const label of labels) {
+      const isKnown = places.readLabel(label.robot, p_world);
       p_world.applyMatrix4(T_THREE_WORLD).project(camera);
       const isSeen = isKnown && Math.abs(p_world.z) < 1;
       label.element.hidden = !isSeen;
-      const [x, y] = [((1 + p_world.x) / 2) * width, ((1 - p_world.y) / 2) * height];
+      const x = ((1 + p_world.x) / 2) * width;
+      const y = ((1 - p_world.y) / 2) * height;
       if (!isSeen || (Math.abs(x - label.x) < STILL_PX && Math.abs(y - label.y) < STILL_PX)) continue;
-      [label.x, label.y] = [x, y];
+      label.x = x;
+      label.y = y;
       label.element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -100%)`;
     }
   }
@@ -148,15 +153,16 @@ export function makeRobotOverlay(
     update: () => {
       const robots = state.session?.robots ?? [];
       if (state.spec) places.set(robots, state.spec);
-      for (const name of labels.keys()) if (!robots.some((robot) => robot.name === name)) labels.delete(name);
-      rows.update(robots, ({ name }) => name);
-      menu.update();
-      const mine = state.isReady ? state.heldBy(state.selfId).filter((name) => labels.has(name)) : [];
+      const names = robots.map(({ name }) => name);
+      labels = labels.filter(({ robot }) => names.includes(robot));
+      const mine = state.isReady ? state.heldBy(state.selfId).filter((name) => names.includes(name)) : [];
       const before = chosen;
       chosen = mine.includes(drive.robot) ? drive.robot : mine.includes(chosen) ? chosen : (mine[0] ?? "");
-      for (const [name, { element }] of labels) element.classList.toggle("beside-handles", name === chosen);
+      const { length } = labels;
+      rows.update(robots, ({ name }) => name);
+      menu.update();
       if (chosen !== before) gizmo.letGo();
-      if (chosen !== before || [...labels.values()].some(({ x }) => Number.isNaN(x))) view.touchOverlay();
+      if (chosen !== before || labels.length !== length) view.touchOverlay();
     },
   };
 }
