@@ -264,7 +264,7 @@ def test_a_reload_resumes_with_the_lease(scenario: Scenario, open_page: Callable
     """The person is asked for name and role once, in place."""
     page = open_page(scenario.server, "reload")
     page.wait("!document.querySelector('.welcome').hidden && irisSession.state.role === 'director'")
-    page.select("Your role", "operator")
+    page.select("Your role", "operator: drives")
     page.fill("Name for others", "dan")
     page.click("button", "OK")
     page.wait("irisSession.state.role === 'operator' && document.querySelector('.welcome').hidden")

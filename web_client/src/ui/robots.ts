@@ -12,6 +12,8 @@ import type { ConsentAsked, PageState } from "./state.ts";
 import { holdReasonWords, leaseModeWords, limitWords } from "./words.ts";
 
 const MODES = ["exclusive", "request", "takeover", "priority", "shared"] as const;
+/** Why a robot holds that its holder does not move now. */
+const WAITS_FOR_HOLDER: readonly string[] = [HoldReason.NO_SAMPLE, HoldReason.CLUTCH_OPEN];
 const SCALES = [0.1, 0.25, 0.5, 1, 2] as const;
 
 export function makeRobotsPanel(state: PageState, actions: Actions, drive: Drive): Panel {
@@ -100,7 +102,7 @@ function describe(
   const parts: string[] = [];
   if (state.session?.estop) parts.push("stopped");
   else if (state.pause) parts.push("paused");
-  else if (reason === HoldReason.NO_SAMPLE && state.heldBy(state.selfId).includes(robot)) parts.push("ready: drag the arrows at its gripper, or press Drive");
+  else if (WAITS_FOR_HOLDER.includes(reason) && state.heldBy(state.selfId).includes(robot)) parts.push("ready: drag the arrows at its gripper");
   else if (reason && lease?.holder) parts.push(`holds: ${holdReasonWords(reason, state.heldBy(state.selfId).includes(robot))}`);
   else if (report?.state && report.state !== "hold") parts.push("driven");
   if (lease && lease.expires_ns > 0) parts.push("its holder is disconnected, the lease is kept for a while");

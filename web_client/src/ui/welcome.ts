@@ -5,9 +5,9 @@ import type { PageState } from "./state.ts";
 import { roleWords } from "./words.ts";
 
 const ROLE_NOTES: Record<string, string> = {
-  director: "Directors drive, assign robots, pause, and clear stops.",
-  operator: "Operators drive robots.",
-  observer: "Observers look, press the e-stop and add notes.",
+  director: "drives, assigns, pauses, clears stops",
+  operator: "drives",
+  observer: "looks and stops",
 };
 
 export interface Welcome {
@@ -28,8 +28,6 @@ export function makeWelcome(
   const why = h("p", { class: "note" });
   const name = h("input", { type: "text", id: "welcome-name", attributes: { maxlength: "64", spellcheck: "false", autocomplete: "nickname", placeholder: "Your name", required: "" } });
   const role = h("select", { id: "welcome-role", aria: { label: "Your role" } });
-  const note = h("span", { class: "note" });
-  role.addEventListener("change", () => setText(note, ROLE_NOTES[role.value] ?? ""));
   const element = h(
     "form",
     { class: "welcome", hidden: true, aria: { label: "Who are you?" } },
@@ -39,7 +37,6 @@ export function makeWelcome(
     role,
     h("button", { class: "primary" }, "OK"),
     button("Not now", () => onAnswer("", ""), { class: "quiet" }),
-    note,
   );
   element.addEventListener("submit", (event) => {
     event.preventDefault();
@@ -52,12 +49,11 @@ export function makeWelcome(
       element.hidden = !isShown;
       if (!isShown) return;
       const isOpen = state.info?.pairing === false && state.role === "director";
-      setText(why, isOpen ? `You are “${state.self?.name}”, a director, as everyone is who opens this page on this machine.` : `You are “${state.self?.name}”, ${roleWords(state.role)}.`);
-      setOptions(role, listRoles().map((one) => [one, roleWords(one)] as const));
+      setText(why, isOpen ? `You are “${state.self?.name}”, a director, as everyone on this machine.` : `You are “${state.self?.name}”, ${roleWords(state.role)}.`);
+      setOptions(role, listRoles().map((one) => [one, `${roleWords(one)}: ${ROLE_NOTES[one] ?? ""}`] as const));
       if (!role.dataset.isSet) {
         role.dataset.isSet = "yes";
         setValue(role, state.role);
-        setText(note, ROLE_NOTES[role.value] ?? "");
       }
     },
   };
