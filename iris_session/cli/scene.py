@@ -292,6 +292,7 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
         metavar="FACTOR",
         help="scale of the file: 0.001 for millimetres; not for MJCF and MJB, which are simulated",
     )
+    parser.add_argument("--collisions", action="store_true", help="of a URDF: draw collision shapes, not visuals")
 
 
 def expand_path(text: str | Path) -> Path:
@@ -334,6 +335,8 @@ def check_file_options(arguments: argparse.Namespace, path: Path | None) -> None
             raise CommandError(f"--package-dir {folder}: no such folder")
     if path is None and arguments.package_dir:
         raise CommandError("--package-dir applies to files to show only: MuJoCo's models name their folders themselves")
+    if arguments.collisions and (path is None or path.suffix.lower() != ".urdf"):
+        raise CommandError("--collisions applies to URDF files only; --groups shows those of MuJoCo's models")
     if path is None and arguments.scale is not None:
         raise CommandError(
             f"--scale cannot be used with {arguments.scene or 'the scene'}: MuJoCo simulates it, and its dynamics "
@@ -349,9 +352,11 @@ def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneB
     builder, scale = SceneBuilder(name), 1.0 if arguments.scale is None else arguments.scale
     if (size := path.stat().st_size) > _LARGE_FILE_BYTES:
         print(f"reading {path.name} ({size / 1e6:.1f} MB)", file=sys.stderr, flush=True)
-    add = builder.add_urdf if path.suffix.lower() == ".urdf" else builder.add_file
     try:
-        add(path, package_dirs=arguments.package_dir, scale=scale)
+        if path.suffix.lower() == ".urdf":
+            builder.add_urdf(path, package_dirs=arguments.package_dir, scale=scale, collisions=arguments.collisions)
+        else:
+            builder.add_file(path, package_dirs=arguments.package_dir, scale=scale)
     except SceneBuildError as error:
         advice = " (here: --package-dir DIR)" if "package_dirs" in str(error) else ""
         raise CommandError(f"{error}{advice}") from None

@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 from anchors.pose import compose, inverse
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import IDENTITY, Pose, Vec3
-from iris_session.protocol.names import GeometryKind, TextureKind
+from iris_session.protocol.names import GeometryKind, LightKind, TextureKind
 from iris_session.protocol.scene import (
     Body,
     Camera,
     Deformable,
     Environment,
     Geometry,
+    Headlight,
     Light,
     Material,
     Mesh,
@@ -64,6 +65,18 @@ from iris_session.streams.deformable_topology import DeformableTopology
 #: Minimum viewing distance [m], and viewing distance in extents of the scene.
 _FAR: Final = 50.0
 _FAR_EXTENTS: Final = 10.0
+#: Light of a scene that brings none: white is drawn between 0.3 and 1 of full brightness, by the direction of its surface.
+_DEFAULT_HEADLIGHT: Final = Headlight(True, (0.3,) * 3, (0.35,) * 3, (0.1,) * 3)
+_DEFAULT_LIGHT: Final = Light(
+    name="default",
+    kind=LightKind.DIRECTIONAL,
+    body=0,
+    p_body=(0.0, 0.0, 3.0),
+    direction_body=(0.36, 0.48, -0.8),
+    ambient=(0.0,) * 3,
+    diffuse=(0.35,) * 3,
+    specular=(0.1,) * 3,
+)
 _FACES: Final = 6
 _SCALE_ADVICE: Final = "scale={factor} of what it is now (--scale {factor})"
 #: Maximum coordinate of a vertex in its own frame [m]. Larger ones are a mistake of units, and too large for float32.
@@ -109,6 +122,9 @@ def build_scene(
         )
     )
     surroundings = environment or _build_environment(spec, sources)
+    if environment is None and not spec.lights and (spec.visuals or sources):
+        surroundings = msgspec.structs.replace(surroundings, headlight=_DEFAULT_HEADLIGHT)
+        spec = msgspec.structs.replace(spec, lights=(_DEFAULT_LIGHT,))
     if skybox >= 0:
         surroundings = msgspec.structs.replace(surroundings, skybox=skybox)
     spec = msgspec.structs.replace(spec, environment=surroundings)

@@ -133,7 +133,8 @@ class ScenePublisher(SessionBase):
             self._stepper = processes.make_stepper(core, self.clock, user_owned=True)
             self._pending = PendingState(composed)
             self._loop = PublishLoop(kinematic_model, vertices, self._stepper, processes, processes.state_period_ns)
-            processes.reporter.warning_sources += [self._loop.warnings, self._pending.warnings]
+            sources = [self._loop.warnings, self._pending.warnings, lambda: composed.notes]
+            processes.reporter.warning_sources += sources
             self._loop.start()
         except BaseException:
             self.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,20 @@ def test_millimetres_are_suspected_in_robots_and_models(tmp_path: Path, capsys: 
     for name in ("arm.urdf", "model.xml", "hall.xml"):
         assert run("scene", "inspect", tmp_path / name, "--assets", tmp_path / "assets") == 0
         assert (wanted in capsys.readouterr().out) == (name != "hall.xml")
+
+
+def test_collision_shapes_are_drawn_by_the_option_that_the_advice_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arm, assets = tmp_path / "arm.urdf", ("--assets", tmp_path / "assets", "--json")
+    shape = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'
+    arm.write_text(f'<robot name="arm"><link name="base">{shape}</link></robot>')
+    assert run("scene", "inspect", arm, *assets) == 0
+    (skipped,) = json.loads(capsys.readouterr().out)["skipped"]
+    (option,) = re.findall(r"--\w+", skipped)
+    assert run("scene", "inspect", arm, *assets, option) == 0
+    assert json.loads(capsys.readouterr().out)["skipped"] == []
+    assert run("scene", "inspect", "arm", *assets, option) != 0
 
 
 def test_export_does_not_overwrite_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,6 +68,25 @@ def test_moving_bodies_come_first_and_are_numbered_in_order(tmp_path: Path, stor
     assert spec.textures[spec.environment.skybox].height == 2
 
 
+def test_a_scene_without_lights_is_legible(store: AssetStore) -> None:
+    """A white surface that faces both lights is white; one that faces neither is not dark."""
+    scene = SceneBuilder("part")
+    scene.add_box(half_size=(1, 1, 1))
+    spec = scene.build(store).spec
+    headlight, (light,) = spec.environment.headlight, spec.lights
+    assert headlight.active
+    assert light.castshadow
+    assert min(headlight.ambient) >= 0.3
+    assert sum(max(part) for part in (headlight.ambient, headlight.diffuse, light.diffuse)) == pytest.approx(1.0)
+    scene.add_light("sun")
+    lit = scene.build(store).spec
+    assert [light.name for light in lit.lights] == ["sun"]
+    assert lit.environment.headlight == Environment().headlight
+    dark = SceneBuilder("dark")
+    dark.environment = Environment()
+    assert dark.build(store).spec.lights == ()
+
+
 @pytest.mark.long
 def test_every_process_builds_the_same_scenes(tmp_path: Path) -> None:
     """With another number of threads, another order of sets, and a cold store; a warm one builds nothing."""

@@ -187,9 +187,9 @@ class _Reader:
                 waiting.append((joint.child, len(parts) - 1, np.eye(4)))
         if not items:
             other = (
-                "visuals: leave out collisions=True"
+                "visuals: leave out collisions=True (--collisions)"
                 if self._shape_tag == "collision"
-                else "collisions: give collisions=True"
+                else "collisions: give collisions=True (--collisions)"
             )
             self._skip(f"nothing of it is drawn; what it may have are {other}")
         listed = tuple(
@@ -369,7 +369,7 @@ class _Reader:
         if shape.tag == GeometryKind.BOX:
             self._require(shape, "size")
             x, y, z = (0.5 * v for v in self._numbers(shape, "size", (0.0, 0.0, 0.0)))
-        elif shape.tag == GeometryKind.CYLINDER:
+        elif shape.tag in (GeometryKind.CYLINDER, GeometryKind.CAPSULE):  # the length of a capsule is without its caps
             (x,), (length,) = (self._numbers(shape, key, [math.nan]) for key in ("radius", "length"))
             y, z = x, 0.5 * length
         elif shape.tag == GeometryKind.SPHERE:

@@ -125,12 +125,19 @@ def test_faults_are_named(tmp_path: Path, before: str, after: str, named: str) -
 
 def test_parts_that_are_not_drawn_are_reported(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
-    changed = urdf.read_text().replace('<sphere radius="0.02"/>', '<capsule radius="0.02" length="1"/>', 1)
+    changed = urdf.read_text().replace('<sphere radius="0.02"/>', '<torus radius="0.02" length="1"/>', 1)
     changed = changed.replace('name="orange"/>', 'name="lost"/>')
     urdf.write_text(changed)
     skipped = composed(urdf, tmp_path).skipped
-    assert any("finger_left: shape 'capsule'" in line for line in skipped)
+    assert any("finger_left: shape 'torus'" in line for line in skipped)
     assert any("material 'lost'" in line for line in skipped)
+
+
+def test_capsules_are_drawn_with_their_length_between_the_caps(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    urdf.write_text(urdf.read_text().replace('<sphere radius="0.02"/>', '<capsule radius="0.02" length="1"/>', 1))
+    drawn = [v.geometry for v in composed(urdf, tmp_path).spec.visuals if v.geometry.kind == "capsule"]
+    assert [geometry.size for geometry in drawn] == [(0.02, 0.02, 0.5)]
 
 
 @pytest.mark.parametrize("kind", ["floating", "planar"])
