@@ -2,6 +2,7 @@
 
 import type { WorkerClient } from "../core/page_client.ts";
 import { makeDrive } from "../desktop/drive.ts";
+import { listDrawn } from "../view/anchors.ts";
 import { type AvatarInfo, participantColor } from "../view/avatars.ts";
 import { Gizmo } from "../view/gizmo.ts";
 import { View } from "../view/view.ts";
@@ -236,5 +237,5 @@ function updateOverlay(view: View, state: PageState): void {
     });
   }
   view.avatars.setPeople(people);
-  if (view.anchors.setAnchors(state.session?.anchors ?? [])) view.touch();
+  if (view.anchors.setAnchors(listDrawn(state.session?.anchors ?? [], participants))) view.touch();
 }

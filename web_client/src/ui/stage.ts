@@ -35,8 +35,7 @@ export function makeStage(state: PageState, actions: { pair: () => void; retry: 
   let view: View | null = null;
   camera.addEventListener("change", () => view?.viewpoint.choose(Number(camera.value)));
   const home = button("Whole scene", () => {
-    if (!view?.scene) return;
-    view.viewpoint.frame(view.scene, view.clouds.getBounds());
+    view?.showWhole();
     camera.value = "-1";
   }, { class: "small" });
   const names = h("input", { type: "checkbox", attributes: { checked: "" } });

@@ -2,13 +2,28 @@
 
 import { AxesHelper, BufferGeometry, Float32BufferAttribute, Group, LineLoop, LineBasicMaterial } from "three";
 
-import type { AnchorPlace } from "../core/api.ts";
+import type { AnchorPlace, ParticipantInfo } from "../core/api.ts";
+import { AlignmentKind } from "../protocol/messages.g.ts";
 import { setPose } from "./axes.ts";
 import { Label } from "./labels.ts";
 
 /** Edge that is drawn for an anchor of unknown size [m]. */
 const UNKNOWN_SIZE_M = 0.15;
 const COLOR = "#35d0ba";
+
+/** The sheet of a session in which nobody has configured one: `DEFAULT_ANCHORS` in iris_session/session/config.py. */
+const DEFAULT_SHEET = JSON.stringify(["table", [[0, -0.45, 0], [1, 0, 0, 0]], 0]);
+
+/** Alignments that come from a sheet. */
+const BY_SHEETS: readonly AlignmentKind[] = [AlignmentKind.MEASURED, AlignmentKind.FINGERTIP, AlignmentKind.PERSISTENT];
+
+/** Return the anchors to draw: the default sheet only while somebody is aligned by a sheet. */
+export function listDrawn(anchors: readonly AnchorPlace[], people: readonly ParticipantInfo[]): AnchorPlace[] {
+  const isAligned = people.some(({ alignment }) => BY_SHEETS.includes(alignment?.kind ?? AlignmentKind.NONE));
+  const isDefault = ({ anchor_id, T_world_anchor, error_m }: AnchorPlace): boolean =>
+    JSON.stringify([anchor_id, T_world_anchor, error_m]) === DEFAULT_SHEET;
+  return anchors.filter((anchor) => isAligned || !isDefault(anchor));
+}
 
 /** All anchors. Add `group` to the session's world. */
 export class AnchorOverlay {

@@ -10,6 +10,10 @@ export interface Budget {
   objects: number;
   /** Points of all clouds together. */
   points: number;
+  /** Lights that cast shadows, each of which costs the scene drawn once more while something moves. */
+  shadows: number;
+  /** Side of a shadow map [pixels]. */
+  shadowSide: number;
 }
 
 export interface LevelChoice {
@@ -22,11 +26,11 @@ export interface LevelChoice {
 }
 
 /** Where a Quest 3 begins to struggle; good for phones too. */
-export const HEADSET: Budget = { triangles: 750_000, textureBytes: 700 * 2 ** 20, objects: 200, points: 100_000 };
+export const HEADSET: Budget = { triangles: 750_000, textureBytes: 700 * 2 ** 20, objects: 200, points: 100_000, shadows: 1, shadowSide: 1024 };
 /** A desktop with a graphics card. */
-export const DESKTOP: Budget = { triangles: 6_000_000, textureBytes: 2 ** 31, objects: 0, points: 1_000_000 };
+export const DESKTOP: Budget = { triangles: 6_000_000, textureBytes: 2 ** 31, objects: 0, points: 1_000_000, shadows: 4, shadowSide: 2048 };
 /** No graphics card: the processor draws. */
-export const SOFTWARE: Budget = { triangles: 300_000, textureBytes: 256 * 2 ** 20, objects: 0, points: 20_000 };
+export const SOFTWARE: Budget = { triangles: 300_000, textureBytes: 256 * 2 ** 20, objects: 0, points: 20_000, shadows: 1, shadowSide: 1024 };
 
 const PRIMITIVE_TRIANGLES: Record<string, number> = {
   plane: 2,

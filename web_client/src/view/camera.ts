@@ -4,7 +4,7 @@ import { type Box3, Matrix4, OrthographicCamera, PerspectiveCamera, Quaternion, 
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
 import { T_THREE_WORLD } from "./axes.ts";
-import { findBall, SHOWN_SHARE } from "./framing.ts";
+import { directView, FIRST_ELEVATION, fitDistance, type Sight } from "./framing.ts";
 import { directFollower, placeFollower, tracks, watches, restRotation } from "./lighting.ts";
 import type { SceneView } from "./scene_view.ts";
 import type { Camera } from "./spec.ts";
@@ -20,12 +20,14 @@ export interface FreeCamera {
 
 const T_WORLD_THREE = T_THREE_WORLD.clone().invert();
 const DEFAULT_FOVY = 45;
+/** Nearest and farthest distance that is drawn of scenes of a usual size [m]. */
+const [NEAR_M, FAR_M] = [0.01, 200];
 const KEY_STEP_RAD = 0.08;
 const KEY_ZOOM = 1.1;
 
 /** The camera of the page, and its controls. */
 export class Viewpoint {
-  readonly free = new PerspectiveCamera(DEFAULT_FOVY, 1, 0.01, 200);
+  readonly free = new PerspectiveCamera(DEFAULT_FOVY, 1, NEAR_M, FAR_M);
   private readonly orthographic = new OrthographicCamera();
   private readonly controls: OrbitControls;
   private aspect = 1;
@@ -64,14 +66,16 @@ export class Viewpoint {
 
   private isOrthographic = false;
 
-  /** Look at a scene as a whole, with what is drawn `beside` it: a box in the session's world. */
-  frame({ spec }: Pick<SceneView, "spec">, beside: Box3): void {
-    const { center, radius } = findBall(spec.environment, beside);
-    const extent = radius / SHOWN_SHARE;
-    this.free.far = Math.max(200, spec.environment.zfar * extent);
-    // Narrow pictures, as on phones, are seen from farther away.
-    const distance = (2 * extent) / Math.min(1, this.aspect);
-    this.setFree({ lookat: center.toArray(), azimuth: 145, elevation: -22, distance });
+  /** Look at a box from where all of it is seen, and let the view go on to the ends of the scene. `whole`: box of that. */
+  frame({ box, azimuth }: Sight, whole: Box3, zfar: number): void {
+    const reach = Math.max(whole.getSize(new Vector3()).length() / 2, 1e-3);
+    // As near and as far as parts of this size and halls of that size need; in between the depth is resolved.
+    this.free.near = Math.max(Math.min(NEAR_M, reach / 20), reach / 2000);
+    this.free.far = Math.max(FAR_M, zfar, 30 * reach);
+    this.controls.minDistance = Math.min(0.05, reach / 10);
+    this.controls.maxDistance = Math.max(100, 20 * reach);
+    const distance = fitDistance(box, azimuth, FIRST_ELEVATION, DEFAULT_FOVY, this.aspect);
+    this.setFree({ lookat: box.getCenter(new Vector3()).toArray(), azimuth, elevation: FIRST_ELEVATION, distance });
   }
 
   /** Choose a camera of the scene by its index, or the free one (-1). */
@@ -88,10 +92,8 @@ export class Viewpoint {
   }
 
   setFree({ lookat, azimuth, elevation, distance, fovy }: FreeCamera): void {
-    const [az, el] = [(azimuth * Math.PI) / 180, (elevation * Math.PI) / 180];
-    const forward = new Vector3(Math.cos(el) * Math.cos(az), Math.cos(el) * Math.sin(az), Math.sin(el));
     const target = new Vector3(...lookat);
-    const position = target.clone().addScaledVector(forward, -distance);
+    const position = target.clone().addScaledVector(directView(azimuth, elevation), -distance);
     this.choose(-1);
     this.free.fov = fovy ?? DEFAULT_FOVY;
     this.controls.target.copy(target.applyMatrix4(T_THREE_WORLD));
@@ -186,7 +188,7 @@ export function placeSceneCamera(
   if (camera instanceof OrthographicCamera) {
     [camera.top, camera.bottom] = [spec.fovy / 2, -spec.fovy / 2];
     [camera.right, camera.left] = [camera.top * aspect, -camera.top * aspect];
-    [camera.near, camera.far] = [0.01, 200];
+    [camera.near, camera.far] = [NEAR_M, FAR_M];
   } else {
     camera.fov = spec.fovy;
     camera.aspect = aspect;

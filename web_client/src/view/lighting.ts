@@ -1,14 +1,16 @@
 // Lights of a scene as uniforms of `surface.ts`, in the world frame of three.js, so that every eye of a headset sees
 // them alike. Lights that cast shadows have a light of three.js beside them, of which only the shadow map is used.
 
-import { DirectionalLight, Matrix4, type Object3D, Quaternion, SpotLight, Vector3 } from "three";
+import { Box3, DirectionalLight, Matrix4, type Object3D, Quaternion, Sphere, SpotLight, Vector3 } from "three";
 
-import type { Environment, Light, SceneSpec } from "./spec.ts";
+import type { Budget } from "./budget.ts";
+import { findWholeBox, type Placed } from "./framing.ts";
+import type { Light } from "./spec.ts";
 
 /** Lights beyond these are left out, the last first. MuJoCo draws eight. */
 const MAX_LIGHTS = 12;
-const MAX_SHADOWS = 4;
-const SHADOW_MAP_SIDE = 2048;
+/** Light on everything in a scene without any: MuJoCo 4 draws 0.3 of the colour there. */
+const UNLIT = 0.3;
 
 export interface LightUniform {
   position: Vector3;
@@ -28,9 +30,11 @@ export interface LightUniform {
 export interface LightLayout {
   /** Per light: "" without a shadow, else `directional` or `spot`. */
   shadows: ("" | "directional" | "spot")[];
+  /** No light casts a shadow, so what is below something is darker: objects would seem to float. The last shadow map. */
+  isShaded: boolean;
 }
 
-interface Placed {
+interface PlacedLight {
   spec: Light;
   uniform: LightUniform;
   shadow: DirectionalLight | SpotLight | null;
@@ -48,31 +52,36 @@ export interface Follower {
 export class Lighting {
   readonly uniforms: { lights: { value: LightUniform[] }; headlight: { value: Record<string, Vector3> } };
   readonly layout: LightLayout;
-  private readonly placed: Placed[];
+  private readonly placed: PlacedLight[];
+  private readonly bodies: ReadonlyMap<number, Object3D>;
+  /** What shadows are drawn of: a ball around all that is drawn when the scene begins. */
+  private readonly ball: Sphere;
+  /** Light from straight above, without a light. */
+  private readonly shade: DirectionalLight | null;
 
-  /** `bodies`: frames of bodies by id, below `root`. `withShadows`: draw shadow maps. */
-  constructor(
-    spec: SceneSpec,
-    private readonly root: Object3D,
-    private readonly bodies: ReadonlyMap<number, Object3D>,
-    withShadows: boolean,
-  ) {
+  /** `place`: bodies are below `root`. */
+  constructor(place: Placed, private readonly root: Object3D, budget: Pick<Budget, "shadows" | "shadowSide">) {
+    const { spec } = place;
+    this.bodies = place.bodies;
+    this.ball = findWholeBox(place, new Box3()).getBoundingSphere(new Sphere());
     let shadows = 0;
     const lights = spec.lights.filter((light) => light.active && light.kind !== "image").slice(0, MAX_LIGHTS);
     this.placed = lights.map((light) => {
-      const casts = withShadows && light.castshadow && light.kind !== "point" && shadows < MAX_SHADOWS;
+      const casts = light.castshadow && light.kind !== "point" && shadows < budget.shadows;
       if (casts) shadows += 1;
-      const shadow = casts ? makeShadowLight(light, spec.environment) : null;
+      const shadow = casts ? makeShadowLight(light, this.ball.radius, budget.shadowSide) : null;
       if (shadow) root.add(shadow, shadow.target);
       return { spec: light, uniform: toUniform(light), shadow };
     });
     const { headlight } = spec.environment;
     const on = headlight.active ? 1 : 0;
+    const isUnlit = !headlight.active && lights.length === 0;
+    this.shade = budget.shadows > 0 && shadows === 0 && !isUnlit ? this.makeShade(budget.shadowSide) : null;
     this.uniforms = {
       lights: { value: this.placed.map((light) => light.uniform) },
       headlight: {
         value: {
-          ambient: new Vector3(...headlight.ambient).multiplyScalar(on),
+          ambient: isUnlit ? new Vector3().setScalar(UNLIT) : new Vector3(...headlight.ambient).multiplyScalar(on),
           diffuse: new Vector3(...headlight.diffuse).multiplyScalar(on),
           specular: new Vector3(...headlight.specular).multiplyScalar(on),
         },
@@ -80,19 +89,19 @@ export class Lighting {
     };
     this.layout = {
       shadows: this.placed.map(({ shadow }) => (!shadow ? "" : shadow instanceof SpotLight ? "spot" : "directional")),
+      isShaded: this.shade !== null,
     };
   }
 
   /** Move lights to where their bodies are. Call it after the poses of bodies were set. */
   update(rest: ReadonlyMap<number, Matrix4>): void {
     for (const { spec, uniform, shadow } of this.placed) {
-      const at = { ...spec, p_body: spec.p_body };
-      const p_world = placeFollower(at, this.bodies, rest, uniform.position);
-      directFollower(at, spec.direction_body, p_world, this.bodies, rest, uniform.direction);
-      if (shadow) {
-        const back = spec.kind === "directional" ? shadowDistance(spec) : 0;
-        shadow.position.copy(p_world).addScaledVector(uniform.direction, -back);
-        shadow.target.position.copy(shadow.position).add(uniform.direction);
+      const p_world = placeFollower(spec, this.bodies, rest, uniform.position);
+      directFollower(spec, spec.direction_body, p_world, this.bodies, rest, uniform.direction);
+      if (shadow instanceof DirectionalLight) this.pointFromOutside(shadow, uniform.direction);
+      else if (shadow) {
+        shadow.position.copy(p_world);
+        shadow.target.position.copy(p_world).add(uniform.direction);
       }
       uniform.position.applyMatrix4(this.root.matrix);
       uniform.direction.transformDirection(this.root.matrix);
@@ -101,11 +110,25 @@ export class Lighting {
 
   /** Remove what was added to the root. */
   dispose(): void {
-    for (const { shadow } of this.placed) {
+    for (const shadow of [this.shade, ...this.placed.map((light) => light.shadow)]) {
       if (!shadow) continue;
       this.root.remove(shadow, shadow.target);
       shadow.dispose();
     }
+  }
+
+  private makeShade(side: number): DirectionalLight {
+    const shade = makeDirectionalShadow(this.ball.radius, side);
+    shade.shadow.radius = 4;
+    this.pointFromOutside(shade, new Vector3(0, 0, -1));
+    this.root.add(shade, shade.target);
+    return shade;
+  }
+
+  /** Let the shadows of a light that is infinitely far away begin before everything that is drawn. */
+  private pointFromOutside(shadow: DirectionalLight, direction: Vector3): void {
+    shadow.target.position.copy(this.ball.center);
+    shadow.position.copy(this.ball.center).addScaledVector(direction, -2 * this.ball.radius);
   }
 }
 
@@ -187,29 +210,26 @@ function toUniform(light: Light): LightUniform {
   };
 }
 
-/** Distance behind a directional light from where its shadows are drawn [m]. */
-function shadowDistance(light: Light): number {
-  return Math.max(0, 4 - Math.hypot(...light.p_body));
-}
-
-function makeShadowLight(light: Light, environment: Environment): DirectionalLight | SpotLight {
-  const reach = Math.max(environment.extent, 1);
-  if (light.kind === "directional") {
-    const made = new DirectionalLight();
-    const { camera } = made.shadow;
-    [camera.left, camera.right, camera.bottom, camera.top] = [-reach * 1.5, reach * 1.5, -reach * 1.5, reach * 1.5];
-    [camera.near, camera.far] = [0.01, 20 * reach];
-    return withShadowMap(made, -0.0004, 0.004);
-  }
+/** `reach`: radius of what is drawn [m]. */
+function makeShadowLight(light: Light, reach: number, side: number): DirectionalLight | SpotLight {
+  if (light.kind === "directional") return makeDirectionalShadow(reach, side);
   const made = new SpotLight();
   made.angle = Math.min((Math.max(light.cutoff, 5) * Math.PI) / 180, 1.2);
-  [made.shadow.camera.near, made.shadow.camera.far] = [0.05, light.range > 0 ? light.range : 20 * reach];
-  return withShadowMap(made, -0.0002, 0.004);
+  [made.shadow.camera.near, made.shadow.camera.far] = [Math.min(0.05, reach / 20), light.range > 0 ? light.range : 20 * Math.max(reach, 1)];
+  return withShadowMap(made, side, -0.0002, 0.004);
 }
 
-function withShadowMap<T extends DirectionalLight | SpotLight>(light: T, bias: number, normalBias: number): T {
+function makeDirectionalShadow(reach: number, side: number): DirectionalLight {
+  const made = new DirectionalLight();
+  const { camera } = made.shadow;
+  [camera.left, camera.right, camera.bottom, camera.top] = [-reach, reach, -reach, reach];
+  [camera.near, camera.far] = [0.01 * reach, 4 * reach];
+  return withShadowMap(made, side, -0.0005, (3 * reach) / side); // one and a half pixels of the map
+}
+
+function withShadowMap<T extends DirectionalLight | SpotLight>(light: T, side: number, bias: number, normalBias: number): T {
   light.castShadow = true;
-  light.shadow.mapSize.set(SHADOW_MAP_SIDE, SHADOW_MAP_SIDE);
+  light.shadow.mapSize.set(side, side);
   light.shadow.bias = bias;
   light.shadow.normalBias = normalBias;
   light.shadow.radius = 1.5;

@@ -80,15 +80,11 @@ export class CameraPictures {
     const camera = this.place(scene, due.index);
     if (!camera) return false;
     due.target.setSize(WIDTH, Math.round(WIDTH / aspectOf(scene.spec.cameras[due.index]!)));
-    const { shadowMap } = this.renderer;
-    const wasUpdated = shadowMap.autoUpdate;
     const shown = hidden.filter((object) => object.visible);
     for (const object of shown) object.visible = false;
-    shadowMap.autoUpdate = false; // those of the last frame serve
     this.renderer.setRenderTarget(due.target);
     this.renderer.render(root, camera);
     this.renderer.setRenderTarget(null);
-    shadowMap.autoUpdate = wasUpdated;
     for (const object of shown) object.visible = true;
     due.drawn_ms = now_ms;
     due.isOutdated = false;

@@ -21,17 +21,17 @@ import type { AssetSource, MeshArrays } from "./arrays.ts";
 import { makeWorldRoot, setPose } from "./axes.ts";
 import { type Budget, chooseLevels, type LevelChoice } from "./budget.ts";
 import { type DeformableView, makeDeformable, spanPiece } from "./deformables.ts";
+import { instanceMeshes, type Instances } from "./instancing.ts";
 import { Lighting } from "./lighting.ts";
 import { mergeMeshes } from "./merging.ts";
 import { addTextureCoordinates, buildHeightField, buildPrimitive, cubeDirections, ENDLESS_M } from "./shapes.ts";
 import { makeSky } from "./sky.ts";
 import type { Geometry, Material, Rgba, SceneSpec, Visual } from "./spec.ts";
-import { makeSurface } from "./surface.ts";
+import { type Look, makeSurface } from "./surface.ts";
 import { makeCubeTexture, makeTexture } from "./textures.ts";
 
 export interface SceneOptions {
   budget: Budget;
-  shadows: boolean;
   anisotropy: number;
   /** Called with one line for people when something of the scene cannot be shown. */
   onProblem: (text: string) => void;
@@ -51,6 +51,8 @@ export class SceneView {
   readonly deformables: DeformableView[] = [];
   readonly lighting: Lighting;
   sky: Mesh | null = null;
+  /** Equal shapes: they are not in the groups of their bodies. */
+  private instances: Instances[] = [];
   /** Resolves when everything that can be shown is shown. */
   readonly complete: Promise<void>;
 
@@ -77,7 +79,7 @@ export class SceneView {
       this.rest.set(body.id, new Matrix4().compose(group.position, group.quaternion, new Vector3(1, 1, 1)));
       this.world.add(group);
     }
-    this.lighting = new Lighting(spec, this.world, this.bodies, options.shadows);
+    this.lighting = new Lighting(this, this.world, options.budget);
     this.lighting.update(this.rest);
     this.complete = this.build();
   }
@@ -90,6 +92,11 @@ export class SceneView {
     for (const material of this.materials.values()) material.dispose();
     this.world.removeFromParent();
     this.sky?.removeFromParent();
+  }
+
+  /** Move instances to where their bodies are. Call it after the poses of bodies were set. */
+  placeInstances(): void {
+    for (const instances of this.instances) instances.place();
   }
 
   private async build(): Promise<void> {
@@ -135,9 +142,22 @@ export class SceneView {
     if (!this.isDisposed) this.merge();
   }
 
-  /** Merge what looks the same on each body, and release what is not drawn any more. */
+  /** Draw what is equal at once, merge what looks the same on each body, and release what is not drawn any more. */
   private merge(): void {
-    for (const body of this.bodies.values()) for (const made of mergeMeshes(body)) this.owned.add(made);
+    const makeTinted = (look: Look): ShaderMaterial => {
+      const material = makeSurface({ ...look, rgba: [1, 1, 1, 1], isTinted: true }, this.lighting);
+      this.owned.add(material);
+      return material;
+    };
+    const makeUnit = (unit: Geometry): BufferGeometry => toBufferGeometry(buildPrimitive(unit), unit, "", null, this.spec);
+    const { instances, made } = instanceMeshes(this.bodies, makeTinted, makeUnit);
+    for (const item of made) this.owned.add(item);
+    for (const { object } of instances) this.world.add(object);
+    this.instances = instances;
+    for (const body of this.bodies.values()) {
+      for (const merged of mergeMeshes(body)) this.owned.add(merged);
+      if (body.children.length === 0) body.removeFromParent(); // three.js looks at every object of every frame
+    }
     const drawn = new Set<unknown>();
     this.world.traverse((object) => drawn.add((object as Partial<Mesh>).geometry));
     const release = (geometry: BufferGeometry): void => {
@@ -181,6 +201,7 @@ export class SceneView {
       made.castShadow = castShadow && !isPlane && visual.rgba[3] >= 1;
       made.receiveShadow = true;
       made.userData.isPlane = isPlane;
+      made.userData.geometry = visual.geometry;
       this.bodies.get(visual.body)?.add(made);
       if (isPlane) made.add(await this.makeBackOf(visual, made.geometry));
     }
@@ -294,6 +315,7 @@ export class SceneView {
           side: use.isDoubleSided ? DoubleSide : use.isBack ? BackSide : FrontSide,
           isInterpolated: use.isInterpolated ?? false,
           fadeAt: use.fadeAt ?? 0,
+          isTinted: false,
         },
         this.lighting,
       );

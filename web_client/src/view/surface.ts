@@ -20,10 +20,12 @@ export interface Look {
   isInterpolated: boolean;
   /** Fades out at a distance: a plane without end [m], 0 for no fading. */
   fadeAt: number;
+  /** The attribute `tint` of each instance multiplies the colour. */
+  isTinted: boolean;
 }
 
 /** MuJoCo's values of a shape without a material. */
-const PLAIN = { emission: 0, specular: 0.5, shininess: 0.5, metallic: -1, roughness: -1 };
+export const PLAIN = { emission: 0, specular: 0.5, shininess: 0.5, metallic: -1, roughness: -1 };
 
 const VERTEX = /* glsl */ `
 #include <common>
@@ -46,6 +48,10 @@ varying vec3 vNormal;
   attribute vec4 vertexColor;
   varying vec4 vVertexColor;
 #endif
+#ifdef IS_TINTED
+  attribute vec3 tint;
+  varying vec3 vTint;
+#endif
 void main() {
   #include <beginnormal_vertex>
   #include <begin_vertex>
@@ -65,7 +71,8 @@ void main() {
   vec3 localNormal = objectNormal;
   #ifdef USE_INSTANCING
     local = instanceMatrix * local;
-    localNormal = mat3(instanceMatrix) * localNormal;
+    mat3 turn = mat3(instanceMatrix); // and a scale along its axes, by which normals are divided
+    localNormal = turn * (localNormal / vec3(dot(turn[0], turn[0]), dot(turn[1], turn[1]), dot(turn[2], turn[2])));
   #endif
   vec4 world = modelMatrix * local;
   vPosition = world.xyz;
@@ -79,6 +86,9 @@ void main() {
   #endif
   #ifdef HAS_VERTEX_COLORS
     vVertexColor = vertexColor;
+  #endif
+  #ifdef IS_TINTED
+    vTint = tint;
   #endif
 }`;
 
@@ -113,6 +123,9 @@ varying vec3 vNormal;
 #ifdef HAS_VERTEX_COLORS
   varying vec4 vVertexColor;
 #endif
+#ifdef IS_TINTED
+  varying vec3 vTint;
+#endif
 
 float highlight(vec3 normal, vec3 toLight, vec3 toEye) {
   return pow(max(dot(normal, normalize(toLight + toEye)), 1e-4), shininess);
@@ -141,6 +154,9 @@ void main() {
   vec4 base = vec4(color, opacity);
   #ifdef HAS_VERTEX_COLORS
     base *= vVertexColor;
+  #endif
+  #ifdef IS_TINTED
+    base.rgb *= vTint;
   #endif
   vec3 normal = normalize(vNormal);
   #ifdef DOUBLE_SIDED
@@ -184,6 +200,7 @@ export function makeSurface(look: Look, lighting: Lighting): ShaderMaterial {
   if (look.hasVertexColors) defines.HAS_VERTEX_COLORS = "";
   if (look.side === DoubleSide) defines.DOUBLE_SIDED = "";
   if (look.isInterpolated) defines.IS_INTERPOLATED = "";
+  if (look.isTinted) defines.IS_TINTED = "";
   if (look.fadeAt > 0) defines.FADE_AT = look.fadeAt.toFixed(3);
   const material = new ShaderMaterial({
     defines,
@@ -207,13 +224,14 @@ export function makeSurface(look: Look, lighting: Lighting): ShaderMaterial {
     shadowSide: look.side === DoubleSide ? DoubleSide : FrontSide,
     transparent: alpha < 1 || look.isBlended || look.fadeAt > 0,
   });
+  material.userData.look = look;
   return material;
 }
 
 /** Return the sum over the lights. Shadow maps of one kind are numbered in the order of their lights. */
 function writeLights(lighting: Lighting): string {
   const counts = { directional: 0, spot: 0 };
-  return lighting.layout.shadows
+  const sum = lighting.layout.shadows
     .map((kind, i) => {
       if (kind === "") return `  lit += shine(lights[${i}], normal, toEye, base.rgb, 1.0);\n`;
       const k = counts[kind]++;
@@ -231,4 +249,15 @@ function writeLights(lighting: Lighting): string {
       );
     })
     .join("");
+  return sum + (lighting.layout.isShaded ? SHADE : "");
 }
+
+/** What is below something is darker. */
+const SHADE = /* glsl */ `
+#if defined(USE_SHADOWMAP) && NUM_DIR_LIGHT_SHADOWS > 0
+  if (receiveShadow) {
+    DirectionalLightShadow s = directionalLightShadows[0];
+    lit *= mix(0.6, 1.0, getShadow(directionalShadowMap[0], s.shadowMapSize, s.shadowIntensity, s.shadowBias, s.shadowRadius, vDirectionalShadowCoord[0]));
+  }
+#endif
+`;

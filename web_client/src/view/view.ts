@@ -24,6 +24,7 @@ import { Viewpoint } from "./camera.ts";
 import { CloudViews } from "./clouds.ts";
 import { CameraPictures } from "./pictures.ts";
 import type { DeformableFrame } from "./deformables.ts";
+import { findFirstSight, findWholeBox, FIRST_AZIMUTH } from "./framing.ts";
 import { type Between, DelayEstimator, FrameBuffer, interpolatePoses, interpolateValues, POSE_FLOATS } from "./interpolation.ts";
 import { SceneView } from "./scene_view.ts";
 
@@ -43,7 +44,6 @@ const IDLE_MS = 1000;
 /** What this device can draw. */
 export interface Device {
   budget: Budget;
-  shadows: boolean;
   pixelRatio: number;
   /** Shortest time between two frames [ms]: the processor that draws has other work, too. */
   framePeriod_ms: number;
@@ -108,6 +108,8 @@ export class View {
   private poses = new Float32Array(0);
   private drawnPoses = new Float32Array(0);
   private bodyIds: number[] = [];
+  /** Bodies at the feet of the robots, by id. */
+  private bases: number[] = [];
   private bodiesVersion = -1;
   private sessionOffset_ms = Number.NaN;
   private framesToDraw = FRAMES_AFTER_CHANGE;
@@ -130,7 +132,8 @@ export class View {
     this.renderer = makeRenderer(canvas);
     this.device = inspectDevice(this.renderer);
     this.renderer.setPixelRatio(this.device.pixelRatio);
-    this.renderer.shadowMap.enabled = this.device.shadows;
+    this.renderer.shadowMap.enabled = true;
+    this.renderer.shadowMap.autoUpdate = false; // shadows change when something moves, not with the view
     this.renderer.shadowMap.type = PCFShadowMap;
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.root.background = new Color(BACKGROUND);
@@ -226,7 +229,7 @@ export class View {
     root.background = background;
     for (const object of changed) object.visible = true;
     white.dispose();
-    this.renderer.shadowMap.enabled = this.device.shadows;
+    this.renderer.shadowMap.enabled = true;
     this.renderer.setPixelRatio(this.device.pixelRatio);
     this.resize();
     return picture;
@@ -241,6 +244,7 @@ export class View {
       this.frames.clear();
       this.poses = new Float32Array(0);
     });
+    client.on("session", ({ robots }) => (this.bases = robots.map(({ base_body }) => base_body)));
     client.on("scene", ({ spec }) => this.setScene(spec));
     client.on("cloud", ({ stream, cloud }) => this.clouds.show(stream, cloud));
     client.on("frame", (frame) => this.takeFrame(frame));
@@ -252,7 +256,6 @@ export class View {
     const shown = this.scene;
     const scene = new SceneView(spec, this.assets, {
       budget: this.device.budget,
-      shadows: this.device.shadows,
       anisotropy: Math.min(8, this.renderer.capabilities.getMaxAnisotropy()),
       onProblem: this.events.onProblem,
     });
@@ -263,7 +266,7 @@ export class View {
     const isSameRoom = shown !== null && shown.spec.name === spec.name && shown.spec.bodies.length === spec.bodies.length;
     // A changed scene appears when it is complete; the first one as it comes.
     if (!isSameRoom) {
-      this.viewpoint.frame(scene, this.clouds.getBounds());
+      this.showFirst(scene);
       this.showNext(scene);
     }
     void scene.complete.then(() => {
@@ -271,8 +274,24 @@ export class View {
       if (this.scene !== scene) return;
       if (scene.sky) this.root.add(scene.sky);
       this.root.background = new Color(scene.sky ? BACKGROUND : NO_SKY);
+      this.renderer.shadowMap.needsUpdate = true;
       this.touch();
     });
+  }
+
+  /** Show all of the scene, with the clouds that are drawn. */
+  showWhole(): void {
+    const { scene } = this;
+    if (!scene) return;
+    const box = findWholeBox(scene, this.clouds.getBounds());
+    this.viewpoint.frame({ box, azimuth: FIRST_AZIMUTH }, box, scene.spec.environment.zfar);
+  }
+
+  /** Show a scene for the first time: its robots, if there are any. */
+  private showFirst(scene: SceneView): void {
+    const clouds = this.clouds.getBounds();
+    const sight = findFirstSight(scene, this.bases, clouds);
+    this.viewpoint.frame(sight, findWholeBox(scene, clouds), scene.spec.environment.zfar);
   }
 
   /** Replace the scene in the picture by the next one. */
@@ -283,6 +302,7 @@ export class View {
     this.keepStreams(new Set(scene.spec.deformables.map((part) => part.stream)));
     this.poses = new Float32Array(0); // its bodies lie as they did at first, until they are moved
     this.root.add(scene.world);
+    this.renderer.shadowMap.needsUpdate = true;
     this.touch();
     this.events.onScene(scene.spec);
   }
@@ -335,19 +355,21 @@ export class View {
     else if (nowMs() - this.lastTried_ms < this.device.framePeriod_ms) return;
     this.lastTried_ms = nowMs();
     const session_ms = this.sessionTime() - this.delay.delay_ms;
+    const isMoved = [this.moveBodies(session_ms), this.moveDeformables(session_ms)].some(Boolean);
     const isChanged = [
-      this.moveBodies(session_ms),
-      this.moveDeformables(session_ms),
+      isMoved,
       this.avatars.update(session_ms),
       this.viewpoint.update(this.scene),
     ].some(Boolean);
     const now = nowMs();
-    if (this.clouds.popChanged()) this.touchOverlay();
+    const isIdle = now - this.lastDrawn_ms > IDLE_MS;
+    if (isMoved || isIdle) this.renderer.shadowMap.needsUpdate = true;
+    if (this.clouds.popChanged()) this.touchOverlay(); // pictures are without them
     if (isChanged) this.touch();
     const isOnScreen = !this.renderer.xr.isPresenting;
     const hidden = [this.overlay, this.clouds.group];
     if (isOnScreen && this.pictures.drawDue(this.root, hidden, this.scene, now)) this.framesToDraw = Math.max(1, this.framesToDraw);
-    const isLoading = this.scene !== null && this.sceneCount > 0 && now - this.lastDrawn_ms > IDLE_MS;
+    const isLoading = this.scene !== null && this.sceneCount > 0 && isIdle;
     if (this.framesToDraw <= 0 && !isLoading && !isPresenting) return;
     this.framesToDraw -= 1;
     this.lastDrawn_ms = now;
@@ -368,18 +390,22 @@ export class View {
     if (isNew) this.poses = new Float32Array(length);
     interpolatePoses(found.before.values, found.after.values, found.share, this.poses);
     if (!isNew && !isVisiblyDifferent(this.poses, this.drawnPoses)) return false;
-    this.drawnPoses = this.poses.slice();
+    if (this.drawnPoses.length !== length) this.drawnPoses = new Float32Array(length);
+    this.drawnPoses.set(this.poses);
     for (let row = 0; row < this.bodyIds.length; row++) {
       const group = this.scene.bodies.get(this.bodyIds[row]!);
       if (!group) continue;
       const at = POSE_FLOATS * row;
-      const [x, y, z] = [this.poses[at]!, this.poses[at + 1]!, this.poses[at + 2]!];
+      const x = this.poses[at]!;
+      const y = this.poses[at + 1]!;
+      const z = this.poses[at + 2]!;
       group.visible = Number.isFinite(x + y + z + this.poses[at + 3]!); // a body that diverged is not drawn
       if (!group.visible) continue;
       group.position.set(x, y, z);
       group.quaternion.set(this.poses[at + 4]!, this.poses[at + 5]!, this.poses[at + 6]!, this.poses[at + 3]!);
       group.updateMatrix();
     }
+    this.scene.placeInstances();
     return true;
   }
 
@@ -454,7 +480,6 @@ function inspectDevice(renderer: WebGLRenderer): Device {
   const isMobile = matchMedia("(pointer: coarse)").matches || /quest|oculus/i.test(navigator.userAgent);
   return {
     budget: isSoftware ? SOFTWARE : isMobile ? HEADSET : DESKTOP,
-    shadows: !isSoftware && !isMobile,
     framePeriod_ms: isSoftware ? 30 : 0,
     pixelRatio: isSoftware ? 1 : Math.min(devicePixelRatio, 2),
     renderer: name,

@@ -1,7 +1,18 @@
-import { Box3, Vector3 } from "three";
+import { Box3, Group, Vector3 } from "three";
 import { describe, expect, it } from "vitest";
 
-import { aspectOf, findBall, isInPicture, type Lens, listWatched, SHOWN_SHARE } from "../../src/view/framing.ts";
+import {
+  aspectOf,
+  directView,
+  findFirstSight,
+  findWholeBox,
+  FIRST_AZIMUTH,
+  isInPicture,
+  type Lens,
+  listWatched,
+  type Placed,
+} from "../../src/view/framing.ts";
+import type { SceneSpec } from "../../src/view/spec.ts";
 
 const LENS: Lens = { fovy: 90, orthographic: false, resolution: [200, 100] };
 
@@ -40,26 +51,62 @@ describe("isInPicture", () => {
   });
 });
 
-describe("findBall", () => {
-  const scene = { center: [1, 0, 0] as const, extent: 2 };
-  const box = (low: number[], high: number[]): Box3 => new Box3(new Vector3(...low), new Vector3(...high));
+describe("what the free camera shows", () => {
+  const NOWHERE = new Box3();
+  const shape = (body: number, half: number[], p: number[], kind = "box") => ({
+    id: body, body, name: "", group: 0, material: -1, rgba: [1, 1, 1, 1],
+    T_body_visual: [p, [1, 0, 0, 0]], geometry: { kind, size: half, mesh: -1, hfield: -1 },
+  });
+  /** A robot of two links at the origin, on bodies 1 and 2; body 3 is an object. */
+  const makeScene = (...visuals: ReturnType<typeof shape>[]): Placed => {
+    const bodies = [[0, -1], [1, 0], [2, 1], [3, 0]].map(([id, parent]) => ({ id, parent }));
+    const groups = new Map(bodies.map(({ id }) => [id!, new Group()]));
+    const environment = { center: [0, 0, 0], extent: 1, zfar: 50 };
+    const spec = { visuals, bodies, environment, meshes: [], hfields: [], deformables: [], groups_shown: [0] } as unknown as SceneSpec;
+    return { spec, bodies: groups, rest: new Map([...groups].map(([id, group]) => [id, group.matrix.clone()])) };
+  };
+  const move = (scene: Placed, body: number, x: number): void => {
+    const group = scene.bodies.get(body)!;
+    group.position.x = x;
+    group.updateMatrix();
+  };
+  const robot = [shape(1, [0.1, 0.1, 0.5], [0, 0, 0.5]), shape(2, [0.1, 0.1, 0.2], [0, 0, 1.2])];
 
-  it("is the scene's where nothing is drawn beside it, or only inside", () => {
-    for (const beside of [new Box3(), box([0.5, -1, -1], [1.5, 1, 1])]) {
-      const { center, radius } = findBall(scene, beside);
-      expect([center.toArray(), radius]).toEqual([[1, 0, 0], 2 * SHOWN_SHARE]);
-    }
-    expect(findBall({ ...scene, extent: 0.01 }, new Box3()).radius).toBe(0.2 * SHOWN_SHARE);
+  it("is around all shapes but planes, and the clouds", () => {
+    const scene = makeScene(shape(3, [1, 2, 3], [1, 0, 0]), shape(0, [0, 0, 1], [0, 0, 0], "plane"), shape(3, [0.1, 0.1, 1], [0, 0, 3], "capsule"));
+    expect(findWholeBox(scene, NOWHERE)).toEqual(new Box3(new Vector3(-0.1, -2, -3), new Vector3(2, 2, 4.1)));
+    const cloud = new Box3(new Vector3(-9, 0, 0), new Vector3(-8, 1, 1));
+    expect(findWholeBox(scene, cloud).min.x).toBe(-9);
   });
 
-  it("holds the scene and a cloud that reaches beyond it", () => {
-    const beside = box([-6, -3, 0], [-2, 3, 3]);
-    const ball = findBall(scene, beside);
-    for (const corner of [beside.min, beside.max, new Vector3(1 + 2 * SHOWN_SHARE, 0, 0)]) {
-      expect(ball.center.distanceTo(corner)).toBeLessThanOrEqual(ball.radius + 1e-9);
-    }
-    expect(ball.radius).toBeLessThan(8);
-    expect(ball.center.x).toBeLessThan(0);
+  it("is around what moves, unless that has fallen out of the scene", () => {
+    const scene = makeScene(shape(1, [1, 1, 1], [0, 0, 0]), shape(3, [1, 1, 1], [0, 0, 0]));
+    move(scene, 3, 5);
+    expect(findWholeBox(scene, NOWHERE).max.x).toBe(6);
+    move(scene, 3, 5000);
+    expect(findWholeBox(scene, NOWHERE).max.x).toBe(1);
+  });
+
+  it("is not empty where nothing is drawn", () => {
+    expect(findWholeBox(makeScene(), NOWHERE).getSize(new Vector3()).x).toBe(1);
+  });
+
+  it("is at first the robots in a large scene, and all of a small one", () => {
+    const kitchen = makeScene(...robot, shape(0, [5, 0.1, 2], [0, 8, 2]));
+    const { box } = findFirstSight(kitchen, [1], NOWHERE);
+    expect(box.containsPoint(new Vector3(0, 0, 1.4))).toBe(true);
+    expect(box.max.y).toBeLessThan(1);
+    const table = makeScene(...robot, shape(0, [0.8, 0.4, 0.02], [0, 0, 0]));
+    expect(findFirstSight(table, [1], NOWHERE).box).toEqual(findWholeBox(table, NOWHERE));
+    expect(findFirstSight(kitchen, [], NOWHERE).box).toEqual(findWholeBox(kitchen, NOWHERE));
+  });
+
+  it("is seen from where no wall is before the robots", () => {
+    expect(findFirstSight(makeScene(...robot), [1], NOWHERE).azimuth).toBe(FIRST_AZIMUTH);
+    const before = directView(FIRST_AZIMUTH, 0).multiplyScalar(-1);
+    const wall = shape(0, [0.5, 0.5, 3], [before.x, before.y, 0]);
+    const { azimuth } = findFirstSight(makeScene(...robot, wall), [1], NOWHERE);
+    expect(directView(azimuth, 0).dot(directView(FIRST_AZIMUTH, 0))).toBeLessThan(0.8);
   });
 });
 

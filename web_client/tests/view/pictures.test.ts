@@ -11,7 +11,7 @@ const CAMERA = { body: 0, follow: "fixed", target: -1, T_body_camera: [[0, 0, 1]
 const scene = { spec: { cameras: [CAMERA] }, bodies: new Map(), rest: new Map() } as unknown as SceneView;
 
 function makePictures(onRender: () => void): CameraPictures {
-  const renderer = { shadowMap: { autoUpdate: true }, setRenderTarget: () => undefined, render: onRender } as unknown as WebGLRenderer;
+  const renderer = { setRenderTarget: () => undefined, render: onRender } as unknown as WebGLRenderer;
   const pictures = new CameraPictures(renderer, true);
   pictures.setPanels([{ index: 0, element: {} as HTMLElement }]);
   return pictures;
@@ -48,7 +48,7 @@ class FakeView {
   delay = { delay_ms: 0 };
   avatars = { update: () => false };
   viewpoint = { update: () => false, camera: {} };
-  renderer = { xr: { getReferenceSpace: () => null, isPresenting: false }, render: () => undefined };
+  renderer = { shadowMap: {}, xr: { getReferenceSpace: () => null, isPresenting: false }, render: () => undefined };
   clouds = { group: "clouds", popChanged: () => this.isCloudNew };
   pictures = {
     markOutdated: () => (this.outdated += 1),

@@ -1,6 +1,6 @@
 // What is in the picture while a changed scene is loaded: the scene before, and it moves.
 
-import { Group, type Mesh, Scene } from "three";
+import { Box3, Group, type Mesh, Scene } from "three";
 import { beforeEach, expect, test } from "vitest";
 
 import type { FromWorker, SceneSpec, ToWorker } from "../../src/core/api.ts";
@@ -63,13 +63,14 @@ class Stage {
     poses: new Float32Array(0),
     drawnPoses: new Float32Array(0),
     bodyIds: [],
-    device: { budget: DESKTOP, shadows: false, framePeriod_ms: 0 },
+    bases: [],
+    device: { budget: DESKTOP, framePeriod_ms: 0 },
     delay: { delay_ms: 0, add: () => undefined },
     avatars: { update: () => false },
     viewpoint: { update: () => false, frame: () => undefined, camera: {} },
-    clouds: { group: new Group(), popChanged: () => false, getBounds: () => null },
+    clouds: { group: new Group(), popChanged: () => false, getBounds: () => new Box3() },
     pictures: { markOutdated: () => undefined, drawDue: () => false, show: () => undefined },
-    renderer: { capabilities: { getMaxAnisotropy: () => 1 }, xr: { getReferenceSpace: () => null, isPresenting: false }, render: () => undefined },
+    renderer: { capabilities: { getMaxAnisotropy: () => 1 }, shadowMap: {}, xr: { getReferenceSpace: () => null, isPresenting: false }, render: () => undefined },
     sessionTime: () => this.session_ms,
     lastTried_ms: Number.NEGATIVE_INFINITY,
   });
