@@ -36,9 +36,6 @@ export function makeHeadsetControls(
   const element = h("span", { class: "headset" }, words);
   const controls: HeadsetControls = { element, headset: null };
   if (!view) return controls;
-  const missing = describeMissing(isSecureContext, "xr" in navigator && navigator.xr !== undefined);
-  setText(words, missing);
-  if (missing !== "") return controls;
   const buttons = MODES.map(([mode, text]) => {
     const enter = async (): Promise<void> => {
       for (const one of buttons) one.disabled = true;
@@ -56,13 +53,31 @@ export function makeHeadsetControls(
     };
     return button(text, () => void enter(), { class: "small primary", hidden: true });
   });
+  const emulate = button("Try an emulated headset", () => void startEmulator(), { class: "small", hidden: true });
+  const startEmulator = async (): Promise<void> => {
+    emulate.disabled = true;
+    try {
+      const { installEmulator } = await import("./emulator.ts"); // large, and for few
+      installEmulator();
+      await update();
+    } catch (error) {
+      emulate.disabled = false;
+      setText(words, `The emulated headset cannot be loaded: ${(error as Error).message}`);
+    }
+  };
   element.prepend(...buttons);
+  element.append(emulate);
   const update = async (): Promise<void> => {
     const supported = await Promise.all(MODES.map(([mode]) => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false));
     buttons.forEach((one, i) => (one.hidden = !supported[i]));
     state.offersAr = supported[0] ?? false;
     setText(words, supported.some(Boolean) ? "" : "No headset at this browser.");
+    emulate.hidden = supported.some(Boolean);
   };
+  const missing = describeMissing(isSecureContext, "xr" in navigator && navigator.xr !== undefined);
+  setText(words, missing);
+  emulate.hidden = missing === "" || !isSecureContext;
+  if (missing !== "") return controls;
   navigator.xr?.addEventListener("devicechange", () => void update());
   void update();
   return controls;
