@@ -65,7 +65,7 @@ from iris_session.streams.deformable_topology import DeformableTopology
 #: Minimum viewing distance [m], and viewing distance in extents of the scene.
 _FAR: Final = 50.0
 _FAR_EXTENTS: Final = 10.0
-#: Light of a scene that brings none: white is drawn between 0.3 and 1 of full brightness, by the direction of its surface.
+#: Light of a scene that brings none: white is drawn between 0.3 and 1 of full brightness.
 _DEFAULT_HEADLIGHT: Final = Headlight(True, (0.3,) * 3, (0.35,) * 3, (0.1,) * 3)
 _DEFAULT_LIGHT: Final = Light(
     name="default",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import subprocess
@@ -14,12 +15,14 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 from iris_session.bench.web_tab import WEB_CLIENT
 from iris_session.demo.named_scenes import scene_by_name
 from iris_session.protocol.server_messages import Event, Gap, ParticipantChanged, ParticipantJoined
-from tests.e2e.browser import Browser, Page, join_as, printed_address
+from tests.e2e.browser import Browser, Page, decode_picture, join_as, printed_address
+from tests.e2e.emulated_quest import HEADSET
 from tests.e2e.scenario import Scenario
 from tests.e2e.session_process import COMMAND, DEADLINE_S, END_WITH_PARENT, SessionProcess
 from tests.scene.pictures import ModelRenderer, graphics, silhouette_iou
@@ -115,6 +118,82 @@ def test_the_page_draws_what_mujoco_draws(
     assert page.errors == []
 
 
+#: Draws the frame of the page once more, without labels and people. Returns the size and the picture.
+SHADED: Final = """(() => {
+  const { view } = irisSession;
+  view.overlay.visible = false;
+  view.renderer.shadowMap.needsUpdate = true;
+  view.renderer.render(view.root, view.viewpoint.camera);
+  view.overlay.visible = true;
+  return [view.canvas.width, view.canvas.height, view.canvas.toDataURL("image/png")];
+})()"""
+
+
+def write_parts(path: Path, spheres: int, boxes: int) -> None:
+    """Write a model with bodies of one shape each in a grid, of different sizes and colours; every 100th floats."""
+    rng = np.random.default_rng(1)
+    side = math.ceil((spheres + boxes) ** (1 / 3))
+    bodies = []
+    for i in range(spheres + boxes):
+        p = 0.12 * np.array([i % side, i // side % side, i // side**2])
+        kind, size = ("sphere", rng.uniform(0.02, 0.05, 1)) if i < spheres else ("box", rng.uniform(0.02, 0.05, 3))
+        place, rgb, half = (" ".join(f"{v:.3f}" for v in values) for values in (p, rng.random(3), size))
+        joint = "<freejoint/>" if i % 100 == 0 else ""
+        geom = f'<geom type="{kind}" size="{half}" rgba="{rgb} 1" contype="0" conaffinity="0"/>'
+        bodies.append(f'<body pos="{place}" euler="{10 * (i % 9)} 0 {i % 90}">{joint}{geom}</body>')
+    path.write_text(
+        '<mujoco><option gravity="0 0 0"/><worldbody><light pos="0 0 5"/>' + "".join(bodies) + "</worldbody></mujoco>"
+    )
+
+
+def test_many_equal_shapes_are_few_draws_and_look_as_mujoco_draws_them(
+    serve: Callable[..., SessionProcess], open_page: Callable[..., Page], tmp_path: Path
+) -> None:
+    path = tmp_path / "parts.xml"
+    write_parts(path, spheres=400, boxes=1000)
+    page = open_page(serve(str(path)), "parts")
+    page.evaluate(SHADED)
+    assert page.evaluate("irisSession.view.renderer.info.render.calls") <= 60
+    with graphics():
+        reference = Reference(mujoco.MjModel.from_xml_path(str(path)))
+        camera = reference.look_from(145.0, -28.0, 1.5)
+        page.evaluate(f"irisSession.view.viewpoint.setFree({json.dumps(camera)})")
+        drawn = page.read_picture(WIDTH, HEIGHT, silhouette=True)
+        reference.place(drawn)
+        picture, mask = reference.draw()
+    silhouette = drawn["image"][..., 0] > 127
+    assert silhouette_iou(mask, silhouette) >= MIN_IOU
+    colours = page.read_picture(WIDTH, HEIGHT, silhouette=False)["image"]
+    assert np.abs(colours.astype(int) - picture)[mask & silhouette].mean() <= MAX_COLOUR_DIFFERENCE
+    assert page.errors == []
+
+
+def test_a_file_in_millimetres_is_seen_whole_and_lit_and_its_unit_is_doubted(
+    serve: Callable[..., SessionProcess], browser: Browser, tmp_path: Path
+) -> None:
+    trimesh.creation.box((300, 200, 250)).export(tmp_path / "part.glb")
+    page = browser.open("millimetres", printed_address(serve(str(tmp_path / "part.glb"))))
+    page.wait("irisSession.view.scene && irisSession.state.session?.synced")
+    page.evaluate("irisSession.view.scene.complete.then(() => null)")
+    mask = page.read_picture(WIDTH, HEIGHT, silhouette=True)["image"][..., 0] > 127
+    assert mask.mean() > 0.1
+    assert not np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).any()
+    colours = page.read_picture(WIDTH, HEIGHT, silhouette=False)["image"][mask]
+    assert colours.max() > 180
+    assert np.percentile(colours, 5) > 80
+    page.wait("/--scale 0.001/.test(document.querySelector('#panel-advice').textContent)")
+    page.close()
+
+
+def test_objects_cast_shadows_without_a_graphics_card(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    page = open_page(scenario.server, "shadows")
+    width, height, url = page.evaluate(SHADED)
+    plain = page.read_picture(width, height, silhouette=False)["image"].astype(int)
+    darker = (plain - decode_picture(url)).max(axis=2)
+    assert 0.005 < (darker > 15).mean() < 0.3
+    assert (darker < -15).mean() < 0.001
+
+
 # --- people and leases ------------------------------------------------------------------------------------------------
 
 
@@ -157,6 +236,32 @@ def test_stops_and_pauses_are_seen_on_every_screen(scenario: Scenario, open_page
     scenario.run_until(lambda: not watcher.mirror.estop, "the e-stop is cleared")
     page.click("button", "E-STOP Space")
     scenario.run_until(lambda: watcher.mirror.estop, "the button stops, too")
+
+
+def test_a_headset_can_be_tried_without_one(scenario: Scenario, open_page: Callable[..., Page]) -> None:
+    """The emulator is loaded when it is asked for. Mouse and keys are a person with a headset who is at her place."""
+    page = open_page(scenario.server, "emulated", width=900, height=500)
+    loaded = "performance.getEntriesByType('resource').some(({ name }) => name.includes('emulator'))"
+    assert not page.evaluate(loaded)
+    page.click("button", "Try an emulated headset")
+    page.click("button", "Enter VR")
+    assert page.evaluate(loaded)
+    measured = f"{HEADSET}?.reading?.inputs.filter(({{ tracked, emulated }}) => tracked && !emulated).length === 2"
+    page.wait(f"{measured} && irisSession.state.self?.devices.includes('head')")
+    right = f"{HEADSET}.reading.inputs.find(({{ side }}) => side === 'right')"
+    page.hold("ArrowUp")
+    page.wait(f"{right}.ray.direction[2] > 0.3")
+    page.let_go("ArrowUp")
+    page.hold("ShiftLeft")
+    page.evaluate("dispatchEvent(new PointerEvent('pointerdown'))")
+    page.wait(f"{right}.squeeze === 1 && {right}.trigger === 1")
+    page.let_go("ShiftLeft")
+    page.evaluate("dispatchEvent(new PointerEvent('pointerup'))")
+    page.wait(f"{right}.squeeze === 0 && {right}.trigger === 0")
+    page.press("Escape")
+    page.wait("irisSession.headset.headset === null")
+    page.click("button", "Whole scene")  # nothing lies over the bar
+    assert page.errors == []
 
 
 # --- everyone ---------------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 // Levels of detail that fit what a device can draw. A port of iris_session/scene/budget.py: what loses least detail per
 // triangle saved is coarsened first. Pure.
 
+import { findForm, LEAST_EQUAL } from "./instancing.ts";
 import type { Mesh, SceneSpec, Texture } from "./spec.ts";
 
 /** Limits of what is drawn; but for `points`, 0 means no limit. */
@@ -41,11 +42,24 @@ const PRIMITIVE_TRIANGLES: Record<string, number> = {
   capsule: 1024,
 };
 
+/** Return how many draw calls visuals take at most: equal shapes of many bodies are drawn at once. */
+export function countDraws(shown: SceneSpec["visuals"], textured: ReadonlySet<number>): number {
+  const equal = new Map<string, number>();
+  for (const { geometry, material, rgba } of shown) {
+    const isApart = rgba[3] < 1 || geometry.kind === "plane";
+    const form = textured.has(material) ? null : findForm(geometry);
+    const key = isApart ? "" : `${form?.key ?? JSON.stringify(geometry)} ${material}`;
+    equal.set(key, (equal.get(key) ?? 0) + 1);
+  }
+  return [...equal].reduce((sum, [key, count]) => sum + (key === "" || count < LEAST_EQUAL ? count : 1), 0);
+}
+
 /** Choose the finest levels that fit. Deformables have no levels and are never left out. */
 export function chooseLevels(spec: SceneSpec, budget: Budget): LevelChoice {
   const shown = spec.visuals.filter((v) => v.rgba[3] > 0 && spec.groups_shown.includes(v.group));
   const hidden = new Set<number>();
-  if (budget.objects && shown.length > budget.objects) {
+  const textured = new Set(spec.materials.flatMap(({ textures }, i) => (textures.length > 0 ? [i] : [])));
+  if (budget.objects && countDraws(shown, textured) > budget.objects) {
     const bySize = [...shown].sort((a, b) => visualSize(spec, a) - visualSize(spec, b));
     for (const visual of bySize.slice(0, shown.length - budget.objects)) hidden.add(visual.id);
   }

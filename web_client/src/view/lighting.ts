@@ -108,13 +108,21 @@ export class Lighting {
     }
   }
 
+  /** Show shadows, or light everything as if nothing were in the way. */
+  showShadows(isShown: boolean): void {
+    for (const { shadow } of this.casting) shadow.intensity = isShown ? 1 : 0;
+  }
+
   /** Remove what was added to the root. */
   dispose(): void {
-    for (const shadow of [this.shade, ...this.placed.map((light) => light.shadow)]) {
-      if (!shadow) continue;
-      this.root.remove(shadow, shadow.target);
-      shadow.dispose();
+    for (const light of this.casting) {
+      this.root.remove(light, light.target);
+      light.dispose();
     }
+  }
+
+  private get casting(): (DirectionalLight | SpotLight)[] {
+    return [this.shade, ...this.placed.map((light) => light.shadow)].filter((light) => light !== null);
   }
 
   private makeShade(side: number): DirectionalLight {

@@ -16,6 +16,7 @@ import {
   type Texture,
   Vector3,
 } from "three";
+import { mergeVertices } from "three/examples/jsm/utils/BufferGeometryUtils.js";
 
 import type { AssetSource, MeshArrays } from "./arrays.ts";
 import { makeWorldRoot, setPose } from "./axes.ts";
@@ -149,7 +150,8 @@ export class SceneView {
       this.owned.add(material);
       return material;
     };
-    const makeUnit = (unit: Geometry): BufferGeometry => toBufferGeometry(buildPrimitive(unit), unit, "", null, this.spec);
+    // Corners that are equal are computed once: there may be a million of them.
+    const makeUnit = (unit: Geometry): BufferGeometry => mergeVertices(toBufferGeometry(buildPrimitive(unit), unit, "", null, this.spec));
     const { instances, made } = instanceMeshes(this.bodies, makeTinted, makeUnit);
     for (const item of made) this.owned.add(item);
     for (const { object } of instances) this.world.add(object);

@@ -1,6 +1,7 @@
 // The picture of the page: takes what the worker posts, draws it on the shared clock.
 
 import {
+  BasicShadowMap,
   Color,
   ColorManagement,
   DoubleSide,
@@ -134,7 +135,7 @@ export class View {
     this.renderer.setPixelRatio(this.device.pixelRatio);
     this.renderer.shadowMap.enabled = true;
     this.renderer.shadowMap.autoUpdate = false; // shadows change when something moves, not with the view
-    this.renderer.shadowMap.type = PCFShadowMap;
+    this.renderer.shadowMap.type = this.device.budget === SOFTWARE ? BasicShadowMap : PCFShadowMap;
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.root.background = new Color(BACKGROUND);
     this.pictures = new CameraPictures(this.renderer, this.device.budget === SOFTWARE);
@@ -217,7 +218,7 @@ export class View {
       root.background = new Color(0);
       root.overrideMaterial = white;
     }
-    this.renderer.shadowMap.enabled = false;
+    scene?.lighting.showShadows(false);
     this.renderer.setPixelRatio(1);
     this.renderer.setSize(width, height, false);
     this.viewpoint.setAspect(width / height);
@@ -229,7 +230,7 @@ export class View {
     root.background = background;
     for (const object of changed) object.visible = true;
     white.dispose();
-    this.renderer.shadowMap.enabled = true;
+    scene?.lighting.showShadows(true);
     this.renderer.setPixelRatio(this.device.pixelRatio);
     this.resize();
     return picture;

@@ -30,6 +30,7 @@ const spec = {
   visuals: [visual(1, 0, 1), visual(2, 1, 1), visual(3, -1, 0.01)],
   meshes: [mesh(level(1000, 0), level(250, 0.01)), mesh(level(1000, 0), level(250, 0.001))],
   textures: [],
+  materials: [],
   hfields: [],
   deformables: [],
   groups_shown: [0],
@@ -46,4 +47,10 @@ test("what loses least is coarsened first", () => {
 
 test("the smallest objects are left out first", () => {
   expect([...chooseLevels(spec, { ...NO_LIMIT, objects: 2 }).hidden]).toEqual([3]);
+});
+
+test("shapes that are drawn at once count once", () => {
+  const visuals = Array.from({ length: 400 }, (_, i) => visual(i, -1, 0.01 * (1 + i)));
+  const many = { ...spec, visuals } as unknown as SceneSpec;
+  expect(chooseLevels(many, { ...NO_LIMIT, objects: 200 }).hidden.size).toBe(0);
 });
