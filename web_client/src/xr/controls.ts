@@ -65,19 +65,25 @@ export function makeHeadsetControls(
       setText(words, `The emulated headset cannot be loaded: ${(error as Error).message}`);
     }
   };
+  /** Say why there is no headset, empty: there is one. Where there is a mouse the emulator takes the place of the words. */
+  const offerEmulator = (why: string): void => {
+    emulate.hidden = why === "" || !isSecureContext || matchMedia("(pointer: coarse)").matches;
+    emulate.title = why;
+    setText(words, emulate.hidden ? why : "");
+  };
   element.prepend(...buttons);
   element.append(emulate);
   const update = async (): Promise<void> => {
     const supported = await Promise.all(MODES.map(([mode]) => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false));
     buttons.forEach((one, i) => (one.hidden = !supported[i]));
     state.offersAr = supported[0] ?? false;
-    setText(words, supported.some(Boolean) ? "" : "No headset at this browser.");
-    emulate.hidden = supported.some(Boolean);
+    offerEmulator(supported.some(Boolean) ? "" : "No headset at this browser.");
   };
   const missing = describeMissing(isSecureContext, "xr" in navigator && navigator.xr !== undefined);
-  setText(words, missing);
-  emulate.hidden = missing === "" || !isSecureContext;
-  if (missing !== "") return controls;
+  if (missing !== "") {
+    offerEmulator(missing);
+    return controls;
+  }
   navigator.xr?.addEventListener("devicechange", () => void update());
   void update();
   return controls;
