@@ -3,12 +3,14 @@
 
 import {
   BufferGeometry,
+  DynamicDrawUsage,
   type Group,
   InstancedBufferAttribute,
   InstancedMesh,
   Matrix4,
   Mesh,
   type ShaderMaterial,
+  StaticDrawUsage,
   Vector3,
 } from "three";
 
@@ -23,7 +25,7 @@ const scratch = new Matrix4();
 /** Equal shapes on several bodies. `userData.bodies`: id of the body of each instance, for picking. */
 export interface Instances {
   readonly object: InstancedMesh;
-  /** Move all to where their bodies are. */
+  /** Move those that move to where their bodies are. */
   place(): void;
 }
 
@@ -31,6 +33,13 @@ export interface Instances {
 export interface InstancedShapes {
   instances: Instances[];
   made: { dispose(): void }[];
+}
+
+/** One instance: its number, and where it is on its body. */
+interface Row {
+  i: number;
+  body: Group;
+  T_body_unit: Matrix4;
 }
 
 /** The form of a shape, and its size in units of that. */
@@ -67,11 +76,12 @@ export function findForm(geometry: Geometry): Form | null {
  * Replace equal opaque meshes of bodies by instances. What is transparent stays apart, because it is sorted by distance,
  * and so do planes, which are hidden by themselves.
  *
- * `bodies`: by id. `makeTinted` returns the material of a look whose colour each instance brings; `makeUnit` the
+ * `bodies`: by id. `moving`: those that may move. `makeTinted` returns the material of a look whose colour each instance brings; `makeUnit` the
  * geometry of a form.
  */
 export function instanceMeshes(
   bodies: ReadonlyMap<number, Group>,
+  moving: ReadonlySet<number>,
   makeTinted: (look: Look) => ShaderMaterial,
   makeUnit: (unit: Geometry) => BufferGeometry,
 ): InstancedShapes {
@@ -106,21 +116,22 @@ export function instanceMeshes(
     object.frustumCulled = false; // its instances are everywhere
     object.matrixAutoUpdate = false;
     object.userData.bodies = parts.map(({ id }) => id);
-    const rows = parts.map(({ body, mesh, form: own }) => ({ body, T_body_unit: own ? mesh.matrix.clone().scale(own.scale) : mesh.matrix }));
+    const rows = parts.map(({ id, body, mesh, form: own }, i) => ({ i, id, body, T_body_unit: own ? mesh.matrix.clone().scale(own.scale) : mesh.matrix }));
     for (const { body, mesh } of parts) body.remove(mesh);
-    const place = (): void => {
-      const { array } = object.instanceMatrix;
-      for (let i = 0; i < rows.length; i++) {
-        const { body, T_body_unit } = rows[i]!;
-        (body.visible ? scratch.multiplyMatrices(body.matrix, T_body_unit) : GONE).toArray(array, 16 * i);
-      }
-      object.instanceMatrix.needsUpdate = true;
-    };
-    place();
-    result.instances.push({ object, place });
+    placeRows(object, rows);
+    const moved = rows.filter(({ id }) => moving.has(id));
+    object.instanceMatrix.setUsage(moved.length > 0 ? DynamicDrawUsage : StaticDrawUsage);
+    result.instances.push({ object, place: () => placeRows(object, moved) });
     result.made.push(geometry, object);
   }
   return result;
+}
+
+function placeRows({ instanceMatrix }: InstancedMesh, rows: readonly Row[]): void {
+  for (const { i, body, T_body_unit } of rows) {
+    (body.visible ? scratch.multiplyMatrices(body.matrix, T_body_unit) : GONE).toArray(instanceMatrix.array, 16 * i);
+  }
+  if (rows.length > 0) instanceMatrix.needsUpdate = true;
 }
 
 /** Return a geometry with the vertices of another one, to which more attributes can be added. */

@@ -152,7 +152,8 @@ export class SceneView {
     };
     // Corners that are equal are computed once: there may be a million of them.
     const makeUnit = (unit: Geometry): BufferGeometry => mergeVertices(toBufferGeometry(buildPrimitive(unit), unit, "", null, this.spec));
-    const { instances, made } = instanceMeshes(this.bodies, makeTinted, makeUnit);
+    const moving = new Set(this.spec.bodies.filter((body) => body.moving).map(({ id }) => id));
+    const { instances, made } = instanceMeshes(this.bodies, moving, makeTinted, makeUnit);
     for (const item of made) this.owned.add(item);
     for (const { object } of instances) this.world.add(object);
     this.instances = instances;

@@ -28,6 +28,7 @@ import type { DeformableFrame } from "./deformables.ts";
 import { findFirstSight, findWholeBox, FIRST_AZIMUTH } from "./framing.ts";
 import { type Between, DelayEstimator, FrameBuffer, interpolatePoses, interpolateValues, POSE_FLOATS } from "./interpolation.ts";
 import { SceneView } from "./scene_view.ts";
+import { Shadows } from "./shadows.ts";
 
 // Colours are blended as they are (docs/scene.md).
 ColorManagement.enabled = false;
@@ -102,6 +103,7 @@ export class View {
   private readonly renderer: WebGLRenderer;
   private readonly root = new Scene();
   private readonly overlay = makeWorldRoot();
+  private readonly shadows: Shadows;
   private readonly assets: WorkerAssets;
   private readonly delay = new DelayEstimator();
   private readonly frames: FrameBuffer;
@@ -134,8 +136,8 @@ export class View {
     this.device = inspectDevice(this.renderer);
     this.renderer.setPixelRatio(this.device.pixelRatio);
     this.renderer.shadowMap.enabled = true;
-    this.renderer.shadowMap.autoUpdate = false; // shadows change when something moves, not with the view
     this.renderer.shadowMap.type = this.device.budget === SOFTWARE ? BasicShadowMap : PCFShadowMap;
+    this.shadows = new Shadows(this.renderer.shadowMap, this.device.budget.shadowPeriod_ms);
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.root.background = new Color(BACKGROUND);
     this.pictures = new CameraPictures(this.renderer, this.device.budget === SOFTWARE);
@@ -275,7 +277,7 @@ export class View {
       if (this.scene !== scene) return;
       if (scene.sky) this.root.add(scene.sky);
       this.root.background = new Color(scene.sky ? BACKGROUND : NO_SKY);
-      this.renderer.shadowMap.needsUpdate = true;
+      this.shadows.markOld();
       this.touch();
     });
   }
@@ -303,7 +305,7 @@ export class View {
     this.keepStreams(new Set(scene.spec.deformables.map((part) => part.stream)));
     this.poses = new Float32Array(0); // its bodies lie as they did at first, until they are moved
     this.root.add(scene.world);
-    this.renderer.shadowMap.needsUpdate = true;
+    this.shadows.markOld();
     this.touch();
     this.events.onScene(scene.spec);
   }
@@ -364,7 +366,8 @@ export class View {
     ].some(Boolean);
     const now = nowMs();
     const isIdle = now - this.lastDrawn_ms > IDLE_MS;
-    if (isMoved || isIdle) this.renderer.shadowMap.needsUpdate = true;
+    if (isMoved || isIdle) this.shadows.markOld();
+    if (this.shadows.renew(now)) this.framesToDraw = Math.max(1, this.framesToDraw);
     if (this.clouds.popChanged()) this.touchOverlay(); // pictures are without them
     if (isChanged) this.touch();
     const isOnScreen = !this.renderer.xr.isPresenting;

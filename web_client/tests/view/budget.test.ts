@@ -3,7 +3,7 @@ import { expect, test } from "vitest";
 import { type Budget, chooseLevels } from "../../src/view/budget.ts";
 import type { SceneSpec } from "../../src/view/spec.ts";
 
-const NO_LIMIT: Budget = { triangles: 0, textureBytes: 0, objects: 0, points: Number.POSITIVE_INFINITY, shadows: 0, shadowSide: 0 };
+const NO_LIMIT: Budget = { triangles: 0, textureBytes: 0, objects: 0, points: Number.POSITIVE_INFINITY, shadows: 0, shadowSide: 0, shadowPeriod_ms: 0 };
 const level = (triangles: number, max_error_m: number) => ({
   address: "",
   bytes: 0,

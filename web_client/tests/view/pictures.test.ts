@@ -48,7 +48,8 @@ class FakeView {
   delay = { delay_ms: 0 };
   avatars = { update: () => false };
   viewpoint = { update: () => false, camera: {} };
-  renderer = { shadowMap: {}, xr: { getReferenceSpace: () => null, isPresenting: false }, render: () => undefined };
+  shadows = { markOld: () => undefined, renew: () => false };
+  renderer = { xr: { getReferenceSpace: () => null, isPresenting: false }, render: () => undefined };
   clouds = { group: "clouds", popChanged: () => this.isCloudNew };
   pictures = {
     markOutdated: () => (this.outdated += 1),

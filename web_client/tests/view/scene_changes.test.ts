@@ -11,6 +11,7 @@ import { SheetBuilder } from "../../src/core/sheet.ts";
 import { WorkerAssets } from "../../src/view/assets.ts";
 import { DESKTOP } from "../../src/view/budget.ts";
 import { FrameBuffer } from "../../src/view/interpolation.ts";
+import { Shadows } from "../../src/view/shadows.ts";
 import { View } from "../../src/view/view.ts";
 
 const REST = [[0, 0, 0], [1, 0, 0, 0]];
@@ -69,8 +70,9 @@ class Stage {
     avatars: { update: () => false },
     viewpoint: { update: () => false, frame: () => undefined, camera: {} },
     clouds: { group: new Group(), popChanged: () => false, getBounds: () => new Box3() },
+    shadows: new Shadows({ autoUpdate: true, needsUpdate: false }, 0),
     pictures: { markOutdated: () => undefined, drawDue: () => false, show: () => undefined },
-    renderer: { capabilities: { getMaxAnisotropy: () => 1 }, shadowMap: {}, xr: { getReferenceSpace: () => null, isPresenting: false }, render: () => undefined },
+    renderer: { capabilities: { getMaxAnisotropy: () => 1 }, xr: { getReferenceSpace: () => null, isPresenting: false }, render: () => undefined },
     sessionTime: () => this.session_ms,
     lastTried_ms: Number.NEGATIVE_INFINITY,
   });
