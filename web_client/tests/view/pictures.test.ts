@@ -60,6 +60,7 @@ class FakeView {
     show: () => undefined,
   };
   touch = View.prototype.touch;
+  touchOverlay = View.prototype.touchOverlay;
   sessionTime = () => 0;
   moveBodies = () => this.isMoved;
   moveDeformables = () => false;
