@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from iris_session.authority import engagement
+from iris_session.authority.config import SECOND
 from iris_session.authority.context import Context, build_unknown_denial, find_grant
 from iris_session.authority.state import NO_REPLY, LeaseGrant, LeaseState, Participant, Pending
 from iris_session.protocol.client_messages import Release
@@ -11,13 +14,25 @@ from iris_session.protocol.names import DenialReason, HoldReason, LeaseMode, Tar
 from iris_session.protocol.server_messages import Feedback
 
 
+#: What a request can do that is denied because others hold its target.
+QUEUE_ADVICE: Final = "acquire with wait=True to queue for it"
+
+
 def build_held_denial(ctx: Context, lease: LeaseState, action: str = "ask the holder to release it") -> Denial:
-    """Return the denial `held`, with the holder and what to do."""
-    holder = ctx.get_holder(lease)
-    name = ctx.state.participants[holder].name if holder else ""
-    text = f"{lease.target} is held by {name}" if holder else f"others wait for {lease.target}"
-    advice = f"{action}, or acquire with wait to queue for it"
-    return Denial(DenialReason.HELD, text, advice, lease.target, holder, name)
+    """Return the denial `held`, with the holder and what to do.
+
+    A disconnected holder, such as a program that crashed or a tab that was closed, cannot be asked: the denial says
+    until when it keeps its lease.
+    """
+    holder = ctx.state.participants.get(ctx.get_holder(lease))
+    if holder is None:
+        return Denial(DenialReason.HELD, f"others wait for {lease.target}", QUEUE_ADVICE, lease.target)
+    text, advice = f"{lease.target} is held by {holder.name}", f"{action}, or {QUEUE_ADVICE}"
+    if holder.expires_ns:
+        ago_s, left_s = (ctx.now_ns - holder.heard_ns) // SECOND, -((ctx.now_ns - holder.expires_ns) // SECOND)
+        text += f", disconnected {ago_s} s ago, free in {left_s} s"
+        advice = f"{QUEUE_ADVICE}; a program that joins again with the same identity= resumes it"
+    return Denial(DenialReason.HELD, text, advice, lease.target, holder.id, holder.name)
 
 
 def revoke_grant(ctx: Context, lease: LeaseState, g: LeaseGrant) -> None:

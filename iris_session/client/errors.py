@@ -96,7 +96,7 @@ class DeniedError(ClientError):
             Its message, holder and advice.
         """
         name = denial.holder_name or denial.holder
-        who = "" if not name or name in denial.message.split() else f"held by {name}"
+        who = "" if not name or name in denial.message.replace(",", " ").split() else f"held by {name}"
         return join_parts(denial.message, who, denial.advice)
 
 

@@ -89,7 +89,7 @@ class Admission:
                     AuditKind.KEY_REFUSED, now_ns, subject=key_id, name=hello.name, address=address[0], detail="web"
                 )
             raise _RefusedError(
-                RefusalCode.UNPAIRED, "this key is not on the session's list (any more)", "pair anew with a join code"
+                RefusalCode.UNPAIRED, "this device is not paired with this session", "pair it with a join code"
             )
         budget = self._take_budget(key_id, hello, gateway, now_ns)
         resume_of = self._find_resumed(hello, key_id, address[0], now_ns)

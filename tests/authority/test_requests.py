@@ -623,3 +623,18 @@ def test_leases_of_one_request_are_one_event() -> None:
     assert [
         (lease.holder, who) for lease, who in zip(released.body.leases, released.body.previous_holders, strict=True)
     ] == [("", anna.id)] * 40
+
+
+def test_a_lease_of_a_disconnected_holder_says_since_when_and_until_when() -> None:
+    """Its holder cannot be asked: a program that crashed, or a tab that was closed."""
+    t = Table()
+    anna = t.operator("left")
+    t.step(anna.says(Lost("silent")))
+    t.wait(4 * SECOND)
+    denial = t.operator().acquire("left").denial
+    assert denial is not None
+    assert (denial.reason, denial.holder, denial.holder_name) == ("held", anna.id, anna.name)
+    assert "disconnected 4 s ago, free in 26 s" in denial.message
+    assert "ask the holder" not in denial.advice
+    assert "wait=True" in denial.advice
+    assert "identity=" in denial.advice

@@ -386,6 +386,26 @@ describe("joined", () => {
     expect(bench.last("phase").phase).toBe("ready");
   });
 
+  test.each([1001, 4000])("after its end a session is named as ended, until the next one welcomes (%i)", async (code) => {
+    await bench.join();
+    expect(bench.last("phase").ended).toBe(false);
+    bench.pass(1500);
+    if (code !== 4000) bench.say({ type: "protocol_fault", code: "session_ended", message: "the session has ended", reason: "" }, 1);
+    bench.socket.end(code);
+    expect(bench.last("phase")).toMatchObject({ ended: true });
+    for (let i = 0; i < 8; i++) {
+      bench.pass(2000);
+      bench.socket.end(1006);
+    }
+    expect(bench.last("phase")).toMatchObject({ phase: "waiting", ended: true });
+    bench.pass(2000);
+    bench.socket.open();
+    bench.welcome(2);
+    bench.snapshot("none", 2);
+    bench.pass(60);
+    expect(bench.last("phase")).toMatchObject({ phase: "ready", ended: false });
+  });
+
   test("a client that did too much joins again later", async () => {
     await bench.join();
     bench.pass(1500);

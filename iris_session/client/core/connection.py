@@ -96,6 +96,7 @@ class ClientConnection:
         self.failure: ClientError | None = None
         #: The newest refusal that passes, until a session welcomes us.
         self.retryable_refusal: Refused | None = None
+        self.session_ended = False  # the newest session that welcomed us said that it ends
         self.wake_ns = 0  # deadline of the shell's own work; 0: none
         self.last_protocol_fault: ProtocolFault | None = None  # the newest of `UNREAD_MESSAGE_FAULTS`
         self.stalled = False
@@ -194,6 +195,8 @@ class ClientConnection:
         if self.phase in (ConnectionPhase.WAITING, ConnectionPhase.JOINING):
             if self.retryable_refusal is not None:
                 return f"not let in yet, trying again: {RefusedError(self.retryable_refusal)}"
+            if self.session_ended:
+                return "the session has ended; joining as soon as there is one again"
             return "the connection was lost; joining again" if self.welcome else "no session has answered yet"
         texts = {
             ConnectionPhase.IDLE: "not connected: call connect() first",
@@ -333,7 +336,7 @@ class ClientConnection:
         self.stream.restart()
         self.mirror.synced = False
         self.welcome = welcome
-        self.retryable_refusal = None
+        self.retryable_refusal, self.session_ended = None, False
         self.counters.identity_unwritten += not self.identity.remember(welcome.resume_token)
         self.phase = ConnectionPhase.SYNCING
         self._joined_at = now_ns
@@ -373,6 +376,7 @@ class ClientConnection:
             self.phase = ConnectionPhase.REFUSED
         elif fault.code == "session_ended" and self.is_joined:
             self.counters.reconnects += 1
+            self.session_ended = True
             self._start_backoff(now_ns)
         elif fault.code in ("dropped", "hello"):
             self.handle_disconnect(now_ns)

@@ -143,6 +143,7 @@ def test_faults_end_the_connection(wire: Wire, code: str, phase: ConnectionPhase
     wire.join()
     wire.receive(ProtocolFault(code, "the session let this connection go: heartbeat"), SECOND)
     assert wire.connection.phase is phase
+    assert wire.connection.session_ended == (code == "session_ended")
     assert wire.connection.counters.faults == {code: 1}
 
 

@@ -162,6 +162,8 @@ export interface PhaseUpdate {
   close_code: number;
   /** True while the session reports that it does not step. */
   stalled: boolean;
+  /** True after the session has said that it ends, until one welcomes this page. */
+  ended: boolean;
 }
 
 export interface WelcomeUpdate {

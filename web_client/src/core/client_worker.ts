@@ -373,7 +373,8 @@ export class ClientWorker {
       return;
     }
     const nowNs = this.environment.nowNs();
-    if (code === CloseCode.FLOOD) connection.handleUnreachable(nowNs, true);
+    if (code === CloseCode.SESSION_ENDED && connection.isJoined) connection.handleSessionEnd(nowNs);
+    else if (code === CloseCode.FLOOD) connection.handleUnreachable(nowNs, true);
     else if (connection.isJoined) connection.handleDisconnect(nowNs);
     else connection.handleUnreachable(nowNs);
     this.pump();
@@ -507,12 +508,12 @@ export class ClientWorker {
     const advice = reason?.advice ?? "";
     const refusal = reason?.code ?? "";
     if (connection.isJoined) this.closeCode = 0;
-    this.environment.post({ type: "phase", phase, text, refusal, advice, close_code: this.closeCode, stalled }, []);
+    this.environment.post({ type: "phase", phase, text, refusal, advice, close_code: this.closeCode, stalled, ended: connection.sessionEnded }, []);
   }
 
   /** Post a failure that is not of the session. */
   private postFailure(refusal: string, text: string): void {
-    this.environment.post({ type: "phase", phase: "refused", text, refusal, advice: "", close_code: this.closeCode, stalled: false }, []);
+    this.environment.post({ type: "phase", phase: "refused", text, refusal, advice: "", close_code: this.closeCode, stalled: false, ended: false }, []);
   }
 
   private postBodies({ mirror }: ClientConnection): void {

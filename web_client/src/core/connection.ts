@@ -63,6 +63,8 @@ export class ClientConnection {
   failure: RefusedError | null = null;
   /** The newest refusal that passes, until a session welcomes us. */
   retryableRefusal: Refused | null = null;
+  /** The newest session that welcomed us said that it ends. */
+  sessionEnded = false;
   stalled = false;
   worn = true;
   trackingEpoch = 0;
@@ -133,6 +135,14 @@ export class ClientConnection {
     }
   }
 
+  /** Wait for the next session, and join that: this one has ended. */
+  handleSessionEnd(nowNs: number): void {
+    if (!this.isJoined) return;
+    this.counters.reconnects += 1;
+    this.sessionEnded = true;
+    this.startBackoff(nowNs);
+  }
+
   /**
    * Wait and join again: the socket could not be opened, was closed before the session answered, or was closed because this
    * client did too much (`later`).
@@ -184,6 +194,7 @@ export class ClientConnection {
   describe(): string {
     if (this.phase === "waiting" || this.phase === "joining") {
       if (this.retryableRefusal !== null) return `not let in yet, trying again: ${this.retryableRefusal.message}`;
+      if (this.sessionEnded) return "this page joins as soon as there is one again";
       return this.welcome === null ? "no session has answered yet" : "the connection was lost; joining again";
     }
     if (this.phase === "idle") return "not connected";
@@ -320,6 +331,7 @@ export class ClientConnection {
     this.mirror.synced = false;
     this.welcome = welcome;
     this.retryableRefusal = null;
+    this.sessionEnded = false;
     this.identity.remember(welcome.resume_token);
     this.phase = "syncing";
     this.joinedAt = nowNs;
@@ -356,10 +368,8 @@ export class ClientConnection {
     else if (refused !== null) {
       this.failure = new RefusedError(refused);
       this.phase = "refused";
-    } else if (fault.code === "session_ended" && this.isJoined) {
-      this.counters.reconnects += 1;
-      this.startBackoff(nowNs);
-    } else if (fault.code === "dropped" || fault.code === "hello") this.handleDisconnect(nowNs);
+    } else if (fault.code === "session_ended") this.handleSessionEnd(nowNs);
+    else if (fault.code === "dropped" || fault.code === "hello") this.handleDisconnect(nowNs);
   }
 
   private processEvent(event: Event, nowNs: number): void {

@@ -9,7 +9,7 @@ import { button, h, KeyedList, type Row, setOptions, setText, setValue } from ".
 import { makeSection, type Panel } from "./panel.ts";
 import { makeRobotControls } from "./robot_controls.ts";
 import type { ConsentAsked, PageState } from "./state.ts";
-import { holdReasonWords, leaseModeWords, limitWords } from "./words.ts";
+import { graceWords, holdReasonWords, leaseModeWords, limitWords } from "./words.ts";
 
 const MODES = ["exclusive", "request", "takeover", "priority", "shared"] as const;
 /** Why a robot holds that its holder does not move now. */
@@ -105,7 +105,7 @@ function describe(
   else if (WAITS_FOR_HOLDER.includes(reason) && state.heldBy(state.selfId).includes(robot)) parts.push("ready: drag the arrows at its gripper");
   else if (reason && lease?.holder) parts.push(`holds: ${holdReasonWords(reason, state.heldBy(state.selfId).includes(robot))}`);
   else if (report?.state && report.state !== "hold") parts.push("driven");
-  if (lease && lease.expires_ns > 0) parts.push("its holder is disconnected, the lease is kept for a while");
+  if (lease && lease.expires_ns > 0) parts.push(graceWords(lease.expires_ns, state.sessionTime()));
   if (lease && lease.sub_holders.length > 1) parts.push(`shared by ${lease.sub_holders.map((id) => state.nameOf(id)).join(", ")}`);
   if (lease && lease.queue.length > 0) parts.push(`waiting: ${lease.queue.map((id) => state.nameOf(id)).join(", ")}`);
   if (feedback && feedback.limits.length > 0) parts.push(limitWords(feedback.limits));

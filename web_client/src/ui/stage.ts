@@ -1,5 +1,6 @@
 // The picture and what lies over it: choice of camera, progress of loading, and words when there is no picture.
 
+import type { PhaseUpdate } from "../core/api.ts";
 import type { View } from "../view/view.ts";
 import { button, h, setOptions, setText } from "./dom.ts";
 import type { PageState } from "./state.ts";
@@ -13,6 +14,11 @@ const PHASE_WORDS: Record<string, string> = {
   refused: "The session refused this browser",
   closed: "The session has ended",
 };
+
+function phaseWords({ phase, refusal, ended }: PhaseUpdate): string {
+  if (refusal === "unpaired") return "This browser is not paired yet";
+  return ended && phase !== "refused" ? "The session has ended" : (PHASE_WORDS[phase] ?? phase);
+}
 
 export interface Stage {
   element: HTMLElement;
@@ -91,7 +97,7 @@ export function makeStage(state: PageState, actions: { pair: () => void; retry: 
       message.hidden = phase.phase === "ready" && !isStale;
       message.classList.toggle("slim", spec !== null);
       canvas.classList.toggle("outdated", !message.hidden);
-      setText(title, isStale ? "The session does not step" : (PHASE_WORDS[phase.phase] ?? phase.phase));
+      setText(title, isStale ? "The session does not step" : phaseWords(phase));
       setText(words, phase.text || info?.text || "");
       setText(advice, phase.advice);
       pair.hidden = !(phase.phase === "refused" && (phase.refusal === "unpaired" || phase.refusal === "code"));

@@ -23,6 +23,8 @@ import type { Mode } from "./stream_choices.ts";
 import { type EventLevel, eventWords } from "./words.ts";
 
 const MAX_EVENTS = 300;
+/** Newest lines of the history among which the line about a session that stands still is counted on. */
+const MAX_STALL_LINES = 30;
 /** Behind the session's newest frame: more than frames need on their way. */
 const BEHIND_MS = 2000;
 /** Frames of a stream, one of which comes here at least, by class (docs/protocol.md). In class `none` none comes. */
@@ -33,6 +35,8 @@ export interface LogEntry {
   session_time: number;
   text: string;
   level: EventLevel;
+  /** Of the line about a session that stood still: how often it did. Else 0. */
+  stalls: number;
 }
 
 export interface ConsentAsked {
@@ -62,6 +66,7 @@ const NO_PHASE: PhaseUpdate = {
   advice: "",
   close_code: 0,
   stalled: false,
+  ended: false,
 };
 
 /** State of the page. */
@@ -260,7 +265,21 @@ export class PageState {
   private take(message: InboxMessage): void {
     if (message.type === "feedback") this.feedback.set(message.robot, message);
     else if (message.type === "event") this.takeEvent(message);
-    else if (message.type === "protocol_fault") this.addLog(this.sessionTime(), message.message, "warning");
+    else if (message.type === "protocol_fault") this.takeFault(message);
+  }
+
+  private takeFault({ code, message }: Filled<wire.ProtocolFault>): void {
+    if (code === "stalled") this.addStall(this.sessionTime(), message, true);
+    else if (code === "recovered") this.addStall(this.sessionTime(), "the session stood still for a moment, and steps again", false);
+    else this.addLog(this.sessionTime(), message, "warning");
+  }
+
+  /** Add a line about a session that stands still, or did. A busy machine does so again and again: that is one line. */
+  private addStall(session_time: number, text: string, isNext: boolean): void {
+    const at = this.log.slice(0, MAX_STALL_LINES).findIndex(({ stalls }) => stalls > 0);
+    const before = at < 0 ? 0 : this.log.splice(at, 1)[0]!.stalls;
+    const stalls = before === 0 || isNext ? before + 1 : before;
+    this.addLog(session_time, stalls > 1 ? `${text} (${stalls} times)` : text, "warning", stalls);
   }
 
   private takeEvent({ session_time, body }: Filled<wire.Event>): void {
@@ -279,16 +298,18 @@ export class PageState {
       this.alignmentVersions.set(body.participant, version);
     }
     const words = eventWords(body, (id) => this.nameOf(id));
-    if (words) this.addLog(session_time, words.text, words.level);
+    if (!words) return;
+    if (body.event === "gap" && body.kind === "stalled") this.addStall(session_time, words.text, false);
+    else this.addLog(session_time, words.text, words.level);
   }
 
   /** Session time now [ns], 0 before the clock is known. */
-  private sessionTime(): number {
+  sessionTime(): number {
     return Number.isNaN(this.sessionOffset_ms) ? 0 : Math.round(1e6 * (nowMs() + this.sessionOffset_ms));
   }
 
-  private addLog(session_time: number, text: string, level: EventLevel): void {
-    this.log.unshift({ seq: this.nextSeq++, session_time, text, level });
+  private addLog(session_time: number, text: string, level: EventLevel, stalls = 0): void {
+    this.log.unshift({ seq: this.nextSeq++, session_time, text, level, stalls });
     this.log.length = Math.min(this.log.length, MAX_EVENTS);
   }
 }

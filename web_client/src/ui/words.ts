@@ -2,7 +2,7 @@
 
 import type { Filled } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { AlarmKind, AlignmentDoubt, BudgetClass, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
+import { AlarmKind, AlignmentDoubt, BudgetClass, DenialReason, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
 
 /** What helps when the clutch has to be opened and closed, whatever the clutch is: a key, a handle, a squeeze. */
 const AGAIN = "let go, then hold again";
@@ -204,8 +204,12 @@ export function formatSessionTime(ns: number): string {
 
 export const formatShare = (share: number): string => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;
 
-/** Return a denial as one sentence: what, who holds it, what to do. */
+/** Return when a lease whose holder is disconnected becomes free. */
+export const graceWords = (expires_ns: number, now_ns: number): string => `its holder is disconnected: free in ${formatAge(expires_ns - now_ns)}`;
+
+/** Return a denial as one sentence: what, who holds it, what to do. The advice for `held` is for programs: this page has a button. */
 export function denialWords(denial: Filled<wire.Denial>): string {
+  if (denial.reason === DenialReason.HELD) denial = { ...denial, advice: "“Wait for it” gives it to you as soon as it is free" };
   const holder = denial.holder_name && !denial.message.includes(denial.holder_name) ? ` Held by ${denial.holder_name}.` : "";
   const advice = denial.advice ? ` ${capitalize(denial.advice)}` : "";
   return `${capitalize(denial.message || denial.reason.replaceAll("_", " "))}${endSentence(denial.message)}${holder}${advice}`;
@@ -233,7 +237,7 @@ export function eventWords(
       return info(`${body.participant.name} ${body.resumed ? "is back" : `joined as ${roleWords(body.participant.role)}`}`);
     case "participant_left":
       return body.grace
-        ? warning(`${nameOf(body.participant)} lost the connection (${body.reason.replaceAll("_", " ")}); its leases are kept for a while`)
+        ? warning(`${nameOf(body.participant)} lost the connection (${body.reason.replaceAll("_", " ")}); what it holds is kept for it for a while`)
         : info(`${nameOf(body.participant)} left${body.reason ? ` (${body.reason.replaceAll("_", " ")})` : ""}`);
     case "lease_changed":
       return info(leaseSentence(body.lease, body.cause, body.previous_holder, nameOf));

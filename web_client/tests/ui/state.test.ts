@@ -68,6 +68,18 @@ test("a frame has an age until its stream is forgotten", () => {
   expect(state.ageOf("room")).toBeUndefined();
 });
 
+test("a session that stands still again and again is one line with a count", () => {
+  const sayMessages = (...messages: object[]): unknown => say({ type: "inbox", messages });
+  for (let i = 0; i < 3; i++) {
+    sayMessages({ type: "protocol_fault", code: "stalled", message: "the session does not step: robots hold" });
+    sayMessages({ type: "event", session_time: 1e9 * i, body: { event: "gap", kind: "stalled", duration_ns: 4e8, rows: 0 } });
+    sayMessages({ type: "event", session_time: 1e9 * i, body: { event: "marker_added", participant: "p1", text: "on" } });
+    sayMessages({ type: "protocol_fault", code: "recovered", message: "the session steps again" });
+  }
+  expect(state.log.map(({ stalls }) => stalls)).toEqual([3, 0, 0, 0]);
+  expect(state.log[0]!.text).toMatch(/steps again \(3 times\)/);
+});
+
 test("an alignment is void once the tracking frame has jumped, until the session has none or one to the new frame", () => {
   const align = (alignment: object | null): unknown => {
     say({ type: "session", participant_id: "p1", participants: [{ id: "p1", name: "ann", alignment }] });

@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
 
-import { denialWords, doubtWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, isDoubtful, limitWords, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
+import { denialWords, doubtWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, graceWords, isDoubtful, limitWords, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
 
 const nameOf = (id: string): string => ({ p1: "ann", p2: "ben" })[id] ?? "";
 type Body = Parameters<typeof eventWords>[0];
@@ -22,9 +22,16 @@ test("an event of another version is left out, not an error", () => {
 });
 
 test("a denial names the holder once, and the advice", () => {
-  const denial = { reason: "held", message: "left is held", advice: "wait for it", target: "left", holder: "p1" };
+  const denial = { reason: "not_holder", message: "left is held", advice: "wait for it", target: "left", holder: "p1" };
   expect(denialWords({ ...denial, holder_name: "ann" })).toBe("Left is held. Held by ann. Wait for it");
   expect(denialWords({ ...denial, message: "ann holds left.", holder_name: "ann" })).toBe("Ann holds left. Wait for it");
+});
+
+test("a denial of what others hold has no words of programs, and says when it is free", () => {
+  const denial = { reason: "held", message: "left is held by ann, disconnected 4 s ago, free in 26 s", advice: "acquire with wait=True", target: "left", holder: "p1", holder_name: "ann" };
+  expect(denialWords(denial)).toMatch(/^Left is held by ann, disconnected 4 s ago, free in 26 s\. .*Wait for it/);
+  expect(denialWords(denial)).not.toMatch(/wait=/);
+  expect(graceWords(30e9, 4e9)).toMatch(/free in 26 s/);
 });
 
 test("an unconfirmed alignment says why, also for a reason of another version", () => {
