@@ -8,50 +8,25 @@ from __future__ import annotations
 import math
 import sys
 
-from iris_session import Client, ClientError, HoldReason
-
-#: Holds that end only when the clutch is opened and closed again; others need no reaction.
-OPEN_CLUTCH = frozenset(
-    {
-        HoldReason.REARM,
-        HoldReason.REJECTED,
-        HoldReason.STALE,
-        HoldReason.GAP,
-        HoldReason.SCENE_CHANGED,
-        HoldReason.ESTOP,
-    }
-)
-
-
-def may_close(client: Client, robot: str) -> bool:
-    """Return whether to close the clutch: after a disturbance it must be opened first."""
-    feedback = client.feedback.get(robot)
-    return feedback is not None and feedback.hold_reason not in OPEN_CLUTCH
+from iris_session import Client, ClientError
 
 
 def main(address: str, seconds: float) -> None:
-    with Client(address, role="agent", name="policy", devices=("target",)) as client:
-        (lease,) = client.acquire()  # no name: the assignment policy of the session chooses
-        robot = lease.target
-        if not client.wait_for(lambda c: c.scene.tip_pose(robot) is not None):
-            raise SystemExit("no state arrived within 5 s")
+    with Client(address, role="agent", name="policy", devices="target") as client:
+        robot = client.acquire()[0].target  # no name: the assignment policy of the session chooses
+        client.wait_for(lambda c: c.scene.tip_pose(robot) is not None)
         tip = client.scene.tip_pose(robot)
-        assert tip is not None
+        assert tip is not None, "no state arrived within 5 s"
         (x, y, z), q = tip
-        period_ns = 1_000_000_000 // 60
-        begun = due = client.session_now_ns()
-        while client.session_now_ns() < begun + int(seconds * 1e9):
-            t = (client.session_now_ns() - begun) * 1e-9
+        begun = client.session_now_ns()
+        while (t := (client.session_now_ns() - begun) * 1e-9) < seconds:
             angle, radius = 0.8 * t, 0.05 * min(1.0, t)
             target = (x + radius * math.cos(angle), y + radius * math.sin(angle), z)
-            client.send_sample("target", (target, q), robots=[robot], clutch=may_close(client, robot))
-            due += period_ns
-            client.sleep((due - client.session_now_ns()) * 1e-9)
-        feedback = client.feedback.get(robot)
-        rejected = dict(feedback.rejected) if feedback is not None else {}
-        moved = client.scene.tip_pose(robot)
-        assert moved is not None
-        print(f"{robot}: tip moved {1e3 * math.dist(moved[0], (x, y, z)):.0f} mm, rejected samples: {rejected}")
+            client.send_target(robot, (target, q))  # opens the clutch and closes it again after a disturbance
+            client.sleep(1 / 60)
+        moved, _ = client.scene.tip_pose(robot) or tip
+        rejected = client.feedback[robot].rejected
+        print(f"{robot}: tip moved {1e3 * math.dist(moved, (x, y, z)):.0f} mm, rejected samples: {rejected}")
 
 
 if __name__ == "__main__":

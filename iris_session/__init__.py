@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         RequestTimeoutError,
         SceneState,
         TrustError,
+        UnreachedError,
         find_sessions,
         wait_any,
     )
@@ -143,6 +144,7 @@ _PUBLIC: Final = {
         "RequestTimeoutError",
         "InvalidMessageError",
         "TrustError",
+        "UnreachedError",
         "AssetError",
         "FoundSession",
         "find_sessions",
@@ -212,6 +214,7 @@ __all__ = [
     "RequestTimeoutError",
     "InvalidMessageError",
     "TrustError",
+    "UnreachedError",
     "AssetError",
     "FoundSession",
     "find_sessions",

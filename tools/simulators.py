@@ -111,10 +111,8 @@ class Watch:
 
 def run_case(name: str) -> dict[str, Any]:
     """Share a simulation for ten seconds; return what was seen."""
-    from iris_session import Client, Deformables, HoldReason, SessionConfig, share
+    from iris_session import Client, Deformables, SessionConfig, share
 
-    # After these holds the clutch must be opened first; see examples/policy.py.
-    open_clutch = {HoldReason.REARM, HoldReason.REJECTED, HoldReason.STALE, HoldReason.GAP, HoldReason.ESTOP}
     case: Case = CASES[name]()
     config = SessionConfig(name=name, control_port=0, state_port=0, beacon_port=0, record=False, web=False)
     watch, steps = Watch(), round(SECONDS / case.dt)
@@ -138,9 +136,7 @@ def run_case(name: str) -> dict[str, Any]:
                 (x, y, z), q = start
                 up = LIFT * min(1.0, max(0.0, (t - DRIVE_FROM - 0.2) / 2.0))
                 goal = (float(x), float(y), float(z) + up), tuple(map(float, q))
-                feedback = driver.feedback.get(case.robot)
-                may_close = feedback is not None and feedback.hold_reason not in open_clutch
-                driver.send_sample("target", goal, robots=[case.robot], clutch=may_close)
+                driver.send_target(case.robot, goal)
             watch.begun.append(session.clock())
             case.step()
             watch.truth.append((case.read_poses(), case.read_vertices()))

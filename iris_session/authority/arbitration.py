@@ -15,19 +15,31 @@ import msgspec
 
 from anchors.pose import compose, inverse, quat_rotate
 from iris_session.authority import ageing, engagement, roster, samples, tracking
+from iris_session.authority.config import SECOND
 from iris_session.authority.context import HUMAN, Context
-from iris_session.authority.state import DeviceState, FeedbackState, JointReading, LeaseGrant, LeaseState, Participant
+from iris_session.authority.state import (
+    DeviceState,
+    FeedbackState,
+    JointReading,
+    LeaseGrant,
+    LeaseState,
+    Participant,
+    WarningState,
+)
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import CommandKind, Device, HoldReason, LeaseMode, RejectReason, SampleKind
-from iris_session.protocol.server_messages import Feedback, PresenceItem
+from iris_session.protocol.server_messages import Feedback, Notice, PresenceItem
 from iris_session.protocol.steps import Command, CommandSource, ObjectCommand
 
 #: Objects farther away than this [m] have left the scene; far below what arithmetic can hold.
 _FARTHEST: Final = 1e9
 #: Hold reasons after which a closed clutch changes the reason to `rearm`: the clutch must open and close again.
 _WAITING = (HoldReason.NO_SAMPLE, HoldReason.CLUTCH_OPEN)
+#: A gripper value that is out of range by more than rounding is reported: a policy has other units (0 to 255, -1 to 1).
+GRIPPER_SLACK: Final = 0.01
+GRIPPER_REPORT_NS: Final = 60 * SECOND
 _INVISIBLE = (Device.JOINTS, Device.TARGET)
 
 
@@ -170,6 +182,19 @@ def _set_source(ctx: Context, p: Participant, lease: LeaseState, g: LeaseGrant, 
     g.counted_ns, g.counted_step = ctx.now_ns, ctx.state.step
     if s.gripper is not None:
         g.gripper = min(1.0, max(0.0, float(s.gripper)))
+        if ctx.config.explains and abs(s.gripper - g.gripper) > GRIPPER_SLACK:
+            _report_clipped_gripper(ctx, p, lease, s.gripper, g.gripper)
+
+
+def _report_clipped_gripper(ctx: Context, p: Participant, lease: LeaseState, asked: float, used: float) -> None:
+    """Report a gripper value that is out of range: at once, then once a minute with the number of samples."""
+    w = p.warnings.setdefault("gripper", WarningState(said_ns=ctx.now_ns - GRIPPER_REPORT_NS))
+    w.left_out += 1
+    if ctx.now_ns - w.said_ns >= GRIPPER_REPORT_NS:
+        n = "" if w.left_out == 1 else f" ({w.left_out} samples)"
+        text = f"gripper {asked:g} for {lease.target} is not between 0 (open) and 1 (closed): {used:g} is used{n}"
+        ctx.emit(Notice("warning", f"{p.name}: {text}", p.id))
+        w.said_ns, w.left_out = ctx.now_ns, 0
 
 
 def _publish_presence(ctx: Context, p: Participant, s: Sample) -> None:

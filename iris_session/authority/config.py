@@ -149,6 +149,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # output
     feedback_ns: int = 50 * MS
     report_ns: int = SECOND  # between two `samples_rejected` events of one kind
+    explains: bool = True  # how long the lease of a disconnected holder is kept; grippers that are out of range
     warning_ns: int = 5 * SECOND  # between two warnings of one kind about the alignment of one participant
     contact_step_n: float = 0.5  # contact force is reported in steps of this size [N]
     max_step_ticks: int = 10_000

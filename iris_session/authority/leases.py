@@ -13,9 +13,8 @@ from iris_session.protocol.common import Denial
 from iris_session.protocol.names import DenialReason, HoldReason, LeaseMode, TargetKind
 from iris_session.protocol.server_messages import Feedback
 
-
 #: What a request can do that is denied because others hold its target.
-QUEUE_ADVICE: Final = "acquire with wait=True to queue for it"
+QUEUE_ADVICE: Final = "acquire with wait to queue for it"
 
 
 def build_held_denial(ctx: Context, lease: LeaseState, action: str = "ask the holder to release it") -> Denial:
@@ -28,7 +27,7 @@ def build_held_denial(ctx: Context, lease: LeaseState, action: str = "ask the ho
     if holder is None:
         return Denial(DenialReason.HELD, f"others wait for {lease.target}", QUEUE_ADVICE, lease.target)
     text, advice = f"{lease.target} is held by {holder.name}", f"{action}, or {QUEUE_ADVICE}"
-    if holder.expires_ns:
+    if holder.expires_ns and ctx.config.explains:
         ago_s, left_s = (ctx.now_ns - holder.heard_ns) // SECOND, -((ctx.now_ns - holder.expires_ns) // SECOND)
         text += f", disconnected {ago_s} s ago, free in {left_s} s"
         advice = f"{QUEUE_ADVICE}; a program that joins again with the same identity= resumes it"

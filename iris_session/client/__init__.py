@@ -21,6 +21,7 @@ from iris_session.client.errors import (
     RequestTimeoutError,
     SessionNameError,
     TrustError,
+    UnreachedError,
     VersionError,
 )
 from iris_session.client.group import ClientGroup, poll_all, wait_any
@@ -54,5 +55,6 @@ __all__ = [
     "RequestTimeoutError",
     "SessionNameError",
     "TrustError",
+    "UnreachedError",
     "VersionError",
 ]

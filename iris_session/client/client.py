@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final, Self
 
 from iris_session.client.alignment import ClientAlignment
-from iris_session.client.arguments import PoseLike, to_names, to_numbers, to_pose, to_python_scalar, to_text
+from iris_session.client.arguments import to_names, to_text
 from iris_session.client.assets import ClientAssets
 from iris_session.client.core.arrival_meter import ArrivalMeter
 from iris_session.client.core.connection import ClientConnection
@@ -23,6 +23,7 @@ from iris_session.client.core.outbox import encode_checked
 from iris_session.client.core.samples import SampleBuilder
 from iris_session.client.core.state_stream import SceneState
 from iris_session.client.core.status import ConnectionPhase
+from iris_session.client.driving import ClientDriving
 from iris_session.client.endpoint_resolver import SessionJoiner, parse_connect_request
 from iris_session.client.errors import (
     ClientError,
@@ -48,8 +49,6 @@ from iris_session.protocol.client_messages import (
     Hello,
     Marker,
     Release,
-    Sample,
-    Samples,
     SetMode,
     SetScale,
 )
@@ -64,20 +63,16 @@ DEFAULT_TIMEOUT_S: Final = 5.0
 STATUS_RETRY_S: Final = 0.5
 #: Roles that have no headset, so nothing to align.
 UNALIGNED_ROLES: Final = frozenset({Role.AGENT, Role.LEADER, Role.GATEWAY, Role.RECORDER, Role.CAMERA, Role.SOURCE})
-#: Fields of `Sample` that are lists of numbers, and their lengths.
-ARRAYS: Final[dict[str, int | None]] = {"q": None, "qd": None, "hand_joints": None, "twist": 6}
 
 
-class Client:
+class Client(ClientDriving):
     """A participant of a session.
 
-        with Client("127.0.0.1:7721", role="agent", name="policy", devices=("target",)) as client:
-            client.acquire(["left"])
+        with Client("127.0.0.1:7721", role="agent", name="policy", devices="target") as client:
+            client.acquire("left")
             client.wait_for(lambda c: c.scene.tip_pose("left") is not None)
-            target = client.scene.tip_pose("left")  # T_world_tip: move it
-            for i in range(90):  # the clutch must be seen open once; after 150 ms without a sample the robot holds
-                client.send_sample("target", target, robots=["left"], clutch=i > 0)
-                client.sleep(1 / 60)
+            (x, y, z), q = client.scene.tip_pose("left")  # T_world_tip
+            client.move_to("left", ((x, y, z + 0.05), q))  # in a loop of your own: send_target
 
     Attributes:
         scene: The scene as it is now: newest state, poses by name, presence.
@@ -681,86 +676,3 @@ class Client:
             DeniedError: We may not.
         """
         self.request(Marker(0, text))
-
-    # --- samples ------------------------------------------------------------------------------------------------------
-
-    def send_sample(self, device: str, pose: PoseLike | None = None, **fields: Any) -> bool:
-        """Make one sample of a device with `make_sample`, and send it.
-
-        Args:
-            device: Name of the device, one of `devices`.
-            pose: `T_tracking_device`, `((x, y, z) [m], (w, x, y, z))`.
-            fields: As in `make_sample`.
-
-        Returns:
-            False: dropped for want of a connection, and counted.
-
-        Raises:
-            InvalidMessageError: A value does not fit the protocol; the text names the field.
-        """
-        return self.send(self.make_sample(device, pose, **fields))
-
-    def send_samples(self, samples: Iterable[Sample]) -> bool:
-        """Send samples of several devices as one message.
-
-        For devices that are sampled together: one packet instead of three, and a third of the work on both sides.
-
-        Args:
-            samples: At most 8, from `make_sample`.
-
-        Returns:
-            False: dropped for want of a connection, and counted.
-
-        Raises:
-            InvalidMessageError: A value does not fit the protocol.
-        """
-        return self.send(Samples(tuple(samples)))
-
-    def make_sample(
-        self,
-        device: str,
-        pose: PoseLike | None = None,
-        *,
-        robots: str | Iterable[str] = (),
-        objects: str | Iterable[str] = (),
-        kind: str | None = None,
-        capture_ns: int | None = None,
-        tracking_epoch: int | None = None,
-        **fields: Any,
-    ) -> Sample:
-        """Make a sample of a device as of now; epochs, versions, fencing tokens and `seq` are filled in.
-
-        Args:
-            device: Name of the device, one of `devices`.
-            pose: `T_tracking_device`, `((x, y, z) [m], (w, x, y, z))`.
-            robots: Robots that it drives, one name or several. Those that are not ours are left out (counter
-                `samples_without_lease`), so the sample is mere presence when none is.
-            objects: Objects that it moves, in the same way.
-            kind: A `SampleKind`; by default `joints` with `q`, `twist` with `twist`, else `pose`.
-            capture_ns: Session time of capture [ns], default now.
-            tracking_epoch: Epoch of the tracking frame, default the present one.
-            fields: Other fields of `Sample` (`clutch`, `gripper`, `q` [rad or m], `twist`, ...); arrays are fine.
-
-        Returns:
-            The sample.
-
-        Raises:
-            InvalidMessageError: A value does not fit the protocol, or the session has no such robot or object.
-        """
-        for name, length in ARRAYS.items():
-            if fields.get(name) is not None:
-                fields[name] = to_numbers(name, fields[name], length)
-        fields = {name: to_python_scalar(value) for name, value in fields.items()}
-        own_pose = None if pose is None else to_pose("pose", pose)
-        robots, objects = to_names("robots", robots), to_names("objects", objects)
-        with self._lock:
-            return self._samples.make_sample(
-                device,
-                own_pose,
-                capture_ns=self.session_now_ns() if capture_ns is None else capture_ns,
-                robots=robots,
-                objects=objects,
-                kind=kind,
-                tracking_epoch=tracking_epoch,
-                **fields,
-            )

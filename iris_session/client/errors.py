@@ -7,6 +7,7 @@
     +-- DeniedError            the session denied a request: `denial` (reason, holder, advice); nothing changed
     +-- RequestTimeoutError    no answer in time (also a `TimeoutError`); the request may still take effect,
     |                          but for an `acquire`, which is withdrawn
+    +-- UnreachedError         a motion did not end in time (also a `TimeoutError`): how far away, and why
     +-- InvalidMessageError    a message does not fit the protocol (also a `ValueError`); nothing was sent
     +-- IdentityError          the identity file cannot be used
     +-- TrustError             the session's key is not the trusted one, or it could not prove the join code
@@ -18,10 +19,12 @@ Malformed messages from a server never raise: they are counted in `Client.counte
 
 from __future__ import annotations
 
+import math
+
 from iris_session.assets.errors import AssetStoreError
 from iris_session.protocol.common import Denial
 from iris_session.protocol.errors import IrisError
-from iris_session.protocol.server_messages import Refused
+from iris_session.protocol.server_messages import Feedback, Refused
 
 
 class ClientError(IrisError):
@@ -114,6 +117,38 @@ class RequestTimeoutError(ClientError, TimeoutError):
     def __init__(self, text: str, denial: Denial | None = None) -> None:
         super().__init__(text)
         self.denial = denial
+
+
+class UnreachedError(ClientError, TimeoutError):
+    """`move_to` did not reach its pose in time.
+
+    Args:
+        robot: Name of the robot.
+        timeout_s: Time that it had [s].
+        distance_m: See the attribute.
+        angle_rad: See the attribute.
+        feedback: The newest of the robot.
+
+    Attributes:
+        distance_m: Of the end effector from the pose [m], infinite when the robot was never driven.
+        angle_rad: Of the end effector from the pose [rad].
+        feedback: The newest of the robot: reason why it holds, or its active limits; `None` when none has come.
+    """
+
+    def __init__(
+        self, robot: str, timeout_s: float, distance_m: float, angle_rad: float, feedback: Feedback | None
+    ) -> None:
+        away = f"{1e3 * distance_m:.0f} mm and {math.degrees(angle_rad):.0f} degrees away"
+        if math.isinf(distance_m):
+            away = "it was never driven"
+        if feedback is None:
+            why = "the session has reported nothing about it: do you hold it?"
+        elif feedback.hold_reason:
+            why = f"it holds: {feedback.hold_reason}"
+        else:
+            why = f"its limits: {', '.join(feedback.limits)}" if feedback.limits else "give it more time"
+        super().__init__(f"{robot} did not reach its pose within {timeout_s:g} s: {away}; {why}")
+        self.distance_m, self.angle_rad, self.feedback = distance_m, angle_rad, feedback
 
 
 class InvalidMessageError(ClientError, ValueError):

@@ -28,6 +28,7 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
     ageing: AgeingLaw | None = None
     verify_pairs: bool = False
     min_change_share: float = 1e9
+    explains: bool = False
 
 
 class _RecordedControlConfig(ControlConfig, frozen=True):

@@ -10,10 +10,11 @@ import msgspec
 import pytest
 
 from iris_session.authority import AuthorityConfig
+from iris_session.authority.arbitration import GRIPPER_REPORT_NS
 from iris_session.protocol.client_messages import Acquire, Control, Grasp, Release
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Lost
-from iris_session.protocol.server_messages import EngagementChanged, Feedback, ObjectGrasped
+from iris_session.protocol.server_messages import EngagementChanged, Feedback, Notice, ObjectGrasped
 from iris_session.protocol.steps import ControlStatus
 
 from .table import MS, Person, Table, make_view
@@ -113,6 +114,21 @@ def test_gripper_is_clamped_and_kept_within_an_engagement() -> None:
     assert t.command().gripper == 0.0
     op.engage("left")
     assert t.command().gripper is None
+
+
+def test_a_gripper_out_of_range_is_reported_at_once_and_counted_once_a_minute() -> None:
+    t = Table()
+    op = t.operator("left")
+    op.engage("left", gripper=1.0000001)
+    assert not [event for event in t.events if isinstance(event, Notice)], "that is rounding"
+    for i in range(100):
+        op.sends("left", clutch=True, gripper=255.0 if i else -1.0)
+    (notice,) = [event for event in t.events if isinstance(event, Notice)]
+    assert (notice.level, notice.participant) == ("warning", op.id)
+    assert "-1 for left" in notice.text
+    t.now_ns += GRIPPER_REPORT_NS
+    op.engage("left", gripper=255.0)
+    assert "(100 samples)" in t.last(Notice).text
 
 
 # --- feedback to holders ---

@@ -69,7 +69,7 @@ def test_invalid_samples_raise_at_once_and_name_the_field(session: ClientSession
     ann = join(devices="target")
     assert ann.connection.hello.devices == ("target",)
     bad: list[tuple[str, tuple[object, ...], dict[str, object]]] = [
-        ("gripper", ("target", HERE), {"gripper": "closed"}),
+        *[("gripper", ("target", HERE), {"gripper": value}) for value in ("closed", "5", True)],
         ("pose", ("target", "up"), {}),
         ("pose", ("target", [1, 2, 3, 1, 0, 0, 0]), {}),
         ("pose", ("target", np.zeros(7)), {}),
@@ -90,6 +90,14 @@ def test_invalid_samples_raise_at_once_and_name_the_field(session: ClientSession
     ann.marker("after")
     assert not session.messages_of(Sample)
     assert_no_faults(ann)
+
+
+def test_a_gripper_out_of_range_is_sent_counted_and_logged_once(join: Join, caplog: pytest.LogCaptureFixture) -> None:
+    ann = join(devices="target")
+    for gripper in (0.0, 1.0, 255.0, np.float32(-0.5)):
+        assert ann.send_sample("target", HERE, gripper=gripper)
+    assert ann.counters()["control"]["grippers_clipped"] == 2
+    assert [record.name for record in caplog.records] == ["iris_session.client"]
 
 
 def test_arrays_and_numpy_scalars_are_accepted(session: ClientSession, join: Join) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from typing import Any
 
@@ -10,6 +11,8 @@ from iris_session.client.errors import InvalidMessageError
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.names import SampleKind, TargetKind
+
+_log = logging.getLogger("iris_session.client")
 
 
 class SampleBuilder:
@@ -37,6 +40,11 @@ class SampleBuilder:
         session does not have.
         """
         connection = self._connection
+        gripper = fields.get("gripper")
+        if isinstance(gripper, int | float) and not 0.0 <= gripper <= 1.0:
+            connection.counters.grippers_clipped += 1
+            if connection.counters.grippers_clipped == 1:
+                _log.warning("gripper %g is not between 0 (open) and 1 (closed): the session clips it", gripper)
         if kind is None:
             kind = (
                 SampleKind.JOINTS if fields.get("q") else SampleKind.TWIST if fields.get("twist") else SampleKind.POSE

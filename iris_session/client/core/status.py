@@ -28,6 +28,7 @@ class ConnectionCounters:
     received: int = 0
     samples_not_sent: int = 0  # no connection, or the socket was full: late samples are worthless, they are not kept
     samples_without_lease: int = 0  # named a robot or object that is not ours: sent as mere presence, without it
+    grippers_clipped: int = 0  # gripper values out of range, which the session clips to 0 to 1
     outgoing_dropped: int = 0  # the bounded queue of control messages was full
     malformed: int = 0  # frames that do not fit the protocol
     other_connection: int = 0  # addressed to an earlier connection of ours

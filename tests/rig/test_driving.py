@@ -1,0 +1,78 @@
+"""Programs that drive robots: `move_to`, `send_target`, and a clutch that is opened and closed again by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from anchors.pose import PoseTuple, distance
+from iris_session.client import Client, UnreachedError
+from iris_session.protocol.client_messages import ClearEStop
+from iris_session.protocol.names import HoldReason
+from iris_session.protocol.server_messages import EngagementChanged
+from tests.rig.session import Rig, see_tip
+
+SECOND = 1_000_000_000
+
+
+def join_policy(rig: Rig) -> tuple[Client, PoseTuple]:
+    """Join a policy that holds `left`. Return it, and the pose of the end effector."""
+    policy = rig.join("policy", "agent")
+    policy.acquire("left")
+    rig.run_until(lambda: policy.scene.tip_pose("left") is not None)
+    return policy, see_tip(policy, "left")
+
+
+def list_ends(rig: Rig, name: str = "policy") -> list[str]:
+    """Return the reasons of the engagements that have ended, as a client has learnt them."""
+    return [body.reason for _, body in rig.list_events(name, EngagementChanged) if not body.engaged]
+
+
+def test_move_to_reaches_a_pose_again_and_again_and_waits_for_the_gripper() -> None:
+    with Rig(timestep=0.01) as rig:
+        policy, ((x, y, z), q) = join_policy(rig)
+        policy.move_to("left", ((x, y + 0.1, z + 0.1), q), gripper=1.0, settle_s=0.5)
+        assert distance(see_tip(policy, "left")[0], (x, y + 0.1, z + 0.1)) < 0.003
+        rig.run(0.5)
+        assert list_ends(rig) == [HoldReason.STALE], "it holds once nothing is sent"
+        policy.move_to("left", ((x, y, z), q))
+        assert distance(see_tip(policy, "left")[0], (x, y, z)) < 0.003
+        assert not any(policy.feedback["left"].rejected.values())
+
+
+def test_a_motion_goes_on_after_a_stall_an_estop_and_a_lost_connection() -> None:
+    with Rig(timestep=0.01) as rig:
+        policy, ((x, y, z), q) = join_policy(rig)
+        director = rig.join("dora", "director")
+        now_ns = rig.simulation.now_ns
+        disturbances: tuple[tuple[float, Callable[[], object]], ...] = (
+            (1.0, lambda: rig.stop_loop(0.5)),
+            (3.0, lambda: director.estop("test")),
+            (4.0, lambda: director.submit(ClearEStop(0, 1))),
+            (5.0, lambda: rig.cut(policy)),
+        )
+        for at_s, disturb in disturbances:
+            rig.simulation.call_at(now_ns + round(at_s * SECOND), disturb)  # type: ignore[arg-type]
+        for height in (0.05, 0.0) * 3:
+            policy.move_to("left", ((x, y, z + height), q), settle_s=1.0)
+        assert {HoldReason.GAP, HoldReason.ESTOP, HoldReason.DISCONNECTED} <= set(list_ends(rig, "dora"))
+        assert distance(see_tip(policy, "left")[0], (x, y, z)) < 0.003
+
+
+def test_a_pose_that_is_not_reached_says_how_far_and_why() -> None:
+    with Rig(timestep=0.01) as rig:
+        policy, ((x, y, z), q) = join_policy(rig)
+        assert not policy.is_armed("left"), "the session has not seen the clutch open"
+        with pytest.raises(UnreachedError) as far:
+            policy.move_to("left", ((x + 3.0, y, z), q), timeout_s=2.0)
+        assert far.value.distance_m > 1.0
+        assert far.value.feedback is not None
+        assert "reach" in far.value.feedback.limits
+        policy.estop("test")
+        with pytest.raises(UnreachedError) as stopped:
+            policy.move_to("left", ((x, y, z), q), timeout_s=1.0)
+        assert stopped.value.feedback is not None
+        assert stopped.value.feedback.hold_reason == HoldReason.ESTOP
+        policy.release("left")
+        assert not policy.is_armed("left")
