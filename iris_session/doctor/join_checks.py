@@ -16,6 +16,7 @@ from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.names import DenialReason, RefusalCode
 from iris_session.protocol.pairing import normalise_code
+from iris_session.protocol.server_messages import Endpoints
 from iris_session.protocol.status import StatusReport, compute_quantiles
 from iris_session.security import KeyHome, KeysError, compute_fingerprint, decode_key
 
@@ -162,7 +163,10 @@ def explain_refusal(error: ClientError) -> Finding:
             return failed("role", text, error.advice, f"{advice}: iris-session keys allow")
         return failed("join", f"refused ({error.code}): {error.message}", "", error.advice)
     if isinstance(error, NotConnectedError):
-        advice = "is it the port of another program? a firewall that accepts every connection? the wrong server key?"
+        advice = (
+            "compare the port with the one that `iris-session serve` prints, and try without the firewall between; "
+            "if the session has new keys: iris-session keys forget, then pair again"
+        )
         return failed("join", "the port accepts connections, but no session answers", text, advice)
     return failed("join", text)
 
@@ -184,7 +188,10 @@ def _inspect_joined_session(
         attempt.report = client.status(ANSWER_S)
     except (RequestTimeoutError, NotConnectedError) as error:
         attempt.findings.append(failed("join", f"the connection did not last: {error}", "", "check the network"))
-    attempt.findings += [_check_clock(client), _check_state(client, states)]
+    welcome = client.connection.welcome
+    endpoints = Endpoints() if welcome is None else welcome.endpoints
+    attempt.findings += [_check_clock(client), _check_state(client, states, endpoints.state)]
+    attempt.findings += check_ports(Address.parse(client.address), endpoints)
 
 
 def _check_clock(client: Client) -> Finding:
@@ -195,18 +202,24 @@ def _check_clock(client: Client) -> Finding:
     return ok("clock", text)
 
 
-def _check_state(client: Client, states: list[SceneState]) -> Finding:
-    """Check the state that we received, or why none arrived."""
-    welcome = client.connection.welcome
+def check_ports(address: Address, endpoints: Endpoints) -> list[Finding]:
+    """Check whether the ports of the page, of media and of assets accept connections; those that the session has."""
+    ip = network_checks.check_address(address)[1]
+    ports = {"web": endpoints.web, "media": endpoints.media, "assets": endpoints.assets}
+    return [network_checks.check_tcp(address, ip, port, f"{name}_port", name) for name, port in ports.items() if port]
+
+
+def _check_state(client: Client, states: list[SceneState], port: int) -> Finding:
+    """Check the state that we received, or why none arrived. `port`: of the state."""
     if not states:
-        port = 0 if welcome is None else welcome.endpoints.state
         address = Address.parse(client.address)
         client.close()  # the next check takes seconds without heartbeats: we would be reported as disconnected
         ip = network_checks.check_address(address)[1]
         finding = network_checks.check_tcp(address, ip, port, "state", "state")
         if finding.failed:
             return finding
-        return failed("state", f"no state arrives, but port {port} accepts connections", "the session does not step?")
+        text, why = f"no state arrives, but port {port} accepts connections", "the session may have stopped stepping"
+        return failed("state", text, why, "see the check `session`; if it steps, join again")
     return check_state_age(states, client.connection.stream.counters.queued_old)
 
 

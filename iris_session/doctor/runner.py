@@ -28,10 +28,10 @@ SESSION_CHECKS: Final = (
 #: As a user asks: is there a route, am I admitted, does state arrive, how is the session?
 ORDER: Final = (
     "beacon", "address", "subnet", "tcp", "introduction", "version", "server_key", "key", "code", "role", "join",
-    "clock", "state", *SESSION_CHECKS,
+    "clock", "state", "web_port", "media_port", "assets_port", *SESSION_CHECKS,
 )  # fmt: skip
 #: Checks that are not made every time.
-OPTIONAL: Final = frozenset({"beacon", "code"})
+OPTIONAL: Final = frozenset({"beacon", "code", "web_port", "media_port", "assets_port"})
 
 
 @dataclass

@@ -48,22 +48,26 @@ LATE_CAUSES: Final = {
 }
 #: Advice by reason why a robot holds still although its holder does not want that.
 HOLD_ADVICE: Final = {
-    HoldReason.NO_SAMPLE: "no sample was accepted yet: does the app send samples that name this robot?",
-    HoldReason.STALE: "no accepted sample for 150 ms: the network is slow, or the app stopped sending",
-    HoldReason.UNTRACKED: "the device is not tracked: bring it into view",
-    HoldReason.UNALIGNED: "no alignment, or its error here is too large: bring the sheet into view",
-    HoldReason.VIEW_ONLY: "aligned by a fingertip or a kept anchor: touch marks with a calibrated tip",
-    HoldReason.EMULATED: "the position of the device is an estimate: bring it into the view of the headset's cameras",
-    HoldReason.ZERO_POSE: "the device reports the origin of its tracking frame: wait until it is tracked",
-    HoldReason.FROZEN: "the device reports one pose again and again: move it, or wake it",
-    HoldReason.JUMP: "the tracking of the device jumped: open and close the clutch",
-    HoldReason.UNCONFIRMED: "its alignment is doubted: glance at a sheet, then open and close the clutch",
-    HoldReason.REJECTED: "a sample was rejected: see `rejected`; open and close the clutch",
-    HoldReason.DISCONNECTED: "its holder is disconnected; the lease is kept for a grace period",
+    HoldReason.NO_SAMPLE: "let the app send samples that name this robot, with the clutch open first",
+    HoldReason.STALE: "bring the app to the front, check its network, then open and close the clutch",
+    HoldReason.UNTRACKED: "bring the device into view of the headset's cameras",
+    HoldReason.UNALIGNED: "bring the sheet into view, nearer or from a second place",
+    HoldReason.VIEW_ONLY: "touch marks with a calibrated tip: a fingertip or a kept anchor is enough to look only",
+    HoldReason.EMULATED: "bring the device into view of the headset's cameras: its position is an estimate",
+    HoldReason.ZERO_POSE: "wait until the device is tracked: it reports the origin of its tracking frame",
+    HoldReason.FROZEN: "move the device, or wake it: it reports one pose again and again",
+    HoldReason.JUMP: "open and close the clutch: the tracking of the device jumped",
+    HoldReason.UNCONFIRMED: "glance at a sheet, then open and close the clutch",
+    HoldReason.REJECTED: "see `rejected` for the reason, then open and close the clutch",
+    HoldReason.DISCONNECTED: "wait until its holder is back or its lease ends, or let a director assign the robot",
 }
 
-HEADSET_ADVICE: Final = "check that headset: is the app in front, is it worn, how good is its Wi-Fi?"
-PROGRAM_ADVICE: Final = "check that program: does it run, and does its machine have processor time left for it?"
+HEADSET_ADVICE: Final = (
+    "bring the app of that headset to the front and put the headset on; if that does not help, move it nearer to the "
+    "access point"
+)
+PROGRAM_ADVICE: Final = "start that program again, or end other programs on its machine"
+SCREEN_ADVICE: Final = "open that page again, or wait until its leases end"
 
 
 def check_session_report(report: StatusReport, own_id: str = "") -> list[Finding]:
@@ -211,10 +215,15 @@ def check_clients(people: tuple[ParticipantReport, ...]) -> Finding:
     advice: dict[str, None] = {}
     for p in people:
         problems = list(_list_client_problems(p))
+        is_screen = p.alignment == AlignmentKind.NOT_NEEDED and p.role not in PROGRAMS
+        if not p.connected and is_screen:
+            problems = [f"has closed its page, or lost it; {', '.join(p.holds)} is kept for it"] if p.holds else []
         if problems:
-            advice[PROGRAM_ADVICE if p.role in PROGRAMS else HEADSET_ADVICE] = None
-            (worst if not p.connected or p.heard_ns > SILENT_NS else bad).append(f"{p.name}: {', '.join(problems)}")
-    fine = f"{len(people)} connected, all keep up" if people else "no other participants"
+            advice[SCREEN_ADVICE if is_screen else PROGRAM_ADVICE if p.role in PROGRAMS else HEADSET_ADVICE] = None
+            is_lost = (not p.connected or p.heard_ns > SILENT_NS) and not is_screen
+            (worst if is_lost else bad).append(f"{p.name}: {', '.join(problems)}")
+    connected = sum(p.connected for p in people)
+    fine = f"{connected} connected, all keep up" if connected else "no other participants"
     why = "the application is stopped or too slow, or its network is"
     return report_problems("clients", worst + bad, fine, why, "; ".join(advice), FAILED if worst else WARNING)
 

@@ -11,8 +11,10 @@ import pytest
 from iris_session.client.core.state_stream import SceneState
 from iris_session.client.discovery import Address
 from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
+from iris_session.doctor import network_checks
 from iris_session.doctor.join_checks import (
     attempt_join,
+    check_ports,
     check_server_key,
     check_state_age,
     explain_refusal,
@@ -20,7 +22,7 @@ from iris_session.doctor.join_checks import (
 )
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.server_messages import Refused, StateHeader
+from iris_session.protocol.server_messages import Endpoints, Refused, StateHeader
 from iris_session.security import KeyHome, KeyPair, RegisteredSession
 
 pytestmark = pytest.mark.usefixtures("home")
@@ -48,6 +50,23 @@ def test_every_refusal_has_its_check(error: Exception, check: str) -> None:
     found = explain_refusal(error)  # type: ignore[arg-type]
     assert (found.check, found.state) == (check, "failed")
     assert found.text
+
+
+def test_a_dropped_port_of_the_page_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def probe(_ip: str, port: int, _timeout_s: float) -> None:
+        if port == 7725:
+            raise TimeoutError
+
+    monkeypatch.setattr(network_checks, "probe_tcp", probe)
+    found = check_ports(ADDRESS, Endpoints(state=7722, media=7723, assets=7724, web=7725))
+    assert [(one.check, one.state) for one in found] == [
+        ("web_port", "failed"),
+        ("media_port", "ok"),
+        ("assets_port", "ok"),
+    ]
+    assert "7725 (web)" in found[0].text
+    assert found[0].advice
+    assert not check_ports(ADDRESS, Endpoints(state=7722)), "a session without a page"
 
 
 def test_known_server_key_is_ok(home: KeyHome) -> None:

@@ -184,6 +184,14 @@ def test_slow_clients_are_reported(fields: dict[str, object], state: str, text: 
     assert_only(with_ann(**fields), "clients", state, "ann: ", text)
 
 
+def test_a_closed_page_is_no_failed_headset() -> None:
+    page = change(ANN, id="p2", name="Web", role="director", alignment="not_needed", connected=False, lost="closed")
+    assert problems(change(WELL, participants=(ANN, change(page, holds=())))) == {}
+    kept = change(WELL, participants=(ANN, change(page, holds=("right",))))
+    assert_only(kept, "clients", "warning", "Web: ", "right is kept for it")
+    assert problems(kept)["clients"].advice == session_checks.SCREEN_ADVICE
+
+
 def test_data_age_names_slow_stage() -> None:
     assert_only(
         with_ann(capture_to_receive=Quantiles(50.0, 90.0)), "age", "warning", "device -> front is slow", "90.0 ms (ann)"

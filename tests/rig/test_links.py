@@ -112,3 +112,13 @@ def test_latency_and_jitter_within_bounds_keep_engagement(tmp_path: Path) -> Non
         assert theirs is not None
         assert 10 * MS < mine.age_ns < 120 * MS
         assert theirs.age_ns < 2 * MS
+
+
+def test_everyone_joins_over_a_slow_link_also_without_an_introduction() -> None:
+    """A second is not enough for one attempt. Without an introduction every attempt begins with asking for one."""
+    with Rig(timestep=0.01) as rig:
+        rig.profile = "600ms"
+        ann = rig.open("ann")
+        bob = rig.emulate(name="bob", behaviour="observer")
+        rig.run_until(lambda: ann.ready and bob.client.ready, "both have joined", 15.0)
+        rig.profile = "lan"

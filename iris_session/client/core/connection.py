@@ -126,9 +126,9 @@ class ClientConnection:
     # --- life ---------------------------------------------------------------------------------------------------------
 
     def open(self, now_ns: int) -> None:
-        """Start to join, also after a refusal."""
+        """Start to join, also after a refusal. Attempts stay as long as they have become: the link is that slow."""
         self.failure = self.retryable_refusal = None
-        self._backoff_ns, self._hello_wait_ns = BACKOFF_MIN_NS, HELLO_TIMEOUT_NS
+        self._backoff_ns = BACKOFF_MIN_NS
         self._send_hello(now_ns)
 
     def close(self) -> None:
