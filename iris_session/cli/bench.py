@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import inspect
 import sys
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
@@ -16,48 +14,106 @@ from iris_session.cli.common import CommandError, add_command, add_json_option, 
 if TYPE_CHECKING:
     from iris_session.bench.report import BenchReport
 
-Limits = dict[str, tuple[int, int]]
-
-
 class _Benchmark(NamedTuple):
-    """One benchmark: `run_NAME` in a module of `iris_session.bench`, whose parameters are the options that it takes.
+    """One benchmark: `run_NAME` in a module of `iris_session.bench`.
 
     Attributes:
+        text: What it measures, for its help.
+        options: Its options, as the parameters of `run_NAME`, and their defaults.
         limits: Lowest and highest values that a scene or a session can have.
-        refused: Options that it does not take, and why. Other options are ignored.
     """
 
-    limits: Limits
-    refused: str = ""
-    why: str = ""
+    text: str
+    options: dict[str, int | float | str]
+    limits: dict[str, tuple[int, int]]
 
 
-_CLIENTS: Final[Limits] = {"clients": (1, 64)}
-_BODIES: Final[Limits] = {"bodies": (1, 2000)}
-_VERTICES: Final[Limits] = {"vertices": (16, 10_000)}
-_BOTH: Final = "curve profile"
+_CLIENTS: Final = {"clients": (1, 64)}
+_BODIES: Final = {"bodies": (1, 2000)}
+_VERTICES: Final = {"vertices": (16, 10_000)}
 _BENCHMARKS: Final = {
-    "state": _Benchmark(_CLIENTS | _BODIES),
-    "input": _Benchmark({"robots": (1, 12), "observers": (0, 64)}),
-    "slow-client": _Benchmark({"clients": (3, 64), **_BODIES}),
-    "alignment": _Benchmark({"pairs": (10, 100_000), "headsets": (2, 100_000)}),
-    "deformable": _Benchmark(_CLIENTS | _VERTICES),
-    "cloud": _Benchmark({"points": (10_000, 20_000_000), "cameras": (1, 4)}, _BOTH, "it has no other clients"),
+    "state": _Benchmark(
+        "age, size and error of the state that clients receive",
+        {"clients": 16, "bodies": 300, "seconds": 20.0, "seed": 0, "curve": False, "profile": ""},
+        _CLIENTS | _BODIES,
+    ),
+    "input": _Benchmark(
+        "time from the receipt of a sample to the first frame that shows it applied",
+        {"operators": 8, "robots": 8, "observers": 8, "seconds": 20.0, "seed": 0, "curve": False, "profile": ""},
+        {"robots": (1, 12), "observers": (0, 64)},
+    ),
+    "slow-client": _Benchmark(
+        "two clients that stall in turn: their recovery, and the effect on the others",
+        {"clients": 16, "bodies": 300, "seconds": 50.0, "seed": 0, "curve": False, "profile": ""},
+        {"clients": (3, 64), **_BODIES},
+    ),
+    "alignment": _Benchmark(
+        "distance at which two headsets place the same point",
+        {"pairs": 2000, "headsets": 200, "worlds": "none", "seed": 0},
+        {"pairs": (10, 100_000), "headsets": (2, 100_000)},
+    ),
+    "deformable": _Benchmark(
+        "a cloth in motion, encoded by the session and decoded by clients",
+        {"vertices": 10_000, "clients": 4, "seconds": 20.0, "seed": 0, "curve": False, "profile": ""},
+        _CLIENTS | _VERTICES,
+    ),
+    "cloud": _Benchmark(
+        "depth pictures become clouds that are sent to a session",
+        {"points": 2_000_000, "cameras": 1, "seconds": 20.0, "seed": 0, "beside": False},
+        {"points": (10_000, 20_000_000), "cameras": (1, 4)},
+    ),
     "cloud-stream": _Benchmark(
+        "clouds from a process of their own to clients in others",
+        {"clients": 4, "points": 50_000, "hz": 60, "mbit": 0.0, "seconds": 20.0, "seed": 0, "curve": False},
         {"clients": (1, 16), "points": (1000, 1_000_000), "hz": (1, 120), "mbit": (0, 10_000)},
-        "profile",
-        "--mbit limits its links",
     ),
     "join": _Benchmark(
-        {**_CLIENTS, "objects": (1, 2000), "assets_mb": (1, 2000)}, _BOTH, "its bars are for plain loopback"
+        "a scene with large assets is prepared, fetched, verified and decoded",
+        {"objects": 300, "assets_mb": 200.0, "clients": 4, "seconds": 20.0, "seed": 0},
+        {**_CLIENTS, "objects": (1, 2000), "assets_mb": (1, 2000)},
     ),
-    "share": _Benchmark({}, _BOTH, "its bars are for plain loopback"),
-    "stop": _Benchmark({}, _BOTH, "it uses no network"),
-    "hands": _Benchmark({}, _BOTH, "it uses no network"),
-    "csharp": _Benchmark({**_BODIES, "points": (1000, 1_000_000)}, _BOTH, "it uses no network"),
-    "record": _Benchmark({"kills": (1, 1000)}, _BOTH, "its bars are for loopback"),
+    "share": _Benchmark("what sharing adds to the steps of an environment", {"seconds": 100.0}, {}),
+    "stop": _Benchmark("how far an arm presses on after a hold", {"seconds": 1.0}, {}),
+    "hands": _Benchmark("how far faults of tracking move an arm", {"seconds": 300.0, "seed": 0}, {}),
+    "csharp": _Benchmark(
+        "the C# core of headset apps, on .NET and Mono",
+        {"bodies": 300, "points": 10_000, "seconds": 20.0, "seed": 0},
+        {**_BODIES, "points": (1000, 1_000_000)},
+    ),
+    "record": _Benchmark(
+        "processor time and size of a recording, and what is left after kills",
+        {"seconds": 60.0, "kills": 21, "seed": 0},
+        {"kills": (1, 1000)},
+    ),
     # A tab, one that is disturbed and one that is not; a gateway has three quarters of all connections.
-    "web": _Benchmark({"clients": (3, 48), **_VERTICES}, "profile", "its bars are for loopback"),
+    "web": _Benchmark(
+        "browsers behind the web gateway, one of them a real tab",
+        {"clients": 8, "vertices": 10_000, "seconds": 65.0, "seed": 0, "curve": False, "tab": True},
+        {"clients": (3, 48), **_VERTICES},
+    ),
+}
+_TEXTS: Final = {
+    "clients": "number of clients",
+    "bodies": "moving bodies",
+    "operators": "operators, one robot each",
+    "robots": "seven-joint arms",
+    "observers": "observers",
+    "pairs": "pairs of headsets",
+    "headsets": "headsets in every world",
+    "worlds": "also these worlds, with commas between them: W1 to W12, lab_..., rows, mixes, all",
+    "vertices": "vertices of the cloth, a square number",
+    "points": "points of a cloud, for `cloud` pixels of its cameras",
+    "cameras": "number of cameras",
+    "hz": "clouds per second",
+    "mbit": "bandwidth of every client's link from the middle of the measured part on [Mbit/s]; 0: not limited",
+    "objects": "bodies with meshes",
+    "assets_mb": "size of the assets after compression [MB]",
+    "seconds": "measured part [s]",
+    "kills": "kills of recorder, authority and both",
+    "seed": "random seed",
+    "beside": "beside a session in which two arms are driven, 500 ticks a second",
+    "curve": "encrypted and authenticated",
+    "profile": "link profile of every client (docs/evidence/links.md); bars do not apply then",
 }
 #: What limits a number.
 _NOTES: Final = {("input", "operators"): ", one robot each", ("slow-client", "clients"): ", two of which are slow"}
@@ -68,97 +124,42 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser = add_command(
         commands,
         "bench",
-        run,
+        None,
         help="run a benchmark and compare it with its bars",
-        description="Measure with separate client processes. With --check, exit status 1 if a bar is missed.",
+        description="Measure with separate client processes. With --check, exit status 1 if a bar is missed. "
+        "`iris-session bench NAME --help` has the options of one.",
         examples="""
             iris-session bench state --check
             iris-session bench state --curve --json
             iris-session bench input --operators 4 --robots 4 --seconds 10
-            iris-session bench slow-client --check
             iris-session bench state --profile busy-wifi
-            iris-session bench alignment --pairs 2000 --seed 1 --check
             iris-session bench alignment --worlds W1,mixes --headsets 100 --json
-            iris-session bench deformable --check
-            iris-session bench cloud --check
             iris-session bench cloud --beside --check
             iris-session bench cloud-stream --points 50000 --hz 60 --check
-            iris-session bench join --check
-            iris-session bench stop --check
-            iris-session bench hands --check
-            iris-session bench csharp --check
-            iris-session bench record --check
             iris-session bench record --seconds 20 --kills 4
             iris-session bench web --clients 8 --curve --check
-            iris-session bench web --seconds 300
         """,
     )
-    parser.add_argument("bench", choices=tuple(_BENCHMARKS))
-    for option, kind, default, text in (
-        (
-            "clients",
-            int,
-            None,
-            "state, slow-client, deformable, cloud-stream, join, web: number of clients (default: 16; deformable, "
-            "cloud-stream, join: 4; web: 8)",
-        ),
-        ("bodies", int, 300, "state, slow-client, csharp: moving bodies (default: %(default)s)"),
-        ("operators", int, 8, "input: operators (default: %(default)s)"),
-        ("robots", int, 8, "input: seven-joint arms (default: %(default)s)"),
-        ("observers", int, 8, "input: observers (default: %(default)s)"),
-        ("pairs", int, 2000, "alignment: pairs of headsets (default: %(default)s)"),
-        ("headsets", int, 200, "alignment: headsets in every world (default: %(default)s)"),
-        (
-            "worlds",
-            str,
-            "none",
-            "alignment: also these worlds, with commas between them: W1 to W12, lab_..., rows, mixes, all "
-            "(default: %(default)s)",
-        ),
-        ("vertices", int, 10_000, "deformable, web: vertices of the cloth, a square number (default: %(default)s)"),
-        (
-            "points",
-            int,
-            None,
-            "cloud: pixels of a cloud, shared by its cameras (default: 2000000); cloud-stream, csharp: points of a "
-            "cloud (default: 50000; csharp: 10000)",
-        ),
-        ("cameras", int, 1, "cloud: number of cameras (default: %(default)s)"),
-        ("hz", int, 60, "cloud-stream: clouds per second (default: %(default)s)"),
-        (
-            "mbit",
-            float,
-            0.0,
-            "cloud-stream: bandwidth of every client's link from the middle of the measured part on [Mbit/s]",
-        ),
-        ("objects", int, 300, "join: bodies with meshes (default: %(default)s)"),
-        ("assets-mb", float, 200.0, "join: size of the assets after compression (default: 200)"),
-        (
-            "seconds",
-            parse_seconds,
-            None,
-            "measured part (default: 20; slow-client: 50; record: 60; web: 65; share: 100; stop: 1; "
-            "hands: 300, simulated, of every device and rate)",
-        ),
-        ("kills", int, 21, "record: kills of recorder, authority and both (default: %(default)s)"),
-        ("seed", int, 0, "random seed (default: %(default)s)"),
-    ):
-        parser.add_argument(f"--{option}", type=kind, default=default, help=text)
-    parser.add_argument(
-        "--beside", action="store_true", help="cloud: beside a session in which two arms are driven, 500 ticks a second"
-    )
-    parser.add_argument(
-        "--no-tab", dest="tab", action="store_false", help="web: no real browser, even where one is installed"
-    )
-    parser.add_argument(
-        "--profile",
-        default="",
-        metavar="NAME",
-        help="link profile of every client (docs/evidence/links.md); bars do not apply then",
-    )
-    crypto = parser.add_mutually_exclusive_group()
-    crypto.add_argument("--curve", action="store_true", help="encrypted and authenticated")
-    crypto.add_argument("--plain", action="store_true", help="unencrypted loopback (default)")
+    names = parser.add_subparsers(dest="bench", required=True, metavar="NAME")
+    for name, one in _BENCHMARKS.items():
+        _register_benchmark(names, name, one)
+
+
+def _register_benchmark(
+    names: argparse._SubParsersAction[argparse.ArgumentParser], name: str, one: _Benchmark
+) -> None:
+    example = f"iris-session bench {name} --check"
+    parser = add_command(names, name, run, help=one.text, description=f"Measure: {one.text}.", examples=example)
+    for option, default in one.options.items():
+        flag = f"--{option.replace('_', '-')}"
+        if option == "tab":
+            parser.add_argument("--no-tab", dest="tab", action="store_false", help="no real browser, even if there is")
+        elif isinstance(default, bool):
+            parser.add_argument(flag, action="store_true", help=_TEXTS[option])
+        else:
+            kind = parse_seconds if option == "seconds" else type(default)
+            text = _TEXTS[option] + (" (default: %(default)s)" if default != "" else "")
+            parser.add_argument(flag, type=kind, default=default, help=text)
     parser.add_argument("--check", action="store_true", help="exit status 1 if a bar is missed")
     add_json_option(parser)
 
@@ -170,9 +171,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     name = arguments.bench.replace("-", "_")
     function = getattr(importlib.import_module(f"iris_session.bench.{name}"), f"run_{name}")
-    options = _select_options(arguments, inspect.signature(function).parameters)
-    if arguments.profile:
-        load_profile(arguments.profile)  # fails before anything is started
+    options = _check_options(arguments)
+    if options.get("profile"):
+        load_profile(options["profile"])  # fails before anything is started
 
     def progress(text: str) -> None:
         print(f"bench {arguments.bench}: {text}", file=sys.stderr, flush=True)
@@ -191,22 +192,15 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if report.ok or not arguments.check else 1
 
 
-def _select_options(arguments: argparse.Namespace, names: Iterable[str]) -> dict[str, Any]:
-    """Return the options of the benchmark, of these names, that are given or have a default.
-
-    Raises:
-        CommandError: The benchmark does not take one of the others, or a scene or session cannot have a number.
-    """
+def _check_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of the benchmark. Raises `CommandError` for a number that a scene or session cannot have."""
     one = _BENCHMARKS[arguments.bench]
-    if any(getattr(arguments, name) for name in one.refused.split()):
-        refused = " or ".join(f"--{name}" for name in one.refused.split())
-        raise CommandError(f"bench {arguments.bench} cannot be combined with {refused}: {one.why}")
-    options = {name: value for name in names if (value := getattr(arguments, name, None)) is not None}
+    options = {name: getattr(arguments, name) for name in one.options}
     limits = dict(one.limits)
     if "operators" in options:
         limits["operators"] = (1, arguments.robots)
     for name, (low, high) in limits.items():
-        if not low <= options.get(name, low) <= high:
+        if not low <= options[name] <= high:
             note = _NOTES.get((arguments.bench, name), "")
             raise CommandError(
                 f"--{name.replace('_', '-')} {options[name]}: bench {arguments.bench} takes {low} to {high}{note}"

@@ -117,17 +117,17 @@ def _register_inspect(actions: argparse._SubParsersAction[argparse.ArgumentParse
         "inspect",
         run_inspect,
         help="measure a camera file, or the clouds of a session",
-        description="Measure what a camera file gives, without a session: rate, points, stages, faults. Or, for an "
-        "address, join as an observer and measure the clouds and pictures that arrive: rate, points, age by stage. "
-        "Exit status 1 if there is a fault, or nothing comes.",
+        description="Measure what a camera file gives, without a session: rate, points, stages, faults. Or, without a "
+        "file, join a session as an observer and measure the clouds and pictures that arrive: rate, points, age by "
+        "stage. Exit status 1 if there is a fault, or nothing comes.",
         examples="""
             iris-session cloud inspect camera.toml
-            iris-session cloud inspect 192.168.1.20 --seconds 10
-            iris-session cloud inspect 127.0.0.1:7721 --json
+            iris-session cloud inspect --address 192.168.1.20 --seconds 10
+            iris-session cloud inspect --json
         """,
     )
-    parser.add_argument("target", metavar="FILE|ADDRESS", help="camera file, or HOST:PORT or iris://... of a session")
-    parser.add_argument("--code", default="", help="join code, needed the first time at an encrypted session")
+    parser.add_argument("target", nargs="?", default="", metavar="FILE", help="camera file")
+    add_address_options(parser, option=True)
     parser.add_argument("--seconds", type=parse_seconds, default=3.0, help="time to measure (default: %(default)s)")
     add_json_option(parser)
 
@@ -267,8 +267,9 @@ def run_example(arguments: argparse.Namespace) -> int:
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Measure a camera file, or the clouds of a session."""
     path = Path(arguments.target)
-    if path.suffix == ".toml" or path.exists():
+    if arguments.target and (path.suffix == ".toml" or path.exists()):
         return _inspect_file(arguments, path)
+    arguments.address = arguments.address or arguments.target
     return _inspect_session(arguments)
 
 
@@ -294,7 +295,7 @@ def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
         if camera.body:
             raise CommandError(
                 f"camera {camera.name!r} is on body {camera.body!r}: only a session knows where that is; `iris-session "
-                f"cloud run {path}`, then `iris-session cloud inspect ADDRESS`"
+                f"cloud run {path}`, then `iris-session cloud inspect --address ADDR`"
             )
     with _name_unexpected_error(settings):
         worker = CloudWorker(settings, _NoSink(), open_source, time.perf_counter_ns)
@@ -350,7 +351,6 @@ def _format_drops(report: CameraReport) -> Iterator[str]:
 def _inspect_session(arguments: argparse.Namespace) -> int:
     from iris_session.client.stream_meter import StreamMeter
 
-    arguments.address, arguments.session = arguments.target, ""
     with make_client(arguments, Role.OBSERVER, "cloud inspect") as client:
         shown = (MediaEncoding.CLOUD, MediaEncoding.JPEG)
 

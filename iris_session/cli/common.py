@@ -162,18 +162,17 @@ def add_address_options(
     option: bool = False,
     code: str = "join code, needed the first time at an encrypted session",
 ) -> None:
-    """Add the options by which a client finds a session: `address`, `--session`, `--code`.
+    """Add the options by which a client finds a session: `--address`, `--session`, `--code`.
 
     Args:
         parser: Parser of the command.
-        option: Add the address as `--address` because the command has other positional arguments.
+        option: Take the address by its option only, because the command has other positional arguments.
         code: Help text of `--code`.
     """
     text = "HOST:PORT or iris://... (default: 127.0.0.1:7721)"
-    if option:
-        parser.add_argument("--address", default="", metavar="ADDR", help=text)
-    else:
-        parser.add_argument("address", nargs="?", default="", help=text)
+    parser.add_argument("--address", default="", metavar="ADDR", help=text)
+    if not option:
+        parser.add_argument("address", nargs="?", default=argparse.SUPPRESS, help="the same as --address")
     parser.add_argument("--session", default="", metavar="NAME", help="name of the session, instead of an address")
     parser.add_argument("--code", default="", help=code)
 
@@ -296,7 +295,11 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--state-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--curve", action="store_true", help="encrypt on loopback too, and admit listed keys only")
     group.add_argument(
-        "--curve-key", default="", metavar="FILE", help="CURVE secret key of the server (default: the user's)"
+        "--curve-key",
+        default="",
+        metavar="FILE",
+        help="secret key of the session for encryption, a ZeroMQ certificate *.key_secret that only you can read "
+        "(default: your own, made on first use; `iris-session keys show` has its fingerprint)",
     )
     group.add_argument("--record", metavar="FILE", help="path of the recording (default: below sessions/)")
     group.add_argument(
@@ -318,7 +321,11 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
         help="size that the recording may have, such as 20GB; the session goes on without one then (default: no limit)",
     )
     group.add_argument(
-        "--curve-clients", default="", metavar="DIR", help="public certificates to admit, instead of the allow-list"
+        "--curve-clients",
+        default="",
+        metavar="DIR",
+        help="folder of public ZeroMQ certificates *.key: these keys may join, in every role, and no other; there is "
+        "no pairing and no page then (default: the keys of `iris-session keys list`)",
     )
     add_page_options(group)
     group.add_argument("--no-record", action="store_true", help="record nothing")

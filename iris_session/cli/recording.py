@@ -1,5 +1,5 @@
-"""`iris-session verify`, and `recording` with its actions `inspect` (what a recording, or each of a folder, holds) and
-`repair`. The other actions have modules of their own."""
+"""`iris-session recording` with its actions `inspect` (what a recording, or each of a folder, holds), `episodes`,
+`verify` and `repair`. The other actions have modules of their own. `view` and `verify` are commands, too."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli import recording_export, recording_render
+from iris_session.cli import recording_export, recording_render, view
 from iris_session.cli.common import (
     MOST_LINES,
     CommandError,
@@ -27,7 +27,13 @@ from iris_session.cli.progress import ReadingProgress
 
 if TYPE_CHECKING:
     from iris_session.recording.repair import RepairReport
-    from iris_session.recording.summary import PersonSummary, RecordingSummary, StopSummary, StreamSummary
+    from iris_session.recording.summary import (
+        EpisodeSummary,
+        PersonSummary,
+        RecordingSummary,
+        StopSummary,
+        StreamSummary,
+    )
     from iris_session.rrd.assets import AssetsSummary
 
 SUFFIX: Final = ".rrd"
@@ -44,11 +50,15 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         commands,
         "recording",
         None,
-        help="show what a recording holds, export it as tables, make a film of it, repair it",
-        description="Show what a recording holds, export it as tables, make a film or a picture of it, or repair it.",
+        help="inspect, view, verify, export, render or repair recordings",
+        description="Show what a recording holds, view and verify it, export it as tables, make a film or a picture of "
+        "it, or repair it. `iris-session view` and `iris-session verify` are short for the actions of that name.",
         examples="""
             iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd
             iris-session recording inspect sessions
+            iris-session recording episodes session.rrd
+            iris-session recording verify sessions
+            iris-session recording view
             iris-session recording export session.rrd --to csv -o tables
             iris-session recording render session.rrd -o session.mp4
             iris-session recording repair session.rrd -o repaired.rrd
@@ -71,6 +81,21 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     inspect.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it")
     add_json_option(inspect)
+    episodes = add_command(
+        actions,
+        "episodes",
+        run_episodes,
+        help="the episodes of a recording: when, how long, verdict, label",
+        description="List the episodes of a recording. Exit status 1 if something is damaged or missing inside.",
+        examples="""
+            iris-session recording episodes session.rrd
+            iris-session recording episodes session.rrd --json
+        """,
+    )
+    episodes.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
+    add_json_option(episodes)
+    view.register(actions)
+    _register_verify(actions)
     recording_export.register(actions)
     recording_render.register(actions)
     repair = add_command(
@@ -189,12 +214,7 @@ def format_summary(summary: RecordingSummary) -> Iterator[str]:
         yield f"  deforming  {_join(summary.deformables)}"
     yield from _format_list("people", [_format_person(person) for person in summary.people])
     yield from _format_list("alignment", [*_format_alignments(summary.people)])
-    episodes = [
-        f"{one.number} {one.verdict}{f' {one.label!r}' if one.label else ''} at {one.at_s:.2f} s, "
-        f"{_format_duration(one.duration_s)}, by {one.by}"
-        for one in summary.episodes
-    ]
-    yield from _format_list("episodes", episodes)
+    yield from _format_list("episodes", [_format_episode(one) for one in summary.episodes])
     handovers = [
         f"{one.object}: {_format_hand(one.giver, one.giver_name)} to {_format_hand(one.receiver, one.receiver_name)} "
         f"at {one.at_s:.2f} s, both held it for {one.both_held_s:.2f} s"
@@ -213,6 +233,23 @@ def format_summary(summary: RecordingSummary) -> Iterator[str]:
     yield from _format_list("damage", summary.damage)
     if summary.notes:
         yield from _format_list("notes", summary.notes)
+
+
+def run_episodes(arguments: argparse.Namespace) -> int:
+    """Print a line for each episode of a recording."""
+    from iris_session.system.extras import require_package
+
+    require_package("rerun", "reading recordings")
+    with ending_as_interrupts():
+        summary = _summarise_file(arguments.path)
+    lines = [_format_episode(one) for one in summary.episodes] or ["no episode"]
+    print_result(arguments, {"ok": summary.ok, "episodes": summary.episodes}, lines)
+    return 0 if summary.ok else 1
+
+
+def _format_episode(one: EpisodeSummary) -> str:
+    label = f" {one.label!r}" if one.label else ""
+    return f"{one.number} {one.verdict}{label} at {one.at_s:.2f} s, {_format_duration(one.duration_s)}, by {one.by}"
 
 
 def _format_list(title: str, lines: Sequence[str]) -> Iterator[str]:

@@ -230,12 +230,12 @@ class RecordingPictures:
 
     def _draw_core(self, core: SessionCore, time_ns: int) -> Image:
         """Return a picture of a core as it is now."""
+        people = self._people.advance(time_ns) if self._people is not None else []
         if self._artist is None or self._artist.core_model is not core.world.model:
-            self._artist = self._make_artist(core)
-        people = self._people.advance(time_ns) if self._people is not None else ()
+            self._artist = self._make_artist(core, people)
         return self._artist.draw(core.world.data, core.authority.patches, people)
 
-    def _make_artist(self, core: SessionCore) -> _Renderer:
+    def _make_artist(self, core: SessionCore, people: Sequence[_AvatarMarker]) -> _Renderer:
         model, is_first = core.world.model, self._artist is None
         if self._artist is not None:
             self._artist.close()
@@ -247,6 +247,7 @@ class RecordingPictures:
         camera = self._find_camera(model, is_required=is_first)
         if camera is None:
             view = self._views.get(core.world.bodies) or _SceneBounds(core.world.bodies)
+            view.people = view.people or [one.item.pose.p for one in people]  # one moment is mostly between two states
             camera = view.make_camera(core, self._options.width / self._options.height)
         return _Renderer(model, camera, self._options, self.notes)
 

@@ -179,3 +179,20 @@ def test_commands_load_only_what_they_use() -> None:
     assert not overview & {*HEAVY, "mujoco", "numpy", "asyncio"}
     assert "mujoco" in model
     assert not model & HEAVY
+
+
+@pytest.mark.parametrize("command", ["status", "doctor", "web", "emulate", "anchors status", "estop", "cloud inspect"])
+def test_every_command_of_a_session_takes_its_address_by_the_same_option(command: str) -> None:
+    parser = build_parser()
+    words = command.split()
+    assert parser.parse_args(words).address == ""
+    assert parser.parse_args([*words, "--address", "lab:7721"]).address == "lab:7721"
+    if command not in ("estop", "cloud inspect"):
+        assert parser.parse_args([*words, "lab:7721"]).address == "lab:7721"
+
+
+@pytest.mark.parametrize("action", ["view", "verify"])
+def test_the_short_commands_are_actions_of_recordings(action: str) -> None:
+    parser = build_parser()
+    short, long = parser.parse_args([action, "s.rrd"]), parser.parse_args(["recording", action, "s.rrd"])
+    assert short.run == long.run

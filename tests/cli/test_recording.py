@@ -112,6 +112,15 @@ def test_inspect_shows_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture
     assert (result["ok"], result["steps"], result["people"][0]["held_s"]) == (True, 200, {"left": 0.358})
 
 
+def test_episodes_of_a_recording_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_session(tmp_path / "session.rrd")
+    assert main(["recording", "episodes", str(path), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert main(["recording", "inspect", str(path), "--json"]) == 0
+    assert shown["episodes"] == json.loads(capsys.readouterr().out)["episodes"]
+    assert shown["episodes"]
+
+
 def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a/session.rrd", "b/session.part2.rrd", "b/session.part3.rrd", "b/session.resume2.rrd"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -239,6 +239,19 @@ def project(camera: Any, model: Any, positions: NDArray[np.float64], aspect: flo
     return at @ right / depth / aspect, at @ np.cross(right, forward) / depth
 
 
+def test_the_default_view_of_one_moment_has_the_people_in_it(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A picture is mostly of a moment between two recorded states."""
+    head = PresenceItem("p1", "head", Pose((2.0, -2.0, 1.6), (1.0, 0.0, 0.0, 0.0)), step_ns(10))
+    state = RecordedState(10, 10, 0.02, step_ns(10), np.zeros((0, 7)), (head,), ())
+    monkeypatch.setattr(Recording, "states", lambda self: iter([state]))
+    whole = SMALL._replace(camera="")
+    found, _ = draw_times(played.path, [step_ns(10) + 1], whole._replace(people=True))
+    without, _ = draw_times(played.path, [step_ns(10) + 1], whole)
+    assert (found[0] != without[0]).any()
+    blue = found[0].astype(int)[..., 2] - found[0].astype(int)[..., 0] > 60
+    assert blue.sum() > 20, "the head is in sight"
+
+
 def test_published_worlds_are_refused(tmp_path: Path) -> None:
     kinematic = KinematicModel(["box"], [Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))])
     core = SessionCore(kinematic.model, CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ()))
