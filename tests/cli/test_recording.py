@@ -13,6 +13,7 @@ import pytest
 
 from iris_session.cli.main import INTERRUPTED, main
 from iris_session.cli.recording import MOST_LINES, format_line, format_summary
+from iris_session.protocol.server_messages import EpisodeChanged, Event
 from iris_session.recording import parts
 from iris_session.recording.folders import find_recordings
 from iris_session.recording.summary import (
@@ -25,8 +26,9 @@ from iris_session.recording.summary import (
     StopSummary,
     StreamSummary,
 )
+from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.assets import AssetsSummary
-from tests.recording.support import journal, write
+from tests.recording.support import TICK_NS, journal, write
 from tests.recording.test_summary import write_session
 
 SUMMARY = RecordingSummary(
@@ -113,12 +115,19 @@ def test_inspect_shows_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_episodes_of_a_recording_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_session(tmp_path / "session.rrd")
+    header, batch = journal(20)
+    running, over = (EpisodeChanged(1, state, "pour", "p1") for state in ("running", "success"))
+    batch.events = [Event(1, 5, 6 * TICK_NS, running), Event(2, 15, 16 * TICK_NS, over)]
+    path = tmp_path / "session.rrd"
+    writer = RrdWriter(path, "id")
+    writer.write_header(header)
+    writer.add(batch)
+    writer.close()
     assert main(["recording", "episodes", str(path), "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert main(["recording", "inspect", str(path), "--json"]) == 0
     assert shown["episodes"] == json.loads(capsys.readouterr().out)["episodes"]
-    assert shown["episodes"]
+    assert [one["verdict"] for one in shown["episodes"]] == ["success"]
 
 
 def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
