@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Final
@@ -15,6 +15,7 @@ from iris_session.cli.common import (
     add_address_options,
     add_command,
     add_json_option,
+    list_first,
     make_client,
     parse_seconds,
     pick_attributes,
@@ -214,7 +215,7 @@ def _serve_metrics(client: Client, port: int) -> int:
 
 def format_status(report: StatusReport) -> Iterator[str]:
     """Yield one screen of lines."""
-    from iris_session.doctor.session_checks import measure_stages
+    from iris_session.doctor.session_checks import measure_client_stages, measure_stages
     from iris_session.protocol.status import NOT_PUBLISHED
 
     silent = next((text for text in report.warnings if text.startswith(NOT_PUBLISHED)), "")
@@ -241,6 +242,9 @@ def format_status(report: StatusReport) -> Iterator[str]:
     )
     for p in report.participants:
         yield _format_participant(p)
+    seen = ((p, measure_client_stages(p, report)) for p in report.participants)
+    ages = [f"{p.name} {sum(took.values()):.0f} ms ({_format_stages(took)})" for p, took in seen if took]
+    yield from (f"age of what is seen: {line}" for line in list_first(ages))
     yield ""
     yield f"{'robot':20s} {'holder':20s} {'state':9s} {'hold reason':14s} {'receive to step ms':>19s}  queue"
     for r in report.robots:
@@ -332,6 +336,10 @@ def _format_assets(report: StatusReport) -> Iterator[str]:
         refused = f", {one.refusals} refused" if one.refusals else ""
         waiting = f"; {one.waiting} clients waiting" if one.waiting else ""
         yield f"assets: {one.served} served, {one.bytes_sent / 1e6:.1f} MB sent{refused}{waiting}"
+
+
+def _format_stages(took: Mapping[str, float]) -> str:
+    return ", ".join(f"{stage} {ms:.1f}" for stage, ms in took.items())
 
 
 def _format_quantiles(values: Quantiles | None) -> str:

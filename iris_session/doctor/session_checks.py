@@ -21,6 +21,8 @@ SILENT_NS: Final = 1_000_000_000
 STALLED_NS: Final = 500_000_000
 MISSED_SHARE: Final = 0.2
 OLD_MS: Final = 150.0
+#: Interpolation waits for the next state, and a picture for the display.
+SHOWN_MS: Final = 300.0
 LATE_SHARE: Final = 0.001
 VERY_LATE_SHARE: Final = 0.05
 LOW_DISK: Final = 2 << 30
@@ -32,6 +34,7 @@ STAGES: Final = {
     "front -> authority": (20.0, "the session's steps come late: see the check `ticks`"),
     "authority -> state": (15.0, "the front has too little processor time: see load, and other programs"),
     "state -> client": (OLD_MS, "the network to that client, or the client itself is too slow"),
+    "client -> picture": (SHOWN_MS, "its page is in the background, draws rarely, or waits for states that come late"),
 }
 LATE_CAUSES: Final = {
     LateCause.SCHEDULER: (
@@ -273,7 +276,23 @@ def measure_stages(people: tuple[ParticipantReport, ...], report: StatusReport) 
     if shown:
         ms, who = max(shown)
         took["state -> client"] = (max(0.0, ms - (0.0 if publish is None else publish.p50)), who)
+    drawn = [(stages["render"], p.name) for p in people if "render" in (stages := measure_client_stages(p, report))]
+    if drawn:
+        took["client -> picture"] = max(drawn)
     return took
+
+
+def measure_client_stages(p: ParticipantReport, report: StatusReport) -> dict[str, float]:
+    """Return where the age of what a participant sees arises, medians [ms]: `tick` until the session has sent it,
+    `network` until its application has it, `render` until it is shown. Only what was measured.
+    """
+    if p.state_age is None:
+        return {}
+    tick = 0.0 if report.step_to_publish is None else min(report.step_to_publish.p50, p.state_age.p50)
+    stages = {"tick": tick, "network": p.state_age.p50 - tick}
+    if p.shown_age_ms > 0.0:
+        stages["render"] = max(0.0, p.shown_age_ms - p.state_age.p50)
+    return stages
 
 
 def check_ticks(report: StatusReport) -> Finding:

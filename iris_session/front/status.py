@@ -180,6 +180,7 @@ def _client_fields(report: ClientReport) -> dict[str, Any]:
         "charging": report.charging,
         "thermal": report.thermal,
         "dropped_frames": report.dropped_frames,
+        "shown_age_ms": report.shown_age_ms,
     }
 
 

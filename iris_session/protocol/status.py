@@ -29,7 +29,8 @@ class ClientReport(Message, frozen=True, tag="client_report"):
     `media_bytes_per_s`, `media_age_ms` (median since capture): of the media channel. `display_hz`: frames drawn, 0 when
     none are. `media_limit_mbit_per_s`: upper bound of media that the client asks for, 0 for no limit of its own.
     `battery`: charge of the device, 0 to 1, -1 where it is not known. `thermal`: a `ThermalState`. `dropped_frames`:
-    frames that were not drawn in time, over the last second.
+    frames that were not drawn in time, over the last second. `shown_age_ms`: of the picture that is shown, as
+    `age_ms_p50` and what interpolating and drawing add, 0 where it is not known.
     """
 
     age_ms_p50: float
@@ -46,6 +47,7 @@ class ClientReport(Message, frozen=True, tag="client_report"):
     charging: bool = False
     thermal: Name = ""
     dropped_frames: Count = 0
+    shown_age_ms: float = 0.0
 
 
 class DeliveryBudget(Message, frozen=True, tag="delivery_budget"):
@@ -163,8 +165,8 @@ class ParticipantReport(msgspec.Struct, frozen=True):
     disconnected (`silent`, `closed`, `slow`, ...), empty while connected. `rejected`: samples by reason, `drops`:
     messages dropped, both since it joined. `reported`: its client reports. `media`: the streams that it subscribed to,
     `budget_class` the lowest of theirs, empty without one. `media_bytes_per_s`: sent to it, `media_drops`: frames that
-    its link did not take in time, since it joined. `display_hz`, `battery`, `charging`, `thermal`, `dropped_frames`: of
-    its device, as in `ClientReport`.
+    its link did not take in time, since it joined. `display_hz`, `battery`, `charging`, `thermal`, `dropped_frames`,
+    `shown_age_ms`: as in `ClientReport`.
     """
 
     id: Name
@@ -202,6 +204,7 @@ class ParticipantReport(msgspec.Struct, frozen=True):
     charging: bool = False
     thermal: Name = ""
     dropped_frames: Count = 0
+    shown_age_ms: float = 0.0
 
 
 class StopReport(msgspec.Struct, frozen=True):

@@ -43,6 +43,7 @@ ANN = ParticipantReport(
     heard_ns=10_000_000,
     rejected={"stale": 2},
     reported=True,
+    shown_age_ms=61.5,
 )
 BOB = ParticipantReport("p2", "bob", "operator", False, alignment_void_ns=4_000_000_000, lost="silent")
 REPORT = StatusReport(
@@ -87,6 +88,7 @@ def test_screen_shows_every_part(capsys: pytest.CaptureFixture[str]) -> None:
         assert words in text
     for words in ("device -> front 20.0 ms", "front 1", "mind the gap", "NaN in QPOS", "iris-session reset"):
         assert words in text
+    assert "tick 0.5, network 1.0, render 60.0" in text
     assert "183 served, 17.5 MB sent, 3 refused; 2 clients" in text
     assert all(line.isprintable() for line in shown), "names come from other users"
 

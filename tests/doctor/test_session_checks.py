@@ -200,6 +200,7 @@ def test_data_age_names_slow_stage() -> None:
     assert_only(slow, "age", "warning", "front -> authority is slow", "60.0 ms (left)")
     assert_only(change(WELL, step_to_publish=Quantiles(9.0, 40.0)), "age", "warning", "authority -> state is slow")
     assert_only(with_ann(state_age=Quantiles(90.0, 400.0)), "age", "warning", "state -> client is slow")
+    assert_only(with_ann(shown_age_ms=1000.0), "age", "warning", "client -> picture is slow", "997.0 ms (ann)")
 
 
 @pytest.mark.parametrize("cause", sorted(LATE_CAUSES))

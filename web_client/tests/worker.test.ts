@@ -681,6 +681,22 @@ describe("assets and media", () => {
     expect(bench.last("stats").counters["media not taken"]).toBe(103 - held - 1);
   });
 
+  test("a page reports how old its picture is", async () => {
+    await bench.join();
+    bench.pass(100);
+    for (let i = 0; i < 12; i++) {
+      bench.post({ type: "drawn", frames: 6, age_ms: 70 });
+      bench.pass(100);
+    }
+    const [report] = bench.socket.find("client_report").slice(-1);
+    expect(report?.["display_hz"]).toBeGreaterThan(50);
+    expect(report?.["shown_age_ms"]).toBeGreaterThan(80); // of the state, and a period of 60 Hz
+    expect(report?.["shown_age_ms"]).toBeLessThan(95);
+    bench.pass(2100);
+    const [still] = bench.socket.find("client_report").slice(-1);
+    expect(still?.["shown_age_ms"]).toBe(0); // nothing is drawn
+  });
+
   describe("a ticket", () => {
     const sentTicket = (): unknown => (decodeValue(bench.socket.sent[0]!.frames[0] as Uint8Array) as Message)["ticket"];
     const say = (name: string): void => (bench.sockets[0] as FakeSocket).deliver(5, ticket(name));

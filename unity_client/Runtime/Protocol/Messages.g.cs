@@ -1584,6 +1584,7 @@ namespace IrisSession.Protocol
         public bool Charging;
         public string Thermal = "";
         public long DroppedFrames;
+        public double ShownAgeMs;
 
         public static ClientReport Read(WireReader reader) => reader.ReadInto(new ClientReport());
 
@@ -1603,6 +1604,7 @@ namespace IrisSession.Protocol
             codec.Allow("charging", ref Charging, false);
             codec.Allow("thermal", ref Thermal, 64, "");
             codec.Allow("dropped_frames", ref DroppedFrames, 0, long.MaxValue, 0);
+            codec.Allow("shown_age_ms", ref ShownAgeMs, 0.0);
         }
     }
 

@@ -107,7 +107,7 @@ export type ToWorker =
   /** Assets that are wanted no more. */
   | { type: "cancel_assets"; addresses: string[] }
   /** Frames drawn since the last such message: `display_hz` of the client's report. */
-  | { type: "drawn"; frames: number }
+  | { type: "drawn"; frames: number; age_ms?: number }
   /** A buffer of `frame` that the page has done with. */
   | { type: "recycle"; poses: Float32Array }
   /** The surface of a frame of `deformable` that the page has done with, null for a frame without. */

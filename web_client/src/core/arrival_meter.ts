@@ -17,6 +17,8 @@ export interface Arrivals {
   mediaBytesPerS: number;
   mediaAgeMs: number;
   displayHz: number;
+  /** Age of the picture: of what was drawn last, and the time between two frames; 0: nothing was drawn. */
+  shownAgeMs: number;
 }
 
 /** Collects ages and gaps of the state, media and frames drawn. */
@@ -32,6 +34,7 @@ export class ArrivalMeter {
   private mediaBytes = 0;
   private mediaAgesNs: number[] = [];
   private drawn = 0;
+  private drawnAgeMs = 0;
 
   /**
    * Record a state that was passed on.
@@ -54,9 +57,10 @@ export class ArrivalMeter {
     if (this.mediaAgesNs.length < MAX_AGES) this.mediaAgesNs.push(ageNs);
   }
 
-  /** Record frames that the page drew. */
-  recordDrawn(frames: number): void {
+  /** Record frames that the page drew. `ageMs`: of the state in them. */
+  recordDrawn(frames: number, ageMs = 0): void {
     this.drawn += frames;
+    this.drawnAgeMs = ageMs;
   }
 
   /** Begin anew, with another connection. */
@@ -85,6 +89,7 @@ export class ArrivalMeter {
       mediaBytesPerS: this.mediaBytes / seconds,
       mediaAgeMs: computeQuantilesMs(this.mediaAgesNs)[0],
       displayHz: this.drawn / seconds,
+      shownAgeMs: this.drawn > 0 && this.drawnAgeMs > 0 ? this.drawnAgeMs + (1000 * seconds) / this.drawn : 0,
     };
     this.startPeriod(received, nowNs);
     return arrivals;
@@ -112,6 +117,7 @@ export function makeReport(arrivals: Arrivals, rttNs: number): wire.ClientReport
     media_bytes_per_s: arrivals.mediaBytesPerS,
     media_age_ms: arrivals.mediaAgeMs,
     display_hz: arrivals.displayHz,
+    shown_age_ms: arrivals.shownAgeMs,
   };
 }
 

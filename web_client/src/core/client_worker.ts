@@ -154,7 +154,7 @@ export class ClientWorker {
         for (const address of command.addresses) this.assets.cancel(address);
         break;
       case "drawn":
-        this.meter.recordDrawn(command.frames);
+        this.meter.recordDrawn(command.frames, command.age_ms);
         this.media.onDrawn(command.frames);
         break;
       case "recycle":

@@ -808,8 +808,8 @@ export interface StopReport {
  * disconnected (`silent`, `closed`, `slow`, ...), empty while connected. `rejected`: samples by reason, `drops`:
  * messages dropped, both since it joined. `reported`: its client reports. `media`: the streams that it subscribed to,
  * `budget_class` the lowest of theirs, empty without one. `media_bytes_per_s`: sent to it, `media_drops`: frames that
- * its link did not take in time, since it joined. `display_hz`, `battery`, `charging`, `thermal`, `dropped_frames`: of
- * its device, as in `ClientReport`.
+ * its link did not take in time, since it joined. `display_hz`, `battery`, `charging`, `thermal`, `dropped_frames`,
+ * `shown_age_ms`: as in `ClientReport`.
  */
 export interface ParticipantReport {
   id: string;
@@ -847,6 +847,7 @@ export interface ParticipantReport {
   charging?: boolean;
   thermal?: string;
   dropped_frames?: number;
+  shown_age_ms?: number;
 }
 
 /** One robot: its holder, its state, and the reason why it holds. */
@@ -1252,7 +1253,8 @@ export interface GetStatus {
  * `media_bytes_per_s`, `media_age_ms` (median since capture): of the media channel. `display_hz`: frames drawn, 0 when
  * none are. `media_limit_mbit_per_s`: upper bound of media that the client asks for, 0 for no limit of its own.
  * `battery`: charge of the device, 0 to 1, -1 where it is not known. `thermal`: a `ThermalState`. `dropped_frames`:
- * frames that were not drawn in time, over the last second.
+ * frames that were not drawn in time, over the last second. `shown_age_ms`: of the picture that is shown, as
+ * `age_ms_p50` and what interpolating and drawing add, 0 where it is not known.
  */
 export interface ClientReport {
   type: "client_report";
@@ -1270,6 +1272,7 @@ export interface ClientReport {
   charging?: boolean;
   thermal?: string;
   dropped_frames?: number;
+  shown_age_ms?: number;
 }
 
 /**
@@ -2374,7 +2377,7 @@ export const DEFAULTS = {
   rename: {},
   set_role: {},
   get_status: { request_id: 0 },
-  client_report: { missed: 0, rtt_ms: 0.0, bytes_per_s: 0.0, media_bytes_per_s: 0.0, media_age_ms: 0.0, display_hz: 0.0, media_limit_mbit_per_s: 0.0, battery: -1.0, charging: false, thermal: "", dropped_frames: 0 },
+  client_report: { missed: 0, rtt_ms: 0.0, bytes_per_s: 0.0, media_bytes_per_s: 0.0, media_age_ms: 0.0, display_hz: 0.0, media_limit_mbit_per_s: 0.0, battery: -1.0, charging: false, thermal: "", dropped_frames: 0, shown_age_ms: 0.0 },
   welcome: { key_fingerprint: "" },
   refused: { advice: "", supported_versions: [1] },
   protocol_fault: { reason: "" },
@@ -2546,6 +2549,7 @@ export const VALUE_DEFAULTS = {
     charging: false,
     thermal: "",
     dropped_frames: 0,
+    shown_age_ms: 0.0,
   },
   RobotReport: {
     holder: "",

@@ -338,6 +338,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["charging", ["bool"], [false]],
       ["thermal", ["str", 64, ""], [""]],
       ["dropped_frames", ["int", 0, null], [0]],
+      ["shown_age_ms", ["float"], [0.0]],
     ],
   },
   RobotReport: {
@@ -712,6 +713,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["charging", ["bool"], [false]],
       ["thermal", ["str", 64, ""], [""]],
       ["dropped_frames", ["int", 0, null], [0]],
+      ["shown_age_ms", ["float"], [0.0]],
     ],
   },
   Welcome: {

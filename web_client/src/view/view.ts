@@ -455,7 +455,7 @@ export class View {
   }
 
   private reportDrawn(): void {
-    this.client.post({ type: "drawn", frames: this.drawnSinceReport });
+    this.client.post({ type: "drawn", frames: this.drawnSinceReport, age_ms: this.delay_ms });
     this.drawnSinceReport = 0;
   }
 }
