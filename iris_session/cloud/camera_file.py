@@ -52,6 +52,10 @@ _MISSING: Final = {
 }
 
 
+#: Least focal length, as a share of the width: 157 degrees.
+LEAST_FOCAL: Final = 0.1
+
+
 class CameraFileError(IrisError, ValueError):
     """A camera file, or one that it names, cannot be used. The message is one line.
 
@@ -274,6 +278,8 @@ class _Reader:
                 f"intrinsics are of {model.width} x {model.height} pixels: at most {MAX_IMAGE_SIZE} x {MAX_IMAGE_SIZE}"
             )
             raise self._error("intrinsics", f"{text} are possible", index)
+        if model is not None and (text := _find_impossible(model)):
+            raise self._error("intrinsics", text, index)
         for key in ("model", "camera") if camera.source == "mujoco" else ():
             if not getattr(camera, key):
                 raise self._error(key, f"{key} is missing: a rendered camera needs model and camera", index)
@@ -390,6 +396,17 @@ def find_line(text: str, key: str, camera: int | None = None) -> int:
         elif table == (-1 if camera is None else camera) and re.search(rf"^\s*\[?[\w.]*\b{re.escape(key)}\b", line):
             return number
     return at
+
+
+def _find_impossible(camera: CameraModel) -> str:
+    """Return what is impossible about intrinsics, empty for possible ones."""
+    least = LEAST_FOCAL * camera.width
+    if min(camera.fx, camera.fy) < least:
+        return f"fx {camera.fx:g}, fy {camera.fy:g}: at least a tenth of the width, {least:g} pixels, are possible"
+    if not (0.0 <= camera.cx <= camera.width and 0.0 <= camera.cy <= camera.height):
+        size = f"{camera.width} x {camera.height} pixels"
+        return f"the centre cx {camera.cx:g}, cy {camera.cy:g} is outside the picture of {size}: are they of this size?"
+    return ""
 
 
 def _read_text(path: Path, kind: str) -> str:

@@ -30,6 +30,7 @@ from iris_session.cloud.voxels import (
     VoxelFilter,
     choose_max_cells,
     choose_voxel_m,
+    count_outside,
     make_rays,
 )
 from iris_session.protocol.names import BudgetClass
@@ -193,7 +194,8 @@ class CloudPipeline:
         voxels: The filter, by default one that takes numba where it is installed.
 
     Attributes:
-        drops: Frames and points that were left out: `superseded`, `pose`, `join`, `cells` (points), `budget` (points).
+        drops: Frames and points that were left out: `superseded`, `pose`, `join`, `cells` (points), `budget` (points);
+            of clouds without a point also `range` and `box` (points), which say why.
     """
 
     def __init__(
@@ -296,6 +298,10 @@ class CloudPipeline:
                 points = self._remover.remove(points, at_ns)
         times.append(clock_ns())
         voxel_m, n = self._voxels.voxel_m, len(points.positions)
+        for name, ((frame, model, depth_scale_m), T_world_camera) in frames.items() if not n else ():
+            state = self._states[name]
+            outside = count_outside(frame.depth, state.find_rays(model), T_world_camera, depth_scale_m, state.limits)
+            self.drops.update(dict(zip(("range", "box"), outside, strict=True)))
         self._next_voxel_m = choose_voxel_m(voxel_m, self._count_needed(n), settings.points, settings.voxel_m)
         if n > settings.points:  # as at the beginning, and when a camera turns to something near
             self.drops["budget"] += n - settings.points

@@ -41,6 +41,7 @@ class SourceReader:
     Attributes:
         superseded: Frames that were replaced by newer ones before they were taken.
         refused: Frames that could not be used.
+        incomplete: Frames of a recording that lack a part.
         failures: How often the source could not be opened or read.
         read_ms: Mean age of a frame when its source returned it: of capture, transport and decoding [ms].
     """
@@ -66,7 +67,7 @@ class SourceReader:
         self._source: DepthSource | None = None
         self._n_frames = 0  # of this source
         self._backoff = Backoff(REOPEN_S)
-        self.superseded = self.refused = self.failures = 0
+        self.superseded = self.refused = self.incomplete = self.failures = 0
         self.read_ms = 0.0
         self._thread = threading.Thread(target=self._run, name=f"iris-camera-{name}"[:15], daemon=True)
 
@@ -123,6 +124,7 @@ class SourceReader:
         try:
             if self._source is None:
                 self._source, self._n_frames = self._open_source(), 0
+                self.incomplete = getattr(self._source, "left_out", 0)  # of a folder
                 with self._lock:
                     self._health.restart(self._now_ns())
             else:

@@ -103,6 +103,24 @@ def make_rays(camera: CameraModel) -> Rays:
     return Rays(np.ascontiguousarray(x, np.float32), np.ascontiguousarray(y, np.float32))
 
 
+def count_outside(
+    depth: Depth, rays: Rays, T_world_camera: Floats, depth_scale_m: float, limits: DepthLimits
+) -> tuple[int, int]:
+    """Return how many measured pixels of a depth picture are out of range, and how many of the others out of the box.
+
+    Args:
+        depth, rays, T_world_camera, depth_scale_m, limits: As for `VoxelFilter.add_depth`.
+    """
+    measured = (depth > 0) & (depth < 65_535)
+    z = depth * depth_scale_m
+    near = measured & (z >= limits.nearest_m) & (z <= limits.farthest_m)
+    p_camera = np.stack([rays.x[near], rays.y[near], np.ones(np.count_nonzero(near))]) * z[near]
+    p_world = T_world_camera[:3, :3] @ p_camera + T_world_camera[:3, 3:]
+    low, high = (np.array(corner)[:, None] for corner in (limits.low, limits.high))
+    outside = ((p_world < low) | (p_world >= high)).any(axis=0)
+    return int(np.count_nonzero(measured & ~near)), int(np.count_nonzero(outside))
+
+
 class VoxelFilter:
     """Collect points in cells.
 

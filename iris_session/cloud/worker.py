@@ -241,6 +241,7 @@ class CloudWorker:
         for reader in self._readers.values():
             drops["superseded"] += reader.superseded
             drops["unusable"] += reader.refused
+            drops["incomplete"] += reader.incomplete
         return {reason: n for reason, n in drops.items() if n}
 
     def close(self) -> bool:

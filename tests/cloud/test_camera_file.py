@@ -154,6 +154,8 @@ def test_a_wrong_value_is_named_with_its_line(tmp_path: Path, line: str, key: st
         ("depth_scale_m = 1.0", "depth_scale_m", 16),
         ("height = 4097", "height", 16),
         ("intrinsics = { width = 640, height = 4097, fx = 9.0, fy = 1.0, cx = 1.0, cy = 1.0 }", "intrinsics", 16),
+        ("intrinsics = { width = 640, height = 480, fx = 60.0, fy = 585.0, cx = 320.0, cy = 9.0 }", "intrinsics", 16),
+        ("intrinsics = { width = 640, height = 480, fx = 585.0, fy = 585.0, cx = 960.0, cy = 9.0 }", "intrinsics", 16),
         ("calibration = 'calibration.toml'", "pose", 15),
         ("intrinsics = 'nowhere.toml'", "intrinsics", 16),
         ("intrinsics = { width = 640 }", "height", 9),

@@ -231,6 +231,16 @@ def test_a_cloud_without_points_is_one() -> None:
     assert len(decode_cloud(cloud.frames["full"]).positions) == 0
 
 
+@pytest.mark.parametrize(("depth_mm", "at_m", "reason"), [(9000, 0.0, "range"), (1500, 200.0, "box")])
+def test_a_cloud_without_points_counts_why(depth_mm: int, at_m: float, reason: str) -> None:
+    pipeline = make_pipeline("front")
+    T_world_camera = np.eye(4)
+    T_world_camera[2, 3] = at_m
+    pipeline.offer("front", make_frame(0, depth_mm, T_world_camera=T_world_camera), 0)
+    assert pipeline.make_cloud(pipeline.take_frames(0)).n_points == 0
+    assert +pipeline.drops == {reason: 160 * 120}
+
+
 def test_a_camera_without_a_pose_does_not_stop_the_other() -> None:
     """Its body may not be in this scene. Until that is known, it is waited for."""
     pipeline = make_pipeline("front", "hand", body="gripper", body_pose=lambda body, at: None)

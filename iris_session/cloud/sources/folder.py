@@ -1,10 +1,12 @@
 """A folder of pictures: `NAME.depth.png`, `NAME.color.jpg` or `.png`, and if known `NAME.pose.txt`.
 
-The pose is that of the camera's optical frame, 4 x 4 numbers. The names are those of the 7-Scenes data set.
+The pose is that of the camera's optical frame, 4 x 4 numbers. The names are those of the 7-Scenes data set. A frame
+that lacks one of its files is left out and counted.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -29,6 +31,9 @@ class FolderSource(RecordingSource[str]):
     """Plays the pictures of a folder, in the order of their names.
 
     `pose` of the camera is the pose of the frame in which the poses of the files are, where there are such files.
+
+    Attributes:
+        left_out: Frames that lack a file.
     """
 
     def __init__(self, settings: CameraSettings, now_ns: Callable[[], int]) -> None:
@@ -38,13 +43,27 @@ class FolderSource(RecordingSource[str]):
         self.camera = settings.intrinsics
         self.depth_scale_m = settings.depth_scale_m or 0.001
         self._folder = Path(settings.path)
-        self._names = sorted(path.name.removesuffix(".depth.png") for path in self._folder.glob("*.depth.png"))
-        if not self._names:
-            raise SourceError(f"{self._folder} has no pictures named NAME.depth.png with NAME.color.jpg or .png")
-        self._has_poses = any(self._folder.glob("*.pose.txt"))
+        depth, poses = self._list_names(".depth.png"), self._list_names(".pose.txt")
+        color = self._list_names(".color.jpg") | self._list_names(".color.png")
+        self._has_poses = bool(poses)
+        complete = depth & color & poses if poses else depth & color
+        if not complete:
+            raise SourceError(self._describe_missing())
+        self._names = sorted(complete)
+        self.left_out = len((depth | color | poses) - complete)
         self._T_world_poses = settings.pose.to_matrix() if settings.pose else np.eye(4)
         self._period_ns = SECOND / (settings.hz or DEFAULT_HZ)
         super().__init__(settings, now_ns)
+
+    def _list_names(self, ending: str) -> set[str]:
+        return {path.name.removesuffix(ending) for path in self._folder.glob(f"*{ending}")}
+
+    def _describe_missing(self) -> str:
+        """Return what the folder lacks, and the endings of the files that it has."""
+        endings = Counter("." + path.name.partition(".")[2] for path in self._folder.iterdir() if path.is_file())
+        has = ", ".join(f"{ending} ({n})" for ending, n in endings.most_common(6)) or "no files"
+        wanted = "NAME.depth.png with NAME.color.jpg or .png" + (" and NAME.pose.txt" if self._has_poses else "")
+        return f"{self._folder} has no frame of {wanted}; its files end in {has}"
 
     def _decode_frame(self, content: str, capture_ns: int) -> DepthFrame:
         file = self._folder / f"{content}.depth.png"

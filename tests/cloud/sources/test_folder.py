@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from anchors.camera import CameraModel
 from iris_session.cloud.camera_file import CameraPose, CameraSettings
 from iris_session.cloud.frames import DepthFrame, SourceEndedError, SourceError
+from iris_session.cloud.sources.folder import FolderSource
 from iris_session.cloud.voxels import DepthLimits, VoxelFilter, make_rays
 from tests.cloud.sources.test_rerun_recording import read_source
 
@@ -60,18 +61,36 @@ def spoil(folder: Path, how: str) -> None:
     if how == "no frames":
         for file in folder.iterdir():
             file.unlink()
-    elif how == "no colour":
-        (folder / "b.color.png").unlink()
+    elif how == "other endings":
+        for name in "ab" if (folder / "b.color.png").exists() else "a":
+            (folder / f"{name}.color.png").rename(folder / f"{name}.colour.jpeg")
     elif how == "damaged depth":
         (folder / "b.depth.png").write_bytes((folder / "b.depth.png").read_bytes()[:50])
-    elif how == "no pose":
-        np.savetxt(folder / "a.pose.txt", np.eye(4))
     elif how == "half a pose":
         for name in "ab":
             np.savetxt(folder / f"{name}.pose.txt", np.eye(4)[:2])
 
 
-@pytest.mark.parametrize("how", ["no frames", "no colour", "damaged depth", "no pose", "half a pose"])
+@pytest.mark.parametrize("lacking", ["b.color.png", "b.pose.txt", "b.depth.png"])
+def test_a_frame_that_lacks_a_file_is_left_out_and_counted(tmp_path: Path, lacking: str) -> None:
+    for name in "abc":
+        write_frame(tmp_path, name, 1000)
+        np.savetxt(tmp_path / f"{name}.pose.txt", np.eye(4))
+    (tmp_path / lacking).unlink()
+    source, frames = read_source(make_settings(tmp_path))
+    assert len(frames) == 2
+    assert isinstance(source, FolderSource)
+    assert source.left_out == 1
+
+
+def test_an_error_names_the_endings_that_the_folder_has(tmp_path: Path) -> None:
+    write_frame(tmp_path, "a", 1000)
+    spoil(tmp_path, "other endings")
+    with pytest.raises(SourceError, match=r"\.colour\.jpeg \(1\)"):
+        read_all(make_settings(tmp_path))
+
+
+@pytest.mark.parametrize("how", ["no frames", "other endings", "damaged depth", "half a pose"])
 def test_what_is_missing_or_damaged_is_named(tmp_path: Path, how: str) -> None:
     for name in "ab":
         write_frame(tmp_path, name, 1000)
