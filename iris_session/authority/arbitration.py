@@ -18,6 +18,7 @@ from iris_session.authority import ageing, engagement, roster, samples, tracking
 from iris_session.authority.config import SECOND
 from iris_session.authority.context import HUMAN, Context
 from iris_session.authority.state import (
+    HOST_ID,
     DeviceState,
     FeedbackState,
     JointReading,
@@ -31,6 +32,7 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import CommandKind, Device, HoldReason, LeaseMode, RejectReason, SampleKind
 from iris_session.protocol.server_messages import Feedback, Notice, PresenceItem
+from iris_session.protocol.specs import ON_RELEASE_HOME
 from iris_session.protocol.steps import Command, CommandSource, ObjectCommand
 
 #: Objects farther away than this [m] have left the scene; far below what arithmetic can hold.
@@ -40,6 +42,11 @@ _WAITING = (HoldReason.NO_SAMPLE, HoldReason.CLUTCH_OPEN)
 #: A gripper value that is out of range by more than rounding is reported: a policy has other units (0 to 255, -1 to 1).
 GRIPPER_SLACK: Final = 0.01
 GRIPPER_REPORT_NS: Final = 60 * SECOND
+#: A released robot stands for so long before it goes home, and gives up after so long [ns].
+HOME_AFTER_NS: Final = SECOND // 2
+HOME_WITHIN_NS: Final = 20 * SECOND
+#: It is there when every joint is within this [rad or m].
+HOME_CLOSE: Final = 0.01
 _INVISIBLE = (Device.JOINTS, Device.TARGET)
 
 
@@ -233,6 +240,11 @@ class CommandBuilder:
 
     def _build_command(self, ctx: Context, lease: LeaseState) -> Command:
         grants = lease.grants
+        goes_home = ctx.robots[lease.target].on_release == ON_RELEASE_HOME and not ctx.config.user_owned_loop
+        if goes_home and not lease.home:
+            lease.home = tuple(ctx.view.joints(lease.target))
+        if not grants and lease.freed_ns and (command := _build_home_command(ctx, lease)) is not None:
+            return command
         if not grants:
             return self._get_hold_command(lease.target, HoldReason.ESTOP if ctx.state.estop else HoldReason.NO_LEASE)
         if lease.mode == LeaseMode.SHARED and len(grants) > 1:
@@ -268,6 +280,26 @@ class CommandBuilder:
         gripping = [(g.weight, g.gripper) for g in engaged if g.gripper is not None]
         gripper = sum(w * v for w, v in gripping) / sum(w for w, _ in gripping) if gripping else None
         return Command(lease.target, engaged[0].kind, "", sources, gripper, ctx.get_scale(lease))
+
+
+def _build_home_command(ctx: Context, lease: LeaseState) -> Command | None:
+    """Return the command that moves a released robot to where it stood at the beginning, as a leader's joints would;
+    `None` before and after.
+    """
+    since_ns = ctx.now_ns - lease.freed_ns
+    if since_ns < HOME_AFTER_NS or ctx.state.estop or ctx.state.paused or ctx.reset:
+        return None
+    apart = max((abs(a - b) for a, b in zip(ctx.view.joints(lease.target), lease.home, strict=True)), default=0.0)
+    if apart <= HOME_CLOSE or since_ns > HOME_WITHIN_NS:
+        lease.freed_ns = 0
+        return None
+    is_new = not lease.homing
+    if is_new:
+        lease.homing = ctx.state.next_engagement
+        ctx.state.next_engagement += 1
+    at_ns = lease.freed_ns
+    source = CommandSource(HOST_ID, Device.JOINTS, lease.homing, 0, at_ns, at_ns, new=is_new, q=lease.home)
+    return Command(lease.target, CommandKind.JOINTS, "", (source,))
 
 
 def _age_source(ctx: Context, g: LeaseGrant) -> CommandSource:

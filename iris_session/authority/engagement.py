@@ -65,6 +65,7 @@ def rearm_participant(ctx: Context, p: Participant, reason: str) -> None:
 def rearm_all(ctx: Context, reason: str) -> None:
     """Rearm everything in the session."""
     for lease in (*ctx.state.robots.values(), *ctx.held_objects):
+        lease.freed_ns = 0  # a free robot does not begin to move by itself
         for g in lease.grants:
             rearm_grant(ctx, lease, g, reason)
 

@@ -41,6 +41,9 @@ def revoke_grant(ctx: Context, lease: LeaseState, g: LeaseGrant) -> None:
         # One side of an intervention has left, so it is over: the other one alone is in charge.
         engagement.end_intervention(ctx, lease)
     lease.grants.remove(g)
+    if not lease.grants and lease.home:
+        is_still = ctx.state.estop or ctx.state.paused
+        lease.freed_ns, lease.homing = 0 if is_still else ctx.now_ns, 0
     if lease.kind == TargetKind.OBJECT:
         if not lease.grants:
             lease.lead = 0  # free from here on: it may lie anywhere when it is next taken
@@ -70,6 +73,7 @@ def grant_lease(
     if not joins:
         revoke_all(ctx, lease)
     lease.version += 1
+    lease.freed_ns = 0
     scale = ctx.get_scale(lease) if lease.mode == LeaseMode.SHARED else ctx.default_scale
     lease.grants.append(LeaseGrant(p.id, lease.version, weight, hand, scale, request_id=request_id))
     if lease.kind == TargetKind.OBJECT:

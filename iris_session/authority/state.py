@@ -238,6 +238,9 @@ class LeaseState(msgspec.Struct):
     """One robot or object. `override`: the human who has preempted the agent (mode `priority`), also while it is
     disconnected.
 
+    Robots that go home when they are released: `home`, joint positions at the beginning of the scene; `freed_ns`, since
+    when it may move there, 0: it holds; `homing`, the engagement of that motion.
+
     Objects: `lead` is the engagement of the leading hand, `T_hand_object` its latched offset, `T_world_object` the
     last commanded pose.
     """
@@ -251,6 +254,9 @@ class LeaseState(msgspec.Struct):
     lead: int = 0
     T_hand_object: Pose = IDENTITY
     T_world_object: Pose = IDENTITY
+    home: tuple[float, ...] = ()
+    freed_ns: int = 0
+    homing: int = 0
 
 
 class Pending(msgspec.Struct):

@@ -14,6 +14,7 @@ from iris_session.cli.common import CommandError, add_command, add_json_option, 
 if TYPE_CHECKING:
     from iris_session.bench.report import BenchReport
 
+
 class _Benchmark(NamedTuple):
     """One benchmark: `run_NAME` in a module of `iris_session.bench`.
 
@@ -145,9 +146,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         _register_benchmark(names, name, one)
 
 
-def _register_benchmark(
-    names: argparse._SubParsersAction[argparse.ArgumentParser], name: str, one: _Benchmark
-) -> None:
+def _register_benchmark(names: argparse._SubParsersAction[argparse.ArgumentParser], name: str, one: _Benchmark) -> None:
     example = f"iris-session bench {name} --check"
     parser = add_command(names, name, run, help=one.text, description=f"Measure: {one.text}.", examples=example)
     for option, default in one.options.items():

@@ -33,7 +33,7 @@ from iris_session.physics.names import (
 from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import LeaseMode
-from iris_session.protocol.specs import ARM, HAND, GripperActuator, RobotSpec
+from iris_session.protocol.specs import ARM, HAND, ON_RELEASE_HOLD, ON_RELEASE_HOME, GripperActuator, RobotSpec
 
 #: The keys in their order, and what a value must be.
 _TEXT, _REFERENCES, _ONE_OR_MORE, _NUMBERS, _VECTOR, _QUATERNION = (
@@ -60,9 +60,11 @@ _KEYS: Final = {
     "mode": _TEXT,
     "hold": _TEXT,
     "kind": _TEXT,
+    "on_release": _TEXT,
 }
 _HOLDS: Final = ("", "gravity_pd")
 _KINDS: Final = (ARM, HAND)
+_ON_RELEASE: Final = (ON_RELEASE_HOLD, ON_RELEASE_HOME)
 
 
 def load_robots_toml(path_or_text: str | Path, model: mujoco.MjModel) -> tuple[RobotSpec, ...]:
@@ -121,6 +123,7 @@ def _list_values(robot: RobotSpec) -> dict[str, Any]:
         "mode": robot.mode,
         "hold": robot.hold,
         "kind": robot.kind if robot.kind != ARM else "",
+        "on_release": robot.on_release if robot.on_release != ON_RELEASE_HOLD else "",
     }
     if not robot.site:
         tip = robot.T_body_tip
@@ -152,7 +155,12 @@ def _read_text(path_or_text: str | Path) -> tuple[str, str]:
 def _parse_robot(tree: KinematicTree, table: dict[str, Any], where: str) -> RobotSpec:
     fields = _check_types(table, where)
     where = f"{where} ({fields['name']}): "
-    for key, allowed in (("mode", sorted(LeaseMode.ALL)), ("hold", _HOLDS), ("kind", _KINDS)):
+    for key, allowed in (
+        ("mode", sorted(LeaseMode.ALL)),
+        ("hold", _HOLDS),
+        ("kind", _KINDS),
+        ("on_release", _ON_RELEASE),
+    ):
         if fields.get(key, allowed[0]) not in allowed:
             listed = ", ".join(one or "empty" for one in allowed)
             raise RobotsFileError(f"{where}{key} {fields[key]!r} is none of {listed}")

@@ -11,6 +11,9 @@ from iris_session.protocol.common import IDENTITY, Name, Pose
 #: Kinds of robots: an arm follows poses and joints; a hand, whose fingers are no chain, follows joints only.
 ARM: Final = "arm"
 HAND: Final = "hand"
+#: What a robot does whose lease ends: it holds where it is, or moves to where it stood when its scene began.
+ON_RELEASE_HOLD: Final = "hold"
+ON_RELEASE_HOME: Final = "home"
 
 
 class GripperActuator(msgspec.Struct, frozen=True):
@@ -46,6 +49,7 @@ class RobotSpec(msgspec.Struct, frozen=True):
         T_body_tip: Pose of the end effector in the frame of `tip_body`.
         gripper_partners: Further actuators of the same gripper. Its opening is measured at `gripper_actuator`.
         kind: `arm`, or `hand`: fingers that are controlled in joint space only.
+        on_release: What it does when its lease ends: `hold`, or `home`.
     """
 
     name: Name
@@ -63,6 +67,7 @@ class RobotSpec(msgspec.Struct, frozen=True):
     T_body_tip: Pose = IDENTITY
     gripper_partners: tuple[GripperActuator, ...] = ()
     kind: Name = ARM
+    on_release: Name = ON_RELEASE_HOLD
 
     @property
     def gripper_actuators(self) -> tuple[GripperActuator, ...]:

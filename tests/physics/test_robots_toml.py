@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import msgspec
 import mujoco
 import pytest
 
@@ -69,6 +70,7 @@ MISTAKES = [
     ({"joints": "[0, 99]"}, "joint '#99' does not exist in the model"),
     ({**GRIP, "gripper_open": "[0.04, 0]"}, "1 gripper actuators but 2 values of gripper_open"),
     ({"kind": '"leg"'}, "kind 'leg' is none of arm, hand"),
+    ({"on_release": '"fall"'}, "on_release 'fall' is none of hold, home"),
     ({"hold": '"magic"'}, "hold 'magic' is none of empty, gravity_pd"),
 ]
 
@@ -136,6 +138,13 @@ def test_robot_without_actuators(handover: mujoco.MjModel) -> None:
     (robot,) = load_robots_toml(text, handover)
     assert robot.actuators == ()
     assert load_robots_toml(dump_robots_toml([robot]), handover) == (robot,)
+
+
+def test_a_robot_may_go_home_when_it_is_released(handover: mujoco.MjModel) -> None:
+    robot, _ = find_robots(handover).robots
+    assert robot.on_release == "hold"
+    home = msgspec.structs.replace(robot, on_release="home")
+    assert load_robots_toml(dump_robots_toml([home]), handover) == (home,)
 
 
 def test_one_of_two_finger_actuators_is_refused_with_both() -> None:

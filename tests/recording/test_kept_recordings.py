@@ -69,6 +69,12 @@ def test_what_a_header_does_not_name_was_not_in_force() -> None:
     config = CoreConfig(AuthorityConfig(), ControlConfig(), (robot,), ())
     fields = msgspec.msgpack.decode(msgspec.msgpack.encode(config))
     assert decode_recorded_config(msgspec.msgpack.encode(fields)).control.compensate_sag
-    del fields["control"]["compensate_sag"], fields["control"]["few_joints_orientation_cost"]
-    control = decode_recorded_config(msgspec.msgpack.encode(fields)).control
+    del (
+        fields["authority"]["explains"],
+        fields["control"]["compensate_sag"],
+        fields["control"]["few_joints_orientation_cost"],
+    )
+    recorded = decode_recorded_config(msgspec.msgpack.encode(fields))
+    assert not recorded.authority.explains
+    control = recorded.control
     assert (control.compensate_sag, control.few_joints_orientation_cost) == (False, None)

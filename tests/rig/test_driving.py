@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import msgspec
 import pytest
 
 from anchors.pose import PoseTuple, distance
@@ -11,6 +12,7 @@ from iris_session.client import Client, UnreachedError
 from iris_session.protocol.client_messages import ClearEStop
 from iris_session.protocol.names import HoldReason
 from iris_session.protocol.server_messages import EngagementChanged
+from iris_session.session.session import Session
 from tests.rig.session import Rig, see_tip
 
 SECOND = 1_000_000_000
@@ -76,3 +78,36 @@ def test_a_pose_that_is_not_reached_says_how_far_and_why() -> None:
         assert stopped.value.feedback.hold_reason == HoldReason.ESTOP
         policy.release("left")
         assert not policy.is_armed("left")
+
+
+class HomingRig(Rig):
+    """Its robots go home when they are released."""
+
+    def _make_session(self) -> Session:
+        session = super()._make_session()
+        session.robots = tuple(msgspec.structs.replace(one, on_release="home") for one in session.robots)
+        return session
+
+
+def test_a_released_robot_goes_home_within_its_limits_and_an_estop_stops_it_for_good() -> None:
+    with HomingRig(timestep=0.01) as rig:
+        policy, home = join_policy(rig)
+        director = rig.join("dora", "director")
+        (x, y, z), q = home
+        for stops in (False, True):
+            policy.acquire("left")
+            policy.move_to("left", ((x, y + 0.15, z + 0.1), q))
+            policy.release("left")
+            rig.run(0.2)
+            rig.check_rest(director, "left", 0.2)
+            if stops:
+                rig.run_until(lambda: distance(see_tip(director, "left")[0], (x, y, z)) < 0.1)
+                director.estop("test")
+                rig.run(0.4)
+                director.clear_estop()
+                rig.check_rest(director, "left", 2.0)
+                assert distance(see_tip(director, "left")[0], (x, y, z)) > 0.03
+            else:
+                rig.run(6.0)
+                assert distance(see_tip(director, "left")[0], (x, y, z)) < 0.01
+                rig.check_rest(director, "left", 1.0)
