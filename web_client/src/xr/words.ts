@@ -1,6 +1,7 @@
 // Lines of the panels in the scene, and what is felt in the hand. Pure.
 
 import type { Filled, Lease, ParticipantInfo } from "../core/api.ts";
+import { HoldReason } from "../protocol/messages.g.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import { capitalize, formatMillimetres, holdReasonWords, limitWords } from "../ui/words.ts";
 
@@ -31,7 +32,7 @@ export function describeRobot({ name, lease, holdReason, limits, selfId, isStopp
   const lines = [`${name}: ${who}`];
   if (isStopped) lines.push("stopped by the e-stop");
   else if (isPaused) lines.push("paused");
-  else if (holder !== "" && holdReason !== "") lines.push(...wrap(`holds: ${holdReasonWords(holdReason, isOwn)}`));
+  else if (holder !== "" && holdReason !== "") lines.push(...wrap(isOwn ? describeOwnHold(holdReason) : `holds: ${holdReasonWords(holdReason)}`));
   else if (isOwn && holdReason === "" && limits.length > 0) lines.push(...wrap(limitWords(limits)));
   const place = lease?.queue.indexOf(selfId) ?? -1;
   if (lease && place >= 0) lines.push(`you wait for it, place ${place + 1} of ${lease.queue.length}`);
@@ -41,6 +42,12 @@ export function describeRobot({ name, lease, holdReason, limits, selfId, isStopp
     lines.push(isOwn ? "hold the trigger to release it" : `press the trigger to ${verb} it`);
   }
   return lines;
+}
+
+/** Return why one's own robot holds, in terms of a hand. */
+function describeOwnHold(reason: string): string {
+  if (reason === HoldReason.CLUTCH_OPEN || reason === HoldReason.NO_SAMPLE) return "squeeze to move it";
+  return `holds: ${holdReasonWords(reason, true).replace("hold again", "squeeze again")}`;
 }
 
 /** Return whether a request for a robot waits for the consent of its holder. */

@@ -16,6 +16,8 @@ describe("panels", () => {
     expect(describeRobot({ ...facts, lease, holdReason: "clutch_open" })).toEqual(["left: ben", "holds: the operator has let go"]);
     const own = { ...facts, lease, isOwn: true, isPointedAt: true, holdReason: "untracked" };
     expect(describeRobot(own)).toEqual(["left: you", "holds: tracking lost", "hold the trigger to release it"]);
+    expect(describeRobot({ ...own, holdReason: "clutch_open" })[1]).toBe("squeeze to move it");
+    expect(describeRobot({ ...own, holdReason: "gap" }).join(" ")).toContain("then squeeze again");
     expect(describeRobot({ ...own, isStopped: true })[1]).toBe("stopped by the e-stop");
     expect(describeRobot({ ...own, isPaused: true })[1]).toBe("paused");
     expect(describeRobot({ ...own, holdReason: "", limits: ["joint4"] })[1]).toBe("joint 4 at its end");
