@@ -11,13 +11,13 @@ import { Label } from "./labels.ts";
 const UNKNOWN_SIZE_M = 0.15;
 const COLOR = "#35d0ba";
 
-/** The sheet of a session in which nobody has configured one: `DEFAULT_ANCHORS` in iris_session/session/config.py. */
+/** The sheet of a session that has none configured: `DEFAULT_ANCHORS` in iris_session/session/config.py. */
 const DEFAULT_SHEET = JSON.stringify(["table", [[0, -0.45, 0], [1, 0, 0, 0]], 0]);
 
 /** Alignments that come from a sheet. */
 const BY_SHEETS: readonly AlignmentKind[] = [AlignmentKind.MEASURED, AlignmentKind.FINGERTIP, AlignmentKind.PERSISTENT];
 
-/** Return the anchors to draw: the default sheet only while somebody is aligned by a sheet. */
+/** Return the anchors to draw: the default sheet only while a participant is aligned by a sheet. */
 export function listDrawn(anchors: readonly AnchorPlace[], people: readonly ParticipantInfo[]): AnchorPlace[] {
   const isAligned = people.some(({ alignment }) => BY_SHEETS.includes(alignment?.kind ?? AlignmentKind.NONE));
   const isDefault = ({ anchor_id, T_world_anchor, error_m }: AnchorPlace): boolean =>
