@@ -9,6 +9,7 @@ export default defineConfig({
     assetsInlineLimit: 0,
     target: "es2023",
     chunkSizeWarningLimit: 1500,
+    license: { fileName: "licenses.md" },
   },
   worker: { format: "es" },
 });

@@ -87,19 +87,19 @@ export function findWholeBox(scene: Placed, beside: Box3): Box3 {
 }
 
 /**
- * Return what the first picture of a scene shows: its robots with what is around them, or all of it where that is not
- * much more. `bases`: bodies at the feet of the robots, by id.
+ * Return what the first picture of a scene shows: its robots with what is around them, without any what the scene says
+ * (`environment`), or all of it where that is not much more. `bases`: bodies at the feet of the robots, by id.
  */
 export function findFirstSight(scene: Placed, bases: readonly number[], beside: Box3): Sight {
   const whole = findWholeBox(scene, beside);
   const links = listDescendants(scene.spec, bases);
-  const robots = scene.spec.visuals.filter(({ body }) => links.has(body));
+  const robots = scene.spec.visuals.filter((visual) => links.has(visual.body) && isSolid(scene.spec, visual));
   const focus = unionOf(robots.map((visual) => boxNow(scene, visual)));
-  if (focus.isEmpty()) return { box: whole, azimuth: FIRST_AZIMUTH };
-  const size = focus.getSize(new Vector3());
-  focus.expandByScalar(AROUND_ROBOTS * size.length());
-  const isSmall = whole.getSize(corner).length() > MUCH_MORE * focus.getSize(size).length();
-  const box = isSmall ? focus : whole;
+  const size = new Vector3();
+  if (focus.isEmpty()) focus.union(boxOfEnvironment(scene.spec.environment));
+  else focus.expandByScalar(AROUND_ROBOTS * focus.getSize(size).length());
+  const isPart = whole.getSize(corner).length() > MUCH_MORE * focus.getSize(size).length();
+  const box = isPart ? focus : whole;
   return { box, azimuth: findAzimuth(scene, robots, links, box) };
 }
 
