@@ -623,7 +623,10 @@ describe("assets and media", () => {
       [4, ["cloth"]],
     ]);
     const header = encodeStruct("MediaHeader", ["cloth", "full", 1, 7, bench.now + OFFSET_NS, bench.now + OFFSET_NS, "deformable", 0]);
-    media.deliver(3, new TextEncoder().encode("media/1/cloth/full"), header, fromHex((cloth.frames[0] as { hex: string }).hex));
+    await bench.until(() => {
+      media.deliver(3, new TextEncoder().encode("media/1/cloth/full"), header, fromHex((cloth.frames[0] as { hex: string }).hex));
+      return bench.of("deformable").length > 0; // once its topology has come
+    });
     expect(bench.last("deformable")).toMatchObject({ stream: "cloth", seq: 7, scene_epoch: 1 });
     expect(bench.last("deformable").vertices).toHaveLength(90);
     const { position, normal } = bench.last("deformable").surface!;
