@@ -59,6 +59,38 @@ def find_simulation(environment: Any) -> Simulation | None:
     return without_data
 
 
+def find_path(environment: Any, data: mujoco.MjData) -> tuple[str, ...]:
+    """Return the names of attributes from an environment to its data, for `read_path`; empty if there are none."""
+    level: list[tuple[Any, tuple[str, ...]]] = [(environment, ())]
+    seen = {id(environment)}
+    for _ in range(_MAX_DEPTH):
+        deeper = []
+        for owner, path in level:
+            for name in _DATA:
+                value = read_attribute(owner, name)
+                if value is data:
+                    return (*path, name)
+                binding = next(
+                    (one for one in _BINDINGS if value is not None and read_attribute(value, one) is data), ""
+                )
+                if binding:
+                    return (*path, name, binding)
+            for name in _OWNERS:
+                inner = read_attribute(owner, name)
+                if inner is not None and id(inner) not in seen:
+                    seen.add(id(inner))
+                    deeper.append((inner, (*path, name)))
+        level = deeper
+    return ()
+
+
+def read_path(owner: Any, path: tuple[str, ...]) -> Any:
+    """Return the attribute at the end of a path, `None` where there is none."""
+    for name in path:
+        owner = read_attribute(owner, name)
+    return owner
+
+
 def require_simulation(environment: Any) -> Simulation:
     """Return what an environment simulates. Raises `ConfigError` that says why an object cannot be shared."""
     found = find_simulation(environment)
