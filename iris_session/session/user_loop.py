@@ -147,7 +147,7 @@ class UserLoop:
         self.is_attached = False
         self.unseen_s = 0.0
         self.reset_count = 0
-        #: Wakes the helper thread. In C, so that Ctrl-C in the program leaves no lock behind, as in `Event`.
+        #: Wakes the helper thread. Unlike `Event` it is in C: Ctrl-C in the program leaves no lock held.
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         #: State of the newest look, until a step is taken on it or on a newer one.
         self._noted: deque[Floats] = deque(maxlen=1)

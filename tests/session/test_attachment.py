@@ -371,7 +371,7 @@ def test_while_someone_drives_every_step_is_a_tick(is_opaque: bool) -> None:
 
 
 def test_another_pose_at_the_same_time_is_a_reset() -> None:
-    """Somebody may have engaged while the program was silent: the robot does not go back to where it stood."""
+    """A participant may have engaged while the program was silent: the robot does not go back to where it stood."""
     rig = Rig()
 
     class Placed(Owner):
