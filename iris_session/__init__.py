@@ -61,7 +61,7 @@ if TYPE_CHECKING:
         SetVisual,
         Visual,
     )
-    from iris_session.protocol.server_messages import ParticipantJoined
+    from iris_session.protocol.server_messages import ParticipantJoined, RobotState
     from iris_session.protocol.specs import ObjectSpec, RobotSpec
     from iris_session.recording import RecordingError
     from iris_session.replay.recorded_session import Recording
@@ -128,7 +128,7 @@ _PUBLIC: Final = {
         "AddMaterial",
     ),
     "iris_session.protocol.names": ("HoldReason",),
-    "iris_session.protocol.server_messages": ("ParticipantJoined",),
+    "iris_session.protocol.server_messages": ("ParticipantJoined", "RobotState"),
     "iris_session.client": (
         "Client",
         "ClientGroup",
@@ -206,6 +206,7 @@ __all__ = [
     "Identity",
     "CurveKeys",
     "SceneState",
+    "RobotState",
     "PoseBuffer",
     "ClientError",
     "NotConnectedError",

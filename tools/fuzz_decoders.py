@@ -45,7 +45,7 @@ from iris_session.protocol.media import (
     parse_topic,
 )
 from iris_session.protocol.names import PROTOCOL_VERSION
-from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
+from iris_session.protocol.server_messages import Presence, RobotStates, ServerEnvelope, StateHeader
 from iris_session.protocol.status import DeliveryBudget
 from iris_session.security import KeysError
 from iris_session.security.allow_list import AllowedKey, AllowList
@@ -571,6 +571,7 @@ DECODERS: Final[dict[str, Callable[[Random], Any]]] = {
     "version": lambda rng: Decoder(rng, client_messages(), codec.peek_version, _OURS),
     "state-header": decode_plain(StateHeader, codec.decode_state_header, _OURS),
     "presence": decode_plain(Presence, codec.decode_presence, _OURS),
+    "robot_states": decode_plain(RobotStates, codec.decode_robot_states, _OURS),
     "beacon": lambda rng: Decoder(rng, [_beacons], check_beacon, _OURS),
     "introduction": lambda rng: Decoder(rng, [_introductions], check_introduction, _OURS),
     "rigid": lambda rng: Decoder(rng, [rigid_frames(7)], make_rigid_check(7), (StreamError,)),

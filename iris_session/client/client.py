@@ -54,7 +54,7 @@ from iris_session.protocol.client_messages import (
 )
 from iris_session.protocol.common import Denial, Lease, Target
 from iris_session.protocol.names import AlignmentKind, Role, TargetKind
-from iris_session.protocol.server_messages import Event, Feedback, Reply
+from iris_session.protocol.server_messages import ROBOT_STATES, Event, Feedback, Reply
 from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.status import StatusReport
 
@@ -97,6 +97,7 @@ class Client(ClientDriving):
         name: str = "",
         devices: str | Sequence[str] = (),
         capabilities: Sequence[str] = (),
+        robot_states: bool = False,
         alignment: str | None = None,
         identity: Identity | str | os.PathLike[str] | None = None,
         curve: CurveKeys | None = None,
@@ -118,6 +119,8 @@ class Client(ClientDriving):
             name: Name that other participants see, by default the role.
             devices: Tracked sources of input that samples will name.
             capabilities: Further capabilities for `Hello`.
+            robot_states: Receive joints, grippers, forces and commands of the robots with every state:
+                `scene.robot_state`.
             alignment: `measured` or `not_needed`, by default by role.
             identity: An `Identity`, a file that keeps one across restarts, or `None` for this process only.
             curve: Keys of your own instead of those in the home of keys.
@@ -145,7 +148,7 @@ class Client(ClientDriving):
             software=software,
             devices=to_names("devices", devices),
             # The session keeps our alignment over a lost connection only while this `run` lasts.
-            capabilities=(*capabilities, f"run:{secrets.token_hex(8)}"),
+            capabilities=(*capabilities, *((ROBOT_STATES,) if robot_states else ()), f"run:{secrets.token_hex(8)}"),
             alignment=alignment,
         )
         encode_checked(hello)

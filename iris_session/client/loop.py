@@ -24,7 +24,7 @@ from iris_session.client.media import ClientMedia
 from iris_session.client.scene import ClientScene
 from iris_session.client.sockets import ClientSockets
 from iris_session.protocol.common import Denial
-from iris_session.protocol.server_messages import Event, Feedback, Reply
+from iris_session.protocol.server_messages import ROBOT_STATES, Event, Feedback, Reply
 from iris_session.protocol.session_mirror import MissedEvents
 
 
@@ -237,7 +237,8 @@ class ClientLoop:
             self._connection.receive(frames, now_ns)
         if self._connection.is_joined and self._connection.welcome is not None:
             self._client.scene.on_welcome()
-            self._sockets.open_state(self._connection.welcome.endpoints.state, self._generation)
+            port, capabilities = self._connection.welcome.endpoints.state, self._connection.hello.capabilities
+            self._sockets.open_state(port, self._generation, ROBOT_STATES in capabilities)
         return bool(messages)
 
     def _call_back(self, message: InboxMessage) -> None:

@@ -7,7 +7,8 @@ import time
 
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.scene_follower import SceneFollower
-from iris_session.protocol.server_messages import PresenceItem
+from iris_session.client.errors import ClientError
+from iris_session.protocol.server_messages import ROBOT_STATES, PresenceItem, RobotState
 
 
 class ClientScene(SceneFollower):
@@ -40,6 +41,24 @@ class ClientScene(SceneFollower):
             stream = self._connection.stream
             stream.retain_presence(self._connection.mirror.connected)
             return dict(stream.presence)
+
+    def robot_state(self, robot: str) -> RobotState | None:
+        """Return the newest measured and commanded values of a robot: joints, gripper, end effector, force, target.
+
+        Args:
+            robot: Name of the robot.
+
+        Returns:
+            The values, units and conventions as in `RobotState`; `None` when there is no such robot or no state yet.
+
+        Raises:
+            ClientError: The client was made without `robot_states=True`.
+        """
+        if ROBOT_STATES not in self._connection.hello.capabilities:
+            raise ClientError("states of robots are not received: make the client with robot_states=True")
+        with self._lock:
+            states = self._connection.stream.robots
+        return next((one for one in states.robots if one.robot == robot), None) if states is not None else None
 
     def data_age_ns(self) -> int | None:
         """Return the age of the newest state now [ns].

@@ -19,7 +19,7 @@ from iris_session.client.errors import IdentityError
 from iris_session.link.discovery import host_port
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES
 from iris_session.protocol.media import MAX_STREAMS
-from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, TOPIC_ROBOTS
 from iris_session.security import KeysError, load_public, load_secret
 from iris_session.system.priority import run_at_low_priority
 
@@ -157,8 +157,10 @@ class ClientSockets:
 
     # --- state --------------------------------------------------------------------------------------------------------
 
-    def open_state(self, port: int, generation: int) -> None:
+    def open_state(self, port: int, generation: int, robots: bool = False) -> None:
         """Subscribe to the state channel, again with every `generation` of the control connection.
+
+        `robots`: subscribe to the states of the robots, too.
 
         The cause of a disconnect may have left this connection half open, and it would never receive again. Does
         nothing when it is connected already.
@@ -171,6 +173,8 @@ class ClientSockets:
         state.setsockopt(zmq.RCVBUF, STATE_RCVBUF)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_RIGID)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_PRESENCE)
+        if robots:
+            state.setsockopt(zmq.SUBSCRIBE, TOPIC_ROBOTS)
         self._state, self._state_of = self._connect(state, port), (port, generation)
 
     def drain_state(self) -> list[list[bytes]]:

@@ -28,7 +28,7 @@ from iris_session.control.ik import InverseKinematics
 from iris_session.control.interpolate import JointInterpolator, read_speed_limits
 from iris_session.control.proximity import ProximityLimiter
 from iris_session.control.sag import SAG, SagCompensation
-from iris_session.control.state import ControllerState, RobotState, decode_state, encode_state
+from iris_session.control.state import ControllerState, RobotControlState, decode_state, encode_state
 from iris_session.physics.tip import Tip
 from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.names import CommandKind
@@ -100,7 +100,7 @@ class Controller:
         self._proximity = ProximityLimiter(model, self._robots, self._config)
         self._check_ticks = max(1, round(self._config.proximity_period_s / self._dt))
         self._solves = self._ik.solves_per_tick(self._check_ticks)
-        self._states = [RobotState() for _ in self._robots]
+        self._states = [RobotControlState() for _ in self._robots]
         self._status = [ControlStatus(robot.name) for robot in self._robots]
         self._latched, self._driven = np.zeros((2, len(self._qpos)), dtype=bool)
         self._now_ns = 0
@@ -124,7 +124,7 @@ class Controller:
         self._tick = self._cursor = self._now_ns = 0
         self._estop = False
         self._ready = True
-        before, self._states = self._states, [RobotState() for _ in self._robots]
+        before, self._states = self._states, [RobotControlState() for _ in self._robots]
         for i, arm in enumerate(self._arms):
             r = self._states[i]
             r.T_world_root = _require_finite(_read_body_pose(data, arm.root_body)) or before[i].T_world_root
@@ -169,7 +169,7 @@ class Controller:
             self._sag.begin_support(columns, measured, droop)
             self._sag.forget(i)
         self._ik.rest[columns] = q[columns]
-        r = self._states[i] = RobotState(T_world_root=self._states[i].T_world_root)
+        r = self._states[i] = RobotControlState(T_world_root=self._states[i].T_world_root)
         tip = None if self._writes_ctrl else _require_finite(self._arms[i].tip.read_pose(data))
         r.commanded = tip or self._ik.compute_tip(i, r)
 
@@ -279,6 +279,11 @@ class Controller:
             stands = self._writes_ctrl and r.latch is None
             targets[robot.name] = Pose(*(self._ik.compute_tip(i, r) if stands else r.commanded))
         return targets
+
+    def get_goals(self) -> dict[str, Pose]:
+        """Return where the driven robots are moved to, `T_world_tip`; robots that hold are not in it."""
+        states = zip(self._robots, self._states, strict=True)
+        return {robot.name: Pose(*r.latch.target) for robot, r in states if r.latch is not None}
 
     def list_held(self) -> list[str]:
         """Return the robots that hold: without a command, or with an open clutch."""
@@ -471,7 +476,7 @@ class Controller:
             elif sag.is_standing(i, v):
                 sag.note(i, *self._measure_sag(i, r, data), self._check_ticks * self._dt)
 
-    def _measure_sag(self, i: int, r: RobotState, data: mujoco.MjData) -> tuple[float, float]:
+    def _measure_sag(self, i: int, r: RobotControlState, data: mujoco.MjData) -> tuple[float, float]:
         """Return how far a robot stands from its aim [m, rad]: its tip; of a hand the joint that is farthest."""
         assert self._sag is not None
         if self._robots[i].kind == HAND:
@@ -494,7 +499,7 @@ class Controller:
         q = data.qpos[self._qpos]
         return np.where(np.isfinite(q), q, self._joints.q)
 
-    def _integrate_twist(self, i: int, r: RobotState, state: clutch.Latch) -> None:
+    def _integrate_twist(self, i: int, r: RobotControlState, state: clutch.Latch) -> None:
         config = self._config
         if clutch.integrate_twists(state, self._dt, config.tip_speed, config.tip_angular_speed, self._get_workspace(i)):
             tip = self._ik.compute_tip(i, r) if self._writes_ctrl else r.commanded
@@ -549,7 +554,7 @@ class Controller:
                 self._mark_applied(r)
             self._bound_target(i, r, data)
 
-    def _bound_target(self, i: int, r: RobotState, data: mujoco.MjData) -> None:
+    def _bound_target(self, i: int, r: RobotControlState, data: mujoco.MjData) -> None:
         """Bound the lead of the end-effector target on the measured tip; a hold that begins takes away its push.
 
         The law of `hold.HoldLaw` for a servo of which only the bound is known.
@@ -582,7 +587,7 @@ class Controller:
 
     # --- helpers ------------------------------------------------------------------------------------------------------
 
-    def _mark_applied(self, r: RobotState) -> None:
+    def _mark_applied(self, r: RobotControlState) -> None:
         if r.pending is not None:
             p = r.pending
             r.applied = Applied(p.robot, p.participant, p.device, p.seq, p.capture_ns, p.receive_ns, self._now_ns)
@@ -596,7 +601,7 @@ class Controller:
         cap = joints.velocity[columns]
         joints.cap[columns] = np.minimum(cap, self._config.leader_ramp_speed) if self._states[i].ramping else cap
 
-    def _list_limits(self, i: int, r: RobotState) -> tuple[str, ...]:
+    def _list_limits(self, i: int, r: RobotControlState) -> tuple[str, ...]:
         extra: tuple[str, ...] = ("workspace",) if r.latch is not None and r.latch.clamped else ()
         if r.proximity < 1.0:
             extra += ("proximity",)

@@ -21,7 +21,7 @@ from iris_session.control.arm_model import ArmModel, Floats
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig
 from iris_session.control.interpolate import JointInterpolator
 from iris_session.control.solvers import make_solver
-from iris_session.control.state import RobotState
+from iris_session.control.state import RobotControlState
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.specs import HAND, RobotSpec
 
@@ -73,25 +73,25 @@ class InverseKinematics:
         spare = most > 1 and most * check_ticks - 1 >= needed * check_ticks
         return most, most - spare
 
-    def is_due(self, r: RobotState, tick: int) -> bool:
+    def is_due(self, r: RobotControlState, tick: int) -> bool:
         """Return true when this robot may be solved in this tick."""
         if not r.want_solve:
             return False
         fed = r.pending is not None or (r.latch is not None and r.latch.kind == CommandKind.TWIST)
         return tick - r.last_solve >= (self._solve_ticks if fed else self._refine_ticks)
 
-    def get_interval(self, r: RobotState, tick: int) -> float:
+    def get_interval(self, r: RobotControlState, tick: int) -> float:
         """Return the time since the last goal [s], within the sample intervals of devices: the time to arrive at the
         next one.
         """
         return min(max(tick - r.last_solve, self._solve_ticks) * self._joints.dt, self._slow_interval)
 
-    def compute_tip(self, i: int, r: RobotState) -> PoseTuple:
+    def compute_tip(self, i: int, r: RobotControlState) -> PoseTuple:
         """Return `T_world_tip` of the joint goal: where the robot will stand without further commands."""
         return compose(r.T_world_root, self._arms[i].forward_kinematics(self._joints.get_goal(self._columns[i])))
 
     def clip_to_workspace(
-        self, i: int, r: RobotState, base: PoseTuple, goal: Floats, box: clutch.Box | None
+        self, i: int, r: RobotControlState, base: PoseTuple, goal: Floats, box: clutch.Box | None
     ) -> tuple[Floats, bool]:
         """Return the joint goal clipped to the workspace, and true when it was cut short.
 
@@ -117,12 +117,12 @@ class InverseKinematics:
                 high = middle
         return start + low * (goal - start), True
 
-    def _is_inside(self, i: int, r: RobotState, base: PoseTuple, q: Floats, box: clutch.Box) -> bool:
+    def _is_inside(self, i: int, r: RobotControlState, base: PoseTuple, q: Floats, box: clutch.Box) -> bool:
         p, b = compose(r.T_world_root, self._arms[i].forward_kinematics(q))[0], base[0]
         slack = self._config.position_tolerance
         return all(min(box[0][k], b[k]) - slack <= p[k] <= max(box[1][k], b[k]) + slack for k in range(3))
 
-    def solve(self, i: int, r: RobotState, state: clutch.Latch, tick: int) -> None:
+    def solve(self, i: int, r: RobotControlState, state: clutch.Latch, tick: int) -> None:
         """Take one step from the last solution toward the target; the joints arrive about one sample later.
 
         A hand follows joints only: a pose does not move it, and that is one of its limits.
@@ -153,7 +153,7 @@ class InverseKinematics:
     def _update_limits(
         self,
         i: int,
-        r: RobotState,
+        r: RobotControlState,
         T_world_before: PoseTuple,
         T_world_target: PoseTuple,
         bounded: NDArray[np.bool_],

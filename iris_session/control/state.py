@@ -12,7 +12,7 @@ from iris_session.protocol.common import Applied
 LONG_AGO = -(2**40)
 
 
-class RobotState(msgspec.Struct, array_like=True):
+class RobotControlState(msgspec.Struct, array_like=True):
     """One robot. `latch` is set while it is engaged.
 
     `fresh`: latched in this step, whose sample has not moved the target yet. `want_solve`: the target has moved, or is
@@ -46,7 +46,7 @@ class ControllerState(msgspec.Struct, array_like=True):
     now_ns: int
     tick: int
     cursor: int
-    robots: list[RobotState]
+    robots: list[RobotControlState]
     rest: bytes
     joints: list[bytes]
     moving: bool

@@ -31,13 +31,13 @@ from iris_session.link.tcp_guard import (
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.limits import Drops, KeyedBuckets, TokenBucket
 from iris_session.protocol.names import AuditKind
-from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, TOPIC_ROBOTS
 
 log = logging.getLogger(__name__)
 
 BEFORE_HELLO: Final = "before hello"
 #: What may be subscribed to: these, and every beginning of them (the empty one is everything).
-STATE_TOPICS: Final = (TOPIC_RIGID, TOPIC_PRESENCE)
+STATE_TOPICS: Final = (TOPIC_RIGID, TOPIC_PRESENCE, TOPIC_ROBOTS)
 _CONTROL_REASONS: Final = TcpReasons("control", "strangers_too_many", "", "no_hello", "flood_cut")
 _STATE_REASONS: Final = TcpReasons(
     "state", "strangers_too_many", "subscribers_too_many", "no_subscription", "flood_cut"

@@ -96,6 +96,8 @@ class Downlink:
         if kind == link.STATE:
             if not self._context.publisher.publish(frames[1], frames[2]):
                 self._context.drops.count("state_of_other_scene")
+            elif len(frames) > 3:
+                self._context.publisher.publish_robots(frames[1], frames[3])
         elif kind == link.ACK:
             self._context.authority.acknowledged += frames[1][0]
         elif kind == link.DECIDED:

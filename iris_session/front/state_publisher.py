@@ -10,7 +10,7 @@ import numpy as np
 import zmq
 
 from iris_session.link.config import SceneInfo
-from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, StateHeader
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, TOPIC_ROBOTS, StateHeader
 from iris_session.streams.rigid import RigidEncoder
 
 POSE_BYTES = 56  # seven float64
@@ -26,6 +26,17 @@ class _RawPresence(msgspec.Struct, array_like=True):
     session_time: int
     published_ns: int
     items: msgspec.Raw
+
+
+class _RawRobotStates(msgspec.Struct, array_like=True):
+    """`RobotStates` on the wire, its robots encoded already."""
+
+    scene_epoch: int
+    tick: int
+    sim_time: float
+    session_time: int
+    published_ns: int
+    robots: msgspec.Raw
 
 
 class StatePublisher:
@@ -117,6 +128,13 @@ class StatePublisher:
         if self._state is not None:
             presence = _RawPresence(session_time, self._now_ns(), msgspec.Raw(items))
             self._state.send_multipart((TOPIC_PRESENCE, _encoder.encode(presence)))
+
+    def publish_robots(self, header: bytes, robots: bytes) -> None:
+        """Send the states of the robots. `header`: that of the state; `robots`: encoded array of `RobotState`."""
+        if self._state is not None:
+            head = _decode_header(header)
+            times = (head.scene_epoch, head.tick, head.sim_time, head.session_time, self._now_ns())
+            self._state.send_multipart((TOPIC_ROBOTS, _encoder.encode(_RawRobotStates(*times, msgspec.Raw(robots)))))
 
     def read_keyframe(self) -> tuple[int, bytes]:
         """Return `(state_seq, float64 (n, 7) poses)` for a snapshot: of the newest frame, at first of the scene."""

@@ -17,7 +17,7 @@ from iris_session.link import messages
 from iris_session.link.config import FrontConfig, Ports, SceneInfo
 from iris_session.link.sockets import readable
 from iris_session.protocol.entries import HOST, Entry, FrontRestarted, decode_entries
-from iris_session.protocol.server_messages import ParticipantLeft, PresenceItem, StateHeader
+from iris_session.protocol.server_messages import ParticipantLeft, PresenceItem, RobotState, StateHeader
 from iris_session.protocol.status import StatusReport
 from iris_session.protocol.steps import Decision, Dropped
 
@@ -185,20 +185,28 @@ class FrontLink:
         self._presence.clear()
         self._send(messages.PRESENCE, messages.encoder.encode(items))
 
-    def send_state(self, header: StateHeader, poses: npt.NDArray[np.float64]) -> None:
+    def send_state(
+        self, header: StateHeader, poses: npt.NDArray[np.float64], robots: tuple[RobotState, ...] = ()
+    ) -> None:
         """Send the state after a tick. Frames that the front has no room for are dropped and counted in `state_drops`.
 
         Args:
             header: Header of the frame; the front fills `published_ns`, `state_seq` and `base_seq`.
             poses: T_world_body, float64 (n_bodies, 7) `x y z qw qx qy qz` [m], C-contiguous, in the order of the
                 scene's bodies.
+            robots: States of the robots after the same tick, if they are to be published.
         """
         if self._socket is None or self.ports is None:
             return
+        frames: list[bytes | memoryview] = [
+            messages.STATE,
+            messages.encoder.encode(header),
+            np.ascontiguousarray(poses).data,
+        ]
+        if robots:
+            frames.append(messages.encoder.encode(robots))
         try:
-            self._socket.send_multipart(
-                (messages.STATE, messages.encoder.encode(header), np.ascontiguousarray(poses).data), zmq.DONTWAIT
-            )
+            self._socket.send_multipart(frames, zmq.DONTWAIT)
             self._sent_ns = self._monotonic_ns()
         except zmq.Again:
             self.state_drops += 1

@@ -27,7 +27,7 @@ BEAT: Final = b"B"  # empty: the front works but has nothing to send; not sent w
 
 # authority -> front
 DECIDED: Final = b"D"  # Decided
-STATE: Final = b"P"  # StateHeader, float64 poses
+STATE: Final = b"P"  # StateHeader, float64 poses; tuple[RobotState, ...] if a client reads them
 PRESENCE: Final = b"I"  # list[PresenceItem]
 ACK: Final = b"A"  # one byte: number of batches received
 ALIVE: Final = b"K"  # empty: the authority works but has nothing to send

@@ -29,6 +29,7 @@ from iris_session.physics.errors import (
 )
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.physics.names import find_element_id, list_body_names, list_element_names
+from iris_session.physics.robot_signals import RobotSignals, RobotStateReader
 from iris_session.physics.tip import Tip
 from iris_session.physics.tree import KinematicTree
 from iris_session.physics.view import Flexes, MujocoView
@@ -109,6 +110,8 @@ class World:
         self.robot_infos = tuple(_robot_info(model, spec) for spec in robots)
         #: Measured values of the robots, for recordings.
         self.robot_signals = RobotSignals(model, robots)
+        #: Measured and commanded values of the robots, for clients.
+        self.robot_states = RobotStateReader(model, robots)
         self.tick_period_ns = self._view.tick_period_ns
         #: BLAKE2b of the model bytes, 32 hex characters.
         self.scene_hash = compute_scene_hash(encode_model(model))
@@ -280,81 +283,6 @@ class World:
     def _raise_diverged(self, error: mujoco.FatalError) -> NoReturn:
         self.diverged = one_line(error)
         raise SimulationDivergedError(self._tick, float(self.data.time), self.diverged) from error
-
-
-#: Dynamics with which `ctrl` is a position: none, and filters of it.
-FOLLOWS: Final = (
-    int(mujoco.mjtDyn.mjDYN_NONE),
-    int(mujoco.mjtDyn.mjDYN_FILTER),
-    int(mujoco.mjtDyn.mjDYN_FILTEREXACT),
-)
-
-
-class RobotSignals:
-    """Measured values of the robots of one model: joints, openings of grippers, positions of tips.
-
-    `units`: of the joints of each robot, `rad` or `m`.
-    """
-
-    def __init__(self, model: mujoco.MjModel, robots: Sequence[RobotSpec]) -> None:
-        def find(kind: str, names: Sequence[str], robot: RobotSpec) -> list[int]:
-            return [find_element_id(model, kind, name, f"robot {robot.name!r}: ") for name in names]
-
-        joints = [find("joint", robot.joints, robot) for robot in robots]
-        slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
-        self.units = tuple(tuple("m" if int(model.jnt_type[j]) == slide else "rad" for j in one) for one in joints)
-        self._qpos = np.array([int(model.jnt_qposadr[j]) for one in joints for j in one], np.int64)
-        self._tips = [Tip(model, robot) for robot in robots]
-        sites = [tip.site for tip in self._tips]
-        #: All end effectors at once, where each is a site.
-        self._sites = np.array(sites, np.int64) if all(site >= 0 for site in sites) else None
-        laws = [
-            (i, actuator, *law)
-            for i, robot in enumerate(robots)
-            for actuator in find("actuator", [robot.gripper_actuator] if robot.gripper_actuator else [], robot)
-            if (law := find_opening_law(model, actuator, robot)) is not None
-        ]
-        self._grippers = np.array([law[:2] for law in laws], np.int64).reshape(-1, 2).T
-        self._scale, self._offset = np.array([law[2:] for law in laws]).reshape(-1, 2).T
-        n = len(robots)
-        self._values: NDArray[np.float64] = np.full(len(self._qpos) + 4 * n, np.nan)
-        self._openings = self._values[len(self._qpos) : len(self._qpos) + n]
-
-    def read(self, data: Any) -> bytes:
-        """Return the values of the present state as float64, empty without robots.
-
-        In this order: the joints of all robots [rad or m]; the opening of the gripper of each robot, 0 closed and 1
-        open, NaN without one that is controlled by position; the position of each tip, x y z [m], world frame.
-        """
-        values = self._values
-        values[: len(self._qpos)] = data.qpos[self._qpos]
-        if len(self._scale):
-            self._openings[self._grippers[0]] = data.actuator_length[self._grippers[1]] * self._scale + self._offset
-        tips = values[len(self._qpos) + len(self._tips) :]
-        if self._sites is not None:
-            tips[:] = data.site_xpos[self._sites].ravel()
-        else:
-            tips[:] = np.concatenate([tip.read_position(data) for tip in self._tips])
-        return values.tobytes()
-
-
-def find_opening_law(model: mujoco.MjModel, actuator: int, robot: RobotSpec) -> tuple[float, float] | None:
-    """Return scale and offset from the length of a position actuator to the opening; `None` for other actuators.
-
-    The length is that at which the actuator rests for some `ctrl`; the opening is where that lies between `ctrl` closed
-    and open: 0 closed, 1 open.
-    """
-    gain, (constant, slope) = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator, :2].tolist()
-    span = robot.gripper_open - robot.gripper_closed
-    is_position = (
-        int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
-        and int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
-        and int(model.actuator_dyntype[actuator]) in FOLLOWS
-        and 0.0 not in (gain, slope, span)
-    )
-    if not is_position:
-        return None
-    return -slope / (gain * span), (-constant / gain - robot.gripper_closed) / span
 
 
 def _require_exact(model: mujoco.MjModel) -> None:

@@ -30,6 +30,7 @@ from iris_session.protocol.limits import (
     MAX_MEDIA_PUSH_BYTES,
     MAX_ON_BEHALF_BYTES,
     MAX_PRESENCE_BYTES,
+    MAX_ROBOT_STATES_BYTES,
     MAX_SERVER_BYTES,
     MAX_STATE_HEADER_BYTES,
     SERVER_LIMITS,
@@ -48,6 +49,7 @@ from iris_session.protocol.names import PROTOCOL_VERSION, BudgetClass
 from iris_session.protocol.server_messages import (
     EventKind,
     Presence,
+    RobotStates,
     ServerEnvelope,
     ServerMessage,
     StateHeader,
@@ -145,6 +147,7 @@ _client_name: Final = msgspec.msgpack.Decoder(_ClientName)
 _server_tags: Final = msgspec.msgpack.Decoder(_ServerTags)
 _state_header: Final = msgspec.msgpack.Decoder(StateHeader)
 _presence: Final = msgspec.msgpack.Decoder(Presence)
+_robot_states: Final = msgspec.msgpack.Decoder(RobotStates)
 _beacon: Final = msgspec.msgpack.Decoder(Beacon)
 _introduction: Final = msgspec.msgpack.Decoder(Introduction)
 _media_header: Final = msgspec.msgpack.Decoder(MediaHeader)
@@ -214,6 +217,16 @@ def encode_presence(presence: Presence) -> bytes:
 def decode_presence(data: Bytes) -> Presence:
     """Decode a presence message. Raises `TooLargeError` or `MalformedError`."""
     return _decode("presence", _presence, data, MAX_PRESENCE_BYTES)
+
+
+def encode_robot_states(states: RobotStates) -> bytes:
+    """Return the second frame of a message of robot states, after the topic."""
+    return _encoder.encode(states)
+
+
+def decode_robot_states(data: Bytes) -> RobotStates:
+    """Decode a message of robot states. Raises `TooLargeError` or `MalformedError`."""
+    return _decode("robot states", _robot_states, data, MAX_ROBOT_STATES_BYTES)
 
 
 def encode_media_header(header: MediaHeader) -> bytes:

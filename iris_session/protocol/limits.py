@@ -140,6 +140,7 @@ SERVER_LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
 MAX_SERVER_BYTES: Final = max(limit.max_bytes for limit in SERVER_LIMITS.values())
 MAX_STATE_HEADER_BYTES: Final = 128_000
 MAX_PRESENCE_BYTES: Final = 256_000
+MAX_ROBOT_STATES_BYTES: Final = 128_000
 MAX_MEDIA_HEADER_BYTES: Final = 2_000
 #: First frame of a source's message: two texts of 512 characters are the most of it.
 MAX_MEDIA_PUSH_BYTES: Final = 8_000

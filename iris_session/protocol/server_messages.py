@@ -600,5 +600,48 @@ class Presence(msgspec.Struct, frozen=True, array_like=True):
     items: tuple[PresenceItem, ...]
 
 
+class RobotState(msgspec.Struct, frozen=True, array_like=True):
+    """Measured and commanded values of one robot after a tick.
+
+    Attributes:
+        robot: Its name.
+        q: Joint positions [rad or m], in the order of `RobotInfo.joints`.
+        qd: Joint velocities [rad/s or m/s], in the same order.
+        tip: Measured `T_world_tip` of the end effector.
+        gripper: Measured opening, 0 open to 1 closed, as in samples; beyond these where it is pressed there. `None`
+            without a gripper that is controlled by position.
+        contact_n: Sum of the normal contact forces on the gripper [N].
+        target: `T_world_tip` that the session moves the end effector to; `None` while the robot holds or is driven by
+            joints.
+        ctrl: `ctrl` of its actuators in the last tick, in the order of the joints, then those of the gripper, in the
+            units of the model.
+    """
+
+    robot: Name
+    q: tuple[float, ...]
+    qd: tuple[float, ...]
+    tip: Pose
+    gripper: float | None = None
+    contact_n: float = 0.0
+    target: Pose | None = None
+    ctrl: tuple[float, ...] = ()
+
+
+class RobotStates(msgspec.Struct, frozen=True, array_like=True):
+    """Message on topic `robots`: all robots, latest value. Sent from when a client names the capability
+    `robot_states`. Times and ticks are as in `StateHeader`.
+    """
+
+    scene_epoch: Count
+    tick: Count
+    sim_time: float
+    session_time: Nanoseconds
+    published_ns: Nanoseconds
+    robots: tuple[RobotState, ...]
+
+
 TOPIC_RIGID = b"rigid"
 TOPIC_PRESENCE = b"presence"
+TOPIC_ROBOTS = b"robots"
+#: Capability of a `Hello`: its sender reads the topic `robots`.
+ROBOT_STATES = "robot_states"

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from iris_session.physics.contacts import ContactTables
 from iris_session.physics.names import find_element_id
+from iris_session.physics.robot_signals import find_opening_law
 from iris_session.physics.tip import Tip
 from iris_session.physics.tree import KinematicTree
-from iris_session.physics.world import STATE, find_opening_law
+from iris_session.physics.world import STATE
 from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec

@@ -28,6 +28,7 @@ from iris_session.protocol.entries import (
     HOST,
     Entry,
     EntryMessage,
+    Join,
     PhysicsDiverged,
     RecordingGap,
     ScenePatched,
@@ -36,7 +37,7 @@ from iris_session.protocol.entries import (
     encode_entry,
 )
 from iris_session.protocol.names import ControlAction, DenialReason, EpisodeAction, LateCause
-from iris_session.protocol.server_messages import Reply, StateHeader
+from iris_session.protocol.server_messages import ROBOT_STATES, Reply, RobotState, StateHeader
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Decision
 from iris_session.session.core import Plant, SessionCore, StepOutcome, ignore_lap
@@ -175,6 +176,8 @@ class Stepper:
         self._resumed_from = resumed_from
         self._last_now_ns = -1 if resumed_from is None else resumed_from.now_ns
         self._poses = np.zeros((len(core.world.bodies), 7))
+        #: A client reads the states of the robots: from then on they are published.
+        self._publishes_robots = False
 
     @property
     def paused(self) -> bool:
@@ -266,6 +269,9 @@ class Stepper:
         end_ns = self.clock()
         if self.on_entries is not None:
             self.on_entries(entries)
+        for entry in entries:
+            if isinstance(entry.message, Join) and ROBOT_STATES in entry.message.capabilities:
+                self._publishes_robots = True
         if outcome.diverged and (self.last is None or not self.last.diverged):
             self.post_own(PhysicsDiverged(outcome.decision.scene_epoch, outcome.diverged[:MAX_TEXT]))
             self.post_own(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
@@ -382,7 +388,7 @@ class Stepper:
         header = StateHeader(
             decision.scene_epoch, decision.scene_revision, tick, sim_time, shown_ns, 0, 0, 0, applied
         )  # fmt: skip
-        self.front.send_state(header, self._poses)
+        self.front.send_state(header, self._poses, self._read_robots())
         for callback in self.on_publish:
             callback(decision.scene_epoch, end_ns, shown_ns)
         if self.on_state is not None:
@@ -392,6 +398,13 @@ class Stepper:
             self.recorder.add_state(self._newest_step, tick, sim_time, end_ns, self._poses, applied, robots)
             self.recorder.add_metric(self._newest_step, end_ns, "lateness_ms", self.lateness_ns * 1e-6)
             self.lateness_ns = 0
+
+    def _read_robots(self) -> tuple[RobotState, ...]:
+        """Return the states of the robots once a client reads them; before, and without robots, nothing."""
+        if not self._publishes_robots:
+            return ()
+        world = self.core.world
+        return world.robot_states.read(world.data, world.view(), self.core.controller.get_goals())
 
     def _explain_denials(self, outcome: StepOutcome) -> StepOutcome:
         """Say in denials why a robot can only be watched: the authority knows those that can be driven."""

@@ -19,7 +19,7 @@ from iris_session.protocol.codec import Bytes, encode_client, encode_server
 from iris_session.protocol.errors import MalformedError, ProtocolError, ProtocolVersionError
 from iris_session.protocol.limits import Drops, KeyedBuckets, TokenBucket, find_network
 from iris_session.protocol.names import PROTOCOL_VERSION, FaultCode
-from iris_session.protocol.server_messages import ProtocolFault, ServerEnvelope
+from iris_session.protocol.server_messages import ROBOT_STATES, TOPIC_ROBOTS, ProtocolFault, ServerEnvelope
 from iris_session.web.wire import (
     CLOSE_LIMIT,
     CLOSE_NOT_ALLOWED,
@@ -115,6 +115,7 @@ class Browser:
         name: What the gateway calls it in `on_behalf_of`.
         address: Of its peer; of IPv6 its network.
         identity: SHA-256 of the secret in its hello, empty before.
+        reads_robots: Its newest hello asks for the states of the robots.
         epoch: Connection epoch of its present `welcome`, 0 without one: then it gets no state, media and assets.
         has_budget: The session has sent its delivery budget, so that it may subscribe to media.
         outgoing: Control messages that wait, oldest first.
@@ -128,6 +129,7 @@ class Browser:
         self.name = name
         self.address = find_network(address)
         self.identity = b""
+        self.reads_robots = False
         self.epoch = 0
         self.has_budget = False
         self.outgoing: deque[bytes] = deque()
@@ -330,6 +332,8 @@ class Hub:
             text = "too many pairing attempts from this address: wait a minute"
             self._reject(browser, CLOSE_LIMIT, "web_pair_rate", text)
             return False
+        if kind == _HELLO:
+            browser.reads_robots = isinstance(head.capabilities, list) and ROBOT_STATES in head.capabilities
         if kind == _BYE and browser.said_hello:
             self._leave(browser)
         elif kind != _BYE:
@@ -395,12 +399,13 @@ class Hub:
         self._reject(browser, CLOSE_TOO_SLOW, "web_too_slow", "control messages are not read")
 
     def publish(self, frames: Sequence[Bytes]) -> None:
-        """Set the newest message of a topic of the state channel for every admitted browser."""
-        admitted = [browser for browser in self._browsers.values() if browser.is_admitted]
-        if not admitted:
+        """Set the newest message of a topic of the state channel for every admitted browser that reads it."""
+        topic = bytes(frames[0])
+        readers = [b for b in self._browsers.values() if b.is_admitted and (b.reads_robots or topic != TOPIC_ROBOTS)]
+        if not readers:
             return
-        topic, message = bytes(frames[0]), encode_frames(STATE, frames)
-        for browser in admitted:
+        message = encode_frames(STATE, frames)
+        for browser in readers:
             browser.superseded += topic in browser.latest
             browser.latest[topic] = message
             browser.wake()

@@ -33,7 +33,7 @@ from iris_session.link.sockets import readable
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.media import make_topic
 from iris_session.protocol.names import PROTOCOL_VERSION, AlignmentKind, FaultCode, Role
-from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, TOPIC_ROBOTS
 from iris_session.web.config import GatewayConfig
 from iris_session.web.hub import Browser, Hub
 from iris_session.web.sockets import SocketReader
@@ -200,6 +200,7 @@ class SessionLink:
         state.setsockopt(zmq.RCVBUF, STATE_RCVBUF)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_RIGID)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_PRESENCE)
+        state.setsockopt(zmq.SUBSCRIBE, TOPIC_ROBOTS)
         state.connect(f"tcp://{host_port(self._config.host, welcome.endpoints.state)}")
         self._state = SocketReader(state, self._receive_state, self._publish_state)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgpack
 import msgspec
@@ -98,10 +98,11 @@ class ServerHead(NamedTuple):
 
 
 class ClientHead(msgspec.Struct):
-    """Beginning of a client message: `type`, and the `secret` of a hello."""
+    """Beginning of a client message: `type`, and of a hello the `secret` and `capabilities` (unchecked)."""
 
     type: str = ""
     secret: bytes = b""
+    capabilities: Any = ()
 
 
 class _Type(msgspec.Struct):

@@ -19,7 +19,7 @@ from iris_session.protocol.client_messages import ClientEnvelope
 from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.media import MediaHeader, MediaPush
-from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
+from iris_session.protocol.server_messages import Presence, RobotStates, ServerEnvelope, StateHeader
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
 from tests.streams.poses import random_poses
 from tools.codegen import rigid_reference
@@ -33,6 +33,7 @@ CODECS: dict[str, tuple[Any, Any, Any]] = {
     "server": (ServerEnvelope, codec.encode_server, codec.decode_server),
     "state_header": (StateHeader, codec.encode_state_header, codec.decode_state_header),
     "presence": (Presence, codec.encode_presence, codec.decode_presence),
+    "robot_states": (RobotStates, codec.encode_robot_states, codec.decode_robot_states),
     "media_header": (MediaHeader, codec.encode_media_header, codec.decode_media_header),
     "media_push": (MediaPush, codec.encode_media_push, codec.decode_media_push),
     "asset_request": (AssetRequest, codec.encode_asset_request, codec.decode_asset_request),

@@ -26,6 +26,7 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "server": codec.decode_server,
     "state_header": codec.decode_state_header,
     "presence": codec.decode_presence,
+    "robot_states": codec.decode_robot_states,
     "asset_request": codec.decode_asset_request,
     "asset_chunk": lambda data: codec.decode_asset_chunk(data, 0),
     "asset_refused": codec.decode_asset_refused,

@@ -15,6 +15,7 @@ from typing import Any, Final
 import zmq
 
 from iris_session.netsim.profiles import DOWN, UP, LinkConditions, load_profile
+from iris_session.protocol.server_messages import TOPIC_ROBOTS
 from tests.rig.simulation import Simulation
 
 #: Above every file descriptor of this process, so that no call of the system finds one.
@@ -144,6 +145,7 @@ class _Publisher(Inbox):
         for connection in self._front.connections.values():
             sockets = connection.sockets
             is_subscribed = sockets.connection is connection and sockets.subscribed is self._front
+            is_subscribed &= sockets.reads_robots or copies[0] != TOPIC_ROBOTS
             if is_subscribed and sockets.states_in_flight < STATE_ROOM:
                 sockets.states_in_flight += 1
                 sockets.link.send(DOWN, lambda sockets=sockets: sockets.receive_state(copies))  # type: ignore[misc]
@@ -263,6 +265,7 @@ class RigClientSockets:
         self.host_address = f"192.0.2.{1 + seed % 250}"
         self.connection: Connection | None = None
         self.subscribed: FrontEnd | None = None
+        self.reads_robots = False
         self.states_in_flight = 0
         self.on_arrival: Callable[[], None] = lambda: None
         self._control: list[list[bytes]] = []
@@ -283,7 +286,8 @@ class RigClientSockets:
         self._control, self._is_lost = [], False
         self.connection = self._network.connect(self)
 
-    def open_state(self, port: int, generation: int) -> None:
+    def open_state(self, port: int, generation: int, robots: bool = False) -> None:
+        self.reads_robots = robots
         if self.connection is not None:
             self.subscribed = self.connection.front
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from anchors.pose import PoseTuple, distance
-from iris_session.client import Client, UnreachedError
+from iris_session.client import Client, ClientError, UnreachedError
 from iris_session.protocol.client_messages import ClearEStop
 from iris_session.protocol.names import HoldReason
 from iris_session.protocol.server_messages import EngagementChanged
@@ -111,3 +111,37 @@ def test_a_released_robot_goes_home_within_its_limits_and_an_estop_stops_it_for_
                 rig.run(6.0)
                 assert distance(see_tip(director, "left")[0], (x, y, z)) < 0.01
                 rig.check_rest(director, "left", 1.0)
+
+
+def test_a_client_reads_joints_gripper_force_target_and_commands_of_its_robot() -> None:
+    with Rig(timestep=0.01) as rig:
+        policy = rig.join("policy", "agent", robot_states=True)
+        other = rig.join("other", "observer")
+        policy.acquire("left")
+        rig.run_until(lambda: policy.scene.robot_state("left") is not None)
+        world, robots = rig.session.stepper.core.world, rig.session.stepper.core.scene.robots
+        names = robots[0].actuators + tuple(one.actuator for one in robots[0].gripper_actuators)
+        assert robots[0].name == "left"
+        rest = policy.scene.robot_state("left")
+        assert rest is not None
+        assert rest.target is None, "it holds"
+        (x, y, z), q = rest.tip.p, rest.tip.q
+        policy.move_to("left", ((x, y, z + 0.05), q), gripper=1.0, settle_s=0.5)
+        state = policy.scene.robot_state("left")
+        assert state is not None
+        assert state.target is not None
+        assert distance(state.target.p, (x, y, z + 0.05)) < 1e-6
+        assert rest.gripper == pytest.approx(0.0, abs=0.1)
+        assert state.gripper == pytest.approx(1.0, abs=0.1)
+        rig.run(1.0)  # it holds at rest: what the client sees is what the world is
+        state = policy.scene.robot_state("left")
+        assert state is not None
+        assert state.target is None
+        assert state.q == pytest.approx([world.data.joint(name).qpos[0] for name in robots[0].joints], abs=1e-6)
+        assert state.qd == pytest.approx([world.data.joint(name).qvel[0] for name in robots[0].joints], abs=1e-6)
+        assert state.ctrl == pytest.approx([world.data.actuator(name).ctrl[0] for name in names], abs=1e-6)
+        assert distance(state.tip.p, see_tip(policy, "left")[0]) < 1e-3
+        assert policy.scene.robot_state("nothing") is None
+        with pytest.raises(ClientError, match="robot_states"):
+            other.scene.robot_state("left")
+        assert other.counters()["state"]["robot_states"] == 0, "only who asks receives them"

@@ -13,7 +13,7 @@ from iris_session.journal.rows import CRASHED, JournalRow, Keyframe, check_row
 from iris_session.link import messages as link_messages
 from iris_session.protocol.client_messages import Assign, EStop, Marker
 from iris_session.protocol.entries import HOST, Entry, ExternalReset, RecordingGap, decode_entries
-from iris_session.protocol.server_messages import BodyInfo, StateHeader
+from iris_session.protocol.server_messages import BodyInfo, RobotState, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.session.errors import OwnershipError
 from iris_session.session.stepper import MAX_HOST_ENTRIES, RESERVED_HOST_ENTRIES, Stepper
@@ -40,7 +40,7 @@ class Front:
         assert step == self.first_step + len(self.decisions)
         self.decisions.append(decision)
 
-    def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None:
+    def send_state(self, header: StateHeader, poses: NDArray[np.float64], robots: tuple[RobotState, ...] = ()) -> None:
         assert poses.shape[1] == 7
         self.n_bodies = len(poses)
         self.states.append(header)

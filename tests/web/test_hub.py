@@ -7,7 +7,14 @@ import pytest
 from iris_session.protocol.client_messages import Bye, Disconnected, EStop, Heartbeat, Hello, Pair, wrap_message
 from iris_session.protocol.codec import decode_client, decode_server, encode_client, encode_server
 from iris_session.protocol.common import Message
-from iris_session.protocol.server_messages import Endpoints, ProtocolFault, ServerEnvelope, Welcome
+from iris_session.protocol.server_messages import (
+    ROBOT_STATES,
+    TOPIC_ROBOTS,
+    Endpoints,
+    ProtocolFault,
+    ServerEnvelope,
+    Welcome,
+)
 from iris_session.web import wire
 from iris_session.web.hub import MAX_IDENTITIES, SECOND, TICKET_BYTES, Browser, Hub, HubLimits
 
@@ -193,6 +200,20 @@ def test_state_is_for_admitted_browsers_and_the_newest_only() -> None:
     assert take(hub, ann) == [(wire.STATE, [b"rigid", b"header", b"\2"]), (wire.STATE, [b"presence", b"\2"])]
     assert ann.superseded == 4
     assert take(hub, stranger) == []
+
+
+def test_states_of_robots_are_for_browsers_that_ask_for_them() -> None:
+    hub = Hub()
+    ann, bob = open_browser(hub, 1), open_browser(hub, 2)
+    for browser, secret in ((ann, 1), (bob, 2)):
+        welcome(hub, browser, secret=secret)
+    hello = Hello("observer", "bob", capabilities=(ROBOT_STATES,), secret=(2).to_bytes(32, "big"))
+    hub.receive(bob, wire.encode_frames(wire.CONTROL, [encode_client(wrap_message(hello))]), 0)
+    for browser in (ann, bob):
+        take(hub, browser)
+    hub.publish([TOPIC_ROBOTS, b"states"])
+    assert take(hub, ann) == []
+    assert take(hub, bob) == [(wire.STATE, [TOPIC_ROBOTS, b"states"])]
 
 
 @pytest.mark.parametrize("code", ["dropped", "revoked", "hello", "session_ended"])

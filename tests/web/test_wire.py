@@ -143,7 +143,7 @@ def test_subscriptions_are_bounded_names_and_nonsense_is_refused() -> None:
 def test_types_are_read_without_the_message() -> None:
     assert wire.peek_client_message(encode_client(wrap_message(Bye(), 3, "x"))) == wire.ClientHead("bye")
     hello = encode_client(wrap_message(Hello("observer", "ann", secret=b"s"), 0))
-    assert wire.peek_client_message(hello) == wire.ClientHead("hello", b"s")
+    assert wire.peek_client_message(hello) == wire.ClientHead("hello", b"s", [])
     pong = encode_server(ServerEnvelope(1, 9, ClockPong(1, 2, 3)))
     assert wire.peek_server_message(pong) == (9, "clock_pong", "")
     fault = encode_server(ServerEnvelope(1, 9, ProtocolFault("revoked", "text")))

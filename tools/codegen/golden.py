@@ -22,6 +22,7 @@ from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import (
     Event,
     Presence,
+    RobotStates,
     ServerEnvelope,
     Snapshot,
     StateHeader,
@@ -53,6 +54,7 @@ def render_golden() -> str:
         "server": [*_iterate_messages("server", codec.SERVER_TYPES.values()), *_iterate_events()],
         "state_header": list(_iterate_values("state_header", StateHeader)),
         "presence": list(_iterate_values("presence", Presence)),
+        "robot_states": list(_iterate_values("robot_states", RobotStates)),
         "media_header": list(_iterate_values("media_header", MediaHeader)),
         "media_push": list(_iterate_values("media_push", MediaPush)),
         "asset_request": list(_iterate_values("asset_request", AssetRequest)),

@@ -135,6 +135,8 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         server_messages.StateHeader,
         server_messages.PresenceItem,
         server_messages.Presence,
+        server_messages.RobotState,
+        server_messages.RobotStates,
         media.MediaHeader,
         media.MediaPush,
         assets.AssetRequest,

@@ -111,6 +111,7 @@ def _render_limits() -> str:
     for name, size in (
         ("state header", limits.MAX_STATE_HEADER_BYTES),
         ("presence", limits.MAX_PRESENCE_BYTES),
+        ("robot states", limits.MAX_ROBOT_STATES_BYTES),
         ("media header", limits.MAX_MEDIA_HEADER_BYTES),
         ("media frame", limits.MAX_MEDIA_FRAME_BYTES),
         ("asset header", limits.MAX_ASSET_HEADER_BYTES),

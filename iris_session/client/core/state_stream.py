@@ -15,9 +15,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.codec import decode_presence, decode_state_header
+from iris_session.protocol.codec import decode_presence, decode_robot_states, decode_state_header
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, PresenceItem, StateHeader
+from iris_session.protocol.server_messages import (
+    TOPIC_PRESENCE,
+    TOPIC_RIGID,
+    TOPIC_ROBOTS,
+    PresenceItem,
+    RobotStates,
+    StateHeader,
+)
 from iris_session.streams.errors import StreamError
 from iris_session.streams.rigid import RigidDecoder
 
@@ -68,6 +75,7 @@ class StateCounters:
     rigid_messages: int = 0
     rigid_bytes: int = 0  # topic, header and poses of those
     presence: int = 0
+    robot_states: int = 0
 
 
 class StateStream:
@@ -82,6 +90,8 @@ class StateStream:
         self._presence: dict[tuple[str, str], PresenceItem] = {}
         self._presence_ns = 0
         self._presence_waiting: list[bytes] = []
+        self._robots: RobotStates | None = None
+        self._robots_waiting: bytes | None = None
         self.scene_epoch = 0
         self.wants_snapshot = False
         self._decoder: RigidDecoder | None = None
@@ -93,6 +103,7 @@ class StateStream:
         self._presence = {}
         self._presence_ns = 0
         self._presence_waiting = []
+        self._robots = self._robots_waiting = None
         self.wants_snapshot = False
         self.restart()
 
@@ -130,7 +141,10 @@ class StateStream:
                 self.counters.rigid_bytes += sum(map(len, frames))
                 self.counters.superseded += newest is not None
                 newest = header, frames[2]
-            elif frames[0] in (TOPIC_RIGID, TOPIC_PRESENCE):
+            elif frames[0] == TOPIC_ROBOTS and len(frames) == 2:
+                self.counters.robot_states += 1
+                self._robots_waiting = frames[1]
+            elif frames[0] in (TOPIC_RIGID, TOPIC_PRESENCE, TOPIC_ROBOTS):
                 self.counters.malformed += 1
             else:
                 self.counters.unknown_topic += 1
@@ -158,6 +172,19 @@ class StateStream:
         """Heads and hands of all participants by `(participant, device)`. Decoded on access: the scene has priority."""
         self._decode_presence()
         return self._presence
+
+    @property
+    def robots(self) -> RobotStates | None:
+        """The newest states of the robots of the present scene, `None` before the first. Decoded on access."""
+        waiting, self._robots_waiting = self._robots_waiting, None
+        if waiting is not None:
+            try:
+                self._robots = decode_robot_states(waiting)
+            except ProtocolError:
+                self.counters.malformed += 1
+        if self._robots is not None and self._robots.scene_epoch != self.scene_epoch:
+            return None
+        return self._robots
 
     def retain_presence(self, participants: Container[str]) -> None:
         """Remove all participants but these: presence that they sent before leaving may arrive late and is not

@@ -2523,6 +2523,59 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>Measured and commanded values of one robot after a tick.</summary>
+    public sealed class RobotState : WireValue
+    {
+        internal override bool IsArray => true;
+        public string Robot = "";
+        public double[] Q = Array.Empty<double>();
+        public double[] Qd = Array.Empty<double>();
+        public Pose Tip = new Pose();
+        public double? Gripper;
+        public double ContactN;
+        public Pose Target;
+        public double[] Ctrl = Array.Empty<double>();
+
+        public static RobotState Read(WireReader reader) => reader.ReadInto(new RobotState());
+        internal static readonly Func<RobotState> New = () => new RobotState();
+
+        internal override void Visit(WireCodec codec)
+        {
+            codec.Require("robot", ref Robot, 64);
+            codec.Require("q", ref Q, 0, 0);
+            codec.Require("qd", ref Qd, 0, 0);
+            codec.Require("tip", ref Tip, Protocol.Pose.New);
+            codec.Allow("gripper", ref Gripper);
+            codec.Allow("contact_n", ref ContactN, 0.0);
+            codec.AllowNull("target", ref Target, Protocol.Pose.New);
+            codec.Allow("ctrl", ref Ctrl, 0, 0);
+        }
+    }
+
+    /// <summary>Message on topic robots: all robots, latest value.</summary>
+    public sealed class RobotStates : WireValue
+    {
+        internal override bool IsArray => true;
+        public long SceneEpoch;
+        public long Tick;
+        public double SimTime;
+        public long SessionTime;
+        public long PublishedNs;
+        public RobotState[] Robots = Array.Empty<RobotState>();
+
+        public static RobotStates Read(WireReader reader) => reader.ReadInto(new RobotStates());
+
+        internal override void Visit(WireCodec codec)
+        {
+            codec.Require("scene_epoch", ref SceneEpoch, 0, long.MaxValue);
+            codec.Require("tick", ref Tick, 0, long.MaxValue);
+            codec.Require("sim_time", ref SimTime);
+            codec.Require("session_time", ref SessionTime, long.MinValue, long.MaxValue);
+            codec.Require("published_ns", ref PublishedNs, long.MinValue, long.MaxValue);
+            codec.Require("robots", ref Robots, 0, 0, Protocol.RobotState.New);
+        }
+    }
+
     /// <summary>Second frame of a media message: topic before it, one bulk frame after it.</summary>
     public sealed class MediaHeader : WireValue
     {

@@ -1808,6 +1808,46 @@ export type Presence = [
 ];
 
 /**
+ * Measured and commanded values of one robot after a tick.
+ *
+ * Attributes:
+ *     robot: Its name.
+ *     q: Joint positions [rad or m], in the order of `RobotInfo.joints`.
+ *     qd: Joint velocities [rad/s or m/s], in the same order.
+ *     tip: Measured `T_world_tip` of the end effector.
+ *     gripper: Measured opening, 0 open to 1 closed, as in samples; beyond these where it is pressed there. `None`
+ *         without a gripper that is controlled by position.
+ *     contact_n: Sum of the normal contact forces on the gripper [N].
+ *     target: `T_world_tip` that the session moves the end effector to; `None` while the robot holds or is driven by
+ *         joints.
+ *     ctrl: `ctrl` of its actuators in the last tick, in the order of the joints, then those of the gripper, in the
+ *         units of the model.
+ */
+export type RobotState = [
+  robot: string,
+  q: number[],
+  qd: number[],
+  tip: Pose,
+  gripper?: number | null,
+  contact_n?: number,
+  target?: Pose | null,
+  ctrl?: number[],
+];
+
+/**
+ * Message on topic `robots`: all robots, latest value. Sent from when a client names the capability
+ * `robot_states`. Times and ticks are as in `StateHeader`.
+ */
+export type RobotStates = [
+  scene_epoch: number,
+  tick: number,
+  sim_time: number,
+  session_time: number,
+  published_ns: number,
+  robots: RobotState[],
+];
+
+/**
  * Second frame of a media message: topic before it, one bulk frame after it.
  *
  * `seq`: of the stream, as its source numbered it; at `half` and `quarter` some are left out. `capture_ns`: when it

@@ -1196,6 +1196,32 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["items", ["array", ["struct", "PresenceItem"], 0, 0], []],
     ],
   },
+  RobotState: {
+    array: true,
+    tag: null,
+    fields: [
+      ["robot", ["str", 64, ""], []],
+      ["q", ["array", ["float"], 0, 0], []],
+      ["qd", ["array", ["float"], 0, 0], []],
+      ["tip", ["struct", "Pose"], []],
+      ["gripper", ["null", ["float"]], [null]],
+      ["contact_n", ["float"], [0.0]],
+      ["target", ["null", ["struct", "Pose"]], [null]],
+      ["ctrl", ["array", ["float"], 0, 0], [[]]],
+    ],
+  },
+  RobotStates: {
+    array: true,
+    tag: null,
+    fields: [
+      ["scene_epoch", ["int", 0, null], []],
+      ["tick", ["int", 0, null], []],
+      ["sim_time", ["float"], []],
+      ["session_time", ["int", null, null], []],
+      ["published_ns", ["int", null, null], []],
+      ["robots", ["array", ["struct", "RobotState"], 0, 0], []],
+    ],
+  },
   MediaHeader: {
     array: true,
     tag: null,
@@ -1684,6 +1710,7 @@ export const MAX_CLIENT_BYTES = 48000;
 export const MAX_SERVER_BYTES = 32000000;
 export const MAX_STATE_HEADER_BYTES = 128000;
 export const MAX_PRESENCE_BYTES = 256000;
+export const MAX_ROBOT_STATES_BYTES = 128000;
 export const MAX_MEDIA_HEADER_BYTES = 2000;
 export const MAX_MEDIA_FRAME_BYTES = 8388608;
 export const MAX_ASSET_REQUEST_BYTES = 512;
