@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -13,7 +14,7 @@ from iris_session.physics.names import find_element_id
 from iris_session.physics.tip import Tip
 from iris_session.physics.view import MujocoView
 from iris_session.protocol.common import Pose
-from iris_session.protocol.server_messages import RobotState
+from iris_session.protocol.server_messages import ActuatorInfo, RobotState
 from iris_session.protocol.specs import RobotSpec
 
 Rows = NDArray[np.intp]
@@ -104,17 +105,46 @@ def find_opening_law(model: mujoco.MjModel, actuator: int, robot: RobotSpec) -> 
     The length is that at which the actuator rests for some `ctrl`; the opening is where that lies between `ctrl` closed
     and open: 0 closed, 1 open.
     """
+    span, law = robot.gripper_open - robot.gripper_closed, _find_position_law(model, actuator)
+    if law is None or span == 0.0:
+        return None
+    scale, offset = law
+    return scale / span, (offset - robot.gripper_closed) / span
+
+
+def describe_actuators(model: mujoco.MjModel, robot: RobotSpec) -> tuple[ActuatorInfo, ...]:
+    """Return the actuators of a robot as clients need them, those of its gripper last."""
+    found = []
+    for name in robot.actuators:
+        actuator = find_element_id(model, "actuator", name)
+        scale, offset = _find_position_law(model, actuator) or (0.0, 0.0)
+        found.append(
+            ActuatorInfo(name, *_find_range(model, actuator), scale * float(model.actuator_gear[actuator, 0]), offset)
+        )
+    for one in robot.gripper_actuators:
+        low, high = _find_range(model, find_element_id(model, "actuator", one.actuator))
+        found.append(ActuatorInfo(one.actuator, low, high, one.closed - one.open, one.open))
+    return tuple(found)
+
+
+def _find_range(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
+    if not model.actuator_ctrllimited[actuator]:
+        return -math.inf, math.inf
+    low, high = model.actuator_ctrlrange[actuator].tolist()
+    return low, high
+
+
+def _find_position_law(model: mujoco.MjModel, actuator: int) -> tuple[float, float] | None:
+    """Return scale and offset from the length of an actuator to the `ctrl` with which it rests there; `None` where it
+    is not controlled by position."""
     gain, (constant, slope) = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator, :2].tolist()
-    span = robot.gripper_open - robot.gripper_closed
     is_position = (
         int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
         and int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
         and int(model.actuator_dyntype[actuator]) in FOLLOWS
-        and 0.0 not in (gain, slope, span)
+        and 0.0 not in (gain, slope)
     )
-    if not is_position:
-        return None
-    return -slope / (gain * span), (-constant / gain - robot.gripper_closed) / span
+    return (-slope / gain, -constant / gain) if is_position else None
 
 
 def _find_rows(model: mujoco.MjModel, robot: RobotSpec) -> tuple[Rows, Rows, Rows, int, tuple[float, float] | None]:

@@ -29,7 +29,7 @@ from iris_session.physics.errors import (
 )
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.physics.names import find_element_id, list_body_names, list_element_names
-from iris_session.physics.robot_signals import RobotSignals, RobotStateReader
+from iris_session.physics.robot_signals import RobotSignals, RobotStateReader, describe_actuators
 from iris_session.physics.tip import Tip
 from iris_session.physics.tree import KinematicTree
 from iris_session.physics.view import Flexes, MujocoView
@@ -320,6 +320,7 @@ def _robot_info(model: mujoco.MjModel, spec: RobotSpec) -> RobotInfo:
         site_body=tip.body,
         T_body_site=tip.T_body_tip,
         gripper=bool(spec.gripper_actuator),
+        actuators=describe_actuators(model, spec),
     )
 
 

@@ -135,8 +135,26 @@ class ParticipantInfo(msgspec.Struct, frozen=True):
     alignment: Alignment | None = None
 
 
+class ActuatorInfo(msgspec.Struct, frozen=True, array_like=True):
+    """An actuator of a robot. `low`, `high`: limits of its `ctrl`.
+
+    `scale`, `offset`: `ctrl = scale * x + offset` asks for the position x: of the joint [rad or m], or of the gripper,
+    0 open to 1 closed. `scale` 0: it is not controlled by position.
+    """
+
+    name: Name
+    low: float
+    high: float
+    scale: float = 0.0
+    offset: float = 0.0
+
+
 class RobotInfo(msgspec.Struct, frozen=True):
-    """A robot as clients need it. `site_body`: id of the body that carries the end-effector site; `T_body_site`."""
+    """A robot as clients need it. `site_body`: id of the body that carries the end-effector site; `T_body_site`.
+
+    `actuators`: in the order of `RobotState.ctrl`, one for each of the joints (none for a robot that only its owner's
+    program moves), then those of the gripper.
+    """
 
     name: Name
     joints: tuple[Name, ...]
@@ -144,6 +162,7 @@ class RobotInfo(msgspec.Struct, frozen=True):
     site_body: Count
     T_body_site: Pose
     gripper: bool
+    actuators: tuple[ActuatorInfo, ...] = ()
 
 
 class BodyInfo(msgspec.Struct, frozen=True, array_like=True):

@@ -106,6 +106,7 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         common.Applied,
         server_messages.Endpoints,
         server_messages.ParticipantInfo,
+        server_messages.ActuatorInfo,
         server_messages.RobotInfo,
         server_messages.BodyInfo,
         server_messages.AnchorMark,

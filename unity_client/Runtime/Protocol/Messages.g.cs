@@ -817,6 +817,29 @@ namespace IrisSession.Protocol
         }
     }
 
+    /// <summary>An actuator of a robot.</summary>
+    public sealed class ActuatorInfo : WireValue
+    {
+        internal override bool IsArray => true;
+        public string Name = "";
+        public double Low;
+        public double High;
+        public double Scale;
+        public double Offset;
+
+        public static ActuatorInfo Read(WireReader reader) => reader.ReadInto(new ActuatorInfo());
+        internal static readonly Func<ActuatorInfo> New = () => new ActuatorInfo();
+
+        internal override void Visit(WireCodec codec)
+        {
+            codec.Require("name", ref Name, 64);
+            codec.Require("low", ref Low);
+            codec.Require("high", ref High);
+            codec.Allow("scale", ref Scale, 0.0);
+            codec.Allow("offset", ref Offset, 0.0);
+        }
+    }
+
     /// <summary>A robot as clients need it.</summary>
     public sealed class RobotInfo : WireValue
     {
@@ -826,6 +849,7 @@ namespace IrisSession.Protocol
         public long SiteBody;
         public Pose T_body_site = new Pose();
         public bool Gripper;
+        public ActuatorInfo[] Actuators = Array.Empty<ActuatorInfo>();
 
         public static RobotInfo Read(WireReader reader) => reader.ReadInto(new RobotInfo());
         internal static readonly Func<RobotInfo> New = () => new RobotInfo();
@@ -838,6 +862,7 @@ namespace IrisSession.Protocol
             codec.Require("site_body", ref SiteBody, 0, long.MaxValue);
             codec.Require("T_body_site", ref T_body_site, Protocol.Pose.New);
             codec.Require("gripper", ref Gripper);
+            codec.Allow("actuators", ref Actuators, 0, 0, Protocol.ActuatorInfo.New);
         }
     }
 

@@ -617,7 +617,26 @@ export interface ParticipantInfo {
   alignment?: Alignment | null;
 }
 
-/** A robot as clients need it. `site_body`: id of the body that carries the end-effector site; `T_body_site`. */
+/**
+ * An actuator of a robot. `low`, `high`: limits of its `ctrl`.
+ *
+ * `scale`, `offset`: `ctrl = scale * x + offset` asks for the position x: of the joint [rad or m], or of the gripper,
+ * 0 open to 1 closed. `scale` 0: it is not controlled by position.
+ */
+export type ActuatorInfo = [
+  name: string,
+  low: number,
+  high: number,
+  scale?: number,
+  offset?: number,
+];
+
+/**
+ * A robot as clients need it. `site_body`: id of the body that carries the end-effector site; `T_body_site`.
+ *
+ * `actuators`: in the order of `RobotState.ctrl`, one for each of the joints (none for a robot that only its owner's
+ * program moves), then those of the gripper.
+ */
 export interface RobotInfo {
   name: string;
   joints: string[];
@@ -625,6 +644,7 @@ export interface RobotInfo {
   site_body: number;
   T_body_site: Pose;
   gripper: boolean;
+  actuators?: ActuatorInfo[];
 }
 
 /** One streamed rigid body: its index in state frames is its position in `Snapshot.bodies`. */
@@ -2497,6 +2517,9 @@ export const VALUE_DEFAULTS = {
     worn: true,
     tracking_epoch: 0,
     alignment: null,
+  },
+  RobotInfo: {
+    actuators: [],
   },
   AnchorInfo: {
     size_m: 0.0,

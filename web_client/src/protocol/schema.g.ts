@@ -127,6 +127,17 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["alignment", ["null", ["struct", "Alignment"]], [null]],
     ],
   },
+  ActuatorInfo: {
+    array: true,
+    tag: null,
+    fields: [
+      ["name", ["str", 64, ""], []],
+      ["low", ["float"], []],
+      ["high", ["float"], []],
+      ["scale", ["float"], [0.0]],
+      ["offset", ["float"], [0.0]],
+    ],
+  },
   RobotInfo: {
     array: false,
     tag: null,
@@ -137,6 +148,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["site_body", ["int", 0, null], []],
       ["T_body_site", ["struct", "Pose"], []],
       ["gripper", ["bool"], []],
+      ["actuators", ["array", ["struct", "ActuatorInfo"], 0, 0], [[]]],
     ],
   },
   BodyInfo: {
