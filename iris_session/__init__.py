@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     )
     from iris_session.client.deformables import Deformables
     from iris_session.client.fetched_scene import FetchedScene, fetch_scene
+    from iris_session.client.robot_env import RobotEnv
     from iris_session.cloud.voxels import DepthLimits, PointSet, Rays, VoxelFilter, choose_voxel_m, make_rays
     from iris_session.control.config import ControlConfig
     from iris_session.demo.named_scenes import scene_by_name
@@ -151,6 +152,7 @@ _PUBLIC: Final = {
     ),
     "iris_session.client.fetched_scene": ("fetch_scene", "FetchedScene"),
     "iris_session.client.deformables": ("Deformables",),
+    "iris_session.client.robot_env": ("RobotEnv",),
     "iris_session.streams.cloud": ("encode_cloud", "decode_cloud", "CloudFrame"),
     "iris_session.cloud.voxels": ("VoxelFilter", "PointSet", "Rays", "DepthLimits", "make_rays", "choose_voxel_m"),
     "anchors.camera": ("CameraModel",),
@@ -224,6 +226,7 @@ __all__ = [
     "FetchedScene",
     "Budget",
     "QUEST_3",
+    "RobotEnv",
     "Deformables",
     "DeformableEncoder",
     "DeformableDecoder",

@@ -20,6 +20,7 @@ EXTRAS: Final[Mapping[str, str]] = {
     "rerun_cli": "recording",
     "pyarrow": "recording",
     "rich": "terminal",
+    "gymnasium": "env",
     "trimesh": "files",
     "collada": "files",
     "PIL": "files",

@@ -1,0 +1,98 @@
+"""`RobotEnv`: a policy of Gymnasium in a live session, beside people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.wrappers import PassiveEnvChecker
+
+from iris_session.client import Client, ClientError, robot_env
+from iris_session.client.robot_env import RobotEnv
+from iris_session.protocol.names import LeaseMode
+from tests.rig.session import Rig
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> Any:
+    with Rig(timestep=0.01) as rig:
+        monkeypatch.setattr(
+            robot_env, "Client", lambda _address, name, role, **options: rig.open(name, role, **options)
+        )
+        monkeypatch.setattr(Client, "start", lambda self: self)  # the rig polls
+        yield rig
+
+
+def test_actions_are_ctrl_and_observations_are_what_is_exported(rig: Rig) -> None:
+    env = RobotEnv("", ["left", "right"], hz=20)
+    observation, info = env.reset(seed=1)
+    assert env.observation_space.contains(observation)
+    assert not any(info["intervention"].values())
+    specs, data = rig.session.stepper.core.scene.robots, rig.session.stepper.core.world.data
+    names = [name for one in specs for name in (*one.actuators, *(g.actuator for g in one.gripper_actuators))]
+    assert env.action_space.shape == (len(names),)
+    action = np.array(info["ctrl"])
+    n = len(names) // 2
+    action[0] += 0.1  # [rad]
+    action[n - 1] = env.action_space.high[n - 1]  # the gripper of `left`
+    for _ in range(40):
+        observation, reward, terminated, truncated, info = env.step(action)
+        assert env.observation_space.contains(observation)
+    assert (reward, terminated, truncated) == (0.0, False, False)
+    assert all(info["driven"].values())
+    reached = [data.actuator(name).ctrl[0] for name in names]
+    assert np.abs(np.array(reached) - action).max() < 0.02
+    joints = [data.joint(joint).qpos[0] for joint in specs[0].joints]
+    assert np.abs(observation["agent_pos"][: len(joints)] - joints).max() < 1e-3
+    assert observation["agent_pos"][len(joints)] == pytest.approx(1.0, abs=0.05) or specs[0].gripper_open > 0
+    assert observation["environment_state"][:3] == pytest.approx(data.body(env.objects[0]).xpos, abs=1e-3)
+    with pytest.raises(ValueError, match="shape"):
+        env.step(action[1:])
+    env.close()
+    rig.run(0.5)
+    assert all(lease.holder == "" for lease in rig.join("eve", "observer").mirror.leases.values())
+
+
+def test_people_preempt_the_policy_and_it_goes_on_when_they_stand_by(rig: Rig) -> None:
+    director = rig.join("dora", "director")
+    director.set_mode("left", LeaseMode.PRIORITY)
+    env = RobotEnv("", ["left"], hz=20, resets=True)
+    _, info = env.reset()
+    action = np.array(info["ctrl"])
+    for _ in range(10):
+        *_, info = env.step(action)
+    assert info["driven"]["left"]
+    hand = rig.drive("ann", "left", velocity=(0.0, 0.02, 0.0))
+    for _ in range(10):
+        *_, info = env.step(action)
+    assert info["intervention"]["left"]
+    assert not info["driven"]["left"]
+    assert np.abs(info["ctrl"] - action).max() > 1e-3, "the command in force is that of the person"
+    hand.clutch, hand.velocity = False, (0.0, 0.0, 0.0)
+    for _ in range(100):
+        *_, info = env.step(action)
+    assert not info["intervention"]["left"]
+    assert info["driven"]["left"]
+    assert np.abs(info["ctrl"] - action).max() < 0.02, "it is back where the policy wants it"
+    epoch = director.mirror.scene_epoch
+    env.reset()
+    assert director.mirror.scene_epoch > epoch
+    env.close()
+
+
+def test_what_cannot_be_driven_is_an_error(rig: Rig) -> None:
+    with pytest.raises(ClientError, match="left, right"):
+        RobotEnv("", ["middle"])
+    with pytest.raises(ClientError, match="at least one"):
+        RobotEnv("")
+    rig.run(0.1)
+    assert all(client.connection.phase.name == "CLOSED" for client in rig.clients)
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space")
+def test_it_passes_the_checks_of_gymnasium(rig: Rig) -> None:
+    env = PassiveEnvChecker(RobotEnv("", ["right"], hz=20))
+    _, info = env.reset(seed=1)
+    env.step(info["ctrl"])
+    env.close()
