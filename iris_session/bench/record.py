@@ -1,7 +1,8 @@
 """`bench record`: what recording costs a session, how large its file is, and what kills take from it.
 
-Two operators drive two arms among bodies that fly, at 500 Hz, in sessions with and without a recording in turn. Then
-recorder, authority and both are killed (SIGKILL) in sessions of other processes, and what is left is read.
+Two operators drive two arms among bodies that fly, at 500 Hz, in sessions with and without a recording in turn. A
+session of `handover` in which nothing happens gives what a recording costs at rest. Then recorder, authority and both
+are killed (SIGKILL) in sessions of other processes, and what is left is read.
 
 A loss is the session time from the newest row of the journal in the file to the kill. After a kill of the recorder
 alone the session goes on in the next part, which has the rows that the first one lacks; the loss of that kill is what
@@ -33,7 +34,7 @@ from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.harness import CLIENTS, Measurement, group_clients, make_session_config, measure
 from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
-from iris_session.demo.scenes import free_bodies_scene
+from iris_session.demo.scenes import free_bodies_scene, scene_path
 from iris_session.demo.scenes.generators import (
     ARM_FILE,
     ARM_HOME,
@@ -43,6 +44,7 @@ from iris_session.demo.scenes.generators import (
     compute_circle_radius,
     place_arm,
 )
+from iris_session.journal.feed import RATE_NS
 from iris_session.protocol.common import Pose
 from iris_session.recording import NotARecordingError, RecordedState, Recording
 from iris_session.rrd import paths
@@ -59,6 +61,9 @@ SHORTEST_S: Final = 2.0
 MAX_CPU_SHARE: Final = 0.05
 MAX_LOSS_S: Final = 0.25
 MAX_SIZE_RATIO: Final = 1.5
+MAX_REST_MB: Final = 20.0
+#: Time at rest [s]: the rate of a file is measured over `RATE_NS`, after half of it for scene and assets.
+REST_S: Final = 1.5 * RATE_NS * 1e-9 + 5.0
 RECORDER, AUTHORITY, BOTH = "recorder", "authority", "both"
 #: Kills in their order. A session survives that of its recorder, so it has one of the others, too.
 KINDS: Final = (RECORDER, AUTHORITY, RECORDER, BOTH)
@@ -131,9 +136,11 @@ def run_record(
                 _wait_for_index(path)
         progress("writing the same values as naive logs")
         sizes = [measure_size(folder / f"round{i}.rrd", folder) for i in range(2 * rounds) if i % 4 in (0, 3)]
+        progress("a session at rest")
+        rest_mb = measure_rest(folder / "rest.rrd")
         losses, missing = _kill_sessions(folder, kills, seed, progress)
     results = summarize_rounds(measured) | summarize_sizes(sizes) | summarize_kills(losses)
-    results |= {"kill_rows_missing": missing, "scheduling": scheduling, "drops": drops}
+    results |= {"rest_mb_per_hour": rest_mb, "kill_rows_missing": missing, "scheduling": scheduling, "drops": drops}
     params = {"operators": OPERATORS, "bodies": BODIES, "seconds": 2 * rounds * length_s, "rounds": rounds}
     return BenchReport("record", params | {"kills": kills, "seed": seed}, results, tuple(make_record_bars(results)))
 
@@ -171,6 +178,17 @@ def measure_size(path: Path, folder: Path) -> FileSize:
         naive = write_naive_log(recording, folder / "naive.rrd", LONG_BATCH_S)
         live = write_naive_log(recording, folder / "live.rrd", LOG_BATCH_S)
         return FileSize(path.stat().st_size, naive, live, (times[-1] - times[0]) * 1e-9)
+
+
+def measure_rest(path: Path) -> float:
+    """Return what a session of `handover` without clients adds to its recording in an hour [MB]."""
+    model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+    with Session(model, config=make_session_config(record=path)) as session:
+        session.run(seconds=REST_S)
+        feed = session.processes.feed
+        if feed is None or not feed.stats.bytes_per_hour:
+            raise BenchError("the recording of a session at rest does not grow")
+        return round(feed.stats.bytes_per_hour * 1e-6, 1)
 
 
 def summarize_rounds(rounds: Sequence[Round]) -> dict[str, Any]:
@@ -224,6 +242,7 @@ def make_record_bars(results: dict[str, Any]) -> list[Any]:
         make_bar(results, "writer_cpu_share", "<=", MAX_CPU_SHARE),
         make_bar(results, "late_tick_share_on", "<=", late),
         make_bar(results, "size_ratio", "<=", MAX_SIZE_RATIO),
+        make_bar(results, "rest_mb_per_hour", "<=", MAX_REST_MB),
         make_bar(results, "kill_loss_s_max", "<=", MAX_LOSS_S),
         make_bar(results, "kill_rows_missing", "<=", 0),
     ]

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from iris_session.cli.common import (
     CommandError,
@@ -25,6 +25,9 @@ from iris_session.cli.common import (
 from iris_session.cli.scene import add_file_options, check_file_options, find_scene_file, make_builder
 from iris_session.cli.view import live_viewer
 from iris_session.protocol.names import AssignmentPolicy
+
+#: What `bench record` measures, and what is usual.
+RECORDING_COST: Final = "some 20 MB an hour at rest, 1 to 2 GB with two operators; `iris-session status` says what now"
 
 if TYPE_CHECKING:
     from iris_session.session.config import SessionConfig
@@ -285,7 +288,7 @@ def _serve(
         for note in filter(None, (*session.notes, make_hint(session))):
             print(note, file=out, flush=True)
         if session.recording is not None:
-            print(f"recording to {session.recording}", file=out, flush=True)
+            print(f"recording to {session.recording} ({RECORDING_COST})", file=out, flush=True)
         with live_viewer(session.recording, out) if arguments.view else nullcontext():
             _run_with_live_view(arguments, session, out)
         status = session.status()

@@ -275,8 +275,9 @@ def format_status(report: StatusReport) -> Iterator[str]:
     if one is not None and one.state == "off":
         yield "recorder: off"
     elif one is not None:
+        rate = f" ({one.bytes_per_hour / 1e6:.0f} MB an hour now)" if one.bytes_per_hour else ""
         yield (
-            f"recorder: {one.state}, {one.bytes_written / 1e6:.1f} MB, {one.disk_free_bytes / 1e9:.1f} GB free, "
+            f"recorder: {one.state}, {one.bytes_written / 1e6:.1f} MB{rate}, {one.disk_free_bytes / 1e9:.1f} GB free, "
             f"{one.lost_rows} rows lost, {one.path}{f': {one.text}' if one.text else ''}"
         )
     most = sorted(report.drops.items(), key=lambda item: -item[1])[:8]

@@ -347,7 +347,7 @@ def check_disk(report: StatusReport) -> Finding:
     if one is None or one.state == "off" or not one.disk_free_bytes:
         return ok("disk", "nothing is recorded, or the free space is not known")
     free = one.disk_free_bytes
-    rate = one.bytes_written / max(1.0, report.session_time * 1e-9)
+    rate = one.bytes_per_hour / 3600.0 or one.bytes_written / max(1.0, report.session_time * 1e-9)
     left_s = free / rate if rate > 0.0 else float("inf")
     text = f"{free / 1e9:.2f} GB left for the recording"
     if free < FULL_DISK:

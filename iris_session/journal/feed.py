@@ -5,7 +5,8 @@ first of them, the window, are sent, the others wait in the backlog. A restarted
 not acknowledged. Rows are dropped only if the backlog is full, states and metrics before: they are counted and reported
 by `take_gap`. No step waits for a disk, so nothing here is kept on one.
 
-Vertices of deformables are for the picture only: while batches wait they are dropped and counted.
+Vertices of deformables are for the picture only: while batches wait they are dropped and counted. States of a scene at
+rest are left out (`RestFilter`).
 """
 
 from __future__ import annotations
@@ -57,6 +58,8 @@ WINDOW_BYTES: Final = 16 << 20
 BACKLOG_BYTES: Final = 512 << 20
 #: Maximum number of batches of the backlog that are sent per flush, so that it stays short: four times what is new.
 BACKLOG_BATCHES: Final = 4
+#: Time over which the growth of the file is measured.
+RATE_NS: Final = 30_000_000_000
 #: Share of the backlog above which only what verification needs is kept: rows, keyframes, scenes.
 JOURNAL_SHARE: Final = 0.75
 #: Maximum time without a status while closing. A recorder that writes sends one every half second; a busy machine or
@@ -73,8 +76,9 @@ class FeedStats(msgspec.Struct):
 
     `waiting_batches`, `waiting_bytes`: the backlog. `dropped_rows`: rows missing in the recording; `drop_reason`: why
     the last ones; `dropped_items`: states, events and other items missing;
-    `dropped_vertices`: frames missing in the picture; `recorder`: the last status of the recorder. What comes after the
-    budget of the recording is used up is in none of them.
+    `dropped_vertices`: frames missing in the picture; `recorder`: the last status of the recorder; `bytes_per_hour`:
+    growth of the file at the rate of the last `RATE_NS`, 0 before. What comes after the budget of the recording is used
+    up is in none of them.
     """
 
     window_bytes: int = 0
@@ -86,6 +90,7 @@ class FeedStats(msgspec.Struct):
     recorders: int = 0
     drop_reason: str = ""
     recorder: RecorderStatus | None = None
+    bytes_per_hour: int = 0
 
 
 class RecorderFeed:
@@ -115,6 +120,7 @@ class RecorderFeed:
         self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
         self._socket.connect(endpoint)
         self._vertex_limit = VertexRateLimit()
+        self._rest = RestFilter()
         self._header = b""
         self._scene = Batch()  # the newest `SceneModel`, and the assets of the picture
         self._robots: tuple[RobotLabels, ...] = ()
@@ -128,6 +134,7 @@ class RecorderFeed:
         self._now = (0, 0)  # step and session time of the newest row
         self._sim_time = self._sim_before = 0.0  # of the newest state, and what resets have set it back by [s]
         self._last_status_ns = 0
+        self._size_at = (0, 0)  # session time, and size of the file then
         #: Session time since the last status of a recorder that has something to write: it may hang.
         self.silence_ns = 0
         #: New since the newest state, by participant and device.
@@ -175,6 +182,8 @@ class RecorderFeed:
     def _send_scene_data(self, known: Batch, news: Batch | None = None) -> None:
         """Send scene data. `known`: for recorders that start later; `news`: for the present one, if less than
         `known`."""
+        self._end_rest()
+        self._rest.reset()
         self.flush()
         self._scene, news = known, known if news is None else news
         self._batch.scenes, self._batch.assets = list(news.scenes), list(news.assets)
@@ -207,9 +216,9 @@ class RecorderFeed:
         poses: NDArray[np.float64],
         applied: Sequence[Applied] = (),
         robots: bytes = b"",
-    ) -> None:
+    ) -> bool:
         """Add world poses (n_bodies, 7) `x y z qw qx qy qz` of the header's bodies, at the state rate; presence since
-        the last state with it. `robots`: see `StateFrame`."""
+        the last state with it. `robots`: see `StateFrame`. Return whether it is recorded, see `RestFilter`."""
         presence = tuple(self._presence.values())
         self._presence.clear()
         if sim_time < self._sim_time:
@@ -219,13 +228,22 @@ class RecorderFeed:
         frame = StateFrame(
             step, tick, sim_time, session_time, poses.tobytes(), presence, applied, robots, self._sim_before
         )
-        self._add(self._batch.states, frame)
+        admitted = self._rest.admit_frame(frame, np.concatenate((poses.ravel(), np.frombuffer(robots))))
+        for one in admitted:
+            self._add(self._batch.states, one)
+        return bool(admitted)
+
+    def _end_rest(self) -> None:
+        """Add the newest state if it was left out: what comes next has its simulated time, or replaces its scene."""
+        for frame in self._rest.take_left_out():
+            self._add(self._batch.states, frame)
 
     def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
         """Add events, denials and changed reasons to hold of one step; its presence is sent with the next state."""
         for item in decision.presence:
             self._presence[item.participant, item.device] = item
         for event in decision.events:
+            self._end_rest()
             self._add(self._batch.events, event)
             if isinstance(event.body, ParticipantJoined | ParticipantChanged):
                 self._people[event.body.participant.id] = event.body.participant
@@ -237,10 +255,12 @@ class RecorderFeed:
         for command in decision.commands:
             if self._holds.get(command.robot, "") != command.hold_reason:
                 self._holds[command.robot] = command.hold_reason
+                self._end_rest()
                 self._add(self._batch.holds, HoldRecord(step, session_time, command.robot, command.hold_reason))
         for outgoing in decision.outgoing:
             message = outgoing.message
             if type(message) is Reply and message.denial is not None:
+                self._end_rest()
                 record = DenialRecord(step, session_time, outgoing.connection, message.denial)
                 self._add(self._batch.denials, record)
 
@@ -255,6 +275,7 @@ class RecorderFeed:
         """
         if not self._vertex_limit.admit_frame(stream, read_header(frame).n_vertices, session_time):
             return
+        self._end_rest()
         if self._backlog:
             self.stats.dropped_vertices += 1
         else:
@@ -306,7 +327,10 @@ class RecorderFeed:
         """
         if self._socket.closed:
             return self._complete
+        self._end_rest()
         self.flush()
+        if self._instance and self._header_sent_to == self._instance:
+            self._send(messages.FLUSH, self._next, b"")
         waits = max(1, round(timeout_s / 0.02))
         silent, said = 0, (self.stats.recorder, cpu_s())
         while waits and silent < silence_s / 0.02 and alive() and self._header and (self._window or self._backlog):
@@ -332,6 +356,7 @@ class RecorderFeed:
             self.stats.dropped_items += len(items)
             items.clear()
         self._holds = dict.fromkeys(self._holds)  # what was left out is sent when there is room
+        self._rest.reset()
 
     def _add(self, items: list[_T], item: _T) -> None:
         if len(items) < BATCH_ITEMS:
@@ -355,6 +380,7 @@ class RecorderFeed:
         self.stats.drop_reason = why
         self._gap_rows += rows
         self._lost = True
+        self._rest.reset()
         self._batch.dropped_rows = self.stats.dropped_rows
 
     def _send_batch(self, body: bytes) -> None:
@@ -386,6 +412,9 @@ class RecorderFeed:
             self._instance = status.instance
             self.stats.recorders += 1
             self._vertex_limit.reset()
+            self._rest.reset()  # the picture of a new part begins with a state
+            self._size_at = (self._now[1] + RATE_NS // 2, 0)  # after the scene and its assets
+        self._measure_rate(status.bytes)
         while self._window and self._window[0][0] <= status.written:
             self.stats.window_bytes -= len(self._window.popleft()[1])
         if status.ended:
@@ -399,12 +428,76 @@ class RecorderFeed:
             for number, body in self._window:
                 self._send(messages.BATCH, number, body)
 
+    def _measure_rate(self, size: int) -> None:
+        now_ns, (since_ns, since) = self._now[1], self._size_at
+        if now_ns <= since_ns:
+            self._size_at = (since_ns, size)
+        elif now_ns - since_ns >= RATE_NS:
+            self.stats.bytes_per_hour = max(0, size - since) * 3_600_000_000_000 // (now_ns - since_ns)
+            self._size_at = (now_ns, size)
+
     def _end(self) -> None:
         """Discard what waits, and all that comes: the recorder has closed the last file."""
         self._ended, self._lost, self._gap_rows, self.silence_ns = True, False, 0, 0
         self._window.clear()
         self._backlog.clear()
         self.stats.window_bytes = self.stats.waiting_bytes = 0
+
+
+#: Changes of a state that are not recorded while the scene is at rest: [m], [rad], and in quaternions. Bodies at rest
+#: move by some 1e-11.
+STILL: Final = 1e-6
+#: Time without a larger change after which a scene is at rest, and distance of the states that are recorded then.
+REST_NS: Final = 2_000_000_000
+REST_STATE_NS: Final = 30_000_000_000
+
+
+class RestFilter:
+    """Leave out states of a scene at rest: those that equal the recorded one within `STILL`, without presence.
+
+    The newest state that was left out is recorded before one that moved, so that readers which interpolate between two
+    states see the rest, and then the motion.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Record the next states whatever they are: it is another scene or file, or states were lost."""
+        self._recorded: StateFrame | None = None
+        self._values: NDArray[np.float64] = np.empty(0)
+        self._moved_ns = 0
+        self._left_out: StateFrame | None = None
+
+    def admit_frame(self, frame: StateFrame, values: NDArray[np.float64]) -> list[StateFrame]:
+        """Return what to record now. `values`: what must not change, NaN for what there is not."""
+        is_moving = not self._is_still(frame, values)
+        if is_moving:
+            self._moved_ns = frame.session_time
+        elif frame.session_time - self._moved_ns >= REST_NS and not self._is_due(frame):
+            self._left_out = frame
+            return []
+        left_out = self.take_left_out() if is_moving else []
+        self._recorded, self._values, self._left_out = frame, values, None
+        return [*left_out, frame]
+
+    def take_left_out(self) -> list[StateFrame]:
+        """Return the newest state, if it was left out; it counts as recorded then."""
+        frame, self._left_out = self._left_out, None
+        if frame is None:
+            return []
+        self._recorded = frame
+        return [frame]
+
+    def _is_due(self, frame: StateFrame) -> bool:
+        return self._recorded is None or frame.session_time - self._recorded.session_time >= REST_STATE_NS
+
+    def _is_still(self, frame: StateFrame, values: NDArray[np.float64]) -> bool:
+        before = self._recorded
+        if before is None or frame.presence or frame.applied != before.applied or values.shape != self._values.shape:
+            return False
+        is_same = np.abs(values - self._values) <= STILL
+        return bool((is_same | (np.isnan(values) & np.isnan(self._values))).all())
 
 
 #: Minimum time between frames of one deformable: 20 a second look smooth, if all deformables together fit.

@@ -1,7 +1,8 @@
 """Messages between the authority's feed and the recorder process. Pure.
 
 Authority -> recorder: `HEADER` with the number of the batch that follows it, the header, and a batch with the scene
-loaded last, if any, and the location of its assets; or `BATCH` with its own number, and the body. Recorder ->
+loaded last, if any, and the location of its assets; or `BATCH` with its own number, and the body; or `FLUSH` at the
+end: the recorder collects nothing from then on. Recorder ->
 authority: `RecorderStatus`. The feed keeps every batch until a status confirms that it is in the file; a new recorder
 process requests the header (`expecting` -1) and receives everything that is not confirmed.
 
@@ -75,6 +76,7 @@ class HeaderCopy(msgspec.Struct, frozen=True, array_like=True):
 
 HEADER: Final = b"H"
 BATCH: Final = b"B"
+FLUSH: Final = b"F"
 FRAME: Final = struct.Struct("<cQ")  # kind, batch number
 
 

@@ -237,6 +237,7 @@ class RecorderReport(msgspec.Struct, frozen=True):
     """State of the recorder: `off` (nothing is recorded), `running`, `hangs` (silent for 5 s), `dead` (being replaced),
     `failed` (the file cannot be written) or `ended` (its budget is used up). `disk_free_bytes` 0: not known.
     `spilled_bytes`: what waits in memory for a recorder that is behind. `text`: its last message, for people.
+    `bytes_per_hour`: what the recording costs an hour at the rate of the last half minute; 0: not known yet.
     """
 
     state: Name = "off"
@@ -246,6 +247,7 @@ class RecorderReport(msgspec.Struct, frozen=True):
     lost_rows: Count = 0
     spilled_bytes: Count = 0
     text: Text = ""
+    bytes_per_hour: Count = 0
 
 
 class MediaStreamReport(msgspec.Struct, frozen=True):

@@ -19,7 +19,7 @@ import msgspec
 
 from iris_session.journal.errors import NotARecordingError
 from iris_session.journal.messages import decode_header, decode_header_copy
-from iris_session.journal.rows import FORMAT, VERIFIERS, SessionHeader, blob_root, open_blob, unpack_model
+from iris_session.journal.rows import READ_FORMATS, VERIFIERS, SessionHeader, blob_root, open_blob, unpack_model
 from iris_session.recording.lock import is_being_written
 from iris_session.rrd import batches, paths
 from iris_session.rrd import file as rrd_file
@@ -101,10 +101,6 @@ class RecordingParts:
             except UNREADABLE as error:
                 place = f"{os.path.basename(self.files[i])}: {get_entity(pieces[0])}"
                 self._record_damage(f"{place} holds something damaged, which is left out: {_format_error(error)}")
-
-    def _count_rows(self, entity: str) -> int:
-        """Return the number of rows of an entity; those that are repeated or split by Rerun's tools count again."""
-        return sum(piece.num_rows for _, pieces in self._iterate_spans(entity) for piece in pieces)
 
     def _iterate_spans(self, entities: Entities) -> Iterator[tuple[int, list[Any]]]:
         """Yield part number (from 0) and the record batches of some rows of one entity, over all parts in order."""
@@ -197,11 +193,12 @@ class RecordingParts:
             if not intact:
                 changed = changed or (header, blob_root(blob))
                 continue
-            if header.format != FORMAT:
+            if header.format not in READ_FORMATS:
                 had = f"{path} was recorded in format {header.format} on {header.created_utc[:10] or 'an unknown day'}"
                 right = VERIFIERS.get(header.format, "the one that made it")
+                known = " and ".join(map(str, READ_FORMATS))
                 raise NotARecordingError(
-                    f"{had}, this iris-session reads format {FORMAT}: verify or resume it with {right}"
+                    f"{had}, this iris-session reads formats {known}: verify or resume it with {right}"
                 )
             self._leave_out_others(blob_root(blob))
             return header, blob_root(blob)
@@ -223,7 +220,7 @@ class RecordingParts:
         for _, blob, intact in self._iterate_blobs(paths.HEADER_COPY):
             with suppress(*UNREADABLE):
                 copy = decode_header_copy(blob)
-                if not intact or copy.header.format != FORMAT:
+                if not intact or copy.header.format not in READ_FORMATS:
                     continue
                 model = b"" if changed is None else changed[0].model
                 try:

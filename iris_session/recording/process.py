@@ -1,10 +1,10 @@
 """The recorder process: `python -m iris_session.recording.process`, configuration as MessagePack on standard input.
 
 Receives batches from the authority and raw samples from the front, and writes them into one Rerun file about seven
-times a second, so that killing any process loses at most 0.25 s. The journal comes first: raw samples are left out, and
-counted, while the disk is slow or nearly full, and media when time is short. Prints `ready` or
-`failed: <one line>` on standard output. Ends on SIGTERM, or when its parent process has ended, after writing everything
-that was received, and when the budget of the recording is used up; SIGINT is left to the parent.
+times a second, so that killing any process loses at most 0.25 s; of a scene at rest every two seconds. The journal
+comes first: raw samples are left out, and counted, while the disk is slow or nearly full, and media when time is short.
+Prints `ready` or `failed: <one line>` on standard output. Ends on SIGTERM, or when its parent process has ended, after
+writing everything that was received, and when the budget of the recording is used up; SIGINT is left to the parent.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from iris_session.journal.errors import RecorderError, WriteError
 from iris_session.journal.messages import (
     BATCH,
     FAULT_PREFIX,
+    FLUSH,
     FRAME,
     HEADER,
     Batch,
@@ -51,6 +52,8 @@ from iris_session.system.log import configure_logging
 #: Period at which sockets are drained, instead of at every message: one wake-up for some twenty messages.
 DRAIN_S: Final = 0.03
 FLUSH_S: Final = 0.14
+#: The same while the scene is at rest: a chunk of the file is mostly its schema.
+REST_FLUSH_S: Final = 1.9
 SYNC_S: Final = 1.0
 STATUS_S: Final = 0.5
 #: Maximum number of messages per drain, so that a flood cannot keep the file from being written.
@@ -107,7 +110,7 @@ class RecorderLoop:
         self._header: SessionHeader | None = None
         self._instance = time.monotonic_ns()  # differs from that of every earlier recorder
         self._expecting = -1
-        self._received = -1
+        self._received = self._written = -1
         self._newest_ns = 0  # session time of the newest row received
         self._lag_ns = 0
         self._samples = 0
@@ -120,7 +123,9 @@ class RecorderLoop:
         self._is_used_up = False  # the budget
         self._ended = False
         self._fault = ""
-        self._stopping = False
+        self._stopping = self._is_ending = False
+        self._flush_at = self._rest_at = self._status_at = 0.0  # on the monotonic clock [s]
+        self._has_news = False  # something was received since the last write
 
     def run(self) -> int:
         """Record until stopped. Return the exit status of the process."""
@@ -217,21 +222,25 @@ class RecorderLoop:
         return socket
 
     def _loop(self) -> None:
-        flush_at = status_at = 0.0
         while not self._stopping and not self._is_used_up and os.getppid() == self._config.parent:
             time.sleep(DRAIN_S)
-            n = self._drain()
-            now = time.monotonic()
-            if now >= flush_at:
-                flush_at = now + FLUSH_S
-                self._flush()
-                self._write_s = self._writer.stream.write_s
-                self._syncer.check()
-                self._write_assets()
-                self._lag_ns = time.monotonic_ns() - self._config.origin_ns - self._newest_ns
-                if n or now >= status_at:
-                    status_at = now + STATUS_S
-                    self._send_status(self._received)
+            self._has_news = bool(self._drain()) or self._has_news
+            self._write_due(time.monotonic())
+
+    def _write_due(self, now_s: float) -> None:
+        """Write what was received, and report, each when it is due."""
+        if now_s >= self._flush_at and (now_s >= self._rest_at or self._is_urgent):
+            self._flush_at, self._rest_at = now_s + FLUSH_S, now_s + REST_FLUSH_S
+            self._flush()
+            self._write_s = self._writer.stream.write_s
+            self._syncer.check()
+            self._write_assets()
+            self._lag_ns = time.monotonic_ns() - self._config.origin_ns - self._newest_ns
+            self._status_at = now_s if self._has_news else self._status_at
+            self._has_news = False
+        if now_s >= self._status_at:
+            self._status_at = now_s + STATUS_S
+            self._send_status(self._written)
 
     def _drain_all(self) -> None:
         until = time.monotonic() + FINISH_S
@@ -240,12 +249,18 @@ class RecorderLoop:
             if self._drain():
                 quiet_at = time.monotonic() + QUIET_S
                 self._flush()
-                self._send_status(self._received)
+                self._send_status(self._written)
             time.sleep(DRAIN_S)
 
     def _flush(self) -> None:
         self._writer.flush()
         self._unwritten_bytes = 0
+        self._written = self._received
+
+    @property
+    def _is_urgent(self) -> bool:
+        """True if what was received is to be written soon; rows of a scene at rest wait for others."""
+        return self._writer.is_urgent or self._is_ending or bool(self._writer.assets)
 
     def _write_assets(self) -> None:
         """Write assets after the journal, as many as the disk takes in a moment: no row waits for them longer."""
@@ -303,6 +318,8 @@ class RecorderLoop:
                 self._writer.add(self._decode(known))
             self._expecting = number
             self._received = number - 1
+        elif kind == FLUSH:
+            self._is_ending = True
         elif kind == BATCH and number == self._expecting and not self._is_used_up:
             self._unwritten_bytes += len(frames[1])
             if self._budget.is_used_up(self._writer.size_with_index + self._unwritten_bytes):

@@ -98,7 +98,7 @@ class Recording(RecordingParts):
 
     @property
     def finished(self) -> bool:
-        """True if the recorder closed the last part; otherwise the last 0.25 s of the session may be missing."""
+        """True if the recorder closed the last part; otherwise its last 0.25 s (at rest 2 s) may be missing."""
         return self.end is not None
 
     @classmethod
@@ -169,11 +169,12 @@ class Recording(RecordingParts):
 
     def count_rows(self) -> int:
         """Return the number of journal rows in the files, for progress reports; repeated rows count again."""
-        return self._count_rows(paths.ROWS)
+        found = self._iterate(paths.ROWS, lambda batch: iter((batches.decode_row_times(batch),)))
+        return sum(len(times.steps) for _, times in found)
 
     def count_samples(self) -> int:
         """Return the number of raw messages in the files, for progress reports."""
-        return self._count_rows(paths.SAMPLES)
+        return sum(piece.num_rows for _, pieces in self._iterate_spans(paths.SAMPLES) for piece in pieces)
 
     def keyframes(self) -> Iterator[Keyframe]:
         """Yield the keyframes in order of steps, each once."""
@@ -183,6 +184,9 @@ class Recording(RecordingParts):
 
     def states(self) -> Iterator[RecordedState]:
         """Yield the states of all bodies at the state rate, in order of time.
+
+        While nothing moves by more than a micrometre for 2 s, there is a state every half minute, and the last one
+        before the next motion.
 
         Returns:
             Iterator over states: `poses` (n_bodies, 7) float64, `x y z qw qx qy qz` ([m], unit quaternion), world

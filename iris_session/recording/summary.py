@@ -273,7 +273,7 @@ def _describe_ending(recording: Recording, end_ns: int) -> str:
     if recording.end is not None:
         return recording.end.reason[:200] or (ABRUPT if recording.end.is_abrupt else "")
     cuts = "".join(f"; {cut}" for cut in recording.cuts)
-    lost = "at most 0.25 s if its recorder was killed, more if the file was cut"
+    lost = "at most 0.25 s, or 2 s at rest, if its recorder was killed, more if the file was cut"
     return f"not closed after {_to_s(end_ns):g} s: what may have followed is missing, {lost}{cuts}"
 
 

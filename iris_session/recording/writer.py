@@ -29,10 +29,23 @@ from iris_session.journal.messages import (
     encode_header_copy,
     encode_scene,
 )
-from iris_session.journal.rows import CLOSED, JournalRow, Keyframe, SessionHeader, blob_root, seal_blob
+from iris_session.journal.rows import (
+    CLOSED,
+    CRASHED,
+    NO_ENTRIES,
+    JournalRow,
+    Keyframe,
+    SessionHeader,
+    blob_root,
+    seal_blob,
+)
+from iris_session.journal.runs import pack_run, split_runs
+from iris_session.protocol.client_messages import Heartbeat
+from iris_session.protocol.entries import decode_entries
 from iris_session.protocol.server_messages import Event
 from iris_session.rrd import paths
 from iris_session.rrd.assets import AssetQueue, AssetRows
+from iris_session.rrd.batches import RUN
 from iris_session.rrd.index import INDEX_BYTES
 from iris_session.rrd.stream import (
     RrdStream,
@@ -49,7 +62,7 @@ from iris_session.viewer.narration import WARN, NarratedEvent, describe_denial, 
 from iris_session.viewer.timelines import MomentTable, to_time_columns
 
 _encode = msgspec.msgpack.Encoder().encode
-#: Columns of tables: those of `JournalRow` behind its times, of raw messages, and of each field of `AssetRows`.
+#: Columns of tables: those of `JournalRow` behind its times, and of runs; of raw messages; of `AssetRows`.
 _NUMBERS: Final = pa.list_(pa.uint32())
 _ROWS: Final = {
     "n_ticks": pa.int64(),
@@ -60,6 +73,7 @@ _ROWS: Final = {
     "chain": pa.binary(),
     "field_crcs": _NUMBERS,
     "plant": pa.binary(),
+    RUN: pa.binary(),
 }
 _SAMPLES: Final = {"connection": pa.int64(), "receive_ns": pa.int64(), "data": pa.binary()}
 _SCENES: Final = {"scene_step": pa.int64(), "scene_ns": pa.int64(), "hash": pa.string(), "recorded": pa.string()}
@@ -84,6 +98,8 @@ class RrdWriter:
         stream: Its bytes.
         drawing: What the viewer shows.
         assets: What `write_assets` writes.
+        is_urgent: Something was collected that is not to wait: all but rows of steps in which nothing but heartbeats
+            came in, plotted values, and what participants report of their states.
     """
 
     def __init__(self, path: str | Path, recording_id: str, assets: AssetQueue | None = None) -> None:
@@ -98,6 +114,7 @@ class RrdWriter:
         self._samples: list[tuple[int, int, bytes]] = []
         self._reports: list[tuple[str, int, float]] = []
         self._media: list[Sequence[bytes]] = []
+        self.is_urgent = False
         self._header: SessionHeader | None = None
         self._newest_row = (-1, b"")
         self._begins_ns: int | None = None  # session time of the first row
@@ -127,6 +144,7 @@ class RrdWriter:
             self.flush()
             self._write_scenes(batch.scenes, batch.assets)
         pending = self._pending
+        self.is_urgent = self.is_urgent or not _is_idle(batch)
         self.drawing.narration.add_people(batch.people)
         for name in ("rows", "states", "events", "denials", "metrics", "keyframes", "holds", "vertices"):
             getattr(pending, name).extend(getattr(batch, name))
@@ -134,6 +152,7 @@ class RrdWriter:
     def add_sample(self, connection: int, receive_ns: int, data: bytes) -> None:
         """Collect one raw message of a client, as received."""
         self._samples.append((connection, receive_ns, data))
+        self.is_urgent = True
 
     def add_report(self, participant: str, receive_ns: int, age_ms: float) -> None:
         """Collect a report of a client: the age [ms] below which 99 % of the states of a second reached it."""
@@ -142,6 +161,7 @@ class RrdWriter:
     def add_media(self, message: Sequence[bytes]) -> None:
         """Collect a message about a stream of clouds or pictures, as `MediaDrawer.draw` takes it."""
         self._media.append(message)
+        self.is_urgent = True
 
     def flush(self, timeout_s: float = 10.0) -> None:
         """Write everything collected. Raises `WriteError`; the file is then valid up to an earlier flush."""
@@ -149,6 +169,7 @@ class RrdWriter:
         samples, self._samples = self._samples, []
         reports, self._reports = self._reports, []
         media, self._media = self._media, []
+        self.is_urgent = False
         self._write_rows(batch.rows)
         self._write_keyframes(batch.keyframes)
         events = self.drawing.events
@@ -248,13 +269,19 @@ class RrdWriter:
     def _write_rows(self, rows: Sequence[JournalRow]) -> None:
         if not rows:
             return
-        columns = table_columns((msgspec.structs.astuple(row)[2:] for row in rows), _ROWS)
-        if not any(row.plant for row in rows):
-            columns.pop()
-        times = [
-            sequence_index(paths.STEP, [row.step for row in rows]),
-            duration_index(paths.SESSION_TIME, [row.now_ns for row in rows]),
-        ]
+        table: list[Sequence[Any]] = []
+        places: list[tuple[int, int]] = []
+        for some in split_runs(rows):
+            run = pack_run(some)
+            if run:
+                table.append((*[None] * (len(_ROWS) - 1), run))
+            else:
+                table += [(*msgspec.structs.astuple(row)[2:-1], row.plant or None, None) for row in some]
+            places += [(row.step, row.now_ns) for row in (some[-1:] if run else some)]
+        used = [any(value is not None for value in values) for values in zip(*table, strict=True)]
+        columns = [column for column, is_used in zip(table_columns(table, _ROWS), used, strict=True) if is_used]
+        steps, times_ns = zip(*places, strict=True)
+        times = [sequence_index(paths.STEP, steps), duration_index(paths.SESSION_TIME, times_ns)]
         self._send_columns(paths.ROWS, times, columns)
         self._newest_row = (rows[-1].step, rows[-1].chain)
         self._newest_ns = rows[-1].now_ns
@@ -323,3 +350,16 @@ class RrdWriter:
                 index = [duration_index(paths.SESSION_TIME, times)]
                 self._send_columns(entity, index, table_columns(table, types))
         self._write_stream(timeout_s)
+
+
+def _is_idle(batch: Batch) -> bool:
+    """Return whether a batch may wait for others, see `RrdWriter.is_urgent`."""
+    urgent: tuple[Sequence[Any], ...] = (batch.states, batch.events, batch.denials, batch.keyframes, batch.scenes)
+    urgent += (batch.assets, batch.holds, batch.vertices)
+    return not any(urgent) and all(_is_idle_row(row) for row in batch.rows)
+
+
+def _is_idle_row(row: JournalRow) -> bool:
+    if row.plant or row.digest == CRASHED:
+        return False
+    return row.entries == NO_ENTRIES or all(type(entry.message) is Heartbeat for entry in decode_entries(row.entries))

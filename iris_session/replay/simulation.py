@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
 from iris_session.journal.environment import compare_environment
-from iris_session.journal.rows import CLOSED, CRASHED, check_fields, check_keyframe
+from iris_session.journal.rows import CLOSED, CRASHED, check_fields, check_keyframe, is_result
 from iris_session.protocol.entries import decode_entries
 from iris_session.recording import JournalRow, Keyframe, Recording, RecordingError
 from iris_session.session.core import SessionCore, StepOutcome
@@ -135,7 +135,7 @@ class Replay:
             raise
         except Exception as error:  # a foreign file may cause any error in the core
             raise self._make_error(f"step {row.step} cannot be taken again", error) from error
-        if outcome.digest != row.digest:
+        if not is_result(row, outcome.digest):
             raise self._make_error(f"step {row.step} gives another result here than in the recording")
         return outcome
 

@@ -7,6 +7,7 @@ messages. It raises one of `UNREADABLE` if the bytes mean something else.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from typing import Any, Final, NamedTuple, TypeVar
 
 import msgspec
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from iris_session.journal.messages import DenialRecord, EndMark, SceneModel, decode_scene
 from iris_session.journal.rows import JournalRow, Keyframe, open_blob
+from iris_session.journal.runs import read_run_times, unpack_run
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.common import Applied
 from iris_session.protocol.media import StreamInfo
@@ -26,6 +28,8 @@ from iris_session.rrd.file import Mark
 
 #: Errors of decoding bytes that mean something else; the last one is Arrow's, for types that it cannot convert.
 UNREADABLE: Final = (msgspec.DecodeError, LookupError, TypeError, ValueError, ArithmeticError, NotImplementedError)
+#: Column of a run of rows (`journal/runs.py`), null in a row that is none.
+RUN: Final = "run"
 #: Bytes of a row id that are the time of the write.
 _WRITE: Final = 8
 _T = TypeVar("_T")
@@ -136,7 +140,47 @@ class FrameTime(NamedTuple):
 
 
 def decode_rows(batch: Any) -> Iterator[JournalRow]:
-    """Yield rows of the journal."""
+    """Yield rows of the journal, those of runs too.
+
+    Raises:
+        ValueError: Runs are damaged. The other rows are yielded before.
+    """
+    damaged: list[str] = []
+    is_run, singles, runs = _split_runs(batch)
+    single_rows = _decode_single_rows(singles) if singles.num_rows else iter(())
+    ends = zip(read_index(runs, paths.STEP), read_index(runs, paths.SESSION_TIME), _read_runs(runs), strict=True)
+    for packed in is_run:
+        if not packed:
+            yield next(single_rows)
+            continue
+        step, now_ns, run = next(ends)
+        try:
+            rows = unpack_run(run)
+        except ValueError as error:
+            damaged.append(f"rows up to step {step}: {error}")
+            continue
+        if (rows[-1].step, rows[-1].now_ns) == (step, now_ns):
+            yield from rows
+        else:
+            damaged.append(f"rows up to step {rows[-1].step}: step or time of a run were changed")
+    if damaged:
+        raise ValueError("; ".join(damaged))
+
+
+def _split_runs(batch: Any) -> tuple[list[bool], Any, Any]:
+    """Return which rows are runs, the rows that are none, and the runs."""
+    if RUN not in batch.schema.names:
+        return [False] * batch.num_rows, batch, batch.slice(0, 0)
+    is_single = batch.column(RUN).is_null()
+    is_run = batch.column(RUN).is_valid()
+    return is_run.to_pylist(), batch.filter(is_single), batch.filter(is_run)
+
+
+def _read_runs(runs: Any) -> list[bytes]:
+    return read_values(runs, RUN) if runs.num_rows else []
+
+
+def _decode_single_rows(batch: Any) -> Iterator[JournalRow]:
     columns = zip(
         read_index(batch, paths.STEP),
         read_index(batch, paths.SESSION_TIME),
@@ -254,8 +298,17 @@ def decode_asset_faults(batch: Any) -> Iterator[AssetFault]:
 
 def decode_row_times(batch: Any) -> RowTimes:
     """Return the times of rows of the journal, which is much quicker than the rows."""
-    step, time = (np.asarray(batch.column(name).cast("int64")) for name in (paths.STEP, paths.SESSION_TIME))
-    return RowTimes(step, time)
+    is_run, singles, runs = _split_runs(batch)
+    step, time = (np.asarray(singles.column(name).cast("int64")) for name in (paths.STEP, paths.SESSION_TIME))
+    found: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    at = 0
+    for place, run in zip(np.flatnonzero(is_run) - np.arange(runs.num_rows), _read_runs(runs), strict=True):
+        found.append((step[at:place], time[at:place]))
+        at = place
+        with suppress(ValueError):  # its rows are missing
+            found.append(read_run_times(run))
+    steps, times = (np.concatenate(values) for values in zip(*found, (step[at:], time[at:]), strict=True))
+    return RowTimes(steps, times)
 
 
 def decode_frame_times(batch: Any) -> Iterator[FrameTime]:

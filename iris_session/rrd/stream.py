@@ -106,9 +106,12 @@ class ArrowColumn:
 
 
 def scalar_column(name: str, values: Any, kind: Any) -> ArrowColumn:
-    """Return a column of one value of Arrow type `kind` per row."""
+    """Return a column of one value of Arrow type `kind` per row; null where it is `None`."""
     array = pa.array(values, kind)
-    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(np.arange(len(array) + 1, dtype=np.int32)), array))
+    is_null = array.is_null() if array.null_count else None
+    ends = np.arange(1, len(array) + 1) if is_null is None else np.cumsum(np.asarray(array.is_valid()))
+    offsets = pa.array(np.concatenate(([0], ends)).astype(np.int32))
+    return ArrowColumn(name, pa.ListArray.from_arrays(offsets, array.drop_null(), mask=is_null))
 
 
 def bytes_column(name: str, values: Iterable[bytes]) -> ArrowColumn:

@@ -242,6 +242,7 @@ def make_recorder_report(feed: RecorderFeed | None, recorder: RecorderProcess | 
         stats.dropped_rows,
         stats.waiting_bytes,
         fault[:MAX_TEXT],
+        stats.bytes_per_hour,
     )
 
 

@@ -127,7 +127,7 @@ class Stepper:
         last: Outcome of the newest step.
         view: Participants, leases and events so far.
         requests: What participants ask of the owner of a user loop, oldest first.
-        lateness_ns: Worst lateness of a tick since the last published state, set by the pacing loop.
+        lateness_ns: Worst lateness of a tick since the last recorded state, set by the pacing loop.
         on_scene: Called with a scene or patch before the step that loads it.
         on_publish: Called after a state was published, with scene epoch and the times of `publish_now`.
         on_state: Called with what was published; for measurements and tests.
@@ -395,9 +395,9 @@ class Stepper:
             self.on_state(header, self._poses)
         if self.recorder is not None:
             robots = world.robot_signals.read(world.data)
-            self.recorder.add_state(self._newest_step, tick, sim_time, end_ns, self._poses, applied, robots)
-            self.recorder.add_metric(self._newest_step, end_ns, "lateness_ms", self.lateness_ns * 1e-6)
-            self.lateness_ns = 0
+            if self.recorder.add_state(self._newest_step, tick, sim_time, end_ns, self._poses, applied, robots):
+                self.recorder.add_metric(self._newest_step, end_ns, "lateness_ms", self.lateness_ns * 1e-6)
+                self.lateness_ns = 0
 
     def _read_robots(self) -> tuple[RobotState, ...]:
         """Return the states of the robots once a client reads them; before, and without robots, nothing."""

@@ -39,7 +39,11 @@ def _results(late_on: int) -> dict[str, object]:
     rounds = [Round(True, late_on, 1000, 0.04), Round(False, 0, 1000, 0.0), Round(False, 4, 1000, 0.0)]
     rounds.append(Round(True, late_on, 1000, 0.02))
     results = summarize_rounds(rounds) | summarize_sizes([FileSize(3_000_000, 2_500_000, 4_000_000, 30.0)])
-    return results | summarize_kills([Kill(RECORDER, 0.1), Kill(AUTHORITY, 0.0)]) | {"kill_rows_missing": 0}
+    return (
+        results
+        | summarize_kills([Kill(RECORDER, 0.1), Kill(AUTHORITY, 0.0)])
+        | {"kill_rows_missing": 0, "rest_mb_per_hour": 18.0}
+    )
 
 
 @pytest.mark.parametrize(("late_on", "ok"), [(6, True), (7, False)])

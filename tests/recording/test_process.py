@@ -23,7 +23,7 @@ from iris_session.protocol.scene import list_assets
 from iris_session.protocol.status import ClientReport
 from iris_session.recording import RecorderError, Recording, RecordingLock, summarise, verify
 from iris_session.recording import process as process_module
-from iris_session.recording.process import DRAIN_S, FLUSH_S, RecorderLoop
+from iris_session.recording.process import DRAIN_S, FLUSH_S, REST_FLUSH_S, RecorderLoop
 from iris_session.rrd.assets import ALL, list_recorded_assets
 from iris_session.rrd.paths import part_path
 from tests.recording.support import TICK_NS, LoopRecorder, SmallCore, SmallSession, loop_recorder
@@ -249,3 +249,4 @@ def test_assets_follow_the_journal_and_each_part_has_them(tmp_path: Path) -> Non
 def test_killed_recorder_loses_at_most_a_quarter_second() -> None:
     """Delays of batch, transfer and write add up."""
     assert BATCH_NS * 1e-9 + DRAIN_S + FLUSH_S + DRAIN_S <= 0.25
+    assert BATCH_NS * 1e-9 + DRAIN_S + REST_FLUSH_S + DRAIN_S <= 2.0, "of a scene at rest"

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from iris_session.journal.rows import FORMAT, VERIFIERS
+from iris_session.journal.rows import VERIFIERS
 from iris_session.recording import NotARecordingError, Recording, verify
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd import file as rrd_file
@@ -128,9 +128,9 @@ def test_undecodable_content_is_one_line_with_its_place(tmp_path: Path) -> None:
 
 def test_recording_of_another_format_is_rejected_in_one_line(tmp_path: Path) -> None:
     header, batch = journal(5)
-    old = msgspec.structs.replace(header, format=FORMAT - 1, created_utc="2026-11-20T10:00:00.000+00:00")
+    old = msgspec.structs.replace(header, format=3, created_utc="2026-11-20T10:00:00.000+00:00")
     path = write(tmp_path / "old.rrd", old, batch)
-    with pytest.raises(NotARecordingError, match=f"format {FORMAT - 1} on 2026-11-20") as refused:
+    with pytest.raises(NotARecordingError, match=r"format 3 on 2026-11-20.*formats 4 and 5") as refused:
         Recording.open(path)
-    assert VERIFIERS[FORMAT - 1] in str(refused.value)
+    assert VERIFIERS[3] in str(refused.value)
     assert "\n" not in str(refused.value)

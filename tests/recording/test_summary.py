@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from iris_session.journal.messages import DenialRecord
+from iris_session.journal.rows import FORMAT
 from iris_session.protocol.common import IDENTITY, Alignment, Denial, Lease
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
@@ -233,7 +234,7 @@ def test_a_small_recording_is_summarised(tmp_path: Path) -> None:
     assert (summary.ok, summary.finished, summary.ending, summary.damage) == (True, True, "", ())
     assert (summary.steps, summary.begin_s, summary.duration_s) == (200, 0.002, 0.398)
     assert (summary.robots, summary.objects, summary.bodies) == (("left", "right"), ("hammer",), 4)
-    assert (summary.format, summary.recording_class, summary.files) == (4, "closed", ("session.rrd",))
+    assert (summary.format, summary.recording_class, summary.files) == (FORMAT, "closed", ("session.rrd",))
     assert summary.bytes == (tmp_path / "session.rrd").stat().st_size
     (ann,) = summary.people
     assert (ann.present_s, ann.held_s) == (0.398, {"left": 0.358})

@@ -886,6 +886,7 @@ export interface RobotReport {
  * State of the recorder: `off` (nothing is recorded), `running`, `hangs` (silent for 5 s), `dead` (being replaced),
  * `failed` (the file cannot be written) or `ended` (its budget is used up). `disk_free_bytes` 0: not known.
  * `spilled_bytes`: what waits in memory for a recorder that is behind. `text`: its last message, for people.
+ * `bytes_per_hour`: what the recording costs an hour at the rate of the last half minute; 0: not known yet.
  */
 export interface RecorderReport {
   state?: string;
@@ -895,6 +896,7 @@ export interface RecorderReport {
   lost_rows?: number;
   spilled_bytes?: number;
   text?: string;
+  bytes_per_hour?: number;
 }
 
 /**
@@ -2630,6 +2632,7 @@ export const VALUE_DEFAULTS = {
     lost_rows: 0,
     spilled_bytes: 0,
     text: "",
+    bytes_per_hour: 0,
   },
   MediaStreamReport: {
     hz: 0.0,

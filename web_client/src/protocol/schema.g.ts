@@ -378,6 +378,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["lost_rows", ["int", 0, null], [0]],
       ["spilled_bytes", ["int", 0, null], [0]],
       ["text", ["str", 512, ""], [""]],
+      ["bytes_per_hour", ["int", 0, null], [0]],
     ],
   },
   MediaStreamReport: {

@@ -90,7 +90,8 @@ export function makeRecordingPanel(state: PageState, actions: Actions): Panel {
       };
       facts.set("State", recorder ? (names[recorder.state] ?? recorder.state) : "–");
       facts.set("File", recorder?.path || "–");
-      facts.set("Written", recorder ? formatBytes(recorder.bytes_written) : "–");
+      const rate = recorder && recorder.bytes_per_hour > 0 ? `, ${formatBytes(recorder.bytes_per_hour)} an hour now` : "";
+      facts.set("Written", recorder ? formatBytes(recorder.bytes_written) + rate : "–");
       facts.set("Disk free", recorder && recorder.disk_free_bytes > 0 ? formatBytes(recorder.disk_free_bytes) : "–");
       facts.set("Lost", recorder ? `${recorder.lost_rows} steps` : "–");
       const text = recorder?.text ?? "";
