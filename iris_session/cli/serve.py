@@ -26,8 +26,8 @@ from iris_session.cli.scene import add_file_options, check_file_options, find_sc
 from iris_session.cli.view import live_viewer
 from iris_session.protocol.names import AssignmentPolicy
 
-#: What `bench record` measures, and what is usual.
-RECORDING_COST: Final = "some 20 MB an hour at rest, 1 to 2 GB with two operators; `iris-session status` says what now"
+#: What `bench record` and `demo handover` cost.
+RECORDING_COST: Final = "some 20 MB an hour at rest, 0.7 GB and more with two operators; `iris-session status`: now"
 
 if TYPE_CHECKING:
     from iris_session.session.config import SessionConfig
