@@ -14,7 +14,7 @@ from typing import Final
 import msgspec
 
 from anchors.pose import compose, inverse, quat_rotate
-from iris_session.authority import ageing, engagement, roster, samples, tracking
+from iris_session.authority import ageing, engagement, episodes, roster, samples, tracking
 from iris_session.authority.config import SECOND
 from iris_session.authority.context import HUMAN, Context
 from iris_session.authority.state import (
@@ -60,7 +60,10 @@ def process_sample(ctx: Context, entry: Entry, s: Sample) -> None:
     if reason:
         return samples.reject_sample(ctx, p, s, reason)
     usable = samples.is_measured(ctx, p, s)
+    before = p.seen[s.device].buttons if s.device in p.seen else s.buttons
     _store_payload(p, s, usable)
+    if s.buttons != before:
+        episodes.press_buttons(ctx, p, s, before)
     if s.worn != p.worn:
         roster.set_worn(ctx, p, s.worn)
     way = samples.follow_device(ctx, p, s) if usable else tracking.STEADY
@@ -101,7 +104,7 @@ def _store_payload(p: Participant, s: Sample, usable: bool) -> None:
     seen = p.seen.get(s.device)
     if seen is None:
         seen = p.seen[s.device] = DeviceState()
-    seen.seq = s.seq
+    seen.seq, seen.buttons = s.seq, s.buttons
     # Capture times that go back must not make time for a jump when they come forward again.
     if usable and s.kind == SampleKind.POSE:
         seen.pose, seen.pose_ns = s.pose, max(seen.pose_ns, s.capture_ns)
@@ -148,7 +151,7 @@ def _update_latch(ctx: Context, p: Participant, lease: LeaseState, g: LeaseGrant
 
 def _may_engage(ctx: Context, p: Participant, lease: LeaseState) -> bool:
     # In the step of a reset the world seen is the one before it: nothing may be latched against that.
-    if ctx.state.estop or ctx.state.paused or ctx.reset:
+    if ctx.state.estop or ctx.state.paused or ctx.reset or ctx.is_closing:
         return False
     return not lease.override or lease.override == p.id or p.role in HUMAN
 
@@ -246,14 +249,14 @@ class CommandBuilder:
         if not grants and lease.freed_ns and (command := _build_home_command(ctx, lease)) is not None:
             return command
         if not grants:
-            return self._get_hold_command(lease.target, HoldReason.ESTOP if ctx.state.estop else HoldReason.NO_LEASE)
+            return self._get_hold_command(lease.target, _choose_hold(ctx, HoldReason.NO_LEASE))
         if lease.mode == LeaseMode.SHARED and len(grants) > 1:
             return self._blend_sources(ctx, lease)
         g = grants[0]
         if lease.override:
             g = next(other for other in grants if other.participant == lease.override)
         if not g.engagement or g.source is None:
-            return self._get_hold_command(lease.target, HoldReason.ESTOP if ctx.state.estop else g.hold)
+            return self._get_hold_command(lease.target, _choose_hold(ctx, g.hold))
         source = _age_source(ctx, g)
         last = self._last.get(lease.target)
         if last is not None and last.sources[0] is source and last.scale == g.scale and len(last.sources) == 1:
@@ -274,7 +277,7 @@ class CommandBuilder:
         """
         engaged = [g for g in lease.grants if g.engagement and g.source is not None]
         if not engaged:
-            return self._get_hold_command(lease.target, HoldReason.ESTOP if ctx.state.estop else lease.grants[0].hold)
+            return self._get_hold_command(lease.target, _choose_hold(ctx, lease.grants[0].hold))
         total = sum(g.weight for g in engaged)
         sources = tuple(msgspec.structs.replace(_age_source(ctx, g), weight=g.weight / total) for g in engaged)
         gripping = [(g.weight, g.gripper) for g in engaged if g.gripper is not None]
@@ -282,12 +285,17 @@ class CommandBuilder:
         return Command(lease.target, engaged[0].kind, "", sources, gripper, ctx.get_scale(lease))
 
 
+def _choose_hold(ctx: Context, reason: str) -> str:
+    """Return the reason of a hold: what stops every robot counts before its own `reason`."""
+    return HoldReason.ESTOP if ctx.state.estop else HoldReason.EPISODE if ctx.is_closing else reason
+
+
 def _build_home_command(ctx: Context, lease: LeaseState) -> Command | None:
     """Return the command that moves a released robot to where it stood at the beginning, as a leader's joints would;
     `None` before and after.
     """
     since_ns = ctx.now_ns - lease.freed_ns
-    if since_ns < HOME_AFTER_NS or ctx.state.estop or ctx.state.paused or ctx.reset:
+    if since_ns < HOME_AFTER_NS or ctx.state.estop or ctx.state.paused or ctx.reset or ctx.is_closing:
         return None
     apart = max((abs(a - b) for a, b in zip(ctx.view.joints(lease.target), lease.home, strict=True)), default=0.0)
     if apart <= HOME_CLOSE or since_ns > HOME_WITHIN_NS:

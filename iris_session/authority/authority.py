@@ -16,6 +16,7 @@ from iris_session.authority import (
     alignment,
     anchoring,
     arbitration,
+    episodes,
     handover,
     leases,
     pairs,
@@ -67,6 +68,7 @@ HOST_ONLY: Final = (
     em.SessionResumed,
     em.SceneLoaded,
     em.ScenePatched,
+    em.ObjectsPlaced,
     em.OwnerListens,
 )
 #: Entries that the front itself makes for the participant of a connection: no envelope, quota or sign of life.
@@ -92,6 +94,7 @@ class Authority:
             objects=session_control.create_object_leases(self._initial_targets[1]),
             participants={HOST_ID: roster.create_host()},
             anchors={name: alignment.normalise_pose(T) for name, T in config.anchors.items()},
+            episode=episodes.create_first(config.task),
         )
         self._ctx = Context(config, robots, objects, state)
         self._commands = arbitration.CommandBuilder()
@@ -117,6 +120,7 @@ class Authority:
             if isinstance(entry.message, cm.Sample):
                 arbitration.process_sample(ctx, entry, entry.message)
         roster.expire_participants(ctx)
+        episodes.advance_episode(ctx)
         arbitration.expire_samples(ctx)
         alignment.advance_corrections(ctx)
         ageing.check_ages(ctx)
@@ -362,7 +366,7 @@ class Authority:
         ctx = self._ctx
         if isinstance(m, em.ExternalReset):
             session_control.begin_scene_epoch(ctx, "external")
-            session_control.start_rerecording(ctx)
+            episodes.complete_reset(ctx)
         elif isinstance(m, em.PhysicsDiverged):
             session_control.record_divergence(ctx, m)
         elif isinstance(m, em.FrontRestarted):
@@ -382,9 +386,12 @@ class Authority:
                 ageing.add_unknown_age(ctx)
         elif isinstance(m, em.SceneLoaded):
             session_control.load_scene(ctx, m)
+            episodes.end_unknown(ctx)
             self._commands = arbitration.CommandBuilder()
         elif isinstance(m, em.ScenePatched):
             session_control.patch_scene(ctx, m)
+        elif isinstance(m, em.ObjectsPlaced):
+            episodes.place_objects(ctx, m)
         elif isinstance(m, em.StalledGap) and not self._has_gap:
             self._has_gap = True
             session_control.record_gap(ctx, m.duration_ns)
@@ -431,7 +438,7 @@ _HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
     cm.Align: anchoring.control_alignment_run,
     cm.MoveAnchor: anchoring.move_anchor,
     cm.TrackingEpoch: alignment.set_tracking_epoch,
-    cm.Episode: session_control.control_episode,
+    cm.Episode: episodes.control_episode,
     cm.ClearEStop: session_control.clear_estop,
     cm.Control: session_control.control_session,
     cm.Marker: _process_marker,

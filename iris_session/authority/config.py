@@ -12,7 +12,7 @@ from anchors.ageing import AgeingLaw
 from anchors.pose import is_rigid
 from iris_session.protocol.common import Name, Pose
 from iris_session.protocol.names import AssignmentPolicy, Device, LeaseMode, Role
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.specs import ObjectSpec, RobotSpec, TaskSpec
 
 MS: Final = 1_000_000
 SECOND: Final = 1_000_000_000
@@ -77,6 +77,8 @@ POSITIVE: Final = (
     "slide_ns",
     "slide_m_per_s",
     "slide_rad_per_s",
+    "confirm_ns",
+    "verdict_ns",
 )
 
 
@@ -89,6 +91,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     begins no engagement. `ageing`: how its stated error grows since the last look; None: not. `verify_pairs`: those who
     saw an anchor last before another participant aligned by it are to glance at it, and headsets that see the same
     shift of an anchor outvote it. `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
+    `episode_rules`: episodes have a countdown, a closing and people who may leave; False: as in earlier recordings.
     """
 
     # samples
@@ -146,6 +149,13 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # handover: contact flickers for a few ticks at every change of grip
     handover_hold_ns: int = 100 * MS  # giver must have held it alone this long; receiver afterwards too
     handover_flicker_ns: int = 50 * MS
+    # episodes
+    episode_rules: bool = True
+    countdown_ns: int = 3 * SECOND
+    confirm_ns: int = 3 * SECOND  # a discard is confirmed within it
+    takeover_ns: int = 10 * SECOND  # an episode whose leader is disconnected is then unknown
+    verdict_ns: int = 60 * SECOND  # an episode that was stopped without a verdict is then unknown
+    task: TaskSpec | None = None
     # output
     feedback_ns: int = 50 * MS
     report_ns: int = SECOND  # between two `samples_rejected` events of one kind
@@ -170,6 +180,16 @@ def check_config(config: AuthorityConfig, robots: Sequence[RobotSpec], objects: 
     unknown = [r for given in config.assignments.values() for r in given if r not in names]
     if unknown:
         raise ValueError(f"assignments name unknown robots {unknown}, robots: {names}")
+    if config.task is not None:
+        unknown = [r for r in config.task.robots if r not in names]
+        if unknown:
+            raise ValueError(f"the task names unknown robots {unknown}, robots: {names}")
+        known = [o.name for o in objects]
+        unknown = [o.object for o in config.task.objects if o.object not in known]
+        if unknown:
+            raise ValueError(f"the task names unknown objects {unknown}, objects: {known}")
+        if config.task.objects and config.user_owned_loop:
+            raise ValueError("the objects of a task are placed in the loop of run(); your own loop places its objects")
     if config.leader_apart not in ("ramp", "refuse"):
         raise ValueError(f"leader_apart is {config.leader_apart!r}, must be 'ramp' or 'refuse'")
     unknown = [who for who in config.unaligned if who not in Role.ALL | Device.ALL and not who.startswith(KEY_PREFIX)]

@@ -14,7 +14,7 @@ import msgspec
 from iris_session.authority.config import AuthorityConfig
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, AuthorityState, LeaseGrant, LeaseState, Participant
 from iris_session.protocol.common import Denial, Lease
-from iris_session.protocol.names import DenialReason, LeaseMode, Role, TargetKind
+from iris_session.protocol.names import DenialReason, EpisodeState, LeaseMode, Role, TargetKind
 from iris_session.protocol.server_messages import (
     MAX_LEASES,
     AlignmentChanged,
@@ -82,6 +82,11 @@ class Context:
         self.step_ticks = 0
         #: Connections whose e-stop was counted in this step. For look-ups only.
         self.stopped_by: set[int] = set()
+
+    @property
+    def is_closing(self) -> bool:
+        """True while an episode is closing, so that every robot holds."""
+        return self.state.episode is not None and self.state.episode.state == EpisodeState.CLOSING
 
     # --- effects ---
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from iris_session.authority import alignment, anchoring, assignment, engagement, leases
+from iris_session.authority import alignment, anchoring, assignment, engagement, episodes, leases
 from iris_session.authority.context import HUMAN, Context, build_absent_denial, build_value_denial
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
 from iris_session.protocol.client_messages import RemoveParticipant, Rename, SetRole
@@ -132,6 +132,7 @@ def _admit_participant(ctx: Context, p: Participant, connection: int, m: Join, r
         ctx.emit(AlignmentRun(p.id, False, p.alignment_run))
     if resumed:
         leases.renew_fencing_tokens(ctx, p)
+        episodes.note_return(ctx, p)
 
 
 def _evict_disconnected(ctx: Context) -> bool:
@@ -156,6 +157,7 @@ def disconnect_participant(ctx: Context, p: Participant, reason: str, *, keeps_p
     p.expires_ns = ctx.now_ns + ctx.config.grace_ns
     leases.cancel_requests(ctx, p, "", keeps_place=keeps_place)
     ctx.emit(ParticipantLeft(p.id, reason, grace=True))
+    episodes.note_leaving(ctx, p, "lost")
     for lease in ctx.list_leases(p):
         for g in lease.grants:
             if g.participant == p.id:
@@ -238,6 +240,7 @@ def set_role(ctx: Context, p: Participant, m: SetRole) -> None:
         detail = f"{p.name}: {person.role} to {m.role}"[:MAX_TEXT]
         ctx.emit(Audited(AuditKind.ROLE_CHANGED, person.id, person.name, "", detail))
         if m.role not in Role.DRIVING or (m.role in HUMAN) != (person.role in HUMAN):
+            leases.cancel_requests(ctx, person, "your role is another one")
             leases.release_everything(ctx, person, "role")
         person.hello_role, person.role = person.hello_role or person.role, m.role
         ctx.publish_participant(person)
@@ -277,6 +280,7 @@ def _disconnect_clients(ctx: Context, gateway: int, reason: str, *, keeps_place:
 
 def remove_participant(ctx: Context, p: Participant, cause: str, reason: str = "") -> None:
     """Remove a participant and free what it holds."""
+    episodes.note_leaving(ctx, p, cause)
     leases.release_everything(ctx, p, cause)
     for feedback in ctx.state.feedback.values():
         feedback.sent.pop(p.id, None)

@@ -1,9 +1,9 @@
-"""Control of the whole session: e-stop, pause, step, reset, gaps, episodes, and scenes.
+"""Control of the whole session: e-stop, pause, step, reset, gaps, and scenes.
 
 Another scene brings other robots and objects and a new scene epoch. The holder of a robot whose name the new scene has
 too keeps it, and must clutch again. Every other lease and pending request ends with its scene.
 
-Episodes are of training data: start, end with a verdict, discard, record again, reset between them.
+Episodes are in `episodes`; here is only how recordings of earlier versions have them.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ VERDICTS: Final = {
     EpisodeAction.FAILURE: "failure",
     EpisodeAction.DISCARD: "discarded",
 }
+ACTIONS: Final = frozenset({"start", "success", "failure", "discard", "rerecord", "reset"})
 #: Stops in force that are kept for the status, the newest of each participant.
 MAX_STOPS: Final = 16
 #: Characters of a stop's reason in a denial.
@@ -205,15 +206,13 @@ def record_gap(ctx: Context, duration_ns: int, kind: str = "stalled") -> None:
     engagement.rearm_all(ctx, HoldReason.GAP)
 
 
-# --- episodes ---
+# --- episodes of earlier recordings ---
 
 
-def control_episode(ctx: Context, p: Participant, m: Episode) -> None:
-    """Process one action of a participant that may drive. `rerecord` discards, resets and starts the next number at
-    once; in a user loop whose owner listens, the next number starts when the owner has reset the scene.
-    """
-    if m.action not in EpisodeAction.ALL:
-        return ctx.deny(p, m.request_id, build_value_denial("action", m.action, EpisodeAction.ALL))
+def mark_episode(ctx: Context, p: Participant, m: Episode) -> None:
+    """Process an action on an episode as before `AuthorityConfig.episode_rules`, so that earlier recordings replay."""
+    if m.action not in ACTIONS:
+        return ctx.deny(p, m.request_id, build_value_denial("action", m.action, ACTIONS))
     if p.role not in Role.DRIVING:
         denial = Denial(DenialReason.ROLE, f"role {p.role} may not control episodes", "ask an operator or director")
         return ctx.deny(p, m.request_id, denial)

@@ -49,6 +49,7 @@ class DeviceState(msgspec.Struct):
     pose: Pose | None = None
     joints: dict[int, JointReading] = {}
     track: Track | None = None
+    buttons: int = 0
 
 
 class Rejections(msgspec.Struct):
@@ -330,7 +331,7 @@ class AuthorityState(msgspec.Struct):
     touched". `handovers`: objects on their way between people; `regrasps`: between two robots, of one person too.
     `stop_seq` counts the e-stops, `stops` are those in force, oldest first. `diverged`: why physics stands still
     until a reset, which also ends the pause that came of it (`paused_by_divergence`). `owner_listens`: the owner of
-    a user loop takes requests. `rerecording`: the episode that begins when that owner has reset the scene.
+    a user loop takes requests. `rerecording`: the episode whose number begins again when the scene is reset.
     """
 
     robots: dict[str, LeaseState]
@@ -387,8 +388,9 @@ def is_same_snapshot(recorded: bytes, snapshot: bytes) -> bool:
             del fields[added]
         seen = had[name].get("seen")
         for device, state in fields["seen"].items():
-            if isinstance(seen, dict) and "track" not in seen.get(device, ()):
-                del state["track"]
+            for added in ("track", "buttons"):
+                if isinstance(seen, dict) and added not in seen.get(device, ()):
+                    del state[added]
         alignment = had[name].get("alignment")
         if isinstance(alignment, dict) and "pivot_world" not in alignment and fields["alignment"] is not None:
             del fields["alignment"]["pivot_world"]
@@ -396,4 +398,7 @@ def is_same_snapshot(recorded: bytes, snapshot: bytes) -> bool:
         if isinstance(correction, dict) and fields["correction"] is not None:
             for added in {"looked_ns", "walked_m"} - correction.keys():
                 del fields["correction"][added]
+    for name in ("episode", "rerecording"):
+        if isinstance(episode := earlier.get(name), dict) and isinstance(present.get(name), dict):
+            present[name] = {key: value for key, value in present[name].items() if key in episode}
     return bool(earlier == present)

@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
 from iris_session.cli.common import (
     CommandError,
     add_address_options,
@@ -39,6 +41,8 @@ NEWS_S: Final = 0.5
 #: Roles that may ask for it, the least powerful first: a key may have few of them.
 DIRECTORS: Final = (Role.DIRECTOR,)
 DRIVERS: Final = (Role.AGENT, Role.OPERATOR, Role.LEADER, Role.DIRECTOR)
+#: A director may end the episodes of others; it comes first.
+EPISODE_ROLES: Final = tuple(reversed(DRIVERS))
 ALL_ROLES: Final = (Role.OBSERVER, *DRIVERS)
 #: A reason of one word that is an address was meant as one.
 _ADDRESS: Final = re.compile(r"iris://.*|\d+\.\d+\.\d+\.\d+(:\d+)?|[\w.-]+:\d+|\[[0-9a-fA-F:]+\](:\d+)?")
@@ -104,10 +108,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         control_episode,
         "episode start --label pour",
         "episode success",
+        "episode discard",
+        "episode take_over",
     )
     episode.add_argument("action", choices=sorted(EpisodeAction.ALL), help="what happens to the episode")
-    episode.set_defaults(roles=DRIVERS)
-    episode.add_argument("--label", default="", help="label of the episode")
+    episode.set_defaults(roles=EPISODE_ROLES)
+    episode.add_argument("--label", default="", help="free text about the episode")
+    episode.add_argument("--countdown", type=float, metavar="S", help="seconds until `start` begins (default: 3)")
     marker = _add_command(
         commands, "marker", "put a note into the recording", place_marker, 'marker "gripper was cleaned"'
     )
@@ -296,23 +303,23 @@ def set_modes(client: Client, arguments: argparse.Namespace) -> Outcome:
 
 
 def control_episode(client: Client, arguments: argparse.Namespace) -> Outcome:
-    """Start, end, discard or repeat an episode."""
-    before = client.mirror.episode
-    client.episode(arguments.action, arguments.label)
-    if arguments.action == EpisodeAction.RESET:
-        return "scene reset, no episode runs", {"action": arguments.action}
-
-    def is_over(one: Client) -> bool:  # the reply may come before the event; `rerecord` makes two events
-        now = one.mirror.episode
-        begins = arguments.action in (EpisodeAction.START, EpisodeAction.RERECORD)
-        return now is not None and now != before and (now.state == "running") == begins
-
-    client.wait_for(is_over, TIMEOUT_S)
-    episode = client.mirror.episode
-    if episode is None:
-        raise CommandError(f"the session accepted {arguments.action}, but announced no episode", 1)
-    fields = {"action": arguments.action, "number": episode.number, "state": episode.state}
-    return f"episode {episode.number}: {episode.state}", fields
+    """Start, end, discard, repeat or take over an episode."""
+    action = arguments.action
+    if action == EpisodeAction.RESET:
+        client.episode(action)
+        return "scene reset, no episode runs", {"action": action}
+    if action == EpisodeAction.START:
+        episode = client.start_episode(arguments.label, countdown_s=arguments.countdown)
+    elif action in (EpisodeAction.DISCARD, EpisodeAction.RERECORD):
+        episode = client.discard_episode(again=action == EpisodeAction.RERECORD)
+    elif action == EpisodeAction.TAKE_OVER:
+        episode = client.take_over_episode()
+    else:
+        stops = action == EpisodeAction.STOP
+        episode = client.stop_episode() if stops else client.end_episode(action, arguments.label)
+    fields = {"action": action, **msgspec.structs.asdict(episode)}
+    count = f", {episode.successes} of {episode.wanted}" if episode.wanted else ""
+    return f"episode {episode.number}: {episode.state}{count}", fields
 
 
 def place_marker(client: Client, arguments: argparse.Namespace) -> Outcome:

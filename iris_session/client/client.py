@@ -11,7 +11,7 @@ import os
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, Final, Self
 
 from iris_session.client.alignment import ClientAlignment
@@ -27,6 +27,7 @@ from iris_session.client.driving import ClientDriving
 from iris_session.client.endpoint_resolver import SessionJoiner, parse_connect_request
 from iris_session.client.errors import (
     ClientError,
+    DeniedError,
     NotConnectedError,
     RequestTimeoutError,
 )
@@ -53,12 +54,14 @@ from iris_session.protocol.client_messages import (
     SetScale,
 )
 from iris_session.protocol.common import Denial, Lease, Target
-from iris_session.protocol.names import AlignmentKind, Role, TargetKind
-from iris_session.protocol.server_messages import ROBOT_STATES, Event, Feedback, Reply
+from iris_session.protocol.names import AlignmentKind, DenialReason, EpisodeAction, EpisodeState, Role, TargetKind
+from iris_session.protocol.server_messages import ROBOT_STATES, EpisodeChanged, Event, Feedback, Reply
 from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.status import StatusReport
 
 DEFAULT_TIMEOUT_S: Final = 5.0
+#: Longest wait of `start_episode`: a countdown has at most 60 s.
+START_S: Final = 65.0
 #: A status request without an answer is repeated; twice a second is below the limit of its type.
 STATUS_RETRY_S: Final = 0.5
 #: Roles that have no headset, so nothing to align.
@@ -657,17 +660,118 @@ class Client(ClientDriving):
         """
         self.request(Control(0, action, ticks))
 
-    def episode(self, action: str, label: str = "") -> None:
-        """Mark an episode in the recording.
+    def episode(self, action: str, label: str = "", countdown_s: float | None = None) -> None:
+        """Send one action on an episode; the methods below also wait for what comes of it.
 
         Args:
-            action: `start`, `success`, `failure`, `discard`, `rerecord` or `reset`.
-            label: Label of the episode.
+            action: `start`, `stop`, `success`, `failure`, `unknown`, `discard`, `rerecord`, `take_over` or `reset`. The
+                first `discard` or `rerecord` asks, a second one within 3 s does it.
+            label: Free text about the episode.
+            countdown_s: Of `start`, at most 60 [s]; `None` for that of the session.
+
+        Raises:
+            DeniedError: We may not, or the episode is not in a state for it.
+        """
+        self.request(Episode(0, action, label, None if countdown_s is None else round(countdown_s * 1e9)))
+
+    def start_episode(self, label: str = "", *, countdown_s: float | None = None) -> EpisodeChanged:
+        """Start an episode and wait until it is recorded.
+
+        Args:
+            label: Free text about the episode.
+            countdown_s: As of `episode`.
+
+        Returns:
+            The running episode: number, task, instruction, robots.
+
+        Raises:
+            DeniedError: We may not, an episode is running, or the countdown was cancelled.
+        """
+        before = self.mirror.episode
+        self.episode(EpisodeAction.START, label, countdown_s)
+        episode = self._wait_for_episode(before, EpisodeState.ALL - {EpisodeState.COUNTDOWN}, START_S)
+        if episode.state == EpisodeState.CANCELLED:
+            text = f"the countdown of episode {episode.number} was cancelled"
+            raise DeniedError(Denial(DenialReason.EPISODE_STATE, text, "start it again"))
+        return episode
+
+    def stop_episode(self) -> EpisodeChanged:
+        """End the recording of the episode: robots hold until its verdict is given.
+
+        Returns:
+            The closing episode.
 
         Raises:
             DeniedError: We may not, or no episode runs.
         """
-        self.request(Episode(0, action, label))
+        before = self.mirror.episode
+        self.episode(EpisodeAction.STOP)
+        return self._wait_for_episode(before, EpisodeState.ALL)
+
+    def end_episode(self, verdict: str = EpisodeAction.SUCCESS, label: str = "") -> EpisodeChanged:
+        """Give the verdict of the episode, and wait until the scene is ready for the next one.
+
+        Args:
+            verdict: `success`, `failure` or `unknown`.
+            label: Free text instead of the one from the start.
+
+        Returns:
+            The episode as it ended, with the number of successes so far.
+
+        Raises:
+            DeniedError: We may not, or no episode runs.
+        """
+        before = self.mirror.episode
+        self.episode(verdict, label)
+        return self._wait_for_episode(before, EpisodeState.OVER)
+
+    def discard_episode(self, *, again: bool = False) -> EpisodeChanged:
+        """Discard the episode, or cancel its countdown. The session asks twice: this confirms at once.
+
+        Args:
+            again: Count down to the same number again.
+
+        Returns:
+            The discarded episode, or the one that counts down.
+
+        Raises:
+            DeniedError: We may not, or no episode runs.
+        """
+        before = self.mirror.episode
+        action = EpisodeAction.RERECORD if again else EpisodeAction.DISCARD
+        self.episode(action)
+        asked = self._wait_for_episode(before, EpisodeState.ALL)
+        if asked.state != EpisodeState.CONFIRM:
+            return asked  # of a countdown, or confirmed what was asked before
+        self.episode(action)
+        begun = {EpisodeState.COUNTDOWN, EpisodeState.RUNNING}
+        return self._wait_for_episode(asked, begun if again else EpisodeState.OVER)
+
+    def take_over_episode(self) -> EpisodeChanged:
+        """Lead the episode from now on: as director, or when its leader is disconnected or has the headset off.
+
+        Returns:
+            The episode.
+
+        Raises:
+            DeniedError: Its leader is there, or no episode runs.
+        """
+        before = self.mirror.episode
+        self.episode(EpisodeAction.TAKE_OVER)
+        return self._wait_for_episode(before, EpisodeState.ALL)
+
+    def _wait_for_episode(
+        self, before: EpisodeChanged | None, states: Collection[str], timeout_s: float = DEFAULT_TIMEOUT_S
+    ) -> EpisodeChanged:
+        """Wait until an event after `before` has the episode in one of `states`: it may come after the reply."""
+        self.wait_for(
+            lambda client: (now := client.mirror.episode) is not None and now is not before and now.state in states,
+            timeout_s,
+        )
+        now = self.mirror.episode
+        if now is None:
+            raise RequestTimeoutError("the session has accepted the request, but announced no episode")
+        return now
 
     def marker(self, text: str) -> None:
         """Put a note into the recording.

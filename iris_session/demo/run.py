@@ -262,7 +262,8 @@ class _GoalTracker:
     def restart(self) -> None:
         """Forget what was reached; the episode is discarded."""
         if self._began:
-            self._session.post(Episode(0, EpisodeAction.DISCARD, self._name))
+            for _ in range(2):  # it is asked for twice
+                self._session.post(Episode(0, EpisodeAction.DISCARD, self._name))
         self._monitors = tuple(GoalMonitor(one.goal) for one in self._monitors)
         self._began, self._finished_s = False, None
 
@@ -272,7 +273,7 @@ class _GoalTracker:
             return
         if not self._began:
             self._began = True
-            self._session.post(Episode(0, EpisodeAction.START, self._name))
+            self._session.post(Episode(0, EpisodeAction.START, self._name, countdown_ns=0))
         world = self._session.stepper.core.world
         now_s, reached = world.view().sim_time, False
         for watch in self._monitors:

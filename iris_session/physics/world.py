@@ -33,6 +33,7 @@ from iris_session.physics.robot_signals import RobotSignals, RobotStateReader, d
 from iris_session.physics.tip import Tip
 from iris_session.physics.tree import KinematicTree
 from iris_session.physics.view import Flexes, MujocoView
+from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
@@ -107,6 +108,7 @@ class World:
         whole = bool(ids) and ids == list(range(ids[0], ids[0] + len(ids)))
         #: Rows of `xpos` to stream: a slice unless flexes lie between the bodies, which is much cheaper to copy.
         self._rows: Any = slice(ids[0], ids[0] + len(ids)) if whole else np.array(ids, np.int64)
+        self._free_joints = find_free_joints(model, objects)
         self.robot_infos = tuple(_robot_info(model, spec) for spec in robots)
         #: Measured values of the robots, for recordings.
         self.robot_signals = RobotSignals(model, robots)
@@ -143,6 +145,17 @@ class World:
         self._reset_data(self.data)
         self._forces = (0.0,) * len(self._forces)
         self._derive_state(0)
+
+    def place_objects(self, objects: Sequence[str], poses: Sequence[Pose]) -> None:
+        """Put free objects at rest at `T_world_object`, right after a reset. Others, and unknown ones, stay."""
+        model, data = self.model, self.data
+        for name, pose in zip(objects, poses, strict=False):
+            joint = self._free_joints.get(name)
+            if joint is not None:
+                at, velocity = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+                data.qpos[at : at + 7] = (*pose.p, *pose.q)
+                data.qvel[velocity : velocity + 6] = 0.0
+        self._derive_state(self._tick)
 
     def tick(self) -> None:
         """Take one timestep with the present `ctrl` and applied forces.
@@ -283,6 +296,16 @@ class World:
     def _raise_diverged(self, error: mujoco.FatalError) -> NoReturn:
         self.diverged = one_line(error)
         raise SimulationDivergedError(self._tick, float(self.data.time), self.diverged) from error
+
+
+def find_free_joints(model: mujoco.MjModel, objects: Sequence[ObjectSpec]) -> dict[str, int]:
+    """Return the free joint of each object that has one."""
+    found: dict[str, int] = {}
+    for one in objects:
+        joint = int(model.body_jntadr[find_element_id(model, "body", one.body)])
+        if joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            found[one.name] = joint
+    return found
 
 
 def _require_exact(model: mujoco.MjModel) -> None:

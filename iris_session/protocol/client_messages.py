@@ -258,11 +258,14 @@ class TrackingEpoch(Message, frozen=True, tag="tracking_epoch"):
 
 
 class Episode(Message, frozen=True, tag="episode"):
-    """Start or end an episode, `EpisodeAction`: start, success, failure, discard, rerecord, reset."""
+    """Start, end or take over an episode (`EpisodeAction`). `countdown_ns`: of `start`, at most 60 s; None: that of the
+    session.
+    """
 
     request_id: Count
     action: Name
     label: Text = ""
+    countdown_ns: Nanoseconds | None = None
 
 
 class EStop(Message, frozen=True, tag="estop"):

@@ -226,6 +226,19 @@ class ScenePatched(Message, frozen=True, tag="scene_patched"):
     scene_hash: Name
 
 
+class ObjectsPlaced(Message, frozen=True, tag="objects_placed"):
+    """The scene is reset with the objects of the task at other places (host only).
+
+    `objects`, `poses`: `T_world_object`, in the same order. `number`: of the episode that they are for. `seed`: from
+    which, with the number, they were drawn. Between episodes only: else it does nothing.
+    """
+
+    objects: Names
+    poses: Annotated[tuple[Pose, ...], msgspec.Meta(max_length=64)]
+    number: Count = 0
+    seed: Count = 0
+
+
 class OwnerListens(Message, frozen=True, tag="owner_listens"):
     """The owner's loop takes requests of directors from here on: to reset, to record an episode again (host only)."""
 
@@ -271,6 +284,7 @@ EntryMessage = (
     | SessionResumed
     | SceneLoaded
     | ScenePatched
+    | ObjectsPlaced
     | OwnerListens
 )
 

@@ -220,6 +220,9 @@ class HoldReason:
     FROZEN: Final = "frozen"  # the device reports one pose again and again; clutch again
     JUMP: Final = "jump"  # the pose of the device jumped; clutch again
     UNCONFIRMED: Final = "unconfirmed"  # the alignment is doubted (`AlignmentDoubt`): glance at a sheet; clutch again
+    EPISODE: Final = (
+        "episode"  # an episode is closing: its verdict is missing, or the scene is being reset; clutch again
+    )
 
 
 class RejectReason:
@@ -318,12 +321,43 @@ class EpisodeAction:
     """Action of `episode`."""
 
     START: Final = "start"
+    STOP: Final = "stop"  # it is over, the verdict follows
     SUCCESS: Final = "success"
     FAILURE: Final = "failure"
-    DISCARD: Final = "discard"
-    RERECORD: Final = "rerecord"
+    UNKNOWN: Final = "unknown"
+    DISCARD: Final = "discard"  # asked twice
+    RERECORD: Final = "rerecord"  # discard and begin the same number again; asked twice
+    TAKE_OVER: Final = "take_over"  # lead it from now on
     RESET: Final = "reset"
-    ALL: Final = frozenset({"start", "success", "failure", "discard", "rerecord", "reset"})
+    ALL: Final = frozenset(
+        {"start", "stop", "success", "failure", "unknown", "discard", "rerecord", "take_over", "reset"}
+    )
+
+
+class EpisodeState:
+    """State of an episode (`EpisodeChanged`)."""
+
+    IDLE: Final = "idle"  # of a task before its first episode
+    COUNTDOWN: Final = "countdown"  # it begins at `until_ns`
+    RUNNING: Final = "running"
+    CONFIRM: Final = "confirm"  # running, and a discard was asked for: once more until `until_ns` confirms it
+    LEFT: Final = "left"  # running, and its leader is disconnected: it can be taken over until `until_ns`
+    CLOSING: Final = "closing"  # over: the verdict is missing, or the scene is being reset; robots hold
+    SUCCESS: Final = "success"
+    FAILURE: Final = "failure"
+    DISCARDED: Final = "discarded"
+    UNKNOWN: Final = "unknown"
+    CANCELLED: Final = "cancelled"  # in the countdown: the number is used again
+    ALL: Final = frozenset(
+        {
+            *("idle", "countdown", "running", "confirm", "left", "closing"),
+            *("success", "failure", "discarded", "unknown", "cancelled"),
+        }
+    )
+    #: States in which it is recorded.
+    RECORDED: Final = frozenset({"running", "confirm", "left"})
+    #: States in which the next episode can begin.
+    OVER: Final = ALL - RECORDED - {"countdown", "closing"}
 
 
 class ControlAction:

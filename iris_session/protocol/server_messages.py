@@ -399,12 +399,30 @@ class PauseChanged(EventBody, frozen=True, tag="pause_changed"):
 
 
 class EpisodeChanged(EventBody, frozen=True, tag="episode_changed"):
-    """`state`: running, success, failure, discarded. `number` counts episodes from 1."""
+    """An episode is in another `EpisodeState`, by `participant`.
+
+    `number` counts from 1, in a task also those of earlier sessions. `label`: free text that was given with it. `task`,
+    `instruction`, `wanted`: of the task, empty and 0 without one; `successes`: so many there are by now.
+    `started_by`, `started_by_name`: who started it; `led_by`: who leads it now. `started_ns`: session time from which
+    it is recorded, 0 before. `until_ns`: end of the countdown, of the question, or of the time to take it over or to
+    give the verdict; 0: none. `verdict`: while closing, empty until it is given. `robots`: that belong to it.
+    """
 
     number: Count
     state: Name
     label: Text = ""
     participant: Name = ""
+    task: Name = ""
+    instruction: Text = ""
+    wanted: Count = 0
+    successes: Count = 0
+    started_by: Name = ""
+    started_by_name: Name = ""
+    led_by: Name = ""
+    started_ns: Nanoseconds = 0
+    until_ns: Nanoseconds = 0
+    verdict: Name = ""
+    robots: Names = ()
 
 
 class ObjectGrasped(EventBody, frozen=True, tag="object_grasped"):

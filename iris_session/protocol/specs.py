@@ -6,7 +6,7 @@ from typing import Final
 
 import msgspec
 
-from iris_session.protocol.common import IDENTITY, Name, Pose
+from iris_session.protocol.common import IDENTITY, Count, Name, Pose, Text
 
 #: Kinds of robots: an arm follows poses and joints; a hand, whose fingers are no chain, follows joints only.
 ARM: Final = "arm"
@@ -88,3 +88,46 @@ class ObjectSpec(msgspec.Struct, frozen=True):
 
     name: Name
     body: Name
+
+
+class ObjectRange(msgspec.Struct, frozen=True):
+    """Range of places where an object of a task lies at the beginning of an episode.
+
+    Attributes:
+        object: Name of the object.
+        x, y: Range of its position in the world, or a single value twice [m].
+        z: Likewise its height; `None`: as in the scene.
+        yaw: Range of the turn about the vertical axis, added to how it lies in the scene [rad].
+    """
+
+    object: Name
+    x: tuple[float, float]
+    y: tuple[float, float]
+    z: tuple[float, float] | None = None
+    yaw: tuple[float, float] = (0.0, 0.0)
+
+
+class TaskSpec(msgspec.Struct, frozen=True):
+    """A task of which episodes are recorded.
+
+    Attributes:
+        name: Name of the task.
+        instruction: What is to be done, for people and for the training data.
+        wanted: Number of successes that are wanted; 0: no number.
+        robots: Robots that belong to its episodes; empty: those that are held when an episode begins.
+        objects: Objects that lie elsewhere in each episode.
+        seed: From which, with the number of the episode, their places are drawn.
+        reset: The scene is reset after each episode.
+        recorded: Number of the last episode of earlier sessions.
+        successes: Number of their successes.
+    """
+
+    name: Name
+    instruction: Text = ""
+    wanted: Count = 0
+    robots: tuple[Name, ...] = ()
+    objects: tuple[ObjectRange, ...] = ()
+    seed: Count = 0
+    reset: bool = True
+    recorded: Count = 0
+    successes: Count = 0

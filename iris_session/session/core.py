@@ -15,16 +15,18 @@ import msgspec
 import mujoco
 import numpy as np
 
+from anchors.pose import is_rigid
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.control import ControlConfig, ControlError, Controller
 from iris_session.control.solvers import name_solver
 from iris_session.physics import SimulationDivergedError, World
 from iris_session.physics.world import STATE
 from iris_session.protocol.common import Alignment
-from iris_session.protocol.entries import HOST, Entry, ExternalReset, SceneLoaded
+from iris_session.protocol.entries import HOST, Entry, ExternalReset, ObjectsPlaced, SceneLoaded
 from iris_session.protocol.names import LateCause
 from iris_session.protocol.server_messages import (
     AlignmentChanged,
+    EpisodeChanged,
     Event,
     ParticipantChanged,
     ParticipantJoined,
@@ -50,6 +52,10 @@ _DIGESTED_FIELDS: Final = tuple(name for name in Snapshot.__struct_fields__ if n
 _DigestedSnapshot: Final = msgspec.defstruct("Snapshot", _DIGESTED_FIELDS, tag_field="type", tag="snapshot")
 _ALIGNMENT_FIELDS: Final = tuple(name for name in Alignment.__struct_fields__ if name != "pivot_world")
 _DigestedAlignment: Final = msgspec.defstruct("Alignment", _ALIGNMENT_FIELDS)
+#: Of an episode, in recordings before `AuthorityConfig.episode_rules`.
+_DigestedEpisode: Final = msgspec.defstruct(
+    "EpisodeChanged", ("number", "state", "label", "participant"), tag_field="event", tag="episode_changed"
+)
 _decode_status = msgspec.msgpack.Decoder(tuple[ControlStatus, ...]).decode
 _decode_shared = msgspec.msgpack.Decoder(tuple[bytes, bytes]).decode
 
@@ -169,6 +175,7 @@ class SessionCore:
         lap(LateCause.AUTHORITY)
         if decision.reset:
             self._reset_world()
+            self._place_objects(entries)
             self._reset_control()
         elif any(entry.connection == HOST and isinstance(entry.message, ExternalReset) for entry in entries):
             self._reset_control()  # the owner moved the robots: they are where they stand now
@@ -220,6 +227,14 @@ class SessionCore:
         self.world.reset()
         if self.scene.initial_state:
             self.world.restore_state(self.scene.initial_state)
+
+    def _place_objects(self, entries: Sequence[Entry]) -> None:
+        for entry in entries:
+            m = entry.message
+            if not isinstance(m, ObjectsPlaced) or not entry.connection == entry.connection_epoch == HOST:
+                continue
+            if all(is_rigid((pose.p, pose.q)) for pose in m.poses):
+                self.world.place_objects(m.objects, m.poses)
 
     def _make_first_plant(self) -> Plant:
         config = self.config
@@ -311,15 +326,25 @@ def _to_digested(message: Any) -> Any:
     if isinstance(message, Snapshot):
         values = {name: getattr(message, name) for name in _DIGESTED_FIELDS}
         values["participants"] = tuple(_without_pivot(one) for one in message.participants)
+        values["episode"] = _to_digested_episode(message.episode)
         return _DigestedSnapshot(**values)
     if not isinstance(message, Event):
         return message
     body: Any = message.body
     if isinstance(body, AlignmentChanged):
         body = _without_pivot(body)
+    elif isinstance(body, EpisodeChanged):
+        body = _to_digested_episode(body)
     elif isinstance(body, ParticipantJoined | ParticipantChanged):
         body = msgspec.structs.replace(body, participant=_without_pivot(body.participant))
     return msgspec.structs.replace(message, body=body)
+
+
+def _to_digested_episode(episode: EpisodeChanged | None) -> Any:
+    """Return an episode of earlier rules, which do not say who has started it, as digests have it."""
+    if episode is None or episode.started_by or episode.task:
+        return episode
+    return _DigestedEpisode(episode.number, episode.state, episode.label, episode.participant)
 
 
 def _without_pivot(holder: Any) -> Any:

@@ -37,7 +37,7 @@ from iris_session.protocol.entries import (
     encode_entry,
 )
 from iris_session.protocol.names import ControlAction, DenialReason, EpisodeAction, LateCause
-from iris_session.protocol.server_messages import ROBOT_STATES, Reply, RobotState, StateHeader
+from iris_session.protocol.server_messages import ROBOT_STATES, EpisodeChanged, Reply, RobotState, StateHeader
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Decision
 from iris_session.session.core import Plant, SessionCore, StepOutcome, ignore_lap
@@ -346,6 +346,8 @@ class Stepper:
                     continue
                 denial = reply.denial
                 is_left = denial is None or denial.reason == DenialReason.USER_OWNED
+                if kind == EpisodeAction.RERECORD and denial is None:
+                    is_left = any(isinstance(e.body, EpisodeChanged) and e.body.verdict for e in decision.events)
                 if reply.request_id == m.request_id and is_left and entry.connection != HOST:
                     sender = self.core.authority.find_sender(entry.connection)
                     self.requests.append(OwnerRequest(kind, *sender, label, entry.receive_ns * 1e-9))

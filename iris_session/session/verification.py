@@ -29,6 +29,7 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
     verify_pairs: bool = False
     min_change_share: float = 1e9
     explains: bool = False
+    episode_rules: bool = False
 
 
 class _RecordedControlConfig(ControlConfig, frozen=True):

@@ -16,7 +16,7 @@ from iris_session.journal.messages import DenialRecord
 from iris_session.journal.rows import CLOSED as CLASS_CLOSED
 from iris_session.journal.rows import SessionHeader
 from iris_session.protocol.common import Alignment
-from iris_session.protocol.names import AlarmKind, AlignmentKind, HoldReason
+from iris_session.protocol.names import AlarmKind, AlignmentKind, EpisodeState, HoldReason
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentChanged,
@@ -91,7 +91,21 @@ PAUSED: Final = "paused"
 _CLUTCH: Final = {CLOSED: _GREEN}
 _ESTOP: Final = {STOPPED: _RED}
 _PAUSE: Final = {PAUSED: _AMBER}
-_EPISODE: Final = {"success": _GREEN, "failure": _RED, "discarded": _GREY}
+_EPISODE: Final = {
+    EpisodeState.SUCCESS: _GREEN,
+    EpisodeState.FAILURE: _RED,
+    EpisodeState.DISCARDED: _GREY,
+    EpisodeState.UNKNOWN: _AMBER,
+}
+_NO_EPISODE: Final = (EpisodeState.IDLE, EpisodeState.CANCELLED)
+#: What a line says of an episode in each state; of a final one, the state.
+_EPISODE_WORDS: Final = {
+    EpisodeState.COUNTDOWN: "counts down",
+    EpisodeState.RUNNING: "runs",
+    EpisodeState.CONFIRM: "discard?",
+    EpisodeState.LEFT: "its leader is disconnected",
+    EpisodeState.CLOSING: "closing",
+}
 _ALIGNMENT: Final = {AlignmentKind.MEASURED: _GREEN, AlignmentKind.PLACED: _BLUE, AlignmentKind.NOT_NEEDED: _GREY}
 
 #: Ends of an engagement that its holder wanted.
@@ -297,10 +311,11 @@ class EventNarration:
                 text = f"{self._name(who)} {'pauses' if paused else 'resumes'} the simulation"
                 return LogLine(INFO, text + (f": {reason}" if reason else ""))
             case EpisodeChanged(number=number, state=state, label=label, participant=who):
-                running = state == "running"
-                self._episodes.add(number)
-                self._set(("episode",), f"episode {number}" if running else state, _EPISODE)
-                text = f"episode {number}: {'begins' if running else state}"
+                if state in EpisodeState.RECORDED:
+                    self._episodes.add(number)
+                shown = f"episode {number}" if state in EpisodeState.RECORDED else state
+                self._set(("episode",), "" if state in _NO_EPISODE else shown, _EPISODE)
+                text = f"episode {number}: {_EPISODE_WORDS.get(state, state)}"
                 return LogLine(INFO, f"{text}{f', {label}' if label else ''} ({self._name(who)})")
             case _:
                 return self._describe_other(body)

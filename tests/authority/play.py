@@ -27,13 +27,14 @@ from iris_session.protocol.entries import (
     FrontRestarted,
     Join,
     Lost,
+    ObjectsPlaced,
     SessionResumed,
     decode_entries,
     encode_entries,
 )
-from iris_session.protocol.server_messages import ConsentRequested, Reply, Snapshot
+from iris_session.protocol.server_messages import ConsentRequested, EpisodeChanged, Reply, Snapshot
 from iris_session.protocol.session_mirror import SessionMirror
-from iris_session.protocol.specs import ObjectSpec
+from iris_session.protocol.specs import ObjectRange, ObjectSpec, TaskSpec
 from iris_session.protocol.steps import Command, Decision, FixedView, ObjectContact
 
 from .alignment_books import AlignmentBooks
@@ -52,6 +53,11 @@ CONFIG: Final = AuthorityConfig(
     quota=8,
     announce_ns=200 * MS,
     slide_ns=50 * MS,
+    countdown_ns=100 * MS,
+    confirm_ns=300 * MS,
+    takeover_ns=300 * MS,
+    verdict_ns=500 * MS,
+    task=TaskSpec("stack", "Stack them.", 3, objects=(ObjectRange("hammer", (0.0, 0.1), (0.0, 0.1)),)),
     anchors={
         "table": Pose((0.0, -0.5, 0.0), (1.0, 0.0, 0.0, 0.0)),
         "door": Pose((2.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),
@@ -59,6 +65,7 @@ CONFIG: Final = AuthorityConfig(
 )
 #: Holds after which the clutch must be seen open before the robot may move again.
 REARMED: Final = (
+    "episode",
     "estop",
     "gap",
     "scene_changed",
@@ -69,6 +76,17 @@ REARMED: Final = (
     "not_worn",
     "untracked",
 )
+#: States of an episode after which the next one may have the same number.
+REPEATED: Final = ("countdown", "cancelled", "discarded")
+#: What an episode may become next, by its state.
+NEXT: Final = {
+    "countdown": {"running", "cancelled", "countdown"},
+    "running": {"running", "confirm", "left", "closing"},
+    "confirm": {"running", "confirm", "left", "closing"},
+    "left": {"running", "closing"},
+    "closing": {"closing", "success", "failure", "discarded", "unknown"},
+    **{s: {"countdown", "running"} for s in ("idle", "success", "failure", "discarded", "unknown", "cancelled")},
+}
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(Decision).decode
 
@@ -112,6 +130,7 @@ class Play:
         #: Where a device was that moved something, by (participant, connection, device, tracking epoch).
         self.moved_from: dict[tuple[str, int, str, int], tuple[int, Pose]] = {}
         self.newest_engagement = 0
+        self.episode, self.ended = EpisodeChanged(0, "idle"), 0
         self.moved = 0
         self.flush()
         self.host(cm.GetSnapshot(1))
@@ -163,6 +182,7 @@ class Play:
         self.follow_events()
         self.check_commands(entries)
         self.alignments.check(self.state, self.decision, entries, self.now_ns)
+        self.check_episodes()
         self.check_urgent(entries)
         self.check_bounds()
         self.check_queue()
@@ -286,7 +306,6 @@ class Play:
                     1, rng.choice(NAMES), rng.choice(["exclusive", "request", "takeover", "priority", "shared"])
                 ),
                 cm.Control(1, rng.choice(["pause", "step", "reset"])),
-                cm.Episode(1, rng.choice(["start", "success", "rerecord", "reset"])),
                 cm.PlaceAlignment(1, person, pose, rng.random() < 0.5),
                 cm.Align(1, rng.choice(["start", "stop", "dance"]), person),
                 cm.MoveAnchor(1, rng.choice(["table", "moon"]), pose),
@@ -296,6 +315,32 @@ class Play:
             ]
         )
         self.host(message)
+
+    def record(self) -> None:
+        """An episode: mostly what its people do with it, sometimes the places of its objects."""
+        actions = [
+            "start",
+            "stop",
+            "success",
+            "success",
+            "failure",
+            "discard",
+            "discard",
+            "rerecord",
+            "take_over",
+            "reset",
+        ]
+        place = ObjectsPlaced(("hammer",), (Pose((0.1, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0)),), 1, 7)
+        state = self.state.episode.state if self.state.episode is not None else ""
+        if self.rng.random() < (0.7 if state == "closing" else 0.1):
+            return self.host(place)
+        client = self.who()
+        if self.episode.state in ("idle", "success", "failure", "discarded", "unknown", "cancelled"):
+            return self.say(client, cm.Episode(1, "start", countdown_ns=self.rng.choice([0, None])))
+        if self.rng.random() < 0.3:
+            buttons = self.rng.choice([0, 0, 16, 32])
+            return self.say(client, self.sample(client, (), "controller/right", False, buttons=buttons))
+        return self.say(client, cm.Episode(1, self.rng.choice(actions)))
 
     def align(self) -> None:
         client = self.who()
@@ -481,6 +526,7 @@ class Play:
             assert p.alignment is not None or s.device == "joints"
             assert not self.state.estop
             assert not self.state.paused
+            assert self.state.episode is None or self.state.episode.state != "closing"
             assert s.pose_world is None or all(map(math.isfinite, (*s.pose_world.p, *s.pose_world.q)))
             if self.engagements.get((c.robot, s.participant)) != s.engagement:
                 assert s.engagement > self.engagements.get((c.robot, s.participant), 0)
@@ -505,6 +551,19 @@ class Play:
             (version, *_) = [t.lease_version for t in m.targets if t.name == c.robot]
             assert grants[s.participant].version <= version <= lease.version
             assert -CONFIG.future_ns <= self.now_ns - m.capture_ns <= CONFIG.freshness_ns
+
+    def check_episodes(self) -> None:
+        """An episode goes from state to state as it may, and only one with its people becomes a success."""
+        for event in self.decision.events:
+            if isinstance(one := event.body, EpisodeChanged):
+                before, self.episode = self.episode, one
+                assert one.state in NEXT[before.state]
+                grows = one.number - before.number
+                begins = "countdown" in NEXT[before.state] and before.state != "countdown"
+                assert grows == (begins and before.state not in REPEATED) or (before.state, grows) == ("discarded", 1)
+                assert one.successes - before.successes == (one.state == "closing" and one.verdict == "success")
+                assert one.verdict != "success" or before.state != "left"
+                self.ended += one.state in ("success", "failure", "discarded", "unknown")
 
     def check_urgent(self, entries: list[Entry]) -> None:
         moving = {s.participant for c in self.decision.commands for s in c.sources}
@@ -567,6 +626,8 @@ class Play:
         holding = {g.participant for name in NAMES for g in self.state.robots[name].grants}
         for i, w in enumerate(self.state.queue):
             assert w.participant not in holding
+            if self.state.participants[w.participant].connection < 0:
+                continue  # it keeps its place, and gets a robot when it is back
             assert w.any_robot or any(self.state.robots[n].grants or self.promised(i, n) for n in w.robots)
 
     def promised(self, place: int, name: str) -> bool:
@@ -585,6 +646,7 @@ ACTIONS: Final[list[tuple[float, Callable[[Play], None]]]] = [
     (1.0, Play.direct),
     (0.7, Play.trouble),
     (0.7, Play.align),
+    (0.7, Play.record),
     (0.3, Play.watch),
     (0.05, Play.go_on),
     (0.5, Play.join),

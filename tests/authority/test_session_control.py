@@ -1,4 +1,4 @@
-"""E-stop, pause, reset, gaps and scene epochs; episodes."""
+"""E-stop, pause, reset, gaps and scene epochs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, ClearEStop, Control, Episode, EStop, Grasp, Release
+from iris_session.protocol.client_messages import Acquire, ClearEStop, Control, EStop, Grasp, Release
 from iris_session.protocol.entries import (
     Entry,
     ExternalReset,
@@ -19,7 +19,6 @@ from iris_session.protocol.entries import (
     StalledGap,
 )
 from iris_session.protocol.server_messages import (
-    EpisodeChanged,
     EStopChanged,
     Gap,
     LeaseChanged,
@@ -204,7 +203,6 @@ def test_a_loop_of_the_user_is_not_paused_or_reset() -> None:
     boss = t.join("director")
     for action in ("pause", "resume", "step", "reset"):
         assert boss.denied(Control(1, action)) == "user_owned"
-    assert boss.denied(Episode(1, "reset")) == "user_owned"
 
 
 def test_an_owner_that_listens_is_asked_to_reset() -> None:
@@ -214,14 +212,6 @@ def test_an_owner_that_listens_is_asked_to_reset() -> None:
     assert boss.denied(Control(1, "pause")) == "user_owned"
     assert boss.asks(Control(2, "reset")).ok
     assert not t.decision.reset
-    assert boss.asks(Episode(3, "start")).ok
-    assert boss.asks(Episode(4, "rerecord", "once more")).ok
-    assert t.since(EpisodeChanged)[-1].state == "discarded"
-    t.step()
-    t.step(t.host(ExternalReset()))
-    assert t.last(EpisodeChanged) == EpisodeChanged(2, "running", "once more", boss.id)
-    t.step(t.host(ExternalReset()))
-    assert t.since(EpisodeChanged) == []
 
 
 def test_a_gap_between_steps_holds_until_clutched_again() -> None:
@@ -267,27 +257,6 @@ def test_recording_gap_is_announced() -> None:
     t, *_ = playing()
     t.step(t.host(RecordingGap(3)))
     assert t.since(Gap) == [Gap("recording", 0, 3)]
-
-
-# --- episodes ---
-
-
-def test_episode_life() -> None:
-    t, op, boss = playing()
-    assert op.denied(Episode(1, "dance")) == "unknown_value"
-    assert t.join("observer").denied(Episode(1, "start")) == "role"
-    assert op.denied(Episode(1, "success")) == "episode_state"
-    assert op.asks(Episode(1, "start", "stack")).ok
-    assert t.since(EpisodeChanged) == [EpisodeChanged(1, "running", "stack", op.id)]
-    assert op.denied(Episode(1, "start")) == "episode_state"
-    assert op.denied(Episode(1, "reset")) == "episode_state"
-    assert boss.asks(Episode(1, "rerecord")).ok
-    assert [(e.number, e.state) for e in t.since(EpisodeChanged)] == [(1, "discarded"), (2, "running")]
-    assert t.decision.reset
-    assert op.asks(Episode(1, "success")).ok
-    assert t.last(EpisodeChanged).state == "success"
-    assert op.asks(Episode(1, "reset")).ok
-    assert t.decision.reset
 
 
 def test_release_acts_before_an_acquire_that_was_sent_earlier() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from iris_session.client import Client, DeniedError, RequestTimeoutError
 from iris_session.protocol.client_messages import Acquire, Observation, Withdraw
-from iris_session.protocol.names import DenialReason, Device, EpisodeAction, LeaseMode
+from iris_session.protocol.names import DenialReason, Device, EpisodeState, LeaseMode
 from iris_session.protocol.server_messages import (
     ConsentRequested,
     EpisodeChanged,
@@ -55,9 +55,17 @@ def test_director_requests_are_executed(session: ClientSession, join: Join) -> N
     boss.clear_estop()
     assert ann.wait_for(lambda c: not c.mirror.estop)
     boss.marker("look here")
-    boss.episode(EpisodeAction.START, "first")
-    boss.episode(EpisodeAction.SUCCESS)
-    assert boss.wait_for(lambda c: len(bodies(events, EpisodeChanged)) >= 2)
+    assert boss.start_episode("first", countdown_s=0).state == EpisodeState.RUNNING
+    assert boss.take_over_episode().led_by == boss.participant_id
+    assert boss.stop_episode().state == EpisodeState.CLOSING
+    assert boss.end_episode().successes == 1
+    assert boss.start_episode(countdown_s=0.1).number == 2
+    assert boss.discard_episode(again=True).number == 2
+    assert boss.discard_episode().state == EpisodeState.CANCELLED
+    with pytest.raises(DeniedError, match="no episode is running"):
+        boss.end_episode("failure")
+    states = [event.state for event in bodies(events, EpisodeChanged)]
+    assert states[-5:] == ["confirm", "closing", "discarded", "countdown", "cancelled"]
     assert bodies(events, MarkerAdded) == [MarkerAdded(boss.participant_id, "look here")]
 
 

@@ -74,8 +74,14 @@ def test_robots_are_assigned_and_released(terminal: Terminal) -> None:
 
 
 def test_episodes_and_markers_are_events(terminal: Terminal) -> None:
-    assert terminal.run("episode", "start", "--label", "pour")["state"] == "running"
+    begun = terminal.run("episode", "start", "--label", "pour")
+    assert (begun["state"], begun["number"], begun["label"]) == ("running", 1, "pour")
+    assert terminal.run("episode", "stop")["state"] == "closing"
     assert terminal.run("episode", "success")["state"] == "success"
+    assert terminal.run("episode", "start", "--countdown", "0")["number"] == 2
+    again = terminal.run("episode", "rerecord")
+    assert (again["state"], again["number"]) == ("countdown", 2)
+    assert terminal.run("episode", "discard")["state"] == "cancelled"
     terminal.run("marker", "gripper was cleaned")
     notes = [e.body.text for e in terminal.rig.events["ann"] if isinstance(e.body, MarkerAdded)]
     assert "gripper was cleaned" in notes

@@ -167,6 +167,8 @@ class Fuzz:
             return rng.choice((None, self.pose()))
         if name == "residuals_px":
             return (number,) * rng.choice([0, 2])
+        if name == "poses":
+            return tuple(Pose((0.1 * n, 0.5, rng.choice((0.5, math.nan))), (1.0, 0.0, 0.0, 0.0)) for n in range(3))
         if name == "grip_poses":
             return tuple(self.pose() for _ in range(rng.randrange(4)))
         if name == "anchors":

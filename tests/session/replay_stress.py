@@ -344,7 +344,8 @@ class Stress:
             cm.SetScale(1, (rng.choice(robots),), rng.choice([0.1, 0.5, 1, 3.0, math.nan])),
             cm.Assign(1, tuple(rng.sample(robots, 1)), rng.choice(["", person.id])),
             cm.PlaceAlignment(1, person.id, Pose((0.2, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), rng.random() < 0.5),
-            cm.Episode(1, rng.choice(["start", "success", "rerecord"])),
+            cm.Episode(1, rng.choice(["start", "success", "rerecord", "rerecord"]), countdown_ns=0),
+            em.ObjectsPlaced(("hammer", "cube"), (Pose((0.2, 0.1, 0.5), (1.0, 0.0, 0.0, 0.0)),) * 2),
             em.StalledGap(200 * MS),
             em.RecordingGap(3),
         ]

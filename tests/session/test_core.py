@@ -12,7 +12,7 @@ import pytest
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import load_model
 from iris_session.protocol.client_messages import Control
-from iris_session.protocol.server_messages import Event, EventBody, Notice, Snapshot
+from iris_session.protocol.server_messages import EpisodeChanged, Event, EventBody, Notice, Snapshot
 from iris_session.protocol.steps import Decision, OutgoingMessage
 from iris_session.session.core import SessionCore, encode_for_digest, read_plant_state
 from tests.session.play import TICK_NS, host, make_core, play
@@ -63,6 +63,17 @@ def test_digest_has_events_without_the_pivot_that_alignments_got_later(cls: type
                 del holder["alignment"]["pivot_world"]
     assert encode_for_digest(decision) == msgspec.msgpack.encode(expected)
     assert b"pivot_world" not in encode_for_digest(decision)
+
+
+def test_digest_has_the_four_fields_of_episodes_that_do_not_say_who_started_them() -> None:
+    before = EpisodeChanged(3, "running", "stack", "p1")
+    digested = encode_for_digest(Decision((), events=(Event(1, 2, 3, before),)))
+    assert msgspec.msgpack.decode(digested)["events"][0]["body"] == {
+        **{"event": "episode_changed", "number": 3},
+        **{"state": "running", "label": "stack", "participant": "p1"},
+    }
+    led = Decision((), events=(Event(1, 2, 3, msgspec.structs.replace(before, started_by="p1")),))
+    assert encode_for_digest(led) == msgspec.msgpack.encode(led)
 
 
 def test_initial_state_is_used_at_start_and_by_reset() -> None:

@@ -15,7 +15,7 @@ import msgspec
 
 from iris_session.protocol import codec
 from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
-from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Pair, Sample, wrap_message
+from iris_session.protocol.client_messages import Bye, ClientEnvelope, Episode, Hello, Pair, Sample, wrap_message
 from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.media import MediaHeader, MediaPush, StreamBudget
 from iris_session.protocol.names import PROTOCOL_VERSION
@@ -38,6 +38,7 @@ ADDED_FIELDS: Final[dict[type[msgspec.Struct], tuple[str, ...]]] = {
     Hello: ("certificate_hash",),
     Pair: ("identity",),
     Sample: ("emulated",),
+    Episode: ("countdown_ns",),
     Snapshot: ("anchors",),
     MediaHeader: ("sent_ns", "received_ns"),
     MediaPush: ("info", "sent_ns", "connection_epoch"),

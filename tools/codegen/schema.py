@@ -186,6 +186,8 @@ _ENUMS: Final[dict[str, str]] = {
     "Observation.source": "ObservationSource",
     "TipCalibrated.device": "Device",
     "Episode.action": "EpisodeAction",
+    "EpisodeChanged.state": "EpisodeState",
+    "EpisodeChanged.verdict": "EpisodeState",
     "Control.action": "ControlAction",
     "Target.kind": "TargetKind",
     "Lease.kind": "TargetKind",

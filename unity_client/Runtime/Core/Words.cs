@@ -52,6 +52,7 @@ namespace IrisSession.Core
             [HoldReason.ZeroPose] = new Phrase("the device has no pose yet", "wait until it is tracked, then " + Reclutch),
             [HoldReason.Frozen] = new Phrase("the pose of the device is frozen", "move or wake it, then " + Reclutch),
             [HoldReason.Jump] = new Phrase("tracking jumped", Reclutch),
+            [HoldReason.Episode] = new Phrase("an episode is closing", Reclutch),
             [HoldReason.Unconfirmed] = new Phrase("the alignment is doubted", "glance at a sheet, then " + Reclutch),
         };
 

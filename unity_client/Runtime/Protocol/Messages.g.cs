@@ -179,6 +179,7 @@ namespace IrisSession.Protocol
         public const string Frozen = "frozen";
         public const string Jump = "jump";
         public const string Unconfirmed = "unconfirmed";
+        public const string Episode = "episode";
     }
 
     /// <summary>Reason why a sample was rejected.</summary>
@@ -277,11 +278,30 @@ namespace IrisSession.Protocol
     public static class EpisodeAction
     {
         public const string Start = "start";
+        public const string Stop = "stop";
         public const string Success = "success";
         public const string Failure = "failure";
+        public const string Unknown = "unknown";
         public const string Discard = "discard";
         public const string Rerecord = "rerecord";
+        public const string TakeOver = "take_over";
         public const string Reset = "reset";
+    }
+
+    /// <summary>State of an episode (EpisodeChanged).</summary>
+    public static class EpisodeState
+    {
+        public const string Idle = "idle";
+        public const string Countdown = "countdown";
+        public const string Running = "running";
+        public const string Confirm = "confirm";
+        public const string Left = "left";
+        public const string Closing = "closing";
+        public const string Success = "success";
+        public const string Failure = "failure";
+        public const string Discarded = "discarded";
+        public const string Unknown = "unknown";
+        public const string Cancelled = "cancelled";
     }
 
     /// <summary>Action of control.</summary>
@@ -1423,7 +1443,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>Start or end an episode, EpisodeAction: start, success, failure, discard, rerecord, reset.</summary>
+    /// <summary>Start, end or take over an episode (EpisodeAction).</summary>
     public sealed class Episode : ClientMessage
     {
         public const string TagName = "episode";
@@ -1431,6 +1451,7 @@ namespace IrisSession.Protocol
         public long RequestId;
         public string Action = "";
         public string Label = "";
+        public long? CountdownNs;
 
         public static Episode Read(WireReader reader) => reader.ReadInto(new Episode());
 
@@ -1439,6 +1460,7 @@ namespace IrisSession.Protocol
             codec.Require("request_id", ref RequestId, 0, long.MaxValue);
             codec.Require("action", ref Action, 64);
             codec.Allow("label", ref Label, 512, "");
+            codec.Allow("countdown_ns", ref CountdownNs, long.MinValue, long.MaxValue);
         }
     }
 
@@ -2270,7 +2292,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>state: running, success, failure, discarded.</summary>
+    /// <summary>An episode is in another EpisodeState, by participant.</summary>
     public sealed class EpisodeChanged : EventKind
     {
         public const string TagName = "episode_changed";
@@ -2279,6 +2301,17 @@ namespace IrisSession.Protocol
         public string State = "";
         public string Label = "";
         public string Participant = "";
+        public string Task = "";
+        public string Instruction = "";
+        public long Wanted;
+        public long Successes;
+        public string StartedBy = "";
+        public string StartedByName = "";
+        public string LedBy = "";
+        public long StartedNs;
+        public long UntilNs;
+        public string Verdict = "";
+        public string[] Robots = Array.Empty<string>();
 
         public static EpisodeChanged Read(WireReader reader) => reader.ReadInto(new EpisodeChanged());
         internal static readonly Func<EpisodeChanged> New = () => new EpisodeChanged();
@@ -2289,6 +2322,17 @@ namespace IrisSession.Protocol
             codec.Require("state", ref State, 64);
             codec.Allow("label", ref Label, 512, "");
             codec.Allow("participant", ref Participant, 64, "");
+            codec.Allow("task", ref Task, 64, "");
+            codec.Allow("instruction", ref Instruction, 512, "");
+            codec.Allow("wanted", ref Wanted, 0, long.MaxValue, 0);
+            codec.Allow("successes", ref Successes, 0, long.MaxValue, 0);
+            codec.Allow("started_by", ref StartedBy, 64, "");
+            codec.Allow("started_by_name", ref StartedByName, 64, "");
+            codec.Allow("led_by", ref LedBy, 64, "");
+            codec.Allow("started_ns", ref StartedNs, long.MinValue, long.MaxValue, 0);
+            codec.Allow("until_ns", ref UntilNs, long.MinValue, long.MaxValue, 0);
+            codec.Allow("verdict", ref Verdict, 64, "");
+            codec.Allow("robots", ref Robots, 0, 32, 64);
         }
     }
 

@@ -200,6 +200,7 @@ export const HoldReason = {
   FROZEN: "frozen",
   JUMP: "jump",
   UNCONFIRMED: "unconfirmed",
+  EPISODE: "episode",
 } as const;
 export type HoldReason = (typeof HoldReason)[keyof typeof HoldReason] | (string & {});
 
@@ -298,13 +299,32 @@ export type FaultCode = (typeof FaultCode)[keyof typeof FaultCode] | (string & {
 /** Action of `episode`. */
 export const EpisodeAction = {
   START: "start",
+  STOP: "stop",
   SUCCESS: "success",
   FAILURE: "failure",
+  UNKNOWN: "unknown",
   DISCARD: "discard",
   RERECORD: "rerecord",
+  TAKE_OVER: "take_over",
   RESET: "reset",
 } as const;
 export type EpisodeAction = (typeof EpisodeAction)[keyof typeof EpisodeAction] | (string & {});
+
+/** State of an episode (`EpisodeChanged`). */
+export const EpisodeState = {
+  IDLE: "idle",
+  COUNTDOWN: "countdown",
+  RUNNING: "running",
+  CONFIRM: "confirm",
+  LEFT: "left",
+  CLOSING: "closing",
+  SUCCESS: "success",
+  FAILURE: "failure",
+  DISCARDED: "discarded",
+  UNKNOWN: "unknown",
+  CANCELLED: "cancelled",
+} as const;
+export type EpisodeState = (typeof EpisodeState)[keyof typeof EpisodeState] | (string & {});
 
 /** Action of `control`. */
 export const ControlAction = {
@@ -1176,12 +1196,16 @@ export interface TrackingEpoch {
   tracking_epoch: number;
 }
 
-/** Start or end an episode, `EpisodeAction`: start, success, failure, discard, rerecord, reset. */
+/**
+ * Start, end or take over an episode (`EpisodeAction`). `countdown_ns`: of `start`, at most 60 s; None: that of the
+ * session.
+ */
 export interface Episode {
   type: "episode";
   request_id: number;
   action: EpisodeAction;
   label?: string;
+  countdown_ns?: number | null;
 }
 
 /** Stop everything. Any participant may do so. Latched. Not a safety-rated stop. */
@@ -1696,13 +1720,32 @@ export interface PauseChanged {
   reason?: string;
 }
 
-/** `state`: running, success, failure, discarded. `number` counts episodes from 1. */
+/**
+ * An episode is in another `EpisodeState`, by `participant`.
+ *
+ * `number` counts from 1, in a task also those of earlier sessions. `label`: free text that was given with it. `task`,
+ * `instruction`, `wanted`: of the task, empty and 0 without one; `successes`: so many there are by now.
+ * `started_by`, `started_by_name`: who started it; `led_by`: who leads it now. `started_ns`: session time from which
+ * it is recorded, 0 before. `until_ns`: end of the countdown, of the question, or of the time to take it over or to
+ * give the verdict; 0: none. `verdict`: while closing, empty until it is given. `robots`: that belong to it.
+ */
 export interface EpisodeChanged {
   event: "episode_changed";
   number: number;
-  state: string;
+  state: EpisodeState;
   label?: string;
   participant?: string;
+  task?: string;
+  instruction?: string;
+  wanted?: number;
+  successes?: number;
+  started_by?: string;
+  started_by_name?: string;
+  led_by?: string;
+  started_ns?: number;
+  until_ns?: number;
+  verdict?: EpisodeState;
+  robots?: string[];
 }
 
 /** A hand took a free object (`grasped`), or released it. */
@@ -2429,7 +2472,7 @@ export const DEFAULTS = {
   align: { participant: "" },
   move_anchor: { force: false },
   tracking_epoch: {},
-  episode: { label: "" },
+  episode: { label: "", countdown_ns: null },
   estop: { reason: "" },
   clear_estop: { stop_seq: 0 },
   control: { ticks: 1 },
@@ -2469,7 +2512,7 @@ export const DEFAULTS = {
   scene_changed: { scene_hash: "", tick_period_ns: 0 },
   estop_changed: { reason: "", stop_seq: 0 },
   pause_changed: { participant: "", reason: "" },
-  episode_changed: { label: "", participant: "" },
+  episode_changed: { label: "", participant: "", task: "", instruction: "", wanted: 0, successes: 0, started_by: "", started_by_name: "", led_by: "", started_ns: 0, until_ns: 0, verdict: "", robots: [] },
   object_grasped: {},
   handover: {},
   marker_added: {},

@@ -28,6 +28,7 @@ const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string>
   zero_pose: `the device has no pose yet: wait until it is tracked, ${AGAIN}`,
   frozen: `the pose of the device is frozen: move or wake it, ${AGAIN}`,
   jump: `tracking jumped: ${AGAIN}`,
+  episode: `an episode is closing: ${AGAIN}`,
 };
 
 /** Limits of control, but for names of joints (docs/guide.md): what an operator has to know first comes first. */
@@ -82,10 +83,9 @@ const LEASE_CAUSES: Record<string, string> = {
 };
 
 const EPISODE_STATES: Record<string, string> = {
-  running: "running",
-  success: "success",
-  failure: "failure",
-  discarded: "discarded",
+  countdown: "begins soon",
+  confirm: "discard it?",
+  left: "its leader is disconnected",
 };
 
 const STREAM_FAULTS: Record<string, string> = {
