@@ -40,7 +40,7 @@ from iris_session.protocol.names import (
     Role,
 )
 from iris_session.protocol.scene import PatchOp
-from iris_session.protocol.server_messages import Audited, Gap, MarkerAdded, Reply
+from iris_session.protocol.server_messages import Audited, EpisodeChanged, Gap, MarkerAdded, Reply
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.status import AlignmentReport, CrossCheckReport, StopReport, UnverifiedReport
 from iris_session.protocol.steps import ControlStatus, Decision, OutgoingMessage, WorldView
@@ -198,6 +198,16 @@ class Authority:
     def anchors(self) -> dict[str, Pose]:
         """`T_world_anchor` by id, as they are now."""
         return dict(self._ctx.state.anchors)
+
+    @property
+    def episode(self) -> EpisodeChanged | None:
+        """The present or last episode, `None` before the first."""
+        return self._ctx.state.episode
+
+    @property
+    def next_episode(self) -> int:
+        """Number of the episode that begins next."""
+        return episodes.find_next_number(self._ctx)
 
     @property
     def stop_seq(self) -> int:

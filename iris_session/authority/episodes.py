@@ -120,6 +120,14 @@ def _holds_robot(ctx: Context, p: Participant, now: EpisodeChanged) -> bool:
     return any(g.participant == p.id for lease in leases for g in lease.grants)
 
 
+def find_next_number(ctx: Context) -> int:
+    """Return the number of the episode that begins next: that of a cancelled or repeated one is used again."""
+    now, again = ctx.state.episode, ctx.state.rerecording
+    if now is None or again is not None:
+        return 1 if again is None else again.number
+    return now.number + (now.state != EpisodeState.CANCELLED)
+
+
 def _start(ctx: Context, p: Participant, m: Episode) -> Denial | None:
     state = ctx.state
     countdown_ns = ctx.config.countdown_ns if m.countdown_ns is None else m.countdown_ns
@@ -130,8 +138,7 @@ def _start(ctx: Context, p: Participant, m: Episode) -> Denial | None:
     if not 0 <= countdown_ns <= MAX_COUNTDOWN_NS:
         text = f"a countdown of {countdown_ns / SECOND:g} s"
         return Denial(DenialReason.INVALID, text, f"give 0 to {MAX_COUNTDOWN_NS // SECOND} s")
-    before = state.episode
-    number = 1 if before is None else before.number + (before.state != EpisodeState.CANCELLED)
+    before, number = state.episode, find_next_number(ctx)
     now = _describe(ctx.config.task, number, EpisodeState.COUNTDOWN, None if before is None else before.successes)
     now = msgspec.structs.replace(now, label=m.label, started_by=p.id, started_by_name=p.name, led_by=p.id)
     _count_down(ctx, now, countdown_ns)

@@ -1,4 +1,4 @@
-"""Keys of the terminal that runs `serve`: e-stop, clear, pause. Nothing is read without a terminal."""
+"""Keys of the terminal that runs `serve`: e-stop, clear, pause, episodes. Nothing is read without a terminal."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import tty
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
+
+from iris_session.protocol.names import EpisodeAction, EpisodeState
 
 if TYPE_CHECKING:
     from iris_session.session.session_base import SessionBase
@@ -29,7 +31,9 @@ class KeyBinding(NamedTuple):
 
 
 def bind_session_keys(session: SessionBase) -> dict[str, KeyBinding]:
-    """Return the keys of a session: space for the e-stop, `c` to clear it, `p` to pause and resume where it can."""
+    """Return the keys of a session: space for the e-stop, `c` to clear it, `p` to pause and resume where it can, and
+    those of episodes.
+    """
     from iris_session.session.session import Session
 
     keys = {
@@ -41,7 +45,16 @@ def bind_session_keys(session: SessionBase) -> dict[str, KeyBinding]:
         def toggle_pause() -> None:
             session.resume() if session.status().paused else session.pause()
 
+        def begin_or_succeed() -> None:
+            now = session.episode
+            is_over = now is None or now.state in EpisodeState.OVER
+            session.start_episode() if is_over else session.end_episode()
+
         keys["p"] = KeyBinding("p pause/resume", toggle_pause)
+        keys["e"] = KeyBinding("e start/success", begin_or_succeed)
+        keys["f"] = KeyBinding("f failure", lambda: session.end_episode(EpisodeAction.FAILURE))
+        keys["d"] = KeyBinding("d discard", session.discard_episode)
+        keys["t"] = KeyBinding("t take over", session.take_over_episode)
     return keys
 
 

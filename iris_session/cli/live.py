@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import select
 import signal
@@ -17,13 +18,14 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from iris_session.cli.common import to_printable
+from iris_session.protocol.names import EpisodeState
 from iris_session.system.process import ChildProcess
 from iris_session.viewer.narration import DEBUG, EventNarration
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from iris_session.protocol.server_messages import Event
+    from iris_session.protocol.server_messages import EpisodeChanged, Event
     from iris_session.session.session_base import SessionBase
 
 #: Refresh of the display [s].
@@ -89,6 +91,7 @@ class TerminalView:
         lines = [format_event(event, line.text) for event, line in narrated if line.level != DEBUG]
         status = self._session.status().as_dict()
         status["handovers"] = len(status.get("handovers", ()))  # the list grows with the session
+        status["episode"] = describe_episode(self._session.episode, self._session.clock())
         self._pending = json.dumps({"status": status, "events": lines}).encode() + b"\n"
         self._send()
         if fresh:
@@ -102,6 +105,29 @@ class TerminalView:
         except (BlockingIOError, BrokenPipeError):
             return False
         return True
+
+
+#: What the live view says of an episode in each state; of a final one, the state.
+_EPISODES: Final = {
+    EpisodeState.IDLE: "e starts the next one",
+    EpisodeState.COUNTDOWN: "begins in {left:.0f} s, d cancels",
+    EpisodeState.RUNNING: "is recorded, by {leader}",
+    EpisodeState.CONFIRM: "discard it? d confirms within {left:.0f} s",
+    EpisodeState.LEFT: "{leader} is disconnected: t takes it over, within {left:.0f} s",
+    EpisodeState.CLOSING: "is closing {verdict}",
+}
+
+
+def describe_episode(now: EpisodeChanged | None, now_ns: int) -> str:
+    """Return the line about the episode, empty before the first one of a session without a task."""
+    if now is None:
+        return ""
+    left = max(0.0, math.ceil((now.until_ns - now_ns) * 1e-9))
+    verdict = now.verdict or "(verdict: e success, f failure, d discard)"
+    text = _EPISODES.get(now.state, now.state).format(left=left, leader=now.started_by_name, verdict=verdict)
+    count = f", {now.successes} of {now.wanted}" if now.wanted else ""
+    task = f"{now.instruction or now.task}: " if now.task else ""
+    return f"{task}episode {now.number}{count}: {text}"
 
 
 def _render_table(title: str, status: dict[str, Any], events: list[str], footer: str = "") -> RenderableType:
@@ -127,6 +153,8 @@ def _render_table(title: str, status: dict[str, Any], events: list[str], footer:
         f"lateness p99 {late.get('p99_ms', 0.0):.2f} ms  handovers {status['handovers']}  "
         f"drops {sum(status['drops'].values())}"
     )
+    if status.get("episode"):
+        line += f"\n{status['episode']}"
     if reason := status.get("pause_reason"):
         line += f"\nphysics stands still: {reason}; `iris-session reset` begins anew"
     for stop in status.get("stops", ()):

@@ -49,6 +49,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request
             iris-session serve scene.xml --anchors anchors.toml
             iris-session serve scene.xml --camera room.toml    (a point cloud; see `iris-session cloud example`)
+            iris-session serve handover --task pour.toml    (episodes of a task)
             iris-session serve handover --assign ann=left --assign bob=right
             iris-session serve aloha --seconds 30
             iris-session serve handover --interface wlan0 --name lab-1
@@ -93,6 +94,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         type=Path,
         metavar="TOML",
         help="depth cameras to show as a point cloud, repeatable; see `iris-session cloud example`",
+    )
+    parser.add_argument(
+        "--task",
+        type=Path,
+        metavar="TOML",
+        help="task whose episodes are recorded; its progress is kept beside the file",
     )
     parser.add_argument(
         "--resume",
@@ -155,6 +162,7 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
         web_cert=arguments.web_cert,
         web_key=arguments.web_key,
         cameras=tuple(getattr(arguments, "camera", ())),
+        task=getattr(arguments, "task", None),
         groups=arguments.groups,
         sites=arguments.sites,
         authority=authority,
@@ -208,7 +216,7 @@ def create_publisher(arguments: argparse.Namespace, path: Path) -> ScenePublishe
     """Return a publisher that shows a file in which nothing moves."""
     from iris_session.session.scene_publisher import ScenePublisher
 
-    drives = ("robots", "assign", "unaligned", "assignment", "mode")
+    drives = ("robots", "assign", "unaligned", "assignment", "mode", "task")
     if given := [f"--{name}" for name in drives if getattr(arguments, name)]:
         raise CommandError(f"{', '.join(given)}: {path.name} has no robots, it is shown as it is")
     scene = make_builder(path, path.name, arguments)

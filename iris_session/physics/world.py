@@ -91,6 +91,7 @@ class World:
         objects: Sequence[ObjectSpec],
     ) -> None:
         self.model = model
+        self.objects = tuple(objects)
         _require_exact(model)
         _check_specs(model, robots, objects)
         #: What control writes to, and what the view shows.

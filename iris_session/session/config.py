@@ -26,7 +26,7 @@ from iris_session.control import ControlConfig
 from iris_session.protocol.common import Pose
 from iris_session.protocol.discovery import DISCOVERY_PORT
 from iris_session.protocol.server_messages import MAX_MARKS
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.specs import ObjectSpec, RobotSpec, TaskSpec
 from iris_session.recording.budget import MIN_BUDGET_BYTES
 from iris_session.rrd.assets import RECORD_ASSETS, SCENE
 from iris_session.scene.mujoco_visuals import Shown, make_shown
@@ -88,6 +88,8 @@ class SessionConfig:
         realtime: `run()` asks for real-time priority, and continues without it when it is refused.
         resume: A recording of `run()`, or its folder, to continue. Scene, robots, name, authority and control come from
             it, and addresses, ports and keys unless they are given.
+        task: The task whose episodes are recorded: a task file, beside which its progress is kept, or a `TaskSpec`.
+            With `resume`, the file that the session had.
         authority: Rules of leases, samples, handovers and alignment.
         control: Limits and gains of robots that participants drive.
 
@@ -126,6 +128,7 @@ class SessionConfig:
     adapt_media: bool = True
     realtime: bool = True
     resume: str | Path | None = None
+    task: str | Path | TaskSpec | None = None
     authority: AuthorityConfig = field(default_factory=AuthorityConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
 

@@ -32,7 +32,7 @@ from iris_session.protocol.server_messages import (
     ParticipantJoined,
     Snapshot,
 )
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.specs import ObjectSpec, RobotSpec, TaskSpec
 from iris_session.protocol.steps import ControlStatus, Decision, OutgoingMessage
 from iris_session.session.config import SessionConfig
 from iris_session.session.ctrl_sharing import CtrlSharing
@@ -377,9 +377,11 @@ def make_session_core(
     objects: tuple[ObjectSpec, ...],
     user_owned: bool,
     known: SessionCore | None = None,
+    task: TaskSpec | None = None,
 ) -> SessionCore:
     """Return the core of a session that begins with `data` as it is now; `known` when it is the same."""
-    authority = msgspec.structs.replace(session.authority, user_owned_loop=user_owned, anchors=session.anchor_poses())
+    anchors, task = session.anchor_poses(), task or session.authority.task
+    authority = msgspec.structs.replace(session.authority, user_owned_loop=user_owned, anchors=anchors, task=task)
     initial = b"" if data is None else read_plant_state(model, data)
     config = CoreConfig(authority, name_solver(session.control), robots, objects, initial)
     if known is not None and known.config == config:

@@ -78,6 +78,7 @@ from iris_session.session.stepper import (
     make_session_clock,
     normalize_message,
 )
+from iris_session.session.tasks import TaskRunner, check_same_task, find_progress_path, load_task
 from iris_session.session.tick_times import TickTimes
 from iris_session.session.user_loop import UserLoop
 from iris_session.system.priority import freeze_garbage_collector, tick_priority
@@ -141,6 +142,10 @@ class Session(SessionBase):
             config = dataclasses.replace(config, **choose_shown(config, groups, sites)._asdict())
         self._past, self.config, scene = prepare_session(config, model, data, robots, objects)
         self.model, self.robots, self.objects, self._robot_notices = scene
+        self._task = load_task(self.config.task)
+        if self._past is not None and self._task is not None:
+            check_same_task(self._task, self._past.core.config.authority.task)
+        self._task_runner: TaskRunner | None = None
         self._robot_choice: FixedChoice = None
         self._object_choice: tuple[ObjectSpec, ...] | None = None  # of an attached program
         self.data = data
@@ -223,6 +228,8 @@ class Session(SessionBase):
             if self._user_loop is not None:
                 self._user_loop.close()
         finally:
+            if self._task_runner is not None:
+                self._task_runner.close()
             if self._processes is not None:
                 self.recording_fault = self._processes.close()
                 self._recording, self._processes = self._processes.recording, None
@@ -730,6 +737,10 @@ class Session(SessionBase):
             live, core = self._require_started(), self._make_core(user_owned=user_owned)
             stepper = live.make_stepper(core, self.clock, user_owned=user_owned)
             stepper.list_notices = lambda: self._robot_notices
+            if core.config.authority.task is not None:
+                given = self.config.task
+                progress = find_progress_path(Path(given)) if isinstance(given, str | Path) else None
+                self._task_runner = TaskRunner(stepper, progress, is_new=self._past is None)
             if not user_owned:
                 self.data = core.world.data
                 stepper.on_scene.append(self._follow_scene)
@@ -754,5 +765,5 @@ class Session(SessionBase):
                 raise OwnershipError("a resumed session is driven by run(): its physics are in the recording")
             return self._past.core
         scene = self.model, self.data, self.robots, self.objects
-        self._core = make_session_core(self.config, *scene, user_owned, self._core)
+        self._core = make_session_core(self.config, *scene, user_owned, self._core, self._task)
         return self._core

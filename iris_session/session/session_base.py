@@ -16,12 +16,12 @@ from types import FrameType, TracebackType
 from typing import Self
 
 from iris_session.physics import Pacer
-from iris_session.protocol.client_messages import ClearEStop, EStop, Marker
+from iris_session.protocol.client_messages import ClearEStop, Episode, EStop, Marker
 from iris_session.protocol.entries import EntryMessage, OwnerListens, ScenePatched
 from iris_session.protocol.media import StreamInfo
-from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.names import EpisodeAction, MediaEncoding
 from iris_session.protocol.scene import PatchOp, SceneError, SceneSpec
-from iris_session.protocol.server_messages import Event
+from iris_session.protocol.server_messages import EpisodeChanged, Event
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.processes import SessionProcesses
@@ -128,6 +128,51 @@ class SessionBase:
             OwnershipError: The queue of inputs is full, or the session is closed.
         """
         self.post(Marker(request_id=0, text=text))
+
+    @property
+    def episode(self) -> EpisodeChanged | None:
+        """The present or last episode; `None` before the first, unless there is a task."""
+        return None if self._stepper is None else self._stepper.core.authority.episode
+
+    def start_episode(self, label: str = "", *, countdown_s: float | None = None) -> None:
+        """Start an episode with the next step. What the session denies is in its log; `episode` says how it stands.
+
+        Args:
+            label: Free text about it.
+            countdown_s: Time until it is recorded, 0 to 60 [s]; `None` for 3.
+
+        Raises:
+            OwnershipError: The queue of inputs is full, or the session is closed.
+        """
+        countdown_ns = None if countdown_s is None else round(countdown_s * 1e9)
+        self.post(Episode(0, EpisodeAction.START, label, countdown_ns))
+
+    def end_episode(self, verdict: str = EpisodeAction.SUCCESS) -> None:
+        """Give the verdict of the episode: `success`, `failure` or `unknown`; `stop` lets robots hold until it comes.
+
+        Raises:
+            OwnershipError: The queue of inputs is full, or the session is closed.
+        """
+        self.post(Episode(0, verdict))
+
+    def discard_episode(self, *, again: bool = False) -> None:
+        """Discard the episode, or cancel its countdown. It is asked for twice: call it again within 3 s.
+
+        Args:
+            again: Count down to the same number again.
+
+        Raises:
+            OwnershipError: The queue of inputs is full, or the session is closed.
+        """
+        self.post(Episode(0, EpisodeAction.RERECORD if again else EpisodeAction.DISCARD))
+
+    def take_over_episode(self) -> None:
+        """Lead the episode from the next step on, instead of a participant.
+
+        Raises:
+            OwnershipError: The queue of inputs is full, or the session is closed.
+        """
+        self.post(Episode(0, EpisodeAction.TAKE_OVER))
 
     def poll_requests(self) -> list[OwnerRequest]:
         """Return what participants ask of your loop, oldest first, each once: to reset, to record an episode again.

@@ -132,6 +132,7 @@ class Stepper:
         on_publish: Called after a state was published, with scene epoch and the times of `publish_now`.
         on_state: Called with what was published; for measurements and tests.
         on_entries: Called with the entries of every step; for measurements and tests.
+        on_decision: Called after every step with its decision and entries; for the task.
         list_notices: Returns what is said of robots that can only be watched; a denial to take one says it, too.
         on_lap: Called after each part of a step with the `LateCause` that its time counts as. The pacing loop sets it.
     """
@@ -171,6 +172,7 @@ class Stepper:
         self.on_publish: list[Callable[[int, int, int], None]] = []
         self.on_state: Callable[[StateHeader, NDArray[np.float64]], None] | None = None
         self.on_entries: Callable[[Sequence[Entry]], None] | None = None
+        self.on_decision: Callable[[Decision, Sequence[Entry]], None] | None = None
         self.list_notices: Callable[[], Sequence[str]] = tuple
         self.on_lap: Callable[[str], None] = ignore_lap
         self._resumed_from = resumed_from
@@ -286,6 +288,8 @@ class Stepper:
             denial = outgoing.message.denial if isinstance(outgoing.message, Reply) else None
             if outgoing.connection == HOST and denial is not None:
                 _log.warning("the session denied its owner: %s; %s", denial.message, denial.advice or denial.reason)
+        if self.on_decision is not None:
+            self.on_decision(outcome.decision, entries)
         if entries and self.core.config.authority.user_owned_loop:
             self._collect_requests(entries, outcome.decision)
         if self.recorder is not None:

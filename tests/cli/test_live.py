@@ -8,10 +8,11 @@ import os
 import signal
 import sys
 
+import msgspec
 import pytest
 
-from iris_session.cli.live import TerminalView, _render_table, format_event, main
-from iris_session.protocol.server_messages import Event, MarkerAdded, SamplesRejected
+from iris_session.cli.live import TerminalView, _render_table, describe_episode, format_event, main
+from iris_session.protocol.server_messages import EpisodeChanged, Event, MarkerAdded, SamplesRejected
 
 STATUS = {
     "session_time_s": 12.3,
@@ -57,8 +58,32 @@ def test_display_prints_events_and_ignores_truncated_lines(
     assert capsys.readouterr().out.split() == ["one", "two"]
 
 
+def test_episode_has_a_line_that_says_what_to_do() -> None:
+    now = EpisodeChanged(
+        13, "countdown", "", "p1", "pour", "Pour the cup.", 50, 12, "p1", "ann", until_ns=3_000_000_000
+    )
+    assert describe_episode(None, 0) == ""
+    assert describe_episode(now, 900_000_000) == "Pour the cup.: episode 13, 12 of 50: begins in 3 s, d cancels"
+    for state, text in {
+        "idle": "e starts the next one",
+        "running": "is recorded, by ann",
+        "confirm": "discard it? d confirms within 3 s",
+        "left": "ann is disconnected: t takes it over, within 3 s",
+        "closing": "is closing (verdict: e success, f failure, d discard)",
+        "success": "success",
+    }.items():
+        line = describe_episode(msgspec.structs.replace(now, state=state), 0)
+        assert line == f"Pour the cup.: episode 13, 12 of 50: {text}"
+    assert describe_episode(EpisodeChanged(1, "running", started_by_name="bob"), 0) == "episode 1: is recorded, by bob"
+
+
 class _Session:
     """The part of a session that `TerminalView` uses."""
+
+    episode = None
+
+    def clock(self) -> int:
+        return 0
 
     def __init__(self) -> None:
         self.events: list[Event] = []
