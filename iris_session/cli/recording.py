@@ -85,7 +85,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         actions,
         "episodes",
         run_episodes,
-        help="the episodes of a recording: when, how long, verdict, label",
+        help="the episodes of a recording: when, how long, verdict, people, task, robots",
         description="List the episodes of a recording. Exit status 1 if something is damaged or missing inside.",
         examples="""
             iris-session recording episodes session.rrd
@@ -249,7 +249,11 @@ def run_episodes(arguments: argparse.Namespace) -> int:
 
 def _format_episode(one: EpisodeSummary) -> str:
     label = f" {one.label!r}" if one.label else ""
-    return f"{one.number} {one.verdict}{label} at {one.at_s:.2f} s, {_format_duration(one.duration_s)}, by {one.by}"
+    parts = [f"{one.number} {one.verdict}{label} at {one.at_s:.2f} s, {_format_duration(one.duration_s)}, by {one.by}"]
+    parts += [f"started by {one.started_by}"] if one.started_by not in ("", one.by) else []
+    parts += [f"task {one.task}"] if one.task else []
+    parts += [f"with {', '.join(one.robots)}"] if one.robots else []
+    return ", ".join(parts)
 
 
 def _format_list(title: str, lines: Sequence[str]) -> Iterator[str]:

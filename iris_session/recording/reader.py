@@ -22,6 +22,7 @@ from iris_session.journal.errors import NotARecordingError
 from iris_session.journal.messages import DenialRecord
 from iris_session.journal.rows import JournalRow, Keyframe, unpack_model
 from iris_session.protocol.server_messages import Event
+from iris_session.recording.episodes import EpisodeCollector, RecordedEpisode
 from iris_session.recording.folders import find_session_in
 from iris_session.recording.parts import RecordingParts
 from iris_session.rrd import batches, paths
@@ -269,6 +270,18 @@ class Recording(RecordingParts):
     def events(self) -> Iterator[Event]:
         """Yield the events of the shared history in order of `event_seq`, each once."""
         return self._iterate_unique(paths.EVENTS, batches.decode_events, lambda event: event.event_seq)
+
+    @property
+    def episodes(self) -> tuple[RecordedEpisode, ...]:
+        """The episodes in order, discarded ones too: number, task, label, starter, session times and robots."""
+        found, end_ns = EpisodeCollector(), 0
+        for event in self.events():
+            found.add(event)
+            end_ns = event.session_time
+        if (episodes := found.list_episodes()) and not episodes[-1].ended:
+            for _, times in self._iterate(paths.ROWS, lambda batch: iter([batches.decode_row_times(batch)])):
+                end_ns = max(end_ns, int(times.session_times.max(initial=0)))
+        return found.list_episodes(end_ns)
 
     def denials(self) -> Iterator[DenialRecord]:
         """Yield the denials that participants received, in order, each once."""

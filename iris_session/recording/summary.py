@@ -22,7 +22,6 @@ from iris_session.protocol.names import TargetKind
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentChanged,
-    EpisodeChanged,
     EStopChanged,
     Event,
     Gap,
@@ -37,6 +36,7 @@ from iris_session.protocol.server_messages import (
     SamplesRejected,
     SceneChanged,
 )
+from iris_session.recording.episodes import EpisodeCollector
 from iris_session.recording.reader import Recording
 from iris_session.rrd.assets import AssetCollector, AssetFault, AssetPiece, AssetsSummary, RecordedScene
 from iris_session.rrd.batches import FrameTime, RecordedStream, RowTimes
@@ -83,8 +83,9 @@ class PersonSummary(msgspec.Struct, frozen=True):
 
 
 class EpisodeSummary(msgspec.Struct, frozen=True):
-    """An episode. `verdict`: success, failure, discarded; running: it did not end. `at_s`: its start, or its end if it
-    began before the recording; `duration_s` is then 0. `by`: who gave the verdict, or started it.
+    """An episode. `verdict`: success, failure, discarded, unknown; running: it did not end. `label`: free text. `at_s`:
+    its start, or its end if it began before the recording; `duration_s` is then 0. `by`: who gave the verdict, or
+    started it.
     """
 
     number: int
@@ -93,6 +94,9 @@ class EpisodeSummary(msgspec.Struct, frozen=True):
     at_s: float
     duration_s: float
     by: str
+    task: str = ""
+    started_by: str = ""
+    robots: tuple[str, ...] = ()
 
 
 class HandoverSummary(msgspec.Struct, frozen=True):
@@ -348,7 +352,7 @@ class SummaryBuilder:
         self._event_ns = 0
         self._people: dict[str, _Person] = {}
         self._holders: dict[str, dict[str, int]] = {}  # by robot: since when, by participant
-        self._episodes: dict[int, tuple[EpisodeChanged, int, int | None]] = {}  # newest event, start, end
+        self._episodes = EpisodeCollector()
         self._streams: dict[str, _Stream] = {}
         self._unattributed: dict[tuple[str, str], int] = {}  # rejected samples of connections that had not joined
         self._denials: Counter[str] = Counter()
@@ -401,6 +405,7 @@ class SummaryBuilder:
             self._add_gap(self._event_gaps, f"{missing}, from {_to_s(self._event_ns):g} s to {_to_s(now_ns):g} s")
         self._event_seq, self._event_ns = event.event_seq, now_ns
         self.end_ns = max(self.end_ns, now_ns)
+        self._episodes.add(event)
         self._apply_person(event.body, now_ns)
         self._apply_history(event.body, now_ns)
 
@@ -437,9 +442,6 @@ class SummaryBuilder:
     def _apply_history(self, body: object, now_ns: int) -> None:
         """Apply an event about the session."""
         match body:
-            case EpisodeChanged(number=number, state=state):
-                begun_ns = self._episodes[number][1] if number in self._episodes else now_ns
-                self._episodes[number] = (body, begun_ns, None if state == _RUNNING else now_ns)
             case Handover():
                 self.handovers.append(
                     HandoverSummary(
@@ -550,14 +552,17 @@ class SummaryBuilder:
         """Return the episodes in order."""
         return tuple(
             EpisodeSummary(
-                body.number,
-                body.state,
-                body.label,
-                _to_s(begun_ns),
-                _to_s((self.end_ns if end_ns is None else end_ns) - begun_ns),
-                self._get_name(body.participant),
+                one.number,
+                one.label if one.ended else _RUNNING,
+                one.text,
+                _to_s(one.start_ns),
+                _to_s(one.end_ns - one.start_ns),
+                one.ended_by or one.started_by,
+                one.task,
+                one.started_by,
+                one.robots,
             )
-            for body, begun_ns, end_ns in self._episodes.values()
+            for one in self._episodes.list_episodes(self.end_ns)
         )
 
     def list_stops(self, stops: Iterable[_Stop]) -> tuple[StopSummary, ...]:

@@ -14,7 +14,7 @@ import pytest
 from iris_session.cli.main import INTERRUPTED, main
 from iris_session.cli.recording import MOST_LINES, format_line, format_summary
 from iris_session.protocol.server_messages import EpisodeChanged, Event
-from iris_session.recording import parts
+from iris_session.recording import Recording, parts
 from iris_session.recording.folders import find_recordings
 from iris_session.recording.summary import (
     AlignmentSummary,
@@ -128,6 +128,18 @@ def test_episodes_of_a_recording_are_listed(tmp_path: Path, capsys: pytest.Captu
     assert main(["recording", "inspect", str(path), "--json"]) == 0
     assert shown["episodes"] == json.loads(capsys.readouterr().out)["episodes"]
     assert [one["verdict"] for one in shown["episodes"]] == ["success"]
+    with Recording.open(path) as recording:
+        (episode,) = recording.episodes
+    assert (episode.label, episode.text, episode.start_ns) == ("success", "pour", 6 * TICK_NS)
+    batch.events = [Event(1, 5, 6 * TICK_NS, running)]
+    path = tmp_path / "cut.rrd"
+    writer = RrdWriter(path, "id")
+    writer.write_header(header)
+    writer.add(batch)
+    writer.close()
+    with Recording.open(path) as recording:
+        (episode,) = recording.episodes
+    assert (episode.label, episode.ended, episode.end_ns) == ("unknown", False, 20 * TICK_NS)
 
 
 def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

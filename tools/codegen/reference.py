@@ -30,6 +30,7 @@ REACHED: Final = {
         "iris_session.replay.recorded_session.TimeSeries",
         "iris_session.replay.recorded_session.CommandSeries",
         "iris_session.recording.records.DeviceSamples",
+        "iris_session.recording.episodes.RecordedEpisode",
     ),
 }
 #: Title of each section and the first public name in it, in the order of `__all__`.
