@@ -62,7 +62,7 @@ def process_sample(ctx: Context, entry: Entry, s: Sample) -> None:
     usable = samples.is_measured(ctx, p, s)
     before = p.seen[s.device].buttons if s.device in p.seen else s.buttons
     _store_payload(p, s, usable)
-    if s.buttons != before:
+    if s.buttons != before and s.tracked and s.worn:
         episodes.press_buttons(ctx, p, s, before)
     if s.worn != p.worn:
         roster.set_worn(ctx, p, s.worn)

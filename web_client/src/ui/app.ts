@@ -10,10 +10,10 @@ import { Actions } from "./actions.ts";
 import { makeAlignmentPanel, makeAnchorsPanel } from "./alignment.ts";
 import { makeCameras } from "./cameras.ts";
 import { h, setText } from "./dom.ts";
+import { makeEpisodeStrip } from "./episodes.ts";
 import { makeBadge, makeEstop, makePauseBanner, makeSelf } from "./header.ts";
 import {
   makeAdvicePanel,
-  makeEpisodesPanel,
   makeEventsPanel,
   makeLoopPanel,
   makeRecordingPanel,
@@ -147,11 +147,13 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   });
   const title = h("h1", {}, "iris-session");
   const header = h("header", { class: "bar" }, title, badge.element, self.element, estop.stop);
+  const episodes = makeEpisodeStrip(state, actions);
+  stage.element.append(episodes.element);
   const panels = [
     makeAdvicePanel(state),
     makeRobotsPanel(state, actions, drive),
     makeParticipantsPanel(state, actions),
-    makeEpisodesPanel(state, actions),
+    episodes.panel,
     makeAlignmentPanel(state, actions),
     makeEventsPanel(state),
     makeRecordingPanel(state, actions),
@@ -190,6 +192,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     drive.update();
     robots?.update();
     cameras.update();
+    episodes.update();
     for (const panel of panels) panel.update(state);
     if (view) updateOverlay(view, state);
   });

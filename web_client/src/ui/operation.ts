@@ -1,40 +1,10 @@
-// The session itself: its loop, episodes, recording, and the advice of its own checks.
+// The session itself: its loop, recording, and the advice of its own checks.
 
 import type { Actions } from "./actions.ts";
 import { button, h, KeyedList, setText } from "./dom.ts";
 import { makeFacts, makeSection, type Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
-import { episodeStateWords, formatBytes, formatMilliseconds, formatShare, formatSessionTime } from "./words.ts";
-
-/** Roles that may start and end episodes. */
-const EPISODE_ROLES = ["operator", "director", "agent", "leader"];
-
-export function makeEpisodesPanel(state: PageState, actions: Actions): Panel {
-  const now = h("p", { class: "big", aria: { live: "polite" } });
-  const label = h("input", { type: "text", id: "episode-label", attributes: { maxlength: "512", placeholder: "Label (optional)" } });
-  const act = (text: string, action: string, className = "small"): HTMLButtonElement =>
-    button(text, () => void actions.request({ type: "episode", action, label: label.value.trim() }), { class: className });
-  const start = act("Start", "start", "small primary");
-  const endings = [act("Success", "success", "small good"), act("Failure", "failure"), act("Discard", "discard"), act("Record again", "rerecord")];
-  const reset = act("Reset scene", "reset");
-  const controls = h("div", { class: "controls" }, start, ...endings, reset);
-  const field = h("div", { class: "controls" }, h("label", { for: "episode-label", class: "hidden-text" }, "Label of the episode"), label);
-  const section = makeSection("episodes", "Episodes", h("div", {}, now, field, controls));
-  return {
-    element: section.element,
-    update: () => {
-      const episode = state.session?.episode ?? null;
-      const isRunning = episode?.state === "running";
-      const name = episode ? `Episode ${episode.number}: ${episodeStateWords(episode.state)}` : "No episode yet";
-      setText(now, episode?.label ? `${name} (${episode.label})` : name);
-      now.classList.toggle("running", isRunning);
-      const mayAct = state.isReady && EPISODE_ROLES.includes(state.role);
-      field.hidden = controls.hidden = !mayAct;
-      start.hidden = isRunning;
-      for (const ending of endings) ending.hidden = !isRunning;
-    },
-  };
-}
+import { formatBytes, formatMilliseconds, formatShare, formatSessionTime } from "./words.ts";
 
 export function makeLoopPanel(state: PageState, actions: Actions): Panel {
   const facts = makeFacts(["Time", "Rate", "Late ticks", "Processor", "Memory", "State after"]);

@@ -9,7 +9,7 @@ import type { SampleInput } from "../core/api.ts";
 import { Grips } from "./grips.ts";
 import type { MenuItem } from "./picture_places.ts";
 import type { Answer } from "./question.ts";
-import { BUTTON, type FrameReading, type InputReading, type Side } from "./reading.ts";
+import type { FrameReading, InputReading, Side } from "./reading.ts";
 
 /** A value is pressed from the first on, and until it falls below the second. */
 const PRESS = 0.6;
@@ -32,7 +32,6 @@ export type Intent =
   | { type: "acquire"; robot: string }
   | { type: "release"; robot: string }
   | { type: "press"; target: Target }
-  | { type: "episode"; action: "start" | "success" | "discard" }
   /** Stay where the scene is shown. */
   | { type: "place" };
 
@@ -50,7 +49,6 @@ export interface Context {
   pointed: Partial<Record<Side, string>>;
   /** The answer to a question, or the item of a menu, that each hand points at; it is nearer than robots. */
   aimed: Partial<Record<Side, Target>>;
-  isEpisodeRunning: boolean;
   /** This participant may place itself, and is not aligned. */
   canPlace: boolean;
   /** The person touches marks: a trigger that is pressed at no target is meant for them. */
@@ -197,9 +195,6 @@ export class Hands {
     if (isNew) return;
     if (hand.squeeze && !before.squeeze) this.beginSqueeze(side, context.held);
     this.readTrigger(side, hand, before.trigger, now_ms, context, intents);
-    const pressed = buttons & ~before.buttons;
-    if (pressed & BUTTON.lower) intents.push({ type: "episode", action: context.isEpisodeRunning ? "success" : "start" });
-    if (pressed & BUTTON.upper && context.isEpisodeRunning) intents.push({ type: "episode", action: "discard" });
   }
 
   private readTrigger(side: Side, hand: Hand, wasPressed: boolean, now_ms: number, context: Context, intents: Intent[]): void {

@@ -8,6 +8,7 @@ import type { WorkerClient } from "../core/page_client.ts";
 import { HoldReason } from "../protocol/messages.g.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import type { Actions } from "../ui/actions.ts";
+import { describeEpisode, isUrgent } from "../ui/episodes.ts";
 import { DESKTOP, type Entry, type PageState } from "../ui/state.ts";
 import { doubtWords, pauseWords } from "../ui/words.ts";
 import type { Mode as PageMode, StreamChoices } from "../ui/stream_choices.ts";
@@ -205,7 +206,6 @@ export class Headset {
       guessed: [...robots].filter((name) => state.feedback.get(name)?.hold_reason === HoldReason.EMULATED),
       pointed: this.pointed,
       aimed: this.aimed,
-      isEpisodeRunning: state.session?.episode?.state === "running",
       canPlace: this.canPlace,
       isTouching: this.marks.isActive,
     };
@@ -262,8 +262,7 @@ export class Headset {
 
   private ask(intents: readonly Intent[]): void {
     for (const intent of intents) {
-      if (intent.type === "episode") void this.actions.request({ type: "episode", action: intent.action });
-      else if (intent.type === "press") this.press(intent.target);
+      if (intent.type === "press") this.press(intent.target);
       else if (intent.type === "acquire") void this.acquire(intent.robot);
       else if (intent.type === "place") this.placeSelf();
       else {
@@ -330,10 +329,12 @@ export class Headset {
       advice: report?.advice ?? "",
       notice: performance.now() < this.notice.until_ms ? this.notice.text : "",
     });
-    this.props.urgent.setText([...urgent, ...steps], URGENT_COLOR);
+    const episode = session?.episode ?? null;
+    const lines = describeEpisode(episode, state.sessionTime(), episode?.led_by ? state.nameOf(episode.led_by) : "").flatMap(wrap);
+    this.props.urgent.setText([...urgent, ...steps, ...(isUrgent(episode) ? lines : [])], URGENT_COLOR);
     const driven = [...this.hands.driven].map(([side, robot]) => `${side} hand: ${robot}`);
     const color = participantColor(state.selfId);
-    this.props.status.setText([state.self?.name ?? "", ...wrap(describeAlignment(alignment)), ...driven], color);
+    this.props.status.setText([state.self?.name ?? "", ...wrap(describeAlignment(alignment)), ...driven, ...lines], color);
     for (const side of SIDES) {
       const input = reading.inputs.find((one) => one.side === side);
       this.props.describeHand(side, input ? describeHand(input.emulated, this.marks.isActive ? null : this.hands.findIgnored(side)) : []);

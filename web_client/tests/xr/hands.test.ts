@@ -27,7 +27,7 @@ function reading(...inputs: InputReading[]): FrameReading {
   return { capture_ms: now, head: POSE, headTracked: true, headEmulated: false, inputs, stops };
 }
 
-const NOTHING: Context = { held: [], tenures: new Map(), following: [], guessed: [], pointed: {}, aimed: {}, isEpisodeRunning: false, canPlace: false, isTouching: false };
+const NOTHING: Context = { held: [], tenures: new Map(), following: [], guessed: [], pointed: {}, aimed: {}, canPlace: false, isTouching: false };
 
 function step(context: Partial<Context>, ...inputs: InputReading[]): Intent[] {
   return hands.update(reading(...inputs), { ...NOTHING, ...context });
@@ -236,16 +236,10 @@ describe("answers", () => {
 });
 
 describe("buttons", () => {
-  test("A starts an episode and ends it with success, B discards it", () => {
+  test("those of episodes are in the samples, for the session to act on", () => {
     step({}, input());
-    expect(step({}, input({ buttons: BUTTON.lower }))).toEqual([{ type: "episode", action: "start" }]);
-    const running = { isEpisodeRunning: true };
-    expect(step(running, input({ buttons: BUTTON.lower }))).toEqual([]);
-    step(running, input());
-    expect(step(running, input({ buttons: BUTTON.lower }))).toEqual([{ type: "episode", action: "success" }]);
-    expect(step(running, input({ buttons: BUTTON.lower | BUTTON.upper }))).toEqual([{ type: "episode", action: "discard" }]);
-    step({}, input());
-    expect(step({}, input({ buttons: BUTTON.upper }))).toEqual([]);
+    expect(step({}, input({ buttons: BUTTON.lower }))).toEqual([]);
+    expect(sample({}, [input({ buttons: BUTTON.lower })])?.buttons).toBe(BUTTON.lower);
   });
 
   test("a thumbstick stops, and the pad of a controller without one: once for each press, of each controller", () => {

@@ -1,0 +1,54 @@
+// What is said of an episode, on the page and before the eyes.
+
+import { describe, expect, test } from "vitest";
+import { describeEpisode, type EpisodeNow, episodeAdvice, episodeTitle, isEpisodeOver, isUrgent, secondsLeft } from "../../src/ui/episodes.ts";
+
+const NOW: EpisodeNow = {
+  event: "episode_changed",
+  number: 13,
+  state: "countdown",
+  label: "",
+  participant: "p1",
+  task: "pour",
+  instruction: "Pour the cup.",
+  wanted: 50,
+  successes: 12,
+  started_by: "p1",
+  started_by_name: "ann",
+  led_by: "p1",
+  started_ns: 0,
+  until_ns: 3e9,
+  verdict: "",
+  robots: [],
+};
+
+describe("words", () => {
+  test("a countdown is in whole seconds, and none before the clock is known", () => {
+    expect([1, 1e9, 2.01e9, 3e9, 4e9].map((ns) => secondsLeft(NOW, ns))).toEqual([3, 2, 1, 0, 0]);
+    expect(secondsLeft(NOW, 0)).toBe(0);
+    expect(secondsLeft({ ...NOW, until_ns: 0 }, 1)).toBe(0);
+  });
+
+  test("the board has the task, how far it is, and what to do", () => {
+    expect(describeEpisode(NOW, 1e9, "ann")).toEqual(["Pour the cup.", "Episode 13, 12 of 50: begins in 2"]);
+    expect(describeEpisode({ ...NOW, state: "idle", number: 12 }, 1, "")).toEqual(["Pour the cup.", "12 episodes so far, 12 of 50"]);
+    expect(describeEpisode(null, 1, "")).toEqual([]);
+    expect(episodeTitle({ ...NOW, wanted: 0 })).toBe("Episode 13");
+  });
+
+  test("every state has its advice", () => {
+    const advice = (state: string, verdict = ""): string => episodeAdvice({ ...NOW, state, verdict }, 1e9, "ann");
+    expect(advice("running")).toBe("is recorded, led by ann");
+    expect(advice("confirm")).toBe("discard it? Ask again within 2 s");
+    expect(advice("left")).toBe("ann is disconnected: take it over within 2 s");
+    expect(advice("closing")).toBe("robots hold: was it a success? 2 s");
+    expect(advice("closing", "success")).toBe("success: the scene is made ready");
+    expect(advice("unknown")).toBe("unknown");
+  });
+
+  test("what asks for an answer is before the eyes, and an episode that is over is not", () => {
+    const states = ["countdown", "running", "confirm", "left", "closing", "success", "cancelled"];
+    expect(states.filter((state) => isUrgent({ ...NOW, state }))).toEqual(["countdown", "confirm", "left", "closing"]);
+    expect(states.filter((state) => isEpisodeOver({ ...NOW, state }))).toEqual(["success", "cancelled"]);
+  });
+});
