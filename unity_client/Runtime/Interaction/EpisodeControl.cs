@@ -1,176 +1,101 @@
-// Episodes from the buttons of a controller: a countdown before one begins, and a second press before one ends. Its number is shown.
-using System;
+// The episode before the eyes: its task, number and countdown, and what can be done now. The session itself acts on the buttons of
+// controllers; devices without buttons ask for the same actions.
 using IrisSession.Protocol;
 
 namespace IrisSession.Interaction
 {
-    public enum EpisodeStep
-    {
-        Idle,
-
-        /// <summary>It begins when the countdown is over; any press cancels.</summary>
-        Countdown,
-        Running,
-
-        /// <summary>The same button once more ends it as a success.</summary>
-        AskSuccess,
-
-        /// <summary>The same button once more discards it.</summary>
-        AskDiscard,
-    }
-
-    /// <summary>Counts down, asks again, and says what to send. For one thread.</summary>
+    /// <summary>Says how the episode stands, and what a press asks for. For one thread.</summary>
     public sealed class EpisodeControl
     {
-        /// <summary>Time to bring both hands to where they begin.</summary>
-        public const long CountdownNs = 3_000_000_000;
-
-        /// <summary>A question that has no answer for so long is withdrawn.</summary>
-        private const long AskNs = 4_000_000_000;
-
-        /// <summary>An answer to a request is waited for so long.</summary>
-        private const long ReplyNs = 5_000_000_000;
-
         /// <summary>How long the outcome of the last episode is shown.</summary>
         private const long OutcomeNs = 4_000_000_000;
 
-        private long untilNs;
-        private long waitUntilNs = long.MinValue;
+        private EpisodeChanged episode;
         private long outcomeUntilNs = long.MinValue;
-        private EpisodeStep asked;
-        private long runningNumber = -1;
-        private long outcomeNumber;
-        private string outcome = "";
+        private bool isSeen;
 
-        /// <summary>Number of the episode that runs, or of the next one.</summary>
-        public long Number { get; private set; } = 1;
-
-        public EpisodeStep Step { get; private set; }
-
-        /// <summary>Whole seconds that are left of the countdown.</summary>
+        /// <summary>Whole seconds until the countdown, the question or the time to take it over ends; 0: nothing is waited for.</summary>
         public int SecondsLeft { get; private set; }
 
         /// <summary>True in the frame in which a second of the countdown begins: to be felt.</summary>
         public bool IsTick { get; private set; }
 
-        /// <summary>Take the state of the session, and let time pass. Returns the action to request, an `EpisodeAction`; null for none.</summary>
-        public string Update(EpisodeChanged episode, bool isReady, long nowNs)
+        /// <summary>Take the state of the session, and let its time pass.</summary>
+        public void Update(EpisodeChanged now, long sessionNs)
         {
-            IsTick = false;
-            TakeEpisode(episode, nowNs);
-            bool isRunning = runningNumber >= 0;
-            if (!isReady && Step == EpisodeStep.Countdown) asked = EpisodeStep.Idle;
-            if (asked == EpisodeStep.Countdown && isRunning) asked = EpisodeStep.Idle; // another participant began it
-            if ((asked == EpisodeStep.AskSuccess || asked == EpisodeStep.AskDiscard) && (!isRunning || nowNs >= untilNs)) asked = EpisodeStep.Idle;
-            string action = null;
-            if (asked == EpisodeStep.Countdown && nowNs >= untilNs)
+            if (!ReferenceEquals(now, episode))
             {
-                asked = EpisodeStep.Idle;
-                waitUntilNs = nowNs + ReplyNs;
-                action = EpisodeAction.Start;
+                bool wasOpen = episode != null && !IsOver;
+                episode = now;
+                if (wasOpen && IsOver) outcomeUntilNs = sessionNs + OutcomeNs;
             }
-            Step = asked != EpisodeStep.Idle ? asked : isRunning ? EpisodeStep.Running : EpisodeStep.Idle;
-            int left = Step == EpisodeStep.Countdown ? (int)((untilNs - nowNs + 999_999_999) / 1_000_000_000) : 0;
-            IsTick = left > 0 && left != SecondsLeft;
+            bool isShown = !IsOver || sessionNs < outcomeUntilNs;
+            isSeen = now != null && (isShown || now.Task.Length > 0);
+            int left = now == null || now.UntilNs <= sessionNs ? 0 : (int)((now.UntilNs - sessionNs + 999_999_999) / 1_000_000_000);
+            IsTick = left > 0 && left != SecondsLeft && now.State == EpisodeState.Countdown;
             SecondsLeft = left;
-            return action;
         }
 
-        /// <summary>The lower button was pressed. Returns the action to request, null for none.</summary>
-        public string PressLower(long nowNs)
+        /// <summary>Return what the lower button asks for, an `EpisodeAction`; null: nothing now.</summary>
+        public string FindLower()
         {
-            if (nowNs < waitUntilNs) return null;
-            switch (Step)
+            if (IsOver) return EpisodeAction.Start;
+            switch (episode.State)
             {
-                case EpisodeStep.Idle:
-                    Begin(EpisodeStep.Countdown, nowNs + CountdownNs);
-                    return null;
-                case EpisodeStep.Running:
-                    Begin(EpisodeStep.AskSuccess, nowNs + AskNs);
-                    return null;
-                case EpisodeStep.AskSuccess:
-                    return End(EpisodeAction.Success, nowNs);
-                default:
-                    Begin(EpisodeStep.Idle, nowNs);
-                    return null;
+                case EpisodeState.Countdown: return null;
+                case EpisodeState.Confirm: return EpisodeAction.Failure;
+                case EpisodeState.Left: return EpisodeAction.TakeOver;
+                default: return EpisodeAction.Success;
             }
         }
 
-        /// <summary>The upper button was pressed. Returns the action to request, null for none.</summary>
-        public string PressUpper(long nowNs)
+        /// <summary>Return what the upper button asks for; null: nothing now.</summary>
+        public string FindUpper()
         {
-            if (nowNs < waitUntilNs) return null;
-            switch (Step)
-            {
-                case EpisodeStep.Running:
-                    Begin(EpisodeStep.AskDiscard, nowNs + AskNs);
-                    return null;
-                case EpisodeStep.AskDiscard:
-                    return End(EpisodeAction.Discard, nowNs);
-                default:
-                    Begin(EpisodeStep.Idle, nowNs);
-                    return null;
-            }
-        }
-
-        /// <summary>The session has answered: another press counts again.</summary>
-        public void Settle()
-        {
-            waitUntilNs = long.MinValue;
-        }
-
-        /// <summary>The headset was taken off, or is in the background: nothing begins by itself.</summary>
-        public void Cancel()
-        {
-            asked = EpisodeStep.Idle;
+            return IsOver || episode.State == EpisodeState.Left ? null : EpisodeAction.Discard;
         }
 
         /// <summary>Return the line about the episode, empty when there is nothing to say.</summary>
-        public string Describe(long nowNs)
+        public string Describe()
         {
-            switch (Step)
+            if (!isSeen) return "";
+            string task = episode.Instruction.Length > 0 ? episode.Instruction + " " : "";
+            string count = episode.Wanted > 0 ? ", " + episode.Successes + " of " + episode.Wanted : "";
+            string advice = Advise();
+            return task + "Episode " + episode.Number + count + (advice.Length > 0 ? ": " + advice : "");
+        }
+
+        private bool IsOver
+        {
+            get
             {
-                case EpisodeStep.Countdown:
-                    return "Episode " + Number + " begins in " + SecondsLeft + ": any button cancels";
-                case EpisodeStep.AskSuccess:
-                    return "Episode " + Number + ": press the lower button again for success";
-                case EpisodeStep.AskDiscard:
-                    return "Episode " + Number + ": press the upper button again to discard it";
-                case EpisodeStep.Running:
-                    return "Episode " + Number + " is recorded";
-                default:
-                    return nowNs < outcomeUntilNs ? "Episode " + outcomeNumber + ": " + outcome : "";
+                if (episode == null) return true;
+                switch (episode.State)
+                {
+                    case EpisodeState.Countdown:
+                    case EpisodeState.Running:
+                    case EpisodeState.Confirm:
+                    case EpisodeState.Left:
+                    case EpisodeState.Closing:
+                        return false;
+                    default:
+                        return true;
+                }
             }
         }
 
-        private void TakeEpisode(EpisodeChanged episode, long nowNs)
+        private string Advise()
         {
-            bool isRunning = episode != null && episode.State == "running";
-            if (runningNumber >= 0 && (!isRunning || episode.Number != runningNumber) && episode != null)
+            switch (episode.State)
             {
-                outcomeNumber = runningNumber;
-                outcome = isRunning ? "ended" : episode.State;
-                outcomeUntilNs = nowNs + OutcomeNs;
+                case EpisodeState.Idle: return "the lower button begins the next one";
+                case EpisodeState.Countdown: return "begins in " + SecondsLeft + ", the upper button cancels";
+                case EpisodeState.Running: return "is recorded";
+                case EpisodeState.Confirm: return "upper button again discards it, the lower one makes it a failure";
+                case EpisodeState.Left: return "its leader is disconnected, it ends in " + SecondsLeft;
+                case EpisodeState.Closing: return episode.Verdict.Length > 0 ? episode.Verdict : "lower button for success";
+                default: return episode.State;
             }
-            long before = runningNumber;
-            runningNumber = isRunning ? episode.Number : -1;
-            if (before != runningNumber) Settle();
-            Number = isRunning ? episode.Number : episode == null ? 1 : episode.Number + 1;
-        }
-
-        private void Begin(EpisodeStep step, long until)
-        {
-            asked = step;
-            Step = step == EpisodeStep.Idle && runningNumber >= 0 ? EpisodeStep.Running : step;
-            untilNs = until;
-        }
-
-        private string End(string action, long nowNs)
-        {
-            asked = EpisodeStep.Idle;
-            Step = EpisodeStep.Running;
-            waitUntilNs = nowNs + ReplyNs;
-            return action;
         }
     }
 }

@@ -36,8 +36,6 @@ namespace IrisSession.Interaction
         Acquire,
         Release,
         Press,
-        EpisodeLower,
-        EpisodeUpper,
 
         /// <summary>Stay where the scene is shown.</summary>
         Place,

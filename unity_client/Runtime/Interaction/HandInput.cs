@@ -54,7 +54,6 @@ namespace IrisSession.Interaction
             public bool Squeeze;
             public bool MustLetGo; // the squeeze was held when the hand appeared, and has not been let go since
             public bool MustLetGoTrigger;
-            public long Buttons;
             public long PressedNs; // when the trigger was pressed at one's own robot
             public string PressedAt = "";
             public long TappedNs; // when the trigger was pressed at nothing
@@ -216,7 +215,6 @@ namespace IrisSession.Interaction
             Hand hand = hands[side];
             bool isNew = !hand.IsKnown || hand.Kind != input.Kind;
             bool hadTrigger = hand.Trigger, hadSqueeze = hand.Squeeze;
-            long hadButtons = hand.Buttons;
             bool isSqueezed = IsPressed(isTouching ? 0 : input.Squeeze, isNew || hadSqueeze || hand.MustLetGo);
             bool trigger = IsPressed(input.Trigger, isNew || hadTrigger);
             hand.MustLetGo = isSqueezed && (isNew || hand.MustLetGo);
@@ -225,7 +223,6 @@ namespace IrisSession.Interaction
             hand.Kind = input.Kind;
             hand.Trigger = trigger;
             hand.Squeeze = isSqueezed && !hand.MustLetGo;
-            hand.Buttons = MaskButtons(input);
             if (isNew)
             {
                 hand.PressedNs = hand.TappedNs = Never;
@@ -234,9 +231,6 @@ namespace IrisSession.Interaction
             }
             if (hand.Squeeze && !hadSqueeze) BeginSqueeze(side, context.Held);
             ReadTrigger(side, hadTrigger, nowNs, context, intents);
-            long pressed = hand.Buttons & ~hadButtons;
-            if ((pressed & ButtonBits.Lower) != 0) intents.Add(new HandIntent(IntentKind.EpisodeLower));
-            if ((pressed & ButtonBits.Upper) != 0) intents.Add(new HandIntent(IntentKind.EpisodeUpper));
         }
 
         private void ReadTrigger(int side, bool wasPressed, long nowNs, HandContext context, List<HandIntent> intents)

@@ -17,7 +17,6 @@ namespace IrisSession.Interaction
         {
             public long Ticket;
             public string Robot; // of an acquire
-            public bool IsEpisode;
         }
 
         private readonly ISessionPort session;
@@ -117,9 +116,8 @@ namespace IrisSession.Interaction
                 Hands.Update(Reading, context, intents);
                 foreach (HandIntent intent in intents) Do(intent, nowNs);
             }
-            bool canRecord = isLive && session.IsJoined;
-            Request(Episode.Update(session.Episode, canRecord, nowNs), nowNs);
-            if (Episode.IsTick) PlayBoth(Pulse.Tick);
+            Episode.Update(session.Episode, session.HasClock ? session.ToSessionNs(nowNs) : 0);
+            if (Episode.IsTick && isLive) PlayBoth(Pulse.Tick);
             Send(isLive);
             Markers?.Update(Reading, session);
         }
@@ -170,7 +168,6 @@ namespace IrisSession.Interaction
                 pending.RemoveAt(i);
                 bool isGranted = reply != null && reply.Ok;
                 if (one.Robot != null) Hands.Settle(one.Robot, isGranted, nowNs);
-                if (one.IsEpisode) Episode.Settle();
                 if (reply != null && reply.Denial != null) News.Set(reply.Denial, nowNs);
                 return;
             }
@@ -179,8 +176,8 @@ namespace IrisSession.Interaction
         /// <summary>Do what the lower, or the upper, button of a controller does: for devices without buttons.</summary>
         public void PressEpisode(bool isLower)
         {
-            long nowNs = Reading.CaptureNs;
-            Request(isLower ? Episode.PressLower(nowNs) : Episode.PressUpper(nowNs), nowNs);
+            string action = isLower ? Episode.FindLower() : Episode.FindUpper();
+            if (action != null) session.Request(new Episode { Action = action });
         }
 
         /// <summary>Stop all robots.</summary>
@@ -220,7 +217,6 @@ namespace IrisSession.Interaction
         {
             Hands.Suspend();
             WristStop.Suspend();
-            Episode.Cancel();
             Touching.Suspend();
         }
 
@@ -318,12 +314,6 @@ namespace IrisSession.Interaction
                 case IntentKind.Press:
                     Press(intent.Button);
                     break;
-                case IntentKind.EpisodeLower:
-                    Request(Episode.PressLower(nowNs), nowNs);
-                    break;
-                case IntentKind.EpisodeUpper:
-                    Request(Episode.PressUpper(nowNs), nowNs);
-                    break;
                 case IntentKind.Place:
                     if (!OwnPlace.HasValue) break;
                     PlaceAlignment place = new PlaceAlignment { Participant = session.ParticipantId };
@@ -350,14 +340,6 @@ namespace IrisSession.Interaction
             {
                 CommandError = error; // of the application: samples and the e-stop go on
             }
-        }
-
-        private void Request(string episodeAction, long nowNs)
-        {
-            if (episodeAction == null) return;
-            long ticket = session.Request(new Episode { Action = episodeAction });
-            if (ticket == 0) Episode.Settle();
-            else pending.Add(new PendingRequest { Ticket = ticket, IsEpisode = true });
         }
 
         private void Send(bool isLive)

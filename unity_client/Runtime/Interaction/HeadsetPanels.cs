@@ -160,7 +160,7 @@ namespace IrisSession.Interaction
             }
             if (session.IsJoined && session.AlignmentState == AlignmentState.None && !input.Touching.IsActive) WrapIfAny(PanelWords.DescribeMarkers(input.Markers));
             TouchWords.Describe(text, input.Touching, session, nowNs);
-            WrapIfAny(input.Episode.Describe(nowNs));
+            WrapIfAny(input.Episode.Describe());
             if (nowNs - news.EventNs < NewsNs) WrapIfAny(PanelWords.DescribeEvent(news.Event, input.HoldsRobots));
             WrapIfAny(notice);
             Set(Urgent, text.ToString().TrimStart('\n'));

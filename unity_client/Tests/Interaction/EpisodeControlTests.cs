@@ -8,96 +8,77 @@ namespace IrisSession.Interaction.Tests
     {
         private const long Second = 1_000_000_000;
 
+        private static EpisodeChanged Make(string state, long untilNs = 0)
+        {
+            return new EpisodeChanged
+            {
+                Number = 4, State = state, Task = "pour", Instruction = "Pour the cup.", Wanted = 50, Successes = 3, UntilNs = untilNs,
+            };
+        }
+
         [Test]
-        public void EpisodeBeginsAfterACountdownThatIsFelt()
+        public void CountdownIsFeltOnceASecond()
         {
             EpisodeControl control = new EpisodeControl();
-            Assert.IsNull(control.Update(null, true, 0));
-            Assert.IsNull(control.PressLower(0));
+            EpisodeChanged countdown = Make(EpisodeState.Countdown, 3 * Second);
             int ticks = 0;
             for (long now = 0; now < 3 * Second; now += Second / 10)
             {
-                Assert.IsNull(control.Update(null, true, now));
+                control.Update(countdown, now);
                 if (control.IsTick) ticks++;
-                Assert.AreEqual(EpisodeStep.Countdown, control.Step);
+                StringAssert.Contains("begins in " + control.SecondsLeft, control.Describe());
             }
             Assert.AreEqual(3, ticks);
-            Assert.AreEqual(EpisodeAction.Start, control.Update(null, true, 3 * Second));
-            Assert.IsNull(control.Update(null, true, 3 * Second + 1), "once");
-            Assert.IsNull(control.PressLower(3 * Second + 2), "the answer is waited for");
-            Assert.AreEqual(EpisodeStep.Idle, control.Step);
+            control.Update(countdown, 3 * Second);
+            Assert.AreEqual(0, control.SecondsLeft);
         }
 
-        [TestCase(true)]
-        [TestCase(false)]
-        public void AnyPressCancelsTheCountdown(bool isLower)
+        [TestCase(EpisodeState.Idle, EpisodeAction.Start, null)]
+        [TestCase(EpisodeState.Countdown, null, EpisodeAction.Discard)]
+        [TestCase(EpisodeState.Running, EpisodeAction.Success, EpisodeAction.Discard)]
+        [TestCase(EpisodeState.Confirm, EpisodeAction.Failure, EpisodeAction.Discard)]
+        [TestCase(EpisodeState.Left, EpisodeAction.TakeOver, null)]
+        [TestCase(EpisodeState.Closing, EpisodeAction.Success, EpisodeAction.Discard)]
+        [TestCase(EpisodeState.Unknown, EpisodeAction.Start, null)]
+        public void PressAsksForWhatTheStateAllows(string state, string lower, string upper)
         {
             EpisodeControl control = new EpisodeControl();
-            control.Update(null, true, 0);
-            control.PressLower(0);
-            control.Update(null, true, Second);
-            Assert.IsNull(isLower ? control.PressLower(Second) : control.PressUpper(Second));
-            Assert.IsNull(control.Update(null, true, 4 * Second));
-            Assert.AreEqual(EpisodeStep.Idle, control.Step);
+            control.Update(Make(state, Second), 0);
+            Assert.AreEqual(lower, control.FindLower());
+            Assert.AreEqual(upper, control.FindUpper());
+            StringAssert.StartsWith("Pour the cup. Episode 4, 3 of 50: ", control.Describe());
         }
 
         [Test]
-        public void HeadsetThatIsTakenOffBeginsNothing()
+        public void OutcomeIsShownForAMomentWithoutATask()
         {
             EpisodeControl control = new EpisodeControl();
-            control.Update(null, true, 0);
-            control.PressLower(0);
-            Assert.IsNull(control.Update(null, false, 3 * Second));
-            Assert.IsNull(control.Update(null, true, 4 * Second));
-            control.PressLower(5 * Second);
-            control.Update(null, true, 5 * Second);
-            control.Cancel();
-            Assert.IsNull(control.Update(null, true, 9 * Second));
+            control.Update(null, 0);
+            Assert.AreEqual("", control.Describe());
+            Assert.AreEqual(EpisodeAction.Start, control.FindLower());
+            control.Update(new EpisodeChanged { Number = 1, State = EpisodeState.Running }, Second);
+            Assert.AreEqual("Episode 1: is recorded", control.Describe());
+            EpisodeChanged over = new EpisodeChanged { Number = 1, State = EpisodeState.Discarded };
+            control.Update(over, 2 * Second);
+            Assert.AreEqual("Episode 1: discarded", control.Describe());
+            control.Update(over, 9 * Second);
+            Assert.AreEqual("", control.Describe());
         }
 
         [Test]
-        public void EpisodeEndsByTheSameButtonTwice()
-        {
-            EpisodeControl control = new EpisodeControl();
-            EpisodeChanged running = new EpisodeChanged { Number = 4, State = "running" };
-            control.Update(running, true, 0);
-            Assert.AreEqual(4, control.Number);
-            Assert.IsNull(control.PressLower(0));
-            Assert.AreEqual(EpisodeStep.AskSuccess, control.Step);
-            control.Update(running, true, 5 * Second);
-            Assert.AreEqual(EpisodeStep.Running, control.Step, "no answer");
-            Assert.IsNull(control.PressLower(5 * Second));
-            Assert.IsNull(control.PressUpper(5 * Second), "another button takes it back");
-            Assert.IsNull(control.PressUpper(5 * Second));
-            control.Update(running, true, 6 * Second);
-            Assert.AreEqual(EpisodeAction.Discard, control.PressUpper(6 * Second));
-            control.Update(new EpisodeChanged { Number = 4, State = "discarded" }, true, 7 * Second);
-            Assert.AreEqual(EpisodeStep.Idle, control.Step);
-            Assert.AreEqual(5, control.Number);
-            StringAssert.Contains("4", control.Describe(7 * Second));
-            Assert.AreEqual("", control.Describe(20 * Second));
-            control.PressLower(8 * Second);
-            control.Update(running, true, 8 * Second + 1);
-            Assert.AreEqual(EpisodeStep.Running, control.Step, "another participant began one meanwhile");
-            control.PressLower(9 * Second);
-            Assert.AreEqual(EpisodeAction.Success, control.PressLower(9 * Second));
-        }
-
-        [Test]
-        public void WearerBeginsAndEndsAnEpisodeByTheButtonsOfAController()
+        public void ButtonsOfControllersAreInTheSamplesAndAskForNothing()
         {
             Wearer wearer = new Wearer();
             wearer.Run();
-            wearer.PressButton(Side.Right, ButtonBits.Lower);
-            wearer.RunFor(EpisodeControl.CountdownNs);
-            Assert.AreEqual(EpisodeAction.Start, ((Episode)wearer.Session.Requests[0]).Action);
-            Assert.AreEqual(6, wearer.Haptics.Played.Count, "three seconds, both hands");
-            wearer.Session.Episode = new EpisodeChanged { Number = 1, State = "running" };
-            wearer.Input.TakeReply(1, new Reply { Ok = true }, 0);
+            wearer[Side.Right].Buttons = ButtonBits.Lower;
             wearer.Run();
-            wearer.PressButton(Side.Right, ButtonBits.Lower);
-            wearer.PressButton(Side.Right, ButtonBits.Lower);
-            Assert.AreEqual(EpisodeAction.Success, ((Episode)wearer.Session.Requests[1]).Action);
+            Assert.AreEqual(ButtonBits.Lower, wearer.Session.Find(Device.ControllerRight).Buttons);
+            Assert.IsEmpty(wearer.Session.Requests);
+            wearer.Session.Episode = Make(EpisodeState.Countdown, FakePort.SessionOffset + 1000 * Second);
+            wearer.Run(2);
+            Assert.AreEqual(2, wearer.Haptics.Played.Count, "both hands, once");
+            wearer.Input.PressEpisode(false);
+            Assert.AreEqual(EpisodeAction.Discard, ((Episode)wearer.Session.Requests[0]).Action);
         }
     }
 }

@@ -122,7 +122,7 @@ namespace IrisSession.Interaction.Tests
             wearer.Run(10);
             SampleInput sample = wearer.Session.Find(Device.ControllerRight);
             Assert.IsFalse(sample.Clutch);
-            Assert.AreEqual(EpisodeStep.Idle, wearer.Input.Episode.Step);
+            Assert.AreEqual(0, wearer.Session.Find(Device.ControllerLeft).Buttons & ButtonBits.Lower, "the session begins no episode");
             wearer.PressButton(Side.Left, ButtonBits.Upper);
             wearer.Run(10);
             Assert.IsFalse(touching.IsActive);
