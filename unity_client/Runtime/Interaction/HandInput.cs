@@ -75,6 +75,8 @@ namespace IrisSession.Interaction
         private readonly SampleInput[] bare = { new SampleInput { Device = Device.HandLeft }, new SampleInput { Device = Device.HandRight } };
         private long frameNs = Never;
         private bool isTouching;
+        private bool wasTouching;
+        private readonly long[] withheld = new long[Sides];
 
         /// <summary>Take the buttons of the e-stop. Returns whether one is pressed that was not in the frame before.</summary>
         public bool TakeStops(HeadsetReading reading)
@@ -97,6 +99,7 @@ namespace IrisSession.Interaction
             if (frameNs == Never || nowNs - frameNs > GapNs) Suspend();
             frameNs = nowNs;
             if (isTouching != context.IsTouching) Suspend();
+            wasTouching = isTouching;
             isTouching = context.IsTouching;
             guessed.Clear();
             guessed.AddRange(context.Guessed);
@@ -204,7 +207,7 @@ namespace IrisSession.Interaction
                 if (isNamed) sample.Robots.Add(hand.Driven);
                 sample.Clutch = IsSqueezing((Side)side) && (hand.BoundNs == Never || reading.CaptureNs - hand.BoundNs >= OpenNs);
                 sample.Gripper = sample.Clutch ? hand.Grasp : null;
-                sample.Buttons = MaskButtons(input);
+                sample.Buttons = MaskButtons(side, input);
                 sample.HandJoints = isVisible ? input.Joints : InputReading.NoJoints;
                 samples.Add(sample);
             }
@@ -339,9 +342,12 @@ namespace IrisSession.Interaction
             Bind(side, best);
         }
 
-        private long MaskButtons(InputReading input)
+        /// <summary>Return the buttons without those that are pressed for marks that are touched: these count from their next press.</summary>
+        private long MaskButtons(int side, InputReading input)
         {
-            return isTouching ? input.Buttons & ~TouchingButtons : input.Buttons;
+            bool isForMarks = isTouching || wasTouching; // the press that ends it, too
+            withheld[side] = input.Buttons & (isForMarks ? TouchingButtons : withheld[side]);
+            return input.Buttons & ~withheld[side];
         }
 
         private static bool IsPressed(double value, bool before)

@@ -127,6 +127,7 @@ namespace IrisSession.Interaction.Tests
             wearer.Run(10);
             Assert.IsFalse(touching.IsActive);
             Assert.IsFalse(wearer.Session.Find(Device.ControllerRight).Clutch, "it counts from the next squeeze");
+            Assert.IsEmpty(wearer.Session.Samples.FindAll(one => (one.Buttons & (ButtonBits.Lower | ButtonBits.Upper)) != 0));
             wearer[Side.Right].Squeeze = 0;
             wearer.Run(10);
             wearer[Side.Right].Squeeze = 1;

@@ -9,7 +9,7 @@ import type { SampleInput } from "../core/api.ts";
 import { Grips } from "./grips.ts";
 import type { MenuItem } from "./picture_places.ts";
 import type { Answer } from "./question.ts";
-import type { FrameReading, InputReading, Side } from "./reading.ts";
+import { BUTTON, type FrameReading, type InputReading, type Side } from "./reading.ts";
 
 /** A value is pressed from the first on, and until it falls below the second. */
 const PRESS = 0.6;
@@ -82,6 +82,9 @@ export class Hands {
   private readonly bound_ms = new Map<Side, number>();
   /** Robots that hold for an estimated pose, as the session says. */
   private guessed: readonly string[] = [];
+  private isTouching = false;
+  private wasTouching = false;
+  private readonly withheld = new Map<Side, number>();
   private readonly grips = new Grips();
   /** What is asked of the gripper of each hand in this frame. */
   private readonly grasps = new Map<Side, number | null>();
@@ -103,6 +106,7 @@ export class Hands {
     if (dt_ms > GAP_MS) this.suspend();
     this.frame_ms = capture_ms;
     this.guessed = context.guessed;
+    [this.wasTouching, this.isTouching] = [this.isTouching, context.isTouching];
     for (const [side, robot] of this.driven) if (!context.held.includes(robot)) this.driven.delete(side);
     const intents: Intent[] = [];
     const inputs = reading.inputs.filter(({ tracked }) => tracked);
@@ -166,11 +170,19 @@ export class Hands {
         robots: isNamed ? [robot] : [],
         clutch,
         gripper: clutch ? (this.grasps.get(side) ?? null) : null,
-        buttons: input.buttons,
+        buttons: input.buttons & ~this.withhold(side, input.buttons),
         ...(isVisible && input.joints.length > 0 && { hand_joints: [...input.joints] }),
       });
     }
     return samples;
+  }
+
+  /** Return the buttons of episodes that are pressed for marks that are touched: they are not sent until they are let go. */
+  private withhold(side: Side, buttons: number): number {
+    const isForMarks = this.isTouching || this.wasTouching; // the press that ends it, too
+    const withheld = buttons & (isForMarks ? BUTTON.lower | BUTTON.upper : (this.withheld.get(side) ?? 0));
+    this.withheld.set(side, withheld);
+    return withheld;
   }
 
   private updateHand(input: InputReading, now_ms: number, context: Context, intents: Intent[]): void {

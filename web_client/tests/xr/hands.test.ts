@@ -242,6 +242,16 @@ describe("buttons", () => {
     expect(sample({}, [input({ buttons: BUTTON.lower })])?.buttons).toBe(BUTTON.lower);
   });
 
+  test("those that are pressed for marks are not, and the one that ends it only from its next press", () => {
+    const touching = { isTouching: true };
+    step(touching, input());
+    expect(sample(touching, [input({ buttons: BUTTON.lower | BUTTON.squeeze })])?.buttons).toBe(BUTTON.squeeze);
+    step(touching, input());
+    for (let i = 0; i < 3; i++) expect(sample({}, [input({ buttons: BUTTON.upper })])?.buttons).toBe(0);
+    sample({}, [input()]);
+    expect(sample({}, [input({ buttons: BUTTON.upper })])?.buttons).toBe(BUTTON.upper);
+  });
+
   test("a thumbstick stops, and the pad of a controller without one: once for each press, of each controller", () => {
     const stops = (...inputs: InputReading[]): boolean => hands.takeStops(reading(...inputs).stops);
     for (const buttons of [BUTTON.thumbstick, BUTTON.touchpad]) {
