@@ -126,7 +126,7 @@ def describe_episode(now: EpisodeChanged | None, now_ns: int) -> str:
     verdict = now.verdict or "(verdict: e success, f failure, d discard)"
     text = _EPISODES.get(now.state, now.state).format(left=left, leader=now.started_by_name, verdict=verdict)
     count = f", {now.successes} of {now.wanted}" if now.wanted else ""
-    task = f"{now.instruction or now.task}: " if now.task else ""
+    task = f"{(now.instruction or now.task).rstrip('.')}: " if now.task else ""
     return f"{task}episode {now.number}{count}: {text}"
 
 

@@ -63,7 +63,7 @@ def test_episode_has_a_line_that_says_what_to_do() -> None:
         13, "countdown", "", "p1", "pour", "Pour the cup.", 50, 12, "p1", "ann", until_ns=3_000_000_000
     )
     assert describe_episode(None, 0) == ""
-    assert describe_episode(now, 900_000_000) == "Pour the cup.: episode 13, 12 of 50: begins in 3 s, d cancels"
+    assert describe_episode(now, 900_000_000) == "Pour the cup: episode 13, 12 of 50: begins in 3 s, d cancels"
     for state, text in {
         "idle": "e starts the next one",
         "running": "is recorded, by ann",
@@ -73,7 +73,7 @@ def test_episode_has_a_line_that_says_what_to_do() -> None:
         "success": "success",
     }.items():
         line = describe_episode(msgspec.structs.replace(now, state=state), 0)
-        assert line == f"Pour the cup.: episode 13, 12 of 50: {text}"
+        assert line == f"Pour the cup: episode 13, 12 of 50: {text}"
     assert describe_episode(EpisodeChanged(1, "running", started_by_name="bob"), 0) == "episode 1: is recorded, by bob"
 
 
