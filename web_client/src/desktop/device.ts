@@ -82,15 +82,13 @@ export class DesktopDevice {
       this.disarm(now_ms);
       return false;
     }
-    if (!situation.isReady) this.release("the connection is lost", now_ms);
-    else if (situation.isStopped) this.release("e-stop", now_ms);
-    else if (situation.isPaused) this.release("the session was paused", now_ms);
-    const isBlocked = !situation.isReady || situation.isStopped || situation.isPaused;
+    const blocked = findBlock(situation);
+    if (blocked !== "") this.release(blocked, now_ms);
     const isHeld = this.readDeadMen(inputs);
     const motion = merge(inputs.values());
     const isFlipped = motion.toggle && !this.wasToggled;
     this.wasToggled = motion.toggle;
-    if (!isHeld || isBlocked) {
+    if (!isHeld || blocked !== "") {
       this.sendHold(now_ms);
       return true;
     }
@@ -132,6 +130,13 @@ export class DesktopDevice {
     const { robot } = this;
     return { device: "desktop", kind: "twist", pose: null, capture_ms: now_ms, robots: [robot], clutch: false, twist: [0, 0, 0, 0, 0, 0] };
   }
+}
+
+/** Return in words what keeps every dead-man from counting, empty for nothing. */
+function findBlock({ isReady, isStopped, isPaused }: Situation): string {
+  if (!isReady) return "the connection is lost";
+  if (isStopped) return "e-stop";
+  return isPaused ? "the session was paused" : "";
 }
 
 /** Return the twist of a motion in the world [m/s, rad/s]: no faster than `speed`, whatever the direction. */

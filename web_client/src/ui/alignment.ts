@@ -2,7 +2,7 @@
 
 import type { AnchorPlace, ParticipantInfo } from "../core/api.ts";
 import type { Actions } from "./actions.ts";
-import { button, h, KeyedList, type Row, setText } from "./dom.ts";
+import { button, h, KeyedList, type Row, setLabel, setText } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
 import { alignmentWords, capitalize, doubtWords, formatAge, formatMillimetres } from "./words.ts";
@@ -85,8 +85,8 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
       const mayChange = state.isDirector || id === state.selfId;
       start.hidden = stop.hidden = !mayChange;
       stop.hidden ||= !(report?.running ?? false);
-      start.setAttribute("aria-label", `Measure again: ${item.name}`);
-      stop.setAttribute("aria-label", `Keep: ${item.name}`);
+      setLabel(start, `Measure again: ${item.name}`);
+      setLabel(stop, `Keep: ${item.name}`);
     },
   };
 }

@@ -180,7 +180,8 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   state.onChange(() => {
     const name = state.welcome?.session_name || state.info?.session_name || "";
     setText(title, name || "iris-session");
-    document.title = `${state.session?.estop ? "STOPPED, " : state.pause ? "PAUSED, " : ""}${name ? `${name}, ` : ""}iris-session`;
+    const shownTitle = `${state.session?.estop ? "STOPPED, " : state.pause ? "PAUSED, " : ""}${name ? `${name}, ` : ""}iris-session`;
+    if (document.title !== shownTitle) document.title = shownTitle;
     document.body.classList.toggle("is-stopped", state.session?.estop ?? false);
     document.body.classList.toggle("is-paused", state.pause !== null);
     estop.update();

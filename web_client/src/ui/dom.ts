@@ -44,16 +44,24 @@ export function setText(element: Element, text: string): void {
   if (element.textContent !== text) element.textContent = text;
 }
 
+/** Set what an element is called where its text does not say it, if it differs. */
+export function setLabel(element: Element, text: string): void {
+  if (element.ariaLabel !== text) element.ariaLabel = text;
+}
+
 /** Return a button with a text. */
 export function button(text: string, onClick: () => void, props: Props = {}): HTMLButtonElement {
   return h("button", { type: "button", ...props, on: { click: onClick, ...props.on } }, text);
 }
 
+/** Options that selects have, as one text. */
+const shownOptions = new WeakMap<HTMLSelectElement, string>();
+
 /** Replace the options of a select if they differ, and keep what is chosen. */
 export function setOptions(select: HTMLSelectElement, options: readonly (readonly [value: string, text: string])[]): void {
   const key = JSON.stringify(options);
-  if (select.dataset.options === key) return;
-  select.dataset.options = key;
+  if (shownOptions.get(select) === key) return;
+  shownOptions.set(select, key);
   const { value } = select;
   select.replaceChildren(...options.map(([v, text]) => h("option", { attributes: { value: v } }, text)));
   if (options.some(([v]) => v === value)) select.value = value;

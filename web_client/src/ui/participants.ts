@@ -3,7 +3,7 @@
 import type { ParticipantInfo } from "../core/api.ts";
 import { participantColor } from "../view/avatars.ts";
 import type { Actions } from "./actions.ts";
-import { button, h, KeyedList, type Row, setOptions, setText, setValue } from "./dom.ts";
+import { button, h, KeyedList, type Row, setLabel, setOptions, setText, setValue } from "./dom.ts";
 import { makeSection, type Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
 import { alignmentWords, formatMilliseconds, formatShare, roleWords } from "./words.ts";
@@ -78,9 +78,9 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
       more.hidden = !state.isDirector;
       setOptions(role, [...new Set([item.role, ...ROLES])].map((one) => [one, roleWords(one)] as const));
       setValue(role, item.role);
-      role.setAttribute("aria-label", `Role of ${item.name}`);
-      nameField.setAttribute("aria-label", `New name of ${item.name}`);
-      remove.setAttribute("aria-label", `Remove: ${item.name}`);
+      setLabel(role, `Role of ${item.name}`);
+      setLabel(nameField, `New name of ${item.name}`);
+      setLabel(remove, `Remove: ${item.name}`);
       setValue(nameField, nameField.value || item.name);
       remove.hidden = id === state.selfId;
     },

@@ -2,7 +2,7 @@
 
 import type { Drive } from "../desktop/drive.ts";
 import type { Actions } from "./actions.ts";
-import { button, h, setOptions, setText, setValue } from "./dom.ts";
+import { button, h, setLabel, setOptions, setText, setValue } from "./dom.ts";
 import type { PageState } from "./state.ts";
 
 const FREE = "";
@@ -56,9 +56,9 @@ export function makeRobotControls(robot: () => string, state: PageState, actions
       steer.hidden = !isMine || !state.isReady;
       setText(steer, drive.robot === name ? "Stop driving" : "Drive");
       release.hidden = !isMine || !state.isReady;
-      for (const one of [take, wait, steer, release]) one.setAttribute("aria-label", `${one.textContent ?? ""}: ${name}`);
+      for (const one of [take, wait, steer, release]) setLabel(one, `${one.textContent ?? ""}: ${name}`);
       assign.hidden = !state.isDirector;
-      select.setAttribute("aria-label", `Assign ${name} to`);
+      setLabel(select, `Assign ${name} to`);
       const drivers = (state.session?.participants ?? []).filter((one) => DRIVERS.includes(one.role) || one.id === lease?.holder);
       setOptions(select, [[FREE, "free"], ...drivers.map((one) => [one.id, state.nameOf(one.id)] as const)]);
       setValue(select, lease?.holder ?? FREE);

@@ -22,11 +22,35 @@ const STEP_S = 0.05;
 /** A label that is nearer to where it was is not moved [pixels]. */
 const STILL_PX = 0.5;
 
-interface LabelRow {
-  robot: string;
-  element: HTMLElement;
+/** Where a label is in the picture: the middle of its lower edge, and its size [pixels]. */
+export interface LabelBox {
   x: number;
   y: number;
+  width: number;
+  height: number;
+  /** Distance into the picture: of labels of one rank the nearer one stays. */
+  depth: number;
+  /** The greatest stays. */
+  rank: number;
+}
+
+interface LabelRow extends LabelBox {
+  robot: string;
+  element: HTMLElement;
+  isSeen: boolean;
+}
+
+/** Return the labels that would cover others, and are left out for them. */
+export function findCrowded<T extends LabelBox>(labels: readonly T[]): Set<T> {
+  const shown: T[] = [];
+  const crowded = new Set<T>();
+  for (const one of [...labels].sort((a, b) => b.rank - a.rank || a.depth - b.depth)) {
+    const covers = (other: T): boolean =>
+      Math.abs(one.x - other.x) < (one.width + other.width) / 2 && one.y > other.y - other.height && other.y > one.y - one.height;
+    if (shown.some(covers)) crowded.add(one);
+    else shown.push(one);
+  }
+  return crowded;
 }
 
 export interface RobotOverlay {
@@ -55,7 +79,17 @@ export function makeRobotOverlay(
   let chosen = "";
   let holding: number | null = null;
   let pressed = { pointer: -1, x: 0, y: 0 };
+  /** The robot that the pointer is at, empty for none. */
+  let pointed = "";
   let [width, height] = [1, 1];
+  const sizes = new ResizeObserver((entries) => {
+    for (const { target, borderBoxSize } of entries) {
+      const label = labels.find(({ element }) => element === target);
+      const size = borderBoxSize[0];
+      if (label && size && size.inlineSize > 0) [label.width, label.height] = [size.inlineSize, size.blockSize];
+    }
+    thinOut();
+  });
   view.addToWorld(gizmo.object);
   new ResizeObserver(() => ([width, height] = [canvas.clientWidth, canvas.clientHeight])).observe(canvas);
 
@@ -63,9 +97,10 @@ export function makeRobotOverlay(
     const dot = h("span", { class: "dot", aria: { hidden: "true" } });
     const who = h("span");
     const element = h("button", { type: "button", class: "robot-label", data: { label: name } }, dot, h("strong", {}, name), who);
-    const label: LabelRow = { robot: name, element, x: Number.NEGATIVE_INFINITY, y: 0 };
+    const label: LabelRow = { robot: name, element, x: Number.NEGATIVE_INFINITY, y: 0, width: 0, height: 0, depth: 0, rank: 0, isSeen: true };
     element.addEventListener("click", () => menu.open(name, label));
     labels.push(label);
+    sizes.observe(element);
     const update = (): void => {
       const holder = state.lease(name)?.holder ?? "";
       const isMine = state.heldBy(state.selfId).includes(name);
@@ -91,20 +126,39 @@ export function makeRobotOverlay(
     gizmo.lag_s = (view.delay_ms + (state.rtt_ms || 0)) / 1000 + STEP_S;
     if (gizmo.object.visible) gizmo.place(p_world, q_world, camera);
     if (!isOnScreen) return;
+    let isChanged = false;
     for (const label of labels) {
       const isKnown = places.readLabel(label.robot, p_world);
       p_world.applyMatrix4(T_THREE_WORLD).project(camera);
       const isSeen = isKnown && Math.abs(p_world.z) < 1;
-      label.element.hidden = !isSeen;
+      if (isSeen !== label.isSeen) {
+        label.isSeen = isSeen;
+        label.element.hidden = !isSeen;
+        isChanged = true;
+      }
       const x = ((1 + p_world.x) / 2) * width;
       const y = ((1 - p_world.y) / 2) * height;
       if (!isSeen || (Math.abs(x - label.x) < STILL_PX && Math.abs(y - label.y) < STILL_PX)) continue;
+      isChanged = true;
       label.x = x;
       label.y = y;
+      label.depth = p_world.z;
       label.element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -100%)`;
     }
+    if (isChanged) thinOut();
   }
   view.onDraw = place;
+
+  /** Leave out labels that would cover others: first those of robots that are neither pointed at, nor held by this person. */
+  function thinOut(): void {
+    const mine = state.heldBy(state.selfId);
+    for (const label of labels) {
+      const { robot, element } = label;
+      label.rank = robot === pointed || element === document.activeElement ? 3 : robot === drive.robot ? 2 : mine.includes(robot) ? 1 : 0;
+    }
+    const crowded = findCrowded(labels.filter(({ isSeen }) => isSeen));
+    for (const label of labels) label.element.classList.toggle("crowded", crowded.has(label));
+  }
 
   function onDown(event: PointerEvent): void {
     if (event.target !== canvas) return;
@@ -124,7 +178,13 @@ export function makeRobotOverlay(
     if (event.pointerId === holding) gizmo.drag(toPlace(event));
     else if (event.target === canvas && event.buttons === 0) {
       const at = toPlace(event);
-      canvas.style.cursor = gizmo.hover(at) ? "grab" : places.pick(at, view.viewpoint.camera) === null ? "" : "pointer";
+      const isHandle = gizmo.hover(at);
+      const robot = places.pick(at, view.viewpoint.camera) ?? "";
+      canvas.style.cursor = isHandle ? "grab" : robot === "" ? "" : "pointer";
+      if (robot !== pointed) {
+        pointed = robot;
+        thinOut();
+      }
     } else return;
     view.touchOverlay();
   }
@@ -162,6 +222,7 @@ export function makeRobotOverlay(
       rows.update(robots, ({ name }) => name);
       menu.update();
       if (chosen !== before) gizmo.letGo();
+      thinOut();
       if (chosen !== before || labels.length !== length) view.touchOverlay();
     },
   };

@@ -14,6 +14,7 @@ export function makeWorldRoot(): Group {
   root.name = "world";
   root.matrixAutoUpdate = false;
   root.matrix.copy(T_THREE_WORLD);
+  root.matrixWorldNeedsUpdate = true;
   return root;
 }
 

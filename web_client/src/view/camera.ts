@@ -34,6 +34,7 @@ export class Viewpoint {
   /** Index of the scene's camera that is looked through, -1 for the free one. */
   private chosen = -1;
   private readonly lastMatrix = new Matrix4();
+  private readonly matrix = new Matrix4();
 
   constructor(canvas: HTMLCanvasElement) {
     this.controls = new OrbitControls(this.free, canvas);
@@ -119,9 +120,9 @@ export class Viewpoint {
     }
     const { camera } = this;
     camera.updateMatrixWorld();
-    const now = new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse);
-    if (now.equals(this.lastMatrix)) return false;
-    this.lastMatrix.copy(now);
+    this.matrix.multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse);
+    if (this.matrix.equals(this.lastMatrix)) return false;
+    this.lastMatrix.copy(this.matrix);
     return true;
   }
 

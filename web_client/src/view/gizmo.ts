@@ -20,9 +20,16 @@ const RING_SHARE = 0.65;
 const LEFT_BUTTON = 0;
 const NO_BUTTON = -1;
 
+/** A group that costs nothing while it is hidden: three.js updates what is hidden, too. */
+class HidableGroup extends Group {
+  override updateMatrixWorld(force?: boolean): void {
+    if (this.visible) super.updateMatrixWorld(force);
+  }
+}
+
 /** Handles of one gripper. Add `object` to the session's world. `onChange`: they look different now. */
 export class Gizmo {
-  readonly object = new Group();
+  readonly object = new HidableGroup();
   /** The pointer drags a handle. */
   isHeld = false;
   /** From a sample until its effect is drawn [s]. */
@@ -43,6 +50,7 @@ export class Gizmo {
     const three = new Group();
     three.matrixAutoUpdate = false;
     three.matrix.copy(new Matrix4().copy(T_THREE_WORLD).invert());
+    three.matrixWorldNeedsUpdate = true;
     this.object.add(this.pivot, three);
     const size = matchMedia("(pointer: coarse)").matches ? FINGER_SIZE : SIZE;
     const make = (mode: "translate" | "rotate"): TransformControls => {

@@ -115,6 +115,7 @@ export function instanceMeshes(
     object.receiveShadow = true;
     object.frustumCulled = false; // its instances are everywhere
     object.matrixAutoUpdate = false;
+    object.matrixWorldNeedsUpdate = true;
     object.userData.bodies = parts.map(({ id }) => id);
     const rows = parts.map(({ id, body, mesh, form: own }, i) => ({ i, id, body, T_body_unit: own ? mesh.matrix.clone().scale(own.scale) : mesh.matrix }));
     for (const { body, mesh } of parts) body.remove(mesh);

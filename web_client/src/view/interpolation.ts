@@ -8,6 +8,8 @@ const MIN_DELAY_MS = 10;
 const MAX_DELAY_MS = 300;
 /** The delay shrinks by at most this much per second [ms]: motion looks 2 % slower for a while, not jerky. */
 const SHRINK_MS_PER_S = 20;
+/** Frames whose ages are looked at: those of two seconds. */
+const KEPT_AGES = 120;
 
 /** A received frame of numbers at a session time. */
 export interface TimedFrame {
@@ -97,16 +99,22 @@ export function interpolateValues(a: Float32Array, b: Float32Array, share: numbe
 /** The delay behind session time at which frames are shown: so long that the next frame is usually there. */
 export class DelayEstimator {
   private delay = 50;
-  private ages: number[] = [];
+  /** The newest ages, and the same in order: a frame comes 60 times a second, so nothing is allocated. */
+  private readonly ages = new Float64Array(KEPT_AGES);
+  private readonly sorted = new Float64Array(KEPT_AGES);
+  private count = 0;
   private lastUpdate = 0;
 
   /** Note the age of a frame on arrival [ms], and the time between frames [ms]. */
   add(age_ms: number, period_ms: number, now_ms: number): void {
     if (!Number.isFinite(age_ms)) return;
-    this.ages.push(age_ms);
-    if (this.ages.length > 120) this.ages.shift();
-    const sorted = [...this.ages].sort((x, y) => x - y);
-    const wanted = sorted[Math.floor(0.95 * (sorted.length - 1))]! + 1.2 * period_ms;
+    this.ages[this.count % KEPT_AGES] = age_ms;
+    this.count += 1;
+    const kept = Math.min(this.count, KEPT_AGES);
+    this.sorted.fill(Number.POSITIVE_INFINITY); // what is not known yet is behind the rest
+    this.sorted.set(kept < KEPT_AGES ? this.ages.subarray(0, kept) : this.ages);
+    this.sorted.sort();
+    const wanted = this.sorted[Math.floor(0.95 * (kept - 1))]! + 1.2 * period_ms;
     const target = Math.min(MAX_DELAY_MS, Math.max(MIN_DELAY_MS, wanted));
     const elapsed = this.lastUpdate ? Math.max(0, now_ms - this.lastUpdate) : 0;
     this.lastUpdate = now_ms;

@@ -33,6 +33,7 @@ export function mergeMeshes(body: Group): BufferGeometry[] {
     const geometry = mergeGeometries(placed);
     const merged = new Mesh(geometry, first.material);
     merged.matrixAutoUpdate = false;
+    merged.matrixWorldNeedsUpdate = true;
     merged.name = meshes.map((mesh) => mesh.name).join(" ");
     merged.castShadow = first.castShadow;
     merged.receiveShadow = true;

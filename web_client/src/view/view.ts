@@ -140,6 +140,7 @@ export class View {
     this.shadows = new Shadows(this.renderer.shadowMap, this.device.budget.shadowPeriod_ms);
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.root.background = new Color(BACKGROUND);
+    this.root.matrixAutoUpdate = false; // else three.js computes all that is below anew in every frame
     this.pictures = new CameraPictures(this.renderer, this.device.budget === SOFTWARE);
     this.clouds = new CloudViews(this.device.budget.points);
     this.overlay.add(this.avatars.group, this.anchors.group);
@@ -393,13 +394,15 @@ export class View {
     const isNew = this.poses.length !== length;
     if (isNew) this.poses = new Float32Array(length);
     interpolatePoses(found.before.values, found.after.values, found.share, this.poses);
-    if (!isNew && !isVisiblyDifferent(this.poses, this.drawnPoses)) return false;
     if (this.drawnPoses.length !== length) this.drawnPoses = new Float32Array(length);
-    this.drawnPoses.set(this.poses);
+    let isMoved = isNew;
     for (let row = 0; row < this.bodyIds.length; row++) {
+      const at = POSE_FLOATS * row;
+      if (!isNew && !isVisiblyDifferent(this.poses, this.drawnPoses, at)) continue;
+      isMoved = true;
+      for (let i = at; i < at + POSE_FLOATS; i++) this.drawnPoses[i] = this.poses[i]!;
       const group = this.scene.bodies.get(this.bodyIds[row]!);
       if (!group) continue;
-      const at = POSE_FLOATS * row;
       const x = this.poses[at]!;
       const y = this.poses[at + 1]!;
       const z = this.poses[at + 2]!;
@@ -409,8 +412,8 @@ export class View {
       group.quaternion.set(this.poses[at + 4]!, this.poses[at + 5]!, this.poses[at + 6]!, this.poses[at + 3]!);
       group.updateMatrix();
     }
-    this.scene.placeInstances();
-    return true;
+    if (isMoved) this.scene.placeInstances();
+    return isMoved;
   }
 
   private moveDeformables(session_ms: number): boolean {
@@ -460,10 +463,9 @@ export class View {
   }
 }
 
-/** Return whether two arrays of poses differ by more than the bound of the stream. */
-function isVisiblyDifferent(a: Float32Array, b: Float32Array): boolean {
-  if (a.length !== b.length) return true;
-  for (let i = 0; i < a.length; i++) if (!(Math.abs(a[i]! - b[i]!) <= SAME)) return true;
+/** Return whether two poses at a place of their arrays differ by more than the bound of the stream. */
+function isVisiblyDifferent(a: Float32Array, b: Float32Array, at: number): boolean {
+  for (let i = at; i < at + POSE_FLOATS; i++) if (!(Math.abs(a[i]! - b[i]!) <= SAME)) return true;
   return false;
 }
 
@@ -491,7 +493,9 @@ function inspectDevice(renderer: WebGLRenderer): Device {
 }
 
 function isEqual(a: Float32Array, b: Float32Array): boolean {
-  return a.length === b.length && a.every((value, i) => value === b[i]);
+  if (a.length !== b.length) return false;
+  for (let i = 0; i < a.length; i++) if (a[i] !== b[i]) return false;
+  return true;
 }
 
 function listAddresses(spec: SceneSpec): Set<string> {

@@ -92,7 +92,7 @@ describe("an armed device", () => {
     expect(tick(FORWARD, situation).clutch).toBe(false);
     expect(device.released).toBe(reason);
     tick(makeIdle(), situation); // let go during the stop, pressed again before its end: still nothing
-    tick(FORWARD, situation);
+    expect(tick(FORWARD, situation).clutch).toBe(false);
     expect(tick(FORWARD).clutch).toBe(false);
     tick(makeIdle());
     expect(tick(FORWARD).clutch).toBe(true);

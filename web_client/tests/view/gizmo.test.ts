@@ -82,3 +82,14 @@ test("nothing is held beside the handles, or where they are not shown", () => {
   gizmo.object.visible = false;
   expect(gizmo.grab(find(TIP.x, TIP.y, TIP.z + length))).toBe(false);
 });
+
+test("handles that are hidden are not updated", () => {
+  gizmo.object.visible = false;
+  const { elements } = gizmo["pivot"].matrixWorld;
+  const before = [...elements];
+  draw(new Vector3(0, 0, 1));
+  expect(elements).toEqual(before);
+  gizmo.object.visible = true;
+  draw(new Vector3(0, 0, 1));
+  expect(elements).not.toEqual(before);
+});
