@@ -251,6 +251,7 @@ def _parse_scene(arguments: argparse.Namespace) -> tuple[_ParsedScene, AssetStor
 def _parse_model(scene: str, store: AssetStore) -> _ParsedScene:
     from iris_session.physics import World
     from iris_session.scene.mujoco_scene import parse_mujoco
+    from iris_session.scene.report import check_model_units
 
     model = open_scene(scene).model
     # The initial state of a session: the keyframe `home`, if there is one.
@@ -269,8 +270,6 @@ def _format_size(n_bytes: int) -> str:
 
 #: Suffixes of files that MuJoCo simulates; any other file is composed and shown as it is.
 SIMULATED: Final = (".xml", ".mjcf", ".mjb")
-#: Advice for meshes of a model that are too large or too small.
-_MESH_SCALE_ADVICE: Final = 'scale="{factor} {factor} {factor}" at its <mesh>, times the one that it has,'
 #: Limits above which work takes longer than about a second and progress is printed.
 _LARGE_FILE_BYTES: Final = 5_000_000
 _MANY_TRIANGLES: Final = 100_000
@@ -364,14 +363,3 @@ def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneB
         text = f"preparing meshes of {path.name} ({builder.triangles:,} triangles; cached for the next time)"
         print(text, file=sys.stderr, flush=True)
     return builder
-
-
-def check_model_units(spec: SceneSpec) -> tuple[str, ...]:
-    """Return a note if the meshes of a MuJoCo model do not seem to be in metres.
-
-    Only the largest mesh is considered: poses are in metres, and a hall may be large.
-    """
-    from iris_session.scene.report import format_unit_hint, largest_mesh_side
-
-    hint = format_unit_hint(largest_mesh_side(spec), _MESH_SCALE_ADVICE)
-    return (f"its largest mesh is {hint}",) if hint else ()

@@ -345,6 +345,7 @@ def _robot_info(model: mujoco.MjModel, spec: RobotSpec) -> RobotInfo:
         T_body_site=tip.T_body_tip,
         gripper=bool(spec.gripper_actuator),
         actuators=describe_actuators(model, spec),
+        kind=spec.kind,
     )
 
 

@@ -28,6 +28,7 @@ from iris_session.protocol.common import (
     cut_texts,
 )
 from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.specs import ARM
 from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 #: Marks of one anchor.
@@ -153,7 +154,7 @@ class RobotInfo(msgspec.Struct, frozen=True):
     """A robot as clients need it. `site_body`: id of the body that carries the end-effector site; `T_body_site`.
 
     `actuators`: in the order of `RobotState.ctrl`, one for each of the joints (none for a robot that only its owner's
-    program moves), then those of the gripper.
+    program moves), then those of the gripper. `kind`: `arm`, or `hand`: it follows joints only, no poses.
     """
 
     name: Name
@@ -163,6 +164,7 @@ class RobotInfo(msgspec.Struct, frozen=True):
     T_body_site: Pose
     gripper: bool
     actuators: tuple[ActuatorInfo, ...] = ()
+    kind: Name = ARM
 
 
 class BodyInfo(msgspec.Struct, frozen=True, array_like=True):

@@ -30,6 +30,8 @@ _MIB: Final = 1 << 20
 _LARGEST_M: Final = 10.0
 #: Too small to be seen or grasped [m]; a part of two metres that was divided by 1,000 once too often is smaller.
 _SMALLEST_M: Final = 0.002
+#: Correction of the meshes of a model that are too large or too small.
+_MODEL_SCALE_ADVICE: Final = 'scale="{factor} {factor} {factor}" at its <mesh>, times the one that it has,'
 Points = NDArray[Any]
 
 
@@ -291,6 +293,15 @@ def format_unit_hint(side_m: float, remedy: str) -> str:
         return ""
     remedied = remedy.format(factor=f"{factor:g}")
     return f"{format_length(side_m)} large: {what} {remedied} makes it {format_length(side_m * factor)}"
+
+
+def check_model_units(spec: SceneSpec) -> tuple[str, ...]:
+    """Return a note if the meshes of a MuJoCo model do not seem to be in metres.
+
+    Only the largest mesh is considered: poses are in metres, and a hall may be large.
+    """
+    hint = format_unit_hint(largest_mesh_side(spec), _MODEL_SCALE_ADVICE)
+    return (f"the largest mesh is {hint}",) if hint else ()
 
 
 def format_size(extent: Extent) -> str:

@@ -187,7 +187,7 @@ class SessionProcesses:
                 self.notes.append(f"others reach it at {', '.join(reachable)}")
             self.notes += self.web.start(ports, self.scenes.asset_root)
             self.notes += self.cameras.start(ports)
-            self.reporter.warning_sources.append(self.cameras.list_warnings)
+            self.reporter.warning_sources += [self.cameras.list_warnings, lambda: self.scenes.advice]
             _log.info("session %r on %s, recording: %s", self.name, self._address, self.recording or "none")
         except (FrontError, RecordingError) as error:
             self.close()

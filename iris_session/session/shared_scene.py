@@ -31,6 +31,7 @@ from iris_session.scene import AssetStore, Hold, SceneBuildError
 from iris_session.scene.mujoco_looks import ModelLooks
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.mujoco_visuals import Shown
+from iris_session.scene.report import check_model_units
 from iris_session.scene.result import ComposedScene
 
 #: Specifications of patches that are kept: more than can be pending for the loop, and as long as a slow disk may need
@@ -44,7 +45,7 @@ class SharedScene(NamedTuple):
     """One scene as clients get it.
 
     `spec`: `None` where only bodies and poses are shared. `notes`: what is left out, a line each. `looks`: of the model
-    that the specification was read off.
+    that the specification was read off. `advice`: what its author should look at, a line each.
     """
 
     info: SceneInfo
@@ -52,6 +53,7 @@ class SharedScene(NamedTuple):
     patches: tuple[PatchOp, ...] = ()
     notes: tuple[str, ...] = ()
     looks: ModelLooks | None = None
+    advice: tuple[str, ...] = ()
 
 
 class SharedScenes:
@@ -104,7 +106,12 @@ class SharedScenes:
     def notes(self) -> list[str]:
         """Messages for people about the newest scene and about the store, one line each."""
         newest = self.newest
-        return list(dict.fromkeys((*(() if newest is None else newest.notes), *self._store_notes)))
+        return list(dict.fromkeys((*(() if newest is None else newest.notes), *self.advice, *self._store_notes)))
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """Advice about the newest scene for who made it, one line each."""
+        return () if self.newest is None else self.newest.advice
 
     def make(
         self,
@@ -143,7 +150,8 @@ class SharedScenes:
             made = _store_spec(store, apply_patch(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session works without its picture
             return SharedScene(plain, notes=(f"{NO_SPECIFICATION}: {error}",))
-        return made._replace(notes=tuple(f"left out for clients: {what}" for what in parsed.skipped), looks=looks)
+        notes = tuple(f"left out for clients: {what}" for what in parsed.skipped)
+        return made._replace(notes=notes, looks=looks, advice=() if looks is None else check_model_units(parsed.spec))
 
     def patch(self, ops: Sequence[PatchOp]) -> SharedScene:
         """Return the newest scene with `ops` applied. Raises `SceneError`, `OSError`. Hold `lock` until `show`."""
@@ -160,7 +168,7 @@ class SharedScenes:
             )
         info = msgspec.structs.replace(newest.info, patches=newest.info.patches + 1)
         patched = _store_spec(self._store, apply_patch(newest.spec, ops), info, merging)
-        return patched._replace(notes=newest.notes, looks=newest.looks)
+        return patched._replace(notes=newest.notes, looks=newest.looks, advice=newest.advice)
 
     def show(self, shown: SharedScene) -> SceneInfo:
         """Make a scene the newest. Its files are held, and those of the one before, which the front still serves.

@@ -247,6 +247,8 @@ def test_hand_without_an_arm_is_one_robot(wrist: str) -> None:
     (robot,) = find_robots(m)
     assert (robot.kind, robot.name, robot.tip_body) == (HAND, "h", "palm") if not wrist else ("hand", "hand", "palm")
     assert len(robot.joints) == 12 + bool(wrist)
+    (info,) = World(m, [robot], []).robot_infos
+    assert info.kind == HAND  # a page offers no handles for it
     fingers_only = find_robots(m, all_limbs=True)
     assert [r.name for r in fingers_only] == [f"h_finger{n}" for n in ("", "_2", "_3", "_4")]
 

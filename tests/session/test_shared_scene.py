@@ -107,3 +107,16 @@ def test_groups_and_sites_of_a_session_are_chosen(tmp_path: Path, way: str) -> N
         assert ([one.name for one in session.scene.visuals], session.scene.groups_shown) == (["", "end"], (3,))
     with pytest.raises(ConfigError, match="groups"):
         Session(model, config=plain, groups=["visual"])
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.001])
+def test_model_whose_meshes_seem_to_be_in_millimetres_is_advice(scale: float, tmp_path: Path) -> None:
+    """On the terminal, and on the page, where an empty picture would be all that people see."""
+    box = " ".join(f"{x} {y} {z}" for x in (0, 300) for y in (0, 200) for z in (0, 100))
+    mesh = f'<mesh name="box" vertex="{box}" scale="{scale} {scale} {scale}"/>'
+    xml = f'<mujoco><asset>{mesh}</asset><worldbody><geom type="mesh" mesh="box"/></worldbody></mujoco>'
+    scenes = SharedScenes(tmp_path, "test")
+    scenes.show(scenes.make(World(mujoco.MjModel.from_xml_string(xml), (), ())))
+    assert list(scenes.advice) == scenes.notes == [note for note in scenes.notes if 'scale="0.001' in note]
+    assert bool(scenes.advice) == (scale == 1.0)
+    scenes.close()

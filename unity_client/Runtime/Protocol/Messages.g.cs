@@ -870,6 +870,7 @@ namespace IrisSession.Protocol
         public Pose T_body_site = new Pose();
         public bool Gripper;
         public ActuatorInfo[] Actuators = Array.Empty<ActuatorInfo>();
+        public string Kind = "arm";
 
         public static RobotInfo Read(WireReader reader) => reader.ReadInto(new RobotInfo());
         internal static readonly Func<RobotInfo> New = () => new RobotInfo();
@@ -883,6 +884,7 @@ namespace IrisSession.Protocol
             codec.Require("T_body_site", ref T_body_site, Protocol.Pose.New);
             codec.Require("gripper", ref Gripper);
             codec.Allow("actuators", ref Actuators, 0, 0, Protocol.ActuatorInfo.New);
+            codec.Allow("kind", ref Kind, 64, "arm");
         }
     }
 

@@ -655,7 +655,7 @@ export type ActuatorInfo = [
  * A robot as clients need it. `site_body`: id of the body that carries the end-effector site; `T_body_site`.
  *
  * `actuators`: in the order of `RobotState.ctrl`, one for each of the joints (none for a robot that only its owner's
- * program moves), then those of the gripper.
+ * program moves), then those of the gripper. `kind`: `arm`, or `hand`: it follows joints only, no poses.
  */
 export interface RobotInfo {
   name: string;
@@ -665,6 +665,7 @@ export interface RobotInfo {
   T_body_site: Pose;
   gripper: boolean;
   actuators?: ActuatorInfo[];
+  kind?: string;
 }
 
 /** One streamed rigid body: its index in state frames is its position in `Snapshot.bodies`. */
@@ -2565,6 +2566,7 @@ export const VALUE_DEFAULTS = {
   },
   RobotInfo: {
     actuators: [],
+    kind: "arm",
   },
   AnchorInfo: {
     size_m: 0.0,

@@ -149,6 +149,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["T_body_site", ["struct", "Pose"], []],
       ["gripper", ["bool"], []],
       ["actuators", ["array", ["struct", "ActuatorInfo"], 0, 0], [[]]],
+      ["kind", ["str", 64, ""], ["arm"]],
     ],
   },
   BodyInfo: {

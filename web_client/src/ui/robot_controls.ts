@@ -53,7 +53,7 @@ export function makeRobotControls(robot: () => string, state: PageState, actions
       take.hidden = !canTake;
       setText(take, isFree ? "Take" : lease.mode === "takeover" ? "Take over" : lease.mode === "request" ? "Ask for it" : "Take");
       wait.hidden = !canTake || isFree || lease.queue.includes(state.selfId) || lease.mode === "takeover";
-      steer.hidden = !isMine || !state.isReady;
+      steer.hidden = !isMine || !state.isReady || !state.followsPoses(name);
       setText(steer, drive.robot === name ? "Stop driving" : "Drive");
       release.hidden = !isMine || !state.isReady;
       for (const one of [take, wait, steer, release]) setLabel(one, `${one.textContent ?? ""}: ${name}`);

@@ -215,7 +215,7 @@ export function makeRobotOverlay(
       if (state.spec) places.set(robots, state.spec);
       const names = robots.map(({ name }) => name);
       labels = labels.filter(({ robot }) => names.includes(robot));
-      const mine = state.isReady ? state.heldBy(state.selfId).filter((name) => names.includes(name)) : [];
+      const mine = state.isReady ? state.heldBy(state.selfId).filter((name) => names.includes(name) && state.followsPoses(name)) : [];
       const before = chosen;
       chosen = mine.includes(drive.robot) ? drive.robot : mine.includes(chosen) ? chosen : (mine[0] ?? "");
       const { length } = labels;

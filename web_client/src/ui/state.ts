@@ -47,6 +47,7 @@ export interface ConsentAsked {
   until_ms: number;
 }
 
+const HAND = "hand";
 /** Id of the session's own program among those who do something. */
 const HOST = "host";
 
@@ -227,6 +228,11 @@ export class PageState {
 
   lease(robot: string): Lease | undefined {
     return this.session?.leases.find((lease) => lease.target === robot && lease.kind === "robot");
+  }
+
+  /** Return whether a robot follows a pose or a velocity; a hand follows joints only, which programs and gloves send. */
+  followsPoses(robot: string): boolean {
+    return this.session?.robots.find(({ name }) => name === robot)?.kind !== HAND;
   }
 
   /** Return how old the newest cloud or picture of a stream is [ms]; undefined: this page has none. */

@@ -111,3 +111,8 @@ test("a pause says who and why, and who is not known to a page that joined later
   sayPause({ participant: "host", reason: "numbers that are not finite" });
   expect(state.pause).toEqual({ by: "the session", reason: "numbers that are not finite" });
 });
+
+test("a hand follows no poses, other robots do", () => {
+  say({ type: "session", participants: [], leases: [], robots: [{ name: "arm", kind: "arm" }, { name: "fingers", kind: "hand" }] });
+  expect(["arm", "fingers", "unknown"].map((robot) => state.followsPoses(robot))).toEqual([true, false, true]);
+});
