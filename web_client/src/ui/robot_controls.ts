@@ -20,7 +20,7 @@ export interface RobotControls {
 /** Make the controls of a robot. `name` gives its name: it may change. */
 export function makeRobotControls(robot: () => string, state: PageState, actions: Actions, drive: Drive): RobotControls {
   const acquire = (wait: boolean): void =>
-    void actions.request({ type: "acquire", robots: [robot()], wait }, `The robot ${robot()} is yours.`);
+    void actions.request({ type: "acquire", robots: [robot()], wait }, `The robot ${robot()} is yours${state.followsPoses(robot()) ? ": drag the arrows at its gripper" : ""}.`);
   const take = button("Take", () => acquire(false), { class: "small primary" });
   const wait = button("Wait for it", () => acquire(true), { class: "small" });
   const steer = button("Drive", () => drive.toggle(robot()), { class: "small primary" });

@@ -1,7 +1,7 @@
 // Robots in the picture: a label at each, a menu where one is clicked, and the handles at the gripper of the one that this
 // person may drive.
 
-import { Quaternion, Vector3 } from "three";
+import { type Camera, Quaternion, Vector3 } from "three";
 
 import type { RobotInfo } from "../core/api.ts";
 import type { Drive } from "../desktop/drive.ts";
@@ -75,6 +75,8 @@ export function makeRobotOverlay(
   const list = h("div", { class: "robot-labels" });
   const rows = new KeyedList<RobotInfo>(list, ({ name }) => makeLabel(name));
   const [p_world, q_world] = [new Vector3(), new Quaternion()];
+  /** Where the handles are in the picture. */
+  const p_handles = new Vector3();
   /** The robot with the handles, empty for none. */
   let chosen = "";
   let holding: number | null = null;
@@ -108,7 +110,6 @@ export function makeRobotOverlay(
       dot.classList.toggle("hollow", holder === "");
       setText(who, drive.robot === name ? "you drive" : isMine ? "you" : holder === "" ? "free" : state.nameOf(holder));
       element.classList.toggle("driven", drive.robot === name);
-      element.classList.toggle("beside-handles", chosen === name);
     };
     return { element, update };
   }
@@ -118,36 +119,58 @@ export function makeRobotOverlay(
     return { x: (2 * (event.clientX - box.x)) / box.width - 1, y: 1 - (2 * (event.clientY - box.y)) / box.height };
   }
 
+  /** Turn a point of the world into a place on the canvas [pixels], with its depth; nearer than -1 or farther than 1 is not seen. */
+  function toPixels(p: Vector3, camera: Camera): Vector3 {
+    p.applyMatrix4(T_THREE_WORLD).project(camera);
+    p.x = ((1 + p.x) / 2) * width;
+    p.y = ((1 - p.y) / 2) * height;
+    return p;
+  }
+
   /** Move labels and handles to where the robots are drawn. */
   function place(): void {
     const { camera } = view.viewpoint;
     const isOnScreen = state.mode === "screen";
     gizmo.object.visible = isOnScreen && chosen !== "" && places.readTip(chosen, p_world, q_world);
     gizmo.lag_s = (view.delay_ms + (state.rtt_ms || 0)) / 1000 + STEP_S;
-    if (gizmo.object.visible) gizmo.place(p_world, q_world, camera);
     if (!isOnScreen) return;
     let isChanged = false;
+    if (gizmo.object.visible) {
+      gizmo.place(p_world, q_world, camera);
+      toPixels(p_world, camera);
+      isChanged = Math.abs(p_handles.x - p_world.x) > STILL_PX || Math.abs(p_handles.y - p_world.y) > STILL_PX;
+      if (isChanged) p_handles.copy(p_world);
+    }
     for (const label of labels) {
       const isKnown = places.readLabel(label.robot, p_world);
-      p_world.applyMatrix4(T_THREE_WORLD).project(camera);
-      const isSeen = isKnown && Math.abs(p_world.z) < 1;
+      const { x, y, z } = toPixels(p_world, camera);
+      const isSeen = isKnown && Math.abs(z) < 1;
       if (isSeen !== label.isSeen) {
         label.isSeen = isSeen;
         label.element.hidden = !isSeen;
         isChanged = true;
       }
-      const x = ((1 + p_world.x) / 2) * width;
-      const y = ((1 - p_world.y) / 2) * height;
       if (!isSeen || (Math.abs(x - label.x) < STILL_PX && Math.abs(y - label.y) < STILL_PX)) continue;
       isChanged = true;
       label.x = x;
       label.y = y;
-      label.depth = p_world.z;
+      label.depth = z;
       label.element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -100%)`;
     }
     if (isChanged) thinOut();
   }
   view.onDraw = place;
+
+  /** Let the handles be seen and taken through labels that cover them. */
+  function makeWayForHandles(): void {
+    const isShown = gizmo.object.visible;
+    const { x, y } = p_handles;
+    const reach = gizmo.reach * height;
+    for (const label of labels) {
+      const isNear = Math.abs(label.x - x) < reach + label.width / 2 && label.y > y - reach && label.y - label.height < y + reach;
+      label.element.classList.toggle("beside-handles", isShown && isNear);
+    }
+  }
 
   /** Leave out labels that would cover others: first those of robots that are neither pointed at, nor held by this person. */
   function thinOut(): void {
@@ -158,6 +181,7 @@ export function makeRobotOverlay(
     }
     const crowded = findCrowded(labels.filter(({ isSeen }) => isSeen));
     for (const label of labels) label.element.classList.toggle("crowded", crowded.has(label));
+    makeWayForHandles();
   }
 
   function onDown(event: PointerEvent): void {

@@ -11,7 +11,7 @@ const HOLD_REASONS: Record<(typeof HoldReason)[keyof typeof HoldReason], string>
   no_lease: "no participant has its lease",
   no_sample: "its holder sends nothing yet",
   clutch_open: "the operator has let go",
-  stale: "samples come too late or not at all",
+  stale: `samples came too late: ${AGAIN}`,
   not_worn: "headset taken off",
   untracked: "tracking lost",
   unaligned: "its holder is not aligned",

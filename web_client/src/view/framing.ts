@@ -23,9 +23,10 @@ export const FIRST_AZIMUTH = AZIMUTHS[0];
 export const FIRST_ELEVATION = -22;
 /** Share of a robot that may be behind something in the first view. */
 const HIDDEN_SHARE = 0.25;
-/** What is shown around robots, as a share of their diagonal, and how much larger than that a scene is that is not shown as a whole. */
+/** What is shown around robots, as a share of their diagonal. */
 const AROUND_ROBOTS = 0.1;
-const MUCH_MORE = 1.8;
+/** How much larger a scene is that is not shown as a whole: than its robots, which are to be large enough to be driven, or than what it says. */
+const [MORE_THAN_ROBOTS, MORE_THAN_IT_SAYS] = [1.05, 1.8];
 /** How far bodies may be from where the scene began to count, in its diagonals. */
 const MAX_DRIFT = 2;
 /** Share of half the picture that is filled: above it lies a bar. */
@@ -88,7 +89,7 @@ export function findWholeBox(scene: Placed, beside: Box3): Box3 {
 
 /**
  * Return what the first picture of a scene shows: its robots with what is around them, without any what the scene says
- * (`environment`), or all of it where that is not much more. `bases`: bodies at the feet of the robots, by id.
+ * (`environment`), or all of it where that is hardly more. `bases`: bodies at the feet of the robots, by id.
  */
 export function findFirstSight(scene: Placed, bases: readonly number[], beside: Box3): Sight {
   const whole = findWholeBox(scene, beside);
@@ -96,9 +97,10 @@ export function findFirstSight(scene: Placed, bases: readonly number[], beside: 
   const robots = scene.spec.visuals.filter((visual) => links.has(visual.body) && isSolid(scene.spec, visual));
   const focus = unionOf(robots.map((visual) => boxNow(scene, visual)));
   const size = new Vector3();
+  const more = focus.isEmpty() ? MORE_THAN_IT_SAYS : MORE_THAN_ROBOTS;
   if (focus.isEmpty()) focus.union(boxOfEnvironment(scene.spec.environment));
   else focus.expandByScalar(AROUND_ROBOTS * focus.getSize(size).length());
-  const isPart = whole.getSize(corner).length() > MUCH_MORE * focus.getSize(size).length();
+  const isPart = whole.getSize(corner).length() > more * focus.getSize(size).length();
   const box = isPart ? focus : whole;
   return { box, azimuth: findAzimuth(scene, robots, links, box) };
 }

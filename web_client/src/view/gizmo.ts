@@ -32,6 +32,8 @@ export class Gizmo {
   readonly object = new HidableGroup();
   /** The pointer drags a handle. */
   isHeld = false;
+  /** How far the arrows reach, as a share of the height of the picture. */
+  readonly reach: number;
   /** From a sample until its effect is drawn [s]. */
   lag_s = 0;
   /** Where the gripper is to go, while the handles are held: its axes are those of the world when that begins. */
@@ -53,6 +55,7 @@ export class Gizmo {
     three.matrixWorldNeedsUpdate = true;
     this.object.add(this.pivot, three);
     const size = matchMedia("(pointer: coarse)").matches ? FINGER_SIZE : SIZE;
+    this.reach = size / 8;
     const make = (mode: "translate" | "rotate"): TransformControls => {
       const controls = new TransformControls(camera);
       controls.setMode(mode);
