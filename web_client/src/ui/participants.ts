@@ -75,7 +75,7 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
       ];
       setText(facts, parts.filter((part) => part !== "").join(" · "));
       element.classList.toggle("away", !item.connected);
-      more.hidden = !state.isDirector;
+      more.hidden = !state.isDirector || !state.isReady;
       setOptions(role, [...new Set([item.role, ...ROLES])].map((one) => [one, roleWords(one)] as const));
       setValue(role, item.role);
       setLabel(role, `Role of ${item.name}`);

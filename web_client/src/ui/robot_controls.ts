@@ -20,7 +20,7 @@ export interface RobotControls {
 /** Make the controls of a robot. `name` gives its name: it may change. */
 export function makeRobotControls(robot: () => string, state: PageState, actions: Actions, drive: Drive): RobotControls {
   const acquire = (wait: boolean): void =>
-    void actions.request({ type: "acquire", robots: [robot()], wait }, `The robot ${robot()} is yours${state.followsPoses(robot()) ? ": drag the arrows at its gripper" : ""}.`);
+    void actions.request({ type: "acquire", robots: [robot()], wait }, `${robot()} is yours${state.followsPoses(robot()) ? ": drag its arrows" : ""}.`);
   const take = button("Take", () => acquire(false), { class: "small primary" });
   const wait = button("Wait for it", () => acquire(true), { class: "small" });
   const steer = button("Drive", () => drive.toggle(robot()), { class: "small primary" });
@@ -57,7 +57,7 @@ export function makeRobotControls(robot: () => string, state: PageState, actions
       setText(steer, drive.robot === name ? "Stop driving" : "Drive");
       release.hidden = !isMine || !state.isReady;
       for (const one of [take, wait, steer, release]) setLabel(one, `${one.textContent ?? ""}: ${name}`);
-      assign.hidden = !state.isDirector;
+      assign.hidden = !state.isDirector || !state.isReady;
       setLabel(select, `Assign ${name} to`);
       const drivers = (state.session?.participants ?? []).filter((one) => DRIVERS.includes(one.role) || one.id === lease?.holder);
       setOptions(select, [[FREE, "free"], ...drivers.map((one) => [one.id, state.nameOf(one.id)] as const)]);

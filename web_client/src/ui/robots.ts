@@ -79,8 +79,8 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
       holder.classList.toggle("free", isFree);
       setText(why, describe(state, name, lease, report));
       controls.update();
-      modeLabel.hidden = !state.isDirector;
-      scaleLabel.hidden = !(state.isDirector || isMine) || isFree;
+      modeLabel.hidden = !state.isDirector || !state.isReady;
+      scaleLabel.hidden = !(state.isDirector || isMine) || isFree || !state.isReady;
       fields.hidden = modeLabel.hidden && scaleLabel.hidden;
       setValue(mode, lease?.mode ?? "exclusive");
       const scales = [...new Set([...SCALES, lease?.scale ?? 1])].sort((a, b) => a - b);

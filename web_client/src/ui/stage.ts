@@ -4,7 +4,7 @@ import type { PhaseUpdate } from "../core/api.ts";
 import type { View } from "../view/view.ts";
 import { button, h, setOptions, setText } from "./dom.ts";
 import type { PageState } from "./state.ts";
-import { formatBytes } from "./words.ts";
+import { capitalize, formatBytes } from "./words.ts";
 
 const PHASE_WORDS: Record<string, string> = {
   idle: "Not joined",
@@ -98,7 +98,7 @@ export function makeStage(state: PageState, actions: { pair: () => void; retry: 
       message.classList.toggle("slim", spec !== null);
       canvas.classList.toggle("outdated", !message.hidden);
       setText(title, isStale ? "The session does not step" : phaseWords(phase));
-      setText(words, phase.text || info?.text || "");
+      setText(words, capitalize(phase.text || info?.text || ""));
       setText(advice, phase.advice);
       pair.hidden = !(phase.phase === "refused" && (phase.refusal === "unpaired" || phase.refusal === "code"));
       retry.hidden = !["refused", "closed", "idle"].includes(phase.phase);

@@ -136,7 +136,9 @@ export function formatMillimetres(metres: number): string {
 }
 
 export function formatMilliseconds(ms: number): string {
-  return !Number.isFinite(ms) ? "–" : ms >= 1000 ? `${(ms / 1000).toFixed(1)} s` : `${ms.toFixed(ms < 10 ? 1 : 0)} ms`;
+  if (!Number.isFinite(ms)) return "–";
+  const shown = Math.max(0, ms); // clocks agree to a fraction of a millisecond only
+  return shown >= 1000 ? `${(shown / 1000).toFixed(1)} s` : `${shown.toFixed(shown < 10 ? 1 : 0)} ms`;
 }
 
 export function formatBytes(bytes: number): string {

@@ -42,7 +42,7 @@ export class Props {
   readonly rig = new Group();
   readonly camera = new PerspectiveCamera(70, 1, NEAR_M, FAR_M);
   /** Before the eyes: what cannot wait. */
-  readonly urgent = new Label(0.036);
+  readonly urgent = new Label(0.042);
   /** Above a hand: who one is, alignment, what the buttons do. */
   readonly status = new Label(0.016);
   /** The urgent panel is above what the eyes look at. */

@@ -1,6 +1,6 @@
 import { expect, test } from "vitest";
 
-import { denialWords, doubtWords, eventWords, formatBytes, formatCount, formatMillimetres, formatSessionTime, graceWords, isDoubtful, limitWords, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
+import { denialWords, doubtWords, eventWords, formatBytes, formatCount, formatMillimetres, formatMilliseconds, formatSessionTime, graceWords, isDoubtful, limitWords, streamAgeWords, streamStateWords } from "../../src/ui/words.ts";
 
 const nameOf = (id: string): string => ({ p1: "ann", p2: "ben" })[id] ?? "";
 type Body = Parameters<typeof eventWords>[0];
@@ -87,4 +87,8 @@ test("every limit on the wire has words, and a joint its number or name", () => 
     "joint shoulder pan at its end",
   ]);
   expect(limitWords(["speed", "joint1", "singular", "tracking"])).toBe(limitWords(["tracking", "joint1"])); // the two that count
+});
+
+test("an age is never negative: clocks agree to a fraction of a millisecond only", () => {
+  expect([-0.04, 0.26, 120, 1500, Number.NaN].map(formatMilliseconds)).toEqual(["0.0 ms", "0.3 ms", "120 ms", "1.5 s", "–"]);
 });
