@@ -21,6 +21,8 @@ const CLICK_PX = 6;
 const STEP_S = 0.05;
 /** A label that is nearer to where it was is not moved [pixels]. */
 const STILL_PX = 0.5;
+/** Shortest time between two choices of the labels that are shown [ms]: they do not flicker where arms move fast. */
+const THIN_PERIOD_MS = 200;
 
 /** Where a label is in the picture: the middle of its lower edge, and its size [pixels]. */
 export interface LabelBox {
@@ -81,6 +83,8 @@ export function makeRobotOverlay(
   let chosen = "";
   let holding: number | null = null;
   let pressed = { pointer: -1, x: 0, y: 0 };
+  /** Labels are where they were when they were thinned out, and when that was. */
+  let [isThinned, thinned_ms] = [true, 0];
   /** The robot that the pointer is at, empty for none. */
   let pointed = "";
   let [width, height] = [1, 1];
@@ -157,7 +161,11 @@ export function makeRobotOverlay(
       label.depth = z;
       label.element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -100%)`;
     }
-    if (isChanged) thinOut();
+    isThinned &&= !isChanged;
+    const now = performance.now();
+    if (isThinned || now - thinned_ms < THIN_PERIOD_MS) return;
+    [isThinned, thinned_ms] = [true, now];
+    thinOut();
   }
   view.onDraw = place;
 

@@ -57,6 +57,7 @@ export class Props {
     this.stopLabel.setText(["STOP"], STOP_COLOR);
     this.stop.add(this.stopLabel.sprite);
     for (const label of [this.urgent, this.status, this.stopLabel]) showThrough(label);
+    this.urgent.sprite.renderOrder += 1; // what cannot wait is before all other panels
     this.rig.add(this.camera, this.urgent.sprite, this.status.sprite, this.stop);
   }
 
