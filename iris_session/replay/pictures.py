@@ -11,7 +11,7 @@ import importlib
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
@@ -122,11 +122,31 @@ class Timeline:
 
 def list_cameras(recording: Recording) -> tuple[str, ...]:
     """Return the names of the cameras of a recording's first scene; one without a name has its number."""
-    return _list_cameras(Replay(recording).core.world.model)
+    return list_model_cameras(Replay(recording).core.world.model)
 
 
-def _list_cameras(model: mujoco.MjModel) -> tuple[str, ...]:
+def list_model_cameras(model: mujoco.MjModel) -> tuple[str, ...]:
     return tuple(model.camera(i).name or str(i) for i in range(model.ncam))
+
+
+def find_camera(model: mujoco.MjModel, wanted: str) -> mujoco.MjvCamera | None:
+    """Return the camera of a model with a name, or the number of one without; None if there is none."""
+    names = list_model_cameras(model)
+    number = names.index(wanted) if wanted in names else int(wanted) if wanted.isdecimal() else -1
+    if not 0 <= number < model.ncam:
+        return None
+    camera = mujoco.MjvCamera()
+    camera.type, camera.fixedcamid = int(mujoco.mjtCamera.mjCAMERA_FIXED), number
+    return camera
+
+
+def require_shapes(model: mujoco.MjModel, recording: Recording) -> None:
+    """Raise `PictureError` for the model of a world that MuJoCo cannot draw."""
+    if not (model.ngeom or model.nflex or model.nskin):
+        raise PictureError(
+            f"{recording.files[0]} is of a published world, whose shapes MuJoCo does not have: "
+            "`iris-session view` shows it"
+        )
 
 
 def open_gl(width: int, height: int) -> Any:
@@ -170,7 +190,8 @@ class RecordingPictures:
         self._recording, self._timeline, self._options = recording, timeline, options
         patched = any(isinstance(one.body, SceneChanged) and one.body.cause == "patch" for one in recording.events())
         self._replay = Replay(recording, with_control=patched)  # patches are state of the authority
-        self._artist: _Renderer | None = None
+        self._artist: Renderer | None = None
+        self._camera: mujoco.MjvCamera = None
         self._views: dict[tuple[BodyInfo, ...], _SceneBounds] = {}
         self._people = _PeopleTrack(recording) if options.people else None
         self._gl: Any = None
@@ -233,40 +254,38 @@ class RecordingPictures:
         people = self._people.advance(time_ns) if self._people is not None else []
         if self._artist is None or self._artist.core_model is not core.world.model:
             self._artist = self._make_artist(core, people)
-        return self._artist.draw(core.world.data, core.authority.patches, people)
+        return self._artist.draw(core.world.data, self._camera, core.authority.patches, people)
 
-    def _make_artist(self, core: SessionCore, people: Sequence[_AvatarMarker]) -> _Renderer:
+    def _make_artist(self, core: SessionCore, people: Sequence[_AvatarMarker]) -> Renderer:
         model, is_first = core.world.model, self._artist is None
         if self._artist is not None:
             self._artist.close()
-        if not (model.ngeom or model.nflex or model.nskin):
-            raise PictureError(
-                f"{self._recording.files[0]} is of a published world, whose shapes MuJoCo does not have: "
-                "`iris-session view` shows it"
-            )
-        camera = self._find_camera(model, is_required=is_first)
+        require_shapes(model, self._recording)
+        self._camera = self._choose_camera(core, people, is_first=is_first)
+        return Renderer(model, self._options.width, self._options.height, self.notes)
+
+    def _choose_camera(
+        self, core: SessionCore, people: Sequence[_AvatarMarker], *, is_first: bool
+    ) -> mujoco.MjvCamera:
+        camera = self._find_camera(core.world.model, is_required=is_first)
         if camera is None:
             view = self._views.get(core.world.bodies) or _SceneBounds(core.world.bodies)
             view.people = view.people or [one.item.pose.p for one in people]  # one moment is mostly between two states
             camera = view.make_camera(core, self._options.width / self._options.height)
-        return _Renderer(model, camera, self._options, self.notes)
+        return camera
 
     def _find_camera(self, model: mujoco.MjModel, *, is_required: bool) -> mujoco.MjvCamera | None:
         """Return the camera of the options in a model; `None` for the view of all that moves."""
         wanted = self._options.camera
         if not wanted:
             return None
-        names = _list_cameras(model)
-        number = names.index(wanted) if wanted in names else int(wanted) if wanted.isdecimal() else -1
-        if not 0 <= number < model.ncam:
-            there_are = ", ".join(map(repr, names)) or "none: leave --camera out"
+        camera = find_camera(model, wanted)
+        if camera is None:
+            there_are = ", ".join(map(repr, list_model_cameras(model))) or "none: leave --camera out"
             text = f"there is no camera {wanted!r} in the scene, there are {there_are}"
             if is_required:
                 raise PictureError(text)
             self._add_note(f"in a scene that was loaded later {text}: the view of all that moves is drawn")
-            return None
-        camera = mujoco.MjvCamera()
-        camera.type, camera.fixedcamid = int(mujoco.mjtCamera.mjCAMERA_FIXED), number
         return camera
 
     def _add_note(self, text: str) -> None:
@@ -355,18 +374,35 @@ def _read_reach(
 # --- drawing ----------------------------------------------------------------------------------------------------------
 
 
-class _Renderer:
-    """Draws the states of one model into the current OpenGL context."""
+class Renderer:
+    """Draws the states of one model into the current OpenGL context.
+
+    Args:
+        model: That of the simulation, which is not changed: a copy of it is drawn.
+        width, height: Of the largest picture [px].
+        notes: What cannot be drawn as it was is added, a line each.
+        vary: Changes the copy, for a scene that looks different.
+
+    Raises:
+        PictureError: Pictures of this size cannot be drawn here.
+    """
 
     def __init__(
-        self, model: mujoco.MjModel, camera: mujoco.MjvCamera, options: PictureOptions, notes: list[str]
+        self,
+        model: mujoco.MjModel,
+        width: int,
+        height: int,
+        notes: list[str],
+        vary: Callable[[mujoco.MjModel], None] = lambda model: None,
     ) -> None:
         self.core_model = model  # that of the simulation, which must not be changed
-        self._model = copy.copy(model)
-        self._camera, self._notes = camera, notes
-        self._size = options.width, options.height
+        self._notes, self._size = notes, (width, height)
+        original = copy.copy(model)
+        vary(original)
+        self._model = copy.copy(original)
+        self._fovy = float(self._model.vis.global_.fovy)
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = self._size
-        self._look = _ScenePatches(model, self._model)
+        self._look = _ScenePatches(original, self._model)
         self._option = mujoco.MjvOption()
         for group in set(VIEWER_GROUPS) - set(find_viewer_groups(model)):
             self._option.geomgroup[group] = 0
@@ -374,22 +410,43 @@ class _Renderer:
         try:
             self._context = mujoco.MjrContext(self._model, int(mujoco.mjtFontScale.mjFONTSCALE_150))
         except mujoco.FatalError as error:
-            width, height = self._size
             raise PictureError(f"no picture of {width} x {height} can be drawn here: {error}") from error
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
 
-    def draw(self, data: Any, patches: Sequence[PatchOp], people: Sequence[_AvatarMarker]) -> Image:
-        """Return a picture of a state."""
+    def draw(
+        self,
+        data: Any,
+        camera: mujoco.MjvCamera,
+        patches: Sequence[PatchOp] = (),
+        people: Sequence[_AvatarMarker] = (),
+        *,
+        size: tuple[int, int] | None = None,
+        fovy: float = 0.0,
+    ) -> Image:
+        """Return a picture of a state.
+
+        Args:
+            data: The state, with all that is derived of it.
+            camera: The camera that sees it.
+            patches: Those of the scene at this time.
+            people: Heads and hands that are drawn too.
+            size: Width and height [px]; None: the largest.
+            fovy: Vertical field of view of a free camera [deg]; 0: that of the model.
+
+        Returns:
+            uint8, shape (height, width, 3), RGB.
+        """
         for note in self._look.apply(patches):
             if note not in self._notes:
                 self._notes.append(note)
+        self._model.vis.global_.fovy = fovy or self._fovy
         mujoco.mjv_updateScene(
-            self._model, data, self._option, None, self._camera, int(mujoco.mjtCatBit.mjCAT_ALL), self._scene
+            self._model, data, self._option, None, camera, int(mujoco.mjtCatBit.mjCAT_ALL), self._scene
         )
         self._look.decorate(self._scene, data)
         for figure in people:
             figure.draw(self._scene)
-        width, height = self._size
+        width, height = size or self._size
         area = mujoco.MjrRect(0, 0, width, height)
         image = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_render(area, self._scene, self._context)

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from typing import Final, NamedTuple
 
 from iris_session.journal.environment import compare_environment
 from iris_session.journal.rows import CLOSED, CRASHED, check_fields, check_keyframe, is_result
 from iris_session.protocol.entries import decode_entries
 from iris_session.recording import JournalRow, Keyframe, Recording, RecordingError
-from iris_session.session.core import SessionCore, StepOutcome
+from iris_session.session.core import SessionCore, StepOutcome, ignore_lap
 from iris_session.session.verification import ReplayCore
 
 #: Steps between two calls of `progress`.
@@ -50,10 +51,12 @@ class Replay:
         recording: The recording.
         with_control: In class `open`, run authority and control too; in class `closed` they always run.
         progress: Called as `progress(done, total)` with numbers of steps, `total` 0 if the recording is not finished.
+        lap: Called within each step as that of `SessionCore.step`, where authority and control run.
 
     Attributes:
         core: The session after the newest step. Class `open`: the plant is as at the beginning of that step.
         left_out: First and last step of each range that is missing or damaged, or cannot be taken again after one.
+        step: The step that is being taken, or was taken last.
 
     Raises:
         ReplayError: The session cannot be built from the header.
@@ -66,12 +69,17 @@ class Replay:
         *,
         with_control: bool = True,
         progress: Callable[[int, int], None] | None = None,
+        lap: Callable[[str], None] = ignore_lap,
     ) -> None:
         header = recording.header
-        self._recording = recording
+        self._recording, self._lap = recording, lap
         self._with_control = with_control or header.recording_class == CLOSED
         self._progress = progress or (lambda done, total: None)
         self.left_out: list[tuple[int, int]] = []
+        self.step = header.begins_after
+        self._rows: Iterator[JournalRow] | None = None
+        self._last, self._follows = header.begins_after, header.continues is None
+        self._is_over = False
         try:
             self._replay = ReplayCore(header, recording.model)
         except ImportError:
@@ -83,6 +91,10 @@ class Replay:
     def core(self) -> SessionCore:
         return self._replay.core
 
+    @cached_property
+    def _keyframes(self) -> _KeyframeFinder:
+        return _KeyframeFinder(self._recording)
+
     def steps(self, after: int | None = None) -> Iterator[ReplayedStep]:
         """Take the steps again, and yield each.
 
@@ -93,45 +105,68 @@ class Replay:
             ReplayError: A step cannot be taken again, or gives another result here.
             NotARecordingError: A file can no longer be read.
         """
-        header, end = self._recording.header, self._recording.end
-        last, follows = header.begins_after, header.continues is None
-        total = 0 if end is None else max(0, end.step - header.begins_after)
-        keyframes = _KeyframeFinder(self._recording)
-        if after is not None and (newest := keyframes.find_newest(after)) is not None and newest.step > last:
+        end = self._recording.end
+        total = 0 if end is None else max(0, end.step - self._last)
+        if after is not None and (newest := self._keyframes.find_newest(after)) is not None and newest.step > self._last:
+            total = max(0, total - (newest.step - self._last))
             self._restore(newest)
-            total, last, follows = max(0, total - (newest.step - last)), newest.step, True
-        for done, row in enumerate(self._recording.rows(last if after is not None else None)):
+        for done, row in enumerate(self._recording.rows(self._last if after is not None else None)):
             if done % PROGRESS_STEPS == 0:
                 self._progress(done, total)
-            if check_fields(row) is not None:  # its number may be what was changed
-                last, follows = last + 1, False
-                self._leave_out(last, last)
-                continue
-            if row.step <= last:
-                continue
-            if row.step > last + 1:
-                self._leave_out(last + 1, row.step - 1)
-                follows = False
-            last = row.step
-            if not follows and (keyframe := keyframes.find(row.step - 1)) is not None:
-                self._restore(keyframe)
-                follows = True
-            if not follows:
-                self._leave_out(row.step, row.step)
-                continue
-            if row.digest == CRASHED:  # an error in it ended the session: it has no result
+            step = self._advance(row)
+            if self._is_over:
                 break
-            yield ReplayedStep(row.step, row.now_ns, self._take(row))
+            if step is not None:
+                yield step
         self._progress(total, total)
 
+    def steps_between(self, first: int, end: int) -> Iterator[ReplayedStep]:
+        """Take steps again, and yield each: from the newest keyframe before `first`, which may be earlier, to `end` - 1.
+
+        Call it again for later steps: the files are read once for all calls, so that a call costs what its own steps
+        cost, wherever they are. Raises as `steps`.
+        """
+        if self._rows is None:
+            self._rows = self._recording.rows()
+        newest = self._keyframes.find_newest(first - 1)
+        if newest is not None and (newest.step > self._last or not self._follows):
+            self._restore(newest)
+        while self._last < end - 1 and not self._is_over and (row := next(self._rows, None)) is not None:
+            step = self._advance(row)
+            if step is not None:
+                yield step
+
+    def _advance(self, row: JournalRow) -> ReplayedStep | None:
+        """Take the step of the next row; None for one that is left out, or was taken."""
+        if check_fields(row) is not None:  # its number may be what was changed
+            self._last, self._follows = self._last + 1, False
+            self._leave_out(self._last, self._last)
+            return None
+        if row.step <= self._last:
+            return None
+        if row.step > self._last + 1:
+            self._leave_out(self._last + 1, row.step - 1)
+            self._follows = False
+        if not self._follows and (keyframe := self._keyframes.find(row.step - 1)) is not None:
+            self._restore(keyframe)
+        self._last = row.step
+        if not self._follows:
+            self._leave_out(row.step, row.step)
+            return None
+        if row.digest == CRASHED:  # an error in it ended the session: it has no result
+            self._is_over = True
+            return None
+        return ReplayedStep(row.step, row.now_ns, self._take(row))
+
     def _take(self, row: JournalRow) -> StepOutcome | None:
+        self.step = row.step
         try:
             if not self._with_control:
                 entries = decode_entries(row.entries) if _SCENE_TAG in row.entries else ()
                 self.core.show(entries, row.plant)
                 return None
-            outcome = self.core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant)
-        except ImportError:
+            outcome = self.core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant, lap=self._lap)
+        except (ImportError, RecordingError):
             raise
         except Exception as error:  # a foreign file may cause any error in the core
             raise self._make_error(f"step {row.step} cannot be taken again", error) from error
@@ -140,6 +175,7 @@ class Replay:
         return outcome
 
     def _restore(self, keyframe: Keyframe) -> None:
+        self._last, self._follows = keyframe.step, True
         try:
             self._replay.restore(keyframe)
         except ImportError:

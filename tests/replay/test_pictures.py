@@ -85,13 +85,13 @@ def reference(monkeypatch: pytest.MonkeyPatch) -> Reference:
 def cameras(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The cameras that are made from now on."""
     made: list[Any] = []
-    begin = pictures._Renderer.__init__
+    choose = RecordingPictures._choose_camera
 
-    def keep(self: Any, model: Any, camera: Any, *rest: Any) -> None:
-        made.append(camera)
-        begin(self, model, camera, *rest)
+    def keep(self: Any, *given: Any, **options: Any) -> Any:
+        made.append(choose(self, *given, **options))
+        return made[-1]
 
-    monkeypatch.setattr(pictures._Renderer, "__init__", keep)
+    monkeypatch.setattr(RecordingPictures, "_choose_camera", keep)
     return made
 
 

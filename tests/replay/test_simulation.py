@@ -95,3 +95,14 @@ def test_a_header_that_is_none_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(ReplayError, match="the session cannot be built from the header: ") as found:
         replay(played.write())
     assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("spans", [[(5, 9), (9, 12), (33, 36)], [(30, 31), (62, 70)], [(0, 1), (45, 47)]])
+def test_spans_of_steps_are_taken_in_one_pass(tmp_path: Path, spans: list[tuple[int, int]]) -> None:
+    played = play(tmp_path / "session.rrd", 70)
+    with Recording.open(played.write(), warn=False) as recording:
+        taken = Replay(recording)
+        for first, end in spans:
+            steps = {s.step: taken.core.world.data.qpos.tobytes() for s in taken.steps_between(first, end)}
+            assert sorted(steps) == list(range(min(steps), end)) and first - min(steps) < 20
+            assert_equals(played, sorted(steps), [steps[step] for step in sorted(steps)])
