@@ -166,7 +166,7 @@ class Replay:
                 self.core.show(entries, row.plant)
                 return None
             outcome = self.core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant, lap=self._lap)
-        except (ImportError, RecordingError):
+        except ImportError:
             raise
         except Exception as error:  # a foreign file may cause any error in the core
             raise self._make_error(f"step {row.step} cannot be taken again", error) from error

@@ -1,0 +1,345 @@
+"""Episodes of recordings: which become a data set, in which order, and as what.
+
+They follow from the events of the recording and from its curation, a file beside it (`FILE.episodes.json`) that people
+write and that never touches the recording. Nothing here simulates.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from iris_session.protocol.server_messages import EpisodeChanged, Event, Intervention
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.recording import Recording, RecordingError
+from iris_session.recording.folders import find_recordings
+from iris_session.recording.records import read_names
+from iris_session.rrd.batches import RowTimes
+
+SUCCESS: Final = "success"
+FAILURE: Final = "failure"
+UNKNOWN: Final = "unknown"
+DISCARDED: Final = "discarded"
+#: What may be said of an episode that is exported.
+LABELS: Final = (SUCCESS, FAILURE, UNKNOWN)
+#: Ending of the curation of a recording, behind the name of its file.
+CURATION_SUFFIX: Final = ".episodes.json"
+#: States of `EpisodeChanged` in which an episode is recorded.
+_RECORDED: Final = frozenset({"running", "confirm", "left"})
+_VERDICTS: Final = {SUCCESS: SUCCESS, FAILURE: FAILURE, UNKNOWN: UNKNOWN, DISCARDED: DISCARDED}
+#: Columns of a robot that have to be the same in all recordings of a set.
+_ROBOT_FIELDS: Final = ("joints", "actuators", "site", "tip_body", "gripper_actuator", "gripper_open", "gripper_closed")
+
+
+class DatasetError(RecordingError):
+    """The recordings cannot become one data set, or it cannot be written. One line says what would be right."""
+
+
+class EpisodeCuration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Decisions of people about one episode. `trim`: first and last moment that is kept, in seconds of simulated time
+    since its beginning. `label`: one of `LABELS`. Empty: as in the recording.
+    """
+
+    drop: bool = False
+    trim: tuple[float, float] | None = None
+    label: str = ""
+    task: str = ""
+
+
+class Curation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Decisions about the episodes of one recording, by their numbers. `recording`: `identify_recording`."""
+
+    recording: str
+    episodes: dict[int, EpisodeCuration] = {}
+
+
+class Episode(msgspec.Struct, frozen=True):
+    """An episode that is exported.
+
+    Attributes:
+        recording: Number of its recording in the plan.
+        number: As in the session; 0: the whole of a recording without episodes.
+        label: One of `LABELS`.
+        task: Text of what was to be done.
+        first_step, end_step: Its steps: from the first up to, not including, the last.
+        trim: First and last moment that is exported [s of simulated time since its beginning]; None: all of it.
+    """
+
+    recording: int
+    number: int
+    label: str
+    task: str
+    first_step: int
+    end_step: int
+    trim: tuple[float, float] | None = None
+
+
+class PlannedRecording(msgspec.Struct, frozen=True):
+    """A recording of a plan. `id`: `identify_recording`. `people`: number of each participant in `Plan.people`, by id.
+
+    `interventions`: robot, session time [ns], and whether a human took it from an agent then or gave it back.
+    """
+
+    path: str
+    id: str
+    people: dict[str, int]
+    interventions: tuple[tuple[str, int, bool], ...]
+
+
+class Plan(msgspec.Struct, frozen=True):
+    """Episodes of a data set in their order.
+
+    Attributes:
+        recordings: All recordings, those without an exported episode too.
+        episodes: What is exported.
+        tasks: Their texts, each once, in the order of first use.
+        people: Names of participants.
+        notes: What was left out, one line each.
+    """
+
+    recordings: tuple[PlannedRecording, ...]
+    episodes: tuple[Episode, ...]
+    tasks: tuple[str, ...]
+    people: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+class PlanOptions(msgspec.Struct, frozen=True):
+    """Choice of episodes. `labels`: those that are exported. `task`: text for all that have no other in the curation.
+
+    `anonymise`: names of participants become p1, p2 and so on, in texts of tasks too.
+    """
+
+    labels: tuple[str, ...] = (SUCCESS,)
+    task: str = ""
+    anonymise: bool = False
+
+
+def list_files(given: Sequence[Path]) -> list[Path]:
+    """Return the recordings that files and folders name, each once, in the order of their names within a folder.
+
+    Raises:
+        DatasetError: Something does not exist, cannot be read, or a folder has no recording.
+    """
+
+    def refuse(error: OSError) -> None:
+        raise DatasetError(f"the folder {error.filename} cannot be read: {error.strerror}") from error
+
+    files: dict[str, Path] = {}
+    for path in given:
+        if not path.exists():
+            raise DatasetError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
+        found = find_recordings(path, refuse) if path.is_dir() else [path]
+        if not found:
+            raise DatasetError(f"there is no recording below the folder {path}: give one with .rrd files")
+        files |= {os.path.realpath(one): one for one in found}
+    return list(files.values())
+
+
+def identify_recording(recording: Recording) -> str:
+    """Return 32 hex digits that no other recording has: the chain value before its first row."""
+    return recording.root.hex()
+
+
+def find_curation(path: str | Path) -> Path:
+    """Return where the curation of a recording is, or would be."""
+    path = Path(path)
+    return path.with_name(path.name + CURATION_SUFFIX)
+
+
+def read_curation(recording: Recording) -> Curation:
+    """Return the curation of a recording; an empty one if there is none.
+
+    Raises:
+        DatasetError: The file cannot be read, holds something else, or is of another recording.
+    """
+    path, identity = find_curation(recording.files[0]), identify_recording(recording)
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return Curation(identity)
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read: {error.strerror or error}") from error
+    try:
+        curation = msgspec.json.decode(data, type=Curation)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DatasetError(f"{path} is no curation of a recording: {error}") from error
+    if curation.recording != identity:
+        raise DatasetError(f"{path} is the curation of another recording ({curation.recording[:8]!r}): remove it")
+    for number, one in curation.episodes.items():
+        if one.label not in ("", *LABELS):
+            raise DatasetError(f"{path}: episode {number} has the label {one.label!r:.40}: give {', '.join(LABELS)}")
+        if one.trim is not None and not (0.0 <= one.trim[0] < one.trim[1] < math.inf):
+            raise DatasetError(f"{path}: episode {number} has the trim {one.trim}: give two ascending times from 0 [s]")
+    return curation
+
+
+class _Take(msgspec.Struct):
+    """An episode as its events have it. A number can be taken several times: all but the last were discarded."""
+
+    number: int
+    begin_ns: int
+    end_ns: int | None = None
+    verdict: str = UNKNOWN
+    task: str = ""
+
+
+class _Reading(msgspec.Struct):
+    """Everything of a recording that planning needs."""
+
+    path: Path
+    id: str
+    name: str
+    tick_period_ns: int
+    robots: tuple[RobotSpec, ...]
+    objects: tuple[ObjectSpec, ...]
+    people: dict[str, str]
+    curation: Curation
+    takes: list[_Take]
+    times: RowTimes
+    interventions: list[tuple[str, int, bool]]
+
+
+def make_plan(files: Sequence[Path], options: PlanOptions | None = None) -> Plan:
+    """Plan a data set.
+
+    Args:
+        files: Recordings, as by `list_files`.
+        options: Which episodes; None: successes.
+
+    Raises:
+        DatasetError: A recording differs from the first in what all of a set must have, or nothing is left to export.
+        NotARecordingError: A file cannot be read as a recording.
+    """
+    options = options or PlanOptions()
+    read = [_read(path) for path in files]
+    for one in read[1:]:
+        if difference := find_difference(one, read[0]):
+            raise DatasetError(f"{one.path} does not fit {read[0].path} in one data set: {difference}")
+    names = list(dict.fromkeys(name or id for one in read for id, name in one.people.items()))
+    hide = _make_replacement(names) if options.anonymise else str
+    notes: list[str] = []
+    episodes = [episode for i, one in enumerate(read) for episode in _list_episodes(i, one, options, hide, notes)]
+    if not episodes:
+        why = f": {'; '.join(notes[:3])}" if notes else ""
+        raise DatasetError(f"there is no episode to export{why}; give other recordings, or --labels")
+    numbers = {name: i for i, name in enumerate(names)}
+    recordings = tuple(
+        PlannedRecording(
+            str(one.path),
+            one.id,
+            {id: numbers[name or id] for id, name in one.people.items()},
+            tuple(one.interventions),
+        )
+        for one in read
+    )
+    people = tuple(f"p{i + 1}" for i in range(len(names))) if options.anonymise else tuple(names)
+    tasks = tuple(dict.fromkeys(one.task for one in episodes))
+    return Plan(recordings, tuple(episodes), tasks, people, tuple(notes))
+
+
+def find_difference(one: _Reading, other: _Reading) -> str:
+    """Return in what two recordings differ that must be the same in one data set; empty: in nothing."""
+    if one.tick_period_ns != other.tick_period_ns:
+        return f"{1e9 / one.tick_period_ns:g} ticks a second, not {1e9 / other.tick_period_ns:g}"
+    for kind, here, there in (("robots", one.robots, other.robots), ("objects", one.objects, other.objects)):
+        names = [spec.name for spec in here], [spec.name for spec in there]
+        if names[0] != names[1]:
+            return f"{kind} {', '.join(names[0]) or 'none'}, not {', '.join(names[1]) or 'none'}"
+    for mine, its in zip(one.robots, other.robots, strict=True):
+        for field in _ROBOT_FIELDS:
+            if (here := getattr(mine, field)) != (there := getattr(its, field)):
+                return f"robot {mine.name!r} has {field} {here!r:.80}, not {there!r:.80}"
+    return ""
+
+
+def _read(path: Path) -> _Reading:
+    """Read what planning needs, in one pass over the files besides that over the names."""
+    with Recording.open(path, warn=False) as recording:
+        header = recording.header
+        rows: list[RowTimes] = []
+        takes: list[_Take] = []
+        interventions: list[tuple[str, int, bool]] = []
+        for item in recording.outline():
+            if isinstance(item, RowTimes):
+                rows.append(item)
+            elif isinstance(item, Event):
+                _add_event(item, takes, interventions)
+        if not rows:
+            raise DatasetError(f"{path} has no step: there is nothing to export")
+        steps, first = np.unique(np.concatenate([row.steps for row in rows]), return_index=True)
+        times = RowTimes(steps, np.concatenate([row.session_times for row in rows])[first])
+        return _Reading(
+            *(path, identify_recording(recording), header.session_name, header.tick_period_ns),
+            *(header.robots, header.objects, read_names(recording), read_curation(recording)),
+            *(takes, times, interventions),
+        )
+
+
+def _add_event(event: Event, takes: list[_Take], interventions: list[tuple[str, int, bool]]) -> None:
+    body = event.body
+    if isinstance(body, Intervention):
+        interventions.append((body.robot, event.session_time, body.active))
+    if not isinstance(body, EpisodeChanged):
+        return
+    running = takes[-1] if takes and takes[-1].end_ns is None else None
+    # Texts of a task are in later versions of the event.
+    task = getattr(body, "instruction", "") or getattr(body, "task", "") or body.label
+    if body.state in _RECORDED:
+        if running is None:
+            takes.append(_Take(body.number, event.session_time, task=task))
+        return
+    if running is not None:
+        running.end_ns = event.session_time
+        running.task = running.task or task
+    if takes and takes[-1].number == body.number:
+        takes[-1].verdict = _VERDICTS.get(body.state, takes[-1].verdict)
+
+
+def _list_episodes(
+    index: int, read: _Reading, options: PlanOptions, hide: Callable[[str], str], notes: list[str]
+) -> Iterator[Episode]:
+    """Yield the episodes of a recording that are exported; note those that are not."""
+    where, steps, times = read.path.name, read.times.steps, read.times.session_times
+    takes = read.takes
+    if not takes:
+        notes.append(f"{where} has no episodes: it is exported as a whole, with the label {UNKNOWN}")
+        takes = [_Take(0, int(times[0]), task=read.name)]
+    unknown = set(read.curation.episodes) - {one.number for one in takes}
+    if unknown:
+        there_are = ", ".join(str(one.number) for one in takes)
+        raise DatasetError(f"{where} has no episode {min(unknown)}, which its curation names: it has {there_are}")
+    last_take = {one.number: one for one in takes}
+    for take in takes:
+        curated = read.curation.episodes.get(take.number) if last_take[take.number] is take else None
+        curated = curated or EpisodeCuration()
+        label = curated.label or take.verdict
+        if curated.drop or (label not in options.labels and take.number):
+            why = "dropped" if curated.drop else label
+            notes.append(f"{where}: episode {take.number} is left out: {why}")
+            continue
+        first = int(np.searchsorted(times, take.begin_ns))
+        end = len(times) if take.end_ns is None else int(np.searchsorted(times, take.end_ns))
+        if first >= end:
+            notes.append(f"{where}: episode {take.number} is left out: it has no step")
+            continue
+        task = hide(curated.task or options.task or take.task or read.name)
+        span = int(steps[first]), int(steps[end - 1]) + 1
+        yield Episode(index, take.number, label, task, *span, curated.trim)
+
+
+def _make_replacement(names: Sequence[str]) -> Callable[[str], str]:
+    """Return a function that replaces names in a text by p1, p2, ..., whatever their case."""
+    numbers = {name.lower(): i for i, name in reversed(list(enumerate(names, 1)))}
+    longest_first = sorted(filter(None, numbers), key=len, reverse=True)
+    if not longest_first:
+        return str
+    pattern = re.compile("|".join(map(re.escape, longest_first)), re.IGNORECASE)
+    return lambda text: pattern.sub(lambda found: f"p{numbers.get(found[0].lower(), 0)}", text)

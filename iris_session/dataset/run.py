@@ -1,0 +1,340 @@
+"""`export_dataset`: plans a data set, makes its episodes, in several processes if wanted, and closes them in order.
+
+An episode is one task, which depends on its arguments only; so it can be made anywhere, and only closing it needs to
+know how many there are. A run that was killed is continued by the next one with the same arguments.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import msgspec
+
+from iris_session.dataset.cameras import CameraSet, PictureSpec, make_view
+from iris_session.dataset.episodes import DatasetError, Episode, Plan, PlannedRecording, PlanOptions, make_plan
+from iris_session.dataset.frames import EpisodeLeftOutError, FrameReader, Schema, Table, make_schema
+from iris_session.dataset.lerobot import LeRobotWriter, VideoSink
+from iris_session.dataset.video import Stats
+from iris_session.recording import Recording
+from iris_session.replay.simulation import Replay
+from iris_session.session.core import SessionCore
+from iris_session.system.process import die_with_parent
+
+LEROBOT: Final = "lerobot"
+FORMATS: Final = (LEROBOT,)
+#: Packages whose version changes the bytes of a set.
+_PACKAGES: Final = ("iris-session", "mujoco", "numpy", "pyarrow", "av")
+#: Finished episodes that wait for an earlier one, per process.
+_AHEAD: Final = 2
+
+
+class DatasetOptions(msgspec.Struct, frozen=True):
+    """Options of an export.
+
+    Attributes:
+        fps: Frames a second of simulated time, at most the rate of the ticks.
+        pictures: Cameras, size and looks; without cameras no picture is drawn.
+        choice: Which episodes.
+        jobs: Processes.
+    """
+
+    fps: int = 30
+    pictures: PictureSpec = PictureSpec()
+    choice: PlanOptions = PlanOptions()
+    jobs: int = 1
+
+
+class Shares(NamedTuple):
+    """Seconds of processor and waiting that an episode took: in all, drawing, encoding."""
+
+    total_s: float
+    draw_s: float
+    encode_s: float
+
+
+class DatasetReport(msgspec.Struct, frozen=True):
+    """Result of an export. `episodes`, `frames`: of the whole set, which earlier runs may have begun.
+
+    `seconds`: of this run's episodes, each in order. `shares`: of their time, in re-simulation, drawing and encoding.
+    """
+
+    folder: str
+    format: str
+    episodes: int
+    frames: int
+    tasks: tuple[str, ...]
+    notes: tuple[str, ...]
+    left_out: tuple[str, ...] = ()
+    seconds: tuple[float, ...] = ()
+    shares: dict[str, float] = {}
+
+
+class EpisodeTask(msgspec.Struct, frozen=True):
+    """Everything that making an episode needs. `folder`: for its pictures."""
+
+    index: int
+    planned: PlannedRecording
+    episode: Episode
+    schema: Schema
+    pictures: PictureSpec
+    folder: str
+
+
+class MadeEpisode(NamedTuple):
+    """An episode that was made. `left_out`: why it has no frames, else empty."""
+
+    table: Table | None
+    pictures: dict[tuple[int, str], Stats]
+    shares: Shares
+    left_out: str = ""
+    notes: tuple[str, ...] = ()
+
+
+class EpisodeMaker:
+    """Makes episodes, of one recording after the other: files, scene and renderer stay open meanwhile."""
+
+    def __init__(self) -> None:
+        self._recording: Recording | None = None
+        self._reader: FrameReader | None = None
+        self._cameras: CameraSet | None = None
+        self._key: Any = None
+
+    def make(self, task: EpisodeTask) -> MadeEpisode:
+        """Make one episode: its frames, and its pictures in a folder.
+
+        Raises:
+            RecordingError: The recording does not verify, or cannot be drawn, or is of another kind than the set.
+            OSError: The folder cannot be written to.
+        """
+        began = time.perf_counter()
+        self._open(task)
+        assert self._reader is not None
+        assert self._recording is not None
+        recording, cameras = self._recording, self._cameras
+        draw_s = encode_s = 0.0
+        folder = Path(task.folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        sink = VideoSink(folder, task.schema, task.pictures)
+
+        def draw(core: SessionCore) -> None:
+            nonlocal draw_s, encode_s
+            if cameras is None:
+                return
+            at = time.perf_counter()
+            for look, camera, image in cameras.draw(core, recording):
+                drawn = time.perf_counter()
+                sink.add(look, camera, image)
+                draw_s, encode_s, at = draw_s + drawn - at, encode_s + time.perf_counter() - drawn, time.perf_counter()
+
+        try:
+            table = self._reader.read(task.episode, draw)
+        except EpisodeLeftOutError as error:
+            sink.abort()
+            return MadeEpisode(None, {}, Shares(time.perf_counter() - began, draw_s, encode_s), str(error))
+        except BaseException:
+            with suppress(Exception):
+                sink.abort()
+            raise
+        at = time.perf_counter()
+        stats = sink.close()
+        encode_s += time.perf_counter() - at
+        notes = tuple(cameras.notes) if cameras is not None else ()
+        return MadeEpisode(table, stats, Shares(time.perf_counter() - began, draw_s, encode_s), "", notes)
+
+    def _open(self, task: EpisodeTask) -> None:
+        """Open the recording and the renderer of a task, unless they are open."""
+        key = task.planned.path, task.schema, task.pictures
+        if key == self._key and self._reader is not None:
+            return
+        self.close()
+        self._recording = Recording.open(task.planned.path, warn=False)
+        self._reader = FrameReader(self._recording, task.planned, task.schema)
+        if task.pictures.cameras:
+            self._cameras = CameraSet(task.pictures)
+        self._key = key
+
+    def close(self) -> None:
+        """Close what is open."""
+        self._reader = None
+        if self._cameras is not None:
+            self._cameras.close()
+            self._cameras = None
+        if self._recording is not None:
+            self._recording.close()
+            self._recording = None
+
+
+def export_dataset(
+    files: Sequence[Path],
+    folder: Path,
+    to: str,
+    options: DatasetOptions | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> DatasetReport:
+    """Write a data set of recordings, or finish one that was begun with the same arguments.
+
+    Args:
+        files: Recordings, as by `list_files`.
+        folder: For the set. Every episode is on the disk before the next is closed.
+        to: One of `FORMATS`.
+        options: What frames have; None for numbers at 30 Hz.
+        progress: Called now and then with a text that says how far it is.
+
+    Returns:
+        What the set holds.
+
+    Raises:
+        DatasetError: The recordings do not fit together, or the folder has something else.
+        ReplayError: A recording does not verify here: a step gives another result.
+        RecordingError: A file cannot be read or drawn.
+    """
+    options, say = options or DatasetOptions(), progress or (lambda text: None)
+    if to not in FORMATS:
+        raise ValueError(f"{to!r}: give one of {', '.join(FORMATS)}")
+    say("reading")
+    plan = make_plan(files, options.choice)
+    schema = _find_schema(plan, options)
+    request = _make_request(to, plan, schema, options)
+    try:
+        return _write(folder, to, plan, schema, options, request, say)
+    except OSError as error:
+        reason = " ".join((error.strerror or str(error)).split())
+        raise DatasetError(f"the data set cannot be written to {folder}: {reason}") from error
+
+
+def _find_schema(plan: Plan, options: DatasetOptions) -> Schema:
+    """Return the columns of the first recording with an episode, and check that its scene has the cameras."""
+    with Recording.open(plan.recordings[plan.episodes[0].recording].path, warn=False) as recording:
+        core = Replay(recording).core
+        for camera in options.pictures.cameras:
+            make_view(core.world.model, camera)
+        return make_schema(core, options.fps)
+
+
+def _make_request(to: str, plan: Plan, schema: Schema, options: DatasetOptions) -> dict[str, Any]:
+    """Return all that the bytes of a set follow from, as plain values."""
+    episodes = [msgspec.to_builtins(one) for one in plan.episodes]
+    return {
+        "format": to,
+        "fps": schema.fps,
+        "pictures": msgspec.to_builtins(options.pictures),
+        "recordings": [one.id for one in plan.recordings],
+        "episodes": episodes,
+        "people": list(plan.people),
+        "schema": msgspec.to_builtins(schema),
+        "versions": {name: _find_version(name) for name in _PACKAGES},
+    }
+
+
+def _find_version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def _write(
+    folder: Path,
+    to: str,
+    plan: Plan,
+    schema: Schema,
+    options: DatasetOptions,
+    request: dict[str, Any],
+    say: Callable[[str], None],
+) -> DatasetReport:
+    writer = LeRobotWriter(folder, plan, schema, options.pictures, request)
+    first, first_look = writer.next
+    tasks = [
+        EpisodeTask(
+            i,
+            plan.recordings[episode.recording],
+            episode,
+            schema,
+            options.pictures,
+            str(writer.partial / f"{i:06d}"),
+        )
+        for i, episode in enumerate(plan.episodes)
+        if i >= first
+    ]
+    notes = list(plan.notes)
+    left_out: list[str] = []
+    seconds: list[float] = []
+    spent = [0.0, 0.0, 0.0]
+    say(f"episode {first + 1} of {len(plan.episodes)}")
+    for task, made in _make_all(tasks, options.jobs):
+        where = f"{Path(task.planned.path).name}: episode {task.episode.number}"
+        if made.table is None:
+            left_out.append(f"{where} is left out: {made.left_out}")
+        else:
+            for look in range(options.pictures.looks + 1):
+                if (task.index, look) >= (first, first_look):
+                    writer.close_episode(task.index, look, made.table, made.pictures, Path(task.folder))
+            notes += [f"{where}: {note}" for note in made.table.notes]
+        notes += [note for note in made.notes if note not in notes]
+        seconds.append(made.shares.total_s)
+        spent = [one + more for one, more in zip(spent, made.shares, strict=True)]
+        say(f"episode {task.index + 2} of {len(plan.episodes)}")
+    writer.finish()
+    total_s, draw_s, encode_s = spent
+    shares = {"resimulate": total_s - draw_s - encode_s, "draw": draw_s, "encode": encode_s}
+    return DatasetReport(
+        *(str(folder), to, writer.n_episodes, writer.n_frames, plan.tasks, tuple(notes), tuple(left_out)),
+        *(tuple(seconds), {name: one / total_s for name, one in shares.items()} if total_s else {}),
+    )
+
+
+def _make_all(tasks: Sequence[EpisodeTask], jobs: int) -> Iterator[tuple[EpisodeTask, MadeEpisode]]:
+    """Yield the episodes in order, made here or by `jobs` processes."""
+    if jobs == 1 or len(tasks) < 2:
+        maker = EpisodeMaker()
+        try:
+            for task in tasks:
+                yield task, maker.make(task)
+        finally:
+            maker.close()
+        return
+    # Spawned, since OpenGL and threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(tasks)), context, _begin_worker) as pool:
+        running: deque[tuple[EpisodeTask, Future[MadeEpisode]]] = deque()
+        ahead = iter(tasks)
+        try:
+            while True:
+                while len(running) < _AHEAD * jobs and (task := next(ahead, None)) is not None:
+                    running.append((task, pool.submit(make_episode, task)))
+                if not running:
+                    return
+                task, future = running.popleft()
+                yield task, future.result()
+        except BrokenProcessPool as error:
+            raise DatasetError(
+                "a process that made an episode was killed: give fewer --jobs if memory is short"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+_maker: EpisodeMaker | None = None
+
+
+def _begin_worker() -> None:
+    """Prepare a process that makes episodes: it ends with the one that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    die_with_parent(signal.SIGKILL)
+
+
+def make_episode(task: EpisodeTask) -> MadeEpisode:
+    """Make one episode in a process that keeps files and renderer open for the next."""
+    global _maker  # noqa: PLW0603
+    _maker = _maker or EpisodeMaker()
+    return _maker.make(task)
