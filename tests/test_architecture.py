@@ -71,6 +71,7 @@ FORBIDDEN = {
     "rrd": SOCKETS | RANDOM | {"mujoco"},
     "viewer": SOCKETS | CLOCKS | THREADS | RANDOM,
     "recording": {"mujoco"},
+    "dataset": SOCKETS | RANDOM | {"zmq", "rerun"},
     "replay": SOCKETS | CLOCKS | THREADS | RANDOM | {"zmq", "rerun"},
     "client": {"mujoco", "rerun"},
     "web": {"mujoco", "rerun"},

@@ -22,6 +22,7 @@ from iris_session.cli import (
     keys,
     pair,
     recording,
+    recording_export,
     scene,
     serve,
     status,
@@ -52,6 +53,7 @@ _EPILOG = """examples:
   iris-session view                          the newest recording in Rerun's viewer
   iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
   iris-session recording inspect sessions    what recordings hold: who, what, how long, damage
+  iris-session export sessions --to lerobot --out set    a data set for training, of all successful episodes
   iris-session recording export session.rrd --to csv -o tables
   iris-session recording render session.rrd -o session.mp4
   iris-session bench state --check           measure the state stream and compare it with its bars
@@ -60,7 +62,8 @@ _EPILOG = """examples:
 
 #: In the order of `--help`.
 _MODULES = (
-    demo, serve, pair, web, keys, status, control, doctor, view, recording, emulate, scene, anchors, cloud, bench,
+    demo, serve, pair, web, keys, status, control, doctor, view, recording, recording_export, emulate, scene, anchors,
+    cloud, bench,
 )  # fmt: skip
 
 

@@ -1,4 +1,5 @@
-"""`iris-session recording export`: a recording as tables, for pandas, NumPy, MATLAB or a spreadsheet; its assets."""
+"""`iris-session export`, also `recording export`: recordings as a data set for training; one as tables, for pandas,
+NumPy, MATLAB or a spreadsheet; its assets."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import argparse
 from pathlib import Path
 from typing import Final
 
+from iris_session.cli import recording_dataset
 from iris_session.cli.common import (
     ABOVE_0,
     MOST_LINES,
@@ -26,26 +28,33 @@ ASSETS: Final = "assets"
 
 
 def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `export` of `recording`."""
+    """Add the command `export`, and the action of `recording`, which are the same."""
     parser = add_command(
         actions,
         "export",
         run_export,
-        help="write joints, poses, forces, commands, samples and events as tables, or what its scenes are drawn of",
-        description="Write a recording as tables: one per robot (joints, end effector, gripper, contact force), per "
-        "object (pose, contact force) and of the commands of each robot, one of raw samples, one of events. Rows are "
-        "steps of the session as they were: of class closed it is simulated again and compared bit for bit, of class "
+        help="write recordings as a data set for training, or one as tables or as what its scenes are drawn of",
+        description="Make a data set of the episodes of recordings: frames of exact simulated time, pictures of "
+        "cameras that are chosen now, actions, labels. Every episode is on the disk before the next begins, and a run "
+        "that was killed is finished by the same command. Or write one recording as tables: one per robot (joints, end "
+        "effector, gripper, contact force), per object (pose, contact force) and of the commands of each robot, one of "
+        "raw samples, one of events. Sessions of class closed are simulated again and compared bit for bit, of class "
         "open the states are in the recording. Or write the assets of its scenes: specifications, meshes, textures, "
-        "each in a file named by its hash, and scenes.json. Exit status 1 if something is damaged or missing.",
+        "each in a file named by its hash. Exit status 1 if something is damaged, missing or left out.",
         examples="""
+            iris-session export sessions --to lerobot --out set --cameras operator --size 320x240 --plain
+            iris-session export session.rrd --to lerobot --out set --cameras "top=0,0,2->0,0,0:50" --looks 5 --jobs 4
             iris-session recording export session.rrd --to parquet -o tables
             iris-session recording export session.rrd --to csv -o tables --hz 30 --robot left --table robots
             iris-session recording export session.rrd --to npz -o tables --hz 500    every step at 500 Hz
             iris-session recording export session.rrd --to assets -o scene-files
         """,
     )
-    parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
-    parser.add_argument("--to", required=True, choices=(*FORMATS, ASSETS), help="format of the tables, or assets")
+    parser.add_argument(
+        "paths", type=Path, nargs="+", metavar="RECORDING", help="a .rrd or a folder; for a data set: any number"
+    )
+    formats = (*recording_dataset.FORMATS, *FORMATS, ASSETS)
+    parser.add_argument("--to", required=True, choices=formats, help="format of the data set or tables, or assets")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the files")
     parser.add_argument(
         "--hz",
@@ -64,13 +73,24 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     )
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty, replace its files")
     add_json_option(parser)
+    recording_dataset.add_options(parser)
 
 
 def run_export(arguments: argparse.Namespace) -> int:
-    """Write the tables, and print a line for each, or write the assets."""
+    """Write a data set; or the tables, and print a line for each; or the assets."""
     from iris_session.system.extras import require_package
 
     require_package("rerun", "reading recordings")
+    if arguments.to in recording_dataset.FORMATS:
+        given = [f"--{name}" for name in ("hz", "robot", "object", "table", "force") if getattr(arguments, name)]
+        if given:
+            raise CommandError(f"{', '.join(given)} are for tables: leave them out with --to {arguments.to}")
+        return recording_dataset.run(arguments)
+    if given := recording_dataset.list_given(arguments):
+        raise CommandError(f"{', '.join(given)} are for data sets: leave them out with --to {arguments.to}")
+    if len(arguments.paths) > 1:
+        raise CommandError(f"--to {arguments.to} takes one recording: give one, or a data set (--to lerobot)")
+    arguments.path = arguments.paths[0]
     if arguments.to == ASSETS:
         return _export_assets(arguments)
     from iris_session.replay.export import TABLES, ExportOptions, export_recording

@@ -57,13 +57,16 @@ class CameraSpec(msgspec.Struct, frozen=True):
 
 
 class PictureSpec(msgspec.Struct, frozen=True):
-    """Pictures of every frame. `looks`: varied looks beside the scene as it is; `seed`: of these."""
+    """Pictures of every frame. `looks`: varied looks beside the scene as it is; `seed`: of these. `plain`: without
+    shadows, reflections and smooth edges.
+    """
 
     cameras: tuple[CameraSpec, ...] = ()
     width: int = 640
     height: int = 480
     looks: int = 0
     seed: int = 0
+    plain: bool = False
 
 
 def parse_camera(text: str) -> CameraSpec:
@@ -158,7 +161,7 @@ class CameraSet:
         for look in range(spec.looks + 1):
             rng = np.random.default_rng((spec.seed, look))
             vary = partial(vary_look, rng=rng) if look else lambda drawn: None
-            self._renderers.append(Renderer(model, spec.width, spec.height, self.notes, vary))
+            self._renderers.append(Renderer(model, spec.width, spec.height, self.notes, vary, plain=spec.plain))
         self._model = model
 
 

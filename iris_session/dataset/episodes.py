@@ -60,7 +60,7 @@ class Curation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     episodes: dict[int, EpisodeCuration] = {}
 
 
-class Episode(msgspec.Struct, frozen=True):
+class PlannedEpisode(msgspec.Struct, frozen=True):
     """An episode that is exported.
 
     Attributes:
@@ -105,7 +105,7 @@ class Plan(msgspec.Struct, frozen=True):
     """
 
     recordings: tuple[PlannedRecording, ...]
-    episodes: tuple[Episode, ...]
+    episodes: tuple[PlannedEpisode, ...]
     tasks: tuple[str, ...]
     people: tuple[str, ...]
     notes: tuple[str, ...] = ()
@@ -305,7 +305,7 @@ def _add_event(event: Event, takes: list[_Take], interventions: list[tuple[str, 
 
 def _list_episodes(
     index: int, read: _Reading, options: PlanOptions, hide: Callable[[str], str], notes: list[str]
-) -> Iterator[Episode]:
+) -> Iterator[PlannedEpisode]:
     """Yield the episodes of a recording that are exported; note those that are not."""
     where, steps, times = read.path.name, read.times.steps, read.times.session_times
     takes = read.takes
@@ -332,7 +332,7 @@ def _list_episodes(
             continue
         task = hide(curated.task or options.task or take.task or read.name)
         span = int(steps[first]), int(steps[end - 1]) + 1
-        yield Episode(index, take.number, label, task, *span, curated.trim)
+        yield PlannedEpisode(index, take.number, label, task, *span, curated.trim)
 
 
 def _make_replacement(names: Sequence[str]) -> Callable[[str], str]:

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.dataset.episodes import DatasetError, Episode, PlannedRecording
+from iris_session.dataset.episodes import DatasetError, PlannedEpisode, PlannedRecording
 from iris_session.physics.names import find_element_id
 from iris_session.physics.world import find_opening_law
 from iris_session.protocol.names import CommandKind, LateCause
@@ -50,7 +50,7 @@ LATE_S: Final = 0.05
 _NO_POSE: Final = (0.0,) * 7
 
 
-class Column(msgspec.Struct, frozen=True):
+class FrameColumn(msgspec.Struct, frozen=True):
     """Numbers of each frame. `key`: for example `robots.left.joint_positions`. `names`: of its numbers."""
 
     key: str
@@ -73,35 +73,35 @@ class RobotColumns(msgspec.Struct, frozen=True):
 
 
 class Schema(msgspec.Struct, frozen=True):
-    """What every frame of a data set has. `ticks_per_s`: of the simulation, as a fraction."""
+    """Content of every frame of a data set. `ticks_per_s`: of the simulation, as a fraction."""
 
     fps: int
     ticks_per_s: tuple[int, int]
     robots: tuple[RobotColumns, ...]
     objects: tuple[str, ...]
 
-    def list_columns(self) -> list[Column]:
+    def list_columns(self) -> list[FrameColumn]:
         """Return the columns of a frame, in order."""
-        columns = [Column(SIM_TIME, FLOAT, ("s",)), Column(SESSION_TIME, INT, ("ns",))]
+        columns = [FrameColumn(SIM_TIME, FLOAT, ("s",)), FrameColumn(SESSION_TIME, INT, ("ns",))]
         for robot in self.robots:
             key = robot.make_key
             columns += [
-                Column(key("joint_positions"), FLOAT, robot.joints),
-                Column(key("joint_velocities"), FLOAT, robot.joints),
-                Column(key("end_effector"), FLOAT, POSE),
+                FrameColumn(key("joint_positions"), FLOAT, robot.joints),
+                FrameColumn(key("joint_velocities"), FLOAT, robot.joints),
+                FrameColumn(key("end_effector"), FLOAT, POSE),
             ]
             if robot.has_gripper:
-                columns.append(Column(key("gripper"), FLOAT, ("closed",)))
+                columns.append(FrameColumn(key("gripper"), FLOAT, ("closed",)))
             if robot.has_force:
-                columns.append(Column(key("contact_force"), FLOAT, ("normal_n",)))
+                columns.append(FrameColumn(key("contact_force"), FLOAT, ("normal_n",)))
             columns += [
-                Column(key(ACTION), FLOAT, robot.actuators),
-                Column(key("operator_pose"), FLOAT, POSE),
-                Column(key("operator"), INT, ("person",)),
-                Column(key("engaged"), BOOL, ("engaged",)),
-                Column(key("intervention"), BOOL, ("intervention",)),
+                FrameColumn(key(ACTION), FLOAT, robot.actuators),
+                FrameColumn(key("operator_pose"), FLOAT, POSE),
+                FrameColumn(key("operator"), INT, ("person",)),
+                FrameColumn(key("engaged"), BOOL, ("engaged",)),
+                FrameColumn(key("intervention"), BOOL, ("intervention",)),
             ]
-        columns += [Column(make_object_key(name), FLOAT, POSE) for name in self.objects]
+        columns += [FrameColumn(make_object_key(name), FLOAT, POSE) for name in self.objects]
         return columns
 
     def find_tick(self, frame: int) -> int:
@@ -125,10 +125,13 @@ class Table(NamedTuple):
 
     Attributes:
         columns: By key, shape (n, numbers of the column).
+        first_state: `mjSTATE_INTEGRATION` of the first frame, float64: commands at the rate of the ticks, applied to
+            it, give the episode again, bit for bit.
         notes: What has to be known of the episode, one line each.
     """
 
     columns: dict[str, NDArray[Any]]
+    first_state: NDArray[np.float64]
     notes: tuple[str, ...]
 
     @property
@@ -187,7 +190,7 @@ class FrameReader:
     def core(self) -> SessionCore:
         return self._replay.core
 
-    def read(self, episode: Episode, draw: Callable[[SessionCore], None] = lambda core: None) -> Table:
+    def read(self, episode: PlannedEpisode, draw: Callable[[SessionCore], None] = lambda core: None) -> Table:
         """Return the frames of an episode.
 
         Args:
@@ -206,6 +209,8 @@ class FrameReader:
             assert step.outcome is not None
             if step.step < episode.first_step:
                 continue
+            if step.step != episode.first_step + n_steps:
+                break
             n_steps += 1
             if not self._is_closed:
                 taking.add_state(self.core, step.step)
@@ -214,9 +219,9 @@ class FrameReader:
             taking.end_step(step.outcome.decision, step.session_time)
             if taking.is_complete:
                 return taking.make_table()
-        missing = episode.end_step - episode.first_step - n_steps
-        if missing:
-            raise EpisodeLeftOutError(f"{missing} of its steps are missing or damaged, or follow such ones")
+        if n_steps < episode.end_step - episode.first_step:
+            missing = f"step {episode.first_step + n_steps} is missing or damaged, or follows such a one"
+            raise EpisodeLeftOutError(f"{missing}: trim it to before")
         return taking.make_table()
 
     def _notice(self, cause: str) -> None:
@@ -237,7 +242,7 @@ class FrameReader:
         found = [(step, float(np.frombuffer(time, np.float64)[0])) for step, time in rows]
         return np.array([step for step, _ in found], np.int64), np.array([time for _, time in found])
 
-    def _find_steps(self, episode: Episode) -> list[int]:
+    def _find_steps(self, episode: PlannedEpisode) -> list[int]:
         """Return the step of each frame of an episode of class `open`."""
         steps, times = self._times
         first, end = np.searchsorted(steps, [episode.first_step, episode.end_step])
@@ -262,7 +267,7 @@ class _Taking:
 
     def __init__(
         self,
-        episode: Episode,
+        episode: PlannedEpisode,
         planned: PlannedRecording,
         schema: Schema,
         draw: Callable[[SessionCore], None],
@@ -283,12 +288,13 @@ class _Taking:
         #: What happened within a step, which has to be finished first.
         self.error: Exception | None = None
         self._reader: PlantReader | None = None
+        self._first_state = b""
         self._next_intervention = 0
         self._intervened: dict[str, bool] = {}
 
     @property
     def is_complete(self) -> bool:
-        """Whether later steps have no frame, because of the trim."""
+        """Return whether later steps have no frame, because of the trim."""
         return self._n_ticks >= self._end_tick
 
     def add_tick(self, core: SessionCore) -> None:
@@ -329,6 +335,7 @@ class _Taking:
                 )
             reader = self._reader = PlantReader(core)
         view, values = reader.world.view(), self._values
+        self._first_state = self._first_state or core.world.save_state()
         values[SIM_TIME].append(view.sim_time)
         for robot in self._schema.robots:
             key, found = robot.make_key, reader.robots[robot.name]
@@ -392,7 +399,7 @@ class _Taking:
             notes.append(
                 f"{self._repeated} frames repeat the state before: the recording has no newer one at their time"
             )
-        return Table(columns, tuple(notes))
+        return Table(columns, np.frombuffer(self._first_state, np.float64), tuple(notes))
 
 
 def find_schema_difference(one: Schema, other: Schema) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.dataset.cameras import PictureSpec
-from iris_session.dataset.episodes import DatasetError, Episode, Plan
+from iris_session.dataset.episodes import DatasetError, Plan, PlannedEpisode
 from iris_session.dataset.frames import ACTION, BOOL, Schema, Table
 from iris_session.dataset.video import (
     CODEC_NAME,
@@ -113,7 +113,7 @@ class LeRobotWriter:
         self.next = (0, 0)
         check_folder(folder, REQUEST, request)
         shutil.rmtree(self.partial, ignore_errors=True)
-        self.partial.mkdir(parents=True)
+        self.partial.mkdir(parents=True, exist_ok=True)
         if (folder / INFO).exists():
             self._continue()
         else:
@@ -127,7 +127,7 @@ class LeRobotWriter:
 
     def _continue(self) -> None:
         """Read how far the set is, and fold the statistics of its episodes again, in their order."""
-        from pyarrow import parquet
+        from pyarrow import parquet  # type: ignore[import-untyped]
 
         count = json.loads((self.folder / INFO).read_bytes())["total_episodes"]
         for i in range(count):
@@ -161,7 +161,7 @@ class LeRobotWriter:
         self._write_table(_format(DATA_PATH, number), _make_table(columns, self._features))
         stats = {key: compute_stats(values) for key, values in columns.items()}
         stats |= {key: pictures[look, camera] for camera, key in self._cameras.items()}
-        row = self._make_row(number, index, look, episode, n, table.notes) | _flatten(stats)
+        row = self._make_row(number, index, look, episode, table) | _flatten(stats)
         self._write_table(_format(EPISODES_PATH, number), _make_row_table(row))
         self._add_stats(stats)
         self.n_episodes, self.n_frames = number + 1, self.n_frames + n
@@ -187,16 +187,14 @@ class LeRobotWriter:
             **given,
         }
         frames = np.arange(n, dtype=np.int64)
-        own = (
+        own: tuple[NDArray[Any], ...] = (
             *((frames / self._schema.fps).astype(np.float32), frames, np.full(n, number, np.int64)),
             *(self.n_frames + frames, np.full(n, task, np.int64)),
         )
         return columns | {key: values[:, None] for key, values in zip(_FRAME_INDEX, own, strict=True)}
 
-    def _make_row(
-        self, number: int, index: int, look: int, episode: Episode, n: int, notes: Sequence[str]
-    ) -> dict[str, Any]:
-        chunk, file = divmod(number, CHUNK)
+    def _make_row(self, number: int, index: int, look: int, episode: PlannedEpisode, table: Table) -> dict[str, Any]:
+        n, (chunk, file) = table.n_frames, divmod(number, CHUNK)
         row: dict[str, Any] = {
             "episode_index": number,
             "tasks": [episode.task],
@@ -216,7 +214,8 @@ class LeRobotWriter:
             "iris/episode": episode.number,
             "iris/plan_index": index,
             "iris/look": look,
-            "iris/notes": "; ".join(notes),
+            "iris/notes": "; ".join(table.notes),
+            "iris/first_state": table.first_state,
         }
 
     def _add_stats(self, stats: Mapping[str, Stats]) -> None:

@@ -15,13 +15,14 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from importlib import metadata
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import msgspec
 
 from iris_session.dataset.cameras import CameraSet, PictureSpec, make_view
-from iris_session.dataset.episodes import DatasetError, Episode, Plan, PlannedRecording, PlanOptions, make_plan
+from iris_session.dataset.episodes import DatasetError, Plan, PlannedEpisode, PlannedRecording, PlanOptions, make_plan
 from iris_session.dataset.frames import EpisodeLeftOutError, FrameReader, Schema, Table, make_schema
 from iris_session.dataset.lerobot import LeRobotWriter, VideoSink
 from iris_session.dataset.video import Stats
@@ -84,7 +85,7 @@ class EpisodeTask(msgspec.Struct, frozen=True):
 
     index: int
     planned: PlannedRecording
-    episode: Episode
+    episode: PlannedEpisode
     schema: Schema
     pictures: PictureSpec
     folder: str
@@ -310,7 +311,7 @@ def _make_all(tasks: Sequence[EpisodeTask], jobs: int) -> Iterator[tuple[Episode
         ahead = iter(tasks)
         try:
             while True:
-                while len(running) < _AHEAD * jobs and (task := next(ahead, None)) is not None:
+                for task in islice(ahead, _AHEAD * jobs - len(running)):
                     running.append((task, pool.submit(make_episode, task)))
                 if not running:
                     return

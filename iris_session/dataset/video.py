@@ -47,9 +47,7 @@ class VideoWriter:
         if CODEC not in av.codecs_available:
             raise DatasetError(f"this PyAV has no {CODEC}: pip install av, whose wheels bring it")
         self._av = av
-        self._container = av.open(
-            str(path), "w", format="mp4", options={"fflags": "+bitexact"}
-        )
+        self._container = av.open(str(path), "w", format="mp4", options={"fflags": "+bitexact"})
         self._stream: Any = self._container.add_stream(CODEC, fps, options=OPTIONS)
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, PIXELS
         self._period, self._n = Fraction(1, fps), 0

@@ -107,7 +107,11 @@ class Replay:
         """
         end = self._recording.end
         total = 0 if end is None else max(0, end.step - self._last)
-        if after is not None and (newest := self._keyframes.find_newest(after)) is not None and newest.step > self._last:
+        if (
+            after is not None
+            and (newest := self._keyframes.find_newest(after)) is not None
+            and newest.step > self._last
+        ):
             total = max(0, total - (newest.step - self._last))
             self._restore(newest)
         for done, row in enumerate(self._recording.rows(self._last if after is not None else None)):
@@ -121,7 +125,7 @@ class Replay:
         self._progress(total, total)
 
     def steps_between(self, first: int, end: int) -> Iterator[ReplayedStep]:
-        """Take steps again, and yield each: from the newest keyframe before `first`, which may be earlier, to `end` - 1.
+        """Take steps again, and yield each: from the newest keyframe before `first`, which may be earlier, up to `end`.
 
         Call it again for later steps: the files are read once for all calls, so that a call costs what its own steps
         cost, wherever they are. Raises as `steps`.

@@ -1,0 +1,100 @@
+"""Options and output of `iris-session export --to lerobot`: a data set for training, made of recordings."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+from iris_session.cli.common import MOST_LINES, CommandError, ending_as_interrupts, make_number_type, print_result
+from iris_session.cli.progress import ProgressLine
+from iris_session.cli.recording_render import parse_size
+
+if TYPE_CHECKING:
+    from iris_session.dataset.run import DatasetReport
+
+#: What `--to` may be, and the packages that each needs.
+FORMATS: Final = {"lerobot": ("pyarrow", "av")}
+LABELS: Final = ("success", "failure", "unknown")
+#: Options that only data sets have, with the values that stand for "not given".
+_OPTIONS: Final = {
+    **dict.fromkeys(("fps", "cameras", "size", "looks", "seed", "labels", "task", "jobs")),
+    **dict.fromkeys(("plain", "anonymise"), False),
+}
+DEFAULT_FPS: Final = 30
+DEFAULT_SIZE: Final = (640, 480)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of data sets."""
+    group = parser.add_argument_group("data sets (--to lerobot)")
+    whole = make_number_type(int, "a rate: give a whole number of frames a second, for example 30", 1, 1000)
+    group.add_argument("--fps", type=whole, metavar="N", help="frames per second of simulated time (default: 30)")
+    group.add_argument(
+        "--cameras",
+        metavar="LIST",
+        help="pictures of every frame: cameras of the model, NAME=CAMERA, or places NAME=X,Y,Z->X,Y,Z:FOVY, separated "
+        "by commas (default: none)",
+    )
+    group.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of a picture (default: 640x480)")
+    looks = make_number_type(int, "a number of looks: give 0 to 1000", 0, 1000)
+    group.add_argument("--looks", type=looks, metavar="N", help="every episode N more times: other light and colours")
+    group.add_argument(
+        "--seed", type=make_number_type(int, "a seed: give a whole number from 0", 0), metavar="N", help="of the looks"
+    )
+    group.add_argument("--plain", action="store_true", help="pictures without shadows: faster without a graphics card")
+    group.add_argument(
+        "--labels", metavar="LIST", help=f"episodes to export, of {', '.join(LABELS)} (default: success)"
+    )
+    group.add_argument("--task", metavar="TEXT", help="what was to be done, for all episodes")
+    group.add_argument("--anonymise", action="store_true", help="p1, p2, ... in place of the names of people")
+    jobs = make_number_type(int, "a number of processes: give 1 or more", 1, 1024)
+    group.add_argument("--jobs", type=jobs, metavar="N", help="processes, an episode each (default: 1)")
+
+
+def list_given(arguments: argparse.Namespace) -> list[str]:
+    """Return the options of data sets that were given."""
+    return [f"--{name}" for name, absent in _OPTIONS.items() if getattr(arguments, name) != absent]
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the data set, and print what it holds."""
+    from iris_session.system.extras import require_package
+
+    for package in FORMATS[arguments.to]:
+        require_package(package, f"--to {arguments.to}")
+    from iris_session.dataset.cameras import PictureSpec, parse_cameras
+    from iris_session.dataset.episodes import PlanOptions, list_files
+    from iris_session.dataset.run import DatasetOptions, export_dataset
+
+    width, height = arguments.size or DEFAULT_SIZE
+    if width % 2 or height % 2:
+        raise CommandError(f"--size {width}x{height}: a video needs even numbers")
+    labels = tuple(dict.fromkeys(filter(None, (arguments.labels or LABELS[0]).replace(" ", "").split(","))))
+    if not labels or not set(labels) <= set(LABELS):
+        raise CommandError(f"--labels {arguments.labels!r:.60}: give some of {', '.join(LABELS)}")
+    options = DatasetOptions(
+        arguments.fps or DEFAULT_FPS,
+        PictureSpec(
+            parse_cameras(arguments.cameras or ""),
+            *(width, height, arguments.looks or 0, arguments.seed or 0, arguments.plain),
+        ),
+        PlanOptions(labels, arguments.task or "", arguments.anonymise),
+        arguments.jobs or 1,
+    )
+    with ending_as_interrupts(), ProgressLine(arguments.out) as progress:
+        files = list_files(arguments.paths)
+        report = export_dataset(files, arguments.out, arguments.to, options, progress.show)
+    print_result(arguments, report, _format(report))
+    return 1 if report.left_out else 0
+
+
+def _format(report: DatasetReport) -> list[str]:
+    n = f"{report.episodes:,} episode{'' if report.episodes == 1 else 's'}"
+    lines = [f"{report.folder}: {n}, {report.frames:,} frames, {report.format}"]
+    return [*lines, *_first(report.left_out), *_first(report.notes)]
+
+
+def _first(lines: Sequence[str]) -> list[str]:
+    more = len(lines) - MOST_LINES
+    return [*(f"  {line}" for line in lines[:MOST_LINES]), *([f"  and {more} more"] if more > 0 else [])]

@@ -1,0 +1,120 @@
+"""Pictures of a data set are MuJoCo's own of the state, bit for bit; looks change what is seen and nothing else."""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from iris_session.dataset.cameras import CameraSet, CameraSpec, PictureSpec, make_view, parse_cameras
+from iris_session.dataset.episodes import DatasetError
+from iris_session.recording import Recording
+from iris_session.replay.pictures import Image, open_gl
+from iris_session.session.core import SessionCore
+from tests.dataset.support import record
+from tests.replay.support import make_drawn_core
+from tests.session.play import make_core
+
+WIDTH, HEIGHT = 128, 96
+TOP = "top=0.4,-0.3,2.4->0,0.01,0.7:50"
+
+Draw = Callable[[SessionCore, Any, float], Image]
+
+
+@pytest.fixture
+def reference(monkeypatch: pytest.MonkeyPatch) -> Draw:
+    """Return a function that draws a state with `mujoco.Renderer`."""
+    from mujoco.egl import GLContext
+
+    module: Any = sys.modules[mujoco.Renderer.__module__]
+    monkeypatch.setattr(module.gl_context, "GLContext", GLContext)
+    open_gl(WIDTH, HEIGHT).free()
+
+    def draw(core: SessionCore, camera: Any, fovy: float) -> Image:
+        model = copy.copy(core.world.model)
+        model.vis.global_.fovy = fovy or model.vis.global_.fovy
+        renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
+        renderer.update_scene(core.world.data, camera)
+        image: Image = renderer.render().copy()
+        renderer.close()
+        return image
+
+    return draw
+
+
+def draw_all(core: SessionCore, spec: PictureSpec, path: Path) -> dict[tuple[int, str], Image]:
+    with Recording.open(path, warn=False) as recording, CameraSet(spec) as cameras:
+        return {(look, name): image for look, name, image in cameras.draw(core, recording)}
+
+
+def test_pictures_are_those_of_mujoco(tmp_path: Path, reference: Draw) -> None:
+    made = record(tmp_path / "session.rrd", {}, steps=60)
+    core = made.core
+    spec = PictureSpec(parse_cameras(f"operator,{TOP}"), WIDTH, HEIGHT)
+    found = draw_all(core, spec, made.path)
+    top = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(core.world.model, top)
+    way = np.array([-0.4, 0.31, -1.7])
+    top.lookat, top.distance = (0.0, 0.01, 0.7), np.linalg.norm(way)
+    top.azimuth, top.elevation = np.degrees(np.arctan2(way[1], way[0])), np.degrees(np.arcsin(way[2] / top.distance))
+    for name, camera, fovy in (("operator", "operator", 0.0), ("top", top, 50.0)):
+        assert found[0, name].std() > 5.0, "the picture is not empty"
+        assert found[0, name].tobytes() == reference(core, camera, fovy).tobytes()
+
+
+def test_looks_follow_from_the_seed_and_change_nothing_that_moves(tmp_path: Path) -> None:
+    made = record(tmp_path / "session.rrd", {}, steps=3)
+    before = made.core.world.encode_model(), made.core.world.save_state()
+    spec = PictureSpec((CameraSpec("operator", "operator"),), WIDTH, HEIGHT, looks=2, seed=4)
+    one, other = draw_all(made.core, spec, made.path), draw_all(made.core, spec, made.path)
+    changed = draw_all(made.core, PictureSpec(spec.cameras, WIDTH, HEIGHT, 1, 5), made.path)
+    assert list(one) == [(look, "operator") for look in range(3)]
+    assert [image.tobytes() for image in one.values()] == [image.tobytes() for image in other.values()]
+    pictures = {image.tobytes() for image in (*one.values(), changed[1, "operator"])}
+    assert len(pictures) == 4
+    assert changed[0, "operator"].tobytes() == one[0, "operator"].tobytes()
+    assert (made.core.world.encode_model(), made.core.world.save_state()) == before
+
+
+def test_plain_pictures_have_no_shadows_and_reflections(tmp_path: Path) -> None:
+    made = record(tmp_path / "session.rrd", {}, steps=3)
+    cameras = (CameraSpec("operator", "operator"),)
+    full = draw_all(made.core, PictureSpec(cameras, WIDTH, HEIGHT), made.path)[0, "operator"]
+    plain = draw_all(made.core, PictureSpec(cameras, WIDTH, HEIGHT, plain=True), made.path)[0, "operator"]
+    model = copy.copy(made.core.world.model)
+    model.light_castshadow[:], model.mat_reflectance[:] = 0, 0.0
+    core = make_core(model)
+    core.world.restore_state(made.core.world.save_state())
+    without = draw_all(core, PictureSpec(cameras, WIDTH, HEIGHT), made.path)[0, "operator"]
+    assert plain.tobytes() == without.tobytes() != full.tobytes()
+
+
+def test_cameras_are_parsed() -> None:
+    assert parse_cameras("") == ()
+    assert parse_cameras("wrist, a/b=side") == (CameraSpec("wrist", "wrist"), CameraSpec("a_b", "side"))
+    assert parse_cameras(f"{TOP},left/wrist") == (
+        CameraSpec("top", "", (0.4, -0.3, 2.4), (0.0, 0.01, 0.7), 50.0),
+        CameraSpec("left_wrist", "left/wrist"),
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["=x", "a=", "top=1,2->3", "top=1,2,3->1,2,3", "top=0,0,1->0,0,0:190", "a b", "top=0,0,1->0,0,nan"]
+)
+def test_what_is_no_camera_is_refused(text: str) -> None:
+    with pytest.raises(DatasetError, match="is no camera: give a name of the model, NAME=CAMERA, or a place"):
+        parse_cameras(text)
+
+
+def test_unknown_and_doubled_cameras_are_refused() -> None:
+    model = make_drawn_core().world.model
+    with pytest.raises(DatasetError, match=r"no camera 'nope' in the scene: give one of its own \(operator, side\)"):
+        make_view(model, CameraSpec("nope", "nope"))
+    with pytest.raises(DatasetError, match="two cameras have the name 'a'"):
+        parse_cameras("a=side,a=operator")
