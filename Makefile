@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 .NOTPARALLEL:
 
-.PHONY: install install-dev demo screenshots test test-long check test-web test-random bench web clean help
+.PHONY: install install-dev demo screenshots test test-long check test-web test-random readers bench web clean help
 
 help:
 	@echo "make demo     two emulated operators hand a hammer over, recorded and verified"
@@ -16,6 +16,7 @@ help:
 	@echo "make check    only lint, format, strict types"
 	@echo "make test-web    only strict types and tests of web_client"
 	@echo "make test-random  the unit tests with other random examples than the usual ones"
+	@echo "make readers  loads exported data sets in LeRobot, in an environment of its own below READERS"
 	@echo "make bench    the benchmarks of docs/benchmarks.md"
 	@echo "make screenshots  records the demo anew and makes the pictures of README and docs"
 	@echo "make install  only makes $(VENV) and installs"
@@ -98,6 +99,11 @@ test-web: web_client/node_modules/.installed
 
 test-random: install-dev
 	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n 3
+
+# The environment (2 GB: LeRobot brings PyTorch) stays in READERS for the next time.
+READERS ?= build/readers
+readers: install
+	@$(BIN)/python tools/readers.py --work "$(READERS)"
 
 # Every benchmark runs, whatever the one before says; the status is that of the worst.
 bench: install

@@ -1,0 +1,166 @@
+"""Load exported data sets in the programs that train on them, and compare every number and label.
+
+    make readers
+    python tools/readers.py --work FOLDER [--recording session.rrd]
+
+A recording of `iris-session demo handover` is exported, then read in an environment of its own (FOLDER/venv) with
+LeRobot's `LeRobotDataset` and `lerobot-doctor`. What they give is compared with what was exported (`reader_checks.py`,
+which runs there); a copy of the set in which one column is shifted by one frame must be noticed. Exit status 0 if all
+agree.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyarrow import parquet
+
+from iris_session.dataset.cameras import CameraSet, PictureSpec, parse_cameras
+from iris_session.dataset.episodes import PlanOptions, make_plan
+from iris_session.dataset.frames import FrameReader, make_schema
+from iris_session.recording import Recording
+from iris_session.replay.simulation import Replay
+from iris_session.session.core import SessionCore
+
+#: What the environment has: the newest LeRobot that this Python can have.
+PACKAGES = ("lerobot", "lerobot-doctor")
+FPS = 30
+CAMERAS = "operator,top=0,0,2.4->0,0.01,0.7:50"
+SIZE = (160, 120)
+#: Every so many pictures, one is compared.
+EVERY = 20
+#: Columns that are shifted by one frame in a copy of the set.
+SHIFTED = ("action", "robots.left.joint_positions", "objects.hammer.pose", "session_time_ns")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, help="folder for environment and data; kept (default: a temporary one)")
+    parser.add_argument("--recording", type=Path, help="a recording of the demo (default: one is made)")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        work: Path = (arguments.work or Path(temporary)).resolve()
+        work.mkdir(parents=True, exist_ok=True)
+        python = make_environment(work / "venv")
+        recording = arguments.recording or record_demo(work)
+        folder = work / "set"
+        shutil.rmtree(folder, ignore_errors=True)
+        size = f"{SIZE[0]}x{SIZE[1]}"
+        export = ["export", str(recording), "--to", "lerobot", "--out", str(folder), "--fps", str(FPS)]
+        run_iris(*export, "--cameras", CAMERAS, "--size", size, "--plain")
+        write_expected(recording, work / "expected.npz")
+        return check(python, work, folder)
+
+
+def make_environment(folder: Path) -> Path:
+    """Make the environment, or use the one that is there. Return its Python."""
+    python = folder / "bin" / "python"
+    if not (folder / ".made").exists():
+        print(f"installing {', '.join(PACKAGES)} into {folder} ...", flush=True)
+        subprocess.run([sys.executable, "-m", "venv", "--clear", str(folder)], check=True)
+        pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        subprocess.run([*pip, *PACKAGES], check=True)
+        (folder / ".made").touch()
+    return python
+
+
+def run_iris(*arguments: str) -> None:
+    subprocess.run([sys.executable, "-m", "iris_session.cli.main", *arguments], check=True)
+
+
+def record_demo(work: Path) -> Path:
+    path = work / "demo" / "session.rrd"
+    shutil.rmtree(path.parent, ignore_errors=True)
+    run_iris("demo", "handover", "--record", str(path))
+    return path
+
+
+def write_expected(recording: Path, path: Path) -> None:
+    """Write the frames of the recording and some of their pictures, before any encoding."""
+    plan = make_plan([recording], PlanOptions(("success", "failure", "unknown")))
+    found: dict[str, Any] = {}
+    with (
+        Recording.open(recording) as opened,
+        CameraSet(PictureSpec(parse_cameras(CAMERAS), *SIZE, plain=True)) as cameras,
+    ):
+        reader = FrameReader(opened, plan.recordings[0], make_schema(Replay(opened).core, FPS))
+        for i, episode in enumerate(plan.episodes):
+            table = reader.read(episode, partial(keep_picture, cameras, opened, found, i, count()))
+            found |= {f"{i}|{key}": values for key, values in table.columns.items()}
+            found[f"{i}|task"] = np.array(episode.task)
+            found[f"{i}|label"] = np.array(episode.label)
+    np.savez(path, **found)
+
+
+def keep_picture(
+    cameras: CameraSet,
+    recording: Recording,
+    found: dict[str, Any],
+    episode: int,
+    frames: Iterator[int],
+    core: SessionCore,
+) -> None:
+    """Draw some of the frames."""
+    frame = next(frames)
+    if frame % EVERY == 0:
+        for _, camera, image in cameras.draw(core, recording):
+            found[f"{episode}|observation.images.{camera}|{frame}"] = image
+
+
+def check(python: Path, work: Path, folder: Path) -> int:
+    """Run the checks in the environment: of the set, and of copies that are wrong."""
+    status = run_checks(python, folder, work / "expected.npz")
+    print(f"LeRobotDataset: {status or 'every number, label and picture is as exported'}", flush=True)
+    failures = [status] if status else []
+    for key in SHIFTED:
+        copy = work / "shifted"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(folder, copy)
+        shift(copy / "data/chunk-000/file-000.parquet", key)
+        noticed = run_checks(python, copy, work / "expected.npz", "--numbers-only")
+        print(f"{key} shifted by one frame: {noticed or 'NOT NOTICED'}", flush=True)
+        failures += [] if key in noticed else [f"a shift of {key} is not noticed"]
+    command = [python.with_name("lerobot-doctor"), "check", folder]
+    doctor = subprocess.run(command, check=False, capture_output=True, text=True)
+    lines = [line for line in doctor.stdout.splitlines() if line.startswith(("[", "Summary"))]
+    print("\n".join(lines), flush=True)
+    if "[FAIL]" in doctor.stdout or not lines:
+        failures.append("lerobot-doctor: a check fails")
+    print("\n".join(f"FAILED {one}" for one in failures) or "all readers agree")
+    return 1 if failures else 0
+
+
+def run_checks(python: Path, folder: Path, expected: Path, *options: str) -> str:
+    """Return the first difference that a reader finds, empty for none."""
+    script = Path(__file__).with_name("reader_checks.py")
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment |= {"HF_HUB_OFFLINE": "1", "HF_HOME": str(expected.parent / "hf")}
+    command = [python, script, folder, expected, *options]
+    done = subprocess.run(command, check=False, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"the reader failed:\n{done.stderr[-3000:]}")
+    return str(json.loads(done.stdout.splitlines()[-1])["difference"])
+
+
+def shift(path: Path, key: str) -> None:
+    """Shift a column by one frame: the first value stands twice, the last is gone."""
+    table = parquet.read_table(path)
+    values = table.column(key).combine_chunks()
+    rows = [0, *range(len(values) - 1)]
+    parquet.write_table(table.set_column(table.column_names.index(key), key, values.take(rows)), path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
