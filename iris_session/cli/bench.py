@@ -86,6 +86,11 @@ _BENCHMARKS: Final = {
         {"seconds": 60.0, "kills": 21, "seed": 0},
         {"kills": (1, 1000)},
     ),
+    "export": _Benchmark(
+        "a data set is made of a recording with episodes, pictures drawn and encoded",
+        {"episodes": 20, "seconds": 20.0, "shadows": False, "jobs": 1, "python": ""},
+        {"episodes": (2, 10_000), "jobs": (1, 1024)},
+    ),
     # A tab, one that is disturbed and one that is not; a gateway has three quarters of all connections.
     "web": _Benchmark(
         "browsers behind the web gateway, one of them a real tab",
@@ -109,7 +114,11 @@ _TEXTS: Final = {
     "mbit": "bandwidth of every client's link from the middle of the measured part on [Mbit/s]; 0: not limited",
     "objects": "bodies with meshes",
     "assets_mb": "size of the assets after compression [MB]",
-    "seconds": "measured part [s]",
+    "seconds": "measured part [s]; for `export` the length of an episode",
+    "episodes": "episodes of the recording",
+    "shadows": "draw pictures in full; without a graphics card this takes most of an hour",
+    "jobs": "processes, an episode each",
+    "python": "a Python with LeRobot, whose own writer is measured beside ours",
     "kills": "kills of recorder, authority and both",
     "seed": "random seed",
     "beside": "beside a session in which two arms are driven, 500 ticks a second",

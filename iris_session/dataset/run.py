@@ -7,6 +7,7 @@ know how many there are. A run that was killed is continued by the next one with
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import signal
 import time
 from collections import deque
@@ -56,17 +57,19 @@ class DatasetOptions(msgspec.Struct, frozen=True):
 
 
 class Shares(NamedTuple):
-    """Seconds of processor and waiting that an episode took: in all, drawing, encoding."""
+    """Seconds that an episode took, once its recording is open: in all, drawing, encoding; and of the processor."""
 
     total_s: float
     draw_s: float
     encode_s: float
+    cpu_s: float
 
 
 class DatasetReport(msgspec.Struct, frozen=True):
     """Result of an export. `episodes`, `frames`: of the whole set, which earlier runs may have begun.
 
-    `seconds`: of this run's episodes, each in order. `shares`: of their time, in re-simulation, drawing and encoding.
+    `seconds`: of the processor, for each episode of this run in order. `shares`: of their time, in re-simulation,
+    drawing, encoding, and closing.
     """
 
     folder: str
@@ -117,8 +120,13 @@ class EpisodeMaker:
             RecordingError: The recording does not verify, or cannot be drawn, or is of another kind than the set.
             OSError: The folder cannot be written to.
         """
-        began = time.perf_counter()
         self._open(task)
+        began, began_cpu = time.perf_counter(), time.process_time()
+
+        def measure() -> Shares:
+            cpu_s = time.process_time() - began_cpu
+            return Shares(time.perf_counter() - began, draw_s, encode_s, cpu_s)
+
         assert self._reader is not None
         assert self._recording is not None
         recording, cameras = self._recording, self._cameras
@@ -141,7 +149,7 @@ class EpisodeMaker:
             table = self._reader.read(task.episode, draw)
         except EpisodeLeftOutError as error:
             sink.abort()
-            return MadeEpisode(None, {}, Shares(time.perf_counter() - began, draw_s, encode_s), str(error))
+            return MadeEpisode(None, {}, measure(), str(error))
         except BaseException:
             with suppress(Exception):
                 sink.abort()
@@ -150,7 +158,7 @@ class EpisodeMaker:
         stats = sink.close()
         encode_s += time.perf_counter() - at
         notes = tuple(cameras.notes) if cameras is not None else ()
-        return MadeEpisode(table, stats, Shares(time.perf_counter() - began, draw_s, encode_s), "", notes)
+        return MadeEpisode(table, stats, measure(), "", notes)
 
     def _open(self, task: EpisodeTask) -> None:
         """Open the recording and the renderer of a task, unless they are open."""
@@ -270,10 +278,11 @@ def _write(
     notes = list(plan.notes)
     left_out: list[str] = []
     seconds: list[float] = []
-    spent = [0.0, 0.0, 0.0]
+    total_s = draw_s = encode_s = close_s = 0.0
     say(f"episode {first + 1} of {len(plan.episodes)}")
     for task, made in _make_all(tasks, options.jobs):
         where = f"{Path(task.planned.path).name}: episode {task.episode.number}"
+        began, began_cpu = time.perf_counter(), time.process_time()
         if made.table is None:
             left_out.append(f"{where} is left out: {made.left_out}")
         else:
@@ -282,12 +291,15 @@ def _write(
                     writer.close_episode(task.index, look, made.table, made.pictures, Path(task.folder))
             notes += [f"{where}: {note}" for note in made.table.notes]
         notes += [note for note in made.notes if note not in notes]
-        seconds.append(made.shares.total_s)
-        spent = [one + more for one, more in zip(spent, made.shares, strict=True)]
+        shutil.rmtree(task.folder, ignore_errors=True)
+        closing_s = time.perf_counter() - began
+        seconds.append(made.shares.cpu_s + time.process_time() - began_cpu)
+        total_s, close_s = total_s + made.shares.total_s + closing_s, close_s + closing_s
+        draw_s, encode_s = draw_s + made.shares.draw_s, encode_s + made.shares.encode_s
         say(f"episode {task.index + 2} of {len(plan.episodes)}")
     writer.finish()
-    total_s, draw_s, encode_s = spent
-    shares = {"resimulate": total_s - draw_s - encode_s, "draw": draw_s, "encode": encode_s}
+    rest_s = total_s - draw_s - encode_s - close_s
+    shares = {"resimulate": rest_s, "draw": draw_s, "encode": encode_s, "close": close_s}
     return DatasetReport(
         *(str(folder), to, writer.n_episodes, writer.n_frames, plan.tasks, tuple(notes), tuple(left_out)),
         *(tuple(seconds), {name: one / total_s for name, one in shares.items()} if total_s else {}),
