@@ -125,13 +125,13 @@ class Table(NamedTuple):
 
     Attributes:
         columns: By key, shape (n, numbers of the column).
-        first_state: `mjSTATE_INTEGRATION` of the first frame, float64: commands at the rate of the ticks, applied to
-            it, give the episode again, bit for bit.
+        states: `mjSTATE_INTEGRATION` of each frame, shape (n, k) float64: commands at the rate of the ticks, applied
+            to the first, give the episode again, bit for bit.
         notes: What has to be known of the episode, one line each.
     """
 
     columns: dict[str, NDArray[Any]]
-    first_state: NDArray[np.float64]
+    states: NDArray[np.float64]
     notes: tuple[str, ...]
 
     @property
@@ -288,7 +288,7 @@ class _Taking:
         #: What happened within a step, which has to be finished first.
         self.error: Exception | None = None
         self._reader: PlantReader | None = None
-        self._first_state = b""
+        self._states: list[bytes] = []
         self._next_intervention = 0
         self._intervened: dict[str, bool] = {}
 
@@ -335,7 +335,7 @@ class _Taking:
                 )
             reader = self._reader = PlantReader(core)
         view, values = reader.world.view(), self._values
-        self._first_state = self._first_state or core.world.save_state()
+        self._states.append(core.world.save_state())
         values[SIM_TIME].append(view.sim_time)
         for robot in self._schema.robots:
             key, found = robot.make_key, reader.robots[robot.name]
@@ -399,7 +399,8 @@ class _Taking:
             notes.append(
                 f"{self._repeated} frames repeat the state before: the recording has no newer one at their time"
             )
-        return Table(columns, np.frombuffer(self._first_state, np.float64), tuple(notes))
+        states = np.frombuffer(b"".join(self._states), np.float64).reshape(self._n_frames, -1)
+        return Table(columns, states, tuple(notes))
 
 
 def find_schema_difference(one: Schema, other: Schema) -> str:

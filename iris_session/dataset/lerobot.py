@@ -8,8 +8,6 @@ videos and data, which nothing names yet; metadata and statistics; `info.json`, 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.dataset.cameras import PictureSpec
-from iris_session.dataset.episodes import DatasetError, Plan, PlannedEpisode
+from iris_session.dataset.episodes import Plan, PlannedEpisode
+from iris_session.dataset.files import SetWriter
 from iris_session.dataset.frames import ACTION, BOOL, Schema, Table
 from iris_session.dataset.video import (
     CODEC_NAME,
@@ -31,7 +30,6 @@ from iris_session.dataset.video import (
 )
 from iris_session.replay.pictures import Image
 from iris_session.system.extras import require_package
-from iris_session.system.files import sync_folder
 
 VERSION: Final = "v3.0"
 #: Files of one kind in a folder.
@@ -48,8 +46,6 @@ REQUEST: Final = "meta/iris-session.json"
 DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-#: Files that are not in their places yet.
-PARTIAL: Final = ".partial"
 STATE: Final = "observation.state"
 _FRAME_INDEX: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
@@ -58,7 +54,7 @@ class VideoSink:
     """Pictures of one episode on their way into videos. `folder`: for these; `look`-`camera`.mp4."""
 
     def __init__(self, folder: Path, schema: Schema, pictures: PictureSpec) -> None:
-        self._folder, self._fps, self._pictures = folder, schema.fps, pictures
+        self._folder, self._fps, self._size = folder, schema.fps, (pictures.width, pictures.height)
         self._writers: dict[tuple[int, str], VideoWriter] = {}
         self._stats: dict[tuple[int, str], PictureStats] = {}
 
@@ -67,7 +63,7 @@ class VideoSink:
         key = look, camera
         if key not in self._writers:
             path = self._folder / f"{look}-{camera}.mp4"
-            self._writers[key] = VideoWriter(path, self._fps, self._pictures.width, self._pictures.height)
+            self._writers[key] = VideoWriter(path, self._fps, *self._size)
             self._stats[key] = PictureStats()
         self._writers[key].add(image)
         self._stats[key].add(image)
@@ -84,45 +80,27 @@ class VideoSink:
             writer.abort()
 
 
-class LeRobotWriter:
-    """A data set in a folder: begun, or continued after its last closed episode.
-
-    Args:
-        folder: Its folder; it is made if it does not exist.
-        plan: The episodes.
-        schema: Their frames.
-        pictures: Their pictures.
-        request: All that the files follow from, as plain values: that of a folder that has a set must be the same.
-
-    Raises:
-        DatasetError: The folder has something else, or a set of another request.
-        OSError: It cannot be written to.
-    """
+class LeRobotWriter(SetWriter):
+    """A set of LeRobot in a folder. Arguments as of `SetWriter`."""
 
     def __init__(
         self, folder: Path, plan: Plan, schema: Schema, pictures: PictureSpec, request: Mapping[str, Any]
     ) -> None:
         require_package("pyarrow", "writing data sets of LeRobot")
-        self.folder, self._plan, self._schema, self._pictures = folder, plan, schema, pictures
-        self.partial = folder / PARTIAL
+        super().__init__(folder, plan, schema, pictures)
         self._cameras = {one.name: f"observation.images.{one.name}" for one in pictures.cameras}
         self._features = _list_features(schema, pictures, self._cameras)
         self._stats: dict[str, Stats] = {}
-        #: Closed episodes and frames, and where the next begins: number in the plan, and look.
-        self.n_episodes = self.n_frames = 0
-        self.next = (0, 0)
-        check_folder(folder, REQUEST, request)
-        shutil.rmtree(self.partial, ignore_errors=True)
-        self.partial.mkdir(parents=True, exist_ok=True)
+        self.prepare(REQUEST, request)
         if (folder / INFO).exists():
             self._continue()
         else:
             self._begin(request)
 
     def _begin(self, request: Mapping[str, Any]) -> None:
-        self._write_json(REQUEST, request)
-        self._write_table(TASKS, _make_tasks(self._plan.tasks))
-        self._write_json(STATS, {})
+        self.write_json(REQUEST, request)
+        self._write_table(TASKS, _make_tasks(self.plan.tasks))
+        self.write_json(STATS, {})
         self._write_info()
 
     def _continue(self) -> None:
@@ -139,25 +117,16 @@ class LeRobotWriter:
                     stats.setdefault(feature, {})[name] = np.array(value, np.float64)
             self._add_stats(stats)
             self.n_episodes, self.n_frames = i + 1, row["dataset_to_index"]
-            index, look = row["iris/plan_index"], row["iris/look"] + 1
-            self.next = (index, look) if look <= self._pictures.looks else (index + 1, 0)
+            self.note_closed(row["iris/plan_index"], row["iris/look"])
 
     def close_episode(
         self, index: int, look: int, table: Table, pictures: Mapping[tuple[int, str], Stats], folder: Path
     ) -> None:
-        """Write an episode, and name it: afterwards it is on the disk.
-
-        Args:
-            index: Its number in the plan.
-            look: Its look.
-            table: Its frames.
-            pictures: Statistics of its pictures, by look and camera.
-            folder: Where its videos are, see `VideoSink`.
-        """
-        number, episode, n = self.n_episodes, self._plan.episodes[index], table.n_frames
+        # Docstring and arguments: `SetWriter`.
+        number, episode, n = self.n_episodes, self.plan.episodes[index], table.n_frames
         for camera, key in self._cameras.items():
-            self._move(folder / f"{look}-{camera}.mp4", _format(VIDEO_PATH, number, video_key=key))
-        columns = self._make_columns(table, number, self._plan.tasks.index(episode.task))
+            self.place(folder / f"{look}-{camera}.mp4", _format(VIDEO_PATH, number, video_key=key))
+        columns = self._make_columns(table, number, self.plan.tasks.index(episode.task))
         self._write_table(_format(DATA_PATH, number), _make_table(columns, self._features))
         stats = {key: compute_stats(values) for key, values in columns.items()}
         stats |= {key: pictures[look, camera] for camera, key in self._cameras.items()}
@@ -165,16 +134,12 @@ class LeRobotWriter:
         self._write_table(_format(EPISODES_PATH, number), _make_row_table(row))
         self._add_stats(stats)
         self.n_episodes, self.n_frames = number + 1, self.n_frames + n
-        self._write_json(STATS, {key: _to_plain(one) for key, one in self._stats.items()})
+        self.write_json(STATS, {key: _to_plain(one) for key, one in self._stats.items()})
         self._write_info()
-
-    def finish(self) -> None:
-        """Remove what only an unfinished set needs."""
-        shutil.rmtree(self.partial, ignore_errors=True)
 
     def _make_columns(self, table: Table, number: int, task: int) -> dict[str, NDArray[Any]]:
         """Return all columns of the data file, each of shape (n, k)."""
-        n, given, robots = table.n_frames, table.columns, self._schema.robots
+        n, given, robots = table.n_frames, table.columns, self.schema.robots
         state: list[NDArray[Any]] = []
         for robot in robots:
             state.append(given[robot.make_key("joint_positions")])
@@ -188,7 +153,7 @@ class LeRobotWriter:
         }
         frames = np.arange(n, dtype=np.int64)
         own: tuple[NDArray[Any], ...] = (
-            *((frames / self._schema.fps).astype(np.float32), frames, np.full(n, number, np.int64)),
+            *((frames / self.schema.fps).astype(np.float32), frames, np.full(n, number, np.int64)),
             *(self.n_frames + frames, np.full(n, task, np.int64)),
         )
         return columns | {key: values[:, None] for key, values in zip(_FRAME_INDEX, own, strict=True)}
@@ -206,16 +171,16 @@ class LeRobotWriter:
         }
         for key in self._cameras.values():
             row |= {f"videos/{key}/chunk_index": chunk, f"videos/{key}/file_index": file}
-            row |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": n / self._schema.fps}
+            row |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": n / self.schema.fps}
         row |= {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
         return row | {
             "iris/label": episode.label,
-            "iris/recording": self._plan.recordings[episode.recording].id,
+            "iris/recording": self.plan.recordings[episode.recording].id,
             "iris/episode": episode.number,
             "iris/plan_index": index,
             "iris/look": look,
             "iris/notes": "; ".join(table.notes),
-            "iris/first_state": table.first_state,
+            "iris/first_state": table.states[0],
         }
 
     def _add_stats(self, stats: Mapping[str, Stats]) -> None:
@@ -228,77 +193,26 @@ class LeRobotWriter:
             "robot_type": ROBOT_TYPE,
             "total_episodes": self.n_episodes,
             "total_frames": self.n_frames,
-            "total_tasks": len(self._plan.tasks),
+            "total_tasks": len(self.plan.tasks),
             "chunks_size": CHUNK,
             "data_files_size_in_mb": DATA_MB,
             "video_files_size_in_mb": VIDEO_MB,
-            "fps": self._schema.fps,
+            "fps": self.schema.fps,
             "splits": {"train": f"0:{self.n_episodes}"},
             "data_path": DATA_PATH,
             "video_path": VIDEO_PATH if self._cameras else None,
             "features": self._features,
         }
-        self._write_json(INFO, info)
+        self.write_json(INFO, info)
 
     # --- files --------------------------------------------------------------------------------------------------------
-
-    def _write_json(self, name: str, value: Any) -> None:
-        path = self.partial / "file.json"
-        path.write_text(json.dumps(value, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")
-        self._move(path, name)
 
     def _write_table(self, name: str, table: Any) -> None:
         from pyarrow import parquet
 
         path = self.partial / "file.parquet"
         parquet.write_table(table, path, compression="snappy")
-        self._move(path, name)
-
-    def _move(self, path: Path, name: str) -> None:
-        """Put a file to its place: it is on the disk before it has its name there."""
-        place_file(path, self.folder / name)
-
-
-def place_file(path: Path, target: Path) -> None:
-    """Give a file its name in a data set, in one step; its content and its name survive a power cut afterwards."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(path, target)
-    sync_folder(target.parent)
-
-
-def check_folder(folder: Path, name: str, request: Mapping[str, Any]) -> None:
-    """Check that a folder is empty, does not exist, or has an unfinished or finished set of the same request.
-
-    Raises:
-        DatasetError: It has something else.
-    """
-    path = folder / name
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise DatasetError(f"{folder} is no folder: give one that is empty or does not exist")
-    if not path.exists():
-        # Folders without files are of a run that was killed at its beginning.
-        if any(one.is_file() for one in folder.rglob("*") if PARTIAL not in one.parts):
-            raise DatasetError(f"the folder {folder} is not empty, and has no data set of ours: give another one")
-        return
-    try:
-        found = json.loads(path.read_bytes())
-        assert isinstance(found, dict)
-    except (ValueError, AssertionError) as error:
-        raise DatasetError(f"{path} is damaged: give another folder") from error
-    asked = json.loads(json.dumps(request))
-    for key in dict.fromkeys((*asked, *found)):
-        if found.get(key) != asked.get(key):
-            here, there = (json.dumps(one.get(key), ensure_ascii=False)[:100] for one in (asked, found))
-            raise DatasetError(
-                f"{folder} has a data set with another {key} ({there}, not {here}): give another folder, or remove it"
-            )
+        self.place(path, name)
 
 
 def _format(pattern: str, number: int, **more: str) -> str:

@@ -65,7 +65,7 @@ def test_actions_applied_to_the_first_state_give_the_episode_again(played: Playe
     for _, table in found:
         assert isinstance(table, Table)
         data = mujoco.MjData(model)
-        mujoco.mj_setState(model, data, table.first_state.copy(), STATE)
+        mujoco.mj_setState(model, data, table.states[0].copy(), STATE)
         for frame in range(table.n_frames):
             for robot in schema.robots:
                 joints = [int(model.joint(name).qposadr[0]) for name in robot.joints]

@@ -1,0 +1,127 @@
+"""Folders of data sets: whose set it is, files that appear whole and stay, and where an unfinished one goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from iris_session.dataset.cameras import PictureSpec
+from iris_session.dataset.episodes import DatasetError, Plan
+from iris_session.dataset.frames import Schema, Table
+from iris_session.dataset.video import Stats
+from iris_session.system.files import sync_folder
+
+#: Files that are not in their places yet.
+PARTIAL: Final = ".partial"
+
+
+class SetWriter(ABC):
+    """A data set in a folder: begun, or continued after its last closed episode.
+
+    Args:
+        folder: Its folder; it is made if it does not exist.
+        plan: The episodes.
+        schema: Their frames.
+        pictures: Their pictures.
+
+    Attributes:
+        partial: Folder for files that are not in their places yet.
+        n_episodes, n_frames: Closed so far.
+        next: Where the next begins: number in the plan, and look.
+
+    Raises:
+        DatasetError: The folder has something else, or a set of another request.
+        OSError: It cannot be written to.
+    """
+
+    def __init__(self, folder: Path, plan: Plan, schema: Schema, pictures: PictureSpec) -> None:
+        self.folder, self.plan, self.schema, self.pictures = folder, plan, schema, pictures
+        self.partial = folder / PARTIAL
+        self.n_episodes = self.n_frames = 0
+        self.next = (0, 0)
+
+    def prepare(self, name: str, request: Mapping[str, Any]) -> None:
+        """Check the folder, and remove what a killed run has left.
+
+        Args:
+            name: File of the request in the folder.
+            request: All that the set follows from, as plain values: that of a set that is there must be the same.
+        """
+        check_folder(self.folder, name, request)
+        shutil.rmtree(self.partial, ignore_errors=True)
+        self.partial.mkdir(parents=True, exist_ok=True)
+
+    def note_closed(self, index: int, look: int) -> None:
+        """Note the last closed episode: its number in the plan, and look."""
+        self.next = (index, look + 1) if look < self.pictures.looks else (index + 1, 0)
+
+    @abstractmethod
+    def close_episode(
+        self, index: int, look: int, table: Table, pictures: Mapping[tuple[int, str], Stats], folder: Path
+    ) -> None:
+        """Write an episode, and name it: afterwards it is on the disk.
+
+        Args:
+            index: Its number in the plan.
+            look: Its look.
+            table: Its frames.
+            pictures: Statistics of its pictures, by look and camera.
+            folder: Where the files of its pictures are.
+        """
+
+    def finish(self) -> None:
+        """Remove what only an unfinished set needs."""
+        shutil.rmtree(self.partial, ignore_errors=True)
+
+    def write_json(self, name: str, value: Any) -> None:
+        """Write a file of the set."""
+        path = self.partial / "file.json"
+        path.write_text(json.dumps(value, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")
+        self.place(path, name)
+
+    def place(self, path: Path, name: str) -> None:
+        """Give a file its name in the set, in one step; content and name survive a power cut afterwards."""
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        target = self.folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(path, target)
+        sync_folder(target.parent)
+
+
+def check_folder(folder: Path, name: str, request: Mapping[str, Any]) -> None:
+    """Check that a folder is empty, does not exist, or has an unfinished or finished set of the same request.
+
+    Raises:
+        DatasetError: It has something else.
+    """
+    path = folder / name
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise DatasetError(f"{folder} is no folder: give one that is empty or does not exist")
+    if not path.exists():
+        # Folders without files are of a run that was killed at its beginning.
+        if any(one.is_file() for one in folder.rglob("*") if PARTIAL not in one.parts):
+            raise DatasetError(f"the folder {folder} is not empty, and has no data set of ours: give another one")
+        return
+    try:
+        found = json.loads(path.read_bytes())
+        assert isinstance(found, dict)
+    except (ValueError, AssertionError) as error:
+        raise DatasetError(f"{path} is damaged: give another folder") from error
+    asked = json.loads(json.dumps(request))
+    for key in dict.fromkeys((*asked, *found)):
+        if found.get(key) != asked.get(key):
+            here, there = (json.dumps(one.get(key), ensure_ascii=False)[:100] for one in (asked, found))
+            raise DatasetError(
+                f"{folder} has a data set with another {key} ({there}, not {here}): give another folder, or remove it"
+            )
