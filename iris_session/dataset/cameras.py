@@ -128,8 +128,9 @@ class CameraSet:
 
     def close(self) -> None:
         """Release what it holds of OpenGL."""
-        self._release()
         if self._gl is not None:
+            self._gl.make_current()  # else what has the same numbers in another context would be freed
+            self._release()
             self._gl.free()
             self._gl = None
 
@@ -145,6 +146,7 @@ class CameraSet:
             DatasetError: The scene has no such camera.
             PictureError: The scene has nothing that MuJoCo can draw.
         """
+        self._gl.make_current()  # another set may have drawn meanwhile
         if self._model is not core.world.model:
             self._begin(core.world.model, recording)
         data, patches = core.world.data, core.authority.patches

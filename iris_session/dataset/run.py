@@ -11,10 +11,10 @@ import shutil
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import closing, suppress
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
@@ -280,23 +280,24 @@ def _write(
     seconds: list[float] = []
     total_s = draw_s = encode_s = close_s = 0.0
     say(f"episode {first + 1} of {len(plan.episodes)}")
-    for task, made in _make_all(tasks, options.jobs):
-        where = f"{Path(task.planned.path).name}: episode {task.episode.number}"
-        began, began_cpu = time.perf_counter(), time.process_time()
-        if made.table is None:
-            left_out.append(f"{where} is left out: {made.left_out}")
-        else:
-            for look in range(options.pictures.looks + 1):
-                if (task.index, look) >= (first, first_look):
-                    writer.close_episode(task.index, look, made.table, made.pictures, Path(task.folder))
-            notes += [f"{where}: {note}" for note in made.table.notes]
-        notes += [note for note in made.notes if note not in notes]
-        shutil.rmtree(task.folder, ignore_errors=True)
-        closing_s = time.perf_counter() - began
-        seconds.append(made.shares.cpu_s + time.process_time() - began_cpu)
-        total_s, close_s = total_s + made.shares.total_s + closing_s, close_s + closing_s
-        draw_s, encode_s = draw_s + made.shares.draw_s, encode_s + made.shares.encode_s
-        say(f"episode {task.index + 2} of {len(plan.episodes)}")
+    with closing(_make_all(tasks, options.jobs)) as episodes:
+        for task, made in episodes:
+            where = f"{Path(task.planned.path).name}: episode {task.episode.number}"
+            began, began_cpu = time.perf_counter(), time.process_time()
+            if made.table is None:
+                left_out.append(f"{where} is left out: {made.left_out}")
+            else:
+                for look in range(options.pictures.looks + 1):
+                    if (task.index, look) >= (first, first_look):
+                        writer.close_episode(task.index, look, made.table, made.pictures, Path(task.folder))
+                notes += [f"{where}: {note}" for note in made.table.notes]
+            notes += [note for note in made.notes if note not in notes]
+            shutil.rmtree(task.folder, ignore_errors=True)
+            closing_s = time.perf_counter() - began
+            seconds.append(made.shares.cpu_s + time.process_time() - began_cpu)
+            total_s, close_s = total_s + made.shares.total_s + closing_s, close_s + closing_s
+            draw_s, encode_s = draw_s + made.shares.draw_s, encode_s + made.shares.encode_s
+            say(f"episode {task.index + 2} of {len(plan.episodes)}")
     writer.finish()
     rest_s = total_s - draw_s - encode_s - close_s
     shares = {"resimulate": rest_s, "draw": draw_s, "encode": encode_s, "close": close_s}
@@ -306,7 +307,7 @@ def _write(
     )
 
 
-def _make_all(tasks: Sequence[EpisodeTask], jobs: int) -> Iterator[tuple[EpisodeTask, MadeEpisode]]:
+def _make_all(tasks: Sequence[EpisodeTask], jobs: int) -> Generator[tuple[EpisodeTask, MadeEpisode], None, None]:
     """Yield the episodes in order, made here or by `jobs` processes."""
     if jobs == 1 or len(tasks) < 2:
         maker = EpisodeMaker()

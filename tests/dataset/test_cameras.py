@@ -118,3 +118,14 @@ def test_unknown_and_doubled_cameras_are_refused() -> None:
         make_view(model, CameraSpec("nope", "nope"))
     with pytest.raises(DatasetError, match="two cameras have the name 'a'"):
         parse_cameras("a=side,a=operator")
+
+
+def test_closing_one_set_of_cameras_leaves_the_pictures_of_another(tmp_path: Path) -> None:
+    made = record(tmp_path / "session.rrd", {}, steps=3)
+    spec = PictureSpec((CameraSpec("operator", "operator"),), WIDTH, HEIGHT)
+    with Recording.open(made.path, warn=False) as recording, CameraSet(spec) as first:
+        before = [image.tobytes() for _, _, image in first.draw(made.core, recording)]
+        with CameraSet(spec) as second:
+            list(second.draw(made.core, recording))
+            first.close()
+            assert [image.tobytes() for _, _, image in second.draw(made.core, recording)] == before
