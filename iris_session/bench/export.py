@@ -191,7 +191,7 @@ def _make_entries(step: int, now_ns: int, ticks: int, period: int) -> Iterator[E
     within = (step - PAUSE_TICKS) % period
     if step >= PAUSE_TICKS and within in (0, ticks):
         action = EpisodeAction.SUCCESS if within else EpisodeAction.START
-        yield Entry(_AGENT, _AGENT, now_ns, Episode(100 + step, action, "swing the arm"))
+        yield Entry(_AGENT, _AGENT, now_ns, Episode(100 + step, action, "swing the arm", countdown_ns=0))
     if step > 2 and step % SAMPLE_TICKS == 0:
         swing = 0.1 * math.sin(now_ns * 1e-9)
         yield Entry(

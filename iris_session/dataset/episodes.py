@@ -16,9 +16,10 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from iris_session.protocol.server_messages import EpisodeChanged, Event, Intervention
+from iris_session.protocol.server_messages import Event, Intervention
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import Recording, RecordingError
+from iris_session.recording.episodes import EpisodeCollector, RecordedEpisode
 from iris_session.recording.folders import find_recordings
 from iris_session.recording.records import read_names
 from iris_session.rrd.batches import RowTimes
@@ -26,14 +27,10 @@ from iris_session.rrd.batches import RowTimes
 SUCCESS: Final = "success"
 FAILURE: Final = "failure"
 UNKNOWN: Final = "unknown"
-DISCARDED: Final = "discarded"
 #: What may be said of an episode that is exported.
 LABELS: Final = (SUCCESS, FAILURE, UNKNOWN)
 #: Ending of the curation of a recording, behind the name of its file.
 CURATION_SUFFIX: Final = ".episodes.json"
-#: States of `EpisodeChanged` in which an episode is recorded.
-_RECORDED: Final = frozenset({"running", "confirm", "left"})
-_VERDICTS: Final = {SUCCESS: SUCCESS, FAILURE: FAILURE, UNKNOWN: UNKNOWN, DISCARDED: DISCARDED}
 #: Columns of a robot that have to be the same in all recordings of a set.
 _ROBOT_FIELDS: Final = ("joints", "actuators", "site", "tip_body", "gripper_actuator", "gripper_open", "gripper_closed")
 
@@ -181,16 +178,6 @@ def read_curation(recording: Recording) -> Curation:
     return curation
 
 
-class _Take(msgspec.Struct):
-    """An episode as its events have it. A number can be taken several times: all but the last were discarded."""
-
-    number: int
-    begin_ns: int
-    end_ns: int | None = None
-    verdict: str = UNKNOWN
-    task: str = ""
-
-
 class _Reading(msgspec.Struct):
     """Everything of a recording that planning needs."""
 
@@ -202,7 +189,7 @@ class _Reading(msgspec.Struct):
     objects: tuple[ObjectSpec, ...]
     people: dict[str, str]
     curation: Curation
-    takes: list[_Take]
+    episodes: tuple[RecordedEpisode, ...]
     times: RowTimes
     interventions: list[tuple[str, int, bool]]
 
@@ -265,13 +252,15 @@ def _read(path: Path) -> _Reading:
     with Recording.open(path, warn=False) as recording:
         header = recording.header
         rows: list[RowTimes] = []
-        takes: list[_Take] = []
+        episodes = EpisodeCollector()
         interventions: list[tuple[str, int, bool]] = []
         for item in recording.outline():
             if isinstance(item, RowTimes):
                 rows.append(item)
             elif isinstance(item, Event):
-                _add_event(item, takes, interventions)
+                episodes.add(item)
+                if isinstance(body := item.body, Intervention):
+                    interventions.append((body.robot, item.session_time, body.active))
         if not rows:
             raise DatasetError(f"{path} has no step: there is nothing to export")
         steps, first = np.unique(np.concatenate([row.steps for row in rows]), return_index=True)
@@ -279,28 +268,8 @@ def _read(path: Path) -> _Reading:
         return _Reading(
             *(path, identify_recording(recording), header.session_name, header.tick_period_ns),
             *(header.robots, header.objects, read_names(recording), read_curation(recording)),
-            *(takes, times, interventions),
+            *(episodes.list_episodes(int(times.session_times[-1])), times, interventions),
         )
-
-
-def _add_event(event: Event, takes: list[_Take], interventions: list[tuple[str, int, bool]]) -> None:
-    body = event.body
-    if isinstance(body, Intervention):
-        interventions.append((body.robot, event.session_time, body.active))
-    if not isinstance(body, EpisodeChanged):
-        return
-    running = takes[-1] if takes and takes[-1].end_ns is None else None
-    # Texts of a task are in later versions of the event.
-    task = getattr(body, "instruction", "") or getattr(body, "task", "") or body.label
-    if body.state in _RECORDED:
-        if running is None:
-            takes.append(_Take(body.number, event.session_time, task=task))
-        return
-    if running is not None:
-        running.end_ns = event.session_time
-        running.task = running.task or task
-    if takes and takes[-1].number == body.number:
-        takes[-1].verdict = _VERDICTS.get(body.state, takes[-1].verdict)
 
 
 def _list_episodes(
@@ -308,31 +277,32 @@ def _list_episodes(
 ) -> Iterator[PlannedEpisode]:
     """Yield the episodes of a recording that are exported; note those that are not."""
     where, steps, times = read.path.name, read.times.steps, read.times.session_times
-    takes = read.takes
-    if not takes:
+    episodes = read.episodes
+    if not episodes:
         notes.append(f"{where} has no episodes: it is exported as a whole, with the label {UNKNOWN}")
-        takes = [_Take(0, int(times[0]), task=read.name)]
-    unknown = set(read.curation.episodes) - {one.number for one in takes}
+        episodes = (RecordedEpisode(0, start_ns=int(times[0]), end_ns=int(times[-1])),)
+    unknown = set(read.curation.episodes) - {one.number for one in episodes}
     if unknown:
-        there_are = ", ".join(str(one.number) for one in takes)
+        there_are = ", ".join(str(one.number) for one in episodes)
         raise DatasetError(f"{where} has no episode {min(unknown)}, which its curation names: it has {there_are}")
-    last_take = {one.number: one for one in takes}
-    for take in takes:
-        curated = read.curation.episodes.get(take.number) if last_take[take.number] is take else None
+    newest = {one.number: one for one in episodes}  # one that was recorded again has the number of the discarded one
+    for one in episodes:
+        curated = read.curation.episodes.get(one.number) if newest[one.number] is one else None
         curated = curated or EpisodeCuration()
-        label = curated.label or take.verdict
-        if curated.drop or (label not in options.labels and take.number):
+        label = curated.label or one.label
+        if curated.drop or (label not in options.labels and one.number):
             why = "dropped" if curated.drop else label
-            notes.append(f"{where}: episode {take.number} is left out: {why}")
+            notes.append(f"{where}: episode {one.number} is left out: {why}")
             continue
-        first = int(np.searchsorted(times, take.begin_ns))
-        end = len(times) if take.end_ns is None else int(np.searchsorted(times, take.end_ns))
+        first = int(np.searchsorted(times, one.start_ns))
+        is_open = not one.ended and one.end_ns >= int(times[-1])
+        end = len(times) if is_open else int(np.searchsorted(times, one.end_ns))
         if first >= end:
-            notes.append(f"{where}: episode {take.number} is left out: it has no step")
+            notes.append(f"{where}: episode {one.number} is left out: it has no step")
             continue
-        task = hide(curated.task or options.task or take.task or read.name)
+        task = hide(curated.task or options.task or one.instruction or one.task or one.text or read.name)
         span = int(steps[first]), int(steps[end - 1]) + 1
-        yield PlannedEpisode(index, take.number, label, task, *span, curated.trim)
+        yield PlannedEpisode(index, one.number, label, task, *span, curated.trim)
 
 
 def _make_replacement(names: Sequence[str]) -> Callable[[str], str]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from iris_session.dataset.episodes import DatasetError, PlannedEpisode, PlannedRecording
 from iris_session.physics.names import find_element_id
-from iris_session.physics.world import find_opening_law
+from iris_session.physics.robot_signals import find_opening_law
 from iris_session.protocol.names import CommandKind, LateCause
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Decision

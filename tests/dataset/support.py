@@ -31,7 +31,7 @@ def make_entries(episodes: Mapping[int, str] = EPISODES, name: str = NAME) -> Ca
             found = [msgspec.structs.replace(found[0], message=msgspec.structs.replace(found[0].message, name=name))]
         if step in episodes:
             label = f"{name} lifts it" if episodes[step] == "start" else ""
-            message = Episode(100 + step, episodes[step], label)
+            message = Episode(100 + step, episodes[step], label, countdown_ns=0)
             found.append(Entry(ANN, ANN, (step + 1) * TICK_NS, message))
         return found
 

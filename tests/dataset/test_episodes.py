@@ -48,10 +48,15 @@ def test_successes_are_exported(path: Path) -> None:
     assert len(make_plan([path], ALL).episodes) == 3
 
 
-def test_an_episode_that_does_not_end_is_unknown_and_rerecorded_ones_are_discarded(tmp_path: Path) -> None:
-    made = record(tmp_path / "session.rrd", {10: "start", 20: "rerecord", 40: "success", 50: "start"}, steps=60)
-    found = [(one.number, one.label, one.first_step, one.end_step) for one in make_plan([made.path], ALL).episodes]
-    assert found == [(2, "success", 20, 40), (3, "unknown", 50, 60)]
+def test_an_episode_that_does_not_end_is_unknown_and_discarded_ones_are_left_out(tmp_path: Path) -> None:
+    episodes = {10: "start", 20: "discard", 21: "discard", 30: "start", 40: "success", 50: "start"}
+    made = record(tmp_path / "session.rrd", episodes, steps=60)
+    plan = make_plan([made.path], ALL)
+    with Recording.open(made.path) as recording:
+        labels = [one.label for one in recording.episodes]
+    assert labels == ["discarded", "success", "unknown"]
+    found = [(one.label, one.first_step, one.end_step) for one in plan.episodes]
+    assert found == [("success", 30, 40), ("unknown", 50, 60)]
 
 
 def test_a_recording_without_episodes_is_exported_as_a_whole(tmp_path: Path) -> None:

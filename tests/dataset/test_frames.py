@@ -13,6 +13,7 @@ from iris_session.dataset.episodes import DatasetError, PlannedEpisode, PlanOpti
 from iris_session.dataset.frames import EpisodeLeftOutError, FrameReader, Schema, Table, make_schema
 from iris_session.physics.world import STATE
 from iris_session.protocol.client_messages import Control
+from iris_session.protocol.entries import Entry
 from iris_session.recording import OPEN, Recording
 from iris_session.replay.plant_reader import PlantReader
 from tests.dataset.support import EPISODES, make_entries, record
@@ -136,16 +137,19 @@ def test_a_trim_keeps_the_frames_within(played: Played) -> None:
 
 
 def test_episodes_without_exact_frames_are_named(tmp_path: Path) -> None:
-    def with_reset(step: int) -> list[object]:
+    def with_reset(step: int) -> list[Entry]:
         return [*make_entries()(step), *([host(0, Control(0, "reset"))] if step == 60 else [])]
 
-    made = play(tmp_path / "session.rrd", 200, make_entries=with_reset, core=make_drawn_core())  # type: ignore[arg-type]
+    made = play(tmp_path / "session.rrd", 200, make_entries=with_reset, core=make_drawn_core())
     made.batch.rows[120] = damaged(made.batch.rows[120])
     made.write()
-    found = [what for _, what in read(made, 100)[1]]
-    assert "reset or loaded 0.08 s after its beginning" in str(found[0])
-    assert "step 120 is missing or damaged" in str(found[1])
-    assert isinstance(found[2], Table), "others are not concerned"
+    (_, ended), (_, damage), (_, after) = read(made, 100)[1]
+    assert isinstance(ended, Table), "a reset ends an episode"
+    assert ended.n_frames == 8
+    assert "step 120 is missing or damaged" in str(damage)
+    assert isinstance(after, Table), "others are not concerned"
+    within = read(made, 100, first_step=20, end_step=90)[1][0][1]
+    assert "reset or loaded 0.08 s after its beginning" in str(within)
 
 
 def test_lateness_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
