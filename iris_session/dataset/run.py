@@ -7,6 +7,7 @@ know how many there are. A run that was killed is continued by the next one with
 from __future__ import annotations
 
 import multiprocessing
+import os
 import shutil
 import signal
 import time
@@ -30,7 +31,7 @@ from iris_session.dataset.video import Stats
 from iris_session.recording import Recording
 from iris_session.replay.simulation import Replay
 from iris_session.session.core import SessionCore
-from iris_session.system.process import die_with_parent
+from iris_session.system.process import die_with_parent, is_parent
 
 LEROBOT: Final = "lerobot"
 FORMATS: Final = (LEROBOT,)
@@ -319,7 +320,7 @@ def _make_all(tasks: Sequence[EpisodeTask], jobs: int) -> Generator[tuple[Episod
         return
     # Spawned, since OpenGL and threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(tasks)), context, _begin_worker) as pool:
+    with ProcessPoolExecutor(min(jobs, len(tasks)), context, _begin_worker, (os.getpid(),)) as pool:
         running: deque[tuple[EpisodeTask, Future[MadeEpisode]]] = deque()
         ahead = iter(tasks)
         try:
@@ -341,10 +342,12 @@ def _make_all(tasks: Sequence[EpisodeTask], jobs: int) -> Generator[tuple[Episod
 _maker: EpisodeMaker | None = None
 
 
-def _begin_worker() -> None:
+def _begin_worker(parent: int) -> None:
     """Prepare a process that makes episodes: it ends with the one that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     die_with_parent(signal.SIGKILL)
+    if not is_parent(parent):  # it was killed while this one began
+        os._exit(1)
 
 
 def make_episode(task: EpisodeTask) -> MadeEpisode:
