@@ -62,6 +62,7 @@ FORBIDDEN = {
     "simulators": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
     "assets": SOCKETS | {"mujoco", "rerun", "scipy", "cv2", "mink", "open3d"},
     "cloud": SOCKETS | RANDOM,
+    "cameras": SOCKETS | RANDOM | {"rerun"},
     "security": (SOCKETS - {"zmq"}) | RANDOM | HEAVY,
     "system": SOCKETS | RANDOM | HEAVY,
     "link": {"mujoco", "rerun"},

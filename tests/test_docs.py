@@ -137,6 +137,12 @@ def serve_cloth(tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.fixture
+def serve_pictures(tmp_path: Path) -> Iterator[str]:
+    with served(tmp_path, "--picture", "operator:64x48@5", "--plain-pictures") as address:
+        yield address
+
+
+@pytest.fixture
 def run_python(tmp_path: Path) -> Callable[..., str]:
     """Run a script in its own process in an empty folder; return its output."""
 
@@ -176,7 +182,9 @@ def test_first_page_works(page: str, serve: str, run_python: Callable[..., str])
 def test_python_block_runs(block: Block, run_python: Callable[..., str], request: pytest.FixtureRequest) -> None:
     text, has_deformables = block.text, "Deformables(client)" in block.text
     if ADDRESS in text:
-        text = text.replace(ADDRESS, request.getfixturevalue("serve_cloth" if has_deformables else "serve"))
+        has_pictures = ".camera(" in block.text or "cameras=" in block.text
+        session = "serve_cloth" if has_deformables else "serve_pictures" if has_pictures else "serve"
+        text = text.replace(ADDRESS, request.getfixturevalue(session))
     shown = run_python(text)
     assert not has_deformables or "cloth" in shown, "a deformable was seen"
 

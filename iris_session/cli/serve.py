@@ -50,6 +50,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session serve scene.xml --anchors anchors.toml
             iris-session serve scene.xml --camera room.toml    (a point cloud; see `iris-session cloud example`)
             iris-session serve handover --task pour.toml    (episodes of a task)
+            iris-session serve handover --picture operator --picture side:640x480@15    (for policies)
             iris-session serve handover --assign ann=left --assign bob=right
             iris-session serve aloha --seconds 30
             iris-session serve handover --interface wlan0 --name lab-1
@@ -100,6 +101,18 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         type=Path,
         metavar="TOML",
         help="task whose episodes are recorded; its progress is kept beside the file",
+    )
+    parser.add_argument(
+        "--picture",
+        action="append",
+        default=[],
+        metavar="CAMERA[:WxH][@HZ]",
+        help="a camera of the model whose pictures clients get, repeatable (top:320x240@30 is top with the defaults)",
+    )
+    parser.add_argument(
+        "--plain-pictures",
+        action="store_true",
+        help="draw them without shadows, reflections and smooth edges: faster without a graphics card",
     )
     parser.add_argument(
         "--resume",
@@ -163,6 +176,8 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
         web_key=arguments.web_key,
         cameras=tuple(getattr(arguments, "camera", ())),
         task=getattr(arguments, "task", None),
+        pictures=tuple(getattr(arguments, "picture", ())),
+        plain_pictures=getattr(arguments, "plain_pictures", False),
         groups=arguments.groups,
         sites=arguments.sites,
         authority=authority,

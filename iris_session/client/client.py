@@ -17,6 +17,7 @@ from typing import Any, Final, Self
 from iris_session.client.alignment import ClientAlignment
 from iris_session.client.arguments import to_names, to_text
 from iris_session.client.assets import ClientAssets
+from iris_session.client.cameras import CameraFeed, open_camera
 from iris_session.client.core.arrival_meter import ArrivalMeter
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.outbox import encode_checked
@@ -420,6 +421,19 @@ class Client(ClientDriving):
                 continue
             self._loop.wait_for_thread(min(remaining, 0.1))
         return True
+
+    def camera(self, name: str, timeout_s: float = 10.0) -> CameraFeed:
+        """Subscribe to the pictures of a camera: one of the model (`serve --picture`), or a real one.
+
+        Args:
+            name: Name of the camera in the model; of a real one, that of its stream.
+            timeout_s: Seconds to wait for a camera that is not offered yet: its process needs some to start.
+
+        Raises:
+            ClientError: The session offers no such camera; the text lists those that it does.
+            MissingExtraError: Pillow, which decodes pictures, is not installed.
+        """
+        return open_camera(self.media, self.wait_for, self.session_now_ns, name, timeout_s)
 
     # --- messages -----------------------------------------------------------------------------------------------------
 

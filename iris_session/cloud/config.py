@@ -11,11 +11,10 @@ import msgspec
 from iris_session.cloud.camera_file import CloudSettings
 
 
-class CameraStart(msgspec.Struct, frozen=True):
-    """Standard input of a camera process.
+class ProcessStart(msgspec.Struct, frozen=True, kw_only=True):
+    """Standard input of a process that joins the session as a camera.
 
     Attributes:
-        settings: Cameras, pipeline and streams.
         host, control_port: Control channel of the session.
         server_key, public_key, secret_key: CURVE keys as Z85 text, of the session and of the process; empty for a
             session without encryption.
@@ -23,7 +22,6 @@ class CameraStart(msgspec.Struct, frozen=True):
         known_fault: Why the process before this one ended. The same is not logged again.
     """
 
-    settings: CloudSettings
     host: str = "127.0.0.1"
     control_port: int = 7721
     server_key: str = ""
@@ -31,6 +29,12 @@ class CameraStart(msgspec.Struct, frozen=True):
     secret_key: str = ""
     parent_pid: int = 0
     known_fault: str = ""
+
+
+class CameraStart(ProcessStart, frozen=True):
+    """Standard input of the process of a camera file. `settings`: cameras, pipeline and streams."""
+
+    settings: CloudSettings
 
 
 class SourceReport(msgspec.Struct, frozen=True):

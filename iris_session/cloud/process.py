@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
 from types import FrameType
-from typing import Final
+from typing import Final, NoReturn, TypeVar
 
 import msgspec
 
@@ -32,7 +32,7 @@ from iris_session.client.errors import ClientError, InvalidMessageError, NotConn
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.client.sockets import CurveKeys
 from iris_session.cloud.camera_file import CloudSettings
-from iris_session.cloud.config import CameraReport, CameraStart
+from iris_session.cloud.config import CameraReport, CameraStart, ProcessStart
 from iris_session.cloud.robot_points import RobotPoints
 from iris_session.cloud.sources import open_source
 from iris_session.cloud.voxels import PointSet
@@ -66,6 +66,7 @@ _STAY: Final = "points on robots stay in the cloud"
 
 log = logging.getLogger(__name__)
 OnReport = Callable[[CameraReport], None]
+Start = TypeVar("Start", bound=ProcessStart)
 
 
 class BodyHistory:
@@ -300,30 +301,52 @@ def find_taken_stream(settings: CloudSettings, delivery: DeliveryBudget | None) 
 
 def run_start(start: CameraStart, on_report: OnReport, is_ending: Callable[[], bool]) -> str:
     """Run the cameras of a process, and report why they end. Return it, empty where they were to end."""
+    settings = start.settings
+    return join_session(
+        start, settings.stream, on_report, lambda client: run_cameras(settings, client, on_report, is_ending)
+    )
+
+
+def join_session(start: ProcessStart, stream: str, on_report: OnReport, work: Callable[[Client], str]) -> str:
+    """Do the work of a camera process with a client of its session, and report why it ends.
+
+    Args:
+        start: Where the session is, and the keys.
+        stream: Name for people: of the client, and in reports.
+        on_report: Called with the first and the last report.
+        work: Connects the client, closes it at the end, and returns why it ends by itself.
+
+    Returns:
+        Why it ends, empty where it was to end.
+    """
     # Before the filter is compiled: on a busy machine that takes as long again as what was imported by now.
-    on_report(CameraReport(start.settings.stream, starting=True))
+    on_report(CameraReport(stream, starting=True))
     keys = (start.server_key, start.public_key, start.secret_key)
     curve = CurveKeys(*(one.encode() for one in keys)) if start.server_key else None
     try:
         address = host_port(start.host, start.control_port)
-        client = Client(address, role=Role.CAMERA, name=start.settings.stream, curve=curve)
-        fault = run_cameras(start.settings, client, on_report, is_ending)
+        fault = work(Client(address, role=Role.CAMERA, name=stream, curve=curve))
     except (ClientError, MissingExtraError) as error:
         fault = str(error)
     except Exception as error:
         fault = describe_error(error)
         if fault != start.known_fault:  # else once for every restart
-            log.exception("the camera process of %r ends", start.settings.stream)
+            log.exception("the camera process of %r ends", stream)
     if fault:
-        on_report(CameraReport(start.settings.stream, fault=fault))
+        on_report(CameraReport(stream, fault=fault))
     return fault
 
 
-def main() -> int:
-    """Run the camera process of one session. Exit status 1 if the session does not admit it."""
+def run_process(start_type: type[Start], run: Callable[[Start, OnReport, Callable[[], bool]], str]) -> NoReturn:
+    """Run a camera process of one session and end it, with exit status 1 if the session does not admit it.
+
+    Args:
+        start_type: Type of its standard input.
+        run: Does the work: gets the input, writes reports, asks whether it is to end; returns why it ends by itself.
+    """
     configure_logging()
     lower_thread_priority()  # of this thread and those that it starts: no tick is to wait for a cloud
-    start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=CameraStart)
+    start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=start_type)
     reports = take_stdout()  # packages of cameras print
     os.set_blocking(reports, False)
     ending = threading.Event()
@@ -347,10 +370,10 @@ def main() -> int:
 
     gc.collect()
     gc.freeze()
-    fault = run_start(start, write_report, is_ending)
+    fault = run(start, write_report, is_ending)
     # A driver that hangs in a thread would keep the interpreter from ending.
     os._exit(1 if fault else 0)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_process(CameraStart, run_start)

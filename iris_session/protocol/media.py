@@ -65,9 +65,9 @@ class StreamInfo(msgspec.Struct, frozen=True):
 
 class StreamBudget(msgspec.Struct, frozen=True):
     """One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured. `encoding`: of its
-    newest frame, so that a client knows what it would get before it subscribes. `title`, `audience`, `camera`, `fault`,
-    `detail`: of its newest `StreamInfo`. `stale`: no frame came for so long that the newest one shows what was.
-    `taken_by`: what this client sends under the name is refused, because the stream is of that source; else empty.
+    newest frame, so that a client knows what it would get before it subscribes. `title`, `audience`, `camera`, `hz`,
+    `fault`, `detail`: of its newest `StreamInfo`. `stale`: no frame came for so long that the newest one shows what
+    was. `taken_by`: what this client sends under the name is refused, because the stream is of that source; else empty.
     """
 
     stream: Name
@@ -81,6 +81,7 @@ class StreamBudget(msgspec.Struct, frozen=True):
     detail: Text = ""
     stale: bool = False
     taken_by: Text = ""
+    hz: float = 0.0
 
 
 class MediaHeader(msgspec.Struct, frozen=True, array_like=True):

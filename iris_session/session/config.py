@@ -22,6 +22,7 @@ import numpy as np
 from anchors.constellation import Constellation, ConstellationError
 from anchors.pose import IDENTITY_QUAT, PoseTuple, Vec3, quat_normalize
 from iris_session.authority import AuthorityConfig
+from iris_session.cloud.model_camera import parse_model_camera
 from iris_session.control import ControlConfig
 from iris_session.protocol.common import Pose
 from iris_session.protocol.discovery import DISCOVERY_PORT
@@ -80,6 +81,10 @@ class SessionConfig:
         web_key: Its key (PEM).
         assets: Offer meshes and textures to clients: True keeps them in the user's cache, a path in that folder.
         cameras: Camera files, each with a process that publishes its point cloud; see `iris-session cloud example`.
+        pictures: Cameras of a MuJoCo model whose pictures clients get (`client.camera`), `CAMERA[:WIDTHxHEIGHT][@HZ]`
+            each, by default 320x240 at 30 Hz; drawn by one process of its own.
+        plain_pictures: Draw them without shadows, reflections and smooth edges: many times as fast without a graphics
+            card.
         groups: Groups of geoms of a MuJoCo model that clients show; `None` for those that its own viewer shows: 0, 1
             and 2, but not 0 where that has the collision shapes (robosuite).
         sites: Groups of its sites that clients show, True for all sites, False for none; `None` for those that MuJoCo's
@@ -123,6 +128,8 @@ class SessionConfig:
     web_key: str = ""
     assets: bool | str | Path = True
     cameras: tuple[str | Path, ...] = ()
+    pictures: tuple[str, ...] = ()
+    plain_pictures: bool = False
     groups: tuple[int, ...] | None = None
     sites: bool | tuple[int, ...] | None = None
     adapt_media: bool = True
@@ -159,6 +166,8 @@ class SessionConfig:
             )
         try:
             make_shown(self.groups, self.sites)
+            for text in self.pictures:
+                parse_model_camera(text)
         except ValueError as error:
             raise ConfigError(str(error)) from error
         if self.record_assets not in RECORD_ASSETS:

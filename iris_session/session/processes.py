@@ -117,6 +117,7 @@ class SessionProcesses:
         self._in_use: RecordingLock | None = None
         self._note_writer: ResumeNoteWriter | None = None
         self._core = core
+        self._is_published = published is not None
         self._published_deformables = None if published is None else published.deformables
         scene = None if published is None else published.scene
         self.scenes = SharedScenes(config.assets, config.name, scene, Shown(config.groups, config.sites))
@@ -145,7 +146,8 @@ class SessionProcesses:
                 "recording needs rerun: pip install 'iris-session[recording]', or record nothing (--no-record, "
                 "SessionConfig(record=False))"
             )
-        self.cameras = SessionCameras(self._config)
+        # The model of a published world has its bodies, and nothing to be drawn.
+        self.cameras = SessionCameras(self._config, None if self._is_published else self._core.world.model)
         others = NameFinder(self._config.beacon_port)
         try:
             if self.recording is not None:
@@ -286,8 +288,12 @@ class SessionProcesses:
     def _follow_scene(self, scene: NextScene | NextPatch) -> None:
         if self.front is not None:
             self.front.set_scene(scene.shown.info)
-        if self._deformables is not None and isinstance(scene, NextScene):
+        if not isinstance(scene, NextScene):
+            return
+        if self._deformables is not None:
             self._deformables.replace_meshes(scene.deformables)
+        if self.cameras is not None:
+            self.cameras.follow_model(scene.packed_model)
 
     def _make_header(self, core: SessionCore, recording_class: str) -> SessionHeader:
         return SessionHeader(

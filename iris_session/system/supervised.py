@@ -78,6 +78,7 @@ class SupervisedProcess(Generic[Report]):
         hang_ns: A process that has started and then does not report for this long is ended; 0: none ever is.
 
     Attributes:
+        title: As given.
         report: The newest report of the process.
         heard_ns: Time of `poll` at which it came, `None` before the first.
         fault: Why the process before this one ended, as it said; empty where it said nothing, or there was none.
@@ -96,7 +97,7 @@ class SupervisedProcess(Generic[Report]):
         describe_exit: Callable[[int], str] = describe_exit,
         hang_ns: int = 0,
     ) -> None:
-        self._title = title
+        self.title = title
         self._spawn = spawn
         self._type = report_type
         self._prepare = prepare
@@ -196,7 +197,7 @@ class SupervisedProcess(Generic[Report]):
             self._thread = None
         if self._failure:
             failure, self._failure = self._failure, ""
-            return self._announce(f"{self._title} does not start: {failure}", now_ns)
+            return self._announce(f"{self.title} does not start: {failure}", now_ns)
         if self._process is None:
             if self._due_ns and now_ns >= self._due_ns:
                 self.start(now_ns)
@@ -217,7 +218,7 @@ class SupervisedProcess(Generic[Report]):
         self._process.close()
         self._process, self._hang = None, ""
         self._earlier_drops, self.report = self.drops, self._type()
-        return self._announce(f"{self._title} {how}; it is started again", now_ns)
+        return self._announce(f"{self.title} {how}; it is started again", now_ns)
 
     def stop_restarts(self, timeout_s: float) -> None:
         """Start no successor from here on; wait so long for one that is being started.
@@ -298,7 +299,7 @@ class SupervisedProcess(Generic[Report]):
                 self.report = msgspec.json.decode(line, type=self._type)
             except msgspec.MsgspecError:
                 if not self._has_warned:  # there may be one for every frame of a camera
-                    log.warning("%s wrote a line that is no report: %.80r", self._title, line)
+                    log.warning("%s wrote a line that is no report: %.80r", self.title, line)
                 self._has_warned = True
                 continue
             self.heard_ns = now_ns

@@ -69,15 +69,15 @@ def find_stream(client: Client, stream: str) -> StreamBudget | None:
     return next((one for one in budget.streams if one.stream == stream), None) if budget is not None else None
 
 
-def find_cameras(server: SessionProcess) -> list[psutil.Process]:
-    """Return the camera processes of a session."""
+def find_cameras(server: SessionProcess, module: str = "iris_session.cloud.process") -> list[psutil.Process]:
+    """Return the camera processes of a session, by the module that they run."""
     found = []
     for child in psutil.Process(server.process.pid).children():
         try:
             line = child.cmdline()
         except psutil.Error:  # it has just ended
             continue
-        if "iris_session.cloud.process" in line and child.status() != psutil.STATUS_ZOMBIE:
+        if module in line and child.status() != psutil.STATUS_ZOMBIE:
             found.append(child)
     return found
 
@@ -108,6 +108,22 @@ def test_a_killed_camera_process_comes_back_and_ends_with_its_session(
     children = list_descendants(server.process.pid)
     server.kill()
     assert_all_end(children)
+
+
+def test_pictures_of_the_model_at_an_encrypted_session(serve: Callable[..., SessionProcess]) -> None:
+    home = KeyHome()
+    pair = KeyPair.generate()
+    home.clients.allow_key("ann", pair.public, ("observer",))
+    curve = CurveKeys(home.load_server_key().public.encode(), pair.public.encode(), pair.secret.encode())
+    options = ("--picture", "operator:160x120@5", "--plain-pictures", "--curve", "--no-beacon")
+    server = serve("handover", *options)
+    with Client(server.address, role="observer", name="ann", curve=curve).connect(DEADLINE_S) as ann:
+        operator = ann.camera("operator", DEADLINE_S)
+        picture = operator.wait(DEADLINE_S)
+        assert (picture.shape, operator.size, operator.hz) == ((120, 160, 3), (160, 120), 5.0)
+        assert picture.std() > 20.0, "there is something in it"
+        assert len(find_cameras(server, "iris_session.cameras.process")) == 1
+    server.finish()
 
 
 @pytest.mark.long

@@ -95,7 +95,7 @@ def test_client_gets_the_description_and_its_changes() -> None:
     room.tick()
     room.push()
     assert room.tick() == 1
-    expected = StreamBudget("room", encoding="cloud", title="Room", audience="remote", camera=CAMERA)
+    expected = StreamBudget("room", encoding="cloud", title="Room", audience="remote", camera=CAMERA, hz=30.0)
     assert room.find() == expected
     room.push(info=None)
     assert room.tick() == 0

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import pytest
 
 from iris_session.cloud.config import CameraReport
+from iris_session.cloud.model_camera import ModelCamera, PicturesStart
 from iris_session.link import Ports
-from iris_session.session.cameras import SILENT_NS, SLOW_START_NS, SessionCameras, load_camera_files
+from iris_session.session.cameras import (
+    SILENT_NS,
+    SLOW_START_NS,
+    SessionCameras,
+    find_model_cameras,
+    load_camera_files,
+)
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import StartError
+from iris_session.system.supervised import SupervisedProcess
 
 
 def write_file(folder: Path, name: str, *cameras: str, stream: str = "", picture_hz: float = 10.0) -> Path:
@@ -77,3 +86,56 @@ def test_a_process_that_is_silent_is_a_warning(tmp_path: Path, monkeypatch: pyte
     cameras.poll(SLOW_START_NS + 1)
     (text,) = cameras.list_warnings()
     assert text == "the camera process of 'room' starts, which takes long on a busy machine: it is ended after 120 s"
+
+
+MODEL = '<mujoco><worldbody><camera name="top"/><camera name="left/wrist"/><camera/></worldbody></mujoco>'
+
+
+def test_pictures_of_a_model_name_its_cameras(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    found = find_model_cameras(("left/wrist:64x48@5", "top"), model)
+    assert [(one.stream, one.width, one.hz) for one in found] == [("left_wrist", 64, 5.0), ("top", 320, 30.0)]
+    assert find_model_cameras((), None) == ()
+    with pytest.raises(StartError, match=r"no camera 'wrist': it has top, left/wrist$"):
+        find_model_cameras(("wrist",), model)
+    with pytest.raises(StartError, match="none with a name"):
+        find_model_cameras(("0",), mujoco.MjModel.from_xml_string("<mujoco><worldbody><camera/></worldbody></mujoco>"))
+    with pytest.raises(StartError, match="a MuJoCo model"):
+        find_model_cameras(("top",), None)
+    with pytest.raises(StartError, match="two cameras have a stream 'top'"):
+        find_model_cameras(("top", "top@5"), model)
+    config = SessionConfig(cameras=(write_file(tmp_path, "top"),), pictures=("top",))
+    with pytest.raises(StartError, match="two cameras have a stream 'top'"):
+        SessionCameras(config, model)
+
+
+def test_pictures_of_a_loaded_scene_begin_when_the_process_before_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[PicturesStart] = []
+    pids: dict[int, int] = {}
+
+    def start(process: SupervisedProcess[CameraReport], now_ns: int) -> None:
+        process._was_started = True
+        pids[id(process)] = 4711
+        monkeypatch.setattr(process, "poll", lambda _: [])
+        monkeypatch.setattr(process, "terminate", lambda: None)
+        monkeypatch.setattr(process, "close", lambda _: 0)
+        started.append(process._spawn.args[2])  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(SupervisedProcess, "start", start)
+    monkeypatch.setattr(SupervisedProcess, "pid", property(lambda process: pids.get(id(process), 0)))
+    cameras = SessionCameras(SessionConfig(pictures=("top@5",), curve=True), mujoco.MjModel.from_xml_string(MODEL))
+    assert len(cameras.public_keys) == 1
+    cameras.follow_model(b"another")
+    cameras.start(Ports("127.0.0.1", 1, 2))
+    cameras.poll(1)
+    first = cameras._processes["model"]
+    assert started[0].cameras == (ModelCamera("top", hz=5.0),)
+    assert started[0].public_key == cameras.public_keys[0]
+    cameras.follow_model(b"another")
+    cameras.poll(2)
+    assert len(started) == 1, "the one before has the streams"
+    pids[id(first)] = 0
+    cameras.poll(3)
+    cameras.poll(4)
+    assert [one.packed_model for one in started[1:]] == [b"another"]
+    assert cameras.restarts == 0

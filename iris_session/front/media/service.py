@@ -330,6 +330,7 @@ def _describe_stream(name: str, facts: StreamStats, now_ns: int) -> StreamBudget
         title=info.title,
         audience=info.audience,
         camera=info.camera,
+        hz=info.hz,
         fault=info.fault,
         detail=info.detail,
         stale=facts.is_stale(now_ns),

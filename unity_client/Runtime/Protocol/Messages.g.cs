@@ -994,6 +994,7 @@ namespace IrisSession.Protocol
         public string Detail = "";
         public bool Stale;
         public string TakenBy = "";
+        public double Hz;
 
         public static StreamBudget Read(WireReader reader) => reader.ReadInto(new StreamBudget());
         internal static readonly Func<StreamBudget> New = () => new StreamBudget();
@@ -1011,6 +1012,7 @@ namespace IrisSession.Protocol
             codec.Allow("detail", ref Detail, 512, "");
             codec.Allow("stale", ref Stale, false);
             codec.Allow("taken_by", ref TakenBy, 512, "");
+            codec.Allow("hz", ref Hz, 0.0);
         }
     }
 

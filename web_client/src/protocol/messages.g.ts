@@ -739,9 +739,9 @@ export interface StreamInfo {
 
 /**
  * One media stream, and the class that a client gets. `mbit_per_s`: of that class, as measured. `encoding`: of its
- * newest frame, so that a client knows what it would get before it subscribes. `title`, `audience`, `camera`, `fault`,
- * `detail`: of its newest `StreamInfo`. `stale`: no frame came for so long that the newest one shows what was.
- * `taken_by`: what this client sends under the name is refused, because the stream is of that source; else empty.
+ * newest frame, so that a client knows what it would get before it subscribes. `title`, `audience`, `camera`, `hz`,
+ * `fault`, `detail`: of its newest `StreamInfo`. `stale`: no frame came for so long that the newest one shows what
+ * was. `taken_by`: what this client sends under the name is refused, because the stream is of that source; else empty.
  */
 export interface StreamBudget {
   stream: string;
@@ -755,6 +755,7 @@ export interface StreamBudget {
   detail?: string;
   stale?: boolean;
   taken_by?: string;
+  hz?: number;
 }
 
 /** Observations of one anchor by a headset: their number in this run, and the age of the newest. */
@@ -2598,6 +2599,7 @@ export const VALUE_DEFAULTS = {
     detail: "",
     stale: false,
     taken_by: "",
+    hz: 0.0,
   },
   AlignmentReport: {
     version: 0,

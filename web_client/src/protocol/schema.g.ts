@@ -232,6 +232,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["detail", ["str", 512, ""], [""]],
       ["stale", ["bool"], [false]],
       ["taken_by", ["str", 512, ""], [""]],
+      ["hz", ["float"], [0.0]],
     ],
   },
   AnchorSeen: {
