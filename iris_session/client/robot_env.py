@@ -44,13 +44,17 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
     again when that person stands by.
 
     Observations: `agent_pos`: joints [rad or m] of each robot, then its gripper (0 open, 1 closed) if it has one;
-    `environment_state`: `x y z qw qx qy qz` [m] of each object, world frame. Actions: `ctrl` of the actuators of each
-    robot, in the units of the model. These are `observation.state` and `action` of exported data sets.
+    `environment_state`: `x y z qw qx qy qz` [m] of each object, world frame; with `cameras`, `pixels`: the newest
+    picture of each, uint8 (h, w, 3), RGB. Actions: `ctrl` of the actuators of each robot, in the units of the model.
+    These are `observation.state`, `observation.environment_state`, `observation.images` and `action` of exported data
+    sets.
 
     Args:
         address: As of `Client`.
         robots: Names of the robots.
         hz: Steps a second [Hz].
+        cameras: Cameras whose pictures are observed, of those that the session offers (`Client.camera`). They have the
+            names that exported data sets give them: `/` is `_`.
         name: Name that people see; of several robots, followed by that of the robot.
         resets: Join as director, too (`NAME director`), so that `reset` resets the scene. Without it `reset` only takes
             the robots: people, or their episodes, reset the scene.
@@ -58,9 +62,11 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
     Attributes:
         robots: Names of the robots.
         objects: Names of the objects, in the order of `environment_state`.
+        cameras: Feeds of the cameras, by name.
 
     Raises:
-        ClientError: No session; it has no such robot; or a robot is not controlled by position, joint by joint.
+        ClientError: No session; it has no such robot or camera; or a robot is not controlled by position, joint by
+            joint.
         MissingExtraError: Gymnasium is not installed.
     """
 
@@ -72,6 +78,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
         robots: str | Iterable[str] = (),
         *,
         hz: float = 30.0,
+        cameras: str | Iterable[str] = (),
         name: str = "policy",
         resets: bool = False,
         **options: Any,
@@ -105,22 +112,29 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
                 self._director.connect()
             self._viewer = self._clients[self.robots[0]]
             self._infos = {robot: self._find_info(robot) for robot in self.robots}
+            for client in self._list_clients():
+                client.start()
+            feeds = [self._viewer.camera(camera, WAIT_S) for camera in to_names("cameras", cameras)]
+            self.cameras = {feed.feed.stream: feed for feed in feeds}
+            shapes = {camera: feed.wait(WAIT_S).shape for camera, feed in self.cameras.items()}
         except BaseException:
             self.close()
             raise
-        for client in self._list_clients():
-            client.start()
         self.objects = tuple(body.name for body in self._viewer.mirror.bodies if body.object)
         actuators = [one for robot in self.robots for one in self._infos[robot].actuators]
         low, high = ([getattr(one, side) for one in actuators] for side in ("low", "high"))
         n_state = sum(len(info.joints) + info.gripper for info in self._infos.values())
         self.action_space = gymnasium.spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
-        self.observation_space = gymnasium.spaces.Dict(
-            {
-                "agent_pos": gymnasium.spaces.Box(-math.inf, math.inf, (n_state,)),
-                "environment_state": gymnasium.spaces.Box(-math.inf, math.inf, (7 * len(self.objects),)),
+        seen: dict[str, gymnasium.Space[Any]] = {
+            "agent_pos": gymnasium.spaces.Box(-math.inf, math.inf, (n_state,)),
+            "environment_state": gymnasium.spaces.Box(-math.inf, math.inf, (7 * len(self.objects),)),
+        }
+        if shapes:
+            pixels: dict[str, gymnasium.Space[Any]] = {
+                camera: gymnasium.spaces.Box(0, 255, shape, np.uint8) for camera, shape in shapes.items()
             }
-        )
+            seen["pixels"] = gymnasium.spaces.Dict(pixels)
+        self.observation_space = gymnasium.spaces.Dict(seen)
 
     def _list_clients(self) -> list[Client]:
         return [*self._clients.values(), *([self._director] if self._director is not None else [])]
@@ -169,6 +183,10 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
             lambda: all(self._viewer.scene.robot_state(robot) is not None for robot in self.robots),
             "no state of the robots came",
         )
+        begun_ns = self._viewer.session_now_ns()
+        self._wait_for(
+            lambda: all((feed.capture_ns or 0) >= begun_ns for feed in self.cameras.values()), "no new pictures came"
+        )
         end_ns = self._viewer.session_now_ns() + int(WAIT_S * 1e9)
         while not all(map(self._may_drive, self.robots)) and self._viewer.session_now_ns() < end_ns:
             for robot, client in self._clients.items():  # the session has to see the clutch open
@@ -187,7 +205,8 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
         Returns:
             Observation; 0; False; whether the connection to the session is lost; and information: by robot
             `intervention` (a person drives it), `driven` (this policy does), `hold_reason`; `ctrl` in force, shape of
-            the action: in an intervention, that of the person; `session_time_ns`, `sim_time_s`, `tick` of the state.
+            the action: in an intervention, that of the person; `session_time_ns`, `sim_time_s`, `tick` of the state;
+            with cameras, `capture_ns` by camera: session time of the state that its picture shows, which is older.
 
         Raises:
             ValueError: The action has another shape.
@@ -250,10 +269,12 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
                 joints.append(math.nan if state.gripper is None else state.gripper)
         poses = [self._viewer.scene.body_pose(name) for name in self.objects]
         objects = [x for pose in poses for x in ((*pose[0], *pose[1]) if pose is not None else (math.nan,) * 7)]
-        observation = {
+        observation: Observation = {
             "agent_pos": np.array(joints, np.float32),
             "environment_state": np.array(objects, np.float32),
         }
+        if self.cameras:
+            observation["pixels"] = {camera: feed.read() for camera, feed in self.cameras.items()}
         feedback = {robot: client.feedback.get(robot) for robot, client in self._clients.items()}
         header = self._viewer.scene.state.header if self._viewer.scene.state is not None else None
         info = {
@@ -265,6 +286,8 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
             "sim_time_s": header.sim_time if header else 0.0,
             "tick": header.tick if header else 0,
         }
+        if self.cameras:
+            info["capture_ns"] = {camera: feed.capture_ns for camera, feed in self.cameras.items()}
         return observation, info
 
 

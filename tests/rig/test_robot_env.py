@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium.wrappers import PassiveEnvChecker
+from PIL import Image
 
 from iris_session.client import Client, ClientError, robot_env
+from iris_session.client.cameras import CameraFeed
+from iris_session.client.media import MediaFeed, MediaFrame
 from iris_session.client.robot_env import RobotEnv
+from iris_session.protocol.media import MediaHeader
 from iris_session.protocol.names import LeaseMode
 from tests.rig.session import Rig
+
+MS = 1_000_000
 
 
 @pytest.fixture
@@ -88,6 +95,56 @@ def test_what_cannot_be_driven_is_an_error(rig: Rig) -> None:
         RobotEnv("")
     rig.run(0.1)
     assert all(client.connection.phase.name == "CLOSED" for client in rig.clients)
+
+
+class PictureSource:
+    """Pictures of two cameras, drawn every 50 ms, as old as a network makes them: grey values count them."""
+
+    def __init__(self, rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._rig = rig
+        self._feeds: list[MediaFeed] = []
+        monkeypatch.setattr(Client, "camera", lambda client, name, _: self._open(client, name))
+        self._draw()
+
+    def _open(self, client: Client, name: str) -> CameraFeed:
+        if name not in ("top", "left/wrist"):
+            raise ClientError(f"no camera {name}")
+        feed = MediaFeed(name.replace("/", "_"))
+        self._feeds.append(feed)
+        return CameraFeed(name, feed, client.media, client.wait_for, client.session_now_ns)
+
+    def _draw(self) -> None:
+        simulation = self._rig.simulation
+        simulation.call_at(simulation.now_ns + 50 * MS, self._draw)
+        for feed in self._feeds:
+            feed.received += 1
+            file = io.BytesIO()
+            Image.new("RGB", (16, 8), (feed.received,) * 3).save(file, "JPEG", quality=95)
+            capture_ns = self._rig.session.clock() - 20 * MS
+            header = MediaHeader(feed.stream, "full", 1, feed.received, capture_ns, capture_ns, "jpeg")
+            feed.newest = MediaFrame(header, file.getvalue(), 0)
+
+
+def test_pictures_of_cameras_are_observed(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    PictureSource(rig, monkeypatch)
+    env = RobotEnv("", ["left"], hz=20, cameras=("top", "left/wrist"), resets=True)
+    spaces = env.observation_space["pixels"]
+    assert {name: spaces[name].shape for name in spaces} == {"top": (8, 16, 3), "left_wrist": (8, 16, 3)}
+    asked_ns = rig.session.clock()
+    observation, info = env.reset()
+    assert env.observation_space.contains(observation)
+    assert min(info["capture_ns"].values()) > asked_ns, "it shows what is after the reset"
+    seen = [int(observation["pixels"]["top"][0, 0, 0])]
+    for _ in range(5):
+        observation, *_, info = env.step(info["ctrl"])
+        assert env.observation_space.contains(observation)
+        seen.append(int(observation["pixels"]["top"][0, 0, 0]))
+        assert set(info["capture_ns"]) == {"top", "left_wrist"}
+        assert 0 < info["session_time_ns"] - info["capture_ns"]["left_wrist"] < 100 * MS
+    assert sorted(set(seen)) == seen, "each step has a newer one"
+    env.close()
+    with pytest.raises(ClientError, match="no camera side"):
+        RobotEnv("", ["left"], cameras="side")
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space")

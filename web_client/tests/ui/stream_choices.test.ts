@@ -5,7 +5,7 @@ import { beforeEach, expect, test } from "vitest";
 import { MAX_PANELS, type Stream, StreamChoices } from "../../src/ui/stream_choices.ts";
 
 const makeStream = (stream: string, encoding: string, audience = "all"): Stream => ({
-  stream, encoding, audience, budget_class: "full", mbit_per_s: 0, title: "", camera: null, fault: "", detail: "", stale: false, taken_by: "",
+  stream, encoding, audience, budget_class: "full", mbit_per_s: 0, title: "", camera: null, fault: "", detail: "", stale: false, taken_by: "", hz: 0,
 });
 const ROOM = makeStream("room", "cloud", "remote");
 const TABLE = makeStream("table", "cloud");

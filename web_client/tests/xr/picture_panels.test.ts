@@ -71,7 +71,7 @@ describe("places", () => {
 
 describe("panels", () => {
   const makeStream = (stream: string, more: Partial<Stream> = {}): Stream => ({
-    stream, encoding: "jpeg", audience: "remote", budget_class: "full", mbit_per_s: 0, title: `The ${stream}`, camera: null, fault: "", detail: "", stale: false, taken_by: "", ...more,
+    stream, encoding: "jpeg", audience: "remote", budget_class: "full", mbit_per_s: 0, title: `The ${stream}`, camera: null, fault: "", detail: "", stale: false, taken_by: "", hz: 0, ...more,
   });
   let listeners: [string, (update: FromWorker) => void][];
   let state: PageState;
