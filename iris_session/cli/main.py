@@ -21,6 +21,7 @@ from iris_session.cli import (
     emulate,
     keys,
     pair,
+    policy,
     recording,
     recording_export,
     scene,
@@ -47,6 +48,7 @@ _EPILOG = """examples:
   iris-session anchors print --size 150mm    a sheet for headsets and cameras, as PDF
   iris-session cloud example                 a file for depth cameras; inspect it, or run it in a session
   iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
+  iris-session policy --repo PATH --robot left    a trained policy of LeRobot drives a robot, beside people
   iris-session status --watch                participants, robots, ages, late ticks, recorder of a session
   iris-session estop                         stop every robot of the session; clear-estop, pause, assign, ... as well
   iris-session doctor 192.168.1.20           what is wrong, why, and what to do
@@ -62,8 +64,8 @@ _EPILOG = """examples:
 
 #: In the order of `--help`.
 _MODULES = (
-    demo, serve, pair, web, keys, status, control, doctor, view, recording, recording_export, emulate, scene, anchors,
-    cloud, bench,
+    demo, serve, pair, web, keys, status, control, doctor, view, recording, recording_export, emulate, policy, scene,
+    anchors, cloud, bench,
 )  # fmt: skip
 
 

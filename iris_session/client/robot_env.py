@@ -46,8 +46,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
     Observations: `agent_pos`: joints [rad or m] of each robot, then its gripper (0 open, 1 closed) if it has one;
     `environment_state`: `x y z qw qx qy qz` [m] of each object, world frame; with `cameras`, `pixels`: the newest
     picture of each, uint8 (h, w, 3), RGB. Actions: `ctrl` of the actuators of each robot, in the units of the model.
-    These are `observation.state`, `observation.environment_state`, `observation.images` and `action` of exported data
-    sets.
+    These are `observation.state`, `observation.images` and `action` of exported data sets.
 
     Args:
         address: As of `Client`.
