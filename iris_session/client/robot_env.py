@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from iris_session.client.arguments import to_names
 from iris_session.client.client import Client
 from iris_session.client.errors import ClientError, NotConnectedError
-from iris_session.protocol.names import CommandKind, ControlAction, Device, Role
-from iris_session.protocol.server_messages import ActuatorInfo, Event, Intervention, RobotInfo, RobotState
+from iris_session.protocol.names import CommandKind, ControlAction, Device, LeaseMode, Role
+from iris_session.protocol.server_messages import ActuatorInfo, RobotInfo, RobotState
 from iris_session.system.extras import require_package
 
 require_package("gymnasium", "RobotEnv")
@@ -87,7 +87,6 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
             raise ClientError("RobotEnv needs the name of at least one robot")
         self._period_ns = round(1e9 / hz)
         self._due_ns = 0
-        self._intervened: set[str] = set()
         self._director: Client | None = None
         self._clients: dict[str, Client] = {}
         try:
@@ -99,7 +98,6 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
                     name=title,
                     devices=Device.JOINTS,
                     robot_states=not self._clients,
-                    on_event=self._on_event,
                     **options,
                 )
                 self._clients[robot] = client
@@ -119,7 +117,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
         except BaseException:
             self.close()
             raise
-        self.objects = tuple(body.name for body in self._viewer.mirror.bodies if body.object)
+        self.objects = self._list_objects()
         actuators = [one for robot in self.robots for one in self._infos[robot].actuators]
         low, high = ([getattr(one, side) for one in actuators] for side in ("low", "high"))
         n_state = sum(len(info.joints) + info.gripper for info in self._infos.values())
@@ -148,9 +146,8 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
             raise ClientError(f"robot {robot!r} is not controlled by position, joint by joint: use Client.send_target")
         return info
 
-    def _on_event(self, event: Event) -> None:
-        if isinstance(event.body, Intervention):
-            (self._intervened.add if event.body.active else self._intervened.discard)(event.body.robot)
+    def _list_objects(self) -> tuple[str, ...]:
+        return tuple(body.name for body in self._viewer.mirror.bodies if body.object)
 
     # --- Gymnasium ----------------------------------------------------------------------------------------------------
 
@@ -167,21 +164,27 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
             The observation, and information as of `step`.
 
         Raises:
-            DeniedError: A robot is not to be had, or the scene may not be reset; the text says why.
+            DeniedError: A robot is not to be had, or the scene may not be reset; the text says why. Robots that this
+                call took are released.
             NotConnectedError: There is no session any more, or no state came.
+            ClientError: The session has another scene, whose robots or objects differ.
         """
         super().reset(seed=seed)
         if self._director is not None:
             before = self._viewer.mirror.scene_epoch
             self._director.control(ControlAction.RESET)
             self._wait_for(lambda: self._viewer.mirror.scene_epoch > before, "the scene was not reset")
-        for robot, client in self._clients.items():
-            if client.lease_version(robot) is None:
-                client.acquire(robot)
-        self._wait_for(
-            lambda: all(self._viewer.scene.robot_state(robot) is not None for robot in self.robots),
-            "no state of the robots came",
-        )
+        self._wait_for_states()
+        taken: list[str] = []
+        try:
+            for robot, client in self._clients.items():
+                if client.lease_version(robot) is None:
+                    client.acquire(robot)
+                    taken.append(robot)
+        except BaseException:
+            for robot in taken:  # all or none: others may wait for these
+                self._clients[robot].release(robot)
+            raise
         begun_ns = self._viewer.session_now_ns()
         self._wait_for(
             lambda: all((feed.capture_ns or 0) >= begun_ns for feed in self.cameras.values()), "no new pictures came"
@@ -202,18 +205,21 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
             action: `ctrl` of all actuators; what is outside of `action_space` is clipped.
 
         Returns:
-            Observation; 0; False; whether the connection to the session is lost; and information: by robot
+            Observation; 0; False; whether a connection to the session is lost; and information: by robot
             `intervention` (a person drives it), `driven` (this policy does), `hold_reason`; `ctrl` in force, shape of
             the action: in an intervention, that of the person; `session_time_ns`, `sim_time_s`, `tick` of the state;
             with cameras, `capture_ns` by camera: session time of the state that its picture shows, which is older.
 
         Raises:
-            ValueError: The action has another shape.
+            ValueError: The action has another shape, or a value that is not finite.
             NotConnectedError: The session has ended.
+            ClientError: The session has another scene, whose robots or objects differ.
         """
         values = np.asarray(action, np.float64)
         if values.shape != self.action_space.shape:
             raise ValueError(f"action has shape {values.shape}: {self.action_space.shape} is needed")
+        if not np.isfinite(values).all():
+            raise ValueError(f"action has values that are not finite: {values}")
         commands, at = {}, 0
         for robot in self.robots:
             known = self._infos[robot]
@@ -230,7 +236,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
                 break
             self._viewer.sleep(min(left_s, SAMPLE_PERIOD_S))
         observation, info = self._observe()
-        return observation, 0.0, False, not self._viewer.ready, info
+        return observation, 0.0, False, not all(client.ready for client in self._clients.values()), info
 
     def close(self) -> None:
         """Leave the session; the robots are released."""
@@ -240,7 +246,13 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
     # --- inside -------------------------------------------------------------------------------------------------------
 
     def _may_drive(self, robot: str) -> bool:
-        return robot in self._intervened or self._clients[robot].is_armed(robot)
+        return self._is_intervened(robot) or self._clients[robot].is_armed(robot)
+
+    def _is_intervened(self, robot: str) -> bool:
+        """Return whether a person drives a robot of ours: read off its lease, which is right after a reconnect, too."""
+        client = self._clients[robot]
+        lease, us = client.mirror.leases.get(robot), client.participant_id
+        return lease is not None and lease.mode == LeaseMode.PRIORITY and us in lease.sub_holders and lease.holder != us
 
     def _send(self, commands: dict[str, tuple[Any, float | None]]) -> None:
         for robot, (q, gripper) in commands.items():
@@ -259,7 +271,22 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
         if not self._viewer.wait_for(lambda _: condition(), WAIT_S):
             raise NotConnectedError(f"{what} within {WAIT_S:g} s")
 
+    def _wait_for_states(self) -> None:
+        """Wait for states of the present scene: just after a reset there are none."""
+
+        def is_other() -> bool:
+            known = self._viewer.mirror.robots
+            return self._list_objects() != self.objects or any(known.get(r) != info for r, info in self._infos.items())
+
+        self._wait_for(
+            lambda: is_other() or all(self._viewer.scene.robot_state(robot) is not None for robot in self.robots),
+            "no state of the robots came",
+        )
+        if is_other():
+            raise ClientError("the session has another scene, whose robots or objects differ: make a new RobotEnv")
+
     def _observe(self) -> tuple[Observation, dict[str, Any]]:
+        self._wait_for_states()
         states = [self._get_state(robot) for robot in self.robots]
         joints: list[float] = []
         for state in states:
@@ -277,7 +304,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
         feedback = {robot: client.feedback.get(robot) for robot, client in self._clients.items()}
         header = self._viewer.scene.state.header if self._viewer.scene.state is not None else None
         info = {
-            "intervention": {robot: robot in self._intervened for robot in self.robots},
+            "intervention": {robot: self._is_intervened(robot) for robot in self.robots},
             "driven": {robot: one is not None and one.state == CommandKind.JOINTS for robot, one in feedback.items()},
             "hold_reason": {robot: one.hold_reason if one else "" for robot, one in feedback.items()},
             "ctrl": np.array([x for state in states for x in state.ctrl], np.float32),

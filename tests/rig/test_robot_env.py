@@ -5,17 +5,19 @@ from __future__ import annotations
 import io
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.wrappers import PassiveEnvChecker
 from PIL import Image
 
-from iris_session.client import Client, ClientError, robot_env
+from iris_session.client import Client, ClientError, DeniedError, robot_env
 from iris_session.client.cameras import CameraFeed
 from iris_session.client.media import MediaFeed, MediaFrame
 from iris_session.client.robot_env import RobotEnv
+from iris_session.protocol.client_messages import Control, RemoveParticipant
 from iris_session.protocol.media import MediaHeader
-from iris_session.protocol.names import LeaseMode
+from iris_session.protocol.names import ControlAction, LeaseMode
 from tests.rig.session import Rig
 
 MS = 1_000_000
@@ -57,6 +59,8 @@ def test_actions_are_ctrl_and_observations_are_what_is_exported(rig: Rig) -> Non
     assert observation["environment_state"][:3] == pytest.approx(data.body(env.objects[0]).xpos, abs=1e-3)
     with pytest.raises(ValueError, match="shape"):
         env.step(action[1:])
+    with pytest.raises(ValueError, match="not finite"):
+        env.step(np.full_like(action, np.nan))
     env.close()
     rig.run(0.5)
     assert all(lease.holder == "" for lease in rig.join("eve", "observer").mirror.leases.values())
@@ -154,3 +158,57 @@ def test_it_passes_the_checks_of_gymnasium(rig: Rig) -> None:
     _, info = env.reset(seed=1)
     env.step(info["ctrl"])
     env.close()
+
+
+def test_it_goes_on_when_people_reset_the_scene_and_ends_with_another_one(rig: Rig) -> None:
+    director = rig.join("dora", "director")
+    env = RobotEnv("", ["left"], hz=173)  # steps end at all places between two states
+    _, info = env.reset()
+    for i in range(100):
+        if i % 20 == 0:
+            director.submit(Control(0, ControlAction.RESET))
+        observation, *_, info = env.step(info["ctrl"])
+        assert np.isfinite(observation["environment_state"]).all()
+    assert director.mirror.scene_epoch >= 6
+    scene = "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    rig.session.load_scene(mujoco.MjModel.from_xml_string(scene))
+    with pytest.raises(ClientError, match="another scene"):
+        for _ in range(100):
+            env.step(info["ctrl"])
+    with pytest.raises(ClientError, match="another scene"):
+        env.reset()
+    env.close()
+    env.close()
+
+
+def test_of_two_robots_it_takes_both_or_none(rig: Rig) -> None:
+    director = rig.join("dora", "director")
+    hand = rig.drive("ann", "right")
+    env = RobotEnv("", ["left", "right"], hz=20)
+    with pytest.raises(DeniedError, match="ann"):
+        env.reset()
+    rig.run(0.2)
+    assert director.mirror.leases["left"].holder == ""
+    hand.client.release("right")
+    _, info = env.reset()
+    assert not env.step(info["ctrl"])[3]
+    director.request(RemoveParticipant(0, env._clients["right"].participant_id))
+    rig.run(0.2)
+    assert env.step(info["ctrl"])[3], "a robot without its client is the end"
+
+
+def test_an_intervention_that_ends_while_the_policy_is_disconnected_is_over(rig: Rig) -> None:
+    director = rig.join("dora", "director")
+    director.set_mode("left", LeaseMode.PRIORITY)
+    env = RobotEnv("", ["left"], hz=20)
+    _, info = env.reset()
+    hand = rig.drive("ann", "left", velocity=(0.0, 0.02, 0.0))
+    for _ in range(10):
+        *_, info = env.step(info["ctrl"])
+    assert info["intervention"]["left"]
+    rig.cut(env._clients["left"])
+    hand.client.release("left")
+    for _ in range(100):
+        *_, info = env.step(info["ctrl"])
+    assert not info["intervention"]["left"]
+    assert info["driven"]["left"]
