@@ -35,10 +35,13 @@ VERDICTS: Final = {
 }
 #: Actions that must be asked for twice.
 _ASKED_TWICE: Final = (EpisodeAction.DISCARD, EpisodeAction.RERECORD)
+_MAY_PLACE: Final = EpisodeState.OVER | {EpisodeState.COUNTDOWN}
 MAX_COUNTDOWN_NS: Final = 60 * SECOND
 #: Longest wait for the places of objects, and for the owner of a user loop to reset its world.
 PLACEMENT_NS: Final = 5 * SECOND
 OWNER_NS: Final = 30 * SECOND
+#: An episode that has run for less is not ended by a button: people who press it at the end of a countdown want to begin.
+PRESS_NS: Final = SECOND
 #: Bits of `Sample.buttons` (docs/protocol.md, section 6): A or X, and B or Y; and the devices whose buttons count.
 LOWER: Final = 1 << 4
 UPPER: Final = 1 << 5
@@ -121,11 +124,13 @@ def _holds_robot(ctx: Context, p: Participant, now: EpisodeChanged) -> bool:
 
 
 def find_next_number(ctx: Context) -> int:
-    """Return the number of the episode that begins next: that of a cancelled or repeated one is used again."""
+    """Return the number of the episode that begins next: in a countdown its own; that of a cancelled or repeated one
+    is used again.
+    """
     now, again = ctx.state.episode, ctx.state.rerecording
     if now is None or again is not None:
         return 1 if again is None else again.number
-    return now.number + (now.state != EpisodeState.CANCELLED)
+    return now.number + (now.state not in (EpisodeState.COUNTDOWN, EpisodeState.CANCELLED))
 
 
 def _start(ctx: Context, p: Participant, m: Episode) -> Denial | None:
@@ -278,7 +283,9 @@ def note_return(ctx: Context, p: Participant) -> None:
 
 
 def advance_episode(ctx: Context) -> None:
-    """Let time pass: ends of countdowns, questions and waits. A reset by a director ends what is recorded."""
+    """Let time pass: ends of countdowns, questions and waits. A reset by a director ends what is recorded, but not an
+    episode that began in this step: it begins with the reset scene.
+    """
     now = ctx.state.episode
     if now is None or now.state in EpisodeState.OVER or not ctx.config.episode_rules:
         return
@@ -288,7 +295,7 @@ def advance_episode(ctx: Context) -> None:
             _set(ctx, HOST_ID, EpisodeState.CANCELLED)
         elif is_due:
             _run(ctx, now)
-    elif now.state in EpisodeState.RECORDED and ctx.reset:
+    elif now.state in EpisodeState.RECORDED and ctx.reset and now.started_ns < ctx.now_ns:
         end_unknown(ctx)
     elif now.state == EpisodeState.CONFIRM and is_due:
         _set(ctx, HOST_ID, EpisodeState.RUNNING)
@@ -302,9 +309,12 @@ def advance_episode(ctx: Context) -> None:
 
 
 def place_objects(ctx: Context, m: ObjectsPlaced) -> None:
-    """Reset the scene with the objects at the places of `m`, which the core reads from the entry; end the closing."""
+    """Reset the scene with the objects at the places of `m`, which the core reads from the entry; end the closing.
+
+    Nothing is placed while an episode is recorded, or its verdict is missing.
+    """
     now = ctx.state.episode
-    if now is not None and now.state not in EpisodeState.OVER and not now.verdict:
+    if now is not None and now.state not in _MAY_PLACE and not now.verdict:
         return
     session_control.reset_scene(ctx, HOST_ID)
     if now is not None and now.verdict:
@@ -339,8 +349,10 @@ def press_buttons(ctx: Context, p: Participant, s: Sample, before: int) -> None:
     if pressed & LOWER and is_over:
         action = EpisodeAction.START
     elif pressed & LOWER:
-        is_asked = now is not None and now.state == EpisodeState.CONFIRM
-        action = EpisodeAction.FAILURE if is_asked else EpisodeAction.SUCCESS
+        assert now is not None
+        if now.state == EpisodeState.RUNNING and ctx.now_ns - now.started_ns < PRESS_NS:
+            return
+        action = EpisodeAction.FAILURE if now.state == EpisodeState.CONFIRM else EpisodeAction.SUCCESS
     elif is_over:
         return
     _act(ctx, p, Episode(NO_REPLY, action))

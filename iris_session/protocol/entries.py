@@ -230,7 +230,7 @@ class ObjectsPlaced(Message, frozen=True, tag="objects_placed"):
     """The scene is reset with the objects of the task at other places (host only).
 
     `objects`, `poses`: `T_world_object`, in the same order. `number`: of the episode that they are for. `seed`: from
-    which, with the number, they were drawn. Between episodes only: else it does nothing.
+    which, with the number, they were drawn. Not while an episode is recorded: then it does nothing.
     """
 
     objects: Names

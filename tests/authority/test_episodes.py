@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.protocol.client_messages import Bye, Control, Episode, EStop, Heartbeat, Release
+from iris_session.protocol.client_messages import Acquire, Bye, Control, Episode, EStop, Heartbeat, Release, SetRole
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import ExternalReset, Join, Lost, ObjectsPlaced, OwnerListens, SceneLoaded
 from iris_session.protocol.server_messages import EpisodeChanged
@@ -275,6 +275,29 @@ def test_a_reset_or_another_scene_in_the_middle_makes_it_unknown(message: Any) -
     assert states(t)[-1] == (1, "unknown")
 
 
+def test_an_episode_that_begins_in_the_step_of_a_reset_begins_with_the_reset_scene() -> None:
+    t, ann, _, desk = meet(TASK, countdown_ns=0)
+    t.step(desk.says(Control(1, "reset")), ann.says(Episode(1, "start")))
+    assert states(t)[-1] == (15, "running")
+    for _ in range(2):
+        assert ann.asks(Episode(1, "rerecord")).ok
+    assert t.decision.reset
+    t.wait(SECOND)
+    assert states(t)[-1] == (15, "running")
+
+
+def test_a_reset_in_the_countdown_places_the_objects_of_the_episode_that_begins() -> None:
+    t, ann, _, desk = meet(PLACED)
+    assert ann.asks(Episode(1, "start")).ok
+    assert t.authority.next_episode == 15
+    assert desk.asks(Control(1, "reset")).ok
+    t.step(t.host(ObjectsPlaced(("hammer",), (Pose((0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0)),), 15)))
+    assert t.decision.reset
+    t.wait(3 * SECOND)
+    assert states(t)[-1] == (15, "running")
+    assert t.authority.next_episode == 16
+
+
 def test_in_a_user_loop_a_repetition_waits_for_the_owner() -> None:
     t, ann, *_ = meet(user_owned_loop=True)
     assert ann.denied(Episode(1, "reset")) == "user_owned"
@@ -313,6 +336,9 @@ def test_buttons_of_a_holder_start_and_end_it() -> None:
     assert states(t)[-1] == (1, "failure")
     press(ann, A)
     t.wait(3 * SECOND)
+    press(bob, A)
+    assert states(t)[-1] == (2, "running")  # meant to begin it
+    t.wait(SECOND)
     press(ann, A)
     assert states(t)[-1] == (2, "success")
     press(ann, B)
@@ -347,3 +373,7 @@ def test_recordings_before_these_rules_replay_as_they_were() -> None:
     assert states(t)[1:] == [(1, "discarded"), (2, "running")]
     t.step(t.host(Episode(1, "success")))
     assert states(t)[-1] == (2, "success")
+    eve = t.operator(name="eve")
+    eve.does(Acquire(5, ("right",), wait=True))
+    t.step(t.host(SetRole(1, eve.id, "observer")))
+    assert eve.replies() == [], "a request was not ended by another role"
