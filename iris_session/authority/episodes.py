@@ -40,7 +40,7 @@ MAX_COUNTDOWN_NS: Final = 60 * SECOND
 #: Longest wait for the places of objects, and for the owner of a user loop to reset its world.
 PLACEMENT_NS: Final = 5 * SECOND
 OWNER_NS: Final = 30 * SECOND
-#: An episode that has run for less is not ended by a button: people who press it at the end of a countdown want to begin.
+#: An episode that has run for less is not ended by a button: who presses it at the end of a countdown wants to begin.
 PRESS_NS: Final = SECOND
 #: Bits of `Sample.buttons` (docs/protocol.md, section 6): A or X, and B or Y; and the devices whose buttons count.
 LOWER: Final = 1 << 4

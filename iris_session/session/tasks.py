@@ -31,7 +31,6 @@ from iris_session.protocol.names import EpisodeState
 from iris_session.protocol.server_messages import EpisodeChanged
 from iris_session.protocol.specs import ObjectRange, TaskSpec
 from iris_session.protocol.steps import Decision
-from iris_session.session.core import SessionCore
 from iris_session.session.errors import ConfigError
 from iris_session.session.stepper import Stepper
 from iris_session.system.files import Replacement
@@ -124,7 +123,7 @@ def check_same_task(given: TaskSpec, recorded: TaskSpec | None) -> None:
 
 
 class PlacementError(Exception):
-    """No places for the objects of a task are free of contact."""
+    """No places for the objects of a task are free of contact, or one of them cannot be moved."""
 
 
 def draw_places(world: World, initial_state: bytes, task: TaskSpec, number: int) -> ObjectsPlaced:
@@ -135,7 +134,10 @@ def draw_places(world: World, initial_state: bytes, task: TaskSpec, number: int)
     """
     model = world.model
     data = world.make_initial_data(initial_state)
-    joints = {name: find_free_joints(model, world.objects)[name] for name in (one.object for one in task.objects)}
+    free = find_free_joints(model, world.objects)
+    if fixed := [one.object for one in task.objects if one.object not in free]:
+        raise PlacementError(f"{', '.join(fixed)} cannot be placed: only free bodies can")
+    joints = {one.object: free[one.object] for one in task.objects}
     bodies = np.array([model.jnt_bodyid[joint] for joint in joints.values()])
     home = {name: data.qpos[(at := int(model.jnt_qposadr[joint])) : at + 7].copy() for name, joint in joints.items()}
     allowed = _list_touching(model, data, bodies, 0.0)
@@ -175,7 +177,8 @@ class TaskRunner:
     Args:
         stepper: Gets the places, and calls `follow` after every step.
         progress: File of the progress; `None` keeps none.
-        is_new: False for a session that resumes: its objects lie where they were.
+        is_new: False for a session that resumes: its objects lie where they were, unless they were to be placed when it
+            ended.
 
     Raises:
         ConfigError: An object cannot be placed.
@@ -191,21 +194,15 @@ class TaskRunner:
         self._thread = ThreadPoolExecutor(1, "iris-session-task")
         self._draws: dict[int, Future[ObjectsPlaced]] = {}
         if task.objects:
-            self._check_objects(stepper.core)
             self._prepare(stepper.core.authority.next_episode)
             try:
                 placed = self._draws[stepper.core.authority.next_episode].result()
             except PlacementError as error:
                 raise ConfigError(f"task {task.name!r}: {error}") from error
-            if is_new:
+            episode = stepper.core.authority.episode
+            if is_new or (episode is not None and episode.verdict):
                 stepper.post_own(placed)
         stepper.on_decision = self.follow
-
-    def _check_objects(self, core: SessionCore) -> None:
-        free = find_free_joints(core.world.model, core.world.objects)
-        fixed = [one.object for one in self._task.objects if one.object not in free]
-        if fixed:
-            raise ConfigError(f"task {self._task.name!r}: {', '.join(fixed)} cannot be placed: only free bodies can")
 
     def _prepare(self, number: int) -> None:
         """Draw the places of an episode in the thread, if that is not under way."""
@@ -216,19 +213,25 @@ class TaskRunner:
             self._draws[number] = self._thread.submit(draw_places, *work)
 
     def follow(self, decision: Decision, entries: Sequence[Entry]) -> None:
-        """Follow a step: place objects when an episode closes or the scene was reset, and keep the progress."""
+        """Follow a step: place objects when an episode closes, or the scene was reset or is another one; keep the
+        progress.
+        """
         episodes = [event.body for event in decision.events if isinstance(event.body, EpisodeChanged)]
         for one in episodes:
             if one.state in _ENDED and self._progress is not None:
                 self._thread.submit(write_progress, self._progress, one)
-        if not self._task.objects or self._stepper.core.scene is not self._scene:
-            return  # another scene: it has other objects
+        if not self._task.objects:
+            return
+        core = self._stepper.core
+        is_new = core.scene is not self._scene
+        if is_new:
+            self._scene, self._draws = core.scene, {}
         if any(one.state == EpisodeState.RUNNING for one in episodes):
-            self._prepare(episodes[-1].number + 1)
+            self._prepare(core.authority.next_episode)
         is_closing = any(one.state == EpisodeState.CLOSING and one.verdict for one in episodes)
         is_placed = any(isinstance(entry.message, ObjectsPlaced) for entry in entries)
-        if is_closing or (decision.reset and not is_placed):
-            self._place(self._stepper.core.authority.next_episode)
+        if is_new or is_closing or (decision.reset and not is_placed):
+            self._place(core.authority.next_episode)
 
     def _place(self, number: int) -> None:
         self._prepare(number)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from iris_session import scene_path
 from iris_session.client import Client, DeniedError
 from iris_session.protocol.server_messages import EpisodeChanged
 from iris_session.session.errors import ConfigError
@@ -98,3 +100,25 @@ def test_a_task_that_does_not_fit_the_scene_is_refused_at_the_start(task: Path) 
     task.write_text(POUR.replace("objects.board", "objects.moon"))
     with pytest.raises(ConfigError, match=r"unknown objects \['moon'\]"), Rig(timestep=TICK, task=task):
         pass
+
+
+def test_in_another_scene_objects_are_placed_too_and_episodes_close_at_once(task: Path) -> None:
+    with Rig(timestep=TICK, task=task) as rig:
+        desk = rig.join("desk", "director")
+        desk.start_episode(countdown_s=0)
+        model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+        model.opt.timestep = TICK
+        rig.session.load_scene(model).result(60.0)
+        rig.run_until(lambda: states(rig, "desk")[-1] == (1, "unknown"), "the scene is another one", 1.0)
+        rig.run(0.2)
+        first = see_objects(desk)
+        home = model.key_qpos[0] if model.nkey else model.qpos0
+        at = [model.jnt_qposadr[model.body_jntadr[model.body(name).id]] for name in ("hammer", "board")]
+        assert np.abs(first - [home[i : i + 3] for i in at]).max() > 0.01, "they do not lie where the file has them"
+        desk.start_episode(countdown_s=0)
+        desk.end_episode()
+        rig.run(0.2)
+        assert states(rig, "desk")[-2:] == [(2, "closing"), (2, "success")]
+        closing, success = (now_ns for now_ns, _ in rig.list_events("desk", EpisodeChanged)[-2:])
+        assert success - closing <= 2 * TICK * 1e9
+        assert np.abs(see_objects(desk) - first).max() > 0.01

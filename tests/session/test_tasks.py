@@ -11,10 +11,24 @@ import pytest
 
 from iris_session import scene_path
 from iris_session.physics import World, find_objects
+from iris_session.protocol.client_messages import Episode
+from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.server_messages import EpisodeChanged
 from iris_session.protocol.specs import ObjectRange, TaskSpec
+from iris_session.session.config import SessionConfig
+from iris_session.session.core import make_session_core
 from iris_session.session.errors import ConfigError
-from iris_session.session.tasks import PlacementError, check_same_task, draw_places, load_task, write_progress
+from iris_session.session.stepper import Stepper
+from iris_session.session.tasks import (
+    PlacementError,
+    TaskRunner,
+    check_same_task,
+    draw_places,
+    load_task,
+    write_progress,
+)
+
+from .test_stepper import Front
 
 POUR = """
 name = "swap"
@@ -136,3 +150,29 @@ def test_without_a_free_place_the_objects_are_named() -> None:
     inside = ObjectRange("board", (0.0, 0.0), (0.0, 0.0), (-0.02, -0.02))
     with pytest.raises(PlacementError, match="no places of board are free of contact"):
         draw_places(make_world(), b"", TaskSpec("swap", objects=(inside,)), 1)
+
+
+def test_a_session_that_ended_before_its_objects_were_placed_places_them_when_it_resumes() -> None:
+    model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+    objects = find_objects(model)
+    task = TaskSpec("swap", objects=(HAMMER, BOARD))
+    core = make_session_core(SessionConfig(), model, mujoco.MjData(model), (), objects, user_owned=False, task=task)
+    now_ns = 0
+    stepper = Stepper(core, Front(), None, lambda: now_ns, 16_000_000, 100_000_000, b"root")
+
+    def step(*messages: EntryMessage) -> str:
+        nonlocal now_ns
+        for message in messages:
+            stepper.post_own(message)
+        now_ns += 2_000_000
+        stepper.step(1)
+        assert core.authority.episode is not None
+        return core.authority.episode.state
+
+    assert step(Episode(0, "start", countdown_ns=0)) == "running"
+    assert step(Episode(0, "success")) == "closing"
+    runner = TaskRunner(stepper, None, is_new=False)
+    assert step() == "success"
+    hammer = core.world.view().object_pose("hammer").p
+    assert hammer[:2] == pytest.approx(draw_places(core.world, b"", task, 2).poses[0].p[:2], abs=1e-3)
+    runner.close()
