@@ -13,6 +13,7 @@ import zmq
 from iris_session.link import sockets
 from iris_session.link.config import FrontConfig, FrontLimits
 from iris_session.link.sockets import FILE_DESCRIPTORS, RESERVED_DESCRIPTORS, fit_limits, pace_tcp
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, TOPIC_ROBOTS
 
 
 def test_stalled_subscriber_is_cut_off_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,6 +50,26 @@ def _drain(reader: zmq.Socket[bytes]) -> list[bytes]:
     while reader.poll(0):
         got.append(reader.recv())
     return got
+
+
+def test_a_state_its_robots_and_presence_that_come_at_once_all_arrive() -> None:
+    topics = [TOPIC_RIGID, TOPIC_ROBOTS, TOPIC_PRESENCE]
+    with ExitStack() as stack:
+        context = stack.enter_context(zmq.Context())
+        state = stack.enter_context(sockets.open_state(context, FrontConfig(state_port=0), None))
+        reader = stack.enter_context(context.socket(zmq.SUB))
+        state.linger = reader.linger = 0
+        reader.rcvhwm = 2
+        reader.subscribe(b"")
+        reader.connect(f"tcp://127.0.0.1:{sockets.bound_port(state)}")
+        assert state.recv() == b"\x01", "it has subscribed"
+        for _ in range(200):
+            state.get(zmq.EVENTS)  # the time between two states: libzmq looks what was sent on
+            for topic in topics:
+                state.send(topic)
+            for topic in topics:
+                assert reader.poll(5000), f"{topic!r} was dropped"
+                assert reader.recv() == topic
 
 
 @pytest.mark.parametrize("descriptors", [64, 256, 1024, 4096, 8192, 1 << 20])
