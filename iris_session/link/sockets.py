@@ -21,7 +21,7 @@ from iris_session.security import KeyPair
 from iris_session.security.zap import ZAP_ASSETS, ZAP_CONTROL, ZAP_INGEST, ZAP_MEDIA, ZAP_STATE
 
 #: State sockets: what is queued for a slow client; then libzmq drops the newest, not the oldest. A state, its robots
-#: and presence come at once. That these were sent on is reported for every second one only, so three need room for four.
+#: and presence come at once. Of what was sent on only every second one is reported, so three need room for four.
 STATE_HWM = 4
 STATE_BUFFER_BYTES = 32_768
 #: Fits a subscription. The handshake of CURVE has messages of up to 600 bytes. Larger ones, which libzmq would keep as
