@@ -206,9 +206,10 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
 
         Returns:
             Observation; 0; False; whether a connection to the session is lost; and information: by robot
-            `intervention` (a person drives it), `driven` (this policy does), `hold_reason`; `ctrl` in force, shape of
-            the action: in an intervention, that of the person; `session_time_ns`, `sim_time_s`, `tick` of the state;
-            with cameras, `capture_ns` by camera: session time of the state that its picture shows, which is older.
+            `intervention` (a person drives it), `driven` (this policy does), `hold_reason`, `end_effector`
+            (`x y z qw qx qy qz` [m], world frame); `ctrl` in force, shape of the action: in an intervention, that of
+            the person; `session_time_ns`, `sim_time_s`, `tick` of the state; with cameras, `capture_ns` by camera:
+            session time of the state that its picture shows, which is older.
 
         Raises:
             ValueError: The action has another shape, or a value that is not finite.
@@ -307,6 +308,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
             "intervention": {robot: self._is_intervened(robot) for robot in self.robots},
             "driven": {robot: one is not None and one.state == CommandKind.JOINTS for robot, one in feedback.items()},
             "hold_reason": {robot: one.hold_reason if one else "" for robot, one in feedback.items()},
+            "end_effector": {one.robot: np.array((*one.tip.p, *one.tip.q)) for one in states},
             "ctrl": np.array([x for state in states for x in state.ctrl], np.float32),
             "session_time_ns": header.session_time if header else 0,
             "sim_time_s": header.sim_time if header else 0.0,
