@@ -3,9 +3,9 @@
     idle -> countdown -> running -> closing -> success, failure, discarded or unknown, which are idle again
 
 One episode at a time. The participant that starts it leads it. The leader, holders of its robots and directors give the
-verdict; a discard is asked for twice. When its leader disconnects it can be taken over for a while, and then ends
-`unknown`, as it does at once when the holder of one of its robots leaves: an episode without its people is never a
-success. While it closes, every robot holds. Places of objects are drawn outside and come as an entry (`ObjectsPlaced`).
+verdict; a discard is asked for twice. When its leader or a holder disconnects it waits for that one, or for another
+leader, and then ends `unknown`, as it does at once when one of them says goodbye: an episode without its people is no
+success, unless a director says so. While it closes, every robot holds. Places of objects are drawn outside and come as an entry (`ObjectsPlaced`).
 """
 
 from __future__ import annotations
@@ -123,6 +123,12 @@ def _holds_robot(ctx: Context, p: Participant, now: EpisodeChanged) -> bool:
     return any(g.participant == p.id for lease in leases for g in lease.grants)
 
 
+def _has_all_holders(ctx: Context, now: EpisodeChanged) -> bool:
+    """Return whether every holder of a robot of the episode is connected."""
+    people = ctx.state.participants.values()
+    return not any(p.connection == NO_CONNECTION and _holds_robot(ctx, p, now) for p in people)
+
+
 def find_next_number(ctx: Context) -> int:
     """Return the number of the episode that begins next: in a countdown its own; that of a cancelled or repeated one
     is used again.
@@ -191,8 +197,15 @@ def _end_by_request(ctx: Context, p: Participant, now: EpisodeChanged, m: Episod
     if now.verdict:
         text = f"episode {now.number} has its verdict: {now.verdict}"
         return Denial(DenialReason.EPISODE_STATE, text, "wait until the scene is ready")
-    if now.state == EpisodeState.LEFT:
+    leader = ctx.state.participants.get(now.led_by)
+    is_led = not now.led_by or (leader is not None and leader.connection != NO_CONNECTION)
+    if now.state == EpisodeState.LEFT and not is_led:
         return Denial(DenialReason.EPISODE_STATE, f"the leader of episode {now.number} has left", "take it over first")
+    if action == EpisodeAction.SUCCESS and p.role != Role.DIRECTOR and not _has_all_holders(ctx, now):
+        text = f"the holder of a robot of episode {now.number} is disconnected"
+        return Denial(DenialReason.EPISODE_STATE, text, "wait for it, give another verdict, or ask a director")
+    if ctx.state.estop and action == EpisodeAction.SUCCESS:
+        return Denial(DenialReason.ESTOP, "the session is stopped", "clear the e-stop first, or give another verdict")
     if m.label:
         ctx.state.episode = now = msgspec.structs.replace(now, label=m.label)
     if action == EpisodeAction.STOP:
@@ -267,18 +280,24 @@ def note_leaving(ctx: Context, p: Participant, cause: str) -> None:
     if now is None or now.state in EpisodeState.OVER or not ctx.config.episode_rules:
         return
     leads = now.led_by == p.id
-    if leads and cause == "lost" and now.state in EpisodeState.RECORDED:
-        _set(ctx, p.id, EpisodeState.LEFT, ctx.now_ns + ctx.config.takeover_ns)
+    is_needed = now.state in EpisodeState.RECORDED and (leads or _holds_robot(ctx, p, now))
+    if cause == "lost" and is_needed:
+        if now.state != EpisodeState.LEFT:
+            _set(ctx, p.id, EpisodeState.LEFT, ctx.now_ns + ctx.config.takeover_ns)
     elif leads and cause == "left" and not _holds_robot(ctx, p, now):
         _set(ctx, p.id, now.state, now.until_ns, led_by="")
-    elif leads or (now.state in EpisodeState.RECORDED and _holds_robot(ctx, p, now)):
+    elif leads or is_needed:
         end_unknown(ctx, p.id)
 
 
 def note_return(ctx: Context, p: Participant) -> None:
-    """Note that `p` is connected again: it goes on with the episode that it leads."""
+    """Note that `p` is connected again: the episode goes on once its leader and the holders of its robots are."""
     now = ctx.state.episode
-    if now is not None and now.state == EpisodeState.LEFT and now.led_by == p.id:
+    if now is None or now.state != EpisodeState.LEFT:
+        return
+    leader = ctx.state.participants.get(now.led_by)
+    is_led = not now.led_by or (leader is not None and leader.connection != NO_CONNECTION)
+    if is_led and _has_all_holders(ctx, now):
         _set(ctx, p.id, EpisodeState.RUNNING)
 
 

@@ -142,12 +142,37 @@ def test_a_leader_that_resumes_goes_on() -> None:
     assert now(t).state == "running"
 
 
-@pytest.mark.parametrize("message", [Lost(), Bye()])
-def test_the_holder_of_a_robot_that_leaves_makes_it_unknown_at_once(message: Any) -> None:
+def test_the_holder_of_a_robot_that_leaves_makes_it_unknown_at_once() -> None:
     t, ann, bob, _ = meet()
     begin(ann)
-    bob.does(message)
+    bob.does(Bye())
     assert states(t)[-1] == (1, "unknown")
+
+
+@pytest.mark.parametrize("returns", [True, False])
+def test_a_holder_whose_connection_is_lost_may_return_and_until_then_it_is_no_success(returns: bool) -> None:
+    t, ann, bob, _ = meet()
+    begin(ann)
+    bob.does(Lost())
+    assert now(t).state == "left"
+    assert ann.denied(Episode(1, "success")) == "episode_state"
+    t.wait(5 * SECOND)
+    if returns:
+        join = t.host(Join("key2", "operator", "bob", resume_of=bob.id))
+        t.step(msgspec.structs.replace(join, connection=9, connection_epoch=9))
+        assert now(t).state == "running"
+        assert ann.asks(Episode(1, "success")).ok
+    else:
+        t.wait(5 * SECOND)
+        assert states(t)[-1] == (1, "unknown")
+
+
+def test_an_episode_that_was_stopped_by_an_estop_is_no_success() -> None:
+    t, ann, _, _ = meet()
+    begin(ann)
+    ann.does(EStop())
+    assert ann.denied(Episode(1, "success")) == "estop"
+    assert ann.asks(Episode(1, "failure")).ok
 
 
 def test_a_leader_that_says_goodbye_makes_it_unknown_at_once_and_the_scene_is_reset() -> None:
@@ -170,6 +195,7 @@ def test_a_command_of_the_terminal_starts_an_episode_and_another_one_ends_it() -
     t.wait(3 * SECOND)
     assert states(t)[-1] == (1, "running")
     ann.does(Lost())
+    t.wait(10 * SECOND)
     assert states(t)[-1] == (1, "unknown")
 
 
