@@ -5,7 +5,8 @@
 One episode at a time. The participant that starts it leads it. The leader, holders of its robots and directors give the
 verdict; a discard is asked for twice. When its leader or a holder disconnects it waits for that one, or for another
 leader, and then ends `unknown`, as it does at once when one of them says goodbye: an episode without its people is no
-success, unless a director says so. While it closes, every robot holds. Places of objects are drawn outside and come as an entry (`ObjectsPlaced`).
+success, unless a director says so. While it closes, every robot holds. Places of objects are drawn outside and come
+as an entry (`ObjectsPlaced`).
 """
 
 from __future__ import annotations

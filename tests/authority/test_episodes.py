@@ -168,7 +168,7 @@ def test_a_holder_whose_connection_is_lost_may_return_and_until_then_it_is_no_su
 
 
 def test_an_episode_that_was_stopped_by_an_estop_is_no_success() -> None:
-    t, ann, _, _ = meet()
+    _, ann, _, _ = meet()
     begin(ann)
     ann.does(EStop())
     assert ann.denied(Episode(1, "success")) == "estop"
