@@ -13,10 +13,12 @@ from iris_session.cli.common import to_printable
 #: A file that takes longer shows how far it was read [s].
 PROGRESS_AFTER_S: Final = 1.0
 PROGRESS_PERIOD_S: Final = 0.2
+#: In a file or pipe, time between two lines [s].
+LINE_PERIOD_S: Final = 10.0
 
 
 class ProgressLine:
-    """A line on standard error, where that is a terminal, that says how far the work on a file is.
+    """A line on standard error that says how far the work on a file is: in place in a terminal, else now and then.
 
     Args:
         path: The file.
@@ -25,14 +27,19 @@ class ProgressLine:
 
     def __init__(self, path: Path, after_s: float = 0.0) -> None:
         self._path = to_printable(str(path))
-        self._shows = sys.stderr.isatty()
+        self._is_terminal = sys.stderr.isatty()
         self._shown = False
-        self._due_s = time.monotonic() + after_s
+        self._due_s = time.monotonic() + (after_s if self._is_terminal else LINE_PERIOD_S)
 
     def show(self, text: str, *, at_once: bool = False) -> None:
         """Show a text in place of the last one; other than `at_once` not more often than a terminal needs."""
-        if self._shows and (at_once or time.monotonic() >= self._due_s):
-            self._due_s = time.monotonic() + PROGRESS_PERIOD_S
+        now_s = time.monotonic()
+        if not self._is_terminal:
+            if now_s >= self._due_s:
+                self._due_s = now_s + LINE_PERIOD_S
+                print(f"{self._path}: {text}", file=sys.stderr, flush=True)
+        elif at_once or now_s >= self._due_s:
+            self._due_s = now_s + PROGRESS_PERIOD_S
             self._shown = True
             print(f"\r\x1b[K{self._path}: {text}", end="", file=sys.stderr, flush=True)
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 from anchors.pose import distance
 from iris_session.client.arguments import PoseLike, to_names, to_numbers, to_pose, to_python_scalar
 from iris_session.client.core.samples import SampleBuilder
-from iris_session.client.errors import UnreachedError
+from iris_session.client.errors import ClientError, InvalidMessageError, UnreachedError
 from iris_session.client.scene import ClientScene
 from iris_session.protocol.client_messages import ClientMessage, Sample, Samples
 from iris_session.protocol.names import CommandKind, Device, HoldReason
@@ -75,9 +75,15 @@ class ClientDriving(ABC):
 
         Raises:
             UnreachedError: It is not there within `timeout_s`; the text says how far it is away, and what prevents it.
+            InvalidMessageError: A number is not finite.
+            ClientError: We do not hold the robot.
             NotConnectedError: The thread of `start` has ended.
         """
         goal = to_pose("pose", pose)
+        if not all(map(math.isfinite, (*goal.p, *goal.q, gripper or 0.0))):
+            raise InvalidMessageError(f"pose {goal.p}, {goal.q} and gripper {gripper} must be finite numbers")
+        if self.lease_version(robot) is None:
+            raise ClientError(f"we do not hold the robot {robot!r}: acquire it first")
         end_ns = self.session_now_ns() + int(timeout_s * 1e9)
         there_ns: int | None = None
         away_m = away_rad = math.inf

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from anchors.pose import PoseTuple, distance
-from iris_session.client import Client, ClientError, UnreachedError
+from iris_session.client import Client, ClientError, InvalidMessageError, UnreachedError
 from iris_session.protocol.client_messages import ClearEStop
 from iris_session.protocol.names import HoldReason
 from iris_session.protocol.server_messages import EngagementChanged
@@ -66,6 +66,10 @@ def test_a_pose_that_is_not_reached_says_how_far_and_why() -> None:
     with Rig(timestep=0.01) as rig:
         policy, ((x, y, z), q) = join_policy(rig)
         assert not policy.is_armed("left"), "the session has not seen the clutch open"
+        with pytest.raises(InvalidMessageError, match="finite"):
+            policy.move_to("left", ((x, y, z), q), gripper=float("nan"))
+        with pytest.raises(ClientError, match="do not hold the robot 'right'"):
+            policy.move_to("right", ((x, y, z), q))
         with pytest.raises(UnreachedError) as far:
             policy.move_to("left", ((x + 3.0, y, z), q), timeout_s=2.0)
         assert far.value.distance_m > 1.0
