@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import shutil
 import signal
 import time
@@ -39,6 +40,8 @@ FORMATS: Final = (LEROBOT,)
 _PACKAGES: Final = ("iris-session", "mujoco", "numpy", "pyarrow", "av")
 #: Finished episodes that wait for an earlier one, per process.
 _AHEAD: Final = 2
+#: File of what a process has made, in the folder of its task.
+_MADE: Final = "made.pickle"
 
 
 class DatasetOptions(msgspec.Struct, frozen=True):
@@ -321,7 +324,7 @@ def _make_all(tasks: Sequence[EpisodeTask], jobs: int) -> Generator[tuple[Episod
     # Spawned, since OpenGL and threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(tasks)), context, _begin_worker, (os.getpid(),)) as pool:
-        running: deque[tuple[EpisodeTask, Future[MadeEpisode]]] = deque()
+        running: deque[tuple[EpisodeTask, Future[None]]] = deque()
         ahead = iter(tasks)
         try:
             while True:
@@ -330,7 +333,9 @@ def _make_all(tasks: Sequence[EpisodeTask], jobs: int) -> Generator[tuple[Episod
                 if not running:
                     return
                 task, future = running.popleft()
-                yield task, future.result()
+                future.result()
+                made: MadeEpisode = pickle.loads((Path(task.folder) / _MADE).read_bytes())
+                yield task, made
         except BrokenProcessPool as error:
             raise DatasetError(
                 "a process that made an episode was killed: give fewer --jobs if memory is short"
@@ -350,8 +355,13 @@ def _begin_worker(parent: int) -> None:
         os._exit(1)
 
 
-def make_episode(task: EpisodeTask) -> MadeEpisode:
-    """Make one episode in a process that keeps files and renderer open for the next."""
+def make_episode(task: EpisodeTask) -> None:
+    """Make one episode in a process that keeps files and renderer open for the next.
+
+    The result goes through a file: a process that is killed while it writes a large one to the pipe that all share
+    would leave half of it there, and the lock of the pipe, and the others would wait forever.
+    """
     global _maker  # noqa: PLW0603
     _maker = _maker or EpisodeMaker()
-    return _maker.make(task)
+    made = _maker.make(task)
+    (Path(task.folder) / _MADE).write_bytes(pickle.dumps(made))
