@@ -1,8 +1,8 @@
 """Run a demo: a session in this process, emulated operators in others, and a result with a verdict.
 
 A run succeeds only if the session's own detector saw every handover by contact alone, if every goal with a deformable
-was reached (`goals`; recorded as the verdict of an episode), if the streams of its cameras reach every observer, and if
-the recording verifies bit for bit. When an operator fails, such as after dropping an object where it cannot be grasped,
+was reached (`goals`), if the streams of its cameras reach every observer, and if the recording verifies bit for bit.
+Handovers or goals are recorded as the verdict of an episode. When an operator fails, such as after dropping an object where it cannot be grasped,
 the scene is reset and all begin again, as people do who record demonstrations. The demos themselves are in `demos`.
 """
 
@@ -250,12 +250,14 @@ def _open_links(stack: ExitStack, session: Session, n: int, profile: str, seed: 
 
 
 class _GoalTracker:
-    """Tracks the goals of a demo tick by tick, and records the verdict as that of an episode."""
+    """Tracks goals, or else handovers, of a demo tick by tick, and records the verdict as that of an episode."""
 
     def __init__(self, play: Demo, session: Session) -> None:
         self._name = play.name
         self._session = session
         self._monitors = tuple(GoalMonitor(goal) for goal in play.goals)
+        self._objects = () if play.goals else play.objects
+        self._began_s, self._is_given = 0.0, False
         self._began = False
         self._finished_s: float | None = None
 
@@ -269,11 +271,16 @@ class _GoalTracker:
 
     def update(self) -> None:
         """Process one tick."""
-        if not self._monitors:
+        if not self._monitors and not self._objects:
             return
         if not self._began:
-            self._began = True
+            self._began, self._began_s, self._is_given = True, self._session.clock() * 1e-9, False
             self._session.post(Episode(0, EpisodeAction.START, self._name, countdown_ns=0))
+        if self._objects and not self._is_given:
+            seen = {one.object for one in self._session.stepper.view.handovers if one.at_s >= self._began_s}
+            self._is_given = seen.issuperset(self._objects)
+            if self._is_given:
+                self._session.post(Episode(0, EpisodeAction.SUCCESS, self._name))
         world = self._session.stepper.core.world
         now_s, reached = world.view().sim_time, False
         for watch in self._monitors:

@@ -67,3 +67,24 @@ def test_cameras_that_cannot_be_drawn_end_a_demo_before_it_starts(
     assert "libegl1 libgl1-mesa-dri" in str(caught.value)
     assert "MUJOCO_GL=osmesa" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_handover_is_an_episode_with_success() -> None:
+    posted: list[Any] = []
+    view = SimpleNamespace(handovers=[SimpleNamespace(object="hammer", at_s=1.0)])
+    core = SimpleNamespace(world=SimpleNamespace(view=lambda: SimpleNamespace(sim_time=0.0)))
+    session: Any = SimpleNamespace(
+        clock=iter((2_000_000_000, 4_000_000_000)).__next__,
+        post=posted.append,
+        stepper=SimpleNamespace(view=view, core=core),
+    )
+    tracker = run._GoalTracker(Demo("handover", None, {}, (), ("hammer",)), session)
+    tracker.update()
+    assert [one.action for one in posted] == ["start"], "a handover of an earlier attempt does not count"
+    view.handovers.append(SimpleNamespace(object="hammer", at_s=3.0))
+    tracker.update()
+    tracker.update()
+    assert [one.action for one in posted] == ["start", "success"]
+    tracker.restart()
+    tracker.update()
+    assert [one.action for one in posted[2:]] == ["discard", "discard", "start"]
