@@ -1,4 +1,4 @@
-"""Options and output of `iris-session export --to lerobot`: a data set for training, made of recordings."""
+"""Options and output of `iris-session export --to lerobot|robomimic|mcap`: a data set made of recordings."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING, Final
 from iris_session.cli.common import MOST_LINES, CommandError, ending_as_interrupts, make_number_type, print_result
 from iris_session.cli.progress import ProgressLine
 from iris_session.cli.recording_render import parse_size
+from iris_session.dataset.formats import FORMATS
 
 if TYPE_CHECKING:
     from iris_session.dataset.run import DatasetReport
 
-#: What `--to` may be, and the packages that each needs.
-FORMATS: Final = {"lerobot": ("pyarrow", "av")}
 LABELS: Final = ("success", "failure", "unknown")
 #: Options that only data sets have, with the values that stand for "not given".
 _OPTIONS: Final = {
     **dict.fromkeys(("fps", "cameras", "size", "looks", "seed", "labels", "task", "jobs")),
-    **dict.fromkeys(("plain", "anonymise"), False),
+    **dict.fromkeys(("plain", "depth", "masks", "anonymise"), False),
 }
 DEFAULT_FPS: Final = 30
 DEFAULT_SIZE: Final = (640, 480)
@@ -27,7 +26,7 @@ DEFAULT_SIZE: Final = (640, 480)
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of data sets."""
-    group = parser.add_argument_group("data sets (--to lerobot)")
+    group = parser.add_argument_group("data sets (--to lerobot, robomimic or mcap)")
     whole = make_number_type(int, "a rate: give a whole number of frames a second, for example 30", 1, 1000)
     group.add_argument("--fps", type=whole, metavar="N", help="frames per second of simulated time (default: 30)")
     group.add_argument(
@@ -43,6 +42,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--seed", type=make_number_type(int, "a seed: give a whole number from 0", 0), metavar="N", help="of the looks"
     )
     group.add_argument("--plain", action="store_true", help="pictures without shadows: faster without a graphics card")
+    group.add_argument("--depth", action="store_true", help="depth of every picture too (robomimic, mcap)")
+    group.add_argument("--masks", action="store_true", help="the body of every pixel too (robomimic, mcap)")
     group.add_argument(
         "--labels", metavar="LIST", help=f"episodes to export, of {', '.join(LABELS)} (default: success)"
     )
@@ -61,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the data set, and print what it holds."""
     from iris_session.system.extras import require_package
 
-    for package in FORMATS[arguments.to]:
+    for package in FORMATS[arguments.to].packages:
         require_package(package, f"--to {arguments.to}")
     from iris_session.dataset.cameras import PictureSpec, parse_cameras
     from iris_session.dataset.episodes import PlanOptions, list_files
@@ -70,6 +71,9 @@ def run(arguments: argparse.Namespace) -> int:
     width, height = arguments.size or DEFAULT_SIZE
     if width % 2 or height % 2:
         raise CommandError(f"--size {width}x{height}: a video needs even numbers")
+    if not FORMATS[arguments.to].has_layers and (arguments.depth or arguments.masks):
+        there_are = " or ".join(name for name, one in FORMATS.items() if one.has_layers)
+        raise CommandError(f"--to {arguments.to} has no depth and masks, its videos have 8 bits: --to {there_are}")
     labels = tuple(dict.fromkeys(filter(None, (arguments.labels or LABELS[0]).replace(" ", "").split(","))))
     if not labels or not set(labels) <= set(LABELS):
         raise CommandError(f"--labels {arguments.labels!r:.60}: give some of {', '.join(LABELS)}")
@@ -77,7 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.fps or DEFAULT_FPS,
         PictureSpec(
             parse_cameras(arguments.cameras or ""),
-            *(width, height, arguments.looks or 0, arguments.seed or 0, arguments.plain),
+            *(width, height, arguments.looks or 0, arguments.seed or 0),
+            *(arguments.plain, arguments.depth, arguments.masks),
         ),
         PlanOptions(labels, arguments.task or "", arguments.anonymise),
         arguments.jobs or 1,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from iris_session.dataset.episodes import DatasetError
 from iris_session.recording import Recording
 from iris_session.replay.pictures import (
-    Image,
+    Layer,
     Renderer,
     find_camera,
     list_model_cameras,
@@ -58,7 +58,7 @@ class CameraSpec(msgspec.Struct, frozen=True):
 
 class PictureSpec(msgspec.Struct, frozen=True):
     """Pictures of every frame. `looks`: varied looks beside the scene as it is; `seed`: of these. `plain`: without
-    shadows, reflections and smooth edges.
+    shadows, reflections and smooth edges. `depth`, `masks`: these too, as further layers of each camera.
     """
 
     cameras: tuple[CameraSpec, ...] = ()
@@ -67,6 +67,8 @@ class PictureSpec(msgspec.Struct, frozen=True):
     looks: int = 0
     seed: int = 0
     plain: bool = False
+    depth: bool = False
+    masks: bool = False
 
 
 def parse_camera(text: str) -> CameraSpec:
@@ -139,8 +141,10 @@ class CameraSet:
             renderer.close()
         self._renderers.clear()
 
-    def draw(self, core: SessionCore, recording: Recording) -> Iterator[tuple[int, str, Image]]:
+    def draw(self, core: SessionCore, recording: Recording) -> Iterator[tuple[int, str, Layer]]:
         """Yield look, camera and picture of the session's present state: uint8, shape (height, width, 3), RGB.
+
+        After a picture come its layers, if wanted, under the names CAMERA_depth and CAMERA_mask: `Renderer.measure`.
 
         Raises:
             DatasetError: The scene has no such camera.
@@ -153,6 +157,12 @@ class CameraSet:
         for look, renderer in enumerate(self._renderers):
             for spec, camera in self._cameras:
                 yield look, spec.name, renderer.draw(data, camera, patches, fovy=spec.fovy)
+                if self._spec.depth or self._spec.masks:
+                    depth, bodies = renderer.measure()
+                    if self._spec.depth:
+                        yield look, f"{spec.name}_depth", depth
+                    if self._spec.masks:
+                        yield look, f"{spec.name}_mask", bodies
 
     def _begin(self, model: mujoco.MjModel, recording: Recording) -> None:
         """Make the renderers of a model, one for each look."""

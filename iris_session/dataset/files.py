@@ -10,14 +10,35 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from iris_session.dataset.cameras import PictureSpec
 from iris_session.dataset.episodes import DatasetError, Plan
 from iris_session.dataset.frames import Schema, Table
-from iris_session.dataset.video import Stats
+from iris_session.replay.pictures import Layer
 from iris_session.system.files import sync_folder
+
+Stats = dict[str, NDArray[np.float64]]
 
 #: Files that are not in their places yet.
 PARTIAL: Final = ".partial"
+
+
+class PictureSink(ABC):
+    """Pictures of one episode on their way into files of a folder, which `SetWriter.close_episode` finds there."""
+
+    @abstractmethod
+    def add(self, look: int, camera: str, image: Layer) -> None:
+        """Add the picture of a look and camera of the next frame, or a layer of it, as of `CameraSet.draw`."""
+
+    @abstractmethod
+    def close(self) -> dict[tuple[int, str], Stats]:
+        """Finish the files, and return statistics by look and camera where the format has any."""
+
+    @abstractmethod
+    def abort(self) -> None:
+        """Close files that are not needed any more."""
 
 
 class SetWriter(ABC):
@@ -73,6 +94,19 @@ class SetWriter(ABC):
             pictures: Statistics of its pictures, by look and camera.
             folder: Where the files of its pictures are.
         """
+
+    def describe(self, index: int, look: int, table: Table) -> dict[str, Any]:
+        """Return what every format says of an episode: plain values by name."""
+        episode = self.plan.episodes[index]
+        return {
+            "label": episode.label,
+            "task": episode.task,
+            "recording": self.plan.recordings[episode.recording].id,
+            "episode": episode.number,
+            "plan_index": index,
+            "look": look,
+            "notes": "; ".join(table.notes),
+        }
 
     def finish(self) -> None:
         """Remove what only an unfinished set needs."""

@@ -59,11 +59,15 @@ class FrameColumn(msgspec.Struct, frozen=True):
 
 
 class RobotColumns(msgspec.Struct, frozen=True):
-    """A robot of a data set. `has_gripper`: its opening can be measured; `has_force`: contacts of its gripper."""
+    """A robot of a data set. `has_gripper`: its opening can be measured; `has_force`: contacts of its gripper.
+
+    `ranges`: lowest and highest command of each actuator; 0 and 0 where the model has no limits.
+    """
 
     name: str
     joints: tuple[str, ...]
     actuators: tuple[str, ...]
+    ranges: tuple[tuple[float, float], ...]
     has_gripper: bool
     has_force: bool
 
@@ -162,7 +166,10 @@ def make_schema(core: SessionCore, fps: int) -> Schema:
         can_measure = bool(spec.gripper_actuator) and (
             find_opening_law(model, find_element_id(model, "actuator", spec.gripper_actuator), spec) is not None
         )
-        return RobotColumns(spec.name, spec.joints, actuators, can_measure, bool(spec.finger_bodies))
+        ids = [find_element_id(model, "actuator", name) for name in actuators]
+        ranges = model.actuator_ctrlrange * model.actuator_ctrllimited[:, None]
+        limits = tuple((float(ranges[i, 0]), float(ranges[i, 1])) for i in ids)
+        return RobotColumns(spec.name, spec.joints, actuators, limits, can_measure, bool(spec.finger_bodies))
 
     robots = tuple(map(describe, core.scene.robots))
     return Schema(fps, (rate.numerator, rate.denominator), robots, tuple(one.name for one in core.scene.objects))

@@ -17,18 +17,9 @@ from numpy.typing import NDArray
 
 from iris_session.dataset.cameras import PictureSpec
 from iris_session.dataset.episodes import Plan, PlannedEpisode
-from iris_session.dataset.files import SetWriter
+from iris_session.dataset.files import SetWriter, Stats
 from iris_session.dataset.frames import ACTION, BOOL, Schema, Table
-from iris_session.dataset.video import (
-    CODEC_NAME,
-    PIXELS,
-    PictureStats,
-    Stats,
-    VideoWriter,
-    compute_stats,
-    merge_stats,
-)
-from iris_session.replay.pictures import Image
+from iris_session.dataset.video import CODEC_NAME, PIXELS, compute_stats, make_video_name, merge_stats
 from iris_session.system.extras import require_package
 
 VERSION: Final = "v3.0"
@@ -48,36 +39,6 @@ EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:0
 VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 STATE: Final = "observation.state"
 _FRAME_INDEX: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-
-
-class VideoSink:
-    """Pictures of one episode on their way into videos. `folder`: for these; `look`-`camera`.mp4."""
-
-    def __init__(self, folder: Path, schema: Schema, pictures: PictureSpec) -> None:
-        self._folder, self._fps, self._size = folder, schema.fps, (pictures.width, pictures.height)
-        self._writers: dict[tuple[int, str], VideoWriter] = {}
-        self._stats: dict[tuple[int, str], PictureStats] = {}
-
-    def add(self, look: int, camera: str, image: Image) -> None:
-        """Add a picture."""
-        key = look, camera
-        if key not in self._writers:
-            path = self._folder / f"{look}-{camera}.mp4"
-            self._writers[key] = VideoWriter(path, self._fps, *self._size)
-            self._stats[key] = PictureStats()
-        self._writers[key].add(image)
-        self._stats[key].add(image)
-
-    def close(self) -> dict[tuple[int, str], Stats]:
-        """Finish the files, and return the statistics by look and camera."""
-        for writer in self._writers.values():
-            writer.close()
-        return {key: stats.make() for key, stats in self._stats.items()}
-
-    def abort(self) -> None:
-        """Close files that are not needed any more."""
-        for writer in self._writers.values():
-            writer.abort()
 
 
 class LeRobotWriter(SetWriter):
@@ -125,7 +86,7 @@ class LeRobotWriter(SetWriter):
         # Docstring and arguments: `SetWriter`.
         number, episode, n = self.n_episodes, self.plan.episodes[index], table.n_frames
         for camera, key in self._cameras.items():
-            self.place(folder / f"{look}-{camera}.mp4", _format(VIDEO_PATH, number, video_key=key))
+            self.place(folder / make_video_name(look, camera), _format(VIDEO_PATH, number, video_key=key))
         columns = self._make_columns(table, number, self.plan.tasks.index(episode.task))
         self._write_table(_format(DATA_PATH, number), _make_table(columns, self._features))
         stats = {key: compute_stats(values) for key, values in columns.items()}

@@ -26,18 +26,16 @@ import msgspec
 
 from iris_session.dataset.cameras import CameraSet, PictureSpec, make_view
 from iris_session.dataset.episodes import DatasetError, Plan, PlannedEpisode, PlannedRecording, PlanOptions, make_plan
+from iris_session.dataset.files import Stats
+from iris_session.dataset.formats import FORMATS, MODEL, make_sink, open_writer
 from iris_session.dataset.frames import EpisodeLeftOutError, FrameReader, Schema, Table, make_schema
-from iris_session.dataset.lerobot import LeRobotWriter, VideoSink
-from iris_session.dataset.video import Stats
 from iris_session.recording import Recording
 from iris_session.replay.simulation import Replay
 from iris_session.session.core import SessionCore
 from iris_session.system.process import die_with_parent, is_parent
 
-LEROBOT: Final = "lerobot"
-FORMATS: Final = (LEROBOT,)
-#: Packages whose version changes the bytes of a set.
-_PACKAGES: Final = ("iris-session", "mujoco", "numpy", "pyarrow", "av")
+#: Packages whose version changes the bytes of a set, beside those of its format.
+_PACKAGES: Final = ("iris-session", "mujoco", "numpy")
 #: Finished episodes that wait for an earlier one, per process.
 _AHEAD: Final = 2
 #: File of what a process has made, in the folder of its task.
@@ -88,9 +86,10 @@ class DatasetReport(msgspec.Struct, frozen=True):
 
 
 class EpisodeTask(msgspec.Struct, frozen=True):
-    """Everything that making an episode needs. `folder`: for its pictures."""
+    """Everything that making an episode needs. `to`: format. `folder`: for its pictures."""
 
     index: int
+    to: str
     planned: PlannedRecording
     episode: PlannedEpisode
     schema: Schema
@@ -137,7 +136,7 @@ class EpisodeMaker:
         draw_s = encode_s = 0.0
         folder = Path(task.folder)
         folder.mkdir(parents=True, exist_ok=True)
-        sink = VideoSink(folder, task.schema, task.pictures)
+        sink = make_sink(task.to, folder, task.schema, task.pictures)
 
         def draw(core: SessionCore) -> None:
             nonlocal draw_s, encode_s
@@ -158,6 +157,8 @@ class EpisodeMaker:
             with suppress(Exception):
                 sink.abort()
             raise
+        if FORMATS[task.to].has_layers:
+            (folder / MODEL).write_bytes(self._reader.core.world.encode_model())
         at = time.perf_counter()
         stats = sink.close()
         encode_s += time.perf_counter() - at
@@ -245,7 +246,7 @@ def _make_request(to: str, plan: Plan, schema: Schema, options: DatasetOptions) 
         "episodes": episodes,
         "people": list(plan.people),
         "schema": msgspec.to_builtins(schema),
-        "versions": {name: _find_version(name) for name in _PACKAGES},
+        "versions": {name: _find_version(name) for name in (*_PACKAGES, *FORMATS[to].packages.values())},
     }
 
 
@@ -265,11 +266,12 @@ def _write(
     request: dict[str, Any],
     say: Callable[[str], None],
 ) -> DatasetReport:
-    writer = LeRobotWriter(folder, plan, schema, options.pictures, request)
+    writer = open_writer(to, folder, plan, schema, options.pictures, request)
     first, first_look = writer.next
     tasks = [
         EpisodeTask(
             i,
+            to,
             plan.recordings[episode.recording],
             episode,
             schema,

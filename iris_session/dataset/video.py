@@ -9,10 +9,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.dataset.cameras import PictureSpec
 from iris_session.dataset.episodes import DatasetError
+from iris_session.dataset.files import PictureSink, Stats
+from iris_session.dataset.frames import Schema
+from iris_session.replay.pictures import Layer
 from iris_session.system.extras import require_package
-
-Stats = dict[str, NDArray[np.float64]]
 
 CODEC: Final = "libx264"
 #: Name of the codec in files and descriptions.
@@ -67,6 +69,38 @@ class VideoWriter:
     def abort(self) -> None:
         """Close a file that is not needed any more."""
         self._container.close()
+
+
+class VideoSink(PictureSink):
+    """Pictures of one episode on their way into videos: `make_video_name`."""
+
+    def __init__(self, folder: Path, schema: Schema, pictures: PictureSpec) -> None:
+        self._folder, self._fps, self._size = folder, schema.fps, (pictures.width, pictures.height)
+        self._writers: dict[tuple[int, str], VideoWriter] = {}
+        self._stats: dict[tuple[int, str], PictureStats] = {}
+
+    def add(self, look: int, camera: str, image: Layer) -> None:
+        key = look, camera
+        if key not in self._writers:
+            path = self._folder / make_video_name(look, camera)
+            self._writers[key] = VideoWriter(path, self._fps, *self._size)
+            self._stats[key] = PictureStats()
+        self._writers[key].add(image)
+        self._stats[key].add(image)
+
+    def close(self) -> dict[tuple[int, str], Stats]:
+        for writer in self._writers.values():
+            writer.close()
+        return {key: stats.make() for key, stats in self._stats.items()}
+
+    def abort(self) -> None:
+        for writer in self._writers.values():
+            writer.abort()
+
+
+def make_video_name(look: int, camera: str) -> str:
+    """Return the name of the video of a look and camera."""
+    return f"{look}-{camera}.mp4"
 
 
 class PictureStats:

@@ -2,8 +2,9 @@
 
 A run succeeds only if the session's own detector saw every handover by contact alone, if every goal with a deformable
 was reached (`goals`), if the streams of its cameras reach every observer, and if the recording verifies bit for bit.
-Handovers or goals are recorded as the verdict of an episode. When an operator fails, such as after dropping an object where it cannot be grasped,
-the scene is reset and all begin again, as people do who record demonstrations. The demos themselves are in `demos`.
+Handovers or goals are recorded as the verdict of an episode. When an operator fails, such as after dropping an object
+where it cannot be grasped, the scene is reset and all begin again, as people do who record demonstrations. The demos
+themselves are in `demos`.
 """
 
 from __future__ import annotations

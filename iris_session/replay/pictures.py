@@ -41,6 +41,8 @@ from iris_session.session.core import SessionCore
 from iris_session.viewer.narration import find_colour
 
 Image = NDArray[np.uint8]
+#: A picture, depth [m] (float32), or a mask (uint16).
+Layer = NDArray[Any]
 Floats = NDArray[np.float64]
 
 #: Direction of the default view, from the bodies to the eye: in front and above, as in the Rerun viewer.
@@ -58,6 +60,8 @@ MORE_GEOMS: Final = 10_000
 PERSON_M: Final = 0.12
 #: Presence older than this is not drawn: its device is not tracked any more [ns].
 PRESENCE_NS: Final = 250_000_000
+#: Number in a mask where there is no body.
+NO_BODY: Final = 65_535
 #: A group of geoms that MuJoCo does not show by default.
 HIDDEN_GROUP: Final = mujoco.mjNGROUP - 1
 
@@ -457,6 +461,33 @@ class Renderer:
         mujoco.mjr_render(area, self._scene, self._context)
         mujoco.mjr_readPixels(image, None, area, self._context)
         return np.ascontiguousarray(image[::-1])  # OpenGL's first row is the lowest
+
+    def measure(self) -> tuple[NDArray[np.float32], NDArray[np.uint16]]:
+        """Return depth and bodies of the picture that was drawn last.
+
+        Returns:
+            float32, shape (height, width): along the axis of the camera [m], infinite where nothing is. uint16, of the
+            same shape: number of the body in the model, 0 for what stands still, `NO_BODY` where nothing of it is.
+        """
+        width, height = self._size
+        area, flags = mujoco.MjrRect(0, 0, width, height), self._scene.flags.copy()
+        for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+            self._scene.flags[int(flag)] = 1  # without smooth edges, which would mix numbers and distances
+        self._context.readDepthMap = int(mujoco.mjtDepthMap.mjDEPTH_ZEROFAR)
+        codes, buffer = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.float32)
+        mujoco.mjr_render(area, self._scene, self._context)
+        mujoco.mjr_readPixels(codes, buffer, area, self._context)
+        self._scene.flags[:] = flags
+        extent, limits = self._model.stat.extent, self._model.vis.map
+        near, far, value = limits.znear * extent, limits.zfar * extent, buffer[::-1].astype(np.float64)
+        # The buffer is 1 at the near plane, 0 at the far one, linear in 1 / depth.
+        depth = np.where(value > 0.0, near * far / (near + value * (far - near)), np.inf).astype(np.float32)
+        bodies = np.full(self._scene.ngeom + 1, NO_BODY, np.uint16)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.segid >= 0:
+                bodies[geom.segid + 1] = self._model.geom_bodyid[geom.objid]
+        numbers = codes[::-1].astype(np.int64) @ (1, 256, 65536)
+        return depth, bodies[numbers]
 
     def close(self) -> None:
         """Release what the model holds in the context."""

@@ -52,3 +52,7 @@ def record(
     made = play(path, steps, make_entries=make_entries(episodes), core=core, recording_class=recording_class)
     made.write()
     return made
+
+
+def read_files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}

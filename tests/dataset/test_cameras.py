@@ -11,11 +11,12 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from iris_session.dataset.cameras import CameraSet, CameraSpec, PictureSpec, make_view, parse_cameras
 from iris_session.dataset.episodes import DatasetError
 from iris_session.recording import Recording
-from iris_session.replay.pictures import Image, open_gl
+from iris_session.replay.pictures import NO_BODY, Image, open_gl
 from iris_session.session.core import SessionCore
 from tests.dataset.support import record
 from tests.replay.support import make_drawn_core
@@ -66,6 +67,31 @@ def test_pictures_are_those_of_mujoco(tmp_path: Path, reference: Draw) -> None:
     for name, camera, fovy in (("operator", "operator", 0.0), ("top", top, 50.0)):
         assert found[0, name].std() > 5.0, "the picture is not empty"
         assert found[0, name].tobytes() == reference(core, camera, fovy).tobytes()
+
+
+def test_depth_and_masks_are_those_of_mujoco(tmp_path: Path, reference: Draw) -> None:
+    made = record(tmp_path / "session.rrd", {}, steps=60)
+    model = made.core.world.model
+    spec = PictureSpec((CameraSpec("operator", "operator"),), WIDTH, HEIGHT, depth=True, masks=True)
+    found = draw_all(made.core, spec, made.path)
+    renderer = mujoco.Renderer(copy.copy(model), HEIGHT, WIDTH)
+    renderer.update_scene(made.core.world.data, "operator")
+    renderer.enable_segmentation_rendering()
+    ids, kinds = renderer.render().copy().transpose(2, 0, 1)
+    bodies = np.where(kinds == int(mujoco.mjtObj.mjOBJ_GEOM), model.geom_bodyid[ids], NO_BODY)
+    renderer.enable_depth_rendering()
+    depth = renderer.render().copy()
+    renderer.close()
+    mask = found[0, "operator_mask"]
+    assert len(np.unique(mask)) > 5
+    assert np.array_equal(mask, bodies)
+    seen = np.isfinite(found[0, "operator_depth"])
+    assert np.array_equal(seen, mask != NO_BODY)
+    assert np.allclose(found[0, "operator_depth"][seen], depth[seen], rtol=1e-4)
+    assert (
+        found[0, "operator"].tobytes()
+        == draw_all(made.core, replace(spec, depth=False), made.path)[0, "operator"].tobytes()
+    )
 
 
 def test_looks_follow_from_the_seed_and_change_nothing_that_moves(tmp_path: Path) -> None:

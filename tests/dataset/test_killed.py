@@ -1,4 +1,4 @@
-"""SIGKILL of the command `export`, or of a process of it: the set loads each time, and the next run ends with its bytes."""
+"""SIGKILL of the command `export`, or of a process of it: the set loads, and the next run ends with its bytes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,8 @@ from iris_session.dataset import run
 from iris_session.dataset.episodes import DatasetError, PlanOptions
 from iris_session.dataset.run import DatasetOptions, EpisodeTask, export_dataset, make_episode
 from iris_session.system.process import ROOT, child_environment, module_command
-from tests.dataset.support import record
-from tests.dataset.test_lerobot import load, read_files
+from tests.dataset.support import read_files, record
+from tests.dataset.test_lerobot import load
 
 KILLS = 20
 EPISODES = 6
@@ -57,17 +58,26 @@ def test_a_process_that_dies_is_one_line_and_costs_the_episodes_at_work(tmp_path
     assert read_files(tmp_path / "set") == read_files(tmp_path / "whole")
 
 
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
 @pytest.mark.long
 @pytest.mark.e2e
+@pytest.mark.timeout(3600)  # sixty runs of the command, on a busy machine ten seconds each
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_killed_at_random_moments(jobs: int, tmp_path: Path) -> None:
+def test_killed_at_random_moments(jobs: int, tmp_path: Path, stack: ExitStack) -> None:
     record_session(tmp_path / "session.rrd", EPISODES, 250)
     options = ["--cameras", "operator", "--size", "64x48", "--plain", "--jobs", str(jobs)]
 
     def start(folder: Path) -> subprocess.Popen[bytes]:
         command = ["export", str(tmp_path / "session.rrd"), "--to", "lerobot", "--out", str(folder), *options]
         command = module_command("iris_session.cli.main", *command)
-        return subprocess.Popen(command, env=child_environment(), start_new_session=True)
+        process = subprocess.Popen(command, env=child_environment(), start_new_session=True)
+        stack.callback(process.kill)  # if the test ends before
+        return process
 
     def wait_until_closed(process: subprocess.Popen[bytes], episodes: int) -> None:
         """Wait until so many episodes are closed, or the process has ended."""
