@@ -16,7 +16,7 @@ help:
 	@echo "make check    only lint, format, strict types"
 	@echo "make test-web    only strict types and tests of web_client"
 	@echo "make test-random  the unit tests with other random examples than the usual ones"
-	@echo "make readers  loads exported data sets in LeRobot, in an environment of its own below READERS"
+	@echo "make readers  loads exported data sets in LeRobot, robomimic and MCAP, in an environment of its own below READERS"
 	@echo "make bench    the benchmarks of docs/benchmarks.md"
 	@echo "make screenshots  records the demo anew and makes the pictures of README and docs"
 	@echo "make install  only makes $(VENV) and installs"

@@ -4,9 +4,9 @@
     python tools/readers.py --work FOLDER [--recording session.rrd]
 
 A recording of `iris-session demo handover` is exported, then read in an environment of its own (FOLDER/venv) with
-LeRobot's `LeRobotDataset` and `lerobot-doctor`. What they give is compared with what was exported (`reader_checks.py`,
-which runs there); a copy of the set in which one column is shifted by one frame must be noticed. Exit status 0 if all
-agree.
+LeRobot's `LeRobotDataset` and `lerobot-doctor`, robomimic's `SequenceDataset`, and the reader of `mcap`. What they give
+is compared with what was exported (`reader_checks.py`, which runs there); a copy of the set in which one column is
+shifted by one frame must be noticed. Exit status 0 if all agree.
 """
 
 from __future__ import annotations
@@ -24,25 +24,32 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from pyarrow import parquet
 
 from iris_session.dataset.cameras import CameraSet, PictureSpec, parse_cameras
-from iris_session.dataset.episodes import PlanOptions, make_plan
+from iris_session.dataset.episodes import LABELS, PlanOptions, make_plan
 from iris_session.dataset.frames import FrameReader, make_schema
 from iris_session.recording import Recording
 from iris_session.replay.simulation import Replay
 from iris_session.session.core import SessionCore
 
 #: What the environment has: the newest LeRobot that this Python can have.
-PACKAGES = ("lerobot", "lerobot-doctor")
+PACKAGES = ("lerobot", "lerobot-doctor", "robomimic", "mcap")
 FPS = 30
 CAMERAS = "operator,top=0,0,2.4->0,0.01,0.7:50"
 SIZE = (160, 120)
 #: Every so many pictures, one is compared.
 EVERY = 20
-#: Columns that are shifted by one frame in a copy of the set.
-SHIFTED = ("action", "robots.left.joint_positions", "objects.hammer.pose", "session_time_ns")
+#: Columns that are shifted by one frame in a copy of the set, by format.
+SHIFTED = {
+    "lerobot": ("action", "robots.left.joint_positions", "objects.hammer.pose", "session_time_ns"),
+    "robomimic": ("actions_ctrl", "states", "robots.left.joint_positions", "objects.hammer.pose"),
+    "mcap": ("robots.left.joint_positions", "objects.hammer.pose", "session_time_ns"),
+}
 
 
 def main() -> int:
@@ -55,13 +62,11 @@ def main() -> int:
         work.mkdir(parents=True, exist_ok=True)
         python = make_environment(work / "venv")
         recording = arguments.recording or record_demo(work)
-        folder = work / "set"
-        shutil.rmtree(folder, ignore_errors=True)
-        size = f"{SIZE[0]}x{SIZE[1]}"
-        export = ["export", str(recording), "--to", "lerobot", "--out", str(folder), "--fps", str(FPS)]
-        run_iris(*export, "--cameras", CAMERAS, "--size", size, "--plain")
         write_expected(recording, work / "expected.npz")
-        return check(python, work, folder)
+        failures = [one for to in SHIFTED for one in check(to, python, recording, work)]
+        failures += run_doctor(python, work / "lerobot")
+        print("\n".join(f"FAILED {one}" for one in failures) or "all readers agree")
+        return 1 if failures else 0
 
 
 def make_environment(folder: Path) -> Path:
@@ -89,7 +94,7 @@ def record_demo(work: Path) -> Path:
 
 def write_expected(recording: Path, path: Path) -> None:
     """Write the frames of the recording and some of their pictures, before any encoding."""
-    plan = make_plan([recording], PlanOptions(("success", "failure", "unknown")))
+    plan = make_plan([recording], PlanOptions(LABELS))
     found: dict[str, Any] = {}
     with (
         Recording.open(recording) as opened,
@@ -99,6 +104,7 @@ def write_expected(recording: Path, path: Path) -> None:
         for i, episode in enumerate(plan.episodes):
             table = reader.read(episode, partial(keep_picture, cameras, opened, found, i, count()))
             found |= {f"{i}|{key}": values for key, values in table.columns.items()}
+            found[f"{i}|states"] = table.states
             found[f"{i}|task"] = np.array(episode.task)
             found[f"{i}|label"] = np.array(episode.label)
     np.savez(path, **found)
@@ -119,47 +125,88 @@ def keep_picture(
             found[f"{episode}|observation.images.{camera}|{frame}"] = image
 
 
-def check(python: Path, work: Path, folder: Path) -> int:
-    """Run the checks in the environment: of the set, and of copies that are wrong."""
-    status = run_checks(python, folder, work / "expected.npz")
-    print(f"LeRobotDataset: {status or 'every number, label and picture is as exported'}", flush=True)
-    failures = [status] if status else []
-    for key in SHIFTED:
+def check(to: str, python: Path, recording: Path, work: Path) -> list[str]:
+    """Export in a format, and check in the environment the set, and copies that are wrong. Return what fails."""
+    folder, expected = work / to, work / "expected.npz"
+    shutil.rmtree(folder, ignore_errors=True)
+    labels = ["--labels", ",".join(LABELS), "--cameras", CAMERAS, "--size", f"{SIZE[0]}x{SIZE[1]}", "--plain"]
+    run_iris("export", str(recording), "--to", to, "--out", str(folder), "--fps", str(FPS), *labels)
+    status = run_checks(python, to, folder, expected)
+    print(f"{to}: {status or 'every number, label and picture is as exported'}", flush=True)
+    failures = [f"{to}: {status}"] if status else []
+    for key in SHIFTED[to]:
         copy = work / "shifted"
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(folder, copy)
-        shift(copy / "data/chunk-000/file-000.parquet", key)
-        noticed = run_checks(python, copy, work / "expected.npz", "--numbers-only")
-        print(f"{key} shifted by one frame: {noticed or 'NOT NOTICED'}", flush=True)
-        failures += [] if key in noticed else [f"a shift of {key} is not noticed"]
+        SHIFTS[to](copy, key)
+        noticed = run_checks(python, to, copy, expected, "--numbers-only")
+        print(f"{to}: {key} shifted by one frame: {noticed or 'NOT NOTICED'}", flush=True)
+        failures += [] if key in noticed else [f"{to}: a shift of {key} is not noticed"]
+    return failures
+
+
+def run_doctor(python: Path, folder: Path) -> list[str]:
+    """Run `lerobot-doctor`. Return what fails."""
     command = [python.with_name("lerobot-doctor"), "check", folder]
     doctor = subprocess.run(command, check=False, capture_output=True, text=True)
     lines = [line for line in doctor.stdout.splitlines() if line.startswith(("[", "Summary"))]
     print("\n".join(lines), flush=True)
-    if "[FAIL]" in doctor.stdout or not lines:
-        failures.append("lerobot-doctor: a check fails")
-    print("\n".join(f"FAILED {one}" for one in failures) or "all readers agree")
-    return 1 if failures else 0
+    return ["lerobot-doctor: a check fails"] if "[FAIL]" in doctor.stdout or not lines else []
 
 
-def run_checks(python: Path, folder: Path, expected: Path, *options: str) -> str:
+def run_checks(python: Path, to: str, folder: Path, expected: Path, *options: str) -> str:
     """Return the first difference that a reader finds, empty for none."""
     script = Path(__file__).with_name("reader_checks.py")
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     environment |= {"HF_HUB_OFFLINE": "1", "HF_HOME": str(expected.parent / "hf")}
-    command = [python, script, folder, expected, *options]
+    command = [python, script, to, folder, expected, *options]
     done = subprocess.run(command, check=False, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"the reader failed:\n{done.stderr[-3000:]}")
     return str(json.loads(done.stdout.splitlines()[-1])["difference"])
 
 
-def shift(path: Path, key: str) -> None:
+def shift_lerobot(folder: Path, key: str) -> None:
     """Shift a column by one frame: the first value stands twice, the last is gone."""
+    path = folder / "data/chunk-000/file-000.parquet"
     table = parquet.read_table(path)
     values = table.column(key).combine_chunks()
     rows = [0, *range(len(values) - 1)]
     parquet.write_table(table.set_column(table.column_names.index(key), key, values.take(rows)), path)
+
+
+def shift_robomimic(folder: Path, key: str) -> None:
+    with h5py.File(folder / "episodes/episode_000000.hdf5", "r+") as file:
+        data = file[key] if key in file else file[f"obs/{key}"]
+        values = data[:]
+        data[1:] = values[:-1]
+
+
+def shift_mcap(folder: Path, key: str) -> None:
+    path = folder / "episodes/episode_000000.mcap"
+    owner, _, name = key.rpartition(".")
+    topic, before, channels = "/" + owner.replace(".", "/", 1) if owner else "/time", None, {}
+    with path.open("rb") as file:
+        messages = list(make_reader(file).iter_messages())
+        (metadata,) = make_reader(path.open("rb")).iter_metadata()
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata(metadata.name, metadata.metadata)
+        for schema, channel, message in messages:
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            data = message.data
+            if channel.topic == topic:
+                values = json.loads(data)
+                before, values[name] = values[name], values[name] if before is None else before
+                data = json.dumps(values).encode()
+            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
+        writer.finish()
+
+
+SHIFTS = {"lerobot": shift_lerobot, "robomimic": shift_robomimic, "mcap": shift_mcap}
 
 
 if __name__ == "__main__":

@@ -25,6 +25,10 @@ from numpy.typing import NDArray
 from iris_session.authority import AuthorityConfig
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.control import ControlConfig
+from iris_session.dataset.cameras import PictureSpec, parse_cameras
+from iris_session.dataset.episodes import make_plan
+from iris_session.dataset.frames import make_schema
+from iris_session.dataset.run import EpisodeMaker, EpisodeTask
 from iris_session.dataset.video import PictureStats, VideoWriter
 from iris_session.demo.scenes import scene_path
 from iris_session.journal.messages import Batch
@@ -34,8 +38,9 @@ from iris_session.protocol.client_messages import Acquire, Episode, Sample
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.names import EpisodeAction, Role
-from iris_session.recording import CLOSED, Keyframe, SessionHeader, header_root, make_row
+from iris_session.recording import CLOSED, Keyframe, Recording, SessionHeader, header_root, make_row
 from iris_session.recording.writer import RrdWriter
+from iris_session.replay.simulation import Replay
 from iris_session.session.core import CoreConfig, SessionCore
 from iris_session.system.process import child_environment, module_command
 
@@ -70,13 +75,15 @@ def run_export(
     """Measure the export of one recording.
 
     Args:
-        episodes: Number of its episodes.
+        episodes: Number of its episodes, at least 3.
         seconds: Length of each.
         shadows: Draw pictures in full, which takes much longer without a graphics card.
         jobs: Processes.
         python: A Python with LeRobot, for the reference; empty: none.
         progress: Called with short texts.
     """
+    if episodes < 3:
+        raise BenchError(f"{episodes} episodes: give 3 or more, of which the first and last are compared")
     with tempfile.TemporaryDirectory(prefix="iris-bench-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         progress(f"computing a session with {episodes} episodes of {seconds:g} s")
@@ -98,7 +105,10 @@ def run_export(
             raise BenchError(f"the export failed: {' '.join(done.stderr.split())[-300:]}")
         report = json.loads(done.stdout)
         rss_mib = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0  # of the largest process, in KiB
-        results = summarize_export(report, took_s, rss_mib)
+        progress("making early and late episodes in turn")
+        pictures_of = PictureSpec(parse_cameras(CAMERAS), WIDTH, HEIGHT, plain=not shadows)
+        growth = measure_growth(folder / "session.rrd", folder / "made", pictures_of)
+        results = summarize_export(report, took_s, rss_mib, growth)
         progress("writing pictures alone")
         pictures = make_pictures()
         results["write_ms_per_frame"] = round(measure_writer(folder, pictures), 3)
@@ -119,13 +129,37 @@ def run_export(
     return BenchReport("export", params, results, tuple(bars), reference)
 
 
-def summarize_export(report: dict[str, Any], took_s: float, rss_mib: float) -> dict[str, Any]:
-    """Return the results. First and last: processor time of an episode, the mean of the first and last tenth."""
-    seconds, shares = report["seconds"], report["shares"]
-    few = max(1, len(seconds) // 10)
-    first, last = float(np.mean(seconds[:few])), float(np.mean(seconds[-few:]))
+def measure_growth(recording: Path, folder: Path, pictures: PictureSpec) -> tuple[float, float]:
+    """Return the processor time of making an early and a late episode [s]: means over a tenth of the episodes.
+
+    One of each is made in turn, so that the load of the machine, which changes processor time too, meets both alike.
+    """
+    plan = make_plan([recording])
+    with Recording.open(recording, warn=False) as opened:
+        schema = make_schema(Replay(opened).core, FPS)
+    n = len(plan.episodes)
+    few = max(1, n // 10)
+    makers, seconds = (EpisodeMaker(), EpisodeMaker()), [0.0, 0.0]
+    for i in range(few + 1):  # the first of each opens files and renderer
+        for which, number in enumerate((i, n - few - 1 + i)):
+            where = str(folder / f"{which}-{i}")
+            task = EpisodeTask(number, "lerobot", plan.recordings[0], plan.episodes[number], schema, pictures, where)
+            made = makers[which].make(task)
+            seconds[which] += made.shares.cpu_s / few if i else 0.0
+    for maker in makers:
+        maker.close()
+    return seconds[0], seconds[1]
+
+
+def summarize_export(
+    report: dict[str, Any], took_s: float, rss_mib: float, growth: tuple[float, float]
+) -> dict[str, Any]:
+    """Return the results. First and last: processor time of an episode, made (`measure_growth`) and closed."""
+    closing, shares = report["closing"], report["shares"]
+    few = max(1, len(closing) // 10)
+    first, last = growth[0] + float(np.median(closing[:few])), growth[1] + float(np.median(closing[-few:]))
     return {
-        "episodes_per_minute": round(60.0 * len(seconds) / took_s, 2),
+        "episodes_per_minute": round(60.0 * len(closing) / took_s, 2),
         "first_to_last_ratio": round(max(first, last) / min(first, last), 3),
         "first_cpu_s": round(first, 3),
         "last_cpu_s": round(last, 3),

@@ -70,8 +70,8 @@ class Shares(NamedTuple):
 class DatasetReport(msgspec.Struct, frozen=True):
     """Result of an export. `episodes`, `frames`: of the whole set, which earlier runs may have begun.
 
-    `seconds`: of the processor, for each episode of this run in order. `shares`: of their time, in re-simulation,
-    drawing, encoding, and closing.
+    `seconds`: of the processor, for each episode of this run in order; `closing`: those of closing it among them.
+    `shares`: of their time, in re-simulation, drawing, encoding, and closing.
     """
 
     folder: str
@@ -82,6 +82,7 @@ class DatasetReport(msgspec.Struct, frozen=True):
     notes: tuple[str, ...]
     left_out: tuple[str, ...] = ()
     seconds: tuple[float, ...] = ()
+    closing: tuple[float, ...] = ()
     shares: dict[str, float] = {}
 
 
@@ -284,6 +285,7 @@ def _write(
     notes = list(plan.notes)
     left_out: list[str] = []
     seconds: list[float] = []
+    closed: list[float] = []
     total_s = draw_s = encode_s = close_s = 0.0
     say(f"episode {first + 1} of {len(plan.episodes)}")
     with closing(_make_all(tasks, options.jobs)) as episodes:
@@ -300,7 +302,8 @@ def _write(
             notes += [note for note in made.notes if note not in notes]
             shutil.rmtree(task.folder, ignore_errors=True)
             closing_s = time.perf_counter() - began
-            seconds.append(made.shares.cpu_s + time.process_time() - began_cpu)
+            closed.append(time.process_time() - began_cpu)
+            seconds.append(made.shares.cpu_s + closed[-1])
             total_s, close_s = total_s + made.shares.total_s + closing_s, close_s + closing_s
             draw_s, encode_s = draw_s + made.shares.draw_s, encode_s + made.shares.encode_s
             say(f"episode {task.index + 2} of {len(plan.episodes)}")
@@ -309,7 +312,7 @@ def _write(
     shares = {"resimulate": rest_s, "draw": draw_s, "encode": encode_s, "close": close_s}
     return DatasetReport(
         *(str(folder), to, writer.n_episodes, writer.n_frames, plan.tasks, tuple(notes), tuple(left_out)),
-        *(tuple(seconds), {name: one / total_s for name, one in shares.items()} if total_s else {}),
+        *(tuple(seconds), tuple(closed), {name: one / total_s for name, one in shares.items()} if total_s else {}),
     )
 
 
