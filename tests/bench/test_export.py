@@ -27,7 +27,7 @@ def test_results() -> None:
     report = {"closing": [1.0, *[5.0] * 18, 1.1], "shares": {"draw": 0.5, "encode": 0.25}, "frames": 7}
     results = summarize_export(report, 60.0, 100.0, (1.0, 2.0))
     assert results["episodes_per_minute"] == 20.0
-    assert results["first_to_last_ratio"] == round(4.05 / 3.2, 3)
+    assert results["first_to_last_ratio"] == round(5.05 / 4.0, 3)
     assert (results["share_draw"], results["share_encode"], results["frames"]) == (0.5, 0.25, 7)
 
 
