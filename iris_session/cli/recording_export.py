@@ -20,6 +20,7 @@ from iris_session.cli.common import (
     report_damage,
 )
 from iris_session.cli.progress import ProgressLine
+from iris_session.dataset.formats import FORMATS as DATASETS
 
 DEFAULT_HZ: Final = 100.0
 #: What `--to` may be: formats of tables, and the other thing that is exported.
@@ -53,7 +54,7 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     parser.add_argument(
         "paths", type=Path, nargs="+", metavar="RECORDING", help="a .rrd or a folder; for a data set: any number"
     )
-    formats = (*recording_dataset.FORMATS, *FORMATS, ASSETS)
+    formats = (*DATASETS, *FORMATS, ASSETS)
     parser.add_argument("--to", required=True, choices=formats, help="format of the data set or tables, or assets")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the files")
     parser.add_argument(
@@ -81,7 +82,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     from iris_session.system.extras import require_package
 
     require_package("rerun", "reading recordings")
-    if arguments.to in recording_dataset.FORMATS:
+    if arguments.to in DATASETS:
         given = [f"--{name}" for name in ("hz", "robot", "object", "table", "force") if getattr(arguments, name)]
         if given:
             raise CommandError(f"{', '.join(given)} are for tables: leave them out with --to {arguments.to}")
