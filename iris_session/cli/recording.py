@@ -1,5 +1,5 @@
-"""`iris-session recording` with its actions `inspect` (what a recording, or each of a folder, holds), `episodes`,
-`verify` and `repair`. The other actions have modules of their own. `view` and `verify` are commands, too."""
+"""`iris-session recording` with its actions `inspect` (what a recording, or each of a folder, holds), `verify`
+and `repair`. The other actions have modules of their own. `view` and `verify` are commands, too."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli import recording_export, recording_render, view
+from iris_session.cli import recording_episodes, recording_export, recording_render, view
 from iris_session.cli.common import (
     MOST_LINES,
     CommandError,
@@ -56,7 +56,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         examples="""
             iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd
             iris-session recording inspect sessions
-            iris-session recording episodes session.rrd
+            iris-session recording episodes sessions --page
             iris-session recording verify sessions
             iris-session recording view
             iris-session recording export session.rrd --to csv -o tables
@@ -81,19 +81,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     inspect.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it")
     add_json_option(inspect)
-    episodes = add_command(
-        actions,
-        "episodes",
-        run_episodes,
-        help="the episodes of a recording: when, how long, verdict, people, task, robots",
-        description="List the episodes of a recording. Exit status 1 if something is damaged or missing inside.",
-        examples="""
-            iris-session recording episodes session.rrd
-            iris-session recording episodes session.rrd --json
-        """,
-    )
-    episodes.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
-    add_json_option(episodes)
+    recording_episodes.register(actions)
     view.register(actions)
     _register_verify(actions)
     recording_export.register(actions)
@@ -233,18 +221,6 @@ def format_summary(summary: RecordingSummary) -> Iterator[str]:
     yield from _format_list("damage", summary.damage)
     if summary.notes:
         yield from _format_list("notes", summary.notes)
-
-
-def run_episodes(arguments: argparse.Namespace) -> int:
-    """Print a line for each episode of a recording."""
-    from iris_session.system.extras import require_package
-
-    require_package("rerun", "reading recordings")
-    with ending_as_interrupts():
-        summary = _summarise_file(arguments.path)
-    lines = [_format_episode(one) for one in summary.episodes] or ["no episode"]
-    print_result(arguments, {"ok": summary.ok, "episodes": summary.episodes}, lines)
-    return 0 if summary.ok else 1
 
 
 def _format_episode(one: EpisodeSummary) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 from iris_session.protocol.server_messages import Event, Intervention
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
-from iris_session.recording import Recording, RecordingError
+from iris_session.recording import Recording, RecordingError, SessionHeader
 from iris_session.recording.episodes import EpisodeCollector, RecordedEpisode
 from iris_session.recording.folders import find_recordings
 from iris_session.recording.records import read_names
@@ -151,13 +151,17 @@ def find_curation(path: str | Path) -> Path:
     return path.with_name(path.name + CURATION_SUFFIX)
 
 
-def read_curation(recording: Recording) -> Curation:
+def read_curation(path: str | Path, identity: str) -> Curation:
     """Return the curation of a recording; an empty one if there is none.
+
+    Args:
+        path: First file of the recording.
+        identity: Its `identify_recording`.
 
     Raises:
         DatasetError: The file cannot be read, holds something else, or is of another recording.
     """
-    path, identity = find_curation(recording.files[0]), identify_recording(recording)
+    path = find_curation(path)
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -232,7 +236,7 @@ def make_plan(files: Sequence[Path], options: PlanOptions | None = None) -> Plan
     return Plan(recordings, tuple(episodes), tasks, people, tuple(notes))
 
 
-def find_difference(one: _Reading, other: _Reading) -> str:
+def find_difference(one: _Reading | SessionHeader, other: _Reading | SessionHeader) -> str:
     """Return in what two recordings differ that must be the same in one data set; empty: in nothing."""
     if one.tick_period_ns != other.tick_period_ns:
         return f"{1e9 / one.tick_period_ns:g} ticks a second, not {1e9 / other.tick_period_ns:g}"
@@ -267,7 +271,8 @@ def _read(path: Path) -> _Reading:
         times = RowTimes(steps, np.concatenate([row.session_times for row in rows])[first])
         return _Reading(
             *(path, identify_recording(recording), header.session_name, header.tick_period_ns),
-            *(header.robots, header.objects, read_names(recording), read_curation(recording)),
+            *(header.robots, header.objects, read_names(recording)),
+            read_curation(recording.files[0], identify_recording(recording)),
             *(episodes.list_episodes(int(times.session_times[-1])), times, interventions),
         )
 

@@ -196,7 +196,7 @@ class RecordingPictures:
         self._replay = Replay(recording, with_control=patched)  # patches are state of the authority
         self._artist: Renderer | None = None
         self._camera: mujoco.MjvCamera = None
-        self._views: dict[tuple[BodyInfo, ...], _SceneBounds] = {}
+        self._views: dict[tuple[BodyInfo, ...], SceneBounds] = {}
         self._people = _PeopleTrack(recording) if options.people else None
         self._gl: Any = None
         self.notes: list[str] = []
@@ -271,9 +271,10 @@ class RecordingPictures:
     def _choose_camera(self, core: SessionCore, people: Sequence[_AvatarMarker], *, is_first: bool) -> mujoco.MjvCamera:
         camera = self._find_camera(core.world.model, is_required=is_first)
         if camera is None:
-            view = self._views.get(core.world.bodies) or _SceneBounds(core.world.bodies)
+            view = self._views.get(core.world.bodies) or SceneBounds(core.world.bodies)
             view.people = view.people or [one.item.pose.p for one in people]  # one moment is mostly between two states
-            camera = view.make_camera(core, self._options.width / self._options.height)
+            aspect = self._options.width / self._options.height
+            camera = view.make_camera(core.world.model, core.world.data, aspect)
         return camera
 
     def _find_camera(self, model: mujoco.MjModel, *, is_required: bool) -> mujoco.MjvCamera | None:
@@ -298,7 +299,7 @@ class RecordingPictures:
 # --- the default view -------------------------------------------------------------------------------------------------
 
 
-class _SceneBounds:
+class SceneBounds:
     """Places of the moving bodies of a scene in a span of time.
 
     `positions`: of the bodies in the world at each moment, shape (n, 3) [m]. Without any: where they are now. `people`:
@@ -311,10 +312,9 @@ class _SceneBounds:
         self.positions: list[Floats] = []
         self.people: list[Sequence[float]] = []
 
-    def make_camera(self, core: SessionCore, aspect: float) -> mujoco.MjvCamera:
+    def make_camera(self, model: mujoco.MjModel, data: Any, aspect: float) -> mujoco.MjvCamera:
         """Return a camera that sees all of it in a picture of that `aspect`, width by height."""
         camera = mujoco.MjvCamera()
-        model, data = core.world.model, core.world.data
         mujoco.mjv_defaultFreeCamera(model, camera)
         positions = self.positions or [data.xpos[self.ids]]
         radii = np.tile([_measure_radius(model, body) for body in self.ids], len(positions))
@@ -354,9 +354,9 @@ def _measure_radius(model: mujoco.MjModel, body: int) -> float:
 
 def _read_reach(
     recording: Recording, begin_ns: int, end_ns: int, *, with_people: bool
-) -> dict[tuple[BodyInfo, ...], _SceneBounds]:
+) -> dict[tuple[BodyInfo, ...], SceneBounds]:
     """Return the moving bodies of each scene in a span of time, at some moments, as the recorded states have them."""
-    found: dict[tuple[BodyInfo, ...], _SceneBounds] = {}
+    found: dict[tuple[BodyInfo, ...], SceneBounds] = {}
     bodies: tuple[BodyInfo, ...] = ()
     due_ns = begin_ns
     for state in recording.states():
@@ -365,7 +365,7 @@ def _read_reach(
         if state.bodies is not bodies:  # the same object in all states of a scene
             bodies, due_ns = state.bodies, max(begin_ns, state.session_time)
         if state.session_time >= due_ns and len(state.poses) == len(bodies):  # a file may hold any number
-            reach = found.setdefault(bodies, _SceneBounds(bodies))
+            reach = found.setdefault(bodies, SceneBounds(bodies))
             reach.positions.append(state.poses[reach.rows, :3])
             reach.people += [one.pose.p for one in state.presence if with_people]
             moments = max(1, min(MOMENTS, MOST_POSES // max(1, len(reach.rows))))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from iris_session.journal.messages import StateFrame
 from iris_session.protocol.client_messages import Episode
 from iris_session.protocol.entries import Entry, Join
 from iris_session.recording import CLOSED
@@ -19,6 +20,7 @@ NAME = "Zebulon"
 #: Two successes and a failure, by steps; robots move from step 50 on.
 EPISODES: dict[int, str] = {20: "start", 90: "success", 100: "start", 150: "failure", 160: "start", 190: "success"}
 STEPS = 200
+STATE_STEPS = 5
 
 
 def make_entries(episodes: Mapping[int, str] = EPISODES, name: str = NAME) -> Callable[[int], Sequence[Entry]]:
@@ -50,9 +52,19 @@ def record(
     path.parent.mkdir(parents=True, exist_ok=True)
     core = core or make_drawn_core(user_owned_loop=recording_class != CLOSED)
     made = play(path, steps, make_entries=make_entries(episodes), core=core, recording_class=recording_class)
+    made.batch.states = make_states(made)
     made.write()
     return made
 
 
 def read_files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def make_states(played: Played) -> list[StateFrame]:
+    """Return the states of a session as it records them, one in `STATE_STEPS` steps."""
+    ids = [body.id for body in played.header.bodies]
+    return [
+        StateFrame(step, step, step * TICK_NS * 1e-9, played.session_time[step], played.bodies[step][ids].tobytes())
+        for step in range(0, len(played.bodies), STATE_STEPS)
+    ]

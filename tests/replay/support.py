@@ -62,7 +62,8 @@ class Played:
             after = [one for one in keyframes if one.step == row.step or (i == 0 and one.step < row.step)]
             events = [one for one in self.batch.events if one.session_time == row.now_ns]
             loaded = [scenes[row.step - 1]] if row.step - 1 in scenes else []
-            writer.add(Batch(rows=[row], keyframes=after, events=events, scenes=loaded))
+            states = [one for one in self.batch.states if one.step == row.step]
+            writer.add(Batch(rows=[row], keyframes=after, events=events, scenes=loaded, states=states))
         writer.close()
         return self.path
 
