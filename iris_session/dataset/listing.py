@@ -1,7 +1,7 @@
 """Episodes of recordings with the numbers that people choose by: how long, who, how busy, how far, what was in view.
 
-They come from the events and the recorded states, and nothing is simulated, so that a thousand episodes take minutes.
-The decisions in the curations stand beside them. Recordings that cannot be in one data set are listed too, and marked.
+They come from the events and the recorded states: nothing is simulated. The decisions in the curations stand beside
+them. Recordings that cannot be in one data set are listed too, and marked.
 """
 
 from __future__ import annotations
@@ -109,7 +109,11 @@ class ListedRecording(msgspec.Struct, frozen=True):
 
 
 class ListOptions(msgspec.Struct, frozen=True):
-    """Options of a list. `cameras`: those whose pictures are looked at. `aspect`: width of a picture by its height. `verify`: simulate every recording again."""
+    """Options of a list.
+
+    `cameras`: those whose pictures are looked at. `aspect`: width of a picture by its height. `verify`: simulate every
+    recording again.
+    """
 
     cameras: tuple[CameraSpec, ...] = ()
     aspect: float = 4.0 / 3.0
