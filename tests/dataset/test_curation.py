@@ -8,14 +8,14 @@ import shutil
 from pathlib import Path
 
 import pytest
+from pyarrow import parquet
 
 from iris_session.cli.main import main
 from iris_session.dataset.curation import Edits, edit_curation, parse_edits, write_curation
 from iris_session.dataset.episodes import Curation, DatasetError, EpisodeCuration, PlanOptions, find_curation, make_plan
-from iris_session.dataset.frames import FrameReader, Table, make_schema
-from iris_session.recording import Recording
+from iris_session.dataset.run import DatasetOptions, export_dataset
 from tests.dataset.support import record
-from tests.replay.support import Played, make_drawn_core
+from tests.replay.support import Played
 
 LENGTHS = {1: 2.0, 2: 3.0}
 
@@ -121,17 +121,12 @@ def test_an_export_follows_the_edits_and_the_recording_stays(
         {"label": "success", "task": "Lift it"},
         {"trim": [0.01, 0.04]},
     ]
-    plan = make_plan([path])
-    schema = make_schema(make_drawn_core(), 500)
-    with Recording.open(path, warn=False) as recording:
-        reader = FrameReader(recording, plan.recordings[0], schema)
-        tables = [reader.read(episode) for episode in plan.episodes]
-    assert [(one.number, one.label, one.task) for one in plan.episodes] == [
-        (2, "success", "Lift it"),
-        (3, "success", "Zebulon lifts it"),
-    ]
-    assert all(isinstance(table, Table) for table in tables)
-    assert [table.n_frames for table in tables] == [50, 16]
+    report = export_dataset([path], tmp_path / "set", "lerobot", DatasetOptions(500))
+    assert (report.episodes, report.tasks, report.left_out) == (2, ("Lift it", "Zebulon lifts it"), ())
+    files = sorted((tmp_path / "set").glob("meta/episodes/*/*.parquet"))
+    rows = [parquet.read_table(file).to_pylist()[0] for file in files]
+    found = [(row["iris/episode"], row["iris/label"], row["length"], row["tasks"]) for row in rows]
+    assert found == [(2, "success", 50, ["Lift it"]), (3, "success", 16, ["Zebulon lifts it"])]
     assert main(["recording", "episodes", str(path), "--reset", "all", "--json"]) == 0
     assert not find_curation(path).exists()
     assert len(make_plan([path], PlanOptions()).episodes) == 2
