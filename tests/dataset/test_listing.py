@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import mujoco
 import numpy as np
 import pytest
 
-from iris_session.dataset.cameras import parse_camera
+from iris_session.dataset.cameras import CameraSpec, parse_camera
 from iris_session.dataset.curation import write_curation
 from iris_session.dataset.episodes import Curation, DatasetError, EpisodeCuration, list_files, make_plan
 from iris_session.dataset.film_strip import HEIGHT, N_PICTURES, WIDTH, draw_strips
@@ -18,7 +19,7 @@ from iris_session.dataset.listing import ListedEpisode, ListedRecording, ListOpt
 from iris_session.dataset.posed_scene import PosedScene, Projection
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import load_model
-from iris_session.protocol.server_messages import Event, Handover, Intervention, SamplesRejected
+from iris_session.protocol.server_messages import EngagementChanged, Event, Handover, Intervention, SamplesRejected
 from iris_session.recording import Recording
 from iris_session.replay.pictures import Renderer, open_gl
 from iris_session.session.core import SessionCore
@@ -51,7 +52,7 @@ def test_engagement_is_counted(played: Played) -> None:
 
 def test_paths_distances_and_views_are_those_of_the_states(tmp_path: Path) -> None:
     """The left arm moves towards the right one, by 1 mm a state; late in the third episode it is far away."""
-    played = record(tmp_path / "session.rrd")
+    played = record(tmp_path / "session.rrd", {22: "start", 90: "success", 100: "start", 150: "failure", 160: "start"})
     data, model = played.core.world.make_initial_data(), played.core.world.model
     left, right = (np.array(data.site(f"{name}/tcp").xpos) for name in ("left", "right"))
     distance_m = float(np.linalg.norm(right - left))
@@ -64,13 +65,38 @@ def test_paths_distances_and_views_are_those_of_the_states(tmp_path: Path) -> No
         played.batch.states[i] = msgspec.structs.replace(state, poses=poses.tobytes())
     played.path.unlink()
     played.write()
-    first, second, third = read(played.path, cameras=CAMERAS).episodes
-    assert first.path_m == {"left": pytest.approx(70 / STATE_STEPS * 1e-3, abs=1e-4), "right": 0.0}
+    beside = CameraSpec("beside", eye=tuple(left - (0.0, 1.0, 0.0)), target=tuple(left), fovy=20.0)
+    first, second, third = read(played.path, cameras=(*CAMERAS, beside)).episodes
+    assert first.robots == ("left",), "the right one is not looked for"
+    assert first.path_m == {"left": pytest.approx(68 / STATE_STEPS * 1e-3, abs=1e-4), "right": 0.0}
     assert second.path_m["left"] == pytest.approx(50 / STATE_STEPS * 1e-3, abs=1e-4)
     assert first.closest_m == pytest.approx(distance_m - 90 / STATE_STEPS * 1e-3, abs=2e-4)
-    assert (first.outside, second.outside) == ({"operator": 0.0, "away": 1.0},) * 2
-    assert third.outside == {"operator": pytest.approx(0.5, abs=0.02), "away": 1.0}
-    assert first.simulated_s == pytest.approx(70 * 0.002, abs=1e-3)
+    assert (first.outside, second.outside) == ({"operator": 0.0, "away": 1.0, "beside": 0.0},) * 2
+    gone = pytest.approx((200 - 175) / (200 - 160), abs=0.02)
+    assert third.outside == {"operator": gone, "away": 1.0, "beside": gone}
+    assert first.simulated_s == pytest.approx(68 * 0.002, abs=1e-3)
+
+
+def add_events(played: Played, more: dict[int, Any]) -> None:
+    """Write a recording again with more events, by their steps."""
+    events = [*played.batch.events, *(Event(0, step, step_ns(step), body) for step, body in more.items())]
+    events.sort(key=lambda event: event.session_time)
+    played.batch.events[:] = [msgspec.structs.replace(event, event_seq=i + 1) for i, event in enumerate(events)]
+    played.path.unlink()
+    played.write()
+
+
+def test_time_in_which_two_are_engaged_counts_once(tmp_path: Path) -> None:
+    played = record(tmp_path / "session.rrd", {10: "start", 50: "success"}, steps=52)
+    robots = {5: ("left", True), 15: ("left", False), 20: ("left", True), 22: ("right", True), 25: ("right", False)}
+    robots |= {26: ("right", True), 30: ("left", False), 40: ("right", False)}
+    add_events(
+        played, {step: EngagementChanged(name, f"on {name}", engaged) for step, (name, engaged) in robots.items()}
+    )
+    (episode,) = read(played.path).episodes
+    engaged = step_ns(15) - step_ns(10) + step_ns(40) - step_ns(20)
+    idle = pytest.approx(1.0 - engaged / (step_ns(50) - step_ns(10)), abs=1e-4)
+    assert (episode.idle_share, episode.clutches, episode.people) == (idle, 3, ("on left", "on right"))
 
 
 def test_events_within_an_episode_are_counted(tmp_path: Path) -> None:
@@ -88,11 +114,7 @@ def test_events_within_an_episode_are_counted(tmp_path: Path) -> None:
         120: Intervention("left", "p1", "p2", active=False),
         130: reject(2),  # it has joined again
     }
-    events = [*played.batch.events, *(Event(0, step, step_ns(step), body) for step, body in more.items())]
-    events.sort(key=lambda event: event.session_time)
-    played.batch.events[:] = [msgspec.structs.replace(event, event_seq=i + 1) for i, event in enumerate(events)]
-    played.path.unlink()
-    played.write()
+    add_events(played, more)
     listed = read(played.path)
     found = [(one.rejected, one.handovers, one.interventions) for one in listed.episodes]
     assert (found, listed.problems) == ([(5, 1, 0), (2, 0, 1), (0, 0, 0)], ())
