@@ -33,7 +33,7 @@ from anchors.pose import (
 from iris_session.control.controller import Controller
 from iris_session.demo.demos import Demo, make_demo
 from iris_session.demo.scenes import scene_path
-from iris_session.emulator.behaviours import Behaviour, Giver, HandInput, Receiver, make_behaviour
+from iris_session.emulator.behaviours import Behaviour, Giver, HandInput, PlannedGiver, Receiver, make_behaviour
 from iris_session.physics.robots import find_objects, find_robots
 from iris_session.physics.world import World
 from iris_session.protocol.common import Pose
@@ -244,6 +244,9 @@ class Rig:
             referee = self.referees[giver.object]
             if not referee.handed_over(giver.robot, giver.partner):
                 yield f"no clean handover of {giver.object}: {referee.flights}"
+            elif isinstance(giver, PlannedGiver):
+                if referee.flights[-1][-1][1] != (giver.partner,):
+                    yield f"{giver.object} is not in the gripper of {giver.partner}"
             elif not referee.resting:
                 yield f"{giver.object} does not rest on the table alone"
 
@@ -326,7 +329,7 @@ def demo(play: Demo, seed: int, **options: Any) -> Rig:
     """Return a rig with the cast of a demo, one behaviour per robot; operators without a partner are left out."""
     behaviours = {}
     for task in (task for person in play.headsets for task in person.tasks if task.partner):
-        args = (task.behaviour, task.robot, task.object, task.partner, task.device, seed, task.arm, task.place)
+        args = (task.behaviour, task.robot, task.object, task.partner, task.device, seed, task.arm, task.place, task.plan)
         behaviours[task.robot] = make_behaviour(*args)
     return Rig(behaviours, seed, play.objects[0], play.objects[1:], model=play.model, **options)
 

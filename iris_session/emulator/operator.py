@@ -557,7 +557,15 @@ def make_spec_behaviour(spec: HeadsetSpec, robot: str) -> Behaviour | None:
     """Return the behaviour of a spec, `None` for an observer. Raises `ValueError` listing the available ones."""
     hands = [
         make_behaviour(
-            task.behaviour, task.robot or robot, task.object, task.partner, task.device, spec.seed, task.arm, task.place
+            task.behaviour,
+            task.robot or robot,
+            task.object,
+            task.partner,
+            task.device,
+            spec.seed,
+            task.arm,
+            task.place,
+            task.plan,
         )
         for task in spec.tasks
     ]

@@ -6,6 +6,7 @@ import msgspec
 
 from anchors.pose import PoseTuple, Vec3
 from iris_session.client.stream_meter import StreamMeasurement
+from iris_session.emulator.behaviours.plan import HandoverPlan
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_SHEET_M, DEFAULT_T_WORLD_ANCHOR, HeadsetModel
 from iris_session.protocol.names import Device
 
@@ -20,7 +21,8 @@ class HandTask(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     `object`, `partner`: the object that is handed over, and the other robot. `arm`: kind of both robots
     (`behaviours.objects`).
-    `place`: position at which a receiver lays the object, x and y [m, world].
+    `place`: position at which a receiver lays the object, x and y [m, world]. `plan`: of the handover of an object that
+    is not one of these; it is kept then.
     """
 
     behaviour: str
@@ -30,6 +32,7 @@ class HandTask(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     partner: str = ""
     arm: str = "arm"
     place: tuple[float, float] | None = None
+    plan: HandoverPlan | None = None
 
 
 class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -56,6 +59,7 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     partner: str = ""
     arm: str = "arm"
     place: tuple[float, float] | None = None
+    plan: HandoverPlan | None = None
     device: str = Device.CONTROLLER_RIGHT
     hands: tuple[HandTask, ...] = ()
     seed: int = 0
@@ -106,6 +110,7 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
                 partner=self.partner,
                 arm=self.arm,
                 place=self.place,
+                plan=self.plan,
             ),
         )
 

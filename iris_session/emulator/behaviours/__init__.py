@@ -1,6 +1,7 @@
 """Scripted operators: closed loops from what a headset shows to what the hands do. No MuJoCo, no network, no clock.
 
-`base` (the interface), `phases` (task phases), `handover` (giver and receiver), `folder` (folds a cloth with a
+`base` (the interface), `phases` (task phases), `handover` (giver and receiver), `plan` and `planned` (the same by a
+plan, for any object and arms), `folder` (folds a cloth with a
 partner), `stower` (stows a soft body), `wander` (motion without a task), `hand` (clutched motion), `perception`,
 `objects` (objects and arms).
 """
@@ -11,6 +12,8 @@ from iris_session.emulator.behaviours.base import Behaviour, CombinedBehaviour, 
 from iris_session.emulator.behaviours.folder import Folder
 from iris_session.emulator.behaviours.handover import Giver, Receiver
 from iris_session.emulator.behaviours.objects import get_arm_kind
+from iris_session.emulator.behaviours.plan import HandoverPlan
+from iris_session.emulator.behaviours.planned import PlannedGiver, PlannedReceiver
 from iris_session.emulator.behaviours.stower import Stower
 from iris_session.emulator.behaviours.wander import Idle, Wander
 from iris_session.protocol.names import Device
@@ -23,6 +26,8 @@ __all__ = [
     "CombinedBehaviour",
     "Idle",
     "OperatorView",
+    "PlannedGiver",
+    "PlannedReceiver",
     "Receiver",
     "Stower",
     "Wander",
@@ -42,11 +47,13 @@ def make_behaviour(
     seed: int = 0,
     arm: str = "arm",
     place: tuple[float, float] | None = None,
+    plan: HandoverPlan | None = None,
 ) -> Behaviour:
     """Return the behaviour `name` for `robot`. `partner`: the other robot of a handover or fold; default the other of
     left and
     right. `object`: a thing, or a deformable. `arm`: kind of both arms. `place`: where a receiver or stower lays it
-    (x, y [m], world); default before its robot.
+    (x, y [m], world); default before its robot. `plan`: how giver and receiver hand over a thing that is not one of
+    `objects`; it names thing and robots.
 
     Raises `ValueError` listing the available behaviours.
     """
@@ -55,6 +62,10 @@ def make_behaviour(
             raise ValueError(f"the {name} of '{robot}' needs a partner: the name of the other robot")
         partner = "right" if robot == "left" else "left"
     match name:
+        case "giver" if plan is not None:
+            return PlannedGiver(plan, device)
+        case "receiver" if plan is not None:
+            return PlannedReceiver(plan, device)
         case "giver":
             return Giver(robot, object, partner, device, get_arm_kind(arm))
         case "receiver":

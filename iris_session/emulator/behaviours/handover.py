@@ -27,13 +27,29 @@ CAREFUL_SPEED = 0.16
 
 
 class HandoverTask(PhasedTask):
-    """Base of both tasks: it grasps an object, and has a partner. A subclass adds its phases to `self._steps`."""
+    """Base of both tasks: it grasps an object, and has a partner. A subclass adds its phases to `self._steps`.
 
-    def __init__(self, robot: str, object: str, partner: str, device: str, arm: ArmKind = ARM) -> None:
-        others = tuple(name for name in COMMON_OBJECTS if name != object)
-        super().__init__(robot, device, Perception((object,), (robot, partner), others, arm), arm)
+    `perception`: of an object that is not one of `objects`; it has no `object_model` then, and a subclass knows how it
+    is grasped.
+    """
+
+    object_model: HandoverObject
+
+    def __init__(
+        self,
+        robot: str,
+        object: str,
+        partner: str,
+        device: str,
+        arm: ArmKind = ARM,
+        perception: Perception | None = None,
+    ) -> None:
+        if perception is None:
+            others = tuple(name for name in COMMON_OBJECTS if name != object)
+            perception = Perception((object,), (robot, partner), others, arm)
+            self.object_model = find_object(object)
+        super().__init__(robot, device, perception, arm)
         self.object, self.partner = object, partner
-        self.object_model: HandoverObject = find_object(object)
         self._steps |= {
             "approach": self._approach,
             "descend": self._descend,
@@ -50,9 +66,7 @@ class HandoverTask(PhasedTask):
 
     def _approach(self) -> None:
         fault = f"{self.robot} cannot reach the {self.object}"
-        self._reach(
-            lambda: raise_pose(self._compute_grasp(), CLEAR_ABOVE), "descend", (0.008, 0.06), 8.0, fault, trigger=0.0
-        )
+        self._reach(self._compute_approach, "descend", (0.008, 0.06), 8.0, fault, trigger=0.0)
 
     def _descend(self) -> None:
         if self._entering_now:
@@ -90,10 +104,7 @@ class HandoverTask(PhasedTask):
             self._clutched_again = 0
         self.hand.hold_still()
         self.hand.trigger_goal = 0.0
-        if (
-            self.hand.is_trigger_done()
-            and self.perception.compute_gap(self.robot) > 2.0 * self.object_model.half_width + 0.010
-        ):
+        if self.hand.is_trigger_done() and self._is_open(self.robot):
             self._enter(then)
         elif self._has_lasted(8.0):
             self._fail(f"the gripper of {self.robot} does not open")
@@ -111,12 +122,23 @@ class HandoverTask(PhasedTask):
             key=lambda tip: self._compute_turn(tip, T_world_thing),
         )
 
+    def _compute_approach(self) -> PoseTuple:
+        """Return the tip pose at which the straight approach to the grasp begins."""
+        return raise_pose(self._compute_grasp(), CLEAR_ABOVE)
+
     def _compute_turn(self, T_world_tip: PoseTuple, T_world_thing: PoseTuple) -> float:
         """Return the turn of the wrist from home [rad] for a grasp with this tip pose."""
         return quat_angle(T_world_tip[1], (self._home or self.perception.get_tip(self.robot))[1])
 
     def _is_holding(self) -> bool:
-        return self.perception.is_holding(self.robot, self.object, self.object_model.half_width)
+        return self._is_held_by(self.robot)
+
+    def _is_held_by(self, robot: str) -> bool:
+        return self.perception.is_holding(robot, self.object, self.object_model.half_width)
+
+    def _is_open(self, robot: str) -> bool:
+        """Return True if the gripper of `robot` is open around the object."""
+        return self.perception.compute_gap(robot) > 2.0 * self.object_model.half_width + 0.010
 
     def _has_lost_object(self) -> bool:
         """Return True if the object is no longer between the fingers."""
@@ -151,6 +173,8 @@ class Giver(HandoverTask):
     `patience_s`: time for which the object is offered before the giver fails [s].
     """
 
+    _lift_m = CLEAR_ABOVE
+
     def __init__(
         self,
         robot: str,
@@ -159,8 +183,9 @@ class Giver(HandoverTask):
         device: str = Device.CONTROLLER_RIGHT,
         arm: ArmKind = ARM,
         patience_s: float = 150.0,
+        perception: Perception | None = None,
     ) -> None:
-        super().__init__(robot, object, partner, device, arm)
+        super().__init__(robot, object, partner, device, arm, perception)
         self._after_close = "lift"
         self._patience_s = patience_s
         self._taken_since_s = math.inf
@@ -199,7 +224,7 @@ class Giver(HandoverTask):
 
     def _lift(self) -> None:
         if self._entering_now:
-            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), CLEAR_ABOVE))
+            self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), self._lift_m))
         if self._has_lost_object():
             self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
         elif self.hand.has_arrived(0.015, 0.06) or self._has_lasted(4.0):
@@ -231,15 +256,11 @@ class Giver(HandoverTask):
         return farthest + 0.5 * quat_angle(offered[1], T_world_thing[1])
 
     def _offer(self) -> None:
-        thing = self.perception.get_body(self.object)
-        near = apply(
-            thing, (self.object_model.receiver_x if self._take_x < 0.0 else -self.object_model.receiver_x, 0.0, 0.0)
-        )
-        if distance(self.perception.get_tip(self.partner)[0], near) < 0.07:
+        if distance(self.perception.get_tip(self.partner)[0], self._find_partner_grasp()) < 0.07:
             self.hand.hold_still()
         if self._has_lost_object():
             self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
-        elif not self.perception.is_holding(self.partner, self.object, self.object_model.half_width):
+        elif not self._is_held_by(self.partner):
             self._taken_since_s = math.inf
             if self._has_lasted(self._patience_s):
                 self._fail(f"{self.partner} did not take the {self.object} within {self._patience_s:.0f} s")
@@ -247,6 +268,11 @@ class Giver(HandoverTask):
             self._taken_since_s = min(self._taken_since_s, self.hand.now_s)
             if self.hand.now_s - self._taken_since_s >= SURE_S:
                 self._enter("release")
+
+    def _find_partner_grasp(self) -> Vec3:
+        """Return where the partner will grasp the object [m]."""
+        x = self.object_model.receiver_x
+        return apply(self.perception.get_body(self.object), (x if self._take_x < 0.0 else -x, 0.0, 0.0))
 
     def _release(self) -> None:
         self._open_gripper("retreat")
@@ -276,8 +302,9 @@ class Receiver(HandoverTask):
         arm: ArmKind = ARM,
         place: tuple[float, float] | None = None,
         patience_s: float = 150.0,
+        perception: Perception | None = None,
     ) -> None:
-        super().__init__(robot, object, partner, device, arm)
+        super().__init__(robot, object, partner, device, arm, perception)
         self._after_close = "secure"
         self._place = place
         self._patience_s = patience_s
@@ -296,17 +323,20 @@ class Receiver(HandoverTask):
     def _watch(self) -> None:
         if self._entering_now and self._home is not None:
             self.hand.move_to(self._home)
-        middle, _ = self._compute_exchange()
-        offered = (
-            distance(self.perception.get_body(self.object)[0], middle) < OFFERED_M
-            and self.perception.get_still_s(self.object) > 0.4
-            and self.perception.is_holding(self.partner, self.object, self.object_model.half_width)
-        )
-        if offered:
-            self._take_x = self._find_free_end()
-            self._enter("raise")
+        is_still = self.perception.get_still_s(self.object) > 0.4
+        if is_still and self._is_offered() and self._is_held_by(self.partner):
+            self._take()
         elif self._has_lasted(self._patience_s):
             self._fail(f"{self.partner} did not offer the {self.object} within {self._patience_s:.0f} s")
+
+    def _is_offered(self) -> bool:
+        """Return True if the object is where it changes hands."""
+        return distance(self.perception.get_body(self.object)[0], self._compute_exchange()[0]) < OFFERED_M
+
+    def _take(self) -> None:
+        """Begin to take the object that is offered."""
+        self._take_x = self._find_free_end()
+        self._enter("raise")
 
     def _raise_hand(self) -> None:
         """Move straight up to the start of the approach: on a slant, the fingers could push the object away."""
@@ -330,14 +360,17 @@ class Receiver(HandoverTask):
         """Keep hold until the giver has opened and left. Both robots hold the object, so there are no corrections."""
         if self._entering_now:
             self.hand.hold_still()
-        given_at = apply(self.perception.get_body(self.object), (-self._take_x, 0.0, 0.0))
-        opened = self.perception.compute_gap(self.partner) > 2.0 * self.object_model.half_width + 0.010
-        if opened and distance(self.perception.get_tip(self.partner)[0], given_at) > LEFT_M:
+        away = distance(self.perception.get_tip(self.partner)[0], self._find_partner_grasp())
+        if self._is_open(self.partner) and away > LEFT_M:
             self._enter("carry")
         elif self._has_lasted(1.0) and not self._is_holding():
             self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
         elif self._has_lasted(15.0):
             self._retry(f"{self.partner} did not release the {self.object}")
+
+    def _find_partner_grasp(self) -> Vec3:
+        """Return where the giver has held the object [m]."""
+        return apply(self.perception.get_body(self.object), (-self._take_x, 0.0, 0.0))
 
     def _carry(self) -> None:
         if self._entering_now:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 from anchors.pose import PoseTuple, Vec3, apply, distance, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
 from iris_session.emulator.behaviours.base import OperatorView
@@ -42,15 +43,26 @@ class TrackedPose:
 class Perception:
     """Tracks bodies and robot tips by name. `missing`: those that have not been in the scene so far.
 
-    `arm`: the kind of the robots. `perhaps`: bodies that may be absent.
+    `arm`: the kind of the robots. `perhaps`: bodies that may be absent. `pads`: by robot, instead of those of `arm`:
+    the bodies of two fingers, each with the point in its frame that touches what it holds [m]; bases are not tracked
+    then.
     """
 
     def __init__(
-        self, bodies: tuple[str, ...], robots: tuple[str, ...], perhaps: tuple[str, ...] = (), arm: ArmKind = ARM
+        self,
+        bodies: tuple[str, ...],
+        robots: tuple[str, ...],
+        perhaps: tuple[str, ...] = (),
+        arm: ArmKind = ARM,
+        pads: Mapping[str, Sequence[tuple[str, Vec3]]] | None = None,
     ) -> None:
         self._arm = arm
-        parts = tuple(f"{robot}/{part}" for robot in robots for part in (*arm.fingers, arm.base))
-        self._bodies = bodies + parts
+        bases = () if pads is not None else tuple(f"{robot}/{arm.base}" for robot in robots)
+        self._pads = pads or {
+            robot: [(f"{robot}/{finger}", pad) for finger, pad in zip(arm.fingers, arm.pads, strict=True)]
+            for robot in robots
+        }
+        self._bodies = (*bodies, *dict.fromkeys(finger for both in self._pads.values() for finger, _ in both), *bases)
         self._robots = robots
         self._optional = perhaps
         self._tracked: dict[str, TrackedPose] = {}
@@ -96,8 +108,8 @@ class Perception:
 
     def compute_pads(self, robot: str) -> tuple[Vec3, Vec3]:
         """Return the positions of the two finger pads [m], world frame."""
-        one, other = (self._tracked[f"{robot}/{finger}"].pose for finger in self._arm.fingers)
-        return apply(one, self._arm.pads[0]), apply(other, self._arm.pads[1])
+        one, other = (apply(self._tracked[finger].pose, pad) for finger, pad in self._pads[robot])
+        return one, other
 
     def compute_gap(self, robot: str) -> float:
         """Distance between the finger pads [m]."""
