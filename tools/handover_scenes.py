@@ -1,7 +1,6 @@
 """Generated scenes of two arms and a box, and how many handovers in them succeed, in simulated time.
 
-    python -m tools.handover_scenes 10            # ten seeds; a second number is the first seed
-    python -m tools.handover_scenes --markdown 10
+    python -m tools.handover_scenes 10 0 --save DIR    # ten seeds from the first one on, also as files
 
 Arms are drawn from primitives with six or seven joints and a gripper of two fingers, links and fingers of random
 length, 0.6 to 1.1 m apart, turned to each other by up to 35 degrees. A box of 3 to 5 cm lies on the table. Nobody looked
@@ -13,6 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -32,7 +32,7 @@ DOWN = (0.0, 1.0, 0.0, 0.0)
 BOX, CAPSULE, CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
 
 
-def make_scene(seed: int) -> mujoco.MjModel:
+def make_scene(seed: int) -> mujoco.MjSpec:
     """Return the scene of a seed."""
     rng = np.random.default_rng(seed)
     spec = mujoco.MjSpec()
@@ -60,7 +60,8 @@ def make_scene(seed: int) -> mujoco.MjModel:
     box.add_geom(type=BOX, size=half, mass=rng.uniform(0.03, 0.12), condim=4, friction=[0.8, 0.005, 0.0001])
     nearest = 0.5 * apart - 0.06
     _bend_arms(spec, [min(rng.uniform(0.26, 0.34), nearest) for _ in range(2)], rng.uniform(0.28, 0.36))
-    return spec.compile()
+    spec.compile()
+    return spec
 
 
 def _add_arm(spec: Any, name: str, x: float, yaw: float, rng: np.random.Generator) -> None:
@@ -159,10 +160,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenes", type=int)
     parser.add_argument("first", type=int, nargs="?", default=0)
+    parser.add_argument("--save", type=Path, metavar="DIR", help="also write the scenes")
     arguments = parser.parse_args()
     good = 0
     for seed in range(arguments.first, arguments.first + arguments.scenes):
-        model = make_scene(seed)
+        spec = make_scene(seed)
+        model = spec.compile()
+        if arguments.save is not None:
+            (arguments.save / f"scene{seed}.xml").write_text(spec.to_xml())
         began = time.monotonic()
         try:
             rig = make_rig(model, seed)

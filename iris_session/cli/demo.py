@@ -9,10 +9,12 @@ from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from iris_session.cli.common import (
+    CommandError,
     add_command,
     add_json_option,
     add_session_options,
     make_number_type,
+    open_scene,
     parse_seconds,
     print_result,
 )
@@ -20,8 +22,13 @@ from iris_session.cli.view import live_viewer
 
 if TYPE_CHECKING:
     from iris_session.client.stream_meter import StreamMeasurement
+    from iris_session.demo.demos import Demo
     from iris_session.demo.run import DemoResult
     from iris_session.session.session import Session
+
+
+#: Options whose fields have another name, as `from` is a keyword.
+_FIELDS = {"from": "giver", "to": "receiver"}
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -40,24 +47,42 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  soft       two operators stow a soft body each in one box\n"
         "  cloud      handover before two depth cameras; an observer watches their point cloud and pictures. The\n"
         "             cameras are drawn: needs OpenGL without a display (Debian: libegl1 libgl1-mesa-dri)\n\n"
-        "The models of panda and aloha come from IRIS_DATA or the package mujoco-menagerie.",
+        "The models of panda and aloha come from IRIS_DATA or the package mujoco-menagerie.\n\n"
+        "`handover SCENE` plans the handover of an object between two arms of your scene, or says why none is possible "
+        "before it starts. Each handover is an episode of a task in the recording.",
         examples="""
             iris-session demo handover
             iris-session demo handover --seed 7 --json
             iris-session demo handover --operators 8 --observers 8
+            iris-session demo handover scene.xml --object cube --episodes 10 --record cube.rrd
             iris-session demo aloha --profile busy-wifi
             iris-session demo panda --latency 40
             iris-session demo cloud --record cloud.rrd
         """,
     )
     parser.add_argument("demo", choices=("handover", "panda", "aloha", "cloth", "soft", "cloud"))
+    parser.add_argument("scene", nargs="?", help="for handover: your scene, a file or a name as of `serve`")
+    plan = parser.add_argument_group("handover in your scene")
+    plan.add_argument("--object", default="", metavar="NAME", help="the object (default: the only free body)")
+    plan.add_argument("--from", dest="giver", default="", metavar="ROBOT", help="who gives (default: the nearest)")
+    plan.add_argument("--to", dest="receiver", default="", metavar="ROBOT", help="who takes (default: the other)")
+    plan.add_argument(
+        "--episodes",
+        type=make_number_type(int, "a number of handovers: give 1 to 1000", 1, 1000),
+        default=1,
+        metavar="N",
+        help="handovers; with several the object lies a little elsewhere in each (default: 1)",
+    )
     parser.add_argument(
         "--operators", type=int, default=2, metavar="N", help="operators, in pairs; 2 to 8 (default: 2)"
     )
     parser.add_argument("--observers", type=int, default=0, metavar="N", help="observers; 0 to 16 (default: 0)")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the emulated operators")
     parser.add_argument(
-        "--timeout", type=parse_seconds, default=150.0, metavar="S", help="stop after this many seconds"
+        "--timeout",
+        type=parse_seconds,
+        metavar="S",
+        help="stop after this many seconds (default: 150, and 60 for each further episode)",
     )
     link = parser.add_mutually_exclusive_group()
     link.add_argument(
@@ -81,14 +106,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Run one demo and print its summary."""
     from iris_session.cli.live import TerminalView
     from iris_session.cli.serve import make_session_config
-    from iris_session.demo.demos import make_demo
     from iris_session.demo.run import run_demo
     from iris_session.netsim.profiles import load_profile
 
     profile = arguments.profile if arguments.latency is None else f"{arguments.latency:f}ms"
     if profile:
         load_profile(profile)  # fails before anything is started
-    play = make_demo(arguments.demo, arguments.operators, arguments.observers, arguments.seed)
+    play = _make_demo(arguments)
+    timeout_s = arguments.timeout or 150.0 + 60.0 * (arguments.episodes - 1)
     config = make_session_config(arguments, arguments.demo)
     out = sys.stderr if arguments.json else sys.stdout
 
@@ -102,9 +127,34 @@ def run(arguments: argparse.Namespace) -> int:
 
     if play.cameras:
         print("preparing the cameras: the first time takes some seconds", file=out, flush=True)
-    result = run_demo(play, config, arguments.timeout, show, profile, arguments.seed)
+    result = run_demo(play, config, timeout_s, show, profile, arguments.seed)
     print_result(arguments, result, format_summary(result))
     return 130 if result.interrupted else 0 if result.ok else 1
+
+
+def _make_demo(arguments: argparse.Namespace) -> Demo:
+    """Return the demo of the arguments: a packaged one, or the handover in a scene."""
+    from iris_session.demo.demos import make_demo, make_planned_handover
+
+    given = [f"--{name}" for name in ("object", "from", "to") if getattr(arguments, _FIELDS.get(name, name))]
+    given += ["--episodes"] if arguments.episodes > 1 else []
+    if arguments.scene is None:
+        if given:
+            raise CommandError(f"{', '.join(given)}: name the scene, such as `iris-session demo handover scene.xml`")
+        return make_demo(arguments.demo, arguments.operators, arguments.observers, arguments.seed)
+    if arguments.demo != "handover":
+        raise CommandError(f"demo {arguments.demo} has its own scene: `iris-session demo handover {arguments.scene}`")
+    if arguments.operators != 2:
+        raise CommandError(f"--operators {arguments.operators}: two people hand over an object of your scene")
+    return make_planned_handover(
+        open_scene(arguments.scene),
+        arguments.object,
+        arguments.giver,
+        arguments.receiver,
+        episodes=arguments.episodes,
+        observers=arguments.observers,
+        seed=arguments.seed,
+    )
 
 
 def format_summary(result: DemoResult) -> list[str]:
@@ -115,6 +165,9 @@ def format_summary(result: DemoResult) -> list[str]:
         f"  handover of {h.object}: {h.giver} -> {h.receiver} at {h.at_s:.1f} s, both held it for {h.duration_s:.2f} s"
         for h in result.handovers
     ]
+    if result.episodes:
+        successes = result.episodes.count("success")
+        lines.append(f"  {successes} of {len(result.episodes)} episodes are successes")
     lines += [f"  {g.deformable} {g.goal} at {g.at_s:.1f} s" for g in result.goals if g.at_s is not None]
     lines += [
         f"  alignment of {name}: stated {a['stated_p95']:.1f} mm (95 %), true {a['at_sheet']:.1f} mm at the sheet"

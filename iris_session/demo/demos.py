@@ -3,7 +3,7 @@
 `handover`: two arms drawn from primitives and a hammer, or up to eight around a round table; needs no data.
 `panda`: the same with Franka Panda arms. `aloha`: two ALOHA stations, two operators with two arms each. `cloth`: two
 operators fold a cloth. `soft`: two operators stow a soft body each. `cloud`: `handover` before two depth cameras, whose
-cloud and pictures observers watch.
+cloud and pictures observers watch. `make_planned_handover`: an object of any scene.
 """
 
 from __future__ import annotations
@@ -18,17 +18,22 @@ from typing import Final
 import msgspec
 import mujoco
 
-from anchors.pose import PoseTuple, Vec3
+from anchors.pose import IDENTITY_QUAT, PoseTuple, Vec3
 from iris_session.cloud.camera_file import load_camera_file
+from iris_session.control.config import ControlConfig
 from iris_session.demo.goals import FoldGoal, Goal, StowGoal
+from iris_session.demo.handover_plan import plan_handover
 from iris_session.demo.named_scenes import NamedScene, scene_by_name
 from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, RADIUS
 from iris_session.demo.scenes.generators import arm_names, compute_bearing, compute_circle_radius
 from iris_session.demo.scenes.panda import compute_panda_radius
-from iris_session.emulator.headset import DEFAULT_ANCHOR_ID
+from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_SHEET_M
 from iris_session.emulator.specs import HandTask, HeadsetSpec
+from iris_session.physics import find_objects
 from iris_session.protocol.names import Device
+from iris_session.protocol.specs import ObjectRange, TaskSpec
 from iris_session.session.errors import ConfigError
+from iris_session.session.robots import find_drivable_robots
 
 MAX_OPERATORS: Final = 8
 MAX_OBSERVERS: Final = 16
@@ -37,6 +42,10 @@ MORE_PEOPLE: Final = "For more people: iris-session demo handover --operators N"
 NAMES: Final = ("ann", "bob", "cem", "dia", "eli", "fay", "gus", "hoa")
 #: Distance of an operator behind the arm, and height of the eyes above the table [m].
 _BEHIND, _EYES = 0.45, 0.55
+
+
+#: How far from its place in the scene an object of a planned handover lies in each episode [m] along both axes, [rad].
+PLACES_M, PLACES_RAD = 0.02, math.radians(10.0)
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,7 @@ class Demo:
         goals: Goals for deformables.
         cameras: Camera files of the depth cameras of the scene.
         streams: Media streams of these cameras, which every observer watches.
+        task: Of a planned handover: every attempt is an episode of it.
     """
 
     name: str
@@ -61,15 +71,18 @@ class Demo:
     goals: tuple[Goal, ...] = ()
     cameras: tuple[Path, ...] = ()
     streams: tuple[str, ...] = ()
+    task: TaskSpec | None = None
 
 
 def make_demo(name: str, operators: int = 2, observers: int = 0, seed: int = 0) -> Demo:
     """Return the demo `name`. Raises `ConfigError` for an unusable cast, `ModelNotFoundError` without its models."""
     if name not in DEMOS:
         raise ConfigError(f"there is no demo '{name}': {', '.join(DEMOS)}")
-    if not 0 <= observers <= MAX_OBSERVERS:
-        raise ConfigError(f"--observers {observers} is out of range: 0 to {MAX_OBSERVERS}")
-    play = DEMOS[name](operators, seed)
+    _check_observers(observers)
+    return _add_observers(DEMOS[name](operators, seed), observers, seed)
+
+
+def _add_observers(play: Demo, observers: int, seed: int) -> Demo:
     if play.streams:
         observers = max(1, observers)
     sheet = play.anchors[DEFAULT_ANCHOR_ID]
@@ -78,6 +91,78 @@ def make_demo(name: str, operators: int = 2, observers: int = 0, seed: int = 0) 
         for i in range(observers)
     )
     return dataclasses.replace(play, headsets=(*play.headsets, *watching))
+
+
+# --- any object of any scene ------------------------------------------------------------------------------------------
+
+
+def make_planned_handover(
+    scene: NamedScene,
+    thing: str = "",
+    giver: str = "",
+    receiver: str = "",
+    *,
+    episodes: int = 1,
+    observers: int = 0,
+    seed: int = 0,
+) -> Demo:
+    """Return the demo in which two people hand an object of a scene over, once for each episode.
+
+    Args:
+        scene: The scene, with two arms that have grippers of two fingers.
+        thing: The object; empty: the only free body.
+        giver: The robot that gives; empty: the nearest that reaches the object.
+        receiver: The robot that takes; empty: the nearest other one.
+        episodes: Number of handovers that are wanted. The object lies a little elsewhere in each, if there are several.
+        observers: Number of observers.
+        seed: Of people and places.
+
+    Raises:
+        ConfigError: It cannot be done; one line says why.
+    """
+    _check_observers(observers)
+    model, control = scene.model, ControlConfig()
+    plan = plan_handover(
+        model, find_drivable_robots(model, control).robots, find_objects(model), thing, giver, receiver
+    )
+    (x, y, z), _ = plan.T_world_lying
+    sheet: PoseTuple = ((plan.T_world_meeting[0][0], plan.T_world_meeting[0][1], z), IDENTITY_QUAT)
+    people = tuple(
+        HeadsetSpec(
+            name=NAMES[i],
+            behaviour=behaviour,
+            robot=robot,
+            object=plan.object,
+            partner=partner,
+            plan=plan,
+            stays=True,
+            seed=seed + i,
+            eye=(sheet[0][0] + 0.35 * (2 * i - 1), sheet[0][1] - 0.5, z + _EYES),
+            T_world_anchor=sheet,
+        )
+        for i, (behaviour, robot, partner) in enumerate(
+            (
+                ("giver", plan.giver.robot, plan.receiver.robot),
+                ("receiver", plan.receiver.robot, plan.giver.robot),
+            )
+        )
+    )
+    aside, turn = (PLACES_M, PLACES_RAD) if episodes > 1 else (0.0, 0.0)
+    task = TaskSpec(
+        name=f"handover-{plan.object}"[:64],
+        instruction=f"Hand the {plan.object} over from {plan.giver.robot} to {plan.receiver.robot}.",
+        wanted=episodes,
+        robots=(plan.giver.robot, plan.receiver.robot),
+        objects=(
+            (ObjectRange(plan.object, (x - aside, x + aside), (y - aside, y + aside), yaw=(-turn, turn)),)
+            if episodes > 1
+            else ()
+        ),
+        seed=seed,
+    )
+    play = Demo("handover", model, {DEFAULT_ANCHOR_ID: sheet}, people, (plan.object,), task=task)
+    play = dataclasses.replace(play, anchor_sizes=dict.fromkeys(play.anchors, DEFAULT_SHEET_M))
+    return _add_observers(play, observers, seed)
 
 
 # --- arms around a table ----------------------------------------------------------------------------------------------
@@ -101,6 +186,11 @@ def _make_without_cast(name: str, scene_name: str, objects: tuple[str, ...]) -> 
     """Return a demo in the named scene, without its cast."""
     scene: NamedScene = scene_by_name(scene_name)
     return Demo(name, scene.model, scene.anchors, (), objects, anchor_sizes=scene.anchor_sizes, cameras=scene.cameras)
+
+
+def _check_observers(observers: int) -> None:
+    if not 0 <= observers <= MAX_OBSERVERS:
+        raise ConfigError(f"--observers {observers} is out of range: 0 to {MAX_OBSERVERS}")
 
 
 def _check_operators(demo: str, operators: int) -> None:

@@ -3,8 +3,8 @@
 A run succeeds only if the session's own detector saw every handover by contact alone, if every goal with a deformable
 was reached (`goals`), if the streams of its cameras reach every observer, and if the recording verifies bit for bit.
 Handovers or goals are recorded as the verdict of an episode. When an operator fails, such as after dropping an object
-where it cannot be grasped, the scene is reset and all begin again, as people do who record demonstrations. The demos
-themselves are in `demos`.
+where it cannot be grasped, the scene is reset and all begin again, as people do who record demonstrations. Planned
+handovers are episodes of a task, each with its verdict. The demos themselves are in `demos`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.protocol.client_messages import Episode
 from iris_session.protocol.names import EpisodeAction, StreamFault
+from iris_session.protocol.specs import TaskSpec
 from iris_session.session.config import SessionConfig
 from iris_session.session.session import Session
 from iris_session.session.session_view import HandoverStatus
@@ -123,6 +124,7 @@ class DemoResult(msgspec.Struct, frozen=True):
     `alignment_mm`: stated p95 and true error at the sheet [mm], by name of the headset, of the aligned ones only.
     `attempts` (`takes` in JSON): each from a reset scene; `handovers` and `goals` are those of the last one.
     `streams`: the cloud and the pictures of the cameras as they came to each observer, with rate and age, by its name.
+    `episodes`: verdicts of a planned handover, whose `handovers` are those of all episodes.
     """
 
     ok: bool
@@ -144,6 +146,7 @@ class DemoResult(msgspec.Struct, frozen=True):
     goals: tuple[GoalStatus, ...] = ()
     attempts: int = msgspec.field(name="takes", default=1)
     streams: dict[str, tuple[StreamMeasurement, ...]] = {}
+    episodes: tuple[str, ...] = ()
 
 
 def run_demo(
@@ -161,9 +164,12 @@ def run_demo(
     """
     _check_cameras(demo)
     cameras = (*demo.cameras, *config.cameras)
-    config = dataclasses.replace(config, anchors=demo.anchors, anchor_sizes=demo.anchor_sizes, cameras=cameras)
+    config = dataclasses.replace(
+        config, anchors=demo.anchors, anchor_sizes=demo.anchor_sizes, cameras=cameras, task=demo.task or config.task
+    )
     session = Session(demo.model, config=config)
     judge = _GoalTracker(demo, session)
+    episodes = None if demo.task is None else _EpisodeKeeper(demo, demo.task, session)
     with ExitStack() as stack:
         stack.enter_context(session.signals())
         stack.enter_context(session)
@@ -187,6 +193,13 @@ def run_demo(
             is_over = is_over and people.have_seen_streams(now_ns)
             failures = judge.list_failures(people.list_failures(), is_over)
             left_s = timeout_s - (now_ns - began_ns) * 1e-9
+            if episodes is not None:
+                if not episodes.update(people, is_over, failures):
+                    return False
+                if not episodes.is_complete and left_s > ATTEMPT_S:
+                    people.restart(left_s)
+                    return False
+                return True
             if failures and len(failed_attempts) < MAX_ATTEMPTS - 1 and left_s > ATTEMPT_S:
                 failed_attempts.append(f"begun again at {now_ns * 1e-9:.0f} s: {'; '.join(failures)}")
                 judge.restart()
@@ -209,7 +222,9 @@ def run_demo(
     # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify_recording(recording)
     problems = judge.list_problems()
-    if problems or not demo.goals:
+    if episodes is not None:
+        problems = episodes.list_problems()
+    elif problems or not demo.goals:
         problems = _list_problems(demo, reports, handovers, timeout_s) + problems
     problems = ["interrupted before its end"] if interrupted else [*problems, *camera_problems]
     problems += filter(None, (session.recording_fault, verification if verified is False else ""))
@@ -232,11 +247,12 @@ def run_demo(
         real_time_factor=round(status.sim_time / run_s, 3),
         state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items() if math.isfinite(r.age_ms_p99)},
         problems=tuple(problems),
-        notes=(*demo.notes, *failed_attempts, *camera_notes),
+        notes=(*demo.notes, *failed_attempts, *camera_notes, *(() if episodes is None else episodes.notes)),
         interrupted=interrupted,
         goals=judge.get_status(),
         attempts=1 + len(failed_attempts),
         streams={name: r.streams for name, r in watched.items() if r.streams},
+        episodes=() if episodes is None else tuple(episodes.verdicts),
     )
 
 
@@ -323,6 +339,70 @@ class _GoalTracker:
         ]
 
 
+class _EpisodeKeeper:
+    """Records every attempt at a planned handover as an episode of its task, which resets the scene at its end.
+
+    It is a success only if the session saw the handover and the receiver alone holds the object, free of everything
+    else.
+
+    Attributes:
+        verdicts: Of the episodes so far.
+        notes: Why some are failures.
+    """
+
+    def __init__(self, demo: Demo, task: TaskSpec, session: Session) -> None:
+        self._session, self._task = session, task
+        (self._object,) = demo.objects
+        self._giver, self._receiver = task.robots
+        self.verdicts: list[str] = []
+        self.notes: list[str] = []
+        self._runs = self._is_judged = False
+        self._began_s = 0.0
+
+    @property
+    def is_complete(self) -> bool:
+        """True when there are as many successes as wanted, or too many failures."""
+        successes = self.verdicts.count(EpisodeAction.SUCCESS)
+        return successes >= self._task.wanted or len(self.verdicts) - successes >= MAX_ATTEMPTS
+
+    def update(self, people: _EmulatorGroup, is_over: bool, failures: list[str]) -> bool:
+        """Begin an episode once all people work, and give its verdict when they are done.
+
+        Returns True after that, when the session has the verdict: an episode whose people leave before has none.
+        """
+        if self._is_judged:
+            self._is_judged = False
+            return True
+        if not self._runs and people.are_working():
+            self._runs, self._began_s = True, self._session.clock() * 1e-9
+            self._session.post(Episode(0, EpisodeAction.START, f"{self._giver} to {self._receiver}", countdown_ns=0))
+        if not (is_over or failures):
+            return False
+        problems = failures or self._judge()
+        verdict = EpisodeAction.FAILURE if problems else EpisodeAction.SUCCESS
+        self.verdicts.append(verdict)
+        self.notes += [f"episode {len(self.verdicts)}: {problem}" for problem in problems]
+        if self._runs:
+            self._session.post(Episode(0, verdict))
+        self._runs, self._is_judged = False, True
+        return False
+
+    def list_problems(self) -> list[str]:
+        """Return one line if there are fewer successes than wanted."""
+        successes = self.verdicts.count(EpisodeAction.SUCCESS)
+        wanted = self._task.wanted
+        return [] if successes >= wanted else [f"{successes} of {wanted} handovers of the {self._object} succeeded"]
+
+    def _judge(self) -> list[str]:
+        """Return why the present episode is no success."""
+        seen = [one for one in self._session.status().handovers if one.at_s >= self._began_s]
+        if (self._object, self._giver, self._receiver) not in [(h.object, h.giver, h.receiver) for h in seen]:
+            return [f"the detector saw no handover of the {self._object} by contact alone"]
+        contacts = self._session.stepper.core.world.view().object_contacts()
+        held = [c for c in contacts if c.object == self._object and c.touching == (self._receiver,) and not c.others]
+        return [] if held else [f"'{self._receiver}' does not hold the {self._object} alone"]
+
+
 def _group_by_process(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:
     """Group headsets by process: one each for up to two operators, else `WORKERS_PER_PROCESS`."""
     workers = [spec for spec in specs if not spec.observer]
@@ -372,6 +452,13 @@ class _EmulatorGroup:
         for process in (*self._workers, *self._observers):
             process.poll()
         return not any(process.is_running and process.is_busy for process in self._workers)
+
+    def are_working(self) -> bool:
+        """Return True when all operators have their robots and are at work, or done."""
+        reports = [r for process in self._workers for r in process.reports.values()]
+        return len(reports) == sum(len(group) for group in self._groups if not group[0].observer) and all(
+            report.phase in ("work", "done") for report in reports
+        )
 
     def have_seen_streams(self, now_ns: int) -> bool:
         """Return True when all streams were measured for long enough, or `STREAMS_S` after the first call."""

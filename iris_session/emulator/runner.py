@@ -97,9 +97,9 @@ def _fail_late_joins(operators: Sequence[EmulatedOperator], timeout_s: float, no
 
 
 def _are_all_finished(operators: Sequence[EmulatedOperator]) -> bool:
-    """Return True when every task has finished. Observers have none; only observers run for ever."""
+    """Return True when every task has finished, and no one stays. Observers have none; only observers run for ever."""
     working = [operator for operator in operators if not operator.observer]
-    return all(operator.finished for operator in (working or operators))
+    return all(operator.finished and not operator.spec.stays for operator in (working or operators))
 
 
 def _report_changes(

@@ -48,7 +48,8 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     and `bump_yaw_rad` about the head), the headset is taken off, and put on again. `drift_m_per_min`: of the tracking
     frame between the orders `drift` and `steady`; until then that of `model`. `display_delay_s`: age of the displayed
     state: interpolation delay plus the path to the headset. `streams`: media streams to which it subscribes when the
-    session has them, and which it measures. `identity_file`: keeps the identity across restarts.
+    session has them, and which it measures. `stays`: it is in the session until its process is ended, also after its
+    task: an episode ends with its people. `identity_file`: keeps the identity across restarts.
     `curve_server`, `curve_key`: files with the session's public CURVE key and our own secret one; needed off loopback.
     """
 
@@ -83,6 +84,7 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     don_at_s: float | None = None
     phase_timeout_s: float = 30.0
     streams: tuple[str, ...] = ()
+    stays: bool = False
     identity_file: str = ""
     curve_server: str = ""
     curve_key: str = ""
