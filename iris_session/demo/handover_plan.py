@@ -39,16 +39,20 @@ from iris_session.session.errors import ConfigError
 #: Straight way to a grasp and back; and straight up after the first one [m].
 BACK_M: Final = 0.10
 LIFT_M: Final = 0.10
+#: A grasp whose direction falls at least so steeply is one from above.
+FROM_ABOVE: Final = -0.9
 #: A gripper is opened wider than what it takes by this [m].
-SPARE_M: Final = 0.010
+SPARE_M: Final = 0.008
 #: How deep a grip is below the face from which an object is approached, at most [m].
 DEPTH_M: Final = 0.020
+#: Fingers that would stand on the table take it higher by this [m].
+SHALLOWER_M: Final = 0.006
 #: A box that is longer than this may also be taken near its ends [m].
 LONG_M: Final = 0.10
 #: Grasps of the giver, turns of both grippers at the meeting, and meetings that are tried.
 MAX_GRASPS: Final = 4
-MAX_TURNS: Final = 200
-MAX_MEETINGS: Final = 3000
+MAX_TURNS: Final = 300
+MAX_MEETINGS: Final = 4000
 #: Greatest turn of a wrist [rad].
 MAX_TURN: Final = math.radians(150.0)
 #: Places of the meeting about the middle between the bases: along the line between them (shares of their distance),
@@ -62,7 +66,7 @@ PITCHES: Final = tuple(math.radians(a) for a in (0, 35, -35, 85))
 ROLLS: Final = tuple(math.radians(a) for a in range(0, 360, 45))
 #: What counts as much as a turn of one radian: 0.4 m from the middle; grippers that do not face each other.
 PLACE_COST: Final = 2.5
-ASIDE_COST: Final = 1.0
+ASIDE_COST: Final = 2.0
 
 
 class Grasp(NamedTuple):
@@ -204,10 +208,12 @@ class _Planner:
         at = scene.T_world_object
         turn = arm.tip_at_rest[1]
 
+        def rise(grasp: Grasp) -> float:
+            """Return -1 for a grasp from above."""
+            return _ahead(compose(at, grasp.T_object_grip)[1])[2]
+
         def cost(grasp: Grasp) -> float:
-            T_world_tip = compose(at, self._to_tip(name, grasp))
-            down = quat_rotate(compose(at, grasp.T_object_grip)[1], (0.0, 0.0, 1.0))[2]
-            return quat_angle(T_world_tip[1], turn) + 4.0 * (1.0 + down)
+            return quat_angle(compose(at, self._to_tip(name, grasp))[1], turn) + 4.0 * (1.0 + rise(grasp))
 
         found = []
         nearest = math.inf
@@ -222,16 +228,16 @@ class _Planner:
                 if missing:
                     break
             if missing:
-                nearest = min(nearest, missing)
+                nearest = min(nearest, missing + (rise(grasp) > FROM_ABOVE))
             elif self._is_free(name, ways, at, grasp):
                 found.append(GivenGrasp(grasp, q))
                 if len(found) == MAX_GRASPS:
                     break
         if found:
             return found
-        if self._clash:
-            raise ConfigError(f"'{name}' cannot grasp it where it lies: {self._clash} come too close")
-        raise ConfigError(f"'{name}' does not reach it: {1e3 * nearest:.0f} mm are missing")
+        why = [f"{1e3 * nearest:.0f} mm are missing from above"] if nearest < 1.0 else []
+        why += [f"{self._clash} come too close"] if self._clash else []
+        raise ConfigError(f"'{name}' does not reach it where it lies: {', or '.join(why) or 'it is too far away'}")
 
     def _is_free(self, name: str, ways: Sequence[Sequence[Floats]], at: PoseTuple, grasp: Grasp) -> bool:
         approach, reach, lift = ways
@@ -258,8 +264,9 @@ class _Planner:
                     continue
                 along = 3 - closing - approach
                 ends = (0.6 * half[along], -0.6 * half[along]) if 2.0 * half[along] > LONG_M else ()
-                depth = half[approach] - min(half[approach], DEPTH_M)
-                for side, turn, end in itertools.product((1.0, -1.0), (1.0, -1.0), (0.0, *ends)):
+                deep = half[approach] - min(half[approach], DEPTH_M)
+                depths = (deep, deep + SHALLOWER_M) if half[approach] > 1.5 * SHALLOWER_M else (deep,)
+                for side, turn, end, depth in itertools.product((1.0, -1.0), (1.0, -1.0), (0.0, *ends), depths):
                     p = [0.0, 0.0, 0.0]
                     p[approach], p[along] = -side * depth, end
                     q = _make_frame(approach, side, closing, turn)
