@@ -329,7 +329,17 @@ def demo(play: Demo, seed: int, **options: Any) -> Rig:
     """Return a rig with the cast of a demo, one behaviour per robot; operators without a partner are left out."""
     behaviours = {}
     for task in (task for person in play.headsets for task in person.tasks if task.partner):
-        args = (task.behaviour, task.robot, task.object, task.partner, task.device, seed, task.arm, task.place, task.plan)
+        args = (
+            task.behaviour,
+            task.robot,
+            task.object,
+            task.partner,
+            task.device,
+            seed,
+            task.arm,
+            task.place,
+            task.plan,
+        )
         behaviours[task.robot] = make_behaviour(*args)
     return Rig(behaviours, seed, play.objects[0], play.objects[1:], model=play.model, **options)
 

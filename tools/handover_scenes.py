@@ -3,8 +3,8 @@
     python -m tools.handover_scenes 10 0 --save DIR    # ten seeds from the first one on, also as files
 
 Arms are drawn from primitives with six or seven joints and a gripper of two fingers, links and fingers of random
-length, 0.6 to 1.1 m apart, turned to each other by up to 35 degrees. A box of 3 to 5 cm lies on the table. Nobody looked
-at these scenes before people hand the box over: the plan is made from the model alone.
+length, 0.6 to 1.1 m apart, turned to each other by up to 35 degrees. A box of 3 to 5 cm lies on the table. The plan
+of its handover is made from the model alone.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from anchors.pose import IDENTITY_QUAT, quat_from_yaw, quat_mul
+from anchors.pose import quat_from_yaw
 from iris_session.control.arm_model import ArmModel, read_joint_ranges
 from iris_session.control.config import SOLVER_NUMPY, ControlConfig
 from iris_session.control.solvers import make_solver
@@ -32,8 +32,8 @@ DOWN = (0.0, 1.0, 0.0, 0.0)
 BOX, CAPSULE, CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
 
 
-def make_scene(seed: int) -> mujoco.MjSpec:
-    """Return the scene of a seed."""
+def make_scene(seed: int, apart_m: float | None = None, half_m: float | None = None) -> mujoco.MjSpec:
+    """Return the scene of a seed; where given, with arms this far apart and a cube of this half length [m]."""
     rng = np.random.default_rng(seed)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -42,14 +42,16 @@ def make_scene(seed: int) -> mujoco.MjSpec:
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.noslip_iterations = 3
-    spec.worldbody.add_geom(name="table", type=BOX, size=[0.9, 0.7, 0.02], pos=[0, 0, -0.02])
     apart = rng.uniform(0.6, 1.1)
+    apart = apart if apart_m is None else apart_m
+    spec.worldbody.add_geom(name="table", type=BOX, size=[0.5 * apart + 0.5, 0.7, 0.02], pos=[0, 0, -0.02])
     yaws = []
     for side, name in ((-1.0, "left"), (1.0, "right")):
         yaw = (0.0 if side < 0 else math.pi) + rng.uniform(-0.6, 0.6)
         yaws.append(yaw)
         _add_arm(spec, name, side * 0.5 * apart, yaw, rng)
     half = rng.uniform(0.015, 0.025, 3)
+    half = half if half_m is None else np.full(3, half_m)
     reach, aside = rng.uniform(0.30, 0.42), yaws[0] + rng.uniform(-0.7, 0.7)
     box = spec.worldbody.add_body(
         name="cube",
@@ -90,7 +92,9 @@ def _add_arm(spec: Any, name: str, x: float, yaw: float, rng: np.random.Generato
         if length > 0.12:
             parent.add_geom(type=CAPSULE, fromto=[0, 0, 0.03, 0, 0, length - 0.03], size=[radius, 0, 0], mass=1.5)
         else:
-            parent.add_geom(type=CAPSULE, fromto=[0, 0, 0.01, 0, 0, max(length - 0.03, 0.02)], size=[0.035, 0, 0], mass=0.6)
+            parent.add_geom(
+                type=CAPSULE, fromto=[0, 0, 0.01, 0, 0, max(length - 0.03, 0.02)], size=[0.035, 0, 0], mass=0.6
+            )
         kp = [4000, 4000, 3000, 3000, 2000, 1500, 1000][k]
         _add_servo(spec, f"{name}/joint{k + 1}", kp, (-limit, limit), 180.0 if k < 4 else 60.0)
         offset = length
@@ -105,7 +109,10 @@ def _add_gripper(spec: Any, name: str, link: Any, rng: np.random.Generator) -> N
     hand.add_site(name=f"{name}/tcp", pos=[0, 0, 0.04 + long - 0.012])
     for side, finger in ((1.0, "a"), (-1.0, "b")):
         body = hand.add_body(
-            name=f"{name}/finger_{finger}", pos=[0, 0, 0.04], quat=[1, 0, 0, 0] if side > 0 else [0, 0, 0, 1], gravcomp=1.0
+            name=f"{name}/finger_{finger}",
+            pos=[0, 0, 0.04],
+            quat=[1, 0, 0, 0] if side > 0 else [0, 0, 0, 1],
+            gravcomp=1.0,
         )
         slide = body.add_joint(
             name=f"{name}/finger_{finger}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0], range=[0, travel]

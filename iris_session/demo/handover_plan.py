@@ -30,7 +30,7 @@ from anchors.pose import (
     quat_mul,
     quat_rotate,
 )
-from iris_session.demo.planning_scene import Floats, PlannedArm, PlanningScene, make_state
+from iris_session.demo.planning_scene import Floats, PlanningScene, make_state
 from iris_session.emulator.behaviours.objects import raise_pose
 from iris_session.emulator.behaviours.plan import ArmPlan, HandoverPlan
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -134,9 +134,7 @@ def _choose_object(objects: Sequence[ObjectSpec], name: str) -> ObjectSpec:
     raise ConfigError(f"the scene has no free body '{name}'. Free bodies: {listed}")
 
 
-def _list_pairs(
-    scene: PlanningScene, robots: Sequence[RobotSpec], giver: str, receiver: str
-) -> list[tuple[str, str]]:
+def _list_pairs(scene: PlanningScene, robots: Sequence[RobotSpec], giver: str, receiver: str) -> list[tuple[str, str]]:
     """Return pairs of giver and receiver, the arm nearest to the object first."""
     listed = ", ".join(robot.name for robot in robots) or "none"
     for name in filter(None, (giver, receiver)):
@@ -151,9 +149,9 @@ def _list_pairs(
         raise ConfigError(f"a handover takes two arms with grippers, the scene has {len(scene.arms)}{why}")
     p = scene.T_world_object[0]
     near = sorted(scene.arms, key=lambda name: distance(scene.arms[name].T_world_root[0], p))
-    return [
-        (a, b) for a, b in itertools.permutations(near, 2) if giver in ("", a) and receiver in ("", b)
-    ][: 2 if not giver or not receiver else 1]
+    return [(a, b) for a, b in itertools.permutations(near, 2) if giver in ("", a) and receiver in ("", b)][
+        : 2 if not giver or not receiver else 1
+    ]
 
 
 class _Planner:
@@ -195,8 +193,7 @@ class _Planner:
         clash = f", or come too close ({self._clash})" if self._clash else ""
         apart = distance(self._giver.T_world_root[0], self._receiver.T_world_root[0])
         raise ConfigError(
-            f"'{self._names[0]}' and '{self._names[1]}', {apart:.2f} m apart, find no place where both reach "
-            f"it{clash}"
+            f"'{self._names[0]}' and '{self._names[1]}', {apart:.2f} m apart, find no place where both reach it{clash}"
         )
 
     # --- the first grasp ----------------------------------------------------------------------------------------------
@@ -228,16 +225,18 @@ class _Planner:
                 if missing:
                     break
             if missing:
-                nearest = min(nearest, missing + (rise(grasp) > FROM_ABOVE))
+                nearest = min(nearest, missing if rise(grasp) < FROM_ABOVE else math.inf)
             elif self._is_free(name, ways, at, grasp):
                 found.append(GivenGrasp(grasp, q))
                 if len(found) == MAX_GRASPS:
                     break
         if found:
             return found
-        why = [f"{1e3 * nearest:.0f} mm are missing from above"] if nearest < 1.0 else []
+        why = [f"{1e3 * nearest:.0f} mm are missing from above"] if nearest < math.inf else []
         why += [f"{self._clash} come too close"] if self._clash else []
-        raise ConfigError(f"'{name}' does not reach it where it lies: {', or '.join(why) or 'it is too far away'}")
+        raise ConfigError(
+            f"'{name}' does not reach it where it lies: {', or '.join(why) or 'it cannot be taken from above'}"
+        )
 
     def _is_free(self, name: str, ways: Sequence[Sequence[Floats]], at: PoseTuple, grasp: Grasp) -> bool:
         approach, reach, lift = ways

@@ -175,7 +175,7 @@ class PlanningScene:
         self._qpos = self._data.qpos.copy()
         self._widths: dict[tuple[str, float], Floats] = {}
         self._sort_geoms(robots, body)
-        self.boxes = [self._measure_box(g, body) for g in np.flatnonzero(self._owner == OBJECT)]
+        self.boxes = [self._measure_box(int(g), body) for g in np.flatnonzero(self._owner == OBJECT)]
         self._model.geom_margin[:] = np.maximum(self._model.geom_margin, APART_M)
         self._usual: set[tuple[int, int]] = set()
         self._usual = set(self._list_close({}, self.T_world_object, (), rests=True))
@@ -292,9 +292,7 @@ def _settle(model: mujoco.MjModel, state: Any, robots: Sequence[RobotSpec], *, o
     tree = KinematicTree(model)
     below = {b for link in moving for b in tree.list_subtree(link)} - moving
     free = int(mujoco.mjtJoint.mjJNT_FREE)
-    still = [
-        j for j in range(model.njnt) if int(model.jnt_type[j]) != free and int(model.jnt_bodyid[j]) not in below
-    ]
+    still = [j for j in range(model.njnt) if int(model.jnt_type[j]) != free and int(model.jnt_bodyid[j]) not in below]
     positions, dofs = model.jnt_qposadr[still], model.jnt_dofadr[still]  # of hinges and slides; balls stay by friction
     before = data.qpos[positions].copy()
     for robot in robots:

@@ -163,11 +163,7 @@ def run_demo(
     Raises `SourceError` before anything is started if the cameras of the demo cannot be drawn here.
     """
     _check_cameras(demo)
-    cameras = (*demo.cameras, *config.cameras)
-    config = dataclasses.replace(
-        config, anchors=demo.anchors, anchor_sizes=demo.anchor_sizes, cameras=cameras, task=demo.task or config.task
-    )
-    session = Session(demo.model, config=config)
+    session = Session(demo.model, config=_make_config(demo, config))
     judge = _GoalTracker(demo, session)
     episodes = None if demo.task is None else _EpisodeKeeper(demo, demo.task, session)
     with ExitStack() as stack:
@@ -194,12 +190,7 @@ def run_demo(
             failures = judge.list_failures(people.list_failures(), is_over)
             left_s = timeout_s - (now_ns - began_ns) * 1e-9
             if episodes is not None:
-                if not episodes.update(people, is_over, failures):
-                    return False
-                if not episodes.is_complete and left_s > ATTEMPT_S:
-                    people.restart(left_s)
-                    return False
-                return True
+                return episodes.update(people, is_over, failures, left_s)
             if failures and len(failed_attempts) < MAX_ATTEMPTS - 1 and left_s > ATTEMPT_S:
                 failed_attempts.append(f"begun again at {now_ns * 1e-9:.0f} s: {'; '.join(failures)}")
                 judge.restart()
@@ -222,10 +213,9 @@ def run_demo(
     # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify_recording(recording)
     problems = judge.list_problems()
-    if episodes is not None:
-        problems = episodes.list_problems()
-    elif problems or not demo.goals:
+    if problems or not demo.goals:
         problems = _list_problems(demo, reports, handovers, timeout_s) + problems
+    problems = problems if episodes is None else episodes.list_problems()
     problems = ["interrupted before its end"] if interrupted else [*problems, *camera_problems]
     problems += filter(None, (session.recording_fault, verification if verified is False else ""))
     return DemoResult(
@@ -254,6 +244,12 @@ def run_demo(
         streams={name: r.streams for name, r in watched.items() if r.streams},
         episodes=() if episodes is None else tuple(episodes.verdicts),
     )
+
+
+def _make_config(demo: Demo, config: SessionConfig) -> SessionConfig:
+    """Return the configuration of the session of a demo."""
+    cameras, task = (*demo.cameras, *config.cameras), demo.task or config.task
+    return dataclasses.replace(config, anchors=demo.anchors, anchor_sizes=demo.anchor_sizes, cameras=cameras, task=task)
 
 
 def _open_links(stack: ExitStack, session: Session, n: int, profile: str, seed: int) -> list[str]:
@@ -365,14 +361,17 @@ class _EpisodeKeeper:
         successes = self.verdicts.count(EpisodeAction.SUCCESS)
         return successes >= self._task.wanted or len(self.verdicts) - successes >= MAX_ATTEMPTS
 
-    def update(self, people: _EmulatorGroup, is_over: bool, failures: list[str]) -> bool:
-        """Begin an episode once all people work, and give its verdict when they are done.
+    def update(self, people: _EmulatorGroup, is_over: bool, failures: list[str], left_s: float) -> bool:
+        """Begin an episode once all people work, and give its verdict when they are done; then others begin anew.
 
-        Returns True after that, when the session has the verdict: an episode whose people leave before has none.
+        Returns True after the last one. People leave when the session has the verdict: before, it would be unknown.
         """
         if self._is_judged:
             self._is_judged = False
-            return True
+            if self.is_complete or left_s < ATTEMPT_S:
+                return True
+            people.restart(left_s)
+            return False
         if not self._runs and people.are_working():
             self._runs, self._began_s = True, self._session.clock() * 1e-9
             self._session.post(Episode(0, EpisodeAction.START, f"{self._giver} to {self._receiver}", countdown_ns=0))
