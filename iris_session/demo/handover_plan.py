@@ -69,7 +69,7 @@ PLACE_COST: Final = 2.5
 ASIDE_COST: Final = 2.0
 
 
-class Grasp(NamedTuple):
+class ObjectGrasp(NamedTuple):
     """A grasp: `T_object_grip`, grip frame as of `Gripper`, and the width between the pads [m]."""
 
     T_object_grip: PoseTuple
@@ -79,7 +79,7 @@ class Grasp(NamedTuple):
 class GivenGrasp(NamedTuple):
     """A grasp that the giver reaches: with joint positions at the end of each movement up to the lift."""
 
-    grasp: Grasp
+    grasp: ObjectGrasp
     q: Floats
 
 
@@ -89,7 +89,7 @@ class Meeting(NamedTuple):
     cost: float
     given: GivenGrasp
     T_world_object: PoseTuple
-    taken: Grasp
+    taken: ObjectGrasp
 
 
 def plan_handover(
@@ -205,11 +205,11 @@ class _Planner:
         at = scene.T_world_object
         turn = arm.tip_at_rest[1]
 
-        def rise(grasp: Grasp) -> float:
+        def rise(grasp: ObjectGrasp) -> float:
             """Return -1 for a grasp from above."""
             return _ahead(compose(at, grasp.T_object_grip)[1])[2]
 
-        def cost(grasp: Grasp) -> float:
+        def cost(grasp: ObjectGrasp) -> float:
             return quat_angle(compose(at, self._to_tip(name, grasp))[1], turn) + 4.0 * (1.0 + rise(grasp))
 
         found = []
@@ -238,7 +238,7 @@ class _Planner:
             f"'{name}' does not reach it where it lies: {', or '.join(why) or 'it cannot be taken from above'}"
         )
 
-    def _is_free(self, name: str, ways: Sequence[Sequence[Floats]], at: PoseTuple, grasp: Grasp) -> bool:
+    def _is_free(self, name: str, ways: Sequence[Sequence[Floats]], at: PoseTuple, grasp: ObjectGrasp) -> bool:
         approach, reach, lift = ways
         for q in (*approach[::2], *reach):
             if self._meets(self._scene.find_clash({name: (q, None)}, at, rests=True)):
@@ -250,7 +250,7 @@ class _Planner:
                 return False
         return True
 
-    def _list_grasps(self, name: str) -> list[Grasp]:
+    def _list_grasps(self, name: str) -> list[ObjectGrasp]:
         """Return the grasps of the object for a gripper, each face of each box in turn."""
         opening = self._scene.grippers[name].opening
         grasps = []
@@ -269,7 +269,7 @@ class _Planner:
                     p = [0.0, 0.0, 0.0]
                     p[approach], p[along] = -side * depth, end
                     q = _make_frame(approach, side, closing, turn)
-                    grasps.append(Grasp(compose(T_object_box, ((p[0], p[1], p[2]), q)), width))
+                    grasps.append(ObjectGrasp(compose(T_object_box, ((p[0], p[1], p[2]), q)), width))
         if not grasps:
             raise ConfigError(
                 f"the gripper of '{name}' opens to {1e3 * opening:.0f} mm; it is {1e3 * narrowest:.0f} mm wide, and "
@@ -284,7 +284,7 @@ class _Planner:
         give, take = (self._scene.grippers[name].T_tip_grip for name in self._names)
         at_rest = self._receiver.tip_at_rest[1]
         grasps = self._list_grasps(self._names[1])
-        turns: list[tuple[float, Quat, GivenGrasp, Grasp]] = []
+        turns: list[tuple[float, Quat, GivenGrasp, ObjectGrasp]] = []
         for one, (q_grip, aside) in itertools.product(given, self._list_turns()):
             turned = quat_angle(quat_mul(q_grip, quat_conj(give[1])), self._giver.find_tip(one.q)[1])
             if turned > MAX_TURN:
@@ -384,7 +384,7 @@ class _Planner:
             lift=LIFT_M,
         )
 
-    def _make_arm_plan(self, name: str, grasp: Grasp) -> ArmPlan:
+    def _make_arm_plan(self, name: str, grasp: ObjectGrasp) -> ArmPlan:
         gripper = self._scene.grippers[name]
         return ArmPlan(
             robot=name,
@@ -395,7 +395,7 @@ class _Planner:
             width=grasp.width,
         )
 
-    def _to_tip(self, name: str, grasp: Grasp) -> PoseTuple:
+    def _to_tip(self, name: str, grasp: ObjectGrasp) -> PoseTuple:
         """Return `T_object_tip` of a grasp."""
         return compose(grasp.T_object_grip, inverse(self._scene.grippers[name].T_tip_grip))
 
@@ -405,7 +405,7 @@ class _Planner:
     def _back_off(self, name: str, T_world_tip: PoseTuple) -> PoseTuple:
         return compose(T_world_tip, (self._compute_back(name), IDENTITY_QUAT))
 
-    def _carry(self, name: str, q: Floats, grasp: Grasp) -> PoseTuple:
+    def _carry(self, name: str, q: Floats, grasp: ObjectGrasp) -> PoseTuple:
         """Return where the object is in the gripper of an arm with these joints."""
         return compose(self._scene.arms[name].find_tip(q), inverse(self._to_tip(name, grasp)))
 

@@ -1,4 +1,4 @@
-"""What a plan of a handover is checked in: arms with their measured grippers, the paths of their tips, and clashes.
+"""Scene in which a plan of a handover is checked: arms with measured grippers, paths of their tips, and clashes.
 
 Grippers are measured in the simulated scene, opened and closed: how their fingers move, how wide they open, where they
 touch. A path is followed by the inverse kinematics of the session, from joint positions to joint positions, so it ends

@@ -234,7 +234,7 @@ def run_demo(
         },
         late_tick_share=status.lateness.get("late_share", 0.0),
         lateness_ms_p99=round(status.lateness.get("p99_ms", 0.0), 3),
-        real_time_factor=round(status.sim_time / run_s, 3),
+        real_time_factor=round(status.sim_time / run_s if episodes is None else episodes.pace, 3),
         state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items() if math.isfinite(r.age_ms_p99)},
         problems=tuple(problems),
         notes=(*demo.notes, *failed_attempts, *camera_notes, *(() if episodes is None else episodes.notes)),
@@ -344,6 +344,7 @@ class _EpisodeKeeper:
     Attributes:
         verdicts: Of the episodes so far.
         notes: Why some are failures.
+        pace: Simulated time per second, from the reset of the scene to the last verdict.
     """
 
     def __init__(self, demo: Demo, task: TaskSpec, session: Session) -> None:
@@ -353,7 +354,8 @@ class _EpisodeKeeper:
         self.verdicts: list[str] = []
         self.notes: list[str] = []
         self._runs = self._is_judged = False
-        self._began_s = 0.0
+        self._began_s = self._reset_s = 0.0
+        self.pace = 0.0
 
     @property
     def is_complete(self) -> bool:
@@ -378,6 +380,8 @@ class _EpisodeKeeper:
         if not (is_over or failures):
             return False
         problems = failures or self._judge()
+        now_s, sim_s = self._session.clock() * 1e-9, self._session.stepper.core.world.view().sim_time
+        self.pace, self._reset_s = sim_s / (now_s - self._reset_s), now_s
         verdict = EpisodeAction.FAILURE if problems else EpisodeAction.SUCCESS
         self.verdicts.append(verdict)
         self.notes += [f"episode {len(self.verdicts)}: {problem}" for problem in problems]

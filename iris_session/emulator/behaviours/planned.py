@@ -29,7 +29,7 @@ OFFERED_M, OFFERED_RAD = 0.05, 0.35
 
 
 class PlannedTask(HandoverTask):
-    """What giver and receiver have in common: they know fingers and grasps of both from the plan."""
+    """Base of giver and receiver: they know fingers and grasps of both from the plan."""
 
     plan: HandoverPlan
     mine: ArmPlan
