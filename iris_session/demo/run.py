@@ -269,7 +269,7 @@ class _GoalTracker:
         self._name = play.name
         self._session = session
         self._monitors = tuple(GoalMonitor(goal) for goal in play.goals)
-        self._objects = () if play.goals else play.objects
+        self._objects = () if play.goals or play.task is not None else play.objects
         self._began_s, self._is_given = 0.0, False
         self._began = False
         self._finished_s: float | None = None
