@@ -287,7 +287,7 @@ def _write(
     seconds: list[float] = []
     closed: list[float] = []
     total_s = draw_s = encode_s = close_s = 0.0
-    say(f"episode {first + 1} of {len(plan.episodes)}")
+    say(f"{first} of {len(plan.episodes)} episodes")
     with closing(_make_all(tasks, options.jobs)) as episodes:
         for task, made in episodes:
             where = f"{Path(task.planned.path).name}: episode {task.episode.number}"
@@ -306,7 +306,7 @@ def _write(
             seconds.append(made.shares.cpu_s + closed[-1])
             total_s, close_s = total_s + made.shares.total_s + closing_s, close_s + closing_s
             draw_s, encode_s = draw_s + made.shares.draw_s, encode_s + made.shares.encode_s
-            say(f"episode {task.index + 2} of {len(plan.episodes)}")
+            say(f"{task.index + 1} of {len(plan.episodes)} episodes")
     writer.finish()
     rest_s = total_s - draw_s - encode_s - close_s
     shares = {"resimulate": rest_s, "draw": draw_s, "encode": encode_s, "close": close_s}
