@@ -38,8 +38,8 @@ export class DesktopDevice {
   /** Sources whose dead-man was seen let go since dead-men were void. */
   private readonly ready = new Set<string>();
   private gripper: number | null = null;
-  /** What the gripper was told last: 0 open, 1 closed. */
-  lastGripper = 0;
+  /** What the gripper was told last: 0 open, 1 closed; null: it was stopped on its way. */
+  lastGripper: number | null = 0;
   private wasToggled = false;
 
   constructor(private readonly send: (sample: SampleInput) => void) {}
@@ -116,7 +116,7 @@ export class DesktopDevice {
   private readGripper({ close, open, gripper }: Motion, isFlipped: boolean): void {
     if (gripper !== null) this.gripper = gripper;
     else if (close !== open) this.gripper = close ? 1 : 0;
-    else if (isFlipped) this.gripper = 1 - this.lastGripper;
+    else if (isFlipped) this.gripper = 1 - (this.lastGripper ?? 0);
     this.lastGripper = this.gripper ?? this.lastGripper;
   }
 

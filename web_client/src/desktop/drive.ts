@@ -35,6 +35,8 @@ export interface Drive {
   element: HTMLElement;
   /** The robot that is driven, empty for none. */
   readonly robot: string;
+  /** A dead-man is held, and the robot does not follow. */
+  readonly isHeldBack: boolean;
   /** Drive a robot from now on. */
   begin(robot: string): void;
   /** Drive a robot, or stop when it is the one that is driven. */
@@ -59,6 +61,7 @@ export function makeDrive(
   let timer = 0;
   let ticked_ms = 0;
   let engaged_ms = Number.NEGATIVE_INFINITY;
+  let isHeldBack = false;
 
   const robot = h("strong");
   const mark = h("span", { class: "tag" });
@@ -86,7 +89,8 @@ export function makeDrive(
   const keys = h("dl", { class: "facts keys" }, ...KEY_WORDS.map(([key, action]) => h("div", {}, h("dt", {}, key), h("dd", {}, action))));
   const pads = h("p", { class: "note" }, "Gamepad: hold the right shoulder button; sticks, cross, A closes, B opens.");
   const more = h("details", { class: "more" }, h("summary", {}, "Speed, keys, other devices"), h("label", { class: "field" }, h("span", {}, "Speed"), speed, speedText), keys, handle, h("label", { class: "field" }, h("span", {}, "Relative to"), relativeTo), pads, connected, connect);
-  const gripper = h("label", { class: "field" }, h("span", {}, "Gripper"), h("small", {}, "open"), slider, h("small", {}, "closed"));
+  const unfinished = h("small", { class: "unfinished", role: "status" });
+  const gripper = h("div", {}, h("label", { class: "field" }, h("span", {}, "Gripper"), h("small", {}, "open"), slider, h("small", {}, "closed")), unfinished);
   const element = h(
     "section",
     { class: "drive card", hidden: true, aria: { label: "Driving from the desk" } },
@@ -126,7 +130,7 @@ export function makeDrive(
       isPaused: state.pause !== null,
       isHolder: state.heldBy(state.selfId).includes(device.robot),
     };
-    const { isEngaged: wasEngaged, mustLetGo } = device;
+    const { isEngaged: wasEngaged, mustLetGo, lastGripper } = device;
     if (!device.tick(intents, heading, metresPerSecond, situation, now)) {
       warn("Driving has ended: you do not hold the robot any more.");
       stop();
@@ -136,7 +140,20 @@ export function makeDrive(
     } else if (device.mustLetGo !== mustLetGo) {
       show();
     }
-    if (!inputs.isSliding) slider.value = String(100 * device.lastGripper);
+    const wasHeldBack = isHeldBack;
+    isHeldBack = device.robot !== "" && (device.mustLetGo || isHeldBySession(now));
+    if (inputs.isGripperAsked(now) && (isHeldBack || !device.isEngaged)) {
+      inputs.endSlide();
+      device.lastGripper = null;
+    }
+    if (isHeldBack !== wasHeldBack || device.lastGripper !== lastGripper) state.touch();
+    if (!inputs.isSliding) slider.value = String(100 * (device.lastGripper ?? 0.5));
+  }
+
+  /** Return whether the session holds the robot though the clutch is closed. */
+  function isHeldBySession(now: number): boolean {
+    const reason = state.feedback.get(device.robot)?.hold_reason ?? "";
+    return device.isEngaged && reason !== "" && now - engaged_ms > ANSWER_MS;
   }
 
   function start(name: string): void {
@@ -153,6 +170,7 @@ export function makeDrive(
     clearInterval(timer);
     device.disarm(nowMs());
     inputs.stop();
+    isHeldBack = false;
     state.touch();
   }
 
@@ -167,7 +185,9 @@ export function makeDrive(
     setText(robot, `Driving ${device.robot}`);
     const { hold_reason: reason = "", limits = [] } = state.feedback.get(device.robot) ?? {};
     gripper.hidden = state.session?.robots.find(({ name }) => name === device.robot)?.gripper === false;
-    const isHeld = !device.isEngaged || (reason !== "" && nowMs() - engaged_ms > ANSWER_MS);
+    slider.classList.toggle("unknown", device.lastGripper === null);
+    setText(unfinished, device.lastGripper === null ? "not finished: the robot held" : "");
+    const isHeld = !device.isEngaged || isHeldBySession(nowMs());
     setText(mark, isHeld ? "held" : "engaged");
     mark.classList.toggle("good", !isHeld);
     element.classList.toggle("engaged", !isHeld);
@@ -182,6 +202,9 @@ export function makeDrive(
     element,
     get robot() {
       return device.robot;
+    },
+    get isHeldBack() {
+      return isHeldBack;
     },
     begin: (name) => {
       if (device.robot !== name) start(name);

@@ -14,8 +14,8 @@ const METRES_PER_PIXEL = 0.005;
 const WHEEL_PIXELS = [1, 30, 300] as const;
 /** After the focus came back, or a gamepad, the browser may tell an old state of it for this long [ms]. */
 const SETTLE_MS = 200;
-/** An arrow key at the slider of the gripper holds the dead-man for this long [ms]. */
-const SLIDE_MS = 500;
+/** After the slider of the gripper is let go, or moved by a key, the gripper has this long to get there [ms]. */
+const FINISH_MS = 1500;
 
 export interface InputEvents {
   /** The dead-man is void: `reason` in words for people. */
@@ -53,8 +53,10 @@ export class DesktopInputs {
   private readonly pull: Pull | null;
   /** A pointer holds the slider. */
   isSliding = false;
-  /** An arrow key has moved the slider: it counts as held until then [ms]. */
-  private slidUntil_ms = 0;
+  /** The slider was let go, or moved by a key: the gripper goes on until then [ms]. */
+  private finishUntil_ms = 0;
+  /** The robot has held since the pointer took the slider: then it does not go on. */
+  private isSlideVoid = false;
 
   constructor(
     { handle, slider, handles }: Surfaces,
@@ -97,9 +99,10 @@ export class DesktopInputs {
     handle.addEventListener("pointerup", (event) => this.endDrag(event), options);
     handle.addEventListener("pointercancel", (event) => this.endDrag(event), options);
     handle.addEventListener("wheel", (event) => this.turnWheel(event), { ...options, passive: false });
-    this.slider.addEventListener("pointerdown", () => (this.isSliding = true), options);
-    for (const type of ["pointerup", "pointercancel"] as const) window.addEventListener(type, () => (this.isSliding = false), options);
-    this.slider.addEventListener("input", () => !this.isSliding && (this.slidUntil_ms = nowMs() + SLIDE_MS), options);
+    this.slider.addEventListener("pointerdown", () => this.beginSlide(), options);
+    window.addEventListener("pointerup", () => this.finishSlide(), options);
+    window.addEventListener("pointercancel", () => (this.isSliding = false), options);
+    this.slider.addEventListener("input", () => !this.isSliding && (this.finishUntil_ms = nowMs() + FINISH_MS), options);
     void this.spaceMouse.reopen().catch(() => undefined); // taken away meanwhile, or in use by another program
   }
 
@@ -115,19 +118,48 @@ export class DesktopInputs {
    */
   read(speed: number, dt: number, now_ms: number, heading: Heading): ReadonlyMap<string, Intent> {
     this.speed = speed;
-    const slides = this.isSliding || now_ms < this.slidUntil_ms;
-    const slid = { ...makeIdle(), clutch: slides, gripper: slides ? Number(this.slider.value) / 100 : null };
     const dragged = { ...makeIdle(), clutch: this.dragging !== null, move: this.drag.take(speed, dt) };
     const inputs = new Map<string, Intent>([
       ["keyboard", readKeys(this.pressed, this.clutchKey.isHeld)],
       ["SpaceMouse", readSpaceMouse(this.spaceMouse.state, now_ms)],
       ["handle", dragged],
-      ["slider", slid],
     ]);
     if (this.pull) inputs.set("gizmo", this.pull.read(heading, speed));
     for (const pad of listPads()) inputs.set(`gamepad ${pad.index} ${pad.id}`, readPad(pad));
+    this.addSlider(inputs, now_ms);
     const isKnown = !this.isAway && !document.hidden && now_ms - this.back_ms > SETTLE_MS;
     return isKnown ? inputs : new Map();
+  }
+
+  /** Whether the slider asks for the gripper: held, or let go a moment ago. */
+  isGripperAsked(now_ms: number): boolean {
+    return this.isSliding || now_ms < this.finishUntil_ms;
+  }
+
+  /** The robot holds: the gripper does not go on once the slider is let go. */
+  endSlide(): void {
+    this.finishUntil_ms = 0;
+    this.isSlideVoid = true;
+  }
+
+  /** Add what the slider asks for: the gripper alone, unless a dead-man of another input is held, which ends what was let go. */
+  private addSlider(inputs: Map<string, Intent>, now_ms: number): void {
+    const isOtherHeld = [...inputs.values()].some(({ clutch }) => clutch);
+    if (isOtherHeld) this.finishUntil_ms = 0;
+    const isAsked = this.isGripperAsked(now_ms);
+    if (isAsked && !isOtherHeld) for (const [source, { clutch }] of inputs) inputs.set(source, { ...makeIdle(), clutch });
+    inputs.set("slider", { ...makeIdle(), clutch: isAsked, gripper: isAsked ? Number(this.slider.value) / 100 : null });
+  }
+
+  private beginSlide(): void {
+    this.isSliding = true;
+    this.isSlideVoid = false;
+    this.finishUntil_ms = 0;
+  }
+
+  private finishSlide(): void {
+    if (this.isSliding && !this.isSlideVoid) this.finishUntil_ms = nowMs() + FINISH_MS;
+    this.isSliding = false;
   }
 
   private release(reason: string): void {
@@ -139,7 +171,7 @@ export class DesktopInputs {
     this.pressed.clear();
     this.drag.clear();
     this.isSliding = false;
-    this.slidUntil_ms = 0;
+    this.finishUntil_ms = 0;
     this.pull?.letGo();
     this.dragging = null;
     this.handle.classList.remove("held");

@@ -36,7 +36,8 @@ import { type HeadsetControls, makeHeadsetControls } from "../xr/controls.ts";
 const ROLES = ["director", "operator", "observer"] as const;
 const STATUS_PERIOD_MS = 1000;
 const NOTICE_MS = 8000;
-const DEFAULT_NAME = "Web";
+/** Names that pages give themselves. */
+const DEFAULT_NAME = /^Web( \d\d)?$/;
 const SOFTWARE = "iris-session web client";
 /** What is remembered of this browser: choices of the person, no secrets. */
 const STORAGE_KEY = "iris-session.page";
@@ -61,7 +62,11 @@ export interface PageHandle {
 export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const state = new PageState(client);
   const baseUrl = location.origin;
-  const remembered = recall<Remembered>(STORAGE_KEY, { name: DEFAULT_NAME, role: "", roles: [], isAsked: false });
+  const remembered = recall<Remembered>(STORAGE_KEY, { name: "", role: "", roles: [], isAsked: false });
+  if (remembered.name === "" || remembered.name === "Web") {
+    remembered.name = `Web ${10 + Math.floor(90 * Math.random())}`;
+    remember(STORAGE_KEY, remembered);
+  }
   const notices = h("div", { class: "notices", role: "status", aria: { live: "polite" } });
   const show = (text: string, level: EventLevel): void => {
     const notice = h("div", { class: `notice ${level}` }, text);
@@ -139,7 +144,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const estop = makeEstop(state, actions, () => drive.robot !== "");
   const pause = makePauseBanner(state, actions);
   const self = makeSelf(state, listRoles, joinAs);
-  const welcome = makeWelcome(state, () => !remembered.isAsked && remembered.name === DEFAULT_NAME, listRoles, (name, role) => {
+  const welcome = makeWelcome(state, () => !remembered.isAsked && DEFAULT_NAME.test(remembered.name), listRoles, (name, role) => {
     remembered.isAsked = true;
     remember(STORAGE_KEY, remembered);
     if (name) joinAs(name, role);

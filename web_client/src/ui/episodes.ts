@@ -43,7 +43,7 @@ export function episodeAdvice(now: EpisodeNow | null, now_ns: number, leader: st
     case "running":
       return leader ? `is recorded, led by ${leader}` : "is recorded";
     case "confirm":
-      return `discard it? Ask again within ${left} s`;
+      return `discard it? Press Discard again within ${left} s`;
     case "left":
       return `${leader || "its leader"} is disconnected: take it over within ${left} s`;
     case "closing":
@@ -78,14 +78,16 @@ export function makeEpisodeStrip(state: PageState, actions: Actions): EpisodeStr
   const title = h("strong");
   const advice = h("span", { aria: { live: "polite" } });
   const withKey = (one: HTMLButtonElement, key: string): HTMLButtonElement => {
-    one.append(h("span", { class: "key" }, key));
+    one.append(h("kbd", { class: "key", aria: { hidden: "true" } }, key));
+    one.setAttribute("aria-keyshortcuts", key);
     return one;
   };
   const start = withKey(act("Start", "start", "small primary"), "1");
   const verdicts = [withKey(act("Success", "success", "small good"), "1"), withKey(act("Failure", "failure"), "2")];
   const discardText = h("span");
   const discard = button("", () => send("discard"), { class: "small" });
-  discard.append(discardText, h("span", { class: "key" }, "3"));
+  discard.append(discardText);
+  withKey(discard, "3");
   const again = withKey(act("Again", "rerecord"), "4");
   const [stop, takeOver] = [act("Stop", "stop"), act("Take over", "take_over")];
   const controls = h("div", { class: "controls" }, start, ...verdicts, discard, again, stop, takeOver);

@@ -56,7 +56,7 @@ export function makeEstop(state: PageState, actions: Actions, isDriving: () => b
   document.addEventListener(
     "keydown",
     (event) => {
-      if (event.key !== " " || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
+      if (stop.disabled || event.key !== " " || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
       if (!event.shiftKey && (isDriving() ? takesText(event.target) : takesSpace(event.target))) return;
       event.preventDefault();
       press("key in the dashboard");
@@ -77,6 +77,7 @@ export function makeEstop(state: PageState, actions: Actions, isDriving: () => b
     update: () => {
       const isStopped = state.session?.estop ?? false;
       stop.classList.toggle("active", isStopped);
+      stop.disabled = state.phase.ended && !state.isReady;
       stop.title = !state.isReady
         ? "Not connected: use the stop at the robot"
         : isStopped
@@ -86,7 +87,8 @@ export function makeEstop(state: PageState, actions: Actions, isDriving: () => b
       if (banner.hidden === isStopped) banner.hidden = !isStopped;
       if (!isStopped) return;
       const newest = state.status?.stops[0];
-      const who = newest?.name ? ` by ${newest.name}` : "";
+      const name = newest?.participant ? state.nameOf(newest.participant, newest.name) : newest?.name;
+      const who = name ? ` by ${name}` : "";
       setText(text, `Stopped${who}${newest?.reason ? `: ${newest.reason}` : ""}`);
       setText(note, !state.isReady ? "Before the connection was lost." : state.isDirector ? "All robots hold." : "All robots hold. A director can clear it.");
       clear.hidden = !state.isDirector || !state.isReady;

@@ -98,15 +98,11 @@ export function makeEventsPanel(state: PageState): Panel {
   const section = makeSection("events", "Events", h("div", {}, log, empty));
   const rows = new KeyedList<PageState["log"][number]>(
     list,
-    (entry) => ({
-      element: h(
-        "li",
-        { class: entry.level },
-        h("span", { class: "time" }, formatSessionTime(entry.session_time)),
-        h("span", {}, entry.text),
-      ),
-      update: () => undefined,
-    }),
+    (entry) => {
+      const text = h("span", {}, entry.text);
+      const element = h("li", { class: entry.level }, h("span", { class: "time" }, formatSessionTime(entry.session_time)), text);
+      return { element, update: (item) => setText(text, item.text) };
+    },
     empty,
   );
   return {

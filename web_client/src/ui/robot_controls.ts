@@ -1,11 +1,14 @@
 // What this person may do with one robot: take, wait, drive, release, assign. For the list and for the menu in the picture.
 
+import type { Target } from "../protocol/messages.g.ts";
 import type { Drive } from "../desktop/drive.ts";
 import type { Actions } from "./actions.ts";
 import { button, h, setLabel, setOptions, setText, setValue } from "./dom.ts";
 import type { PageState } from "./state.ts";
 
 const FREE = "";
+/** The last sample arrives before the robot is released: the session may take a request first [ms]. */
+const LAST_SAMPLE_MS = 50;
 /** Roles that drive robots. */
 const DRIVERS = ["operator", "agent", "leader", "director"];
 
@@ -28,7 +31,11 @@ export function makeRobotControls(robot: () => string, state: PageState, actions
     "Release",
     () => {
       const lease = state.lease(robot());
-      if (lease) actions.release([[robot(), lease.lease_version, "robot"]]);
+      if (!lease) return;
+      const isDriven = drive.robot === robot();
+      if (isDriven) drive.toggle(robot());
+      const target: Target = [robot(), lease.lease_version, "robot"];
+      setTimeout(() => actions.release([target]), isDriven ? LAST_SAMPLE_MS : 0);
     },
     { class: "small" },
   );

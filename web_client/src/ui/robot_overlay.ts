@@ -42,6 +42,16 @@ interface LabelRow extends LabelBox {
   isSeen: boolean;
 }
 
+const YOU_DRIVE = "you drive";
+
+/** Return what the label of the robot says that this person drives. */
+export function drivenWords(state: PageState, isHeldBack: boolean): string {
+  if (!state.isReady) return state.phase.ended ? "ended" : "not connected";
+  if (state.session?.estop) return "stopped";
+  if (state.pause) return "paused";
+  return isHeldBack || state.phase.stalled ? "held" : YOU_DRIVE;
+}
+
 /** Return the labels that would cover others, and are left out for them. */
 export function findCrowded<T extends LabelBox>(labels: readonly T[]): Set<T> {
   const shown: T[] = [];
@@ -82,6 +92,7 @@ export function makeRobotOverlay(
   /** The robot with the handles, empty for none. */
   let chosen = "";
   let holding: number | null = null;
+  let isHeldBack = false;
   let pressed = { pointer: -1, x: 0, y: 0 };
   /** Labels are where they were when they were thinned out, and when that was. */
   let [isThinned, thinned_ms] = [true, 0];
@@ -112,8 +123,9 @@ export function makeRobotOverlay(
       const isMine = state.heldBy(state.selfId).includes(name);
       dot.style.background = holder === "" ? "transparent" : participantColor(holder);
       dot.classList.toggle("hollow", holder === "");
-      setText(who, drive.robot === name ? "you drive" : isMine ? "you" : holder === "" ? "free" : state.nameOf(holder));
-      element.classList.toggle("driven", drive.robot === name);
+      const isDriven = drive.robot === name;
+      setText(who, isDriven ? drivenWords(state, drive.isHeldBack) : isMine ? "you" : holder === "" ? "free" : state.nameOf(holder));
+      element.classList.toggle("driven", isDriven && drivenWords(state, drive.isHeldBack) === YOU_DRIVE);
     };
     return { element, update };
   }
@@ -254,6 +266,11 @@ export function makeRobotOverlay(
       rows.update(robots, ({ name }) => name);
       menu.update();
       if (chosen !== before) gizmo.letGo();
+      if (isHeldBack !== drive.isHeldBack) {
+        isHeldBack = drive.isHeldBack;
+        gizmo.setHeldBack(isHeldBack);
+        view.touchOverlay();
+      }
       thinOut();
       if (chosen !== before || labels.length !== length) view.touchOverlay();
     },

@@ -103,6 +103,7 @@ function describe(
   if (state.session?.estop) parts.push("stopped");
   else if (state.pause) parts.push("paused");
   else if (WAITS_FOR_HOLDER.includes(reason) && state.heldBy(state.selfId).includes(robot)) parts.push(state.followsPoses(robot) ? "ready: drag the arrows at its gripper" : "ready: a program or a glove moves its joints");
+  else if (reason === HoldReason.DISCONNECTED && lease && lease.expires_ns > 0) parts.push("holds");
   else if (reason && lease?.holder) parts.push(`holds: ${holdReasonWords(reason, state.heldBy(state.selfId).includes(robot))}`);
   else if (report?.state && report.state !== "hold") parts.push("driven");
   if (lease && lease.expires_ns > 0) parts.push(graceWords(lease.expires_ns, state.sessionTime()));

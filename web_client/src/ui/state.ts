@@ -20,11 +20,9 @@ import {
 import type { WorkerClient } from "../core/page_client.ts";
 import type * as wire from "../protocol/messages.g.ts";
 import type { Mode } from "./stream_choices.ts";
-import { type EventLevel, eventWords } from "./words.ts";
+import { type EventLevel, eventWords, formatSessionTime } from "./words.ts";
 
 const MAX_EVENTS = 300;
-/** Newest lines of the history among which the line about a session that stands still is counted on. */
-const MAX_STALL_LINES = 30;
 /** Behind the session's newest frame: more than frames need on their way. */
 const BEHIND_MS = 2000;
 /** Frames of a stream, one of which comes here at least, by class (docs/protocol.md). In class `none` none comes. */
@@ -35,8 +33,10 @@ export interface LogEntry {
   session_time: number;
   text: string;
   level: EventLevel;
-  /** Of the line about a session that stood still: how often it did. Else 0. */
-  stalls: number;
+  /** Of a line that counts on what happens again: its kind and participant. Else empty. */
+  key: string;
+  /** How often it happened. */
+  count: number;
 }
 
 export interface ConsentAsked {
@@ -126,6 +126,7 @@ export class PageState {
       this.touch();
     });
     client.on("welcome", ({ welcome }) => {
+      if (this.welcome !== null && this.welcome.session_id !== welcome.session_id) this.log.length = 0;
       this.welcome = welcome;
       this.feedback.clear();
       this.consents = [];
@@ -218,10 +219,10 @@ export class PageState {
     return this.session?.participants.find((participant) => participant.id === id);
   }
 
-  /** Return the name of a participant, with the id where another present one has the same. */
-  nameOf(id: string): string {
+  /** Return the name of a participant, with the id where another present one has the same. `before`: of one that is not known. */
+  nameOf(id: string, before = id): string {
     if (id === HOST) return "the session";
-    const name = this.participant(id)?.name ?? this.formerNames.get(id) ?? id;
+    const name = this.participant(id)?.name ?? this.formerNames.get(id) ?? before;
     const isShared = this.session?.participants.some((other) => other.id !== id && other.name === name) ?? false;
     return isShared ? `${name} (${id})` : name;
   }
@@ -282,10 +283,20 @@ export class PageState {
 
   /** Add a line about a session that stands still, or did. A busy machine does so again and again: that is one line. */
   private addStall(session_time: number, text: string, isNext: boolean): void {
-    const at = this.log.slice(0, MAX_STALL_LINES).findIndex(({ stalls }) => stalls > 0);
-    const before = at < 0 ? 0 : this.log.splice(at, 1)[0]!.stalls;
-    const stalls = before === 0 || isNext ? before + 1 : before;
-    this.addLog(session_time, stalls > 1 ? `${text} (${stalls} times)` : text, "warning", stalls);
+    const before = this.findLine("stall")?.count ?? 0;
+    const count = before === 0 || isNext ? before + 1 : before;
+    this.countOn("stall", session_time, count > 1 ? `${text} (${count} times)` : text, count);
+  }
+
+  /** Add a line, or change the one with the same key where it is. */
+  private countOn(key: string, session_time: number, text: string, count: number): void {
+    const line = this.findLine(key);
+    if (!line) this.addLog(session_time, text, "warning", key, count);
+    else Object.assign(line, { text: count > 1 ? `${text}, last at ${formatSessionTime(session_time)}` : text, count });
+  }
+
+  private findLine(key: string): LogEntry | undefined {
+    return this.log.find((entry) => entry.key === key);
   }
 
   private takeEvent({ session_time, body }: Filled<wire.Event>): void {
@@ -306,6 +317,7 @@ export class PageState {
     const words = eventWords(body, (id) => this.nameOf(id));
     if (!words) return;
     if (body.event === "gap" && body.kind === "stalled") this.addStall(session_time, words.text, false);
+    else if (body.event === "samples_rejected") this.countOn(`rejected ${body.participant} ${body.device} ${body.reason}`, session_time, words.text, body.count);
     else this.addLog(session_time, words.text, words.level);
   }
 
@@ -314,8 +326,8 @@ export class PageState {
     return Number.isNaN(this.sessionOffset_ms) ? 0 : Math.round(1e6 * (nowMs() + this.sessionOffset_ms));
   }
 
-  private addLog(session_time: number, text: string, level: EventLevel, stalls = 0): void {
-    this.log.unshift({ seq: this.nextSeq++, session_time, text, level, stalls });
+  private addLog(session_time: number, text: string, level: EventLevel, key = "", count = 0): void {
+    this.log.unshift({ seq: this.nextSeq++, session_time, text, level, key, count });
     this.log.length = Math.min(this.log.length, MAX_EVENTS);
   }
 }

@@ -117,6 +117,11 @@ export class Gizmo {
     this.place(this.p_world, this.q_world, this.mover.camera);
   }
 
+  /** Draw the handle that is held grey: the robot does not follow it. */
+  setHeldBack(isHeldBack: boolean): void {
+    for (const controls of [this.mover, this.turner]) controls.setColors("#ff0000", "#00ff00", "#0000ff", isHeldBack ? "#8a8f99" : "#ffff00");
+  }
+
   /** Set the way from the gripper to where it is dragged, in the world: `move` [m] or `turn` [rad], the other one zero. */
   readWay(move: [number, number, number], turn: [number, number, number]): void {
     move.fill(0);

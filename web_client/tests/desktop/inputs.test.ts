@@ -193,16 +193,47 @@ it("a SpaceMouse that comes back with its button held has to be let go", async (
   expect(tick().clutch).toBe(false);
 });
 
-it("the slider moves the gripper alone, while it is held", () => {
+it("the slider moves the gripper alone, while it is held and a moment longer", () => {
   slider.value = "60";
   expect(tick()).toMatchObject({ clutch: false });
   slider.dispatchEvent(new Event("pointerdown"));
   expect(tick()).toMatchObject({ clutch: true, gripper: 0.6, twist: [0, 0, 0, 0, 0, 0] });
+  pads = [{ ...makePad(false), axes: [1, -1, 1, 1] }]; // its button is not held
+  expect(tick().twist).toEqual([0, 0, 0, 0, 0, 0]);
+  dispatch("pointerup", NONE);
+  expect(tick(1400)).toMatchObject({ clutch: true, gripper: 0.6, twist: [0, 0, 0, 0, 0, 0] });
+  expect(tick(200).clutch).toBe(false);
+  slider.dispatchEvent(new Event("input")); // an arrow key
+  expect(tick(1400).clutch).toBe(true);
+  expect(tick(200).clutch).toBe(false);
+});
+
+it("a gripper that finishes ends with the focus, another input, or a hold, and does not begin anew", () => {
+  const slide = (): boolean => {
+    slider.dispatchEvent(new Event("pointerdown"));
+    tick();
+    dispatch("pointerup", NONE);
+    return tick().clutch === true;
+  };
+  expect(slide()).toBe(true);
+  dispatch("blur");
+  expect(tick().clutch).toBe(false);
+  dispatch("focus");
+  expect(tick(500).clutch).toBe(false);
+  expect(slide()).toBe(true);
+  handles.isHeld = true;
+  expect(tick(51)).toMatchObject({ clutch: true, twist: [0, 0, expect.closeTo(0.1), 0, 0, 0] });
+  handles.isHeld = false;
+  expect(tick().clutch).toBe(false);
+  expect(slide()).toBe(true);
+  inputs.endSlide();
+  expect(tick().clutch).toBe(false);
+  slider.dispatchEvent(new Event("pointerdown"));
+  tick();
+  inputs.endSlide();
+  expect(tick().clutch).toBe(true); // as long as it is held
   dispatch("pointerup", NONE);
   expect(tick().clutch).toBe(false);
-  slider.dispatchEvent(new Event("input")); // an arrow key
-  expect(tick(400).clutch).toBe(true);
-  expect(tick(200).clutch).toBe(false);
 });
 
 it("handles that are held when the focus is lost are let go, and do not count when it is back", () => {

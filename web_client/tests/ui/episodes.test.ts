@@ -39,7 +39,7 @@ describe("words", () => {
   test("every state has its advice", () => {
     const advice = (state: string, verdict = ""): string => episodeAdvice({ ...NOW, state, verdict }, 1e9, "ann");
     expect(advice("running")).toBe("is recorded, led by ann");
-    expect(advice("confirm")).toBe("discard it? Ask again within 2 s");
+    expect(advice("confirm")).toBe("discard it? Press Discard again within 2 s");
     expect(advice("left")).toBe("ann is disconnected: take it over within 2 s");
     expect(advice("closing")).toBe("robots hold: was it a success? 2 s");
     expect(advice("closing", "success")).toBe("success: the scene is made ready");

@@ -68,6 +68,28 @@ test("a frame has an age until its stream is forgotten", () => {
   expect(state.ageOf("room")).toBeUndefined();
 });
 
+test("events of the session before are gone when another one begins", () => {
+  const sayWelcome = (session_id: string): unknown => say({ type: "welcome", welcome: { session_id } });
+  sayWelcome("a");
+  state.note("old");
+  sayWelcome("a");
+  expect(state.log.length).toBe(1);
+  sayWelcome("b");
+  expect(state.log).toEqual([]);
+});
+
+test("rejected samples of one participant and kind are one line that counts up where it is", () => {
+  const sayRejected = (participant: string, count: number): unknown =>
+    say({ type: "inbox", messages: [{ type: "event", session_time: 65e9, body: { event: "samples_rejected", participant, device: "desktop", reason: "stale", count } }] });
+  for (const count of [3, 300, 622]) {
+    sayRejected("p1", count);
+    sayRejected("p2", 1);
+    state.note("between");
+  }
+  expect(state.log.map(({ count }) => count)).toEqual([0, 0, 0, 1, 622]);
+  expect(state.log.at(-1)!.text).toBe("622 samples of p1 (desktop) rejected: stale, last at 1:05.0");
+});
+
 test("a session that stands still again and again is one line with a count", () => {
   const sayMessages = (...messages: object[]): unknown => say({ type: "inbox", messages });
   for (let i = 0; i < 3; i++) {
@@ -76,8 +98,8 @@ test("a session that stands still again and again is one line with a count", () 
     sayMessages({ type: "event", session_time: 1e9 * i, body: { event: "marker_added", participant: "p1", text: "on" } });
     sayMessages({ type: "protocol_fault", code: "recovered", message: "the session steps again" });
   }
-  expect(state.log.map(({ stalls }) => stalls)).toEqual([3, 0, 0, 0]);
-  expect(state.log[0]!.text).toMatch(/steps again \(3 times\)/);
+  expect(state.log.map(({ count }) => count)).toEqual([0, 0, 0, 3]);
+  expect(state.log[3]!.text).toMatch(/steps again \(3 times\)/);
 });
 
 test("an alignment is void once the tracking frame has jumped, until the session has none or one to the new frame", () => {
