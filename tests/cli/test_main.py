@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -39,8 +40,8 @@ def test_every_command_has_help_for_its_options_and_valid_examples(name: str) ->
     examples = [line.strip() for line in text.splitlines() if line.startswith("  iris-session ")]
     assert examples
     for example in examples:
-        words = re.split(r" {2,}|>", example)[0].split()[1:]  # the rest is a comment, or a file
-        PARSERS["iris-session"].parse_args(join_negative_poses([word.strip('"') for word in words]))
+        words = shlex.split(re.split(r" {2,}| >", example)[0])[1:]  # the rest is a comment, or a file
+        PARSERS["iris-session"].parse_args(join_negative_poses(words))
     silent = [action.option_strings for action in PARSERS[name]._actions if action.option_strings and not action.help]
     assert silent == []
 
