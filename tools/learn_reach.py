@@ -8,8 +8,8 @@
    network of two layers in numpy. It is tried at new places, through `RobotEnv`, in a session of its own.
 4. The same with the actions of the episodes exchanged: it must fail, or the trial proves nothing.
 
-A place counts as reached when the tip is within 3 cm of the goal at the end. All of it takes about ten minutes; two
-processes besides, one core. Needs `iris-session[all,env]`.
+A place counts as reached when the tip is within 3 cm of the goal at the end. All of it takes a quarter of an hour.
+Needs `iris-session[all,env]`.
 """
 
 from __future__ import annotations

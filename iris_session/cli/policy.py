@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 HZ: Final = 30.0
 #: A policy that computes is waited for so long; then the command before is repeated, else the robot would hold [s].
 PATIENCE_S: Final = 0.1
+#: After so long without a decision it commands nothing: robots hold, as for everything that has stopped [s].
+STUCK_S: Final = 1.0
 REPORT_S: Final = 1.0
 NO_LEROBOT: Final = (
     "LeRobot is not installed here: make an environment with both, pip install lerobot 'iris-session[env,files]'"
@@ -240,6 +242,8 @@ def drive(env: RobotEnv, policy: LeRobotPolicy, log: RunLog, seconds: float | No
                 found = future.result(PATIENCE_S)
                 future, action = None, action if is_stale else found
                 log.note_policy(time.monotonic() - began_s)
+            if future is not None and time.monotonic() - began_s > STUCK_S:
+                continue
             observation, _, _, lost, info = env.step(action)
             if lost:
                 return True

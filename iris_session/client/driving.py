@@ -32,6 +32,10 @@ class ClientDriving(ABC):
 
     @property
     @abstractmethod
+    def ready(self) -> bool: ...
+
+    @property
+    @abstractmethod
     def feedback(self) -> dict[str, Feedback]: ...
 
     @abstractmethod
@@ -82,7 +86,7 @@ class ClientDriving(ABC):
         goal = to_pose("pose", pose)
         if not all(map(math.isfinite, (*goal.p, *goal.q, gripper or 0.0))):
             raise InvalidMessageError(f"pose {goal.p}, {goal.q} and gripper {gripper} must be finite numbers")
-        if self.lease_version(robot) is None:
+        if self.ready and self.lease_version(robot) is None:
             raise ClientError(f"we do not hold the robot {robot!r}: acquire it first")
         end_ns = self.session_now_ns() + int(timeout_s * 1e9)
         there_ns: int | None = None

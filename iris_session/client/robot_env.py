@@ -85,6 +85,8 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[Any]]):
         self.robots = to_names("robots", robots)
         if not self.robots:
             raise ClientError("RobotEnv needs the name of at least one robot")
+        if not 1.0 <= hz <= 240.0:
+            raise ClientError(f"hz={hz:g}: 1 to 240 steps a second are possible")
         self._period_ns = round(1e9 / hz)
         self._due_ns = 0
         self._director: Client | None = None

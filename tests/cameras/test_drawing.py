@@ -20,9 +20,7 @@ from iris_session.physics.names import get_element_name
 from iris_session.protocol.media import StreamInfo, find_info_problem
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.replay.pictures import Renderer, find_camera, open_gl
-from tests.conftest import NO_OPENGL
 
-pytestmark = pytest.mark.skipif(bool(NO_OPENGL), reason=f"no OpenGL: {NO_OPENGL}")
 MS = 1_000_000
 #: Everything that moves with bodies and is drawn.
 ROOM = """<mujoco><worldbody><light pos="0 0 3"/><geom type="plane" size="3 3 .1" rgba=".4 .6 .4 1"/>

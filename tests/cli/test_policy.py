@@ -128,6 +128,24 @@ def test_a_policy_that_computes_for_long_lets_the_command_before_stand(monkeypat
     assert max(env.actions) > 0.0
 
 
+def test_robots_hold_while_a_policy_does_not_decide(monkeypatch: pytest.MonkeyPatch) -> None:
+    deciding, now_s = threading.Event(), 0.0
+
+    def advance() -> float:
+        nonlocal now_s
+        now_s += 0.3
+        if now_s > 20.0:
+            deciding.set()
+        return now_s
+
+    monkeypatch.setattr(policy, "PATIENCE_S", 0.001)
+    monkeypatch.setattr(policy, "time", SimpleNamespace(monotonic=advance))
+    env = FakeEnv(40)
+    run_drive(env, FakePolicy(deciding))
+    before = next(i for i, action in enumerate(env.actions) if action >= 0.0)
+    assert before <= 12, "of some sixty rounds, only those of the first second commanded the robot"
+
+
 def test_every_second_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     now = iter(np.arange(0.0, 1e3, 0.3))
     monkeypatch.setattr(policy, "time", SimpleNamespace(monotonic=lambda: next(now)))

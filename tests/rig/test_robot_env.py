@@ -98,6 +98,8 @@ def test_what_cannot_be_driven_is_an_error(rig: Rig) -> None:
         RobotEnv("", ["middle"])
     with pytest.raises(ClientError, match="at least one"):
         RobotEnv("")
+    with pytest.raises(ClientError, match="1 to 240"):
+        RobotEnv("", ["left"], hz=0)
     rig.run(0.1)
     assert all(client.connection.phase.name == "CLOSED" for client in rig.clients)
 
