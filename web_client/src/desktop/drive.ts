@@ -187,7 +187,7 @@ export function makeDrive(
     gripper.hidden = state.session?.robots.find(({ name }) => name === device.robot)?.gripper === false;
     slider.classList.toggle("unknown", device.lastGripper === null);
     setText(unfinished, device.lastGripper === null ? "not finished: the robot held" : "");
-    const isHeld = !device.isEngaged || isHeldBySession(nowMs());
+    const isHeld = !device.isEngaged || state.phase.stalled || isHeldBySession(nowMs());
     setText(mark, isHeld ? "held" : "engaged");
     mark.classList.toggle("good", !isHeld);
     element.classList.toggle("engaged", !isHeld);

@@ -49,7 +49,7 @@ export function makeWelcome(
       element.hidden = !isShown;
       if (!isShown) return;
       const isOpen = state.info?.pairing === false && state.role === "director";
-      setText(why, isOpen ? `You are “${state.self?.name}”, a director, as everyone on this machine.` : `You are “${state.self?.name}”, ${roleWords(state.role)}.`);
+      setText(why, isOpen ? `You are “${state.self?.name}”, director like all on this machine.` : `You are “${state.self?.name}”, ${roleWords(state.role)}.`);
       setOptions(role, listRoles().map((one) => [one, `${roleWords(one)}: ${ROLE_NOTES[one] ?? ""}`] as const));
       if (!role.dataset.isSet) {
         role.dataset.isSet = "yes";
