@@ -100,7 +100,7 @@ test-web: web_client/node_modules/.installed
 test-random: install-dev
 	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n 3
 
-# The environment (2 GB: LeRobot brings PyTorch) stays in READERS for the next time.
+# The environment (9 GB: LeRobot brings PyTorch) stays in READERS for the next time.
 READERS ?= build/readers
 readers: install
 	@$(BIN)/python tools/readers.py --work "$(READERS)"

@@ -133,6 +133,7 @@ def shoot_headset(browser: Browser, scratch: Path, picture: Path, mode: str) -> 
 #: How far an arrow is dragged on the desk, and on the phone [pixels].
 DRAG_PX, PHONE_DRAG_PX = 50.0, 25.0
 OPEN_MENU: Final = "document.querySelector('[data-label=left]').click()"
+ENGAGED: Final = "document.querySelector('.drive.engaged')"
 TAKE: Final = "document.querySelector('.robot-menu button.primary').click()"
 
 
@@ -161,8 +162,7 @@ def shoot_states(browser: Browser, scratch: Path, folder: Path) -> None:
             do(lambda: desk.screenshot(states / "menu.png"), lambda: desk.evaluate(TAKE))
             do(lambda: desk.wait("irisSession.gizmo.object.visible"), lambda: desk.screenshot(states / "taken.png"))
             x, y = desk.find_arrow("z")
-            do(lambda: desk.point(x, y, "down"), lambda: desk.point(x, y - DRAG_PX))
-            do(lambda: desk.wait("document.querySelector('.drive.engaged')"))
+            do(lambda: desk.point(x, y, "down"), lambda: desk.point(x, y - DRAG_PX), lambda: desk.wait(ENGAGED))
             do(lambda: desk.screenshot(folder / "driving.png"), lambda: desk.point(x, y - DRAG_PX, "up"))
             ann.control("pause")
             scenario.run_for(1.0)
@@ -181,8 +181,7 @@ def shoot_states(browser: Browser, scratch: Path, folder: Path) -> None:
             do(lambda: phone.wait("irisSession.gizmo.object.visible"))
             px, py = phone.find_arrow("z")
             do(lambda: phone.touch(px, py, "touchStart"), lambda: phone.touch(px, py - PHONE_DRAG_PX, "touchMove"))
-            do(lambda: phone.wait("document.querySelector('.drive.engaged')"))
-            do(lambda: phone.screenshot(folder / "phone-driving.png"), lambda: phone.touch(px, py, "touchEnd"))
+            do(lambda: phone.wait(ENGAGED), lambda: phone.screenshot(folder / "phone-driving.png"))
             phone.close()
             last = browser.open("last", url, width=1280, height=800)
             do(last.wait_until_ready)
