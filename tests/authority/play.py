@@ -83,7 +83,7 @@ NEXT: Final = {
     "countdown": {"running", "cancelled", "countdown"},
     "running": {"running", "confirm", "left", "closing"},
     "confirm": {"running", "confirm", "left", "closing"},
-    "left": {"running", "closing"},
+    "left": {"running", "left", "closing"},
     "closing": {"closing", "success", "failure", "discarded", "unknown"},
     **{s: {"countdown", "running"} for s in ("idle", "success", "failure", "discarded", "unknown", "cancelled")},
 }
@@ -127,8 +127,8 @@ class Play:
         self.open: set[tuple[int, int]] = set()
         self.opened: set[tuple[str, str, str]] = set()
         self.engagements: dict[tuple[str, str], int] = {}
-        #: Where a device was that moved something, by (participant, connection, device, tracking epoch).
-        self.moved_from: dict[tuple[str, int, str, int], tuple[int, Pose]] = {}
+        #: Where a device was that moved something, by (participant, connection, device, tracking epoch, engagement).
+        self.moved_from: dict[tuple[str, int, str, int, int], tuple[int, Pose]] = {}
         self.newest_engagement = 0
         self.episode, self.ended = EpisodeChanged(0, "idle"), 0
         self.moved = 0
@@ -542,7 +542,8 @@ class Play:
             assert e.connection_epoch == e.connection
             assert m.clutch
             if m.kind == "pose" and m.pose is not None:
-                device = (p.id, p.connection, s.device, p.tracking_epoch)
+                # An engagement moves its robot relative to where it began, but a target of a policy is a place.
+                device = (p.id, p.connection, s.device, p.tracking_epoch, 0 if s.absolute else s.engagement)
                 then, before = self.moved_from.get(device, (m.capture_ns, m.pose))
                 bound = max(0, m.capture_ns - then) * 1e-9 * 10.0 + CONFIG.speed_slack_m
                 assert math.dist(m.pose.p, before.p) <= bound, "nobody moves that fast"
@@ -562,7 +563,8 @@ class Play:
                 begins = "countdown" in NEXT[before.state] and before.state != "countdown"
                 assert grows == (begins and before.state not in REPEATED) or (before.state, grows) == ("discarded", 1)
                 assert one.successes - before.successes == (one.state == "closing" and one.verdict == "success")
-                assert one.verdict != "success" or before.state != "left"
+                by = self.state.participants.get(one.participant)
+                assert one.verdict != "success" or before.state != "left" or (by is not None and by.role == "director")
                 self.ended += one.state in ("success", "failure", "discarded", "unknown")
 
     def check_urgent(self, entries: list[Entry]) -> None:
