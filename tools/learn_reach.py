@@ -111,7 +111,7 @@ def find_goal(client: Any) -> tuple[float, float, float]:
 class Operator:
     """A scripted person: leads the episodes, shows how to reach, and corrects a policy."""
 
-    def __init__(self, address: str, role: str = "operator") -> None:
+    def __init__(self, address: str, role: str = "director") -> None:
         from iris_session import Client
 
         self.client = Client(address, role=role, name="ann", devices="target", alignment="not_needed")

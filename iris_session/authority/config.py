@@ -92,6 +92,8 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     saw an anchor last before another participant aligned by it are to glance at it, and headsets that see the same
     shift of an anchor outvote it. `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
     `episode_rules`: episodes have a countdown, a closing and people who may leave; False: as in earlier recordings.
+    `strict_episodes`: who starts one holds a robot, objects are placed before it begins, a button counts a second after
+    the state changed, and a refused one is reported; False: as in earlier recordings.
     """
 
     # samples
@@ -151,6 +153,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     handover_flicker_ns: int = 50 * MS
     # episodes
     episode_rules: bool = True
+    strict_episodes: bool = True
     countdown_ns: int = 3 * SECOND
     confirm_ns: int = 3 * SECOND  # a discard is confirmed within it
     takeover_ns: int = 10 * SECOND  # an episode whose leader is disconnected is then unknown

@@ -2,11 +2,11 @@
 
     idle -> countdown -> running -> closing -> success, failure, discarded or unknown, which are idle again
 
-One episode at a time. The participant that starts it leads it. The leader, holders of its robots and directors give the
-verdict; a discard is asked for twice. When its leader or a holder disconnects it waits for that one, or for another
-leader, and then ends `unknown`, as it does at once when one of them says goodbye: an episode without its people is no
-success, unless a director says so. While it closes, every robot holds. Places of objects are drawn outside and come
-as an entry (`ObjectsPlaced`).
+One episode at a time. Holders of a robot of the task and directors start it; who does leads it. The leader, holders of
+its robots and directors give the verdict; a discard is asked for twice. When its leader or a holder disconnects it
+waits for that one, or for another leader, and then ends `unknown`, as it does at once when one of them says goodbye: an
+episode without its people is no success, unless a director says so. While it closes, every robot holds. Places of
+objects are drawn outside and come as an entry (`ObjectsPlaced`).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import msgspec
 
 from iris_session.authority import engagement, session_control
 from iris_session.authority.config import SECOND
-from iris_session.authority.context import Context, build_value_denial
-from iris_session.authority.state import HOST_ID, NO_CONNECTION, NO_REPLY, Participant
+from iris_session.authority.context import Context, build_value_denial, join_names
+from iris_session.authority.state import HOST_ID, NO_CONNECTION, NO_REPLY, Participant, WarningState
 from iris_session.protocol.client_messages import Episode, Sample
-from iris_session.protocol.common import Denial
+from iris_session.protocol.common import MAX_TEXT, Denial
 from iris_session.protocol.entries import ObjectsPlaced
 from iris_session.protocol.names import DenialReason, Device, EpisodeAction, EpisodeState, HoldReason, Role
-from iris_session.protocol.server_messages import EpisodeChanged
+from iris_session.protocol.server_messages import EpisodeChanged, Notice
 from iris_session.protocol.specs import TaskSpec
 
 #: Final state that each action ends an episode in.
@@ -41,7 +41,7 @@ MAX_COUNTDOWN_NS: Final = 60 * SECOND
 #: Longest wait for the places of objects, and for the owner of a user loop to reset its world.
 PLACEMENT_NS: Final = 5 * SECOND
 OWNER_NS: Final = 30 * SECOND
-#: An episode that has run for less is not ended by a button: who presses it at the end of a countdown wants to begin.
+#: A button that is pressed so soon after the state has changed was meant for the state before.
 PRESS_NS: Final = SECOND
 #: Bits of `Sample.buttons` (docs/protocol.md, section 6): A or X, and B or Y; and the devices whose buttons count.
 LOWER: Final = 1 << 4
@@ -66,6 +66,8 @@ def _describe(task: TaskSpec | None, number: int, state: str, successes: int | N
 def _set(ctx: Context, by: str, state: str, until_ns: int = 0, **changes: object) -> None:
     now = ctx.state.episode
     assert now is not None
+    if state != now.state:
+        ctx.state.episode_ns = ctx.now_ns
     episode = msgspec.structs.replace(now, state=state, participant=by, until_ns=until_ns, **changes)
     ctx.state.episode = episode
     ctx.emit(episode)
@@ -95,6 +97,8 @@ def _act(ctx: Context, p: Participant, m: Episode) -> Denial | None:
     if now is None or now.state in EpisodeState.OVER:
         if m.action not in (EpisodeAction.START, EpisodeAction.RESET):
             return Denial(DenialReason.EPISODE_STATE, "no episode is running", "start one")
+        if denial := _check_right_to_begin(ctx, p):
+            return denial
         if m.action == EpisodeAction.START:
             return _start(ctx, p, m)
         if not ctx.config.user_owned_loop:
@@ -109,9 +113,21 @@ def _act(ctx: Context, p: Participant, m: Episode) -> Denial | None:
     return denial or _end_by_request(ctx, p, now, m)
 
 
+def _check_right_to_begin(ctx: Context, p: Participant) -> Denial | None:
+    """Deny what only holders of a robot of the task and directors may do: it can let the robots of all others hold."""
+    task = ctx.config.task
+    wanted = task.robots if task is not None else ()
+    if not ctx.config.strict_episodes or p.role == Role.DIRECTOR or _holds_robot(ctx, p, wanted):
+        return None
+    if not any(not wanted or name in wanted for name in ctx.state.robots):
+        return None  # bare hands
+    text = f"you hold no robot of the task: {join_names(wanted)}" if wanted else "you hold no robot"
+    return Denial(DenialReason.NOT_HOLDER, text, "acquire one first, or ask its holder or a director")
+
+
 def _check_right(ctx: Context, p: Participant, now: EpisodeChanged) -> Denial | None:
     """Deny what only the leader, holders of its robots and directors may do."""
-    if now.led_by in ("", p.id) or p.role == Role.DIRECTOR or _holds_robot(ctx, p, now):
+    if now.led_by in ("", p.id) or p.role == Role.DIRECTOR or _holds_robot(ctx, p, now.robots):
         return None
     leader = ctx.state.participants.get(now.led_by)
     name = now.started_by_name if leader is None else leader.name
@@ -119,15 +135,16 @@ def _check_right(ctx: Context, p: Participant, now: EpisodeChanged) -> Denial | 
     return Denial(DenialReason.HELD, text, f"ask {name} or a director, or take it over", "", now.led_by, name)
 
 
-def _holds_robot(ctx: Context, p: Participant, now: EpisodeChanged) -> bool:
-    leases = [lease for name, lease in ctx.state.robots.items() if not now.robots or name in now.robots]
+def _holds_robot(ctx: Context, p: Participant, robots: tuple[str, ...]) -> bool:
+    """Return whether `p` holds one of `robots`; empty: any robot."""
+    leases = [lease for name, lease in ctx.state.robots.items() if not robots or name in robots]
     return any(g.participant == p.id for lease in leases for g in lease.grants)
 
 
 def _has_all_holders(ctx: Context, now: EpisodeChanged) -> bool:
     """Return whether every holder of a robot of the episode is connected."""
     people = ctx.state.participants.values()
-    return not any(p.connection == NO_CONNECTION and _holds_robot(ctx, p, now) for p in people)
+    return not any(p.connection == NO_CONNECTION and _holds_robot(ctx, p, now.robots) for p in people)
 
 
 def find_next_number(ctx: Context) -> int:
@@ -158,13 +175,18 @@ def _start(ctx: Context, p: Participant, m: Episode) -> Denial | None:
 
 
 def _count_down(ctx: Context, now: EpisodeChanged, countdown_ns: int) -> None:
-    """Begin the episode `now` after a countdown."""
+    """Begin the episode `now` after a countdown; one whose objects are placed at the end of a step at the earliest."""
     ctx.state.episode = now
-    if countdown_ns:
+    if countdown_ns or _places_objects(ctx):
         until_ns = ctx.now_ns + countdown_ns
         _set(ctx, now.led_by or HOST_ID, EpisodeState.COUNTDOWN, until_ns, started_ns=0, robots=())
     else:
         _run(ctx, now)
+
+
+def _places_objects(ctx: Context) -> bool:
+    task = ctx.config.task
+    return ctx.config.strict_episodes and task is not None and bool(task.objects)
 
 
 def _run(ctx: Context, now: EpisodeChanged) -> None:
@@ -176,6 +198,8 @@ def _run(ctx: Context, now: EpisodeChanged) -> None:
 
 def _take_over(ctx: Context, p: Participant, now: EpisodeChanged) -> Denial | None:
     """Let `p` lead: a director at any time, others once the leader is disconnected or does not wear the headset."""
+    if ctx.config.strict_episodes and now.verdict:
+        return _build_verdict_denial(now)
     leader = ctx.state.participants.get(now.led_by)
     is_there = leader is not None and leader.worn and leader.connection != NO_CONNECTION
     if leader is not None and is_there and p is not leader and p.role != Role.DIRECTOR:
@@ -188,6 +212,11 @@ def _take_over(ctx: Context, p: Participant, now: EpisodeChanged) -> Denial | No
     return None
 
 
+def _build_verdict_denial(now: EpisodeChanged) -> Denial:
+    text = f"episode {now.number} has its verdict: {now.verdict}"
+    return Denial(DenialReason.EPISODE_STATE, text, "wait until the scene is ready")
+
+
 def _end_by_request(ctx: Context, p: Participant, now: EpisodeChanged, m: Episode) -> Denial | None:
     action = m.action
     if now.state == EpisodeState.COUNTDOWN:
@@ -196,8 +225,7 @@ def _end_by_request(ctx: Context, p: Participant, now: EpisodeChanged, m: Episod
         _set(ctx, p.id, EpisodeState.CANCELLED)
         return None
     if now.verdict:
-        text = f"episode {now.number} has its verdict: {now.verdict}"
-        return Denial(DenialReason.EPISODE_STATE, text, "wait until the scene is ready")
+        return _build_verdict_denial(now)
     leader = ctx.state.participants.get(now.led_by)
     is_led = not now.led_by or (leader is not None and leader.connection != NO_CONNECTION)
     if now.state == EpisodeState.LEFT and not is_led:
@@ -280,12 +308,14 @@ def note_leaving(ctx: Context, p: Participant, cause: str) -> None:
     now = ctx.state.episode
     if now is None or now.state in EpisodeState.OVER or not ctx.config.episode_rules:
         return
+    if ctx.config.strict_episodes and now.verdict:
+        return
     leads = now.led_by == p.id
-    is_needed = now.state in EpisodeState.RECORDED and (leads or _holds_robot(ctx, p, now))
+    is_needed = now.state in EpisodeState.RECORDED and (leads or _holds_robot(ctx, p, now.robots))
     if cause == "lost" and is_needed:
         if now.state != EpisodeState.LEFT:
             _set(ctx, p.id, EpisodeState.LEFT, ctx.now_ns + ctx.config.takeover_ns)
-    elif leads and cause == "left" and not _holds_robot(ctx, p, now):
+    elif leads and cause == "left" and not _holds_robot(ctx, p, now.robots):
         _set(ctx, p.id, now.state, now.until_ns, led_by="")
     elif leads or is_needed:
         end_unknown(ctx, p.id)
@@ -304,7 +334,7 @@ def note_return(ctx: Context, p: Participant) -> None:
 
 def advance_episode(ctx: Context) -> None:
     """Let time pass: ends of countdowns, questions and waits. A reset by a director ends what is recorded, but not an
-    episode that began in this step: it begins with the reset scene.
+    episode that began in this step: it begins with the reset scene. A countdown waits for the objects of a reset scene.
     """
     now = ctx.state.episode
     if now is None or now.state in EpisodeState.OVER or not ctx.config.episode_rules:
@@ -314,7 +344,9 @@ def advance_episode(ctx: Context) -> None:
         if ctx.state.estop or (ctx.state.paused and not ctx.config.user_owned_loop):
             _set(ctx, HOST_ID, EpisodeState.CANCELLED)
         elif is_due:
-            _run(ctx, now)
+            has_objects = not _places_objects(ctx) or ctx.state.placed_epoch == ctx.state.scene_epoch
+            if has_objects or ctx.now_ns >= now.until_ns + PLACEMENT_NS:
+                _run(ctx, now)
     elif now.state in EpisodeState.RECORDED and ctx.reset and now.started_ns < ctx.now_ns:
         end_unknown(ctx)
     elif now.state == EpisodeState.CONFIRM and is_due:
@@ -337,6 +369,7 @@ def place_objects(ctx: Context, m: ObjectsPlaced) -> None:
     if now is not None and now.state not in _MAY_PLACE and not now.verdict:
         return
     session_control.reset_scene(ctx, HOST_ID)
+    ctx.state.placed_epoch = ctx.state.scene_epoch
     if now is not None and now.verdict:
         _finish(ctx, now.participant, now.verdict)
 
@@ -370,9 +403,38 @@ def press_buttons(ctx: Context, p: Participant, s: Sample, before: int) -> None:
         action = EpisodeAction.START
     elif pressed & LOWER:
         assert now is not None
-        if now.state == EpisodeState.RUNNING and ctx.now_ns - now.started_ns < PRESS_NS:
-            return
         action = EpisodeAction.FAILURE if now.state == EpisodeState.CONFIRM else EpisodeAction.SUCCESS
     elif is_over:
         return
-    _act(ctx, p, Episode(NO_REPLY, action))
+    denial = _check_press(ctx, p, pressed) or _act(ctx, p, Episode(NO_REPLY, action))
+    if denial is not None and ctx.config.strict_episodes:
+        _report_denied_press(ctx, p, denial)
+
+
+def _check_press(ctx: Context, p: Participant, pressed: int) -> Denial | None:
+    """Deny a press that was meant for the state before: so soon the lower button ends and begins nothing, and only the
+    one who asked whether to discard answers that.
+    """
+    now = ctx.state.episode
+    if now is None:
+        return None
+    if ctx.config.strict_episodes:
+        is_soon = ctx.now_ns - ctx.state.episode_ns < PRESS_NS
+        is_meant = now.participant == p.id if now.state == EpisodeState.CONFIRM else not pressed & LOWER
+    else:
+        is_soon = now.state == EpisodeState.RUNNING and ctx.now_ns - now.started_ns < PRESS_NS
+        is_meant = not pressed & LOWER
+    if is_meant or not is_soon:
+        return None
+    text = f"episode {now.number} has been in state {now.state} for less than {PRESS_NS / SECOND:g} s"
+    return Denial(DenialReason.EPISODE_STATE, text, "press again if you mean that state")
+
+
+def _report_denied_press(ctx: Context, p: Participant, denial: Denial) -> None:
+    """Tell who pressed a button why it did nothing, at most once a second: a press has no reply."""
+    w = p.warnings.setdefault("button", WarningState(said_ns=ctx.now_ns - PRESS_NS))
+    w.left_out += 1
+    if ctx.now_ns - w.said_ns >= PRESS_NS:
+        n = "" if w.left_out == 1 else f" ({w.left_out} presses)"
+        ctx.emit(Notice("warning", f"{p.name}: {denial.message}; {denial.advice}{n}"[:MAX_TEXT], p.id, denial.reason))
+        w.said_ns, w.left_out = ctx.now_ns, 0

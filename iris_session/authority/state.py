@@ -332,6 +332,8 @@ class AuthorityState(msgspec.Struct):
     `stop_seq` counts the e-stops, `stops` are those in force, oldest first. `diverged`: why physics stands still
     until a reset, which also ends the pause that came of it (`paused_by_divergence`). `owner_listens`: the owner of
     a user loop takes requests. `rerecording`: the episode whose number begins again when the scene is reset.
+    `episode_ns`: when the episode came into its state. `placed_epoch`: scene epoch that began with the objects of the
+    task placed.
     """
 
     robots: dict[str, LeaseState]
@@ -360,6 +362,8 @@ class AuthorityState(msgspec.Struct):
     episode: EpisodeChanged | None = None
     owner_listens: bool = False
     rerecording: EpisodeChanged | None = None
+    episode_ns: int = 0
+    placed_epoch: int = 0
     handovers: dict[str, HandoverTrack] = {}
     regrasps: dict[str, HandoverTrack] = {}
     handover_tick: int = -1
@@ -398,6 +402,9 @@ def is_same_snapshot(recorded: bytes, snapshot: bytes) -> bool:
         if isinstance(correction, dict) and fields["correction"] is not None:
             for added in {"looked_ns", "walked_m"} - correction.keys():
                 del fields["correction"][added]
+    for added in ("episode_ns", "placed_epoch"):
+        if added not in earlier:
+            present.pop(added, None)
     for name in ("episode", "rerecording"):
         if isinstance(episode := earlier.get(name), dict) and isinstance(present.get(name), dict):
             present[name] = {key: value for key, value in present[name].items() if key in episode}

@@ -473,7 +473,7 @@ class Gap(EventBody, frozen=True, tag="gap"):
 
 class Notice(EventBody, frozen=True, tag="notice"):
     """A text for an operator. `level`: info, warning, error. `participant`: whom it concerns. `reason`: the
-    `DenialReason` of a refusal that answers no request (of an alignment).
+    `DenialReason` of a refusal that answers no request (of an alignment, or of a button).
     """
 
     level: Name

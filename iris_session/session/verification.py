@@ -30,6 +30,7 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
     min_change_share: float = 1e9
     explains: bool = False
     episode_rules: bool = False
+    strict_episodes: bool = False
 
 
 class _RecordedControlConfig(ControlConfig, frozen=True):

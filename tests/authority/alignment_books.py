@@ -91,8 +91,8 @@ class AlignmentBooks:
         same_frame = (p.tracking_epoch, p.connection) == (before.tracking_epoch, before.connection)
         if new is None or not same_frame:
             self._used.discard(p.id)  # it may be aligned in the new frame already
-        if new is None or p.id not in self._used:
             self._told_ns.pop(p.id, None)
+        if new is None or p.id not in self._used:
             return
         assert new.version > old.version
         if new.kind == "placed" or p.offset != before.offset or p.offset is not None:

@@ -32,13 +32,13 @@ from iris_session.protocol.entries import (
     decode_entries,
     encode_entries,
 )
-from iris_session.protocol.server_messages import ConsentRequested, EpisodeChanged, Reply, Snapshot
+from iris_session.protocol.server_messages import ConsentRequested, EpisodeChanged, LeaseChanged, Reply, Snapshot
 from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.specs import ObjectRange, ObjectSpec, TaskSpec
 from iris_session.protocol.steps import Command, Decision, FixedView, ObjectContact
 
 from .alignment_books import AlignmentBooks
-from .table import MS, SECOND, make_view, proposal, robot
+from .table import MS, SECOND, make_view, proposal, robot, single_changes
 
 ROBOTS: Final = (robot("left"), robot("right", "priority"), robot("third", "shared"))
 OBJECTS: Final = (ObjectSpec("hammer", "hammer"), ObjectSpec("board", "board"))
@@ -83,7 +83,7 @@ NEXT: Final = {
     "countdown": {"running", "cancelled", "countdown"},
     "running": {"running", "confirm", "left", "closing"},
     "confirm": {"running", "confirm", "left", "closing"},
-    "left": {"running", "closing"},
+    "left": {"running", "left", "closing"},
     "closing": {"closing", "success", "failure", "discarded", "unknown"},
     **{s: {"countdown", "running"} for s in ("idle", "success", "failure", "discarded", "unknown", "cancelled")},
 }
@@ -127,10 +127,12 @@ class Play:
         self.open: set[tuple[int, int]] = set()
         self.opened: set[tuple[str, str, str]] = set()
         self.engagements: dict[tuple[str, str], int] = {}
-        #: Where a device was that moved something, by (participant, connection, device, tracking epoch).
-        self.moved_from: dict[tuple[str, int, str, int], tuple[int, Pose]] = {}
+        #: Where a device was that moved something, by (participant, connection, device, tracking epoch, engagement).
+        self.moved_from: dict[tuple[str, int, str, int, int], tuple[int, Pose]] = {}
         self.newest_engagement = 0
         self.episode, self.ended = EpisodeChanged(0, "idle"), 0
+        #: The objects of the task lie where they were placed since the last reset.
+        self.is_placed = False
         self.moved = 0
         self.flush()
         self.host(cm.GetSnapshot(1))
@@ -182,7 +184,7 @@ class Play:
         self.follow_events()
         self.check_commands(entries)
         self.alignments.check(self.state, self.decision, entries, self.now_ns)
-        self.check_episodes()
+        self.check_episodes(entries)
         self.check_urgent(entries)
         self.check_bounds()
         self.check_queue()
@@ -331,11 +333,13 @@ class Play:
             "reset",
         ]
         place = ObjectsPlaced(("hammer",), (Pose((0.1, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0)),), 1, 7)
-        state = self.state.episode.state if self.state.episode is not None else ""
-        if self.rng.random() < (0.7 if state == "closing" else 0.1):
+        is_awaited = self.episode.state == "closing" or not self.is_placed
+        if self.rng.random() < (0.7 if is_awaited else 0.1):
             return self.host(place)
-        client = self.who()
-        if self.episode.state in ("idle", "success", "failure", "discarded", "unknown", "cancelled"):
+        holders = [c for c in self.people if self.still_here(c) and {*self.held(c)} & {*NAMES}]
+        client = self.rng.choice(holders) if holders and self.rng.random() < 0.6 else self.who()
+        is_over = "countdown" in NEXT[self.episode.state] and self.episode.state != "countdown"
+        if is_over and self.rng.random() < 0.8:
             return self.say(client, cm.Episode(1, "start", countdown_ns=self.rng.choice([0, None])))
         if self.rng.random() < 0.3:
             buttons = self.rng.choice([0, 0, 16, 32])
@@ -401,7 +405,9 @@ class Play:
         }
         if forged.get("kind") == "twist":
             fields |= {"pose": None, "twist": (0.1, 0.0, 0.0, 0.0, 0.0, 0.1)}
-        return cm.Sample(**{**fields, **forged})
+        sample = cm.Sample(**{**fields, **forged})
+        client.seq = max(client.seq, sample.seq)
+        return sample
 
     def held(self, client: Client) -> tuple[str, ...]:
         leases = (*self.state.robots.values(), *self.state.objects.values())
@@ -488,9 +494,14 @@ class Play:
 
     def check_commands(self, entries: list[Entry]) -> None:
         assert tuple(c.robot for c in self.decision.commands) == NAMES
-        sent = {(e.connection, e.message.device, e.message.seq): e for e in entries if isinstance(e.message, cm.Sample)}
-        for e in sent.values():
-            self.note_open(e)
+        sent: dict[tuple[int, str, int], Entry] = {}
+        shut: set[tuple[str, str, str]] = set()
+        for e in entries:
+            if isinstance(s := e.message, cm.Sample):
+                shut |= self.note_clutch(e.connection, s)
+                sent.setdefault((e.connection, s.device, s.seq), e)
+        changes = [body for e in self.decision.events for body in single_changes(e.body)]
+        changed = {body.lease.target for body in changes if isinstance(body, LeaseChanged)}
         for c in self.decision.commands:
             assert (c.kind == "hold") == (c.hold_reason != "") == (not c.sources)
             assert len(c.sources) <= 1 or self.state.robots[c.robot].mode == "shared"
@@ -503,13 +514,17 @@ class Play:
             self.check_sources(c, sent)
             # With several holders the reason is that of one of them; the others' latches are their own.
             if c.hold_reason in REARMED and len(self.state.robots[c.robot].grants) == 1:
-                self.opened = {o for o in self.opened if o[2] != c.robot}
+                # These two may be of one device, and another one, whose clutch was open, drives on.
+                by_device = c.hold_reason in ("rearm", "untracked") and c.robot not in changed
+                self.opened = {o for o in self.opened if o[2] != c.robot or (by_device and o not in shut)}
 
-    def note_open(self, e: Entry) -> None:
-        s = e.message
-        client = next((c for c in self.people if c.connection == e.connection), None)
-        if isinstance(s, cm.Sample) and client is not None and not s.clutch:
-            self.opened |= {(client.id, s.device, t.name) for t in s.targets}
+    def note_clutch(self, connection: int, s: cm.Sample) -> set[tuple[str, str, str]]:
+        """Note where a sample opens the clutch; return where it does not."""
+        client = next((c for c in self.people if c.connection == connection), None)
+        named = {(client.id, s.device, t.name) for t in s.targets} if client is not None else set()
+        if not s.clutch:
+            self.opened |= named
+        return named if s.clutch or not s.tracked else set()
 
     def check_sources(self, c: Command, sent: dict[tuple[int, str, int], Entry]) -> None:
         lease = self.state.robots[c.robot]
@@ -542,7 +557,8 @@ class Play:
             assert e.connection_epoch == e.connection
             assert m.clutch
             if m.kind == "pose" and m.pose is not None:
-                device = (p.id, p.connection, s.device, p.tracking_epoch)
+                # An engagement moves its robot relative to where it began, but a target of a policy is a place.
+                device = (p.id, p.connection, s.device, p.tracking_epoch, 0 if s.absolute else s.engagement)
                 then, before = self.moved_from.get(device, (m.capture_ns, m.pose))
                 bound = max(0, m.capture_ns - then) * 1e-9 * 10.0 + CONFIG.speed_slack_m
                 assert math.dist(m.pose.p, before.p) <= bound, "nobody moves that fast"
@@ -552,17 +568,22 @@ class Play:
             assert grants[s.participant].version <= version <= lease.version
             assert -CONFIG.future_ns <= self.now_ns - m.capture_ns <= CONFIG.freshness_ns
 
-    def check_episodes(self) -> None:
+    def check_episodes(self, entries: list[Entry]) -> None:
         """An episode goes from state to state as it may, and only one with its people becomes a success."""
+        if self.decision.reset:
+            self.is_placed = any(isinstance(e.message, ObjectsPlaced) for e in entries)
         for event in self.decision.events:
             if isinstance(one := event.body, EpisodeChanged):
                 before, self.episode = self.episode, one
                 assert one.state in NEXT[before.state]
+                has_waited = self.now_ns - before.until_ns >= 5 * SECOND
+                assert (before.state, one.state) != ("countdown", "running") or self.is_placed or has_waited
                 grows = one.number - before.number
                 begins = "countdown" in NEXT[before.state] and before.state != "countdown"
                 assert grows == (begins and before.state not in REPEATED) or (before.state, grows) == ("discarded", 1)
                 assert one.successes - before.successes == (one.state == "closing" and one.verdict == "success")
-                assert one.verdict != "success" or before.state != "left"
+                by = self.state.participants.get(one.participant)
+                assert one.verdict != "success" or before.state != "left" or (by is not None and by.role == "director")
                 self.ended += one.state in ("success", "failure", "discarded", "unknown")
 
     def check_urgent(self, entries: list[Entry]) -> None:
@@ -646,7 +667,7 @@ ACTIONS: Final[list[tuple[float, Callable[[Play], None]]]] = [
     (1.0, Play.direct),
     (0.7, Play.trouble),
     (0.7, Play.align),
-    (0.7, Play.record),
+    (1.2, Play.record),
     (0.3, Play.watch),
     (0.05, Play.go_on),
     (0.5, Play.join),

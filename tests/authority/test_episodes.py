@@ -11,7 +11,7 @@ from iris_session.authority import Authority, AuthorityConfig
 from iris_session.protocol.client_messages import Acquire, Bye, Control, Episode, EStop, Heartbeat, Release, SetRole
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import ExternalReset, Join, Lost, ObjectsPlaced, OwnerListens, SceneLoaded
-from iris_session.protocol.server_messages import EpisodeChanged
+from iris_session.protocol.server_messages import EpisodeChanged, Notice
 from iris_session.protocol.specs import ObjectRange, TaskSpec
 
 from .table import MS, SECOND, Person, Table, robot
@@ -344,6 +344,72 @@ def press(person: Person, buttons: int, **fields: Any) -> None:
     person.sends(buttons=buttons, **fields)
 
 
+def notices(t: Table) -> list[tuple[str, str]]:
+    """Return whom the last step has told why, of what it refused."""
+    return [(e.participant, e.reason) for e in t.since(Notice)]
+
+
+def test_who_holds_no_robot_of_it_starts_and_resets_nothing() -> None:
+    t, ann, bob, desk = meet(msgspec.structs.replace(TASK, robots=("left",)))
+    denial = bob.asks(Episode(1, "start")).denial
+    assert denial is not None
+    assert (denial.reason, denial.message, denial.advice) == (
+        "not_holder",
+        "you hold no robot of the task: left",
+        "acquire one first, or ask its holder or a director",
+    )
+    assert bob.denied(Episode(1, "reset")) == "not_holder"
+    assert not t.decision.reset
+    for person in (desk, ann):
+        begin(person)
+        assert person.asks(Episode(1, "failure")).ok
+    eve = meet()[0].join()
+    assert eve.denied(Episode(1, "start")) == "not_holder"
+
+
+def test_in_a_scene_without_robots_everybody_starts_episodes() -> None:
+    t = Table(CONFIG)
+    t.step(t.host(SceneLoaded("hands", ())))
+    begin(t.join())
+
+
+def test_with_its_verdict_an_episode_closes_once_whoever_leaves_or_wants_to_lead() -> None:
+    t, ann, bob, desk = meet(PLACED)
+    t.step(t.host(ObjectsPlaced((), (), 15)))
+    begin(desk)
+    assert ann.asks(Episode(1, "success")).ok
+    assert desk.denied(Episode(1, "take_over")) == "episode_state"
+    desk.does(Bye())
+    bob.does(Bye())
+    assert states(t)[-2:] == [(15, "running"), (15, "closing")]
+    assert now(t).successes == 12
+
+
+@pytest.mark.parametrize("steps", [["reset start"], ["start reset"], ["reset", "start"], ["count", "reset"]])
+@pytest.mark.parametrize("is_placed", [True, False])
+def test_an_episode_begins_when_the_objects_of_a_reset_are_placed(steps: list[str], is_placed: bool) -> None:
+    t, ann, _, desk = meet(PLACED)
+    place = ObjectsPlaced(("hammer",), (Pose((0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0)),), 15)
+    t.step(t.host(place))
+    words = {
+        "reset": desk.says(Control(1, "reset")),
+        "start": ann.says(Episode(1, "start", countdown_ns=0)),
+        "count": ann.says(Episode(1, "start", countdown_ns=2 * MS)),
+    }
+    for step in steps:
+        t.step(*(words[word] for word in step.split()))
+    assert (now(t).state, t.authority.next_episode) == ("countdown", 15)
+    if is_placed:
+        t.step(t.host(place))
+        assert t.decision.reset
+    else:
+        t.wait(4900 * MS)
+        assert now(t).state == "countdown"
+        t.wait(100 * MS)
+    t.step()
+    assert (states(t)[-2:], t.decision.reset) == ([(15, "countdown"), (15, "running")], False)
+
+
 def test_buttons_of_a_holder_start_and_end_it() -> None:
     t, ann, bob, _ = meet()
     ann.sends(buttons=A)
@@ -354,23 +420,60 @@ def test_buttons_of_a_holder_start_and_end_it() -> None:
     assert states(t) == [(1, "countdown")]
     press(ann, B)
     assert states(t)[-1] == (1, "cancelled")
+    t.wait(SECOND)
     press(ann, A)
-    t.wait(3 * SECOND)
+    t.wait(4 * SECOND)
     press(bob, B)
     assert now(t).state == "confirm"
     press(bob, A)
     assert states(t)[-1] == (1, "failure")
-    press(ann, A)
-    t.wait(3 * SECOND)
-    press(bob, A)
-    assert states(t)[-1] == (2, "running")  # meant to begin it
     t.wait(SECOND)
     press(ann, A)
+    t.wait(4 * SECOND)
+    press(bob, A)
     assert states(t)[-1] == (2, "success")
     press(ann, B)
     bob.does(Release(1))
+    t.wait(SECOND)
     press(bob, A)
-    assert states(t)[-1] == (2, "success")
+    assert (states(t)[-1], t.since(Notice)) == ((2, "success"), [])
+
+
+def test_of_two_people_who_press_at_once_the_second_is_told_why_nothing_comes_of_it() -> None:
+    t, ann, bob, _ = meet()
+    refused = [(bob.id, "episode_state")]
+    press(ann, A)
+    press(bob, A)
+    assert (states(t), notices(t)) == ([(1, "countdown")], refused)
+    assert t.last(Notice).text == "bob: episode 1 has not begun; discard cancels it"
+    t.wait(3 * SECOND)
+    press(bob, A)  # meant to begin it
+    assert (states(t)[-1], notices(t)) == ((1, "running"), refused)
+    press(bob, A)
+    press(bob, A)
+    assert (states(t)[-1], notices(t)) == ((1, "running"), [])
+    t.wait(SECOND)
+    press(ann, B)
+    for button in (A, B):
+        press(bob, button)
+        assert now(t).state == "confirm", "bob has not seen the question"
+    assert "state confirm for less than 1 s; press again if you mean that state" in t.last(Notice).text
+    assert "(3 presses)" in t.last(Notice).text
+    t.wait(SECOND)
+    press(bob, A)
+    press(ann, A)
+    assert (states(t)[-1], notices(t)) == ((1, "failure"), [(ann.id, "episode_state")])
+    t.wait(SECOND)
+    press(ann, A)
+    assert states(t)[-1] == (2, "countdown")
+
+
+def test_a_press_that_is_denied_says_what_a_request_would() -> None:
+    t, ann, *_ = meet()
+    ann.does(EStop())
+    press(ann, A)
+    assert notices(t) == [(ann.id, "estop")]
+    assert t.last(Notice).text == "ann: the session is stopped; clear the e-stop first"
 
 
 def test_a_countdown_has_bounds() -> None:
@@ -390,7 +493,7 @@ def test_a_task_must_fit_the_scene() -> None:
 
 
 def test_recordings_before_these_rules_replay_as_they_were() -> None:
-    t, ann, *_ = meet(episode_rules=False)
+    t, ann, *_ = meet(episode_rules=False, strict_episodes=False)
     assert ann.asks(Episode(1, "start", "stack")).ok
     assert t.since(EpisodeChanged) == [EpisodeChanged(1, "running", "stack", ann.id)]
     ann.does(Lost())
@@ -403,3 +506,18 @@ def test_recordings_before_these_rules_replay_as_they_were() -> None:
     eve.does(Acquire(5, ("right",), wait=True))
     t.step(t.host(SetRole(1, eve.id, "observer")))
     assert eve.replies() == [], "a request was not ended by another role"
+
+
+def test_recordings_before_strict_episodes_replay_as_they_were() -> None:
+    t, ann, bob, desk = meet(PLACED, strict_episodes=False)
+    bob.does(Release(1))
+    begin(bob)
+    press(ann, A)
+    assert (now(t).state, t.since(Notice)) == ("running", [])
+    assert desk.asks(Control(1, "reset")).ok
+    assert desk.asks(Episode(1, "take_over")).ok
+    assert [e.state for e in t.since(EpisodeChanged)] == ["closing"]
+    t.wait(5 * SECOND)
+    press(ann, A, scene_epoch=2)
+    t.wait(3 * SECOND)
+    assert (now(t).number, now(t).state) == (16, "running")

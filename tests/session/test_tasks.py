@@ -11,8 +11,8 @@ import pytest
 
 from iris_session import scene_path
 from iris_session.physics import World, find_objects
-from iris_session.protocol.client_messages import Episode
-from iris_session.protocol.entries import EntryMessage
+from iris_session.protocol.client_messages import Control, Episode
+from iris_session.protocol.entries import EntryMessage, ObjectsPlaced
 from iris_session.protocol.server_messages import EpisodeChanged
 from iris_session.protocol.specs import ObjectRange, TaskSpec
 from iris_session.session.config import SessionConfig
@@ -152,27 +152,56 @@ def test_without_a_free_place_the_objects_are_named() -> None:
         draw_places(make_world(), b"", TaskSpec("swap", objects=(inside,)), 1)
 
 
-def test_a_session_that_ended_before_its_objects_were_placed_places_them_when_it_resumes() -> None:
-    model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
-    objects = find_objects(model)
-    task = TaskSpec("swap", objects=(HAMMER, BOARD))
-    core = make_session_core(SessionConfig(), model, mujoco.MjData(model), (), objects, user_owned=False, task=task)
-    now_ns = 0
-    stepper = Stepper(core, Front(), None, lambda: now_ns, 16_000_000, 100_000_000, b"root")
+class Desk:
+    """A session of a task in steps of one tick, without a front."""
 
-    def step(*messages: EntryMessage) -> str:
-        nonlocal now_ns
+    def __init__(self) -> None:
+        model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+        objects = find_objects(model)
+        self.task = TaskSpec("swap", objects=(HAMMER, BOARD))
+        data = mujoco.MjData(model)
+        self.core = make_session_core(SessionConfig(), model, data, (), objects, user_owned=False, task=self.task)
+        self.now_ns = 0
+        self.stepper = Stepper(self.core, Front(), None, lambda: self.now_ns, 16_000_000, 100_000_000, b"root")
+
+    def step(self, *messages: EntryMessage) -> str:
+        """Return the state of the episode after a step."""
         for message in messages:
-            stepper.post_own(message)
-        now_ns += 2_000_000
-        stepper.step(1)
-        assert core.authority.episode is not None
-        return core.authority.episode.state
+            self.stepper.post_own(message)
+        self.now_ns += 2_000_000
+        self.stepper.step(1)
+        assert self.core.authority.episode is not None
+        return self.core.authority.episode.state
 
-    assert step(Episode(0, "start", countdown_ns=0)) == "running"
-    assert step(Episode(0, "success")) == "closing"
-    runner = TaskRunner(stepper, None, is_new=False)
-    assert step() == "success"
-    hammer = core.world.view().object_pose("hammer").p
-    assert hammer[:2] == pytest.approx(draw_places(core.world, b"", task, 2).poses[0].p[:2], abs=1e-3)
+    def is_placed(self, number: int) -> bool:
+        """Return whether the hammer lies where it is placed in an episode."""
+        drawn = draw_places(self.core.world, b"", self.task, number).poses[0].p
+        return self.core.world.view().object_pose("hammer").p[:2] == pytest.approx(drawn[:2], abs=1e-3)
+
+
+def test_a_session_that_ended_before_its_objects_were_placed_places_them_when_it_resumes() -> None:
+    desk = Desk()
+    assert desk.step(ObjectsPlaced((), (), 1), Episode(0, "start", countdown_ns=0)) == "running"
+    assert desk.step(Episode(0, "success")) == "closing"
+    runner = TaskRunner(desk.stepper, None, is_new=False)
+    assert desk.step() == "success"
+    assert desk.is_placed(2)
+    runner.close()
+
+
+@pytest.mark.parametrize("order", ["reset | start", "start reset", "start | reset"])
+def test_an_episode_that_begins_beside_a_reset_has_its_own_places(order: str) -> None:
+    desk = Desk()
+    runner = TaskRunner(desk.stepper, None)
+    countdown_ns = 2_000_000 if order == "start | reset" else 0
+    words: dict[str, EntryMessage] = {
+        "reset": Control(0, "reset"),
+        "start": Episode(0, "start", countdown_ns=countdown_ns),
+    }
+    desk.step()
+    states = [desk.step(*(words[word] for word in step.split())) for step in order.split(" | ")]
+    while states[-1] != "running":
+        states.append(desk.step())
+    assert len(states) <= 3
+    assert desk.is_placed(1)
     runner.close()

@@ -1796,7 +1796,7 @@ export interface Gap {
 
 /**
  * A text for an operator. `level`: info, warning, error. `participant`: whom it concerns. `reason`: the
- * `DenialReason` of a refusal that answers no request (of an alignment).
+ * `DenialReason` of a refusal that answers no request (of an alignment, or of a button).
  */
 export interface Notice {
   event: "notice";

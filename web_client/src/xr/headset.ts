@@ -298,6 +298,7 @@ export class Headset {
   private takeInbox(update: Extract<FromWorker, { type: "inbox" }>): void {
     this.marks.takeInbox(update);
     for (const message of update.messages) {
+      if (message.type === "event" && message.body.event === "notice") this.takeNotice(message.body);
       if (message.type !== "feedback") continue;
       const pulse = findPulse(this.feedback.get(message.robot) as typeof message | undefined, message);
       this.feedback.set(message.robot, message);
@@ -307,6 +308,12 @@ export class Headset {
       const [actuator] = (source?.gamepad as { hapticActuators?: HapticActuator[] } | undefined)?.hapticActuators ?? [];
       void actuator?.pulse?.(pulse.intensity, pulse.duration_ms);
     }
+  }
+
+  /** Show why a press of the wearer's button did nothing; what refuses an alignment has lines of its own. */
+  private takeNotice(notice: { text: string; participant: string; reason: string }): void {
+    const isShown = ["", "alignment_refused", "view_only"].includes(notice.reason);
+    if (notice.participant === this.state.selfId && !isShown) this.show(notice.text);
   }
 
   // --- panels ---------------------------------------------------------------------------------------------------------

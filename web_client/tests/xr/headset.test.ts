@@ -38,12 +38,17 @@ let stops: number;
 let isGranted: boolean;
 let headset: Headset;
 let enter: (mode: Mode) => Headset;
+let takeInbox: (update: unknown) => void;
 afterEach(() => void vi.useRealTimers());
 beforeEach(() => {
   vi.useFakeTimers({ toFake: ["performance"] });
   vi.stubGlobal("document", { createElement: () => ({ getContext: () => null }) });
   [session, posted, requests, stops, isGranted] = [new Session(), [], [], 0, true];
-  const client = { on: () => () => undefined, post: (message: ToWorker) => posted.push(message) } as unknown as WorkerClient;
+  const on = (type: string, listener: typeof takeInbox): (() => void) => {
+    if (type === "inbox") takeInbox = listener;
+    return () => undefined;
+  };
+  const client = { on, post: (message: ToWorker) => posted.push(message) } as unknown as WorkerClient;
   state = new PageState(client);
   state.phase = { ...state.phase, phase: "ready" };
   state.spec = { environment: { center: [0, 0, 0], extent: 1 }, bodies: [] } as unknown as PageState["spec"];
@@ -230,4 +235,11 @@ test("a robot that was denied does not come to the hand when it is assigned late
   setSession({}, ["arm"]);
   show();
   expect(hands.driven.get("right")).toBe("arm");
+});
+
+test("why a press of the wearer's button did nothing is before its eyes, and not that of others", () => {
+  const shown = vi.spyOn(headset, "show");
+  const notice = (participant: string, reason: string): object => ({ type: "event", body: { event: "notice", level: "warning", text: reason, participant, reason } });
+  takeInbox({ type: "inbox", messages: [notice("p1", "not_holder"), notice("p2", "held"), notice("p1", "alignment_refused"), notice("p1", "")] });
+  expect(shown.mock.calls).toEqual([["not_holder"]]);
 });
