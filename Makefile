@@ -110,7 +110,7 @@ bench: install
 	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment" "join" "deformable" \
 	  "cloud" "cloud --cameras 2" "cloud --beside" \
 	  "cloud-stream" "cloud-stream --points 100000 --mbit 300 --clients 1" "cloud-stream --mbit 20 --clients 1" \
-	  "stop" "csharp" "record" "web --curve"; do \
+	  "stop" "csharp" "record" "export" "web --curve"; do \
 	  $(BIN)/iris-session bench $$bench --check || status=1; \
 	done; exit $$status
 
