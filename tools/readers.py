@@ -46,9 +46,9 @@ SIZE = (160, 120)
 EVERY = 20
 #: Columns that are shifted by one frame in a copy of the set, by format.
 SHIFTED = {
-    "lerobot": ("action", "robots.left.joint_positions", "objects.hammer.pose", "session_time_ns"),
-    "robomimic": ("actions_ctrl", "states", "robots.left.joint_positions", "objects.hammer.pose"),
-    "mcap": ("robots.left.joint_positions", "objects.hammer.pose", "session_time_ns"),
+    "lerobot": ("action", "robots.left.joint_positions", "objects.hammer.contact_force", "session_time_ns"),
+    "robomimic": ("actions_ctrl", "states", "robots.left.joint_positions", "objects.hammer.contact_force"),
+    "mcap": ("robots.left.joint_positions", "objects.hammer.contact_force", "session_time_ns"),
 }
 
 

@@ -26,7 +26,9 @@ from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Decision
 from iris_session.recording import CLOSED, Recording
 from iris_session.replay.plant_reader import (
+    CONTACT_FORCE,
     END_EFFECTOR,
+    FORCE,
     GRIPPER,
     JOINTS,
     POSE,
@@ -97,7 +99,7 @@ class Schema(msgspec.Struct, frozen=True):
             if robot.has_gripper:
                 columns.append(FrameColumn(key("gripper"), FLOAT, ("closed",)))
             if robot.has_force:
-                columns.append(FrameColumn(key("contact_force"), FLOAT, ("normal_n",)))
+                columns.append(FrameColumn(key(CONTACT_FORCE), FLOAT, FORCE))
             columns += [
                 FrameColumn(key(ACTION), FLOAT, robot.actuators),
                 FrameColumn(key("operator_pose"), FLOAT, POSE),
@@ -105,7 +107,9 @@ class Schema(msgspec.Struct, frozen=True):
                 FrameColumn(key("engaged"), BOOL, ("engaged",)),
                 FrameColumn(key("intervention"), BOOL, ("intervention",)),
             ]
-        columns += [FrameColumn(make_object_key(name), FLOAT, POSE) for name in self.objects]
+        for name in self.objects:
+            columns.append(FrameColumn(make_object_key(name, POSES), FLOAT, POSE))
+            columns.append(FrameColumn(make_object_key(name, CONTACT_FORCE), FLOAT, ("x_n", "y_n", "z_n")))
         return columns
 
     def find_tick(self, frame: int) -> int:
@@ -119,9 +123,9 @@ def to_key(name: str) -> str:
     return name.replace("/", "_")
 
 
-def make_object_key(name: str) -> str:
-    """Return the key of the poses of an object."""
-    return f"objects.{to_key(name)}.pose"
+def make_object_key(name: str, quantity: str) -> str:
+    """Return the key of a column of an object."""
+    return f"objects.{to_key(name)}.{quantity}"
 
 
 class Table(NamedTuple):
@@ -234,9 +238,11 @@ class FrameReader:
     def _notice(self, cause: str) -> None:
         """Take a frame where a tick begins: its state is there still, and its commands are there already."""
         taking = self._taking
-        if taking is None or cause != LateCause.CONTROL or not self._is_closed:
+        if taking is None or taking.error is not None or self._replay.step < taking.episode.first_step:
             return
-        if self._replay.step >= taking.episode.first_step and taking.error is None:
+        if cause == LateCause.AUTHORITY or (cause == LateCause.PHYSICS and self._is_closed):
+            taking.state_before = self.core.world.save_state()
+        elif cause == LateCause.CONTROL and self._is_closed:
             try:
                 taking.add_tick(self.core)
             except Exception as error:  # of a full disk, for example: the step, which is not to blame, is finished
@@ -292,6 +298,8 @@ class _Taking:
         self._end_tick = math.inf if math.isinf(until) else math.floor(until / self._period_s + 1e-6) + 1
         self._n_ticks = self._n_frames = self._n_pending = self._repeated = 0
         self._begin_s, self._begin_ns, self._late_s, self._late_at_s = 0.0, 0, 0.0, 0.0
+        #: State of the coming tick, with the inputs of the one before.
+        self.state_before = b""
         #: What happened within a step, which has to be finished first.
         self.error: Exception | None = None
         self._reader: PlantReader | None = None
@@ -353,9 +361,11 @@ class _Taking:
             if robot.has_gripper:
                 values[key("gripper")].append(1.0 - found[GRIPPER].read()[0])
             if robot.has_force:
-                values[key("contact_force")].append(view.gripper_force(robot.name))
-        for name in self._schema.objects:
-            values[make_object_key(name)].append(reader.objects[name][POSES].read())
+                values[key(CONTACT_FORCE)].append(view.gripper_force(robot.name))
+        forces = reader.solve_forces(self.state_before)[1][:, 1:] if self._schema.objects else ()
+        for name, force in zip(self._schema.objects, forces, strict=True):
+            values[make_object_key(name, POSES)].append(reader.objects[name][POSES].read())
+            values[make_object_key(name, CONTACT_FORCE)].append(force)
         self._n_frames += 1
         self._n_pending += 1
         self._draw(core)

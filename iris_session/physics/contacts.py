@@ -157,22 +157,25 @@ class ContactTables:
                 forces[robot] += normal
         return tuple(forces)
 
-    def object_forces(self, model: mujoco.MjModel, data: Any) -> tuple[float, ...]:
-        """Return per object the sum of the normal contact forces on its bodies [N]. Valid as for `gripper_forces`.
+    def object_forces(self, model: mujoco.MjModel, data: Any) -> NDArray[np.float64]:
+        """Return the contact forces on the bodies of each object [N], shape (n, 4). Valid as for `gripper_forces`.
 
-        Contacts between bodies of one object do not count.
+        The sum of the normal forces, then the vector sum with friction, world frame. Contacts between bodies of one
+        object do not count.
         """
-        forces = [0.0] * len(self._object_names)
-        if not data.ncon or not forces:
-            return tuple(forces)
-        pairs = self._geom_object[data.contact.geom]
-        contact_force = np.empty(6)
+        forces = np.zeros((len(self._object_names), 4))
+        if not data.ncon or not len(forces):
+            return forces
+        contact, contact_force = data.contact, np.empty(6)
+        pairs = self._geom_object[contact.geom]
         for row in np.nonzero(pairs[:, 0] != pairs[:, 1])[0].tolist():
             mujoco.mj_contactForce(model, data, row, contact_force)
-            for index in pairs[row].tolist():
+            force_world = contact_force[:3] @ contact.frame[row].reshape(3, 3)  # on the second geom
+            for index, sign in zip(pairs[row].tolist(), (-1.0, 1.0), strict=True):
                 if index >= 0:
-                    forces[index] += float(contact_force[0])
-        return tuple(forces)
+                    forces[index, 0] += contact_force[0]
+                    forces[index, 1:] += sign * force_world
+        return forces
 
 
 def _find_roots(model: mujoco.MjModel, tree: KinematicTree, spec: RobotSpec) -> tuple[int, ...]:

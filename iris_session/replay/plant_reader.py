@@ -68,8 +68,7 @@ class PlantReader:
         self._tables = ContactTables(self._model, self._specs, core.scene.objects, self._tree)
         self._scratch: Any = None
         self._solved = b""
-        self._gripper_forces: tuple[float, ...] = ()
-        self._object_forces: tuple[float, ...] = ()
+        self._forces: tuple[tuple[float, ...], NDArray[np.float64]] = ((), np.empty((0, 4)))
         self.robots = {spec.name: self._list_robot(i, spec) for i, spec in enumerate(self._specs)}
         self.objects = {spec.name: self._list_object(i, spec) for i, spec in enumerate(core.scene.objects)}
         if not (self.robots or self.objects):
@@ -90,7 +89,7 @@ class PlantReader:
         if spec.gripper_actuator:
             found[GRIPPER] = Quantity(("opening",), self._make_opening(spec))
         if spec.finger_bodies:
-            found[CONTACT_FORCE] = Quantity(FORCE, lambda: (self._solve_forces()[0][index],))
+            found[CONTACT_FORCE] = Quantity(FORCE, lambda: (self.solve_forces()[0][index],))
         return found
 
     def _list_object(self, index: int, spec: ObjectSpec) -> dict[str, Quantity]:
@@ -98,7 +97,7 @@ class PlantReader:
         found = {POSES: Quantity(POSE, lambda: _to_numbers(view.object_pose(name)))}
         bodies = self._tree.list_subtree(find_element_id(self._model, "body", spec.body))
         if any(int(self._model.body_geomnum[body]) for body in bodies):  # without geoms nothing touches it
-            found[CONTACT_FORCE] = Quantity(FORCE, lambda: (self._solve_forces()[1][index],))
+            found[CONTACT_FORCE] = Quantity(FORCE, lambda: (float(self.solve_forces()[1][index, 0]),))
         return found
 
     def _list_body(self, name: str) -> dict[str, Quantity]:
@@ -130,18 +129,25 @@ class PlantReader:
         scale, offset = find_opening_law(self._model, actuator, spec) or (math.nan, math.nan)
         return lambda: (scale * float(data.actuator_length[actuator]) + offset,)
 
-    def _solve_forces(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the forces on grippers and objects [N], solved once per state."""
-        state = self.world.save_state()
+    def solve_forces(self, state: bytes = b"") -> tuple[tuple[float, ...], NDArray[np.float64]]:
+        """Return the contact forces on grippers and objects [N], as of `ContactTables`, solved once per state.
+
+        Args:
+            state: `World.save_state`; empty: the present one.
+        """
+        state = state or self.world.save_state()
         if state != self._solved:
             if self._scratch is None:
                 self._scratch = mujoco.MjData(self._model)
             mujoco.mj_setState(self._model, self._scratch, np.frombuffer(state).copy(), STATE)
             mujoco.mj_forward(self._model, self._scratch)
-            self._gripper_forces = self._tables.gripper_forces(self._model, self._scratch)
-            self._object_forces = self._tables.object_forces(self._model, self._scratch)
+            tables = self._tables
+            self._forces = (
+                tables.gripper_forces(self._model, self._scratch),
+                tables.object_forces(self._model, self._scratch),
+            )
             self._solved = state
-        return self._gripper_forces, self._object_forces
+        return self._forces
 
 
 def list_moving(bodies: Sequence[BodyInfo]) -> list[str]:

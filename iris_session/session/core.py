@@ -172,13 +172,13 @@ class SessionCore:
         if plant:
             world.restore_state(plant)
         decision = self.authority.step(now_ns, entries, n_ticks, world.view(), self._status)
-        lap(LateCause.AUTHORITY)
         if decision.reset:
             self._reset_world()
             self._place_objects(entries)
             self._reset_control()
         elif any(entry.connection == HOST and isinstance(entry.message, ExternalReset) for entry in entries):
             self._reset_control()  # the owner moved the robots: they are where they stand now
+        lap(LateCause.AUTHORITY)
         owner_ctrl = world.ctrl if self.sharing is None else world.ctrl.copy()
         if self.sharing is not None:
             self.sharing.begin(decision, self.authority.list_holders(), world.data, owner_ctrl)

@@ -11,14 +11,16 @@ import pytest
 
 from iris_session.dataset.episodes import DatasetError, PlannedEpisode, PlanOptions, make_plan
 from iris_session.dataset.frames import EpisodeLeftOutError, FrameReader, Schema, Table, make_schema
+from iris_session.demo.scenes import scene_path
+from iris_session.physics.load import load_model
 from iris_session.physics.world import STATE
 from iris_session.protocol.client_messages import Control
 from iris_session.protocol.entries import Entry
-from iris_session.recording import OPEN, Recording
+from iris_session.recording import CLOSED, OPEN, Recording
 from iris_session.replay.plant_reader import PlantReader
 from tests.dataset.support import EPISODES, make_entries, record
 from tests.replay.support import Played, damaged, make_drawn_core, play
-from tests.session.play import host
+from tests.session.play import host, make_core
 
 ALL = PlanOptions(("success", "failure", "unknown"))
 
@@ -76,6 +78,41 @@ def test_actions_applied_to_the_first_state_give_the_episode_again(played: Playe
                     data.ctrl[model.actuator(name).id] = value
             mujoco.mj_step(model, data)
     assert np.ptp(found[0][1].columns["robots.left.joint_positions"], axis=0).max() > 1e-4  # type: ignore[union-attr]
+
+
+def sum_contact_forces(model: mujoco.MjModel, data: mujoco.MjData, body: str) -> np.ndarray:
+    """Return the contact force on a body and those below it, as docs/datasets.md defines it."""
+    root, total = model.body(body).id, np.zeros(3)
+    for row, contact in enumerate(data.contact):
+        sides = [model.body_rootid[model.geom_bodyid[geom]] == root for geom in contact.geom]
+        if sides[0] != sides[1]:
+            force = np.zeros(6)
+            mujoco.mj_contactForce(model, data, row, force)
+            total += (1.0 if sides[1] else -1.0) * contact.frame.reshape(3, 3).T @ force[:3]
+    return total
+
+
+@pytest.mark.parametrize("recording_class", [CLOSED, OPEN])
+def test_contact_forces_of_objects_are_those_of_the_state_before_its_action(
+    recording_class: str, tmp_path: Path
+) -> None:
+    model = load_model(scene_path("handover"))
+    at = model.jnt_qposadr[model.body("board").jntadr[0]]
+    model.key_qpos[0, at : at + 7] = (-0.2, 0.0, 0.46, 1.0, 0.0, 0.0, 0.0)  # on the left arm
+    core = make_core(model, user_owned_loop=recording_class == OPEN)
+    made = record(tmp_path / "session.rrd", core=core, recording_class=recording_class)
+    data = mujoco.MjData(model)
+    for episode, table in read(made, 500)[1]:
+        assert isinstance(table, Table)
+        for frame, state in enumerate(table.states):
+            mujoco.mj_setState(model, data, state.copy(), STATE)
+            data.ctrl[:] = made.ctrl[episode.first_step + frame - 1]
+            mujoco.mj_forward(model, data)
+            for one in made.header.objects:
+                force = table.columns[f"objects.{one.name}.contact_force"][frame]
+                assert np.allclose(force, sum_contact_forces(model, data, one.body), rtol=0.0, atol=1e-9)
+        carried = table.columns["objects.board.contact_force"].mean(axis=0)
+        assert carried == pytest.approx([0.0, 0.0, 0.26 * 9.81], abs=0.5)
 
 
 @pytest.mark.parametrize("fps", [30, 37, 499])
@@ -150,6 +187,12 @@ def test_episodes_without_exact_frames_are_named(tmp_path: Path) -> None:
     assert isinstance(after, Table), "others are not concerned"
     within = read(made, 100, first_step=20, end_step=90)[1][0][1]
     assert "reset or loaded 0.08 s after its beginning" in str(within)
+    begun = read(made, 100, first_step=60, end_step=90)[1][0][1]
+    assert isinstance(begun, Table), "a reset may begin an episode"
+    data = made.core.world.make_initial_data()
+    mujoco.mj_forward(made.core.world.model, data)
+    force = sum_contact_forces(made.core.world.model, data, "board")
+    assert begun.columns["objects.board.contact_force"][0] == pytest.approx(force, abs=1e-9)
 
 
 def test_lateness_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,14 +69,17 @@ def test_grasp_is_reported_with_its_force(cone: str) -> None:
     objects = find_objects(world.model)
     tables = ContactTables(world.model, find_robots(world.model).robots, objects, KinematicTree(world.model))
 
-    def forces() -> dict[str, float]:
+    def forces() -> dict[str, list[float]]:
+        """Return the sum of the normal forces on each object, and their vector sum with friction."""
         mujoco.mj_forward(world.model, world.data)
-        return dict(zip([one.name for one in objects], tables.object_forces(world.model, world.data), strict=True))
+        found = tables.object_forces(world.model, world.data).tolist()
+        return dict(zip([one.name for one in objects], found, strict=True))
 
     for _ in range(500):
         world.tick()
-    at_rest = {"cube": 0.11 * 9.81, "spare": 0.1 * 9.81, "lonely": 0.0}  # the lid is a part of the cube
-    assert forces() == pytest.approx(at_rest, rel=0.01)
+    weights = {"cube": 0.11 * 9.81, "spare": 0.1 * 9.81, "lonely": 0.0}  # the lid is a part of the cube
+    for name, found in forces().items():
+        assert found == pytest.approx([weights[name], 0.0, 0.0, weights[name]], rel=0.01, abs=1e-3)
     assert contacts_of(world) == {
         "cube": ObjectContact("cube", (), (), ("table",)),
         "spare": ObjectContact("spare", (), (), ("table",)),
@@ -93,7 +96,9 @@ def test_grasp_is_reported_with_its_force(cone: str) -> None:
         world.tick()
     assert contacts_of(world)["cube"] == ObjectContact("cube", ("robot",), ("robot",), ())
     assert view.object_pose("cube").p[2] > 0.1
-    assert forces()["cube"] == pytest.approx(20.0, rel=0.02), "two fingers, and nothing below"
+    normal, *vector = forces()["cube"]
+    assert normal == pytest.approx(20.0, rel=0.02), "two fingers, and nothing below"
+    assert vector == pytest.approx([0.0, 0.0, weights["cube"]], abs=0.02), "friction carries it"
     restored = grasp_world(cone)
     restored.restore(world.snapshot())
     assert restored.view().gripper_force("robot") == view.gripper_force("robot") > 19.0
