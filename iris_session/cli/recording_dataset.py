@@ -32,10 +32,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--cameras",
         metavar="LIST",
-        help="pictures of every frame: cameras of the model, NAME=CAMERA, or places NAME=X,Y,Z->X,Y,Z:FOVY, separated "
-        "by commas (default: none)",
+        help="pictures of every frame: cameras of the model, streams of recorded pictures, NAME=CAMERA, or places "
+        "NAME=X,Y,Z->X,Y,Z:FOVY, separated by commas (default: none)",
     )
-    group.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of a picture (default: 640x480)")
+    group.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of a drawn picture (default: 640x480)")
     looks = make_number_type(int, "a number of looks: give 0 to 1000", 0, 1000)
     group.add_argument("--looks", type=looks, metavar="N", help="every episode N more times: other light and colours")
     group.add_argument(

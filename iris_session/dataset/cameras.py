@@ -1,13 +1,13 @@
 """Cameras of a data set, chosen after the session: of the model, or anywhere; and looks of the scene, by a seed.
 
 A picture of look 0 is what MuJoCo's own renderer draws of the state, bit for bit. Other looks change light, colours and
-textures, and nothing that moves.
+textures, and nothing that moves. Pictures of real cameras are those that the session recorded, in every look.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from types import TracebackType
 from typing import Any, Final, Self
@@ -15,10 +15,14 @@ from typing import Any, Final, Self
 import msgspec
 import mujoco
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from iris_session.dataset.episodes import DatasetError
-from iris_session.recording import Recording
+from iris_session.dataset.frames import EpisodeLeftOutError
+from iris_session.protocol.media import is_stream_name
+from iris_session.protocol.names import AssetEncoding, MediaEncoding
+from iris_session.recording import RecordedImage, Recording
 from iris_session.replay.pictures import (
     Layer,
     Renderer,
@@ -27,6 +31,8 @@ from iris_session.replay.pictures import (
     open_gl,
     require_shapes,
 )
+from iris_session.scene.errors import AssetDecodeError
+from iris_session.scene.images import decode_image, read_stated_size
 from iris_session.session.core import SessionCore
 
 #: Most pixels of a side of a picture, and fewest.
@@ -47,6 +53,8 @@ class CameraSpec(msgspec.Struct, frozen=True):
         camera: Camera of the model, empty for one that stands anywhere.
         eye, target: Where it stands, and a point that it looks at [m], world frame. Up is up.
         fovy: Vertical field of view [deg]; 0: that of the model's free camera.
+        stream: Stream of recorded pictures, empty for a camera that is drawn.
+        size: Width and height of those pictures [px].
     """
 
     name: str
@@ -54,6 +62,8 @@ class CameraSpec(msgspec.Struct, frozen=True):
     eye: tuple[float, float, float] = (0.0, 0.0, 0.0)
     target: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fovy: float = 0.0
+    stream: str = ""
+    size: tuple[int, int] = (0, 0)
 
 
 class PictureSpec(msgspec.Struct, frozen=True):
@@ -70,9 +80,13 @@ class PictureSpec(msgspec.Struct, frozen=True):
     depth: bool = False
     masks: bool = False
 
+    def get_size(self, camera: CameraSpec) -> tuple[int, int]:
+        """Return width and height of the pictures of a camera [px]."""
+        return camera.size if camera.stream else (self.width, self.height)
+
 
 def parse_camera(text: str) -> CameraSpec:
-    """Parse a camera: `wrist`, a camera of the model; `top=overview`, under another name; or a place,
+    """Parse a camera: `wrist`, of the model or a stream; `top=overview`, under another name; or a place,
     `top=1.2,0,2->0,0,0.8:45`: where it stands, a point that it looks at, and its vertical field of view.
 
     Raises:
@@ -104,6 +118,88 @@ def parse_cameras(text: str) -> tuple[CameraSpec, ...]:
         twice = next(name for name in names if names.count(name) > 1)
         raise DatasetError(f"two cameras have the name {twice!r}: give one another name, NAME=CAMERA")
     return cameras
+
+
+def find_streams(pictures: PictureSpec, model: mujoco.MjModel, recording: Recording) -> PictureSpec:
+    """Return pictures of which those that the model has no camera for come from streams that were recorded.
+
+    Raises:
+        DatasetError: There is neither such a camera nor such a stream, or the size of its pictures is odd.
+    """
+
+    def find(spec: CameraSpec) -> CameraSpec:
+        if not spec.camera or find_camera(model, spec.camera) is not None:
+            return spec
+        first = next(recording.pictures(spec.camera), None) if is_stream_name(spec.camera) else None
+        if first is None:
+            jpeg = (one.stream for one in recording.streams() if one.encoding == MediaEncoding.JPEG)
+            streams, cameras = (", ".join(names) or "none" for names in (sorted(set(jpeg)), list_model_cameras(model)))
+            raise DatasetError(
+                f"there is no camera {spec.camera!r} in the scene, and no recorded picture of it: give a camera of the "
+                f"scene ({cameras}), a stream of {recording.files[0]} ({streams}), or a place, {spec.name}=X,Y,Z->X,Y,Z"
+            )
+        width, height = read_stated_size(first.jpeg, AssetEncoding.JPEG)
+        if width % 2 or height % 2:
+            raise DatasetError(f"pictures of {spec.camera!r} are {width}x{height}: a video needs even numbers")
+        return replace(spec, camera="", stream=spec.camera, size=(width, height))
+
+    return replace(pictures, cameras=tuple(map(find, pictures.cameras)))
+
+
+class RecordedCamera:
+    """Pictures of a real camera, as the session recorded them.
+
+    Args:
+        recording: The open recording.
+        spec: A camera that has a `stream`.
+    """
+
+    def __init__(self, recording: Recording, spec: CameraSpec) -> None:
+        self.spec = spec
+        self._pictures = recording.pictures(spec.stream)
+        self._next = next(self._pictures, None)
+        self._newest: RecordedImage | None = None
+
+    def read(self, times_ns: Sequence[int]) -> Iterator[tuple[Layer, int]]:
+        """Yield the newest picture at each frame of an episode, uint8, shape (height, width, 3), and its capture [ns].
+
+        Args:
+            times_ns: Session times of the frames, ascending, and later than those of earlier calls.
+
+        Raises:
+            EpisodeLeftOutError: The first frame has no picture yet, none is of the episode, or one has another size.
+        """
+        image, shown, of_stream = None, None, f"picture of {self.spec.stream!r}"
+        for at_ns in times_ns:
+            while self._next is not None and find_capture(self._next) <= at_ns:
+                self._newest = max(filter(None, (self._next, self._newest)), key=find_capture)
+                self._next = next(self._pictures, None)
+            if self._newest is None:
+                if self._next is None:
+                    raise EpisodeLeftOutError(f"the recording has no {of_stream}")
+                late_s = (find_capture(self._next) - at_ns) * 1e-9
+                raise EpisodeLeftOutError(f"the first {of_stream} is {late_s:.2f} s after its first frame: trim it")
+            if image is None or shown is not self._newest:
+                image, shown = self._decode(self._newest), self._newest
+            yield image, find_capture(self._newest)
+        if self._newest is None or find_capture(self._newest) < times_ns[0]:
+            raise EpisodeLeftOutError(f"no {of_stream} was taken in it")
+
+    def _decode(self, picture: RecordedImage) -> Layer:
+        try:
+            pixels = decode_image(picture.jpeg, AssetEncoding.JPEG)
+        except AssetDecodeError as error:
+            raise EpisodeLeftOutError(f"a picture of {self.spec.stream!r} cannot be read: {error}") from error
+        height, width = pixels.shape[:2]
+        if (width, height) != self.spec.size:
+            expected = "x".join(map(str, self.spec.size))
+            raise EpisodeLeftOutError(f"a picture of {self.spec.stream!r} is {width}x{height}, not {expected}")
+        return np.repeat(pixels, 3 // pixels.shape[2], axis=2)
+
+
+def find_capture(picture: RecordedImage) -> int:
+    """Return the session time of a picture [ns]: its capture, at the latest its receipt."""
+    return min(picture.capture_ns, picture.received_ns)
 
 
 class CameraSet:

@@ -79,12 +79,15 @@ class RobotColumns(msgspec.Struct, frozen=True):
 
 
 class Schema(msgspec.Struct, frozen=True):
-    """Content of every frame of a data set. `ticks_per_s`: of the simulation, as a fraction."""
+    """Content of every frame of a data set. `ticks_per_s`: of the simulation, as a fraction. `recorded`: cameras whose
+    pictures were recorded.
+    """
 
     fps: int
     ticks_per_s: tuple[int, int]
     robots: tuple[RobotColumns, ...]
     objects: tuple[str, ...]
+    recorded: tuple[str, ...] = ()
 
     def list_columns(self) -> list[FrameColumn]:
         """Return the columns of a frame, in order."""
@@ -110,6 +113,7 @@ class Schema(msgspec.Struct, frozen=True):
         for name in self.objects:
             columns.append(FrameColumn(make_object_key(name, POSES), FLOAT, POSE))
             columns.append(FrameColumn(make_object_key(name, CONTACT_FORCE), FLOAT, ("x_n", "y_n", "z_n")))
+        columns += [FrameColumn(make_age_key(camera), FLOAT, ("s",)) for camera in self.recorded]
         return columns
 
     def find_tick(self, frame: int) -> int:
@@ -126,6 +130,11 @@ def to_key(name: str) -> str:
 def make_object_key(name: str, quantity: str) -> str:
     """Return the key of a column of an object."""
     return f"objects.{to_key(name)}.{quantity}"
+
+
+def make_age_key(camera: str) -> str:
+    """Return the key of the age of recorded pictures."""
+    return f"pictures.{camera}.age_s"
 
 
 class Table(NamedTuple):
@@ -180,7 +189,8 @@ def make_schema(core: SessionCore, fps: int) -> Schema:
 
 
 class FrameReader:
-    """Reads the frames of the episodes of one recording, in their order; the files are read once for all.
+    """Reads the frames of the episodes of one recording, in their order; the files are read once for all. What belongs
+    to recorded pictures is not in them.
 
     Args:
         recording: The open recording.
@@ -192,7 +202,8 @@ class FrameReader:
     """
 
     def __init__(self, recording: Recording, planned: PlannedRecording, schema: Schema) -> None:
-        self._recording, self._planned, self._schema = recording, planned, schema
+        self._recording, self._planned = recording, planned
+        self._schema = msgspec.structs.replace(schema, recorded=())
         self._is_closed = recording.header.recording_class == CLOSED
         self._replay = Replay(recording, lap=self._notice)
         self._taking: _Taking | None = None

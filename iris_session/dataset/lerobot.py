@@ -38,6 +38,8 @@ DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 STATE: Final = "observation.state"
+#: Beginning of the key of a camera.
+IMAGE: Final = "observation.images."
 _FRAME_INDEX: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
@@ -49,8 +51,8 @@ class LeRobotWriter(SetWriter):
     ) -> None:
         require_package("pyarrow", "writing data sets of LeRobot")
         super().__init__(folder, plan, schema, pictures)
-        self._cameras = {one.name: f"observation.images.{one.name}" for one in pictures.cameras}
-        self._features = _list_features(schema, pictures, self._cameras)
+        self._cameras = {one.name: IMAGE + one.name for one in pictures.cameras}
+        self._features = _list_features(schema, pictures)
         self._stats: dict[str, Stats] = {}
         self.prepare(REQUEST, request)
         if (folder / INFO).exists():
@@ -181,7 +183,7 @@ def _format(pattern: str, number: int, **more: str) -> str:
     return pattern.format(chunk_index=chunk, file_index=file, **more)
 
 
-def _list_features(schema: Schema, pictures: PictureSpec, cameras: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+def _list_features(schema: Schema, pictures: PictureSpec) -> dict[str, dict[str, Any]]:
     """Return LeRobot's description of the columns."""
     state, action = [], []
     for robot in schema.robots:
@@ -200,14 +202,15 @@ def _list_features(schema: Schema, pictures: PictureSpec, cameras: Mapping[str, 
         }
     for key in _FRAME_INDEX:
         features[key] = {"dtype": "float32" if key == "timestamp" else "int64", "shape": [1], "names": None}
-    for key in cameras.values():
-        features[key] = {
+    for camera in pictures.cameras:
+        width, height = pictures.get_size(camera)
+        features[IMAGE + camera.name] = {
             "dtype": "video",
-            "shape": [pictures.height, pictures.width, 3],
+            "shape": [height, width, 3],
             "names": ["height", "width", "channels"],
             "info": {
-                "video.height": pictures.height,
-                "video.width": pictures.width,
+                "video.height": height,
+                "video.width": width,
                 "video.codec": CODEC_NAME,
                 "video.pix_fmt": PIXELS,
                 "video.is_depth_map": False,

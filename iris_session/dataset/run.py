@@ -23,19 +23,28 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import msgspec
+import numpy as np
 
-from iris_session.dataset.cameras import CameraSet, PictureSpec, make_view
+from iris_session.dataset.cameras import CameraSet, PictureSpec, RecordedCamera, find_streams
 from iris_session.dataset.episodes import DatasetError, Plan, PlannedEpisode, PlannedRecording, PlanOptions, make_plan
-from iris_session.dataset.files import Stats
+from iris_session.dataset.files import PictureSink, Stats
 from iris_session.dataset.formats import FORMATS, MODEL, make_sink, open_writer
-from iris_session.dataset.frames import EpisodeLeftOutError, FrameReader, Schema, Table, make_schema
+from iris_session.dataset.frames import (
+    SESSION_TIME,
+    EpisodeLeftOutError,
+    FrameReader,
+    Schema,
+    Table,
+    make_age_key,
+    make_schema,
+)
 from iris_session.recording import Recording
 from iris_session.replay.simulation import Replay
 from iris_session.session.core import SessionCore
 from iris_session.system.process import die_with_parent, is_parent
 
 #: Packages whose version changes the bytes of a set, beside those of its format.
-_PACKAGES: Final = ("iris-session", "mujoco", "numpy")
+_PACKAGES: Final = ("iris-session", "mujoco", "numpy", "pillow")
 #: Finished episodes that wait for an earlier one, per process.
 _AHEAD: Final = 2
 #: File of what a process has made, in the folder of its task.
@@ -115,6 +124,7 @@ class EpisodeMaker:
         self._recording: Recording | None = None
         self._reader: FrameReader | None = None
         self._cameras: CameraSet | None = None
+        self._recorded: list[RecordedCamera] = []
         self._key: Any = None
 
     def make(self, task: EpisodeTask) -> MadeEpisode:
@@ -151,6 +161,10 @@ class EpisodeMaker:
 
         try:
             table = self._reader.read(task.episode, draw)
+            at = time.perf_counter()
+            for camera in self._recorded:
+                table = add_recorded(table, camera, sink, task.pictures.looks)
+            encode_s += time.perf_counter() - at
         except EpisodeLeftOutError as error:
             sink.abort()
             return MadeEpisode(None, {}, measure(), str(error))
@@ -174,19 +188,40 @@ class EpisodeMaker:
         self.close()
         self._recording = Recording.open(task.planned.path, warn=False)
         self._reader = FrameReader(self._recording, task.planned, task.schema)
-        if task.pictures.cameras:
-            self._cameras = CameraSet(task.pictures)
+        cameras = task.pictures.cameras
+        self._recorded = [RecordedCamera(self._recording, one) for one in cameras if one.stream]
+        if drawn := tuple(one for one in cameras if not one.stream):
+            self._cameras = CameraSet(msgspec.structs.replace(task.pictures, cameras=drawn))
         self._key = key
 
     def close(self) -> None:
         """Close what is open."""
-        self._reader = None
+        self._reader, self._recorded = None, []
         if self._cameras is not None:
             self._cameras.close()
             self._cameras = None
         if self._recording is not None:
             self._recording.close()
             self._recording = None
+
+
+def add_recorded(table: Table, camera: RecordedCamera, sink: PictureSink, looks: int) -> Table:
+    """Add the pictures of a real camera to a sink. Return the frames with their ages.
+
+    Raises:
+        EpisodeLeftOutError: Frames have no picture.
+    """
+    times, captures, name = table.columns[SESSION_TIME], [], camera.spec.name
+    for image, capture_ns in camera.read(times[:, 0].tolist()):
+        for look in range(looks + 1):
+            sink.add(look, name, image)
+        captures.append(capture_ns)
+    ages = (times - np.array(captures)[:, None]) * 1e-9
+    repeated = len(captures) - len(set(captures))
+    notes = table.notes
+    if repeated:
+        notes += (f"{repeated} frames repeat the picture of {name} before, the oldest is {ages.max():.2f} s old",)
+    return Table({**table.columns, make_age_key(name): ages}, table.states, notes)
 
 
 def export_dataset(
@@ -218,7 +253,7 @@ def export_dataset(
         raise ValueError(f"{to!r}: give one of {', '.join(FORMATS)}")
     say("reading")
     plan = make_plan(files, options.choice)
-    schema = _find_schema(plan, options)
+    schema, options = _find_schema(plan, options)
     request = _make_request(to, plan, schema, options)
     try:
         return _write(folder, to, plan, schema, options, request, say)
@@ -227,13 +262,14 @@ def export_dataset(
         raise DatasetError(f"the data set cannot be written to {folder}: {reason}") from error
 
 
-def _find_schema(plan: Plan, options: DatasetOptions) -> Schema:
-    """Return the columns of the first recording with an episode, and check that its scene has the cameras."""
+def _find_schema(plan: Plan, options: DatasetOptions) -> tuple[Schema, DatasetOptions]:
+    """Return the columns of the first recording with an episode, and options with the cameras that it has."""
     with Recording.open(plan.recordings[plan.episodes[0].recording].path, warn=False) as recording:
         core = Replay(recording).core
-        for camera in options.pictures.cameras:
-            make_view(core.world.model, camera)
-        return make_schema(core, options.fps)
+        pictures = find_streams(options.pictures, core.world.model, recording)
+        recorded = tuple(one.name for one in pictures.cameras if one.stream)
+        schema = msgspec.structs.replace(make_schema(core, options.fps), recorded=recorded)
+        return schema, msgspec.structs.replace(options, pictures=pictures)
 
 
 def _make_request(to: str, plan: Plan, schema: Schema, options: DatasetOptions) -> dict[str, Any]:

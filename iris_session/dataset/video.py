@@ -75,7 +75,7 @@ class VideoSink(PictureSink):
     """Pictures of one episode on their way into videos: `make_video_name`."""
 
     def __init__(self, folder: Path, schema: Schema, pictures: PictureSpec) -> None:
-        self._folder, self._fps, self._size = folder, schema.fps, (pictures.width, pictures.height)
+        self._folder, self._fps = folder, schema.fps
         self._writers: dict[tuple[int, str], VideoWriter] = {}
         self._stats: dict[tuple[int, str], PictureStats] = {}
 
@@ -83,7 +83,7 @@ class VideoSink(PictureSink):
         key = look, camera
         if key not in self._writers:
             path = self._folder / make_video_name(look, camera)
-            self._writers[key] = VideoWriter(path, self._fps, *self._size)
+            self._writers[key] = VideoWriter(path, self._fps, image.shape[1], image.shape[0])
             self._stats[key] = PictureStats()
         self._writers[key].add(image)
         self._stats[key].add(image)

@@ -6,12 +6,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
+from iris_session.cameras.drawing import encode_jpeg
 from iris_session.journal.messages import StateFrame
 from iris_session.protocol.client_messages import Episode
 from iris_session.protocol.entries import Entry, Join
+from iris_session.protocol.media import StreamInfo
 from iris_session.recording import CLOSED
 from iris_session.session.core import SessionCore
+from tests.recording.test_media import message
 from tests.replay.support import Played, make_drawn_core, play
 from tests.session.play import ANN, TICK_NS, entries
 
@@ -47,14 +51,26 @@ def record(
     steps: int = STEPS,
     core: SessionCore | None = None,
     recording_class: str = CLOSED,
+    captures: Sequence[tuple[int, int]] = (),
 ) -> Played:
-    """Play a session with episodes, and write its recording."""
+    """Play a session with episodes, and write its recording.
+
+    `captures`: of pictures of a real camera, `room-front`: at a step, and so much later [ns]. The i-th has the grey
+    `make_grey(i)`.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     core = core or make_drawn_core(user_owned_loop=recording_class != CLOSED)
     made = play(path, steps, make_entries=make_entries(episodes), core=core, recording_class=recording_class)
     made.batch.states = make_states(made)
+    for i, (step, later_ns) in enumerate(captures):
+        jpeg = encode_jpeg(np.full((32, 48, 3), make_grey(i), np.uint8))
+        made.media.append(message("room-front", jpeg, i, made.session_time[step] + later_ns, "jpeg", StreamInfo()))
     made.write()
     return made
+
+
+def make_grey(i: int) -> int:
+    return 20 + 20 * i
 
 
 def read_files(folder: Path) -> dict[str, bytes]:

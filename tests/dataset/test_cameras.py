@@ -6,6 +6,7 @@ import copy
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -13,9 +14,19 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from iris_session.dataset.cameras import CameraSet, CameraSpec, PictureSpec, make_view, parse_cameras
+from iris_session.cameras.drawing import encode_jpeg
+from iris_session.dataset.cameras import (
+    CameraSet,
+    CameraSpec,
+    PictureSpec,
+    RecordedCamera,
+    find_streams,
+    make_view,
+    parse_cameras,
+)
 from iris_session.dataset.episodes import DatasetError
-from iris_session.recording import Recording
+from iris_session.dataset.frames import EpisodeLeftOutError
+from iris_session.recording import RecordedImage, Recording
 from iris_session.replay.pictures import NO_BODY, Image, open_gl
 from iris_session.session.core import SessionCore
 from tests.dataset.support import record
@@ -144,6 +155,43 @@ def test_unknown_and_doubled_cameras_are_refused() -> None:
         make_view(model, CameraSpec("nope", "nope"))
     with pytest.raises(DatasetError, match="two cameras have the name 'a'"):
         parse_cameras("a=side,a=operator")
+
+
+def read_recorded(pictures: list[RecordedImage], *episodes: list[int]) -> list[list[tuple[int, int]]]:
+    """Return grey and capture of the picture at each frame of episodes, by their session times."""
+    recording: Any = SimpleNamespace(pictures=lambda stream: iter(pictures))
+    camera = RecordedCamera(recording, CameraSpec("front", stream="room", size=(4, 2)))
+    return [[(int(image.mean()), at_ns) for image, at_ns in camera.read(times)] for times in episodes]
+
+
+def take_picture(capture_ns: int, received_ns: int, grey: int, width: int = 4) -> RecordedImage:
+    image = np.full((2, width, 3), grey, np.uint8)
+    return RecordedImage("room", capture_ns, capture_ns, received_ns, encode_jpeg(image))
+
+
+def test_recorded_pictures_are_those_that_were_there() -> None:
+    times = (10, 12), (30, 31), (20, 35), (90, 50)
+    pictures = [take_picture(*one, 40 * i) for i, one in enumerate(times, 1)]
+    assert read_recorded(pictures, [10, 29, 30, 49], [50, 51]) == [
+        [(40, 10), (40, 10), (80, 30), (80, 30)],
+        [(160, 50), (160, 50)],
+    ], "none is shown before a newer one, and none is of a time after its receipt"
+    one, billion = take_picture(10, 10, 40), 1_000_000_000
+    for wrong, times, why in (
+        ([], [5], "the recording has no picture of 'room'"),
+        ([one], [10 - billion], "the first picture of 'room' is 1.00 s after its first frame: trim it"),
+        ([one], [11, 20], "no picture of 'room' was taken in it"),
+        ([one._replace(jpeg=one.jpeg[:-20])], [10], "a picture of 'room' cannot be read: damaged jpeg"),
+        ([take_picture(10, 10, 40, width=6)], [10], "a picture of 'room' is 6x2, not 4x2"),
+    ):
+        with pytest.raises(EpisodeLeftOutError, match=why):
+            read_recorded(wrong, times)
+
+
+def test_recorded_pictures_of_odd_size_fit_into_no_video() -> None:
+    recording: Any = SimpleNamespace(pictures=lambda stream: iter([take_picture(1, 1, 40, width=3)]))
+    with pytest.raises(DatasetError, match="pictures of 'room' are 3x2: a video needs even numbers"):
+        find_streams(PictureSpec(parse_cameras("room")), make_drawn_core().world.model, recording)
 
 
 def test_closing_one_set_of_cameras_leaves_the_pictures_of_another(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ class Played:
     core: SessionCore
     batch: Batch = field(default_factory=Batch)
     samples: list[Entry] = field(default_factory=list)
+    media: list[list[bytes]] = field(default_factory=list)
     qpos: list[NDArray[np.float64]] = field(default_factory=list)
     qvel: list[NDArray[np.float64]] = field(default_factory=list)
     ctrl: list[NDArray[np.float64]] = field(default_factory=list)
@@ -56,6 +57,8 @@ class Played:
         writer.write_header(self.header)
         for entry in self.samples:
             writer.add_sample(entry.connection, entry.receive_ns, msgspec.msgpack.encode(entry.message))
+        for message in self.media:
+            writer.add_media(message)
         scenes = {one.step: one for one in self.batch.scenes}
         keyframes = self.batch.keyframes
         for i, row in enumerate(self.batch.rows):
