@@ -3,7 +3,7 @@
     make readers
     python tools/readers.py --work FOLDER [--recording session.rrd]
 
-A recording of `iris-session demo handover` is exported, then read in an environment of its own (FOLDER/venv) with
+A recording of `iris-session demo cloud` is exported, then read in an environment of its own (FOLDER/venv) with
 LeRobot's `LeRobotDataset` and `lerobot-doctor`, robomimic's `SequenceDataset`, and the reader of `mcap`. What they give
 is compared with what was exported (`reader_checks.py`, which runs there); a copy of the set in which one column is
 shifted by one frame must be noticed. Exit status 0 if all agree.
@@ -20,6 +20,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from functools import partial
+from io import BytesIO
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,12 @@ import h5py
 import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from PIL import Image
 from pyarrow import parquet
 
 from iris_session.dataset.cameras import CameraSet, PictureSpec, parse_cameras
 from iris_session.dataset.episodes import LABELS, PlanOptions, make_plan
-from iris_session.dataset.frames import FrameReader, make_schema
+from iris_session.dataset.frames import FrameReader, Table, make_schema
 from iris_session.recording import Recording
 from iris_session.replay.simulation import Replay
 from iris_session.session.core import SessionCore
@@ -41,14 +43,17 @@ from iris_session.session.core import SessionCore
 PACKAGES = ("lerobot", "lerobot-doctor", "robomimic", "mcap")
 FPS = 30
 CAMERAS = "operator,top=0,0,2.4->0,0.01,0.7:50"
+#: A camera whose pictures were recorded, and its stream.
+REAL, STREAM = "front", "room-front"
+AGE = f"pictures.{REAL}.age_s"
 SIZE = (160, 120)
 #: Every so many pictures, one is compared.
 EVERY = 20
 #: Columns that are shifted by one frame in a copy of the set, by format.
 SHIFTED = {
-    "lerobot": ("action", "robots.left.joint_positions", "objects.hammer.contact_force", "session_time_ns"),
-    "robomimic": ("actions_ctrl", "states", "robots.left.joint_positions", "objects.hammer.contact_force"),
-    "mcap": ("robots.left.joint_positions", "objects.hammer.contact_force", "session_time_ns"),
+    "lerobot": ("action", "robots.left.joint_positions", "objects.hammer.contact_force", "session_time_ns", AGE),
+    "robomimic": ("actions_ctrl", "states", "robots.left.joint_positions", "objects.hammer.contact_force", AGE),
+    "mcap": ("robots.left.joint_positions", "objects.hammer.contact_force", "session_time_ns", AGE),
 }
 
 
@@ -88,7 +93,7 @@ def run_iris(*arguments: str) -> None:
 def record_demo(work: Path) -> Path:
     path = work / "demo" / "session.rrd"
     shutil.rmtree(path.parent, ignore_errors=True)
-    run_iris("demo", "handover", "--record", str(path))
+    run_iris("demo", "cloud", "--record", str(path))
     return path
 
 
@@ -103,11 +108,23 @@ def write_expected(recording: Path, path: Path) -> None:
         reader = FrameReader(opened, plan.recordings[0], make_schema(Replay(opened).core, FPS))
         for i, episode in enumerate(plan.episodes):
             table = reader.read(episode, partial(keep_picture, cameras, opened, found, i, count()))
+            find_recorded(opened, table, found, i)
             found |= {f"{i}|{key}": values for key, values in table.columns.items()}
             found[f"{i}|states"] = table.states
             found[f"{i}|task"] = np.array(episode.task)
             found[f"{i}|label"] = np.array(episode.label)
     np.savez(path, **found)
+
+
+def find_recorded(recording: Recording, table: Table, found: dict[str, Any], episode: int) -> None:
+    """Find the recorded picture of each frame: the newest that is not later."""
+    pictures, times = list(recording.pictures(STREAM)), table.columns["session_time_ns"]
+    captures = np.array([min(one.capture_ns, one.received_ns) for one in pictures])
+    newest = np.searchsorted(captures, times, "right") - 1
+    table.columns[AGE] = (times - captures[newest]) * 1e-9
+    for frame in range(0, len(times), EVERY):
+        image = Image.open(BytesIO(pictures[int(newest[frame, 0])].jpeg))
+        found[f"{episode}|observation.images.{REAL}|{frame}"] = np.array(image.convert("RGB"))
 
 
 def keep_picture(
@@ -129,7 +146,15 @@ def check(to: str, python: Path, recording: Path, work: Path) -> list[str]:
     """Export in a format, and check in the environment the set, and copies that are wrong. Return what fails."""
     folder, expected = work / to, work / "expected.npz"
     shutil.rmtree(folder, ignore_errors=True)
-    labels = ["--labels", ",".join(LABELS), "--cameras", CAMERAS, "--size", f"{SIZE[0]}x{SIZE[1]}", "--plain"]
+    labels = [
+        "--labels",
+        ",".join(LABELS),
+        "--cameras",
+        f"{CAMERAS},{REAL}={STREAM}",
+        "--size",
+        f"{SIZE[0]}x{SIZE[1]}",
+        "--plain",
+    ]
     run_iris("export", str(recording), "--to", to, "--out", str(folder), "--fps", str(FPS), *labels)
     status = run_checks(python, to, folder, expected)
     print(f"{to}: {status or 'every number, label and picture is as exported'}", flush=True)
