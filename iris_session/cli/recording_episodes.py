@@ -20,13 +20,13 @@ from iris_session.cli.common import (
     to_printable,
 )
 from iris_session.cli.progress import PROGRESS_AFTER_S, ProgressLine
+from iris_session.cli.recording_dataset import DEFAULT_SIZE
 from iris_session.cli.recording_render import parse_size
 
 if TYPE_CHECKING:
     from iris_session.dataset.curation import Edits
     from iris_session.dataset.listing import ListedEpisode, ListedRecording
 
-DEFAULT_SIZE: Final = (640, 480)
 #: Columns of a terminal that is not one, and of a wide one.
 WIDTH: Final = 100
 _EDITS: Final = ("drop", "keep", "trim", "label", "task", "reset")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.dataset.cameras import PictureSpec
-from iris_session.dataset.episodes import Plan, PlannedEpisode
+from iris_session.dataset.episodes import Plan
 from iris_session.dataset.files import SetWriter, Stats
 from iris_session.dataset.frames import ACTION, BOOL, Schema, Table
 from iris_session.dataset.video import CODEC_NAME, PIXELS, compute_stats, make_video_name, merge_stats
@@ -86,17 +86,17 @@ class LeRobotWriter(SetWriter):
         self, index: int, look: int, table: Table, pictures: Mapping[tuple[int, str], Stats], folder: Path
     ) -> None:
         # Docstring and arguments: `SetWriter`.
-        number, episode, n = self.n_episodes, self.plan.episodes[index], table.n_frames
+        number, task = self.n_episodes, self.plan.tasks.index(self.plan.episodes[index].task)
         for camera, key in self._cameras.items():
             self.place(folder / make_video_name(look, camera), _format(VIDEO_PATH, number, video_key=key))
-        columns = self._make_columns(table, number, self.plan.tasks.index(episode.task))
+        columns = self._make_columns(table, number, task)
         self._write_table(_format(DATA_PATH, number), _make_table(columns, self._features))
         stats = {key: compute_stats(values) for key, values in columns.items()}
         stats |= {key: pictures[look, camera] for camera, key in self._cameras.items()}
-        row = self._make_row(number, index, look, episode, table) | _flatten(stats)
+        row = self._make_row(number, index, look, table) | _flatten(stats)
         self._write_table(_format(EPISODES_PATH, number), _make_row_table(row))
         self._add_stats(stats)
-        self.n_episodes, self.n_frames = number + 1, self.n_frames + n
+        self.n_episodes, self.n_frames = number + 1, self.n_frames + table.n_frames
         self.write_json(STATS, {key: _to_plain(one) for key, one in self._stats.items()})
         self._write_info()
 
@@ -121,11 +121,11 @@ class LeRobotWriter(SetWriter):
         )
         return columns | {key: values[:, None] for key, values in zip(_FRAME_INDEX, own, strict=True)}
 
-    def _make_row(self, number: int, index: int, look: int, episode: PlannedEpisode, table: Table) -> dict[str, Any]:
+    def _make_row(self, number: int, index: int, look: int, table: Table) -> dict[str, Any]:
         n, (chunk, file) = table.n_frames, divmod(number, CHUNK)
         row: dict[str, Any] = {
             "episode_index": number,
-            "tasks": [episode.task],
+            "tasks": [self.plan.episodes[index].task],
             "length": n,
             "data/chunk_index": chunk,
             "data/file_index": file,
@@ -136,15 +136,8 @@ class LeRobotWriter(SetWriter):
             row |= {f"videos/{key}/chunk_index": chunk, f"videos/{key}/file_index": file}
             row |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": n / self.schema.fps}
         row |= {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
-        return row | {
-            "iris/label": episode.label,
-            "iris/recording": self.plan.recordings[episode.recording].id,
-            "iris/episode": episode.number,
-            "iris/plan_index": index,
-            "iris/look": look,
-            "iris/notes": "; ".join(table.notes),
-            "iris/first_state": table.states[0],
-        }
+        row |= {f"iris/{key}": value for key, value in self.describe(index, look, table).items() if key != "task"}
+        return row | {"iris/first_state": table.states[0]}
 
     def _add_stats(self, stats: Mapping[str, Stats]) -> None:
         for key, one in stats.items():

@@ -79,6 +79,7 @@ class RobomimicWriter(SetWriter):
         require_package("h5py", "writing data sets of robomimic")
         super().__init__(folder, plan, schema, pictures)
         self._labels: list[str] = []
+        self._ranges = np.array([one for robot in schema.robots for one in robot.ranges]).reshape(-1, 2).T
         self.prepare(REQUEST, request)
         if (folder / INDEX).exists():
             self._continue()
@@ -125,7 +126,7 @@ class RobomimicWriter(SetWriter):
 
     def _scale(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return commands from -1 to 1 over the range of each actuator, as robomimic wants them; without one, as is."""
-        low, high = np.array([one for robot in self.schema.robots for one in robot.ranges]).reshape(-1, 2).T
+        low, high = self._ranges
         has_range = high > low
         span = np.where(has_range, high - low, 1.0)
         scaled = np.clip(2.0 * (commands - low) / span - 1.0, -1.0, 1.0)
@@ -149,11 +150,10 @@ class RobomimicWriter(SetWriter):
         masks["valid"] = names[VALID_EVERY - 1 :: VALID_EVERY]
         masks["train"] = [name for name in names if name not in set(masks["valid"])]
         environment = {"env_name": "iris-session", "type": _GYM, "env_kwargs": {"fps": self.schema.fps}}
-        low, high = np.array([one for robot in self.schema.robots for one in robot.ranges]).reshape(-1, 2).T
         with h5py.File(path, "w") as file:
             data = file.create_group("data")
             data.attrs.update({"total": self.n_frames, "env_args": json.dumps(environment)})
-            data.attrs.update({"action_low": low, "action_high": high})
+            data.attrs.update({"action_low": self._ranges[0], "action_high": self._ranges[1]})
             for i, name in enumerate(names):
                 data[name] = h5py.ExternalLink(EPISODE.format(i), "/")
             for name, members in masks.items():
