@@ -55,7 +55,9 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     )
     parser.add_argument("paths", type=Path, nargs="+", metavar="RECORDING", help="recordings, and folders with some")
     parser.add_argument(
-        "--cameras", metavar="LIST", help="cameras as for `export`: share of time with a gripper out of each picture"
+        "--cameras",
+        metavar="LIST",
+        help="drawn cameras as for `export`: share of time with a gripper out of each picture",
     )
     parser.add_argument("--size", type=parse_size, metavar="WxH", help="of their pictures (default: 640x480)")
     parser.add_argument("--verify", action="store_true", help="simulate every recording again, and mark what differs")

@@ -220,7 +220,9 @@ def add_recorded(table: Table, camera: RecordedCamera, sink: PictureSink, looks:
     repeated = len(captures) - len(set(captures))
     notes = table.notes
     if repeated:
-        notes += (f"{repeated} frames repeat the picture of {name} before, the oldest is {ages.max():.2f} s old",)
+        notes += (
+            f"{repeated} of {len(times)} frames repeat a picture of {name}; they are up to {ages.max():.2f} s old",
+        )
     return Table({**table.columns, make_age_key(name): ages}, table.states, notes)
 
 

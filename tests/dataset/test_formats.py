@@ -139,7 +139,7 @@ def test_pictures_of_a_real_camera_are_the_newest_that_are_not_later(
     assert main([*command, *cameras, *labels]) == 1
     printed = capsys.readouterr().out
     assert "session.rrd: episode 3 is left out: no picture of 'room-front' was taken in it" in printed
-    assert "episode 1: 10 frames repeat the picture of front before, the oldest is 0.05 s old" in printed
+    assert "episode 1: 10 of 14 frames repeat a picture of front; they are up to 0.05 s old" in printed
     captures = np.array([made.session_time[step] + later_ns for step, later_ns in CAPTURES])
     episodes = read_pictures(to, tmp_path / "set")
     assert len(episodes) == 4, "two, in two looks each"
