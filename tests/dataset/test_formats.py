@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import av
+import msgspec
 import numpy as np
 import pytest
 
 from iris_session.cli.main import main
-from iris_session.dataset.cameras import PictureSpec, parse_cameras
+from iris_session.dataset.cameras import CameraSpec, PictureSpec, parse_cameras
 from iris_session.dataset.episodes import Plan, make_plan
 from iris_session.dataset.formats import FORMATS, open_writer
 from iris_session.dataset.frames import Schema, make_schema
@@ -24,7 +25,7 @@ from tests.replay.support import Played
 #: For each format: reads a set as its readers do and returns its episodes; files that are written at the beginning, and
 #: for an episode.
 READERS = {
-    "lerobot": (test_lerobot.load, 4, 5),
+    "lerobot": (test_lerobot.load, 4, 6),
     "robomimic": (test_robomimic.load, 2, 2),
     "mcap": (test_mcap.load, 3, 2),
 }
@@ -36,7 +37,8 @@ class Killed(BaseException):
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
-    return record(tmp_path_factory.mktemp("played") / "session.rrd")
+    captures = [(step, 0) for step in range(10, 200, 20)]
+    return record(tmp_path_factory.mktemp("played") / "session.rrd", captures=captures)
 
 
 def make_episodes(to: str, plan: Plan, schema: Schema, pictures: PictureSpec, folder: Path) -> list[Any]:
@@ -56,10 +58,10 @@ def test_killed_at_every_write_it_is_whole_and_finished_with_the_same_bytes(
 ) -> None:
     load, n_first, n_each = READERS[to]
     plan = make_plan([played.path])
-    pictures = PictureSpec(
-        parse_cameras("operator"), 64, 48, plain=True, depth=FORMATS[to].has_layers, masks=FORMATS[to].has_layers
-    )
-    schema = make_schema(played.core, 50)
+    cameras = (*parse_cameras("operator"), CameraSpec("front", stream="room-front", size=(48, 32)))
+    has_layers = FORMATS[to].has_layers
+    pictures = PictureSpec(cameras, 64, 48, plain=True, depth=has_layers, masks=has_layers)
+    schema = msgspec.structs.replace(make_schema(played.core, 50), recorded=("front",))
     made = make_episodes(to, plan, schema, pictures, tmp_path / "made")
 
     def write(folder: Path) -> None:
