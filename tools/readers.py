@@ -67,6 +67,7 @@ def main() -> int:
         work.mkdir(parents=True, exist_ok=True)
         python = make_environment(work / "venv")
         recording = arguments.recording or record_demo(work)
+        trim_to_pictures(recording)
         write_expected(recording, work / "expected.npz")
         failures = [one for to in SHIFTED for one in check(to, python, recording, work)]
         failures += run_doctor(python, work / "lerobot")
@@ -95,6 +96,15 @@ def record_demo(work: Path) -> Path:
     shutil.rmtree(path.parent, ignore_errors=True)
     run_iris("demo", "cloud", "--record", str(path))
     return path
+
+
+def trim_to_pictures(recording: Path) -> None:
+    """Begin the episode after the first recorded picture: the cameras of the demo start within it."""
+    with Recording.open(recording) as opened:
+        episode, first = opened.episodes[0], next(opened.pictures(STREAM))
+    begin_s = max(0.0, (first.capture_ns - episode.start_ns) * 1e-9) + 0.1
+    end_s = (episode.end_ns - episode.start_ns) * 1e-9 - 0.1
+    run_iris("recording", "episodes", str(recording), "--trim", f"{episode.number}={begin_s:.2f}:{end_s:.2f}")
 
 
 def write_expected(recording: Path, path: Path) -> None:
