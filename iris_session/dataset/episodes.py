@@ -206,21 +206,28 @@ def make_plan(files: Sequence[Path], options: PlanOptions | None = None) -> Plan
         options: Which episodes; None: successes.
 
     Raises:
-        DatasetError: A recording differs from the first in what all of a set must have, or nothing is left to export.
+        DatasetError: A recording with an episode to export differs from the first in what all of a set must have, or
+            there is none.
         NotARecordingError: A file cannot be read as a recording.
     """
     options = options or PlanOptions()
     read = [_read(path) for path in files]
-    for one in read[1:]:
-        if difference := find_difference(one, read[0]):
-            raise DatasetError(f"{one.path} does not fit {read[0].path} in one data set: {difference}")
     names = list(dict.fromkeys(name or id for one in read for id, name in one.people.items()))
     hide = _make_replacement(names) if options.anonymise else str
     notes: list[str] = []
-    episodes = [episode for i, one in enumerate(read) for episode in _list_episodes(i, one, options, hide, notes)]
+    takes_whole = not any(one.episodes for one in read)
+    episodes = [
+        episode for i, one in enumerate(read) for episode in _list_episodes(i, one, options, hide, notes, takes_whole)
+    ]
     if not episodes:
         why = f": {'; '.join(notes[:3])}" if notes else ""
         raise DatasetError(f"there is no episode to export{why}; give other recordings, or --labels")
+    first = read[episodes[0].recording]
+    for one in (read[i] for i in dict.fromkeys(episode.recording for episode in episodes)):
+        if difference := find_difference(one, first):
+            raise DatasetError(
+                f"{one.path} does not fit {first.path} in one data set: {difference}; give the recordings of one scene"
+            )
     numbers = {name: i for i, name in enumerate(names)}
     recordings = tuple(
         PlannedRecording(
@@ -278,11 +285,17 @@ def _read(path: Path) -> _Reading:
 
 
 def _list_episodes(
-    index: int, read: _Reading, options: PlanOptions, hide: Callable[[str], str], notes: list[str]
+    index: int, read: _Reading, options: PlanOptions, hide: Callable[[str], str], notes: list[str], takes_whole: bool
 ) -> Iterator[PlannedEpisode]:
-    """Yield the episodes of a recording that are exported; note those that are not."""
+    """Yield the episodes of a recording that are exported; note those that are not.
+
+    `takes_whole`: one without any episode is exported as a whole.
+    """
     where, steps, times = read.path.name, read.times.steps, read.times.session_times
     episodes = read.episodes
+    if not episodes and not takes_whole:
+        notes.append(f"{where} is left out: it has no episodes")
+        return
     if not episodes:
         notes.append(f"{where} has no episodes: it is exported as a whole, with the label {UNKNOWN}")
         episodes = (RecordedEpisode(0, start_ns=int(times[0]), end_ns=int(times[-1])),)

@@ -59,8 +59,9 @@ def test_an_episode_that_does_not_end_is_unknown_and_discarded_ones_are_left_out
     assert found == [("success", 30, 40), ("unknown", 50, 60)]
 
 
-def test_a_recording_without_episodes_is_exported_as_a_whole(tmp_path: Path) -> None:
+def test_a_recording_without_episodes_is_exported_as_a_whole_where_none_has_one(tmp_path: Path, path: Path) -> None:
     made = record(tmp_path / "session.rrd", {}, steps=20)
+    assert {one.recording for one in make_plan([made.path, path]).episodes} == {1}
     plan = make_plan([made.path])
     assert [(one.number, one.label, one.first_step, one.end_step) for one in plan.episodes] == [(0, "unknown", 0, 20)]
     assert "has no episodes: it is exported as a whole" in plan.notes[0]
@@ -109,13 +110,17 @@ def test_recordings_that_differ_are_refused_with_the_difference(tmp_path: Path, 
     other = record(tmp_path / "slow.rrd", {3: "start", 9: "success"}, steps=12, core=make_core(one_arm))
     assert len(make_plan([path, other.path]).episodes) == 3, "its header says the same rate"
     panda = make_core(load_model(scene_path("handover")))
-    renamed = msgspec.structs.replace(panda.scene.robots[0], name="gripper")
-    config = msgspec.structs.replace(panda.config, robots=(renamed, panda.scene.robots[1]))
+    renamed = msgspec.structs.replace(panda.scene.robots[1], name="gripper")
+    config = msgspec.structs.replace(panda.config, robots=(panda.scene.robots[0], renamed))
     core = SessionCore(panda.world.model, config)
     made = record(tmp_path / "renamed.rrd", {3: "start", 9: "success"}, steps=12, core=core)
-    with pytest.raises(DatasetError, match=r"renamed.rrd does not fit .*: robots gripper, right, not left, right"):
+    with pytest.raises(DatasetError, match=r"renamed.rrd does not fit .*: robots left, gripper, not left, right"):
         make_plan([path, made.path])
     assert len(make_plan([made.path]).episodes) == 1
+    failed = record(
+        tmp_path / "failed.rrd", {3: "start", 9: "failure"}, steps=12, core=SessionCore(panda.world.model, core.config)
+    )
+    assert len(make_plan([failed.path, path]).episodes) == 2, "nothing of it is exported"
 
 
 def test_names_are_replaced(path: Path) -> None:

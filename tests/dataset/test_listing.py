@@ -183,7 +183,7 @@ def test_a_film_strip_shows_the_states(played: Played) -> None:
 def test_a_folder_with_recordings_that_do_not_fit_is_listed_and_not_exported(tmp_path: Path, played: Played) -> None:
     shutil.copyfile(played.path, tmp_path / "a.rrd")
     panda = make_core(load_model(scene_path("handover")))
-    robots = (msgspec.structs.replace(panda.scene.robots[0], name="gripper"), panda.scene.robots[1])
+    robots = (panda.scene.robots[0], msgspec.structs.replace(panda.scene.robots[1], name="gripper"))
     core = SessionCore(panda.world.model, msgspec.structs.replace(panda.config, robots=robots))
     record(tmp_path / "b.rrd", {3: "start", 9: "success"}, steps=12, core=core)
     (tmp_path / "c.rrd").write_bytes(played.path.read_bytes()[:100])
@@ -195,13 +195,13 @@ def test_a_folder_with_recordings_that_do_not_fit_is_listed_and_not_exported(tmp
     a, b, c, d = (attach_edits(one) for one in list_recordings(files))
     assert [len(one.episodes) for one in (a, b, c, d)] == [3, 1, 0, 3]
     assert "is the curation of another recording" in a.problems[0]
-    assert b.problems == (f"does not fit {files[0]} in one data set: robots gripper, right, not left, right",)
+    assert b.problems == (f"does not fit {files[0]} in one data set: robots left, gripper, not left, right",)
     assert c.problems
     assert d.problems
     assert "is damaged" in d.problems[0]
     (tmp_path / "a.rrd.episodes.json").unlink()
     (tmp_path / "c.rrd").unlink()
-    with pytest.raises(DatasetError, match=r"b.rrd does not fit .*a.rrd in one data set: robots gripper, right, not"):
+    with pytest.raises(DatasetError, match=r"b.rrd does not fit .*a.rrd in one data set: robots left, gripper, not"):
         make_plan(list_files([tmp_path]))
 
 
