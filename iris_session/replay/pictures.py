@@ -420,7 +420,6 @@ class Renderer:
             self._context = mujoco.MjrContext(self._model, int(mujoco.mjtFontScale.mjFONTSCALE_150))
         except mujoco.FatalError as error:
             raise PictureError(f"no picture of {width} x {height} can be drawn here: {error}") from error
-        mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
 
     def draw(
         self,
@@ -458,6 +457,8 @@ class Renderer:
         width, height = size or self._size
         area = mujoco.MjrRect(0, 0, width, height)
         image = np.empty((height, width, 3), np.uint8)
+        # The framebuffer is that of the OpenGL context: another renderer may have drawn into its own meanwhile.
+        mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
         mujoco.mjr_render(area, self._scene, self._context)
         mujoco.mjr_readPixels(image, None, area, self._context)
         return np.ascontiguousarray(image[::-1])  # OpenGL's first row is the lowest
@@ -475,6 +476,7 @@ class Renderer:
             self._scene.flags[int(flag)] = 1  # without smooth edges, which would mix numbers and distances
         self._context.readDepthMap = int(mujoco.mjtDepthMap.mjDEPTH_ZEROFAR)
         codes, buffer = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.float32)
+        mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), self._context)
         mujoco.mjr_render(area, self._scene, self._context)
         mujoco.mjr_readPixels(codes, buffer, area, self._context)
         self._scene.flags[:] = flags

@@ -61,8 +61,13 @@ def reference(monkeypatch: pytest.MonkeyPatch) -> Draw:
 
 
 def draw_all(core: SessionCore, spec: PictureSpec, path: Path) -> dict[tuple[int, str], Image]:
+    """Return the pictures of a state, which is drawn twice: they are the same."""
     with Recording.open(path, warn=False) as recording, CameraSet(spec) as cameras:
-        return {(look, name): image for look, name, image in cameras.draw(core, recording)}
+        first, second = (
+            {(look, name): image for look, name, image in cameras.draw(core, recording)} for _ in ("first", "second")
+        )
+        assert all(np.array_equal(first[key], second[key]) for key in first)
+        return first
 
 
 def test_pictures_are_those_of_mujoco(tmp_path: Path, reference: Draw) -> None:
@@ -108,13 +113,15 @@ def test_depth_and_masks_are_those_of_mujoco(tmp_path: Path, reference: Draw) ->
 def test_looks_follow_from_the_seed_and_change_nothing_that_moves(tmp_path: Path) -> None:
     made = record(tmp_path / "session.rrd", {}, steps=3)
     before = made.core.world.encode_model(), made.core.world.save_state()
-    spec = PictureSpec((CameraSpec("operator", "operator"),), WIDTH, HEIGHT, looks=2, seed=4)
+    spec = PictureSpec(parse_cameras(f"operator,{TOP}"), WIDTH, HEIGHT, looks=2, seed=4)
     one, other = draw_all(made.core, spec, made.path), draw_all(made.core, spec, made.path)
     changed = draw_all(made.core, PictureSpec(spec.cameras, WIDTH, HEIGHT, 1, 5), made.path)
-    assert list(one) == [(look, "operator") for look in range(3)]
+    assert list(one) == [(look, camera) for look in range(3) for camera in ("operator", "top")]
+    alone = draw_all(made.core, replace(spec, looks=0), made.path)
+    assert all(np.array_equal(one[key], alone[key]) for key in alone)
     assert [image.tobytes() for image in one.values()] == [image.tobytes() for image in other.values()]
     pictures = {image.tobytes() for image in (*one.values(), changed[1, "operator"])}
-    assert len(pictures) == 4
+    assert len(pictures) == 7
     assert changed[0, "operator"].tobytes() == one[0, "operator"].tobytes()
     assert (made.core.world.encode_model(), made.core.world.save_state()) == before
 
