@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import chdir
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -86,7 +87,8 @@ class StandIn(ModuleType):
         return Function
 
     def get(self, begun: Callable[[], Any]) -> Any:
-        return begun()
+        with chdir("/"):  # workers have a folder of their own
+            return begun()
 
     def cancel(self, begun: Any) -> None:
         self.did.append("cancel")
@@ -109,11 +111,14 @@ def ray(monkeypatch: pytest.MonkeyPatch) -> Iterator[StandIn]:
         ray_pool._maker.close()
 
 
-def test_files_of_tasks_become_the_same_set(played: Played, tmp_path: Path, ray: StandIn) -> None:
+def test_files_of_tasks_become_the_same_set(
+    played: Played, tmp_path: Path, ray: StandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(played.path.parent)
     for to in ("lerobot", "robomimic", "mcap"):
         for name, open_pool in (("one", None), ("tasks", partial(RayPool, "local", None))):
             options = DatasetOptions(100, PICTURES, PlanOptions(LABELS))
-            export_dataset([played.path], tmp_path / to / name, to, options, open_pool=open_pool)
+            export_dataset([Path(played.path.name)], tmp_path / to / name, to, options, open_pool=open_pool)
         assert read_files(tmp_path / to / "tasks") == read_files(tmp_path / to / "one")
     assert ray.did.count("begin") == 9
     assert ray.did[-1] == "shutdown"
