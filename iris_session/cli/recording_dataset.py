@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -98,7 +100,11 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.jobs or 1,
     )
     open_pool = partial(RayPool, arguments.ray, arguments.jobs) if arguments.ray else None
-    with ending_as_interrupts(), ProgressLine(arguments.out) as progress:
+    with (
+        ending_as_interrupts(),
+        ProgressLine(arguments.out) as progress,
+        redirect_stdout(sys.stderr),  # of Ray, which tells of workers that died
+    ):
         files = list_files(arguments.paths)
         report = export_dataset(files, arguments.out, arguments.to, options, progress.show, open_pool)
     print_result(arguments, report, _format(report))

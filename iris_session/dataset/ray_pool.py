@@ -10,8 +10,10 @@ from __future__ import annotations
 import os
 import pickle
 import platform
+import re
 import signal
 import tempfile
+import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -68,7 +70,8 @@ class RayPool:
             options["include_dashboard"] = False
         before = signal.getsignal(signal.SIGTERM)
         try:
-            self._ray.init(address=address, **options)
+            with warnings.catch_warnings(action="ignore"):
+                self._ray.init(address=address, **options)
         except Exception as error:  # Ray has no class for it
             raise DatasetError(f"no Ray cluster can be used at {address!r}: {_shorten(error)}") from error
         finally:
@@ -83,7 +86,10 @@ class RayPool:
     def begin(self, task: EpisodeTask) -> Any:
         planned = msgspec.structs.replace(task.planned, path=os.path.abspath(task.planned.path))
         data = pickle.dumps(msgspec.structs.replace(task, planned=planned))
-        begun = self._make.options(name=_name(task)).remote(data, self._versions)
+        try:
+            begun = self._make.options(name=_name(task)).remote(data, self._versions)
+        except ImportError as error:  # from the server of Ray Client
+            raise _make_import_error("the head of the cluster", _shorten(error)) from error
         self._running.add(begun)
         return begun
 
@@ -96,9 +102,8 @@ class RayPool:
             if _NOT_IMPORTED not in (said := str(error.cause)):
                 raise  # a defect, with its traceback
             reason = said.strip().rpartition("\n")[2]
-            raise DatasetError(
-                f"node {error.ip} has no usable iris-session ({reason}): install the same on every node"
-            ) from error
+            at = re.search(r"ip=([^,)]+)", str(error))
+            raise _make_import_error(f"node {at[1] if at else 'of the cluster'}", reason) from error
         except RayError as error:
             attempts = f"{RETRIES + 1} attempts"
             raise DatasetError(f"{_name(task)} was not made in {attempts}: {_shorten(error)}") from error
@@ -124,6 +129,10 @@ class RayPool:
 
 def _name(task: EpisodeTask) -> str:
     return f"{Path(task.planned.path).name}: episode {task.episode.number}"
+
+
+def _make_import_error(node: str, reason: str) -> DatasetError:
+    return DatasetError(f"{node} has no usable iris-session ({reason}): install the same on every node")
 
 
 def _shorten(error: BaseException) -> str:
