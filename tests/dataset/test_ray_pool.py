@@ -305,6 +305,7 @@ def test_an_export_that_ends_leaves_no_process(
     process = start_export(tmp_path / "session.rrd", tmp_path / "set", environment)
     while process.poll() is None and count_closed(tmp_path / "set") < 1:
         time.sleep(0.01)
+    assert process.poll() is None, process.communicate()
     processes = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(number)
     output, errors = process.communicate()
