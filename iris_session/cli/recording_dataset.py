@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from iris_session.cli.common import MOST_LINES, CommandError, ending_as_interrupts, make_number_type, print_result
@@ -17,7 +20,7 @@ if TYPE_CHECKING:
 LABELS: Final = ("success", "failure", "unknown")
 #: Options that only data sets have, with the values that stand for "not given".
 _OPTIONS: Final = {
-    **dict.fromkeys(("fps", "cameras", "size", "looks", "seed", "labels", "task", "jobs")),
+    **dict.fromkeys(("fps", "cameras", "size", "looks", "seed", "labels", "task", "jobs", "ray")),
     **dict.fromkeys(("plain", "depth", "masks", "anonymise"), False),
 }
 DEFAULT_FPS: Final = 30
@@ -51,6 +54,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--anonymise", action="store_true", help="p1, p2, ... in place of the names of people")
     jobs = make_number_type(int, "a number of processes: give 1 or more", 1, 1024)
     group.add_argument("--jobs", type=jobs, metavar="N", help="processes, an episode each (default: 1)")
+    group.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="a Ray cluster makes the episodes, a task each: local (this machine), auto, HOST:PORT or ray://HOST:PORT; "
+        "--jobs is then the number of tasks at once",
+    )
 
 
 def list_given(arguments: argparse.Namespace) -> list[str]:
@@ -64,8 +73,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     for package in FORMATS[arguments.to].packages:
         require_package(package, f"--to {arguments.to}")
+    if arguments.ray:
+        require_package("ray", "--ray")
     from iris_session.dataset.cameras import PictureSpec, parse_cameras
     from iris_session.dataset.episodes import PlanOptions, list_files
+    from iris_session.dataset.ray_pool import RayPool
     from iris_session.dataset.run import DatasetOptions, export_dataset
 
     width, height = arguments.size or DEFAULT_SIZE
@@ -87,9 +99,14 @@ def run(arguments: argparse.Namespace) -> int:
         PlanOptions(labels, arguments.task or "", arguments.anonymise),
         arguments.jobs or 1,
     )
-    with ending_as_interrupts(), ProgressLine(arguments.out) as progress:
+    open_pool = partial(RayPool, arguments.ray, arguments.jobs) if arguments.ray else None
+    with (
+        ending_as_interrupts(),
+        ProgressLine(arguments.out) as progress,
+        redirect_stdout(sys.stderr),  # of Ray, which tells of workers that died
+    ):
         files = list_files(arguments.paths)
-        report = export_dataset(files, arguments.out, arguments.to, options, progress.show)
+        report = export_dataset(files, arguments.out, arguments.to, options, progress.show, open_pool)
     print_result(arguments, report, _format(report))
     return 1 if report.left_out else 0
 

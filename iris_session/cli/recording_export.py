@@ -45,6 +45,7 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         examples="""
             iris-session export sessions --to lerobot --out set --cameras operator --size 320x240 --plain
             iris-session export session.rrd --to lerobot --out set --cameras "top=0,0,2->0,0,0:50" --looks 5 --jobs 4
+            iris-session export /data/sessions --to lerobot --out set --ray auto      on a Ray cluster
             iris-session recording export session.rrd --to parquet -o tables
             iris-session recording export session.rrd --to csv -o tables --hz 30 --robot left --table robots
             iris-session recording export session.rrd --to npz -o tables --hz 500    every step at 500 Hz

@@ -1,7 +1,8 @@
 """`export_dataset`: plans a data set, makes its episodes, in several processes if wanted, and closes them in order.
 
-An episode is one task, which depends on its arguments only; so it can be made anywhere, and only closing it needs to
-know how many there are. A run that was killed is continued by the next one with the same arguments.
+An episode is one task, which depends on its arguments only; so it can be made anywhere (`EpisodePool`), and only
+closing it needs to know how many there are. A run that was killed is continued by the next one with the same arguments.
+Not here: episodes made on a cluster (`ray_pool`).
 """
 
 from __future__ import annotations
@@ -13,20 +14,28 @@ import shutil
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
 
 from iris_session.dataset.cameras import CameraSet, PictureSpec, RecordedCamera, find_streams
-from iris_session.dataset.episodes import DatasetError, Plan, PlannedEpisode, PlannedRecording, PlanOptions, make_plan
+from iris_session.dataset.episodes import (
+    DatasetError,
+    Plan,
+    PlannedEpisode,
+    PlannedRecording,
+    PlanOptions,
+    identify_recording,
+    make_plan,
+)
 from iris_session.dataset.files import PictureSink, Stats
 from iris_session.dataset.formats import FORMATS, MODEL, make_sink, open_writer
 from iris_session.dataset.frames import (
@@ -126,6 +135,7 @@ class EpisodeMaker:
         self._cameras: CameraSet | None = None
         self._recorded: list[RecordedCamera] = []
         self._key: Any = None
+        self._index = -1
 
     def make(self, task: EpisodeTask) -> MadeEpisode:
         """Make one episode: its frames, and its pictures in a folder.
@@ -169,6 +179,7 @@ class EpisodeMaker:
             sink.abort()
             return MadeEpisode(None, {}, measure(), str(error))
         except BaseException:
+            self._key = None  # the session may be within a step
             with suppress(Exception):
                 sink.abort()
             raise
@@ -181,12 +192,15 @@ class EpisodeMaker:
         return MadeEpisode(table, stats, measure(), "", notes)
 
     def _open(self, task: EpisodeTask) -> None:
-        """Open the recording and the renderer of a task, unless they are open."""
-        key = task.planned.path, task.schema, task.pictures
-        if key == self._key and self._reader is not None:
+        """Open the recording and the renderer of a task, unless they are open and at an earlier episode."""
+        key = task.planned, task.schema, task.pictures
+        is_later, self._index = task.index > self._index, task.index
+        if key == self._key and is_later:
             return
         self.close()
         self._recording = Recording.open(task.planned.path, warn=False)
+        if identify_recording(self._recording) != task.planned.id:
+            raise DatasetError(f"{task.planned.path} is not the recording of that path that was planned")
         self._reader = FrameReader(self._recording, task.planned, task.schema)
         cameras = task.pictures.cameras
         self._recorded = [RecordedCamera(self._recording, one) for one in cameras if one.stream]
@@ -196,7 +210,8 @@ class EpisodeMaker:
 
     def close(self) -> None:
         """Close what is open."""
-        self._reader, self._recorded = None, []
+        self._reader = self._key = None
+        self._recorded = []
         if self._cameras is not None:
             self._cameras.close()
             self._cameras = None
@@ -232,6 +247,7 @@ def export_dataset(
     to: str,
     options: DatasetOptions | None = None,
     progress: Callable[[str], None] | None = None,
+    open_pool: Callable[[dict[str, str]], EpisodePool] | None = None,
 ) -> DatasetReport:
     """Write a data set of recordings, or finish one that was begun with the same arguments.
 
@@ -241,6 +257,8 @@ def export_dataset(
         to: One of `FORMATS`.
         options: What frames have; None for numbers at 30 Hz.
         progress: Called now and then with a text that says how far it is.
+        open_pool: Returns what makes the episodes, for example `partial(RayPool, "auto", None)`, given the versions
+            that it has to have, by package; None: processes of this machine.
 
     Returns:
         What the set holds.
@@ -258,7 +276,7 @@ def export_dataset(
     schema, options = _find_schema(plan, options)
     request = _make_request(to, plan, schema, options)
     try:
-        return _write(folder, to, plan, schema, options, request, say)
+        return _write(folder, to, plan, schema, options, request, say, open_pool)
     except OSError as error:
         reason = " ".join((error.strerror or str(error)).split())
         raise DatasetError(f"the data set cannot be written to {folder}: {reason}") from error
@@ -285,11 +303,12 @@ def _make_request(to: str, plan: Plan, schema: Schema, options: DatasetOptions) 
         "episodes": episodes,
         "people": list(plan.people),
         "schema": msgspec.to_builtins(schema),
-        "versions": {name: _find_version(name) for name in (*_PACKAGES, *FORMATS[to].packages.values())},
+        "versions": {name: find_version(name) for name in (*_PACKAGES, *FORMATS[to].packages.values())},
     }
 
 
-def _find_version(package: str) -> str:
+def find_version(package: str) -> str:
+    """Return the version of an installed package, empty if it is not."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -304,6 +323,7 @@ def _write(
     options: DatasetOptions,
     request: dict[str, Any],
     say: Callable[[str], None],
+    open_pool: Callable[[dict[str, str]], EpisodePool] | None,
 ) -> DatasetReport:
     writer = open_writer(to, folder, plan, schema, options.pictures, request)
     first, first_look = writer.next
@@ -326,7 +346,13 @@ def _write(
     closed: list[float] = []
     total_s = draw_s = encode_s = close_s = 0.0
     say(f"{first} of {len(plan.episodes)} episodes")
-    with closing(_make_all(tasks, options.jobs)) as episodes:
+    jobs = min(options.jobs, len(tasks))
+    pool: EpisodePool
+    if open_pool is not None and tasks:
+        pool = open_pool(request["versions"])
+    else:
+        pool = ProcessPool(jobs) if jobs > 1 else _OwnProcess()
+    with closing(make_in_order(tasks, pool)) as episodes:
         for task, made in episodes:
             where = f"{Path(task.planned.path).name}: episode {task.episode.number}"
             began, began_cpu = time.perf_counter(), time.process_time()
@@ -354,37 +380,86 @@ def _write(
     )
 
 
-def _make_all(tasks: Sequence[EpisodeTask], jobs: int) -> Generator[tuple[EpisodeTask, MadeEpisode], None, None]:
-    """Yield the episodes in order, made here or by `jobs` processes."""
-    if jobs == 1 or len(tasks) < 2:
-        maker = EpisodeMaker()
-        try:
-            for task in tasks:
-                yield task, maker.make(task)
-        finally:
-            maker.close()
-        return
-    # Spawned, since OpenGL and threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(tasks)), context, _begin_worker, (os.getpid(),)) as pool:
-        running: deque[tuple[EpisodeTask, Future[None]]] = deque()
-        ahead = iter(tasks)
-        try:
-            while True:
-                for task in islice(ahead, _AHEAD * jobs - len(running)):
-                    running.append((task, pool.submit(make_episode, task)))
-                if not running:
-                    return
-                task, future = running.popleft()
-                future.result()
-                made: MadeEpisode = pickle.loads((Path(task.folder) / _MADE).read_bytes())
-                yield task, made
-        except BrokenProcessPool as error:
-            raise DatasetError(
-                "a process that made an episode was killed: give fewer --jobs if memory is short"
-            ) from error
-        finally:
-            pool.shutdown(cancel_futures=True)
+class EpisodePool(Protocol):
+    """Makes episodes, several at once. `depth`: how many may be begun before the first of them is taken."""
+
+    @property
+    def depth(self) -> int: ...
+
+    def begin(self, task: EpisodeTask) -> Any:
+        """Begin an episode. Return what `take` needs to know of it."""
+
+    def take(self, task: EpisodeTask, begun: Any) -> MadeEpisode:
+        """Wait for an episode, and return it; its pictures are in the folder of its task. Raises what making it did."""
+
+    def close(self) -> None:
+        """Cancel what is not made, and end what makes it."""
+
+
+def make_in_order(
+    tasks: Sequence[EpisodeTask], pool: EpisodePool
+) -> Generator[tuple[EpisodeTask, MadeEpisode], None, None]:
+    """Yield the episodes in order, and close the pool at the end, or when one fails."""
+    begun: deque[tuple[EpisodeTask, Any]] = deque()
+    ahead = iter(tasks)
+    try:
+        while True:
+            for task in islice(ahead, max(0, pool.depth - len(begun))):
+                begun.append((task, pool.begin(task)))
+            if not begun:
+                return
+            task, what = begun.popleft()
+            yield task, pool.take(task, what)
+    finally:
+        pool.close()
+
+
+class _OwnProcess:
+    """Makes one episode after the other, in this process."""
+
+    depth = 1
+
+    def __init__(self) -> None:
+        self._maker = EpisodeMaker()
+
+    def begin(self, task: EpisodeTask) -> None:
+        pass
+
+    def take(self, task: EpisodeTask, begun: None) -> MadeEpisode:
+        return self._maker.make(task)
+
+    def close(self) -> None:
+        self._maker.close()
+
+
+class ProcessPool:
+    """Makes episodes in processes of this machine. They are spawned: OpenGL and threads do not survive a fork."""
+
+    def __init__(self, jobs: int) -> None:
+        self.depth = _AHEAD * jobs
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(jobs, context, _begin_worker, (os.getpid(),))
+
+    def begin(self, task: EpisodeTask) -> Future[None]:
+        with _naming_killed_process():
+            return self._pool.submit(make_episode, task)
+
+    def take(self, task: EpisodeTask, begun: Future[None]) -> MadeEpisode:
+        with _naming_killed_process():
+            begun.result()
+        made: MadeEpisode = pickle.loads((Path(task.folder) / _MADE).read_bytes())
+        return made
+
+    def close(self) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _naming_killed_process() -> Iterator[None]:
+    try:
+        yield
+    except BrokenProcessPool as error:
+        raise DatasetError("a process that made an episode was killed: give fewer --jobs if memory is short") from error
 
 
 _maker: EpisodeMaker | None = None

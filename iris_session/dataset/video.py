@@ -21,8 +21,16 @@ CODEC: Final = "libx264"
 CODEC_NAME: Final = "h264"
 PIXELS: Final = "yuv420p"
 #: Every second picture is whole, as in LeRobot's own videos: frames are read in any order. One thread: the same bytes
-#: on every machine, and other threads have other episodes to do.
-OPTIONS: Final = {"crf": "23", "preset": "veryfast", "g": "2", "bf": "0", "threads": "1"}
+#: on every machine, and other threads have other episodes to do. Without `cpu-independent`, processors decide
+#: differently, and with AVX-512 what lies in memory behind the motion vectors (x264's macroblock tree, core 165).
+OPTIONS: Final = {
+    "crf": "23",
+    "preset": "veryfast",
+    "g": "2",
+    "bf": "0",
+    "threads": "1",
+    "x264-params": "cpu-independent=1",
+}
 #: Quantiles of statistics, by their names.
 QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 #: Statistics are of pictures with about so many pixels a side.

@@ -22,6 +22,7 @@ EXTRAS: Final[Mapping[str, str]] = {
     "av": "dataset",
     "h5py": "dataset",
     "foxglove": "dataset",
+    "ray": "ray",
     "rich": "terminal",
     "gymnasium": "env",
     "trimesh": "files",
