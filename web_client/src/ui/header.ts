@@ -1,7 +1,8 @@
 // The bar above everything: which session, how fresh the picture is, who you are, and the e-stop.
 
 import type { Actions } from "./actions.ts";
-import { button, h, setOptions, setText, setValue, takesText } from "./dom.ts";
+import { button, closeOutside, h, setOptions, setText, setValue, takesText } from "./dom.ts";
+import type { Joining } from "./joining.ts";
 import type { Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
 import { formatMilliseconds, pauseWords, roleWords } from "./words.ts";
@@ -122,37 +123,42 @@ function takesSpace(target: EventTarget | null): boolean {
   return target instanceof HTMLElement && target.closest("button, input, select, textarea, summary, a, dialog") !== null;
 }
 
-/** Who this page is: name and role, to join again with others. `listRoles`: those that this browser may have. */
-export function makeSelf(state: PageState, listRoles: () => readonly string[], join: (name: string, role: string) => void): Panel {
+/** Who this page is: name and role, to change them. */
+export function makeSelf(state: PageState, joining: Joining): Panel {
   const summary = h("summary", {});
   const name = h("input", { type: "text", id: "self-name", attributes: { maxlength: "64", spellcheck: "false", autocomplete: "nickname" } });
   const role = h("select", { id: "self-role" });
   const identity = h("p", { class: "note" });
+  const submit = h("button", { class: "primary" });
   const form = h(
     "form",
     { class: "popover" },
     h("label", { class: "field" }, h("span", {}, "Your name"), name),
     h("label", { class: "field" }, h("span", {}, "Join as"), role),
-    h("button", { class: "primary" }, "Join with these"),
+    submit,
     identity,
   );
   const element = h("details", { class: "self" }, summary, form);
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     element.open = false;
-    join(name.value.trim(), role.value);
+    joining.answer(name.value.trim() || joining.name, role.value);
   });
+  const describe = (): void => setText(submit, joining.describeAnswer(role.value));
+  role.addEventListener("change", describe);
+  closeOutside(element, summary);
   return {
     element,
     update: () => {
       const { self } = state;
-      const roles = new Set([...listRoles(), ...(self ? [self.role] : [])]); // a director may have given it another one
+      const roles = new Set([...joining.listRoles(), ...(self ? [self.role] : [])]); // a director may have given it another one
       setOptions(role, [...roles].map((one) => [one, roleWords(one)] as const));
       setText(summary, self ? `${self.name}, ${roleWords(self.role)}` : "Not joined");
       if (!element.open && self) {
         setValue(name, self.name);
         setValue(role, self.role);
       }
+      describe();
       const fingerprint = state.identity?.fingerprint ?? "";
       setText(identity, fingerprint ? `Fingerprint of this browser: ${fingerprint}` : "");
     },

@@ -126,7 +126,7 @@ export class PageState {
       this.touch();
     });
     client.on("welcome", ({ welcome }) => {
-      if (this.welcome !== null && this.welcome.session_id !== welcome.session_id) this.log.length = 0;
+      if (this.welcome !== null && this.welcome.session_id !== welcome.session_id) this.forgetSession();
       this.welcome = welcome;
       this.feedback.clear();
       this.consents = [];
@@ -157,6 +157,15 @@ export class PageState {
       for (const message of messages) this.take(message);
       this.touch();
     });
+  }
+
+  /** Another session is joined: forget what belongs to the one before. */
+  private forgetSession(): void {
+    this.log.length = 0;
+    this.session = this.status = this.stats = this.budget = this.progress = this.seenPause = null;
+    this.rtt_ms = this.sessionOffset_ms = this.voidEpoch = Number.NaN;
+    this.newest.clear();
+    this.formerNames.clear();
   }
 
   onChange(listener: (state: PageState) => void): void {
