@@ -33,6 +33,7 @@ export class DesktopDevice {
   isEngaged = false;
   /** Why the clutch was opened from outside, until the dead-man is pressed anew; else empty. */
   released = "";
+  private isBlocked = false;
   /** A dead-man is held that does not count before it is let go. */
   mustLetGo = false;
   /** Sources whose dead-man was seen let go since dead-men were void. */
@@ -84,6 +85,8 @@ export class DesktopDevice {
     }
     const blocked = findBlock(situation);
     if (blocked !== "") this.release(blocked, now_ms);
+    else if (this.isBlocked) this.released = ""; // what blocked has passed
+    this.isBlocked = blocked !== "";
     const isHeld = this.readDeadMen(inputs);
     const motion = merge(inputs.values());
     const isFlipped = motion.toggle && !this.wasToggled;

@@ -94,6 +94,7 @@ describe("an armed device", () => {
     tick(makeIdle(), situation); // let go during the stop, pressed again before its end: still nothing
     expect(tick(FORWARD, situation).clutch).toBe(false);
     expect(tick(FORWARD).clutch).toBe(false);
+    expect([device.released, device.mustLetGo]).toEqual(["", true]); // it has passed
     tick(makeIdle());
     expect(tick(FORWARD).clutch).toBe(true);
   });
