@@ -135,6 +135,29 @@ export class DesktopDevice {
   }
 }
 
+/** Pictures a second with which samples are sent in time, whatever is drawn. */
+const ENOUGH_HZ = 15;
+
+/** Notes that drags end because this page draws slowly: its samples wait meanwhile. */
+export class SlownessWatch {
+  /** What is wrong and what helps, from a drag that ended so until the next one; else empty. */
+  words = "";
+  private isEngaged = false;
+  private begin = { pictures: 0, ms: 0 };
+
+  /** `pictures`: that the page could draw since it began. `isLate`: the session holds the robot since samples came too late. */
+  note(isEngaged: boolean, isLate: boolean, pictures: number, now_ms: number): void {
+    if (isEngaged && !this.isEngaged) {
+      this.words = "";
+      this.begin = { pictures, ms: now_ms };
+    }
+    this.isEngaged = isEngaged;
+    const hz = (1000 * (pictures - this.begin.pictures)) / (now_ms - this.begin.ms);
+    if (!isEngaged || !isLate || !(hz < ENOUGH_HZ) || this.words !== "") return;
+    this.words = `This page draws only ${hz.toFixed(0)} pictures a second, so what you drag comes too late. A smaller window helps, or “Labels and people” off, or another browser.`;
+  }
+}
+
 /** Return in words what keeps every dead-man from counting, empty for nothing. */
 function findBlock({ isReady, isStopped, isPaused }: Situation): string {
   if (!isReady) return "the connection is lost";

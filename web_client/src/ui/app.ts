@@ -11,7 +11,7 @@ import { makeAlignmentPanel, makeAnchorsPanel } from "./alignment.ts";
 import { makeCameras } from "./cameras.ts";
 import { h, setText } from "./dom.ts";
 import { makeEpisodeStrip } from "./episodes.ts";
-import { makeBadge, makeEstop, makePauseBanner, makeSelf } from "./header.ts";
+import { makeBadge, makeEstop, makePause, makeSelf } from "./header.ts";
 import { Joining } from "./joining.ts";
 import {
   makeAdvicePanel,
@@ -66,6 +66,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
         state.touch();
       },
       onProblem: (text) => state.note(text, "warning"),
+      measureTop: () => stage.tools.offsetTop + stage.tools.offsetHeight,
     });
     stage.setView(handle.view, "");
   } catch (error) {
@@ -78,7 +79,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
 
   const gizmo = view && new Gizmo(view.viewpoint.camera, () => view.touchOverlay());
   handle.gizmo = gizmo;
-  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"), stage.canvas, gizmo);
+  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"), stage.canvas, gizmo, () => view?.displayed ?? Number.NaN);
   const robots = view && gizmo && makeRobotOverlay(state, actions, drive, view, gizmo, stage.element, stage.canvas);
   const choices = new StreamChoices(() => state.spec?.deformables.map((part) => part.stream) ?? [], () => view !== null);
   const cameras = makeCameras(state, view, makePictures(state, client, choices));
@@ -91,13 +92,14 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   stage.tools.append(handle.headset.element);
   const badge = makeBadge(state, () => view?.delay_ms ?? 0);
   const estop = makeEstop(state, actions, () => drive.robot !== "");
-  const pause = makePauseBanner(state, actions);
+  const pause = makePause(state, actions);
   const self = makeSelf(state, joining);
   const welcome = makeWelcome(state, joining);
   const title = h("h1", {}, "iris-session");
   const header = h("header", { class: "bar" }, title, badge.element, self.element, estop.stop);
   const episodes = makeEpisodeStrip(state, actions);
-  stage.element.append(episodes.element);
+  stage.element.append(h("div", { class: "banners" }, estop.banner, pause.element), episodes.element);
+  stage.tools.prepend(pause.button);
   const panels = [
     makeAdvicePanel(state),
     makeRobotsPanel(state, actions, drive),
@@ -118,8 +120,6 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   root.replaceChildren(
     h("a", { class: "skip", attributes: { href: "#dashboard" } }, "Skip to the dashboard"),
     header,
-    estop.banner,
-    pause.element,
     welcome.element,
     h("main", {}, stage.element, drive.element, dashboard),
     notices,

@@ -97,16 +97,20 @@ export function makeEstop(state: PageState, actions: Actions, isDriving: () => b
   };
 }
 
-/** The banner of a pause: who paused, why, and what ends it. */
-export function makePauseBanner(state: PageState, actions: Actions): { element: HTMLElement; update: () => void } {
+/** A pause: the button over the picture, and the banner with who paused, why, and what ends it. */
+export function makePause(state: PageState, actions: Actions): { button: HTMLElement; element: HTMLElement; update: () => void } {
   const text = h("strong");
   const note = h("span", { class: "note" });
   const resume = button("Resume", () => void actions.request({ type: "control", action: "resume" }), { id: "resume" });
   const element = h("div", { class: "banner paused", role: "alert", hidden: true }, text, note, resume);
+  const begin = button("Pause", () => void actions.request({ type: "control", action: "pause" }), { class: "small pause", title: "Let robots and objects stand still, for everyone" });
   return {
+    button: begin,
     element,
     update: () => {
       const { pause } = state;
+      begin.hidden = !state.isDirector || !state.isReady;
+      begin.toggleAttribute("disabled", pause !== null);
       element.hidden = pause === null;
       if (pause === null) return;
       setText(text, pauseWords(pause.by, pause.reason));
