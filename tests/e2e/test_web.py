@@ -35,12 +35,6 @@ WIDTH, HEIGHT = 640, 360
 MIN_IOU, MAX_COLOUR_DIFFERENCE = 0.97, 8.0
 
 
-def holder(page: Page, robot: str) -> str:
-    """Return the name of the holder of a robot, as the dashboard shows it."""
-    text: str = page.evaluate(f"document.querySelector('[data-robot={robot}] .holder').textContent")
-    return text
-
-
 # --- the picture ------------------------------------------------------------------------------------------------------
 
 

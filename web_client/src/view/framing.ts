@@ -97,11 +97,13 @@ export function findFirstSight(scene: Placed, bases: readonly number[], beside: 
   const robots = scene.spec.visuals.filter((visual) => links.has(visual.body) && isSolid(scene.spec, visual));
   const focus = unionOf(robots.map((visual) => boxNow(scene, visual)));
   const size = new Vector3();
-  const more = focus.isEmpty() ? MORE_THAN_IT_SAYS : MORE_THAN_ROBOTS;
-  if (focus.isEmpty()) focus.union(boxOfEnvironment(scene.spec.environment));
-  else focus.expandByScalar(AROUND_ROBOTS * focus.getSize(size).length());
+  const hasRobots = !focus.isEmpty();
+  const more = hasRobots ? MORE_THAN_ROBOTS : MORE_THAN_IT_SAYS;
+  if (hasRobots) focus.expandByScalar(AROUND_ROBOTS * focus.getSize(size).length());
+  else focus.union(boxOfEnvironment(scene.spec.environment));
   const isPart = whole.getSize(corner).length() > more * focus.getSize(size).length();
   const box = isPart ? focus : whole;
+  if (hasRobots) box.max.z = Math.max(box.max.z, focus.max.z); // labels and arrows are above grippers
   return { box, azimuth: findAzimuth(scene, robots, links, box) };
 }
 

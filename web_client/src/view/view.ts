@@ -40,8 +40,8 @@ const NO_SKY = 0x2a303b;
 const FRAMES_AFTER_CHANGE = 3;
 /** Differences of poses that cannot be seen: two steps of the lattice of positions [m], and of quaternions. */
 const SAME = 1.3e-4;
-/** Place for the label of a robot [pixels], and what is left free above what is shown at most, as a share of the picture. */
-const [LABEL_PX, MAX_ABOVE] = [40, 0.3];
+/** Place for the label of a robot and the arrow at its gripper [pixels], and what is left free above what is shown at most, as a share of the picture. */
+const [LABEL_PX, MAX_ABOVE] = [30, 0.3];
 /** Longest time without a drawn frame [ms]: what changes silently is seen then. */
 const IDLE_MS = 1000;
 
@@ -303,7 +303,7 @@ export class View {
     this.viewpoint.frame(sight, findWholeBox(scene, clouds), scene.spec.environment.zfar, this.measureAbove());
   }
 
-  /** Return the share of the picture that lies behind the bar, and under a label below that. */
+  /** Return the share of the picture that lies behind the bar, and the labels and arrows below that. */
   private measureAbove(): number {
     return Math.min(MAX_ABOVE, (this.events.measureTop() + LABEL_PX) / Math.max(1, this.canvas.clientHeight));
   }
