@@ -154,7 +154,7 @@ export class SlownessWatch {
     this.isEngaged = isEngaged;
     const hz = (1000 * (pictures - this.begin.pictures)) / (now_ms - this.begin.ms);
     if (!isEngaged || !isLate || !(hz < ENOUGH_HZ) || this.words !== "") return;
-    this.words = `This page draws only ${hz.toFixed(0)} pictures a second, so what you drag comes too late. A smaller window helps, or “Labels and people” off, or another browser.`;
+    this.words = `This page draws only ${Math.max(2, Math.ceil(hz))} pictures a second, so what you drag comes too late. A smaller window helps, or “Labels and people” off, or another browser.`;
   }
 }
 

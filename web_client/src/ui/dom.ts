@@ -112,7 +112,7 @@ export class KeyedList<T> {
 /** Close what a summary opens on Escape, and on a press anywhere else. */
 export function closeOutside(element: HTMLDetailsElement, summary: HTMLElement): void {
   document.addEventListener("pointerdown", (event) => !element.contains(event.target as Node) && (element.open = false), { capture: true });
-  element.addEventListener("keydown", (event) => {
+  document.addEventListener("keydown", (event) => {
     if (event.key !== "Escape" || !element.open) return;
     element.open = false;
     summary.focus();
