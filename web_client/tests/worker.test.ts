@@ -208,9 +208,9 @@ class Bench {
     this.socket.open();
   }
 
-  welcome(epoch = 1, resumed = false): void {
+  welcome(epoch = 1, resumed = false, session_id = "s1"): void {
     const times = { session_time: this.now + OFFSET_NS, heartbeat_ns: 1000 * MS, tick_period_ns: 2 * MS, state_period_ns: 16 * MS };
-    const who = { session_id: "s1", session_name: "lab", kind: "live", participant_id: "p1", role: "operator" };
+    const who = { session_id, session_name: "lab", kind: "live", participant_id: "p1", role: "operator" };
     this.say({ type: "welcome", ...who, ...times, connection_epoch: epoch, resume_token: new Uint8Array([epoch]), resumed, endpoints: {} }, epoch);
   }
 
@@ -404,6 +404,32 @@ describe("joined", () => {
     bench.snapshot("none", 2);
     bench.pass(60);
     expect(bench.last("phase")).toMatchObject({ phase: "ready", ended: false });
+  });
+
+  test("another session is said to be another one, though it numbers its connections as the one before", async () => {
+    await bench.join();
+    bench.say({ type: "protocol_fault", code: "session_ended", message: "the session has ended", reason: "" }, 1);
+    bench.pass(2000);
+    bench.socket.open();
+    bench.welcome(1, false, "s2");
+    expect(bench.of("welcome").map(({ welcome }) => welcome.session_id)).toEqual(["s1", "s2"]);
+  });
+
+  test("another name is said at the next hello, which may be now and resumes the participant", async () => {
+    await bench.join();
+    const begin = bench.socket;
+    bench.post({ type: "set_name", name: "eve", rejoins: false });
+    expect(bench.socket).toBe(begin);
+    bench.post({ type: "set_name", name: "dan", rejoins: true });
+    bench.socket.open();
+    expect(begin.find("bye")).toEqual([]); // which would release its leases
+    expect(bench.socket.find("hello")[0]).toMatchObject({ name: "dan", resume_token: new Uint8Array([1]), capabilities: ["run:0011223344556677"] });
+    bench.post({ type: "set_name", name: "eve", rejoins: false });
+    bench.welcome(2, true);
+    bench.pass(1500);
+    bench.socket.end(1006);
+    bench.socket.open();
+    expect(bench.socket.find("hello")[0]).toMatchObject({ name: "eve" });
   });
 
   test("a client that did too much joins again later", async () => {

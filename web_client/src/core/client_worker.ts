@@ -49,6 +49,16 @@ const SOFTWARE = "iris-session web";
 
 const RELOAD = "this page and the session are of different versions: reload the page, or update the session";
 
+/** What the page knows. */
+interface Posted {
+  phase: string;
+  session: string;
+  welcome: ClientConnection["welcome"];
+  clockNs: number;
+}
+
+const NOTHING: Posted = { phase: "", session: "", welcome: null, clockNs: Number.NEGATIVE_INFINITY };
+
 /** Serves one page. Nothing that it receives makes it throw. */
 export class ClientWorker {
   private options: ConnectOptions | null = null;
@@ -68,7 +78,7 @@ export class ClientWorker {
   private readonly media: MediaLink;
   private bodies: readonly BodyInfo[] | null = null;
   private bodiesVersion = 0;
-  private posted = { phase: "", session: "", welcome: 0, clockNs: Number.NEGATIVE_INFINITY };
+  private posted: Posted = { ...NOTHING };
   private framesOut = 0;
   private recycles = false;
   private readonly buffers: Float32Array<ArrayBuffer>[] = [];
@@ -113,6 +123,9 @@ export class ClientWorker {
         break;
       case "rejoin":
         this.rejoin(command.devices, command.alignment);
+        break;
+      case "set_name":
+        this.setName(command.name, command.rejoins);
         break;
       case "pair":
         void this.pair(command);
@@ -213,6 +226,14 @@ export class ClientWorker {
     this.connection?.rejoin(this.makeHello(this.options), this.environment.nowNs());
   }
 
+  private setName(name: string, rejoins: boolean): void {
+    if (this.options === null) return;
+    this.options = { ...this.options, name };
+    const hello = this.makeHello(this.options);
+    if (rejoins) this.connection?.rejoin(hello, this.environment.nowNs());
+    else if (this.connection) this.connection.hello = hello;
+  }
+
   private disconnect(): void {
     const { connection } = this;
     this.attempt += 1;
@@ -224,7 +245,7 @@ export class ClientWorker {
     this.dropSocket();
     this.connection = this.samples = null;
     this.socketGeneration = 0;
-    this.posted = { phase: "", session: "", welcome: 0, clockNs: Number.NEGATIVE_INFINITY };
+    this.posted = { ...NOTHING };
     this.bodies = null;
     this.failRequests("left the session");
     this.media.close();
@@ -470,8 +491,8 @@ export class ClientWorker {
     const { environment, posted } = this;
     const { mirror } = connection;
     this.postPhase();
-    if (connection.welcome !== null && connection.connectionEpoch !== posted.welcome) {
-      posted.welcome = connection.connectionEpoch;
+    if (connection.welcome !== posted.welcome && connection.welcome !== null) {
+      posted.welcome = connection.welcome; // another session may number its connections alike
       this.meter.restart();
       environment.post({ type: "welcome", welcome: connection.welcome }, []);
     }

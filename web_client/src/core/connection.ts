@@ -91,7 +91,7 @@ export class ClientConnection {
   private tickedAt = 0;
 
   constructor(
-    private hello: wire.Hello,
+    public hello: wire.Hello,
     readonly identity: IdentityStore,
   ) {}
 

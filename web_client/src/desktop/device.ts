@@ -33,6 +33,7 @@ export class DesktopDevice {
   isEngaged = false;
   /** Why the clutch was opened from outside, until the dead-man is pressed anew; else empty. */
   released = "";
+  private isBlocked = false;
   /** A dead-man is held that does not count before it is let go. */
   mustLetGo = false;
   /** Sources whose dead-man was seen let go since dead-men were void. */
@@ -84,6 +85,8 @@ export class DesktopDevice {
     }
     const blocked = findBlock(situation);
     if (blocked !== "") this.release(blocked, now_ms);
+    else if (this.isBlocked) this.released = ""; // what blocked has passed
+    this.isBlocked = blocked !== "";
     const isHeld = this.readDeadMen(inputs);
     const motion = merge(inputs.values());
     const isFlipped = motion.toggle && !this.wasToggled;
@@ -129,6 +132,29 @@ export class DesktopDevice {
   private makeSample(now_ms: number): SampleInput {
     const { robot } = this;
     return { device: "desktop", kind: "twist", pose: null, capture_ms: now_ms, robots: [robot], clutch: false, twist: [0, 0, 0, 0, 0, 0] };
+  }
+}
+
+/** Pictures a second with which samples are sent in time, whatever is drawn. */
+const ENOUGH_HZ = 15;
+
+/** Notes that drags end because this page draws slowly: its samples wait meanwhile. */
+export class SlownessWatch {
+  /** What is wrong and what helps, from a drag that ended so until the next one; else empty. */
+  words = "";
+  private isEngaged = false;
+  private begin = { pictures: 0, ms: 0 };
+
+  /** `pictures`: that the page could draw since it began. `isLate`: the session holds the robot since samples came too late. */
+  note(isEngaged: boolean, isLate: boolean, pictures: number, now_ms: number): void {
+    if (isEngaged && !this.isEngaged) {
+      this.words = "";
+      this.begin = { pictures, ms: now_ms };
+    }
+    this.isEngaged = isEngaged;
+    const hz = (1000 * (pictures - this.begin.pictures)) / (now_ms - this.begin.ms);
+    if (!isEngaged || !isLate || !(hz < ENOUGH_HZ) || this.words !== "") return;
+    this.words = `This page draws only ${Math.max(2, Math.ceil(hz))} pictures a second, so what you drag comes too late. A smaller window helps, or “Labels and people” off, or another browser.`;
   }
 }
 

@@ -3,11 +3,12 @@
 
 import { nowMs } from "../core/api.ts";
 import type { WorkerClient } from "../core/page_client.ts";
+import { HoldReason } from "../protocol/messages.g.ts";
 import { button, h, setOptions, setText } from "../ui/dom.ts";
 import type { PageState } from "../ui/state.ts";
 import { recall, remember } from "../ui/storage.ts";
 import { holdReasonWords, limitWords, pauseWords } from "../ui/words.ts";
-import { DesktopDevice, type Heading, SPEED_RANGE, toHeading } from "./device.ts";
+import { DesktopDevice, type Heading, SlownessWatch, SPEED_RANGE, toHeading } from "./device.ts";
 import { DesktopInputs } from "./inputs.ts";
 import { KEY_WORDS, type Vec3 } from "./intent.ts";
 import type { Handles } from "./pull.ts";
@@ -18,6 +19,8 @@ const PERIOD_MS = 17;
 const MAX_DT_S = 0.1;
 /** The session's answer to an engagement takes this long at most [ms]; before, its hold reason is the one before. */
 const ANSWER_MS = 400;
+/** Why a robot holds whose samples come too late. */
+const LATE: readonly string[] = [HoldReason.STALE, HoldReason.REJECTED];
 const STORAGE_KEY = "iris-session.desktop";
 /** What moves the robot. */
 const HOW = matchMedia("(pointer: coarse)").matches
@@ -47,6 +50,7 @@ export interface Drive {
 /**
  * Make the panel. `getCamera`: from where the person looks, null without a picture. `warn`: shows a line for a while.
  * `scene`: gets the focus, so that keys press no button meanwhile. `handles`: at the gripper in the picture.
+ * `countPictures`: how many the page could draw since it began.
  */
 export function makeDrive(
   state: PageState,
@@ -55,8 +59,10 @@ export function makeDrive(
   warn: (text: string) => void,
   scene: HTMLElement,
   handles: Handles | null,
+  countPictures: () => number,
 ): Drive {
   const device = new DesktopDevice((sample) => client.post({ type: "samples", samples: [sample] }));
+  const slowness = new SlownessWatch();
   const chosen = recall(STORAGE_KEY, DEFAULTS);
   let timer = 0;
   let ticked_ms = 0;
@@ -140,6 +146,8 @@ export function makeDrive(
     } else if (device.mustLetGo !== mustLetGo) {
       show();
     }
+    const reason = state.feedback.get(device.robot)?.hold_reason ?? "";
+    slowness.note(device.isEngaged, LATE.includes(reason) && isHeldBySession(now), countPictures(), now);
     const wasHeldBack = isHeldBack;
     isHeldBack = device.robot !== "" && (device.mustLetGo || isHeldBySession(now));
     if (inputs.isGripperAsked(now) && (isHeldBack || !device.isEngaged)) {
@@ -191,7 +199,7 @@ export function makeDrive(
     setText(mark, isHeld ? "held" : "engaged");
     mark.classList.toggle("good", !isHeld);
     element.classList.toggle("engaged", !isHeld);
-    setText(why, describe(device, state, reason, limits, isHeld));
+    setText(why, describe(device, state, reason, limits, isHeld, slowness.words));
     setText(connected, inputs.listConnected().join(", "));
     connect.hidden = !inputs.spaceMouse.isSupported || inputs.spaceMouse.name !== "";
   }
@@ -218,13 +226,14 @@ export function makeDrive(
 }
 
 /** Return in words why the robot holds, or that it follows, and what keeps it from going on. */
-function describe(device: DesktopDevice, state: PageState, reason: string, limits: readonly string[], isHeld: boolean): string {
+function describe(device: DesktopDevice, state: PageState, reason: string, limits: readonly string[], isHeld: boolean, slow: string): string {
   if (!state.isReady) return "Held: not connected.";
   const who = state.isDirector ? "Press" : "A director presses";
   if (state.session?.estop) return `Held: e-stop. ${who} Clear, above.`;
   if (state.pause) return `${pauseWords(state.pause.by, "")}. ${who} Resume, above.`;
   if (state.phase.stalled) return "Held: the session stands still. Let go, and hold again when it goes on.";
   if (!isHeld) return limits.length > 0 ? `It follows you: ${limitWords(limits)}.` : "The robot follows you.";
+  if (slow) return device.isEngaged || device.mustLetGo ? `${slow} Let go, then hold again.` : slow;
   if (device.isEngaged) return `Held by the session: ${holdReasonWords(reason, true)}.`;
   const how = device.mustLetGo ? "Let go, then hold again." : HOW;
   return device.released ? `Held: ${device.released}. ${how}` : `Held. ${how}`;

@@ -11,7 +11,8 @@ import { makeAlignmentPanel, makeAnchorsPanel } from "./alignment.ts";
 import { makeCameras } from "./cameras.ts";
 import { h, setText } from "./dom.ts";
 import { makeEpisodeStrip } from "./episodes.ts";
-import { makeBadge, makeEstop, makePauseBanner, makeSelf } from "./header.ts";
+import { makeBadge, makeEstop, makePause, makeSelf } from "./header.ts";
+import { Joining } from "./joining.ts";
 import {
   makeAdvicePanel,
   makeEventsPanel,
@@ -25,31 +26,14 @@ import { makeRobotOverlay } from "./robot_overlay.ts";
 import { makeRobotsPanel } from "./robots.ts";
 import { makeStage } from "./stage.ts";
 import { PageState } from "./state.ts";
-import { recall, remember } from "./storage.ts";
 import { StreamChoices } from "./stream_choices.ts";
 import { makeStreamsPanel } from "./streams.ts";
 import { type EventLevel, formatMillimetres } from "./words.ts";
 import { makeWelcome } from "./welcome.ts";
 import { type HeadsetControls, makeHeadsetControls } from "../xr/controls.ts";
 
-/** Roles in the order in which they are tried when the person has not chosen one. */
-const ROLES = ["director", "operator", "observer"] as const;
 const STATUS_PERIOD_MS = 1000;
 const NOTICE_MS = 8000;
-/** Names that pages give themselves. */
-const DEFAULT_NAME = /^Web( \d\d)?$/;
-const SOFTWARE = "iris-session web client";
-/** What is remembered of this browser: choices of the person, no secrets. */
-const STORAGE_KEY = "iris-session.page";
-
-interface Remembered {
-  name: string;
-  role: string;
-  roles: string[];
-  /** This person has been asked for a name. */
-  isAsked: boolean;
-}
-
 /** What tests and the console may look at. */
 export interface PageHandle {
   state: PageState;
@@ -62,11 +46,6 @@ export interface PageHandle {
 export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const state = new PageState(client);
   const baseUrl = location.origin;
-  const remembered = recall<Remembered>(STORAGE_KEY, { name: "", role: "", roles: [], isAsked: false });
-  if (remembered.name === "" || remembered.name === "Web") {
-    remembered.name = `Web ${10 + Math.floor(90 * Math.random())}`;
-    remember(STORAGE_KEY, remembered);
-  }
   const notices = h("div", { class: "notices", role: "status", aria: { live: "polite" } });
   const show = (text: string, level: EventLevel): void => {
     const notice = h("div", { class: `notice ${level}` }, text);
@@ -75,40 +54,10 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     setTimeout(() => notice.remove(), NOTICE_MS);
   };
   const actions = new Actions(client, show);
-  const untried: string[] = remembered.role ? [] : [...ROLES];
+  const joining = new Joining(client, state, actions, baseUrl);
+  const pairing = makePairing(client, baseUrl, () => joining.name, (name, roles) => joining.joinPaired(name, roles));
 
-  const join = (name: string, role: string): void => {
-    if (name) remembered.name = name;
-    client.post({
-      type: "connect",
-      base_url: baseUrl,
-      role,
-      name: remembered.name,
-      ...state.entry,
-      software: SOFTWARE,
-    });
-  };
-  const listRoles = (): string[] => ROLES.filter((role) => remembered.roles.length === 0 || remembered.roles.includes(role));
-  const joinByChoice = (): void => {
-    if (!remembered.role) untried.splice(0, untried.length, ...listRoles());
-    join(remembered.name, remembered.role || (untried.shift() ?? "observer"));
-  };
-  const pairing = makePairing(client, baseUrl, () => remembered.name, (name, roles) => {
-    remembered.name = name;
-    remembered.roles = roles;
-    remembered.role = "";
-    remember(STORAGE_KEY, remembered);
-    joinByChoice();
-  });
-  const joinAs = (name: string, role: string): void => {
-    remembered.role = role;
-    if (name) remembered.name = name;
-    remember(STORAGE_KEY, remembered);
-    client.post({ type: "disconnect" });
-    join(name, role);
-  };
-
-  const stage = makeStage(state, { pair: () => pairing.open("", ""), retry: joinByChoice });
+  const stage = makeStage(state, { pair: () => pairing.open("", ""), retry: () => joining.join() });
   const handle: PageHandle = { state, view: null, gizmo: null, headset: null };
   try {
     handle.view = new View(stage.canvas, client, {
@@ -117,6 +66,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
         state.touch();
       },
       onProblem: (text) => state.note(text, "warning"),
+      measureTop: () => stage.tools.offsetTop + stage.tools.offsetHeight,
     });
     stage.setView(handle.view, "");
   } catch (error) {
@@ -129,7 +79,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
 
   const gizmo = view && new Gizmo(view.viewpoint.camera, () => view.touchOverlay());
   handle.gizmo = gizmo;
-  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"), stage.canvas, gizmo);
+  const drive = makeDrive(state, client, () => view?.viewpoint.axes ?? null, (text) => show(text, "warning"), stage.canvas, gizmo, () => view?.displayed ?? Number.NaN);
   const robots = view && gizmo && makeRobotOverlay(state, actions, drive, view, gizmo, stage.element, stage.canvas);
   const choices = new StreamChoices(() => state.spec?.deformables.map((part) => part.stream) ?? [], () => view !== null);
   const cameras = makeCameras(state, view, makePictures(state, client, choices));
@@ -142,22 +92,18 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   stage.tools.append(handle.headset.element);
   const badge = makeBadge(state, () => view?.delay_ms ?? 0);
   const estop = makeEstop(state, actions, () => drive.robot !== "");
-  const pause = makePauseBanner(state, actions);
-  const self = makeSelf(state, listRoles, joinAs);
-  const welcome = makeWelcome(state, () => !remembered.isAsked && DEFAULT_NAME.test(remembered.name), listRoles, (name, role) => {
-    remembered.isAsked = true;
-    remember(STORAGE_KEY, remembered);
-    if (name) joinAs(name, role);
-    else state.touch();
-  });
+  const pause = makePause(state, actions);
+  const self = makeSelf(state, joining);
+  const welcome = makeWelcome(state, joining);
   const title = h("h1", {}, "iris-session");
   const header = h("header", { class: "bar" }, title, badge.element, self.element, estop.stop);
   const episodes = makeEpisodeStrip(state, actions);
-  stage.element.append(episodes.element);
+  stage.element.append(h("div", { class: "banners" }, estop.banner, pause.element), episodes.element);
+  stage.tools.prepend(pause.button);
   const panels = [
     makeAdvicePanel(state),
     makeRobotsPanel(state, actions, drive),
-    makeParticipantsPanel(state, actions),
+    makeParticipantsPanel(state, actions, joining),
     episodes.panel,
     makeAlignmentPanel(state, actions),
     makeEventsPanel(state),
@@ -174,8 +120,6 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   root.replaceChildren(
     h("a", { class: "skip", attributes: { href: "#dashboard" } }, "Skip to the dashboard"),
     header,
-    estop.banner,
-    pause.element,
     welcome.element,
     h("main", {}, stage.element, drive.element, dashboard),
     notices,
@@ -205,16 +149,9 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   client.on("notice", ({ text, level }) => show(text, level));
   client.on("phase", (phase) => {
     if (phase.phase !== "refused") return;
-    if (phase.refusal === "role" && remembered.role) {
-      show(`${phase.text}. Joining with another role.`, "warning");
-      remembered.role = ""; // else every reload would be refused again
-      remember(STORAGE_KEY, remembered);
-      joinByChoice();
-      return;
-    }
-    const next = phase.refusal === "role" ? untried.shift() : undefined;
-    if (next !== undefined) join(remembered.name, next);
-    else if (phase.refusal === "unpaired") pairing.open("", phase.text);
+    const warn = (): void => show(`${phase.text}. Joining with another role.`, "warning");
+    if (phase.refusal === "role" && joining.tryNextRole(warn)) return;
+    if (phase.refusal === "unpaired") pairing.open("", phase.text);
   });
   setInterval(() => {
     if (state.isReady && !document.hidden) client.post({ type: "get_status" });
@@ -225,7 +162,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
     history.replaceState(null, "", location.pathname); // a code must not stay in the address
     pairing.open(code, "");
   } else {
-    joinByChoice();
+    joining.join();
   }
   state.touch();
   return handle;

@@ -3,7 +3,7 @@
 
 import { aspectOf, listWatched } from "../view/framing.ts";
 import type { View } from "../view/view.ts";
-import { h, KeyedList, type Row, setText } from "./dom.ts";
+import { closeOutside, h, KeyedList, type Row, setText } from "./dom.ts";
 import type { Pictures } from "./pictures.ts";
 import type { PageState } from "./state.ts";
 import { recall, remember } from "./storage.ts";
@@ -36,7 +36,9 @@ export function makeCameras(state: PageState, view: View | null, pictures: Pictu
   const choices = h("ul");
   const ofScene = h("section", {}, h("p", { class: "heading" }, "As the scene's cameras record it"), choices);
   const ofStreams = h("section", {}, h("p", { class: "heading" }, "Real cameras"), pictures.choices);
-  const menu = h("details", { class: "menu", hidden: true }, h("summary", { class: "small" }, "Cameras"), h("div", { class: "popover" }, ofStreams, ofScene));
+  const summary = h("summary", { class: "small" }, "Cameras");
+  const menu = h("details", { class: "menu", hidden: true }, summary, h("div", { class: "popover" }, ofStreams, ofScene));
+  closeOutside(menu, summary);
   const places = new Map<string, HTMLElement>();
   const warnings = new Map<string, { text: HTMLElement; panel: HTMLElement; outside: Set<string> }>();
   let listed: unknown = null;

@@ -109,6 +109,16 @@ export class KeyedList<T> {
   }
 }
 
+/** Close what a summary opens on Escape, and on a press anywhere else. */
+export function closeOutside(element: HTMLDetailsElement, summary: HTMLElement): void {
+  document.addEventListener("pointerdown", (event) => !element.contains(event.target as Node) && (element.open = false), { capture: true });
+  document.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape" || !element.open) return;
+    element.open = false;
+    summary.focus();
+  });
+}
+
 /** Return whether keys mean text or a choice to what has the focus. */
 export function takesText(target: EventTarget | null): boolean {
   return target instanceof HTMLElement && target.closest("input[type=text], textarea, [contenteditable], dialog") !== null;

@@ -1,7 +1,8 @@
 // The bar above everything: which session, how fresh the picture is, who you are, and the e-stop.
 
 import type { Actions } from "./actions.ts";
-import { button, h, setOptions, setText, setValue, takesText } from "./dom.ts";
+import { button, closeOutside, h, setOptions, setText, setValue, takesText } from "./dom.ts";
+import type { Joining } from "./joining.ts";
 import type { Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
 import { formatMilliseconds, pauseWords, roleWords } from "./words.ts";
@@ -96,16 +97,20 @@ export function makeEstop(state: PageState, actions: Actions, isDriving: () => b
   };
 }
 
-/** The banner of a pause: who paused, why, and what ends it. */
-export function makePauseBanner(state: PageState, actions: Actions): { element: HTMLElement; update: () => void } {
+/** A pause: the button over the picture, and the banner with who paused, why, and what ends it. */
+export function makePause(state: PageState, actions: Actions): { button: HTMLElement; element: HTMLElement; update: () => void } {
   const text = h("strong");
   const note = h("span", { class: "note" });
   const resume = button("Resume", () => void actions.request({ type: "control", action: "resume" }), { id: "resume" });
   const element = h("div", { class: "banner paused", role: "alert", hidden: true }, text, note, resume);
+  const begin = button("Pause", () => void actions.request({ type: "control", action: "pause" }), { class: "small pause", title: "Let robots and objects stand still, for everyone" });
   return {
+    button: begin,
     element,
     update: () => {
       const { pause } = state;
+      begin.hidden = !state.isDirector || !state.isReady;
+      begin.toggleAttribute("disabled", pause !== null);
       element.hidden = pause === null;
       if (pause === null) return;
       setText(text, pauseWords(pause.by, pause.reason));
@@ -122,37 +127,42 @@ function takesSpace(target: EventTarget | null): boolean {
   return target instanceof HTMLElement && target.closest("button, input, select, textarea, summary, a, dialog") !== null;
 }
 
-/** Who this page is: name and role, to join again with others. `listRoles`: those that this browser may have. */
-export function makeSelf(state: PageState, listRoles: () => readonly string[], join: (name: string, role: string) => void): Panel {
+/** Who this page is: name and role, to change them. */
+export function makeSelf(state: PageState, joining: Joining): Panel {
   const summary = h("summary", {});
   const name = h("input", { type: "text", id: "self-name", attributes: { maxlength: "64", spellcheck: "false", autocomplete: "nickname" } });
   const role = h("select", { id: "self-role" });
   const identity = h("p", { class: "note" });
+  const submit = h("button", { class: "primary" });
   const form = h(
     "form",
     { class: "popover" },
     h("label", { class: "field" }, h("span", {}, "Your name"), name),
     h("label", { class: "field" }, h("span", {}, "Join as"), role),
-    h("button", { class: "primary" }, "Join with these"),
+    submit,
     identity,
   );
   const element = h("details", { class: "self" }, summary, form);
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     element.open = false;
-    join(name.value.trim(), role.value);
+    joining.answer(name.value.trim() || joining.name, role.value);
   });
+  const describe = (): void => setText(submit, joining.describeAnswer(role.value));
+  role.addEventListener("change", describe);
+  closeOutside(element, summary);
   return {
     element,
     update: () => {
       const { self } = state;
-      const roles = new Set([...listRoles(), ...(self ? [self.role] : [])]); // a director may have given it another one
+      const roles = new Set([...joining.listRoles(), ...(self ? [self.role] : [])]); // a director may have given it another one
       setOptions(role, [...roles].map((one) => [one, roleWords(one)] as const));
       setText(summary, self ? `${self.name}, ${roleWords(self.role)}` : "Not joined");
       if (!element.open && self) {
         setValue(name, self.name);
         setValue(role, self.role);
       }
+      describe();
       const fingerprint = state.identity?.fingerprint ?? "";
       setText(identity, fingerprint ? `Fingerprint of this browser: ${fingerprint}` : "");
     },

@@ -58,7 +58,8 @@ export function makeRecordingPanel(state: PageState, actions: Actions): Panel {
         failed: "failed: the file cannot be written",
         ended: "ended: its budget is used up",
       };
-      facts.set("State", recorder ? (names[recorder.state] ?? recorder.state) : "–");
+      const { isReady, phase } = state;
+      facts.set("State", !isReady ? (phase.ended ? "the session has ended" : "not known: not connected") : recorder ? (names[recorder.state] ?? recorder.state) : "–");
       facts.set("File", recorder?.path || "–");
       const rate = recorder && recorder.bytes_per_hour > 0 ? `, ${formatBytes(recorder.bytes_per_hour)} an hour now` : "";
       facts.set("Written", recorder ? formatBytes(recorder.bytes_written) + rate : "–");
@@ -67,8 +68,8 @@ export function makeRecordingPanel(state: PageState, actions: Actions): Panel {
       const text = recorder?.text ?? "";
       setText(words, text);
       words.hidden = text === "";
-      section.setCount(recorder?.state === "running" ? "running" : (recorder?.state ?? ""));
-      form.hidden = !state.isReady;
+      section.setCount(isReady ? (recorder?.state ?? "") : "");
+      form.hidden = !isReady;
     },
   };
 }

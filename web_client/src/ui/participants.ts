@@ -4,17 +4,18 @@ import type { ParticipantInfo } from "../core/api.ts";
 import { participantColor } from "../view/avatars.ts";
 import type { Actions } from "./actions.ts";
 import { button, h, KeyedList, type Row, setLabel, setOptions, setText, setValue } from "./dom.ts";
+import type { Joining } from "./joining.ts";
 import { makeSection, type Panel } from "./panel.ts";
 import type { PageState } from "./state.ts";
 import { alignmentWords, formatMilliseconds, formatShare, roleWords } from "./words.ts";
 
 const ROLES = ["operator", "observer", "director"] as const;
 
-export function makeParticipantsPanel(state: PageState, actions: Actions): Panel {
+export function makeParticipantsPanel(state: PageState, actions: Actions, joining: Joining): Panel {
   const list = h("ul", { class: "rows" });
   const empty = h("p", { class: "empty" }, "No participants.");
   const section = makeSection("participants", "Participants", h("div", {}, list, empty));
-  const rows = new KeyedList<ParticipantInfo>(list, (item) => makeRow(item, state, actions), empty);
+  const rows = new KeyedList<ParticipantInfo>(list, (item) => makeRow(item, state, actions, joining), empty);
   return {
     element: section.element,
     update: () => {
@@ -25,7 +26,7 @@ export function makeParticipantsPanel(state: PageState, actions: Actions): Panel
   };
 }
 
-function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): Row<ParticipantInfo> {
+function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions, joining: Joining): Row<ParticipantInfo> {
   const dot = h("span", { class: "dot", aria: { hidden: "true" } });
   const name = h("strong", { class: "name" });
   const you = h("span", { class: "tag", hidden: true }, "you");
@@ -36,7 +37,8 @@ function makeRow({ id }: ParticipantInfo, state: PageState, actions: Actions): R
   rename.addEventListener("submit", (event) => {
     event.preventDefault();
     const wanted = nameField.value.trim();
-    if (wanted) void actions.request({ type: "rename", participant: id, name: wanted });
+    if (wanted && id === state.selfId) void joining.rename(wanted);
+    else if (wanted) void actions.request({ type: "rename", participant: id, name: wanted });
   });
   role.addEventListener("change", () => {
     void actions

@@ -20,6 +20,31 @@ export interface RobotControls {
   update(): void;
 }
 
+/**
+ * What this person may ask for. `take`: words of the button for a request that is granted at once, or by the holder;
+ * empty where it would be refused. `waits`: a place in the queue may be asked for. `none`: why there is neither.
+ */
+export interface Offer {
+  take: string;
+  waits: boolean;
+  none: string;
+}
+
+/** Return what the session would not refuse: by role, lease mode, and what this person holds or waits for. */
+export function findOffer(state: PageState, robot: string): Offer {
+  const lease = state.lease(robot);
+  const mine = state.heldBy(state.selfId);
+  if (!DRIVERS.includes(state.role)) return { take: "", waits: false, none: "Your role does not drive robots." };
+  if (!state.isReady || mine.includes(robot)) return { take: "", waits: false, none: "" };
+  if (!lease?.holder) return { take: "Take", waits: false, none: "" };
+  const words: Record<string, string> = { takeover: "Take over", request: "Ask for it", shared: "Take" };
+  const isAgentAlone = state.participant(lease.holder)?.role === "agent" && lease.sub_holders.length <= 1;
+  const take = words[lease.mode] ?? (lease.mode === "priority" && isAgentAlone ? "Take" : ""); // people come before agents
+  const queue = state.session?.leases.find((one) => one.queue.includes(state.selfId));
+  const none = mine.length > 0 ? `Release ${mine.join(", ")} to wait for it.` : queue ? `You wait for ${queue.target === robot ? "it" : queue.target}.` : "";
+  return { take, waits: none === "" && (take === "" || lease.mode === "shared"), none };
+}
+
 /** Make the controls of a robot. `name` gives its name: it may change. */
 export function makeRobotControls(robot: () => string, state: PageState, actions: Actions, drive: Drive): RobotControls {
   const acquire = (wait: boolean): void =>
@@ -55,11 +80,11 @@ export function makeRobotControls(robot: () => string, state: PageState, actions
       const name = robot();
       const lease = state.lease(name);
       const isMine = state.heldBy(state.selfId).includes(name);
-      const isFree = !lease || lease.holder === "";
-      const canTake = state.isReady && DRIVERS.includes(state.role) && !isMine;
-      take.hidden = !canTake;
-      setText(take, isFree ? "Take" : lease.mode === "takeover" ? "Take over" : lease.mode === "request" ? "Ask for it" : "Take");
-      wait.hidden = !canTake || isFree || lease.queue.includes(state.selfId) || lease.mode === "takeover";
+      const offer = findOffer(state, name);
+      take.hidden = offer.take === "";
+      setText(take, offer.take || "Take");
+      wait.hidden = !offer.waits;
+      wait.classList.toggle("primary", take.hidden);
       steer.hidden = !isMine || !state.isReady || !state.followsPoses(name);
       setText(steer, drive.robot === name ? "Stop driving" : "Drive");
       release.hidden = !isMine || !state.isReady;

@@ -12,7 +12,7 @@ import { RobotPlaces } from "../view/robot_places.ts";
 import type { View } from "../view/view.ts";
 import type { Actions } from "./actions.ts";
 import { h, KeyedList, type Row, setText } from "./dom.ts";
-import { makeRobotControls } from "./robot_controls.ts";
+import { findOffer, makeRobotControls } from "./robot_controls.ts";
 import type { PageState } from "./state.ts";
 
 /** A press is a click up to this way [pixels]; else it turns the view. */
@@ -283,7 +283,7 @@ function makeMenu(state: PageState, actions: Actions, drive: Drive, stage: HTMLE
   const name = h("strong", { class: "name" });
   const holder = h("span", { class: "note" });
   const controls = makeRobotControls(() => robot, state, actions, drive);
-  const none = h("p", { class: "note" }, "Your role does not drive robots.");
+  const none = h("p", { class: "note" });
   const element = h("div", { class: "robot-menu card", role: "dialog", hidden: true, aria: { label: "Robot" } }, h("div", { class: "line" }, name, holder), h("div", { class: "controls" }, ...controls.buttons), none, controls.assign);
   const close = (): void => {
     element.hidden = true;
@@ -293,8 +293,8 @@ function makeMenu(state: PageState, actions: Actions, drive: Drive, stage: HTMLE
     controls.update();
     setText(name, robot);
     const lease = state.lease(robot);
-    setText(holder, !lease?.holder ? "free" : `held by ${lease.holder === state.selfId ? "you" : state.nameOf(lease.holder)}`);
-    none.hidden = !controls.assign.hidden || controls.buttons.some((one) => !one.hidden);
+    setText(holder, !lease?.holder ? "free" : `held by ${lease.holder === state.selfId ? "you" : state.holderName(lease.holder)}`);
+    setText(none, controls.buttons.some((one) => !one.hidden) ? "" : findOffer(state, robot).none);
   };
   for (const type of ["click", "change"] as const) {
     element.addEventListener(type, (event) => {

@@ -9,7 +9,7 @@ import { button, h, KeyedList, type Row, setOptions, setText, setValue } from ".
 import { makeSection, type Panel } from "./panel.ts";
 import { makeRobotControls } from "./robot_controls.ts";
 import type { ConsentAsked, PageState } from "./state.ts";
-import { graceWords, holdReasonWords, leaseModeWords, limitWords } from "./words.ts";
+import { graceWords, holdReasonWords, leaseModeWords, limitWords, needsAgain } from "./words.ts";
 
 const MODES = ["exclusive", "request", "takeover", "priority", "shared"] as const;
 /** Why a robot holds that its holder does not move now. */
@@ -40,7 +40,7 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
   const dot = h("span", { class: "dot", aria: { hidden: "true" } });
   const title = h("strong", { class: "name" }, name);
   const holder = h("span", { class: "holder" });
-  const why = h("div", { class: "note" });
+  const why = h("div", { class: "note why" });
   const controls = makeRobotControls(() => name, state, actions, drive);
   const mode = h("select", { class: "small", aria: { label: `Lease mode of ${name}` } });
   setOptions(mode, MODES.map((one) => [one, leaseModeWords(one)] as const));
@@ -70,14 +70,13 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
     element,
     update: () => {
       const lease = state.lease(name);
-      const report = state.status?.robots.find((robot) => robot.name === name);
       const isMine = state.heldBy(state.selfId).includes(name);
       const isFree = !lease || lease.holder === "";
       dot.style.background = isFree ? "transparent" : participantColor(lease.holder);
       dot.classList.toggle("hollow", isFree);
-      setText(holder, isFree ? "free" : isMine ? "you" : state.nameOf(lease.holder));
+      setText(holder, isFree ? "free" : isMine ? "you" : state.holderName(lease.holder));
       holder.classList.toggle("free", isFree);
-      setText(why, describe(state, name, lease, report));
+      setText(why, describe(state, drive, name));
       controls.update();
       modeLabel.hidden = !state.isDirector || !state.isReady;
       scaleLabel.hidden = !(state.isDirector || isMine) || isFree || !state.isReady;
@@ -90,26 +89,26 @@ function makeRow({ name }: RobotInfo, state: PageState, actions: Actions, drive:
   };
 }
 
-function describe(
-  state: PageState,
-  robot: string,
-  lease: ReturnType<PageState["lease"]>,
-  report: NonNullable<PageState["status"]>["robots"][number] | undefined,
-): string {
+/** Return the line below the name of a robot: what it does now and why, who waits for it, what keeps it from going on. */
+export function describe(state: PageState, drive: Pick<Drive, "robot" | "isHeldBack">, robot: string): string {
   if (!state.isReady) return "not known: not connected";
-  const feedback = state.feedback.get(robot);
-  const reason = feedback?.hold_reason || report?.hold_reason || "";
+  const lease = state.lease(robot);
+  const isMine = state.heldBy(state.selfId).includes(robot);
+  const reason = state.holdReason(robot);
+  const isPressed = state.mode !== "screen" || (drive.robot === robot && drive.isHeldBack);
+  const isReady = isMine && (WAITS_FOR_HOLDER.includes(reason) || (needsAgain(reason) && !isPressed));
   const parts: string[] = [];
   if (state.session?.estop) parts.push("stopped");
   else if (state.pause) parts.push("paused");
-  else if (WAITS_FOR_HOLDER.includes(reason) && state.heldBy(state.selfId).includes(robot)) parts.push(state.followsPoses(robot) ? "ready: drag the arrows at its gripper" : "ready: a program or a glove moves its joints");
+  else if (isReady) parts.push(state.followsPoses(robot) ? "ready: drag the arrows at its gripper" : "ready: a program or a glove moves its joints");
   else if (reason === HoldReason.DISCONNECTED && lease && lease.expires_ns > 0) parts.push("holds");
-  else if (reason && lease?.holder) parts.push(`holds: ${holdReasonWords(reason, state.heldBy(state.selfId).includes(robot))}`);
-  else if (report?.state && report.state !== "hold") parts.push("driven");
+  else if (reason) parts.push(`holds: ${holdReasonWords(reason, isMine)}`);
+  else if (state.isMoved(robot)) parts.push(lease?.holder ? "driven" : "goes to its home");
   if (lease && lease.expires_ns > 0) parts.push(graceWords(lease.expires_ns, state.sessionTime()));
   if (lease && lease.sub_holders.length > 1) parts.push(`shared by ${lease.sub_holders.map((id) => state.nameOf(id)).join(", ")}`);
   if (lease && lease.queue.length > 0) parts.push(`waiting: ${lease.queue.map((id) => state.nameOf(id)).join(", ")}`);
-  if (feedback && feedback.limits.length > 0) parts.push(limitWords(feedback.limits));
+  const limits = isMine ? (state.feedback.get(robot)?.limits ?? []) : [];
+  if (limits.length > 0) parts.push(limitWords(limits));
   return parts.join(" · ");
 }
 

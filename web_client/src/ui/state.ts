@@ -19,6 +19,8 @@ import {
 } from "../core/api.ts";
 import type { WorkerClient } from "../core/page_client.ts";
 import type * as wire from "../protocol/messages.g.ts";
+import { HoldReason } from "../protocol/messages.g.ts";
+import { recall, remember } from "./storage.ts";
 import type { Mode } from "./stream_choices.ts";
 import { type EventLevel, eventWords, formatSessionTime } from "./words.ts";
 
@@ -47,7 +49,10 @@ export interface ConsentAsked {
   until_ms: number;
 }
 
+const TABS_KEY = "iris-session.tabs";
 const HAND = "hand";
+/** State of a robot that does not move. */
+const HOLD = "hold";
 /** Id of the session's own program among those who do something. */
 const HOST = "host";
 
@@ -104,6 +109,8 @@ export class PageState {
   /** Versions of alignments that the history has. */
   private readonly alignmentVersions = new Map<string, number>();
   private readonly listeners: ((state: PageState) => void)[] = [];
+  /** Participants of this browser in this session. */
+  private ownIds: string[] = [];
   private isQueued = false;
   private nextSeq = 1;
 
@@ -126,8 +133,9 @@ export class PageState {
       this.touch();
     });
     client.on("welcome", ({ welcome }) => {
-      if (this.welcome !== null && this.welcome.session_id !== welcome.session_id) this.log.length = 0;
+      if (this.welcome !== null && this.welcome.session_id !== welcome.session_id) this.forgetSession();
       this.welcome = welcome;
+      this.noteTab(welcome);
       this.feedback.clear();
       this.consents = [];
       this.alignmentVersions.clear(); // of another session they may be the same
@@ -157,6 +165,22 @@ export class PageState {
       for (const message of messages) this.take(message);
       this.touch();
     });
+  }
+
+  /** Another session is joined: forget what belongs to the one before. */
+  private forgetSession(): void {
+    this.log.length = 0;
+    this.session = this.status = this.stats = this.budget = this.progress = this.seenPause = null;
+    this.rtt_ms = this.sessionOffset_ms = this.voidEpoch = Number.NaN;
+    this.newest.clear();
+    this.formerNames.clear();
+  }
+
+  /** Let the other tabs of this browser know which participant this one is. */
+  private noteTab({ session_id, participant_id }: WelcomeUpdate["welcome"]): void {
+    const known = recall(TABS_KEY, { session: "", ids: [] as string[] });
+    this.ownIds = [...new Set([...(known.session === session_id ? known.ids : []), participant_id])];
+    remember(TABS_KEY, { session: session_id, ids: this.ownIds });
   }
 
   onChange(listener: (state: PageState) => void): void {
@@ -261,6 +285,37 @@ export class PageState {
   heldBy(id: string): string[] {
     const leases = this.session?.leases ?? [];
     return leases.filter((l) => l.holder === id || l.sub_holders.includes(id)).map((l) => l.target);
+  }
+
+  /**
+   * Return why a robot holds now, empty: it does not, or that is not known. Own robots by their feedback, others by the
+   * newest report while that is of the same holder: it may be a second old. What has passed since is no reason.
+   */
+  holdReason(robot: string): string {
+    const holder = this.lease(robot)?.holder ?? "";
+    if (holder === "") return "";
+    const isOwn = this.heldBy(this.selfId).includes(robot);
+    const reported = this.report(robot)?.hold_reason ?? (isOwn ? HoldReason.NO_SAMPLE : "");
+    const reason = (isOwn ? this.feedback.get(robot)?.hold_reason : undefined) ?? reported;
+    if (reason === HoldReason.ESTOP && !this.session?.estop) return HoldReason.REARM;
+    return reason === HoldReason.NO_LEASE ? HoldReason.NO_SAMPLE : reason;
+  }
+
+  /** Return whether something moves a robot now, as far as is known. */
+  isMoved(robot: string): boolean {
+    const own = this.heldBy(this.selfId).includes(robot) ? this.feedback.get(robot) : undefined;
+    return ((own ?? this.report(robot))?.state ?? HOLD) !== HOLD;
+  }
+
+  /** Return the newest report about a robot, if that is of its present holder. */
+  private report(robot: string): StatusReport["robots"][number] | undefined {
+    const report = this.status?.robots.find(({ name }) => name === robot);
+    return report?.holder === (this.lease(robot)?.holder ?? "") ? report : undefined;
+  }
+
+  /** Return the name of a holder, and whether it is this person in another tab. */
+  holderName(id: string): string {
+    return `${this.nameOf(id)}${this.ownIds.includes(id) ? ", your other tab" : ""}`;
   }
 
   /** Add a line of the page's own to the history. */

@@ -1,6 +1,7 @@
 // Asked once in each browser: what others call this person, and as what they are here.
 
 import { button, h, setOptions, setText, setValue } from "./dom.ts";
+import type { Joining } from "./joining.ts";
 import type { PageState } from "./state.ts";
 import { roleWords } from "./words.ts";
 
@@ -15,19 +16,14 @@ export interface Welcome {
   update(): void;
 }
 
-/**
- * Make the row that asks. `isAsking`: whether it still has to. `listRoles`: those that this browser may have. `onAnswer`
- * gets name and role, or an empty name: this person wants none.
- */
-export function makeWelcome(
-  state: PageState,
-  isAsking: () => boolean,
-  listRoles: () => readonly string[],
-  onAnswer: (name: string, role: string) => void,
-): Welcome {
+/** Make the row that asks. */
+export function makeWelcome(state: PageState, joining: Joining): Welcome {
   const why = h("p", { class: "note" });
   const name = h("input", { type: "text", id: "welcome-name", attributes: { maxlength: "64", spellcheck: "false", autocomplete: "nickname", placeholder: "Your name", required: "" } });
   const role = h("select", { id: "welcome-role", aria: { label: "Your role" } });
+  const submit = h("button", { class: "primary" });
+  const describe = (): void => setText(submit, joining.describeAnswer(role.value));
+  role.addEventListener("change", describe);
   const element = h(
     "form",
     { class: "welcome", hidden: true, aria: { label: "Who are you?" } },
@@ -35,26 +31,27 @@ export function makeWelcome(
     h("label", { class: "hidden-text", for: "welcome-name" }, "Name for others"),
     name,
     role,
-    h("button", { class: "primary" }, "OK"),
-    button("Not now", () => onAnswer("", ""), { class: "quiet" }),
+    submit,
+    button("Not now", () => joining.answer("", ""), { class: "quiet" }),
   );
   element.addEventListener("submit", (event) => {
     event.preventDefault();
-    if (name.value.trim()) onAnswer(name.value.trim(), role.value);
+    if (name.value.trim()) joining.answer(name.value.trim(), role.value);
   });
   return {
     element,
     update: () => {
-      const isShown = isAsking() && state.isReady && state.self !== undefined;
+      const isShown = joining.isAsking && state.isReady && state.self !== undefined;
       element.hidden = !isShown;
       if (!isShown) return;
       const isOpen = state.info?.pairing === false && state.role === "director";
       setText(why, isOpen ? `You are “${state.self?.name}”, director like all on this machine.` : `You are “${state.self?.name}”, ${roleWords(state.role)}.`);
-      setOptions(role, listRoles().map((one) => [one, `${roleWords(one)}: ${ROLE_NOTES[one] ?? ""}`] as const));
+      setOptions(role, joining.listRoles().map((one) => [one, `${roleWords(one)}: ${ROLE_NOTES[one] ?? ""}`] as const));
       if (!role.dataset.isSet) {
         role.dataset.isSet = "yes";
         setValue(role, state.role);
       }
+      describe();
     },
   };
 }

@@ -106,8 +106,12 @@ const look = (table: Record<string, string>, value: string): string => table[val
 /** Return why a robot holds. `isOwn`: to the person who drives it. */
 export function holdReasonWords(reason: string, isOwn = false): string {
   const words = look(HOLD_REASONS, reason);
-  return isOwn ? words : words.replace(AGAIN, "its operator has to let go and hold again");
+  return isOwn ? words : words.replace(AGAIN, "it waits for its operator");
 }
+
+/** Return whether a robot holds until its clutch was opened and closed again: nothing is to be done where it is open. */
+export const needsAgain = (reason: string): boolean => look(HOLD_REASONS, reason).endsWith(AGAIN);
+
 /** Return in words what keeps a robot from going on: the first two things. */
 export function limitWords(limits: readonly string[]): string {
   const known = Object.keys(LIMITS);
@@ -209,9 +213,12 @@ export const formatShare = (share: number): string => `${(100 * share).toFixed(s
 /** Return when a lease whose holder is disconnected becomes free. */
 export const graceWords = (expires_ns: number, now_ns: number): string => `its holder is disconnected: free in ${formatAge(expires_ns - now_ns)}`;
 
-/** Return a denial as one sentence: what, who holds it, what to do. The advice for `held` is for programs: this page has a button. */
+/** Return a denial as one sentence: what, who holds it, what to do. The advice for `held` is for programs: this page has a button, for those who may wait. */
 export function denialWords(denial: Filled<wire.Denial>): string {
-  if (denial.reason === DenialReason.HELD) denial = { ...denial, advice: "“Wait for it” gives it to you as soon as it is free" };
+  if (denial.reason === DenialReason.HELD) {
+    if (!denial.advice.includes("wait")) return `${capitalize(denial.message)}${endSentence(denial.message)}`;
+    denial = { ...denial, advice: "“Wait for it” gives it to you as soon as it is free" };
+  }
   const holder = denial.holder_name && !denial.message.includes(denial.holder_name) ? ` Held by ${denial.holder_name}.` : "";
   const advice = denial.advice ? ` ${capitalize(denial.advice)}` : "";
   return `${capitalize(denial.message || denial.reason.replaceAll("_", " "))}${endSentence(denial.message)}${holder}${advice}`;

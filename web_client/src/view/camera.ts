@@ -4,7 +4,7 @@ import { type Box3, Matrix4, OrthographicCamera, PerspectiveCamera, Quaternion, 
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
 import { T_THREE_WORLD } from "./axes.ts";
-import { directView, FIRST_ELEVATION, fitDistance, type Sight } from "./framing.ts";
+import { directView, FIRST_ELEVATION, fitView, type Sight } from "./framing.ts";
 import { directFollower, placeFollower, tracks, watches, restRotation } from "./lighting.ts";
 import type { SceneView } from "./scene_view.ts";
 import type { Camera } from "./spec.ts";
@@ -67,16 +67,19 @@ export class Viewpoint {
 
   private isOrthographic = false;
 
-  /** Look at a box from where all of it is seen, and let the view go on to the ends of the scene. `whole`: box of that. */
-  frame({ box, azimuth }: Sight, whole: Box3, zfar: number): void {
+  /**
+   * Look at a box from where all of it is seen, and let the view go on to the ends of the scene. `whole`: box of that;
+   * `above`: share of the picture's height over which a bar lies.
+   */
+  frame({ box, azimuth }: Sight, whole: Box3, zfar: number, above: number): void {
     const reach = Math.max(whole.getSize(new Vector3()).length() / 2, 1e-3);
     // As near and as far as parts of this size and halls of that size need; in between the depth is resolved.
     this.free.near = Math.max(Math.min(NEAR_M, reach / 20), reach / 2000);
     this.free.far = Math.max(FAR_M, zfar, 30 * reach);
     this.controls.minDistance = Math.min(0.05, reach / 10);
     this.controls.maxDistance = Math.max(100, 20 * reach);
-    const distance = fitDistance(box, azimuth, FIRST_ELEVATION, DEFAULT_FOVY, this.aspect);
-    this.setFree({ lookat: box.getCenter(new Vector3()).toArray(), azimuth, elevation: FIRST_ELEVATION, distance });
+    const { lookat, distance } = fitView(box, azimuth, FIRST_ELEVATION, DEFAULT_FOVY, this.aspect, above);
+    this.setFree({ lookat: lookat.toArray(), azimuth, elevation: FIRST_ELEVATION, distance });
   }
 
   /** Choose a camera of the scene by its index, or the free one (-1). */

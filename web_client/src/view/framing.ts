@@ -29,7 +29,7 @@ const AROUND_ROBOTS = 0.1;
 const [MORE_THAN_ROBOTS, MORE_THAN_IT_SAYS] = [1.05, 1.8];
 /** How far bodies may be from where the scene began to count, in its diagonals. */
 const MAX_DRIFT = 2;
-/** Share of half the picture that is filled: above it lies a bar. */
+/** Share of half the picture that is filled. */
 const FILLED_SHARE = 0.85;
 
 /** Return width / height of the pictures of a camera. */
@@ -97,11 +97,13 @@ export function findFirstSight(scene: Placed, bases: readonly number[], beside: 
   const robots = scene.spec.visuals.filter((visual) => links.has(visual.body) && isSolid(scene.spec, visual));
   const focus = unionOf(robots.map((visual) => boxNow(scene, visual)));
   const size = new Vector3();
-  const more = focus.isEmpty() ? MORE_THAN_IT_SAYS : MORE_THAN_ROBOTS;
-  if (focus.isEmpty()) focus.union(boxOfEnvironment(scene.spec.environment));
-  else focus.expandByScalar(AROUND_ROBOTS * focus.getSize(size).length());
+  const hasRobots = !focus.isEmpty();
+  const more = hasRobots ? MORE_THAN_ROBOTS : MORE_THAN_IT_SAYS;
+  if (hasRobots) focus.expandByScalar(AROUND_ROBOTS * focus.getSize(size).length());
+  else focus.union(boxOfEnvironment(scene.spec.environment));
   const isPart = whole.getSize(corner).length() > more * focus.getSize(size).length();
   const box = isPart ? focus : whole;
+  if (hasRobots) box.max.z = Math.max(box.max.z, focus.max.z); // labels and arrows are above grippers
   return { box, azimuth: findAzimuth(scene, robots, links, box) };
 }
 
@@ -138,20 +140,29 @@ export function directView(azimuth: number, elevation: number): Vector3 {
   return new Vector3(Math.cos(el) * Math.cos(az), Math.cos(el) * Math.sin(az), Math.sin(el));
 }
 
-/** Return how far from the centre of a box a camera sees all of it [m]. `fovy`: [deg], of a picture `aspect` times as wide as high. */
-export function fitDistance(box: Box3, azimuth: number, elevation: number, fovy: number, aspect: number): number {
+/**
+ * Return from where a camera sees all of a box: what it looks at, and how far from there it is [m].
+ *
+ * `fovy`: [deg], of a picture `aspect` times as wide as high. `above`: share of its height over which a bar lies.
+ */
+export function fitView(box: Box3, azimuth: number, elevation: number, fovy: number, aspect: number, above: number): { lookat: Vector3; distance: number } {
   const forward = directView(azimuth, elevation);
   const right = forward.clone().cross(new Vector3(0, 0, 1)).normalize();
   const up = right.clone().cross(forward);
-  const high = FILLED_SHARE * Math.tan((fovy * Math.PI) / 360);
+  const tan = Math.tan((fovy * Math.PI) / 360);
+  // From the middle of the picture to the upper edge of what is filled, and to the lower one, in halves of its height.
+  const [upper, lower] = [Math.min(FILLED_SHARE, 1 - 2 * above), FILLED_SHARE];
+  const filled = (upper + lower) / 2;
+  const shift = (lower - upper) / 2;
   const half = box.getSize(new Vector3()).multiplyScalar(0.5);
   let distance = 0;
   for (let i = 0; i < 8; i++) {
     corner.set(i & 1 ? half.x : -half.x, i & 2 ? half.y : -half.y, i & 4 ? half.z : -half.z);
-    const across = Math.max(Math.abs(corner.dot(right)) / (high * aspect), Math.abs(corner.dot(up)) / high);
-    distance = Math.max(distance, across - corner.dot(forward));
+    const [x, y, z] = [corner.dot(right) / tan, corner.dot(up) / tan, corner.dot(forward)];
+    const across = Math.abs(x) / (FILLED_SHARE * aspect) - z;
+    distance = Math.max(distance, across, (y - upper * z) / filled, (-y - lower * z) / filled);
   }
-  return distance;
+  return { lookat: box.getCenter(new Vector3()).addScaledVector(up, shift * tan * distance), distance };
 }
 
 function listDescendants({ bodies }: SceneSpec, bases: readonly number[]): Set<number> {

@@ -40,6 +40,8 @@ const NO_SKY = 0x2a303b;
 const FRAMES_AFTER_CHANGE = 3;
 /** Differences of poses that cannot be seen: two steps of the lattice of positions [m], and of quaternions. */
 const SAME = 1.3e-4;
+/** Place for the label of a robot and the arrow at its gripper [pixels], and what is left free above what is shown at most, as a share of the picture. */
+const [LABEL_PX, MAX_ABOVE] = [30, 0.3];
 /** Longest time without a drawn frame [ms]: what changes silently is seen then. */
 const IDLE_MS = 1000;
 
@@ -56,6 +58,8 @@ export interface ViewEvents {
   /** The scene was replaced: its cameras may be others. */
   onScene: (spec: SceneSpec) => void;
   onProblem: (text: string) => void;
+  /** Height of what lies over the upper edge of the picture [pixels]. */
+  measureTop: () => number;
 }
 
 /** What a headset adds to the scene, and what it does at each of its frames. */
@@ -93,8 +97,9 @@ export class View {
   scene: SceneView | null = null;
   /** Called before each drawn frame, when everything else is where it is drawn. */
   onDraw?: () => void;
-  /** Frames drawn since the page began. */
+  /** Frames drawn since the page began, and those of the display: as many could have been drawn. */
   drawn = 0;
+  displayed = 0;
   /** Age of what is drawn: delay of the interpolation behind session time [ms]. */
   get delay_ms(): number {
     return this.delay.delay_ms;
@@ -288,14 +293,19 @@ export class View {
     const { scene } = this;
     if (!scene) return;
     const box = findWholeBox(scene, this.clouds.getBounds());
-    this.viewpoint.frame({ box, azimuth: FIRST_AZIMUTH }, box, scene.spec.environment.zfar);
+    this.viewpoint.frame({ box, azimuth: FIRST_AZIMUTH }, box, scene.spec.environment.zfar, this.measureAbove());
   }
 
   /** Show a scene for the first time: its robots, if there are any. */
   private showFirst(scene: SceneView): void {
     const clouds = this.clouds.getBounds();
     const sight = findFirstSight(scene, this.bases, clouds);
-    this.viewpoint.frame(sight, findWholeBox(scene, clouds), scene.spec.environment.zfar);
+    this.viewpoint.frame(sight, findWholeBox(scene, clouds), scene.spec.environment.zfar, this.measureAbove());
+  }
+
+  /** Return the share of the picture that lies behind the bar, and the labels and arrows below that. */
+  private measureAbove(): number {
+    return Math.min(MAX_ABOVE, (this.events.measureTop() + LABEL_PX) / Math.max(1, this.canvas.clientHeight));
   }
 
   /** Replace the scene in the picture by the next one. */
@@ -352,6 +362,7 @@ export class View {
   }
 
   private draw(frame?: XRFrame): void {
+    this.displayed += 1;
     const { headset } = this;
     const space = this.renderer.xr.getReferenceSpace();
     const isPresenting = headset !== null && frame !== undefined && space !== null;

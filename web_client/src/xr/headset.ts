@@ -356,12 +356,11 @@ export class Headset {
     const { state } = this;
     const lease = state.lease(name);
     const isOwn = lease !== undefined && (lease.holder === state.selfId || lease.sub_holders.includes(state.selfId));
-    const holdReason = (isOwn ? state.feedback.get(name)?.hold_reason : undefined) ?? state.status?.robots.find((robot) => robot.name === name)?.hold_reason ?? "";
     const sides = SIDES.filter((side) => this.pointed[side] === name);
     const lines = describeRobot({
       name,
       lease,
-      holdReason,
+      holdReason: state.holdReason(name),
       limits: state.feedback.get(name)?.limits ?? [],
       selfId: state.selfId,
       isStopped: state.session?.estop ?? false,

@@ -1,7 +1,7 @@
 import { beforeEach, describe, expect, it } from "vitest";
 
 import type { SampleInput } from "../../src/core/api.ts";
-import { DesktopDevice, SPEED_RANGE, type Situation, toHeading, toTwist } from "../../src/desktop/device.ts";
+import { DesktopDevice, SlownessWatch, SPEED_RANGE, type Situation, toHeading, toTwist } from "../../src/desktop/device.ts";
 import { type Intent, makeIdle, readKeys } from "../../src/desktop/intent.ts";
 
 const HOLDER: Situation = { isReady: true, isStopped: false, isPaused: false, isHolder: true };
@@ -94,6 +94,7 @@ describe("an armed device", () => {
     tick(makeIdle(), situation); // let go during the stop, pressed again before its end: still nothing
     expect(tick(FORWARD, situation).clutch).toBe(false);
     expect(tick(FORWARD).clutch).toBe(false);
+    expect([device.released, device.mustLetGo]).toEqual(["", true]); // it has passed
     tick(makeIdle());
     expect(tick(FORWARD).clutch).toBe(true);
   });
@@ -217,5 +218,26 @@ describe("toHeading", () => {
   it("is the top of the picture of a camera that looks down, and its bottom when it looks up", () => {
     expect(toHeading([0, 0, -1], [0, 1, 0])).toEqual([0, 1]);
     expect(toHeading([0, 0, 1], [0, 1, 0])).toEqual([-0, -1]);
+  });
+});
+
+describe("a page that draws slowly", () => {
+  /** A drag of half a second in which so many pictures are drawn, and then one without the robot. */
+  const drag = (watch: SlownessWatch, pictures: number, isLate: boolean): string => {
+    watch.note(true, false, 100, 1000);
+    watch.note(true, isLate, 100 + pictures, 1500);
+    watch.note(false, false, 160 + pictures, 2500);
+    return watch.words;
+  };
+
+  it("says so when that ends a drag, until the next one", () => {
+    const watch = new SlownessWatch();
+    expect(drag(watch, 3, true)).toMatch(/draws only 6 pictures a second.*smaller window/);
+    expect(drag(watch, 3, false)).toBe("");
+  });
+
+  it("is not the reason where enough is drawn, or where there is no picture", () => {
+    const watch = new SlownessWatch();
+    expect([drag(watch, 30, true), drag(watch, Number.NaN, true)]).toEqual(["", ""]);
   });
 });

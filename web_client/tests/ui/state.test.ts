@@ -68,14 +68,19 @@ test("a frame has an age until its stream is forgotten", () => {
   expect(state.ageOf("room")).toBeUndefined();
 });
 
-test("events of the session before are gone when another one begins", () => {
-  const sayWelcome = (session_id: string): unknown => say({ type: "welcome", welcome: { session_id } });
+test("what belongs to a session is gone when another one begins, not when the same one welcomes again", () => {
+  const sayWelcome = (session_id: string): unknown => say({ type: "welcome", welcome: { session_id, session_name: `scene ${session_id}` } });
   sayWelcome("a");
+  say({ type: "session", participants: [{ id: "p1", name: "ann" }], paused: false, episode: { number: 3 } });
+  say({ type: "stats", state_hz: 60 });
+  sayStatus(10_000, 0);
+  sayFrame(10_000);
   state.note("old");
   sayWelcome("a");
-  expect(state.log.length).toBe(1);
+  expect([state.log.length, state.session?.episode?.number, state.status?.media.length, state.nameOf("p1")]).toEqual([1, 3, 1, "ann"]);
   sayWelcome("b");
-  expect(state.log).toEqual([]);
+  expect(state.welcome?.session_name).toBe("scene b");
+  expect([state.log.length, state.session, state.status, state.stats, state.ageOf("room"), state.nameOf("p1")]).toEqual([0, null, null, null, undefined, "p1"]);
 });
 
 test("rejected samples of one participant and kind are one line that counts up where it is", () => {

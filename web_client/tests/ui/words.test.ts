@@ -31,6 +31,8 @@ test("a denial of what others hold has no words of programs, and says when it is
   const denial = { reason: "held", message: "left is held by ann, disconnected 4 s ago, free in 26 s", advice: "acquire with wait=True", target: "left", holder: "p1", holder_name: "ann" };
   expect(denialWords(denial)).toMatch(/^Left is held by ann, disconnected 4 s ago, free in 26 s\. .*Wait for it/);
   expect(denialWords(denial)).not.toMatch(/wait=/);
+  const own = { ...denial, message: "who holds a robot cannot wait for another: you hold right", advice: "release it and acquire all robots in one request" };
+  expect(denialWords(own)).toBe("Who holds a robot cannot wait for another: you hold right.");
   expect(graceWords(30e9, 4e9)).toMatch(/free in 26 s/);
 });
 

@@ -51,7 +51,8 @@ class Stage {
   readonly view = Object.assign(Object.create(View.prototype) as View, {
     client: this.client,
     assets: new WorkerAssets(this.client),
-    events: { onScene: (spec: SceneSpec) => this.shownSpecs.push(spec.visuals[0]?.name ?? ""), onProblem: (text: string) => this.problems.push(text) },
+    canvas: { clientHeight: 100 },
+    events: { onScene: (spec: SceneSpec) => this.shownSpecs.push(spec.visuals[0]?.name ?? ""), onProblem: (text: string) => this.problems.push(text), measureTop: () => 0 },
     root: this.root,
     overlay: new Group(),
     frames: new FrameBuffer(),
