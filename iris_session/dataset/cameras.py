@@ -104,7 +104,9 @@ def parse_camera(text: str) -> CameraSpec:
             raise wrong
         return CameraSpec(name.replace("/", "_"), what or name)
     x, y, z, tx, ty, tz, fovy = (float(number or 0.0) for number in place.groups())
-    if (x, y, z) == (tx, ty, tz) or not (fovy == 0.0 or 1.0 <= fovy <= 170.0):
+    if (x, y, z) == (tx, ty, tz):
+        raise DatasetError(f"{text!r:.80} looks at where it stands: give two places")
+    if not (fovy == 0.0 or 1.0 <= fovy <= 170.0):
         raise wrong
     return CameraSpec(name, "", (x, y, z), (tx, ty, tz), fovy)
 
@@ -136,7 +138,8 @@ def find_streams(pictures: PictureSpec, model: mujoco.MjModel, recording: Record
             streams, cameras = (", ".join(names) or "none" for names in (sorted(set(jpeg)), list_model_cameras(model)))
             raise DatasetError(
                 f"there is no camera {spec.camera!r} in the scene, and no recorded picture of it: give a camera of the "
-                f"scene ({cameras}), a stream of {recording.files[0]} ({streams}), or a place, {spec.name}=X,Y,Z->X,Y,Z"
+                f"scene ({cameras}), a stream of {recording.files[0]} ({streams}), or a place, "
+                f"{spec.name}=X,Y,Z->X,Y,Z:FOVY"
             )
         width, height = read_stated_size(first.jpeg, AssetEncoding.JPEG)
         if width % 2 or height % 2:
@@ -285,7 +288,7 @@ def make_view(model: mujoco.MjModel, spec: CameraSpec) -> mujoco.MjvCamera:
             there_are = ", ".join(list_model_cameras(model)) or "none"
             raise DatasetError(
                 f"there is no camera {spec.camera!r} in the scene: give one of its own ({there_are}), or a place, "
-                f"{spec.name}=X,Y,Z->X,Y,Z"
+                f"{spec.name}=X,Y,Z->X,Y,Z:FOVY"
             )
         return camera
     camera = mujoco.MjvCamera()

@@ -32,6 +32,7 @@ LABELS: Final = (SUCCESS, FAILURE, UNKNOWN)
 #: Ending of the curation of a recording, behind the name of its file.
 CURATION_SUFFIX: Final = ".episodes.json"
 #: Columns of a robot that have to be the same in all recordings of a set.
+_CUT: Final = ", the recording ends in the middle of it"
 _ROBOT_FIELDS: Final = ("joints", "actuators", "site", "tip_body", "gripper_actuator", "gripper_open", "gripper_closed")
 
 
@@ -196,6 +197,7 @@ class _Reading(msgspec.Struct):
     episodes: tuple[RecordedEpisode, ...]
     times: RowTimes
     interventions: list[tuple[str, int, bool]]
+    is_cut: bool
 
 
 def make_plan(files: Sequence[Path], options: PlanOptions | None = None) -> Plan:
@@ -274,6 +276,10 @@ def _read(path: Path) -> _Reading:
                     interventions.append((body.robot, item.session_time, body.active))
         if not rows:
             raise DatasetError(f"{path} has no step: there is nothing to export")
+        if recording.damage:
+            raise DatasetError(
+                f"{path} is damaged ({recording.damage[0]}): `iris-session recording repair` writes what is left of it"
+            )
         steps, first = np.unique(np.concatenate([row.steps for row in rows]), return_index=True)
         times = RowTimes(steps, np.concatenate([row.session_times for row in rows])[first])
         return _Reading(
@@ -281,6 +287,7 @@ def _read(path: Path) -> _Reading:
             *(header.robots, header.objects, read_names(recording)),
             read_curation(recording.files[0], identify_recording(recording)),
             *(episodes.list_episodes(int(times.session_times[-1])), times, interventions),
+            is_cut=not recording.finished,
         )
 
 
@@ -308,8 +315,9 @@ def _list_episodes(
         curated = read.curation.episodes.get(one.number) if newest[one.number] is one else None
         curated = curated or EpisodeCuration()
         label = curated.label or one.label
+        is_cut = read.is_cut and not one.ended
         if curated.drop or (label not in options.labels and one.number):
-            why = "dropped" if curated.drop else label
+            why = "dropped" if curated.drop else f"{label}{_CUT}" if is_cut else label
             notes.append(f"{where}: episode {one.number} is left out: {why}")
             continue
         first = int(np.searchsorted(times, one.start_ns))
@@ -318,6 +326,8 @@ def _list_episodes(
         if first >= end:
             notes.append(f"{where}: episode {one.number} is left out: it has no step")
             continue
+        if is_cut:
+            notes.append(f"{where}: episode {one.number} is not whole{_CUT}")
         task = hide(curated.task or options.task or one.instruction or one.task or one.text or read.name)
         span = int(steps[first]), int(steps[end - 1]) + 1
         yield PlannedEpisode(index, one.number, label, task, *span, curated.trim)

@@ -6,7 +6,8 @@ import json
 import os
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -145,17 +146,33 @@ def check_folder(folder: Path, name: str, request: Mapping[str, Any]) -> None:
     if not path.exists():
         # Folders without files are of a run that was killed at its beginning.
         if any(one.is_file() for one in folder.rglob("*") if PARTIAL not in one.parts):
-            raise DatasetError(f"the folder {folder} is not empty, and has no data set of ours: give another one")
+            raise DatasetError(
+                f"the folder {folder} is not empty, and has no data set of this format: give another one"
+            )
         return
     try:
         found = json.loads(path.read_bytes())
         assert isinstance(found, dict)
     except (ValueError, AssertionError) as error:
         raise DatasetError(f"{path} is damaged: give another folder") from error
-    asked = json.loads(json.dumps(request))
-    for key in dict.fromkeys((*asked, *found)):
-        if found.get(key) != asked.get(key):
-            here, there = (json.dumps(one.get(key), ensure_ascii=False)[:100] for one in (asked, found))
-            raise DatasetError(
-                f"{folder} has a data set with another {key} ({there}, not {here}): give another folder, or remove it"
-            )
+    if difference := _find_difference(found, json.loads(json.dumps(request))):
+        where, there, here = difference
+        raise DatasetError(
+            f"{folder} has a data set with another {where} ({there}, not {here}): give another folder, or remove it"
+        )
+
+
+def _find_difference(there: Any, here: Any, where: str = "") -> tuple[str, str, str] | None:
+    """Return where two plain values differ first, and what stands there in each; None: nowhere."""
+    if there == here:
+        return None
+    keys: Iterable[Any] = ()
+    if isinstance(there, dict) and isinstance(here, dict):
+        keys = dict.fromkeys((*here, *there))
+        there, here = defaultdict(lambda: None, there), defaultdict(lambda: None, here)
+    elif isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
+        keys = range(len(here))
+    for key in keys:
+        if difference := _find_difference(there[key], here[key], f"{where}.{key}".lstrip(".")):
+            return difference
+    return where, json.dumps(there, ensure_ascii=False)[:100], json.dumps(here, ensure_ascii=False)[:100]

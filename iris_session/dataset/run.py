@@ -36,7 +36,7 @@ from iris_session.dataset.episodes import (
     identify_recording,
     make_plan,
 )
-from iris_session.dataset.files import PictureSink, Stats
+from iris_session.dataset.files import PARTIAL, PictureSink, Stats
 from iris_session.dataset.formats import FORMATS, MODEL, make_sink, open_writer
 from iris_session.dataset.frames import (
     SESSION_TIME,
@@ -278,6 +278,7 @@ def export_dataset(
     try:
         return _write(folder, to, plan, schema, options, request, say, open_pool)
     except OSError as error:
+        shutil.rmtree(folder / PARTIAL, ignore_errors=True)  # on a full disk others need the place
         reason = " ".join((error.strerror or str(error)).split())
         raise DatasetError(f"the data set cannot be written to {folder}: {reason}") from error
 

@@ -57,6 +57,12 @@ def test_an_episode_that_does_not_end_is_unknown_and_discarded_ones_are_left_out
     assert labels == ["discarded", "success", "unknown"]
     found = [(one.label, one.first_step, one.end_step) for one in plan.episodes]
     assert found == [("success", 30, 40), ("unknown", 50, 60)]
+    cut = tmp_path / "cut.rrd"
+    cut.write_bytes(made.path.read_bytes()[:-3000])
+    for choice, word in ((PlanOptions(), "left out: unknown"), (ALL, "not whole")):
+        (note,) = (one for one in make_plan([cut], choice).notes if "episode 3" in one)
+        assert word in note
+        assert "the recording ends in the middle of it" in note
 
 
 def test_a_recording_without_episodes_is_exported_as_a_whole_where_none_has_one(tmp_path: Path, path: Path) -> None:

@@ -127,7 +127,9 @@ def test_other_folders_are_refused(played: Played, tmp_path: Path) -> None:
     export_dataset([played.path], folder, "lerobot", DatasetOptions(50))
     with pytest.raises(DatasetError, match=r"has a data set with another fps \(50, not 25\)"):
         export_dataset([played.path], folder, "lerobot", DatasetOptions(25))
-    with pytest.raises(DatasetError, match="is not empty, and has no data set of ours"):
+    with pytest.raises(DatasetError, match=r"with another pictures.looks \(0, not 2\)"):
+        export_dataset([played.path], folder, "lerobot", DatasetOptions(50, PictureSpec(looks=2)))
+    with pytest.raises(DatasetError, match="is not empty, and has no data set of this format"):
         export_dataset([played.path], played.path.parent, "lerobot", DatasetOptions(25))
     with pytest.raises(DatasetError, match="is no folder"):
         export_dataset([played.path], played.path, "lerobot", DatasetOptions(25))

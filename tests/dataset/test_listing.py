@@ -201,6 +201,9 @@ def test_a_folder_with_recordings_that_do_not_fit_is_listed_and_not_exported(tmp
     assert "is damaged" in d.problems[0]
     (tmp_path / "a.rrd.episodes.json").unlink()
     (tmp_path / "c.rrd").unlink()
+    with pytest.raises(DatasetError, match=r"d.rrd is damaged"):
+        make_plan(list_files([tmp_path]))
+    (tmp_path / "d.rrd").unlink()
     with pytest.raises(DatasetError, match=r"b.rrd does not fit .*a.rrd in one data set: robots left, gripper, not"):
         make_plan(list_files([tmp_path]))
 
