@@ -29,6 +29,7 @@ from iris_session.client.endpoint_resolver import SessionJoiner, parse_connect_r
 from iris_session.client.errors import (
     ClientError,
     DeniedError,
+    InvalidMessageError,
     NotConnectedError,
     RequestTimeoutError,
 )
@@ -55,7 +56,15 @@ from iris_session.protocol.client_messages import (
     SetScale,
 )
 from iris_session.protocol.common import Denial, Lease, Target
-from iris_session.protocol.names import AlignmentKind, DenialReason, EpisodeAction, EpisodeState, Role, TargetKind
+from iris_session.protocol.names import (
+    AlignmentKind,
+    DenialReason,
+    Device,
+    EpisodeAction,
+    EpisodeState,
+    Role,
+    TargetKind,
+)
 from iris_session.protocol.server_messages import ROBOT_STATES, EpisodeChanged, Event, Feedback, Reply
 from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.status import StatusReport
@@ -121,7 +130,7 @@ class Client(ClientDriving):
             session: Name of a session to find on the network instead.
             role: A `Role`.
             name: Name that other participants see, by default the role.
-            devices: Tracked sources of input that samples will name.
+            devices: Tracked sources of input that samples will name, each a `Device`: `target` for `move_to`.
             capabilities: Further capabilities for `Hello`.
             robot_states: Receive joints, grippers, forces and commands of the robots with every state:
                 `scene.robot_state`.
@@ -155,6 +164,9 @@ class Client(ClientDriving):
             capabilities=(*capabilities, *((ROBOT_STATES,) if robot_states else ()), f"run:{secrets.token_hex(8)}"),
             alignment=alignment,
         )
+        unknown = [device for device in hello.devices if device not in Device.ALL]
+        if unknown:
+            raise InvalidMessageError(f"devices: {', '.join(unknown)[:80]} is none of {', '.join(sorted(Device.ALL))}")
         encode_checked(hello)
         self.connection = ClientConnection(hello, identity)
         self.on_state = on_state
@@ -272,6 +284,11 @@ class Client(ClientDriving):
     def name(self) -> str:
         """Our name in the session."""
         return self.connection.hello.name
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """Devices that the client was made with."""
+        return self.connection.hello.devices
 
     @property
     def participant_id(self) -> str:
