@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, Final, Self
 
 from iris_session.client.alignment import ClientAlignment
-from iris_session.client.arguments import to_names, to_text
+from iris_session.client.arguments import to_devices, to_names, to_text
 from iris_session.client.assets import ClientAssets
 from iris_session.client.cameras import CameraFeed, open_camera
 from iris_session.client.core.arrival_meter import ArrivalMeter
@@ -29,7 +29,6 @@ from iris_session.client.endpoint_resolver import SessionJoiner, parse_connect_r
 from iris_session.client.errors import (
     ClientError,
     DeniedError,
-    InvalidMessageError,
     NotConnectedError,
     RequestTimeoutError,
 )
@@ -56,15 +55,7 @@ from iris_session.protocol.client_messages import (
     SetScale,
 )
 from iris_session.protocol.common import Denial, Lease, Target
-from iris_session.protocol.names import (
-    AlignmentKind,
-    DenialReason,
-    Device,
-    EpisodeAction,
-    EpisodeState,
-    Role,
-    TargetKind,
-)
+from iris_session.protocol.names import AlignmentKind, DenialReason, EpisodeAction, EpisodeState, Role, TargetKind
 from iris_session.protocol.server_messages import ROBOT_STATES, EpisodeChanged, Event, Feedback, Reply
 from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.status import StatusReport
@@ -159,14 +150,11 @@ class Client(ClientDriving):
             role=role,
             name=name or role,
             software=software,
-            devices=to_names("devices", devices),
+            devices=to_devices(devices),
             # The session keeps our alignment over a lost connection only while this `run` lasts.
             capabilities=(*capabilities, *((ROBOT_STATES,) if robot_states else ()), f"run:{secrets.token_hex(8)}"),
             alignment=alignment,
         )
-        unknown = [device for device in hello.devices if device not in Device.ALL]
-        if unknown:
-            raise InvalidMessageError(f"devices: {', '.join(unknown)[:80]} is none of {', '.join(sorted(Device.ALL))}")
         encode_checked(hello)
         self.connection = ClientConnection(hello, identity)
         self.on_state = on_state
@@ -284,11 +272,6 @@ class Client(ClientDriving):
     def name(self) -> str:
         """Our name in the session."""
         return self.connection.hello.name
-
-    @property
-    def devices(self) -> tuple[str, ...]:
-        """Devices that the client was made with."""
-        return self.connection.hello.devices
 
     @property
     def participant_id(self) -> str:

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from anchors.pose import distance
 from iris_session.client.arguments import PoseLike, to_names, to_numbers, to_pose, to_python_scalar
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.samples import SampleBuilder
 from iris_session.client.errors import ClientError, InvalidMessageError, UnreachedError
 from iris_session.client.scene import ClientScene
@@ -17,7 +18,6 @@ from iris_session.protocol.client_messages import ClientMessage, Sample, Samples
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import CommandKind, Device, HoldReason
 from iris_session.protocol.server_messages import Feedback
-from iris_session.protocol.session_mirror import SessionMirror
 
 #: Fields of `Sample` that are lists of numbers, and their lengths.
 ARRAYS: Final[dict[str, int | None]] = {"q": None, "qd": None, "hand_joints": None, "twist": 6}
@@ -39,6 +39,7 @@ _PAUSED: Final = "the session is paused: a director goes on with control('resume
 class ClientDriving(ABC):
     """The part of a `Client` that drives robots."""
 
+    connection: ClientConnection
     scene: ClientScene
     _samples: SampleBuilder
     _lock: threading.RLock
@@ -50,14 +51,6 @@ class ClientDriving(ABC):
     @property
     @abstractmethod
     def feedback(self) -> dict[str, Feedback]: ...
-
-    @property
-    @abstractmethod
-    def mirror(self) -> SessionMirror: ...
-
-    @property
-    @abstractmethod
-    def devices(self) -> tuple[str, ...]: ...
 
     @abstractmethod
     def send(self, message: ClientMessage) -> bool: ...
@@ -117,8 +110,8 @@ class ClientDriving(ABC):
         while there_ns is None or self.session_now_ns() < there_ns + int(settle_s * 1e9):
             now_ns, why = self.session_now_ns(), ""
             begins = math.isinf(away_m) or now_ns < begin_ns + BEGIN_NS
-            if begins and self.ready and (self.mirror.estop or self.mirror.paused):
-                why = _STOPPED if self.mirror.estop else _PAUSED
+            if begins and self.ready and (self.connection.mirror.estop or self.connection.mirror.paused):
+                why = _STOPPED if self.connection.mirror.estop else _PAUSED
             elif there_ns is None and now_ns > moved_ns + int(stall_s * 1e9):
                 why = f"it came no nearer for {stall_s:g} s"
             if why or now_ns > begin_ns + int(timeout_s * 1e9):
@@ -139,7 +132,7 @@ class ClientDriving(ABC):
             elif there_ns is None:
                 there_ns = self.session_now_ns()
             nearer = away_m < best_m - PROGRESS_M or away_rad < best_rad - PROGRESS_RAD
-            if nearer or self.mirror.paused or DEAD_ENDS.isdisjoint(feedback.limits):
+            if nearer or self.connection.mirror.paused or DEAD_ENDS.isdisjoint(feedback.limits):
                 best_m, best_rad, moved_ns = min(best_m, away_m), min(best_rad, away_rad), self.session_now_ns()
 
     def _check_move(self, robot: str, goal: Pose, gripper: float | None) -> None:
@@ -149,10 +142,11 @@ class ClientDriving(ABC):
         length = math.hypot(*goal.q)
         if abs(length - 1.0) > UNIT_TOLERANCE:
             raise InvalidMessageError(f"pose: the quaternion {goal.q} has the length {length:.4g}; it must be 1")
-        if self.devices and Device.TARGET not in self.devices:
+        devices = self.connection.hello.devices
+        if devices and Device.TARGET not in devices:
             raise ClientError(
                 f"move_to sends samples of the device {Device.TARGET!r}, and this client was made with "
-                f"{', '.join(self.devices)}: make it with devices={Device.TARGET!r}"
+                f"{', '.join(devices)}: make it with devices={Device.TARGET!r}"
             )
         if self.ready and self.lease_version(robot) is None:
             raise ClientError(f"we do not hold the robot {robot!r}: acquire it first")

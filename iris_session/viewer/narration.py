@@ -130,7 +130,7 @@ _AUDITS: Final = {
     AuditKind.REMOVED: (WARN, "a director removes a participant"),
     AuditKind.RENAMED: (INFO, "a director changes a name"),
     AuditKind.ROLE_CHANGED: (INFO, "a director changes a role"),
-    AuditKind.GATEWAY_REFUSED: (WARN, "a message in the name of somebody else is refused"),
+    AuditKind.GATEWAY_REFUSED: (WARN, "a message in the name of another is refused"),
     AuditKind.TOKEN_REFUSED: (DEBUG, "joins anew, its resume token is not of this session"),
     AuditKind.FLOOD: (WARN, "a client sends more than its limits"),
 }
