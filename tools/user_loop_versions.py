@@ -122,8 +122,11 @@ def is_slowed(model: Any) -> bool:
         data.joint(f"{name}1").qpos[0], data.joint(f"{name}3").qpos[0] = turned * math.pi, math.radians(-10.0)
     mujoco.mj_forward(model, data)
     limiter, swing = ProximityLimiter(model, find_robots(model).robots, ControlConfig()), np.eye(6)[2]
-    closing, opening = (limiter.compute_speed_factors(data, [way * swing, way * swing]) for way in (-1.0, 1.0))
-    return max(closing) < 1.0 == min(opening)
+    closing, opening = (
+        [factors.min() for factors in limiter.compute_speed_factors(data, [way * swing, way * swing])]
+        for way in (-1.0, 1.0)
+    )
+    return bool(max(closing) < 1.0 == min(opening))
 
 
 def drive(model: Any, own_loop: bool) -> dict[str, Any]:

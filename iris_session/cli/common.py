@@ -383,11 +383,13 @@ def open_scene(scene: str) -> NamedScene:
 
 
 def format_scene_names() -> str:
-    """Return the named scenes, one per line."""
-    from iris_session.demo.scene_names import SCENE_NAMES
+    """Return the named scenes, one per line under a heading."""
+    from iris_session.demo.scene_names import SCENE_NAMES, SCENE_NOTE
 
     width = max(map(len, SCENE_NAMES))
-    return "\n".join(f"  {name:<{width}}  {what}" for name, what in SCENE_NAMES.items())
+    return "\n".join(
+        (f"named scenes ({SCENE_NOTE}):", *(f"  {name:<{width}}  {what}" for name, what in SCENE_NAMES.items()))
+    )
 
 
 def to_printable(text: str) -> str:

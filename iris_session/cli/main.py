@@ -73,6 +73,10 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one line, as all others; `--help` has the usage."""
 
     def error(self, message: str) -> NoReturn:
+        for action in self._actions:
+            name = action.metavar or action.dest
+            if action.choices and not action.option_strings and message.endswith(f"arguments are required: {name}"):
+                message += f", one of {', '.join(action.choices)}"
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 

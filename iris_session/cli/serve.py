@@ -26,6 +26,11 @@ from iris_session.cli.scene import add_file_options, check_file_options, find_sc
 from iris_session.cli.view import live_viewer
 from iris_session.protocol.names import AssignmentPolicy
 
+#: How the robot of a URDF is driven: it has joints, and nothing that moves them.
+URDF_ADVICE: Final = (
+    "to drive it: mujoco.MjSpec.from_file, spec.add_actuator for each joint, spec.to_xml, and serve that .xml "
+    "(docs/robots.md)"
+)
 #: What `bench record` and `demo handover` cost.
 RECORDING_COST: Final = "some 20 MB an hour at rest, 0.7 GB and more with two operators; `iris-session status`: now"
 
@@ -59,7 +64,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session serve part.stl --scale 0.001    (a part in millimetres)
             iris-session serve --resume sessions/20261121T093000.000000Z-handover    (continue where it ended)
         """,
-        notes=f"named scenes (panda and aloha need the package mujoco-menagerie):\n{format_scene_names()}",
+        notes=format_scene_names(),
     )
     parser.add_argument("scene", nargs="?", help="MJCF or MJB file, a file to show, or the name of a scene, see below")
     parser.add_argument(
@@ -295,7 +300,8 @@ def _describe_shown_file(session: Session | ScenePublisher, path: Path) -> str:
         extent = None
     if extent is not None:
         what += f"; its extent is {format_size(extent)}"
-    return "\n".join((what, *list_large_meshes(spec)))
+    advice = (URDF_ADVICE,) if path.suffix.lower() == ".urdf" else ()
+    return "\n".join((what, *advice, *list_large_meshes(spec)))
 
 
 def _serve(

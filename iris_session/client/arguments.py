@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from iris_session.client.errors import InvalidMessageError
 from iris_session.protocol.common import MAX_TEXT, Pose
+from iris_session.protocol.names import Device
 
 Numbers = Sequence[float] | NDArray[Any]
 #: `((x, y, z) [m], (w, x, y, z))` of tuples, lists or arrays, or a `Pose`.
@@ -37,6 +38,15 @@ def to_names(field: str, names: str | Iterable[str]) -> tuple[str, ...]:
     for name in found:
         if not isinstance(name, str):
             raise InvalidMessageError(f"{field}: expected names, got {str(name)[:40]} of type {type(name).__name__}")
+    return found
+
+
+def to_devices(devices: str | Iterable[str]) -> tuple[str, ...]:
+    """Convert names of devices to a tuple."""
+    found = to_names("devices", devices)
+    unknown = [device for device in found if device not in Device.ALL]
+    if unknown:
+        raise InvalidMessageError(f"devices: {', '.join(unknown)[:80]} is none of {', '.join(sorted(Device.ALL))}")
     return found
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, Final, Self
 
 from iris_session.client.alignment import ClientAlignment
-from iris_session.client.arguments import to_names, to_text
+from iris_session.client.arguments import to_devices, to_names, to_text
 from iris_session.client.assets import ClientAssets
 from iris_session.client.cameras import CameraFeed, open_camera
 from iris_session.client.core.arrival_meter import ArrivalMeter
@@ -121,7 +121,7 @@ class Client(ClientDriving):
             session: Name of a session to find on the network instead.
             role: A `Role`.
             name: Name that other participants see, by default the role.
-            devices: Tracked sources of input that samples will name.
+            devices: Tracked sources of input that samples will name, each a `Device`: `target` for `move_to`.
             capabilities: Further capabilities for `Hello`.
             robot_states: Receive joints, grippers, forces and commands of the robots with every state:
                 `scene.robot_state`.
@@ -150,7 +150,7 @@ class Client(ClientDriving):
             role=role,
             name=name or role,
             software=software,
-            devices=to_names("devices", devices),
+            devices=to_devices(devices),
             # The session keeps our alignment over a lost connection only while this `run` lasts.
             capabilities=(*capabilities, *((ROBOT_STATES,) if robot_states else ()), f"run:{secrets.token_hex(8)}"),
             alignment=alignment,

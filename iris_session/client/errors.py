@@ -20,11 +20,20 @@ Malformed messages from a server never raise: they are counted in `Client.counte
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Final
 
 from iris_session.assets.errors import AssetStoreError
 from iris_session.protocol.common import Denial
 from iris_session.protocol.errors import IrisError
+from iris_session.protocol.names import HoldReason
 from iris_session.protocol.server_messages import Feedback, Refused
+
+#: What would be right where a limit is active.
+LIMIT_ADVICE: Final = {
+    "reach": "choose a pose within its reach",
+    "proximity": "another robot is near: go around it, or move it away first",
+}
 
 
 class ClientError(IrisError):
@@ -120,7 +129,7 @@ class RequestTimeoutError(ClientError, TimeoutError):
 
 
 class UnreachedError(ClientError, TimeoutError):
-    """`move_to` did not reach its pose in time.
+    """`move_to` did not reach its pose in time, or cannot reach it.
 
     Args:
         robot: Name of the robot.
@@ -128,6 +137,8 @@ class UnreachedError(ClientError, TimeoutError):
         distance_m: See the attribute.
         angle_rad: See the attribute.
         feedback: The newest of the robot.
+        why: What ended the motion before its time was up.
+        rejected: `RejectReason`s of samples that were rejected meanwhile.
 
     Attributes:
         distance_m: Of the end effector from the pose [m], infinite when the robot was never driven.
@@ -136,18 +147,31 @@ class UnreachedError(ClientError, TimeoutError):
     """
 
     def __init__(
-        self, robot: str, timeout_s: float, distance_m: float, angle_rad: float, feedback: Feedback | None
+        self,
+        robot: str,
+        timeout_s: float,
+        distance_m: float,
+        angle_rad: float,
+        feedback: Feedback | None,
+        *,
+        why: str = "",
+        rejected: Sequence[str] = (),
     ) -> None:
         away = f"{1e3 * distance_m:.0f} mm and {math.degrees(angle_rad):.0f} degrees away"
         if math.isinf(distance_m):
-            away = "it was never driven"
+            away = "" if why else "it was never driven"
         if feedback is None:
-            why = "the session has reported nothing about it: do you hold it?"
+            report = "" if why else "the session has reported nothing about it: do you hold it?"
         elif feedback.hold_reason:
-            why = f"it holds: {feedback.hold_reason}"
+            reasons = ", ".join(rejected) if feedback.hold_reason == HoldReason.REJECTED else ""
+            report = f"it holds: {feedback.hold_reason}" + (f" ({reasons})" if reasons else "")
+            report = "" if why and not away else report
         else:
-            why = f"its limits: {', '.join(feedback.limits)}" if feedback.limits else "give it more time"
-        super().__init__(f"{robot} did not reach its pose within {timeout_s:g} s: {away}; {why}")
+            report = f"its limits: {', '.join(feedback.limits)}" if feedback.limits else "give it more time"
+        limits = () if feedback is None else feedback.limits
+        advice = [text for limit, text in LIMIT_ADVICE.items() if limit in limits]
+        within = "" if why else f" within {timeout_s:g} s"
+        super().__init__(f"{robot} did not reach its pose{within}: {join_parts(away, why, report, *advice)}")
         self.distance_m, self.angle_rad, self.feedback = distance_m, angle_rad, feedback
 
 

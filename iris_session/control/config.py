@@ -120,6 +120,7 @@ class ControlConfig(msgspec.Struct, frozen=True):
     proximity_stop: float = 0.02  # [m]: at this distance it is zero
     proximity_gain: float = 4.0  # [1/s]: closing speed <= gain * (distance - stop)
     proximity_period_s: float = 0.01
+    proximity_per_joint: bool = True  # only joints that close the distance are slowed; False: all of the robot alike
     compensate_sag: bool = True  # position servos carry gravity, payloads and friction: see `sag`
     tracking_error: float = 0.3  # [rad or m]: joints further than this from where they are commanded are reported
     # --- objects held by hands without a robot

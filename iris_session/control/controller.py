@@ -521,14 +521,14 @@ class Controller:
         A robot that holds is not bounded: it brakes as hard as it can already.
         """
         joints = self._joints
-        factors = [1.0] * len(self._states)
+        factors = [np.ones(1)] * len(self._states)
         speed = joints.velocity
         wanted = np.minimum(np.maximum((joints.goal - joints.q) / joints.remaining, -speed), speed)
         if joints.moving:
             factors = self._proximity.compute_speed_factors(data, [wanted[columns] for columns in self._columns])
         for i, (r, factor) in enumerate(zip(self._states, factors, strict=True)):
             columns = self._columns[i]
-            r.proximity = 1.0 if r.latch is None else factor
+            r.proximity = 1.0 if r.latch is None else float(factor.min())
             joints.near[columns] = speed[columns] if r.proximity == 1.0 else np.abs(wanted[columns]) * factor
 
     def _move_targets(self, data: mujoco.MjData) -> None:

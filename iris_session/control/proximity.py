@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from bisect import insort
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -27,6 +28,19 @@ _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
 #: the nearest of all; this many of the nearest bound the speed. Both bound the cost of a check.
 _MEASURED_PAIRS = 32
 _BOUNDED_PAIRS = 6
+#: Sweeps over all pairs in which joints that retreat make up for others; after those they no longer do.
+_SWEEPS = 4
+_SETTLED = 1e-9  # change of a factor that is rounding
+
+
+class _Approach(NamedTuple):
+    """Two robots at their places on one pair of geoms.
+
+    `allowed`: closing speed [m/s]. `robots`: index, and the closing speed due to each of its joints, shape (n,).
+    """
+
+    allowed: float
+    robots: tuple[tuple[int, Floats], tuple[int, Floats]]
 
 
 class ProximityLimiter:
@@ -50,11 +64,23 @@ class ProximityLimiter:
         self._segment = np.zeros(6)
         self.active = config.proximity_margin > 0.0 and sum(len(g) > 0 for g in self._geoms) > 1
 
-    def compute_speed_factors(self, data: mujoco.MjData, wanted: Sequence[Floats]) -> list[float]:
-        """Return a factor 0..1 on each robot's joint speed. `wanted`: joint velocities [rad/s] each robot would take,
-        (n_i,).
+    def compute_speed_factors(self, data: mujoco.MjData, wanted: Sequence[Floats]) -> list[Floats]:
+        """Return factors 0..1 on the joint speeds of each robot: one per joint, or one for all, shape (n_i,) or (1,).
+
+        `wanted`: joint velocities [rad/s] each robot would take, (n_i,).
         """
-        factors = [1.0] * len(self._geoms)
+        per_joint = self._config.proximity_per_joint
+        factors = [np.ones(len(joints) if per_joint else 1) for joints in wanted]
+        approaches = self._list_approaches(data, wanted)
+        for _ in range(_SWEEPS if per_joint else 1):
+            before, factors = factors, _slow_approaches(approaches, factors)
+            if all(float((b - f).max()) < _SETTLED for b, f in zip(before, factors, strict=True)):
+                return factors
+        return _slow_approaches(approaches, factors, share=False) if per_joint else factors
+
+    def _list_approaches(self, data: mujoco.MjData, wanted: Sequence[Floats]) -> list[_Approach]:
+        """Return the nearest pairs of robots of which at least one moves."""
+        approaches = []
         moves = [bool(joints.any()) for joints in wanted]
         for a, b in self._near_robots(data):
             if not (moves[a] or moves[b]):  # neither robot approaches
@@ -63,21 +89,11 @@ class ProximityLimiter:
                 gap = p_b - p_a
                 # Points of penetrating geoms are swapped: the direction from a to b stays the same.
                 normal = gap / math.copysign(max(float(np.linalg.norm(gap)), 1e-9), distance)
-                closing = [
-                    float(normal @ self._point_velocity(data, a, geom_a, p_a, wanted[a])),
-                    -float(normal @ self._point_velocity(data, b, geom_b, p_b, wanted[b])),
-                ]
                 allowed = max(0.0, self._config.proximity_gain * (distance - self._config.proximity_stop))
-                total = closing[0] + closing[1]
-                if total <= allowed:
-                    continue
-                # Only those who approach are slowed; someone who retreats keeps his speed and its benefit is shared.
-                approach = max(closing[0], 0.0) + max(closing[1], 0.0)
-                factor = max(0.0, (allowed - total + approach) / approach)
-                for robot, speed in zip((a, b), closing, strict=True):
-                    if speed > 0.0:
-                        factors[robot] = min(factors[robot], factor)
-        return factors
+                closing_a = self._closing_speeds(data, a, geom_a, p_a, normal, wanted[a])
+                closing_b = -self._closing_speeds(data, b, geom_b, p_b, normal, wanted[b])
+                approaches.append(_Approach(allowed, ((a, closing_a), (b, closing_b))))
+        return approaches
 
     def _near_robots(self, data: mujoco.MjData) -> list[tuple[int, int]]:
         """Return pairs of robots whose boxes are within the margin, in index order."""
@@ -125,11 +141,39 @@ class ProximityLimiter:
         found.sort(key=lambda pair: pair[:3])
         return found[:_BOUNDED_PAIRS]
 
-    def _point_velocity(self, data: mujoco.MjData, robot: int, geom: int, point: Floats, joints: Floats) -> Floats:
-        body = int(self._model.geom_bodyid[geom])
-        mujoco.mj_jac(self._model, data, self._jacobian, None, point, body)
-        velocity: Floats = self._jacobian[:, self._dofs[robot]] @ joints
-        return velocity
+    def _closing_speeds(
+        self, data: mujoco.MjData, robot: int, geom: int, point: Floats, normal: Floats, joints: Floats
+    ) -> Floats:
+        """Return the speed of a point along `normal` due to each joint, shape (n,); due to all, shape (1,)."""
+        mujoco.mj_jac(self._model, data, self._jacobian, None, point, int(self._model.geom_bodyid[geom]))
+        J = self._jacobian[:, self._dofs[robot]]
+        speeds: Floats = normal @ J * joints if self._config.proximity_per_joint else np.array([normal @ (J @ joints)])
+        return speeds
+
+
+def _slow_approaches(approaches: Sequence[_Approach], factors: Sequence[Floats], share: bool = True) -> list[Floats]:
+    """Return `factors`, lowered so that every pair closes no faster than allowed if the others do not change.
+
+    `share`: joints that retreat make up for those of their own robot that approach. What they make up for may be gone
+    once they are slowed themselves, because of another pair.
+    """
+    slowed = [f.copy() for f in factors]
+    for allowed, robots in approaches:
+        closing = [speeds * factors[i] for i, speeds in robots]
+        if not share:
+            closing = [np.maximum(speeds, 0.0) for speeds in closing]
+        sums = [float(speeds.sum()) for speeds in closing]
+        total = sums[0] + sums[1]
+        if total <= allowed:
+            continue
+        # Only those who approach are slowed; someone who retreats keeps his speed and its benefit is shared.
+        approach = max(sums[0], 0.0) + max(sums[1], 0.0)
+        factor = max(0.0, (allowed - total + approach) / approach)
+        for (i, _), speeds, speed in zip(robots, closing, sums, strict=True):
+            if speed > 0.0:
+                nearer = speeds > 0.0
+                slowed[i][nearer] = np.minimum(slowed[i], factors[i] * factor)[nearer]
+    return slowed
 
 
 def compute_box_bounds(

@@ -14,7 +14,7 @@ from typing import Any, Final
 import mujoco
 
 from anchors.pose import IDENTITY_QUAT, PoseTuple
-from iris_session.demo.scene_names import SCENE_NAMES
+from iris_session.demo.scene_names import list_scene_names
 from iris_session.demo.scenes import free_bodies_scene, n_arms_scene, scene_path
 from iris_session.demo.scenes.aloha import SHEET_Z, aloha_scene
 from iris_session.demo.scenes.deformables import cloth_scene, soft_scene
@@ -99,8 +99,7 @@ def scene_by_name(name: str) -> NamedScene:
     """
     match = re.fullmatch(r"([a-z]+)([0-9]{1,3})", name)
     if name not in SCENES and (match is None or match[1] not in NUMBERED):
-        names = ", ".join(SCENE_NAMES)
-        raise ConfigError(f"unknown scene '{name}'; expected one of {names}, or a file ({FILES})")
+        raise ConfigError(f"unknown scene '{name}'; expected one of {list_scene_names()}, or a file ({FILES})")
     try:
         return SCENES[name]() if match is None else NUMBERED[match[1]](int(match[2]))
     except IrisError:

@@ -15,3 +15,10 @@ SCENE_NAMES: Final = {
     "cloud": "the scene handover, two drawn depth cameras and what they see of a room around it",
     "bodies": "300 bodies that fly about, no robot",
 }
+#: Of those, what must be said with their names.
+SCENE_NOTE: Final = "the robots of panda and aloha are downloaded on first use"
+
+
+def list_scene_names() -> str:
+    """Return the names in one line, for error texts."""
+    return f"{', '.join(SCENE_NAMES)} ({SCENE_NOTE})"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import re
 import sys
 import threading
 from collections.abc import Iterator
@@ -36,7 +37,7 @@ def load_model(path: str | Path) -> mujoco.MjModel:
 
     Raises:
         ModelNotFoundError: The file is missing, or has an unknown suffix.
-        ModelInvalidError: MuJoCo cannot compile or load it; the message is MuJoCo's.
+        ModelInvalidError: MuJoCo cannot compile or load it; the message is MuJoCo's, or in plain words.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -54,8 +55,18 @@ def load_model(path: str | Path) -> mujoco.MjModel:
         raise ModelInvalidError(f"{path.name}: a name in it is not UTF-8: save the file as UTF-8") from error
     except (ValueError, mujoco.FatalError) as error:
         advice = f"; damaged, or not of MuJoCo {mujoco.__version__}: save it again" if suffix == ".mjb" else ""
-        raise ModelInvalidError(f"{path.name}: {one_line(error)}{advice}") from error
+        raise ModelInvalidError(f"{path.name}: {_explain_error(error)}{advice}") from error
     return model
+
+
+def _explain_error(error: Exception) -> str:
+    """Return MuJoCo's message in one line, or what would be right where it does not say so."""
+    text = one_line(error)
+    if "mass and inertia of moving bodies" not in text:
+        return text
+    name = re.search(r"Element name '([^']+)'", text)
+    body = f"body {name[1]!r}" if name else "a body"
+    return f"{body} moves and has no mass: give it an <inertial>, or in MJCF a geom with a density"
 
 
 def _load_binary(name: str, assets: dict[str, bytes] | None = None) -> mujoco.MjModel:

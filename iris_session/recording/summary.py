@@ -45,6 +45,8 @@ from iris_session.rrd.file import get_size
 #: Maximum number of lines about missing steps, and about missing events: a file may have any number of gaps.
 MOST_GAPS: Final = 100
 _RUNNING: Final = "running"
+#: Longest time from the e-stop of a client that joins to the same one under its name.
+_JOIN_NS: Final = 2_000_000_000
 
 
 class AlignmentSummary(msgspec.Struct, frozen=True):
@@ -609,9 +611,17 @@ class SummaryBuilder:
 
 
 def _change_stops(stops: list[_Stop], stop: _Stop, *, active: bool) -> None:
-    """Add a stop, or end all that are in force."""
+    """Add a stop, or end all that are in force.
+
+    A client that stops the session while it joins says so twice: the second time under its name.
+    """
     if active:
-        stops.append(stop)
+        last = stops[-1] if stops else None
+        early = last is not None and not last.participant and last.until_ns is None and last.reason == stop.reason
+        if last is not None and early and stop.at_ns - last.at_ns <= _JOIN_NS:
+            last.participant = stop.participant
+        else:
+            stops.append(stop)
         return
     for one in reversed(stops):
         if one.until_ns is not None:

@@ -37,6 +37,7 @@ class _RecordedControlConfig(ControlConfig, frozen=True):
     compensate_sag: bool = False
     few_joints_orientation_cost: float | None = None
     target_grippers: bool = False
+    proximity_per_joint: bool = False
 
 
 #: Settings of control that recordings got later; what one of them does not name was off when it was made.

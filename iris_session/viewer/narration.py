@@ -16,12 +16,13 @@ from iris_session.journal.messages import DenialRecord
 from iris_session.journal.rows import CLOSED as CLASS_CLOSED
 from iris_session.journal.rows import SessionHeader
 from iris_session.protocol.common import Alignment
-from iris_session.protocol.names import AlarmKind, AlignmentKind, EpisodeState, HoldReason
+from iris_session.protocol.names import AlarmKind, AlignmentKind, AuditKind, EpisodeState, HoldReason
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentChanged,
     AlignmentRun,
     AnchorMoved,
+    Audited,
     ConsentRequested,
     EngagementChanged,
     EpisodeChanged,
@@ -116,6 +117,22 @@ _SCENES: Final = {
     "new_scene": "another scene is loaded",
     "patch": "the scene is changed",
     "external": "the user's loop has gone back in time",
+}
+
+#: A program or page that was in an earlier session tries the token of that one, and joins without: debugging.
+_AUDITS: Final = {
+    AuditKind.PAIRED: (INFO, "paired"),
+    AuditKind.CODE_REFUSED: (WARN, "a wrong join code is refused"),
+    AuditKind.CODE_EXHAUSTED: (WARN, "a join code is void after too many wrong ones"),
+    AuditKind.KEY_REFUSED: (WARN, "a key that is not paired is refused"),
+    AuditKind.KEY_REVOKED: (WARN, "a key is revoked"),
+    AuditKind.ROLE_REFUSED: (WARN, "a role that the key may not have is refused"),
+    AuditKind.REMOVED: (WARN, "a director removes a participant"),
+    AuditKind.RENAMED: (INFO, "a director changes a name"),
+    AuditKind.ROLE_CHANGED: (INFO, "a director changes a role"),
+    AuditKind.GATEWAY_REFUSED: (WARN, "a message in the name of another is refused"),
+    AuditKind.TOKEN_REFUSED: (DEBUG, "joins anew, its resume token is not of this session"),
+    AuditKind.FLOOD: (WARN, "a client sends more than its limits"),
 }
 
 
@@ -368,6 +385,10 @@ class EventNarration:
                 self._plots.append((REJECTED, who, rejected.total()))
                 text = f"{self._name(who)}'s {_to_device(device)}: {count} samples rejected ({_to_words(reason)})"
                 return LogLine(DEBUG, text)
+            case Audited(kind=kind, name=name, address=address, detail=detail, count=count):
+                level, text = _AUDITS.get(kind, (WARN, _to_words(kind)))
+                parts = (name, address, detail, f"{count} times" if count > 1 else "")
+                return LogLine(level, f"{text}: {', '.join(filter(None, parts))}")
             case MarkerAdded(participant=who, text=text):
                 return LogLine(INFO, f"{self._name(who)}: {text}")
             case Notice(level=level, text=text, participant=who):

@@ -46,14 +46,26 @@ def test_every_command_has_help_for_its_options_and_valid_examples(name: str) ->
     assert silent == []
 
 
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["serve", "--seconds", "nan"]])
-def test_invalid_command_line_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "required: COMMAND, one of demo, serve"),
+        (["fly"], "fly"),
+        (["serve", "--seconds", "nan"], "nan"),
+        (["episode"], "required: action, one of discard, failure, rerecord, reset, start, stop, success"),
+        (["recording"], "required: ACTION, one of inspect"),
+    ],
+)
+def test_invalid_command_line_exits_with_2(
+    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
     said = capsys.readouterr().err
     assert said.startswith("iris-session")
     assert "--help" in said
+    assert expected in said
     assert said.count("\n") == 1
 
 

@@ -73,6 +73,15 @@ def test_file_is_shown_until_the_end(part: Path, capfd: pytest.CaptureFixture[st
     assert json.loads(out)["ok"]
     assert "session 'Part-no.-1' on 127.0.0.1:" in errors
     assert "extent is 0.5 x 0.5 x 0 m" in errors
+    assert "to drive it" not in errors
+
+
+def test_a_urdf_that_is_shown_says_how_it_gets_a_robot(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    arm = tmp_path / "arm.urdf"
+    box = '<visual><geometry><box size="0.1 0.1 0.4"/></geometry></visual>'
+    arm.write_text(f'<robot name="arm"><link name="base">{box}</link></robot>')
+    assert main(["serve", str(arm), "--seconds", "0.1", "--json", *QUIET]) == 0
+    assert "to drive it: mujoco.MjSpec.from_file, spec.add_actuator for each joint" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("given", ["0", "nan", "small"])

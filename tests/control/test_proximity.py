@@ -9,11 +9,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from anchors.pose import PoseTuple
 from iris_session.control import ControlConfig
 from iris_session.control.proximity import ProximityLimiter, compute_box_bounds
+from iris_session.demo.scenes import scene_path
+from iris_session.physics import find_robots
 from iris_session.protocol.specs import RobotSpec
 from iris_session.protocol.steps import Command
-from tests.control.rigs import PANDA_HOME, Rig, decision, panda_arms, pose_command
+from tests.control.rigs import PANDA_HOME, Rig, apart, decision, hold_command, panda_arms, pose_command
 
 FACING = ([(0.0, 0.0, 0.0), (1.3, 0.0, 0.0)], [0.0, math.pi])
 
@@ -81,6 +84,60 @@ def test_leaders_that_send_at_every_step_do_not_lift_the_bound() -> None:
     assert lean(free, 700) < 0.0, "without the bound they would have collided"
 
 
+def send(rig: Rig, goal: PoseTuple, seconds: float) -> float:
+    """A program sends the first robot to a pose; returns the smallest gap."""
+    proximity, smallest = rig.controller._proximity, 1.0
+    for k in range(round(seconds / rig.model.opt.timestep)):
+        source = rig.source(*goal, absolute=True, device="target", new=k % 4 == 0)
+        rig.step(decision([pose_command(rig.robots[0].name, source), hold_command(rig.robots[1].name)]))
+        smallest = min([smallest, *(pair[0] for pair in proximity._near_geoms(rig.data, 0, 1)[:1])])
+    return smallest
+
+
+def make_handover(**settings: object) -> tuple[Rig, PoseTuple]:
+    """The two arms of the scene `handover`, and where the first one begins."""
+    model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+    model.opt.timestep = 0.004
+    rig = Rig(model, list(find_robots(model).robots), ControlConfig(**settings))  # type: ignore[arg-type]
+    rig.hold(5)
+    return rig, rig.tip()
+
+
+def test_an_arm_stretched_towards_another_comes_back_without_coming_nearer() -> None:
+    rig, home = make_handover()
+    (x, y, z), q = home
+    smallest = send(rig, ((x + 3.0, y, z), q), 4.0)
+    assert "proximity" in rig.controller.get_status()[0].limits
+    assert apart(rig.tip(), home)[0] > 0.4
+    assert min(smallest, send(rig, home, 3.0)) > 0.015
+    assert apart(rig.tip(), home)[0] < 0.005
+    jammed, _ = make_handover(proximity_per_joint=False)
+    send(jammed, ((x + 3.0, y, z), q), 4.0)
+    send(jammed, home, 3.0)
+    assert apart(jammed.tip(), home)[0] > 0.4, "recordings made before are verified with the law of then"
+
+
+def test_no_pair_closes_faster_than_allowed_and_joints_that_open_all_of_them_are_not_slowed() -> None:
+    model, robots = panda_arms([(0.0, 0.0, 0.0), (0.75, 0.0, 0.0), (0.4, 0.5, 0.0)], [0.0, math.pi, -math.pi / 2])
+    rig, rng, slowed, kept = Rig(model, robots, home=PANDA_HOME), np.random.default_rng(2), 0, 0
+    proximity, home = rig.controller._proximity, rig.data.qpos.copy()
+    for _ in range(60):
+        rig.data.qpos[:] = home + rng.normal(0.0, 0.3, len(home))
+        mujoco.mj_forward(model, rig.data)
+        wanted = [rng.normal(0.0, 1.0, 7) for _ in robots]
+        factors = proximity.compute_speed_factors(rig.data, wanted)
+        approaches = proximity._list_approaches(rig.data, wanted)
+        for allowed, sides in approaches:
+            assert sum(float(speeds @ factors[i]) for i, speeds in sides) <= allowed * (1.0 + 1e-6) + 1e-12
+        for i, factor in enumerate(factors):
+            mine = [speeds for approach in approaches for k, speeds in approach.robots if k == i]
+            opens = np.all([speeds <= 0.0 for speeds in mine], axis=0) if mine else np.ones(7, dtype=bool)
+            assert (factor[opens] == 1.0).all()
+            slowed += int((factor < 1.0).sum())
+            kept += int(opens.sum()) if factor.min() < 1.0 else 0
+    assert min(slowed, kept) > 50
+
+
 SLIDERS = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/>
 <body name="a"><body><joint name="a" type="slide" axis="1 0 0"/>
   <geom size=".1" pos="0 0 1"/><site name="a" pos="0 0 1"/>
@@ -103,9 +160,10 @@ def sliders(apart: float, finger: float = 0.0) -> tuple[mujoco.MjModel, mujoco.M
 
 def factors(apart: float, va: float, vb: float, finger: float = 0.0) -> list[float]:
     model, data, robots = sliders(apart, finger)
-    return ProximityLimiter(model, robots, ControlConfig()).compute_speed_factors(
+    found = ProximityLimiter(model, robots, ControlConfig()).compute_speed_factors(
         data, [np.array([va]), np.array([vb]), np.array([0.0])]
     )
+    return [float(factor.item()) for factor in found]
 
 
 @pytest.mark.parametrize(
@@ -132,7 +190,7 @@ def test_fingers_are_exempt() -> None:
     guarded = ProximityLimiter(model, [msgspec.structs.replace(r, finger_bodies=()) for r in robots], ControlConfig())
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    assert guarded.compute_speed_factors(data, [np.array([1.0]), np.array([0.0]), np.array([0.0])])[0] == 0.0
+    assert guarded.compute_speed_factors(data, [np.array([1.0]), np.array([0.0]), np.array([0.0])])[0] == [0.0]
 
 
 def test_nothing_to_check_for_one_robot_or_without_geoms() -> None:
@@ -172,7 +230,7 @@ def test_the_nearest_pair_cannot_hide_behind_49_others() -> None:
     assert len(proximity._geoms[0]) == 8
     towards = [np.array([0.4]), np.array([-0.4])]
     # 30 mm apart, 20 mm are kept: the closing speed is at most 4 * 10 mm/s of 0.8 m/s.
-    assert proximity.compute_speed_factors(data, towards) == pytest.approx([0.05, 0.05])
+    assert np.concatenate(proximity.compute_speed_factors(data, towards)) == pytest.approx([0.05, 0.05])
 
 
 def test_box_bounds_are_no_greater_than_the_distance() -> None:

@@ -64,5 +64,5 @@ def test_error_names_what_would_help(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(ModelNotFoundError, match=r"aloha.*mujoco-menagerie.*IRIS_DATA.*models/aloha/scene\.xml"):
         find_model_file("aloha", "scene.xml")
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", Menagerie())
-    with pytest.raises(ModelNotFoundError, match="no connection"):
+    with pytest.raises(ModelNotFoundError, match=r"no connection\): it is downloaded on first use(?!.*pip install)"):
         find_model_file("aloha", "scene.xml")

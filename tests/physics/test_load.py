@@ -12,6 +12,9 @@ from tests.physics.models import clutter
 
 XML = '<mujoco><worldbody><body name="b"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
 
+URDF = """<robot name="arm"><link name="base"/><link name="upper"/><joint name="j" type="revolute"><parent link="base"/>
+<child link="upper"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
 
 def test_xml_and_mjb_give_the_same_model(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(XML)
@@ -26,13 +29,15 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "good.xml").write_text(XML)
     (tmp_path / "bad.xml").write_text("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
     (tmp_path / "broken.xml").write_text("<mujoco>")
+    (tmp_path / "arm.urdf").write_text(URDF)
     (tmp_path / "robot.stl").write_bytes(b"solid")
     cases = [
-        ("gone.xml", ModelNotFoundError, "does not exist; its folder has bad.xml, broken.xml, good.xml"),
+        ("gone.xml", ModelNotFoundError, "does not exist; its folder has arm.urdf, bad.xml, broken.xml, good.xml"),
         ("no/where.xml", ModelNotFoundError, "neither does its folder"),
         ("robot.stl", ModelNotFoundError, "must end in one of .xml, .mjcf, .urdf, .mjb"),
-        ("bad.xml", ModelInvalidError, "bad.xml: Error: mass and inertia"),
+        ("bad.xml", ModelInvalidError, "bad.xml: a body moves and has no mass: give it an <inertial>"),
         ("broken.xml", ModelInvalidError, "broken.xml: "),
+        ("arm.urdf", ModelInvalidError, "arm.urdf: body 'upper' moves and has no mass: give it an <inertial>"),
     ]
     for name, kind, text in cases:
         with pytest.raises(kind) as caught:

@@ -9,6 +9,7 @@ from typing import get_args
 import msgspec
 
 from iris_session.protocol.common import Alignment, Lease, Pose
+from iris_session.protocol.names import AuditKind
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentChanged,
@@ -64,6 +65,19 @@ def narrate(narration: EventNarration, *bodies: EventKind) -> list[LogLine]:
 def test_lost_rows_are_an_error_and_rejected_samples_are_for_debugging() -> None:
     lines = narrate(ann_and_bob(), Gap("recording", 7, 12), SamplesRejected("p1", "controller/left", "stale", 3))
     assert [line.level for line in lines] == ["ERROR", "DEBUG"]
+
+
+def test_security_events_are_sentences_and_the_return_to_another_session_is_for_debugging() -> None:
+    bodies = [Audited(kind, "1f2e", "ann", "10.0.0.9", "operator", 2) for kind in get_values(AuditKind)]
+    lines = dict(zip(get_values(AuditKind), narrate(ann_and_bob(), *bodies), strict=True))
+    assert all(line.text.endswith(": ann, 10.0.0.9, operator, 2 times") for line in lines.values())
+    assert not [line.text for line in lines.values() if "=" in line.text or "_" in line.text or "1f2e" in line.text]
+    assert {kind for kind, line in lines.items() if line.level == "DEBUG"} == {AuditKind.TOKEN_REFUSED}
+    assert lines[AuditKind.FLOOD].level == "WARN"
+
+
+def get_values(kinds: type) -> list[str]:
+    return [value for name, value in vars(kinds).items() if name.isupper()]
 
 
 def test_checks_of_two_headsets_are_told_when_they_change() -> None:

@@ -133,6 +133,8 @@ def test_history_names_people_and_lasts_as_long_as_it_did() -> None:
             (4.0, EpisodeChanged(2, "running", "", "p1")),
             (5.0, EStopChanged(True, "", "hand in the way", 1)),
             (5.5, EStopChanged(True, "p1", "", 2)),
+            (5.6, EStopChanged(True, "", "from a terminal", 2)),
+            (5.7, EStopChanged(True, "p1", "from a terminal", 2)),
             (6.0, EStopChanged(False, "p1", "", 2)),
             (7.0, EStopChanged(True, "p1", "", 3)),
             (7.0, PauseChanged(True, "p1")),
@@ -152,6 +154,7 @@ def test_history_names_people_and_lasts_as_long_as_it_did() -> None:
     assert [(one.by, one.duration_s, one.ended) for one in stops] == [
         ("", 1.0, True),
         ("ann", 0.5, True),
+        ("ann", 0.4, True),
         ("ann", 3.0, False),
     ]
     assert [one.duration_s for one in builder.list_stops(builder.pauses)] == [1.0]

@@ -68,20 +68,67 @@ def test_a_pose_that_is_not_reached_says_how_far_and_why() -> None:
         assert not policy.is_armed("left"), "the session has not seen the clutch open"
         with pytest.raises(InvalidMessageError, match="finite"):
             policy.move_to("left", ((x, y, z), q), gripper=float("nan"))
+        for length, bad in ((0.0, (0.0, 0.0, 0.0, 0.0)), (2.0, (2.0, 0.0, 0.0, 0.0))):
+            with pytest.raises(InvalidMessageError, match=f"has the length {length:g}; it must be 1"):
+                policy.move_to("left", ((x, y, z), bad))
         with pytest.raises(ClientError, match="do not hold the robot 'right'"):
             policy.move_to("right", ((x, y, z), q))
-        with pytest.raises(UnreachedError) as far:
-            policy.move_to("left", ((x + 3.0, y, z), q), timeout_s=2.0)
-        assert far.value.distance_m > 1.0
-        assert far.value.feedback is not None
-        assert "reach" in far.value.feedback.limits
-        policy.estop("test")
-        with pytest.raises(UnreachedError) as stopped:
-            policy.move_to("left", ((x, y, z), q), timeout_s=1.0)
-        assert stopped.value.feedback is not None
-        assert stopped.value.feedback.hold_reason == HoldReason.ESTOP
+        with pytest.raises(UnreachedError, match=r"within 0\.1 s") as soon:
+            policy.move_to("left", ((x, y + 0.2, z), q), timeout_s=0.1)
+        assert soon.value.distance_m > 0.1
         policy.release("left")
+        rig.run(0.1)
         assert not policy.is_armed("left")
+        with pytest.raises(InvalidMessageError, match=r"devices: joystick is none of controller/left, .*target"):
+            Client(devices=("target", "joystick"))
+        desktop = rig.join("ann", devices="desktop")
+        desktop.acquire("left")
+        with pytest.raises(ClientError, match=r"made with desktop: make it with devices='target'"):
+            desktop.move_to("left", ((x, y, z), q))
+
+
+def test_a_pose_out_of_reach_is_given_up_soon_and_the_arm_comes_back_from_beside_another() -> None:
+    with Rig(timestep=0.005) as rig:
+        policy, ((x, y, z), q) = join_policy(rig)
+        begin_s = rig.now_s
+        with pytest.raises(
+            UnreachedError, match=r"came no nearer for 1 s; its limits: .*reach.*within its reach"
+        ) as far:
+            policy.move_to("left", ((x + 3.0, y, z), q))
+        assert rig.now_s - begin_s < 6.0
+        assert far.value.distance_m > 1.0
+        rig.run(0.5)
+        rig.check_rest(policy, "left", 0.5)
+        policy.move_to("left", ((x + 0.1, y, z), q))
+        policy.move_to("left", ((x, y, z), q))
+        with pytest.raises(UnreachedError, match=r"within 3 s"):
+            policy.move_to("left", ((x + 3.0, y, z), q), timeout_s=3.0, stall_s=5.0)
+
+
+def test_a_motion_does_not_begin_while_the_session_is_stopped_or_paused() -> None:
+    with Rig(timestep=0.01) as rig:
+        policy, ((x, y, z), q) = join_policy(rig)
+        director = rig.join("dora", "director")
+        for stop, go_on, why in (
+            (lambda: policy.estop("test"), director.clear_estop, r"stopped \(e-stop\).*clear_estop"),
+            (lambda: director.control("pause"), lambda: director.control("resume"), "is paused"),
+        ):
+            stop()
+            begin_s = rig.now_s
+            with pytest.raises(UnreachedError, match=why):
+                policy.move_to("left", ((x, y, z + 0.05), q))
+            assert rig.now_s - begin_s < 0.5
+            go_on()
+            rig.run(0.2)
+            policy.move_to("left", ((x, y, z + 0.05), q))
+            policy.move_to("left", ((x, y, z), q))
+
+
+def test_the_error_of_a_motion_whose_samples_are_rejected_says_why() -> None:
+    with Rig(timestep=0.01) as rig:
+        policy, ((x, y, z), q) = join_policy(rig)
+        with pytest.raises(UnreachedError, match=r"it holds: rejected \(not_finite\)"):
+            policy.move_to("left", ((x + 2000.0, y, z), q), timeout_s=1.0)
 
 
 class HomingRig(Rig):

@@ -56,8 +56,9 @@ def test_a_recording_that_names_no_solver_was_made_with_mink(monkeypatch: pytest
         replay(header)
 
 
-def test_a_recording_from_before_grippers_were_targets_has_none() -> None:
+@pytest.mark.parametrize("name", ["target_grippers", "proximity_per_joint"])
+def test_what_a_recording_made_before_does_not_name_was_off(name: str) -> None:
     config = msgspec.msgpack.decode(header_of(make_core()).config)
-    del config["control"]["target_grippers"]
+    del config["control"][name]
     header = msgspec.structs.replace(header_of(make_core()), config=msgspec.msgpack.encode(config))
-    assert not ReplayCore(header, {}.__getitem__).core.config.control.target_grippers
+    assert not getattr(ReplayCore(header, {}.__getitem__).core.config.control, name)

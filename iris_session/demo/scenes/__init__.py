@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from iris_session.demo.scene_names import list_scene_names
 from iris_session.demo.scenes.generators import free_bodies_scene, n_arms_scene
 
 __all__ = ["free_bodies_scene", "n_arms_scene", "scene_path"]
@@ -26,10 +27,13 @@ def scene_path(name: str) -> Path:
         Path of the MJCF file.
 
     Raises:
-        FileNotFoundError: There is no such scene; the message lists the available ones.
+        FileNotFoundError: There is no such file; the message lists the available ones, and all names of `serve`.
     """
     path = _FOLDER / f"{name}.xml"
     if path.parent != _FOLDER or not path.is_file():
         available = ", ".join(sorted(p.stem for p in _FOLDER.glob("*.xml")))
-        raise FileNotFoundError(f"no scene '{name}' in the package. Available scenes: {available}")
+        raise FileNotFoundError(
+            f"no file of a scene '{name}' in the package. Available files: {available}. "
+            f"`iris-session serve` and scene_by_name also build scenes: {list_scene_names()}"
+        )
     return path

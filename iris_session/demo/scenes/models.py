@@ -30,7 +30,7 @@ def find_model_file(robot: str, name: str) -> Path:
     Raises:
         ModelNotFoundError: No source has the file; the message says what to install or to set.
     """
-    failure = ""
+    failure, advice = "", "pip install mujoco-menagerie, which downloads it on first use"
     if value := os.environ.get(VARIABLE, ""):
         path = (Path(value).expanduser() / "models" / robot / name).resolve()
         if path.is_file():
@@ -43,14 +43,15 @@ def find_model_file(robot: str, name: str) -> Path:
             path = Path(mujoco_menagerie.get(robot).path(), name)
         except (mujoco_menagerie.MenagerieError, OSError, RuntimeError) as error:  # RuntimeError: no home folder
             failure = f" (mujoco-menagerie: {one_line(error)})"
+            advice = "it is downloaded on first use: connect this machine to the internet once"
         else:
             if path.is_file():
                 return path.resolve()
     if (folder := find_wheel_folder()) is not None and (folder / robot / name).is_file():
         return folder / robot / name
     raise ModelNotFoundError(
-        f"this scene needs the robot model {robot} of MuJoCo Menagerie{failure}: pip install mujoco-menagerie, which "
-        f"downloads it on first use, or set {VARIABLE} to a folder that has models/{robot}/{name}"
+        f"this scene needs the robot model {robot} of MuJoCo Menagerie{failure}: {advice}, "
+        f"or set {VARIABLE} to a folder that has models/{robot}/{name}"
     )
 
 

@@ -2,7 +2,7 @@
 
 import type { Filled } from "../core/api.ts";
 import type * as wire from "../protocol/messages.g.ts";
-import { AlarmKind, AlignmentDoubt, BudgetClass, DenialReason, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
+import { AlarmKind, AlignmentDoubt, AuditKind, BudgetClass, DenialReason, type HoldReason, StreamFault } from "../protocol/messages.g.ts";
 
 /** What helps when the clutch has to be opened and closed, whatever the clutch is: a key, a handle, a squeeze. */
 const AGAIN = "let go, then hold again";
@@ -322,6 +322,7 @@ export function eventWords(
     case "notice":
       return { level: body.level === "error" || body.level === "warning" ? body.level : "info", text: body.text };
     case "audited":
+      if (body.kind === AuditKind.TOKEN_REFUSED) return null; // a return from an earlier session
       return warning(
         [body.kind.replaceAll("_", " "), body.name, body.address, body.detail, body.count > 1 ? `${body.count} times` : ""]
           .filter((part) => part !== "")

@@ -21,6 +21,12 @@ test("an event of another version is left out, not an error", () => {
   expect(eventWords({ event: "from_the_future" } as unknown as Body, nameOf)).toBeNull();
 });
 
+test("the return from an earlier session is no news, other security events are", () => {
+  const audited = { event: "audited", kind: "flood", subject: "", name: "ann", address: "", detail: "", count: 2 };
+  expect(eventWords(audited as Body, nameOf)!.text).toBe("flood, ann, 2 times");
+  expect(eventWords({ ...audited, kind: "token_refused" } as Body, nameOf)).toBeNull();
+});
+
 test("a denial names the holder once, and the advice", () => {
   const denial = { reason: "not_holder", message: "left is held", advice: "wait for it", target: "left", holder: "p1" };
   expect(denialWords({ ...denial, holder_name: "ann" })).toBe("Left is held. Held by ann. Wait for it");
