@@ -181,13 +181,10 @@ def run_demo(
             update()
             now_ns = session.clock()
             began_ns = began_ns or now_ns  # preparing the loop is not part of its pace
-            if judge.has_begun:
-                judge.update()
+            judge.update(people.are_working)
             if now_ns < next_read_ns:
                 return False
             next_read_ns = now_ns + READ_PERIOD_NS
-            if not judge.has_begun and people.are_working():  # nobody learns from a robot that waits for its operator
-                judge.update()
             is_over = (people.is_finished() and judge.is_settled()) or judge.is_reached_for(LEAVE_S)
             is_over = is_over and people.have_seen_streams(now_ns)
             failures = judge.list_failures(people.list_failures(), is_over)
@@ -266,11 +263,7 @@ def _open_links(stack: ExitStack, session: Session, n: int, profile: str, seed: 
 
 
 class _GoalTracker:
-    """Tracks goals, or else handovers, of a demo tick by tick, and records the verdict as that of an episode.
-
-    Attributes:
-        has_begun: The episode was started.
-    """
+    """Tracks goals, or else handovers, of a demo tick by tick, and records the verdict as that of an episode."""
 
     def __init__(self, play: Demo, session: Session) -> None:
         self._name = play.name
@@ -278,23 +271,23 @@ class _GoalTracker:
         self._monitors = tuple(GoalMonitor(goal) for goal in play.goals)
         self._objects = () if play.goals or play.task is not None else play.objects
         self._began_s, self._is_given = 0.0, False
-        self.has_begun = False
+        self._began = False
         self._finished_s: float | None = None
 
     def restart(self) -> None:
         """Forget what was reached; the episode is discarded."""
-        if self.has_begun:
+        if self._began:
             for _ in range(2):  # it is asked for twice
                 self._session.post(Episode(0, EpisodeAction.DISCARD, self._name))
         self._monitors = tuple(GoalMonitor(one.goal) for one in self._monitors)
-        self.has_begun, self._finished_s = False, None
+        self._began, self._finished_s = False, None
 
-    def update(self) -> None:
-        """Process one tick."""
-        if not self._monitors and not self._objects:
+    def update(self, are_working: Callable[[], bool]) -> None:
+        """Process one tick. The episode begins when people work: nobody learns from a robot that waits for them."""
+        if not (self._monitors or self._objects) or not (self._began or are_working()):
             return
-        if not self.has_begun:
-            self.has_begun, self._began_s, self._is_given = True, self._session.clock() * 1e-9, False
+        if not self._began:
+            self._began, self._began_s, self._is_given = True, self._session.clock() * 1e-9, False
             self._session.post(Episode(0, EpisodeAction.START, self._name, countdown_ns=0))
         if self._objects and not self._is_given:
             seen = {one.object for one in self._session.stepper.view.handovers if one.at_s >= self._began_s}

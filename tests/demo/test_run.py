@@ -79,12 +79,14 @@ def test_a_handover_is_an_episode_with_success() -> None:
         stepper=SimpleNamespace(view=view, core=core),
     )
     tracker = run._GoalTracker(Demo("handover", None, {}, (), ("hammer",)), session)
-    tracker.update()
+    tracker.update(lambda: False)
+    assert not posted
+    tracker.update(lambda: True)
     assert [one.action for one in posted] == ["start"], "a handover of an earlier attempt does not count"
     view.handovers.append(SimpleNamespace(object="hammer", at_s=3.0))
-    tracker.update()
-    tracker.update()
+    tracker.update(lambda: True)
+    tracker.update(lambda: True)
     assert [one.action for one in posted] == ["start", "success"]
     tracker.restart()
-    tracker.update()
+    tracker.update(lambda: True)
     assert [one.action for one in posted[2:]] == ["discard", "discard", "start"]
