@@ -283,7 +283,7 @@ class _GoalTracker:
         self._began, self._finished_s = False, None
 
     def update(self, are_working: Callable[[], bool]) -> None:
-        """Process one tick. The episode begins when people work: nobody learns from a robot that waits for them."""
+        """Process one tick. The episode begins when people work: a robot that waits is no demonstration."""
         if not (self._monitors or self._objects) or not (self._began or are_working()):
             return
         if not self._began:
