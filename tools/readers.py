@@ -60,13 +60,19 @@ SHIFTED = {
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, help="folder for environment and data; kept (default: a temporary one)")
-    parser.add_argument("--recording", type=Path, help="a recording of the demo (default: one is made)")
+    parser.add_argument("--recording", type=Path, help="a recording of `demo cloud` (default: one is made)")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         work: Path = (arguments.work or Path(temporary)).resolve()
         work.mkdir(parents=True, exist_ok=True)
         python = make_environment(work / "venv")
-        recording = arguments.recording or record_demo(work)
+        recording = work / "demo" / "session.rrd"
+        shutil.rmtree(recording.parent, ignore_errors=True)
+        if arguments.recording is None:
+            run_iris("demo", "cloud", "--record", str(recording))
+        else:  # a copy, whose curation is changed
+            recording.parent.mkdir()
+            shutil.copyfile(arguments.recording, recording)
         trim_to_pictures(recording)
         write_expected(recording, work / "expected.npz")
         failures = [one for to in SHIFTED for one in check(to, python, recording, work)]
@@ -89,13 +95,6 @@ def make_environment(folder: Path) -> Path:
 
 def run_iris(*arguments: str) -> None:
     subprocess.run([sys.executable, "-m", "iris_session.cli.main", *arguments], check=True)
-
-
-def record_demo(work: Path) -> Path:
-    path = work / "demo" / "session.rrd"
-    shutil.rmtree(path.parent, ignore_errors=True)
-    run_iris("demo", "cloud", "--record", str(path))
-    return path
 
 
 def trim_to_pictures(recording: Path) -> None:

@@ -141,7 +141,12 @@ def find_streams(pictures: PictureSpec, model: mujoco.MjModel, recording: Record
                 f"scene ({cameras}), a stream of {recording.files[0]} ({streams}), or a place, "
                 f"{spec.name}=X,Y,Z->X,Y,Z:FOVY"
             )
-        width, height = read_stated_size(first.jpeg, AssetEncoding.JPEG)
+        try:
+            width, height = read_stated_size(first.jpeg, AssetEncoding.JPEG)
+        except AssetDecodeError as error:
+            raise DatasetError(
+                f"the first picture of {spec.camera!r} in {recording.files[0]} cannot be read: {error}"
+            ) from error
         if width % 2 or height % 2:
             raise DatasetError(f"pictures of {spec.camera!r} are {width}x{height}: a video needs even numbers")
         return replace(spec, camera="", stream=spec.camera, size=(width, height))

@@ -32,8 +32,8 @@ LABELS: Final = (SUCCESS, FAILURE, UNKNOWN)
 #: Ending of the curation of a recording, behind the name of its file.
 CURATION_SUFFIX: Final = ".episodes.json"
 #: Columns of a robot that have to be the same in all recordings of a set.
-_CUT: Final = ", the recording ends in the middle of it"
 _ROBOT_FIELDS: Final = ("joints", "actuators", "site", "tip_body", "gripper_actuator", "gripper_open", "gripper_closed")
+_CUT: Final = ", the recording ends in the middle of it"
 
 
 class DatasetError(RecordingError):

@@ -88,6 +88,8 @@ class RayPool:
         data = pickle.dumps(msgspec.structs.replace(task, planned=planned))
         try:
             begun = self._make.options(name=_name(task)).remote(data, self._versions)
+        except ConnectionError as error:  # of Ray Client
+            raise DatasetError(f"the Ray cluster is lost: {_shorten(error)}") from error
         except ImportError as error:  # from the server of Ray Client
             raise _make_import_error("the head of the cluster", _shorten(error)) from error
         self._running.add(begun)
@@ -104,6 +106,8 @@ class RayPool:
             reason = said.strip().rpartition("\n")[2]
             at = re.search(r"ip=([^,)]+)", str(error))
             raise _make_import_error(f"node {at[1] if at else 'of the cluster'}", reason) from error
+        except ConnectionError as error:  # of Ray Client
+            raise DatasetError(f"the Ray cluster is lost: {_shorten(error)}") from error
         except RayError as error:
             attempts = f"{RETRIES + 1} attempts"
             raise DatasetError(f"{_name(task)} was not made in {attempts}: {_shorten(error)}") from error
@@ -119,12 +123,15 @@ class RayPool:
 
     def close(self) -> None:
         running = list(self._running)
-        for begun in running:
-            self._ray.cancel(begun)
-        if running:
-            self._ray.wait(running, num_returns=len(running), timeout=CANCEL_S)
-        if self._is_owner:
-            self._ray.shutdown()
+        try:
+            with suppress(ConnectionError):  # a lost cluster has no tasks any more
+                for begun in running:
+                    self._ray.cancel(begun)
+                if running:
+                    self._ray.wait(running, num_returns=len(running), timeout=CANCEL_S)
+        finally:
+            if self._is_owner:
+                self._ray.shutdown()
 
 
 def _name(task: EpisodeTask) -> str:

@@ -250,8 +250,10 @@ class Admission:
             return ""
         participant_id = self._context.tokens.find_participant(hello.resume_token, key_id)
         if participant_id is None:
+            is_known = self._context.tokens.is_known(hello.resume_token)
+            kind = AuditKind.TOKEN_MISUSED if is_known else AuditKind.TOKEN_REFUSED
             self._context.audit.record(
-                AuditKind.TOKEN_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail=hello.role
+                kind, now_ns, subject=key_id, name=hello.name, address=address, detail=hello.role
             )
             raise _RefusedError(
                 RefusalCode.RESUME_TOKEN, "this resume token is used, unknown, or of another key", "join without one"

@@ -383,7 +383,8 @@ class AuditKind:
     RENAMED: Final = "renamed"  # by a director
     ROLE_CHANGED: Final = "role_changed"  # by a director
     GATEWAY_REFUSED: Final = "gateway_refused"  # `on_behalf_of` from a participant that is no gateway
-    TOKEN_REFUSED: Final = "token_refused"
+    TOKEN_REFUSED: Final = "token_refused"  # unknown or used up, as after an earlier session
+    TOKEN_MISUSED: Final = "token_misused"  # it is that of a participant with another key
     FLOOD: Final = "flood"  # a client sends more than its limits for seconds
 
 

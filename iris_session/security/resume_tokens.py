@@ -91,6 +91,10 @@ class ResumeTokens:
         record = self._records.get(_hash_token(token))
         return record.participant_id if record is not None and record.key_id == key_id else None
 
+    def is_known(self, token: bytes) -> bool:
+        """Return whether `token` is that of a participant, with whatever key."""
+        return _hash_token(token) in self._records
+
     def count_participants(self, key_id: str) -> int:
         """Return the number of participants of a key, disconnected ones and those behind it included."""
         return len({one.participant_id for one in self._records.values() if key_id in (one.key_id, one.behind)})

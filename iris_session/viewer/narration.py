@@ -131,7 +131,8 @@ _AUDITS: Final = {
     AuditKind.RENAMED: (INFO, "a director changes a name"),
     AuditKind.ROLE_CHANGED: (INFO, "a director changes a role"),
     AuditKind.GATEWAY_REFUSED: (WARN, "a message in the name of another is refused"),
-    AuditKind.TOKEN_REFUSED: (DEBUG, "joins anew, its resume token is not of this session"),
+    AuditKind.TOKEN_REFUSED: (DEBUG, "joins anew, its resume token is not known here"),
+    AuditKind.TOKEN_MISUSED: (WARN, "comes with the resume token of another key and is refused"),
     AuditKind.FLOOD: (WARN, "a client sends more than its limits"),
 }
 

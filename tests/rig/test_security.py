@@ -61,7 +61,7 @@ def test_forged_and_replayed_messages_move_nothing_and_are_audited() -> None:
         assert list_rejections(rig, eve) == {RejectReason.NOT_HOLDER, RejectReason.STALE}
         assert list_rejections(rig, ann) == {RejectReason.SEQ}
         assert {a.kind for _, a in rig.list_events("ann", Audited)} == {
-            AuditKind.TOKEN_REFUSED,
+            AuditKind.TOKEN_MISUSED,
             AuditKind.GATEWAY_REFUSED,
         }
         assert forger.list_received(ProtocolFault)

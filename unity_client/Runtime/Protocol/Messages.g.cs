@@ -327,6 +327,7 @@ namespace IrisSession.Protocol
         public const string RoleChanged = "role_changed";
         public const string GatewayRefused = "gateway_refused";
         public const string TokenRefused = "token_refused";
+        public const string TokenMisused = "token_misused";
         public const string Flood = "flood";
     }
 

@@ -348,6 +348,7 @@ export const AuditKind = {
   ROLE_CHANGED: "role_changed",
   GATEWAY_REFUSED: "gateway_refused",
   TOKEN_REFUSED: "token_refused",
+  TOKEN_MISUSED: "token_misused",
   FLOOD: "flood",
 } as const;
 export type AuditKind = (typeof AuditKind)[keyof typeof AuditKind] | (string & {});
