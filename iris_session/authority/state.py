@@ -332,8 +332,8 @@ class AuthorityState(msgspec.Struct):
     `stop_seq` counts the e-stops, `stops` are those in force, oldest first. `diverged`: why physics stands still
     until a reset, which also ends the pause that came of it (`paused_by_divergence`). `owner_listens`: the owner of
     a user loop takes requests. `rerecording`: the episode whose number begins again when the scene is reset.
-    `episode_ns`: when the episode came into its state, but its countdown. `placed_epoch`: scene epoch that began with the objects of the
-    task placed.
+    `episode_ns`: when the episode came into its state, other than its countdown. `placed_epoch`: scene epoch that began
+    with the objects of the task placed.
     """
 
     robots: dict[str, LeaseState]
