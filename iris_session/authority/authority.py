@@ -45,7 +45,7 @@ from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.status import AlignmentReport, CrossCheckReport, StopReport, UnverifiedReport
 from iris_session.protocol.steps import ControlStatus, Decision, OutgoingMessage, WorldView
 
-#: Requests that only a director (or the host) may make.
+#: Requests that only a director (or the host) may make; one's own name everyone may change.
 DIRECTOR_ONLY: Final = (
     cm.Assign,
     cm.SetMode,
@@ -364,7 +364,7 @@ class Authority:
             samples.count_rejection(ctx, p, "", RejectReason.CONNECTION_EPOCH)
             denial = Denial(DenialReason.NOT_JOINED, "the envelope names another connection", "use the latest welcome")
             self._deny_entry(entry, denial)
-        elif isinstance(m, DIRECTOR_ONLY) and p.role != Role.DIRECTOR:
+        elif isinstance(m, DIRECTOR_ONLY) and p.role != Role.DIRECTOR and not roster.is_self_rename(ctx, p, m):
             self._deny_entry(entry, Denial(DenialReason.ROLE, f"role {p.role} may not do this", "ask a director"))
         elif isinstance(m, HOST_ONLY):
             if p.id == HOST_ID:

@@ -94,6 +94,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `episode_rules`: episodes have a countdown, a closing and people who may leave; False: as in earlier recordings.
     `strict_episodes`: who starts one holds a robot, objects are placed before it begins, a button counts a second after
     the state changed, and a refused one is reported; False: as in earlier recordings.
+    `self_rename`: everyone may change their own name; False: as in earlier recordings.
     """
 
     # samples
@@ -113,6 +114,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gap_ns: int = 150 * MS  # a longer time between two steps is a gap: robots hold until clutched again
     drain_ns: int = 250 * MS  # after a gap nothing expires before the waiting entries had this long to arrive
     max_participants: int = 64
+    self_rename: bool = True
     quota: int = 64  # entries per participant and step, urgent ones not counted
     # leases
     policy: Name = AssignmentPolicy.JOIN_ORDER

@@ -9,7 +9,7 @@ from iris_session.authority.context import HUMAN, Context, build_absent_denial, 
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
 from iris_session.protocol.client_messages import RemoveParticipant, Rename, SetRole
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
-from iris_session.protocol.entries import HOST, Join
+from iris_session.protocol.entries import HOST, EntryMessage, Join
 from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, Device, HoldReason, RefusalCode, Role
 from iris_session.protocol.server_messages import (
     AlignmentRun,
@@ -105,7 +105,7 @@ def _resume_participant(ctx: Context, connection: int, m: Join, p: Participant) 
         if not p.aligning:
             p.aligning, p.alignment_run = True, p.alignment_run + 1
             ctx.emit(AlignmentRun(p.id, True, p.alignment_run))
-    if m.name != p.hello_name:  # else a director has renamed it
+    if m.name != p.hello_name:  # else it has been renamed
         p.name, p.hello_name = m.name, ""
     p.needs_alignment = needs_alignment
     p.warnings.pop("doubt", None)  # it may not have arrived: it is said again
@@ -197,8 +197,13 @@ def process_removal(ctx: Context, p: Participant, m: RemoveParticipant) -> None:
     return _disconnect_clients(ctx, connection, "gateway")
 
 
+def is_self_rename(ctx: Context, p: Participant, m: EntryMessage) -> bool:
+    """Return whether a participant asks for another name of its own, which needs no director."""
+    return ctx.config.self_rename and isinstance(m, Rename) and m.participant == p.id
+
+
 def rename_participant(ctx: Context, p: Participant, m: Rename) -> None:
-    """Give a participant another name for a director; one that another participant has gets a number."""
+    """Give a participant another name, for itself or a director; one that another participant has gets a number."""
     person = _find_person(ctx, p, m)
     name = m.name.strip()
     if person is None:

@@ -300,6 +300,7 @@ class Admission:
                     self._context.ports.media_ingest,
                 ),
                 self._context.ports.key_fingerprint,
+                config.task_robots,
             ),
         )
 

@@ -152,6 +152,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
     session_id: str = ""
     session_name: str = "session"
     session_kind: str = "live"
+    task_robots: tuple[str, ...] = ()
     origin_ns: int = 0
     heartbeat_ns: int = 500 * MILLISECOND
     silence_ns: int = 2 * SECOND

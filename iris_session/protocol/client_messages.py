@@ -323,7 +323,7 @@ class RemoveParticipant(Message, frozen=True, tag="remove_participant"):
 
 
 class Rename(Message, frozen=True, tag="rename"):
-    """Give a participant another name. Directors only. A name that another participant has gets a number."""
+    """Give a participant another name: oneself, or as a director anyone. A name that another one has gets a number."""
 
     request_id: Count
     participant: Name

@@ -124,7 +124,7 @@ MAX_CONTROL_BYTES: Final = MAX_CLIENT_BYTES + MAX_ON_BEHALF_BYTES + 64
 #: From the server, checked by clients. A snapshot names every body: 65,535 of them.
 SERVER_LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
     {
-        Welcome: Limit(4_000),
+        Welcome: Limit(16_000),
         Refused: Limit(8_000),
         ProtocolFault: Limit(4_000),
         ClockPong: Limit(512),

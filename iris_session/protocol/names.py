@@ -380,7 +380,7 @@ class AuditKind:
     KEY_REVOKED: Final = "key_revoked"
     ROLE_REFUSED: Final = "role_refused"
     REMOVED: Final = "removed"
-    RENAMED: Final = "renamed"  # by a director
+    RENAMED: Final = "renamed"  # by itself or a director
     ROLE_CHANGED: Final = "role_changed"  # by a director
     GATEWAY_REFUSED: Final = "gateway_refused"  # `on_behalf_of` from a participant that is no gateway
     TOKEN_REFUSED: Final = "token_refused"  # unknown or used up, as after an earlier session

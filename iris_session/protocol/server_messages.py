@@ -48,7 +48,8 @@ class Endpoints(msgspec.Struct, frozen=True):
 class Welcome(Message, frozen=True, tag="welcome"):
     """Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once.
 
-    `tick_period_ns`: of the present scene; another scene may have another (`SceneChanged`).
+    `tick_period_ns`: of the present scene; another scene may have another (`SceneChanged`). `task_robots`: robots of
+    the task, whose holders start its episodes; empty: any robot.
     """
 
     session_id: Name
@@ -65,6 +66,7 @@ class Welcome(Message, frozen=True, tag="welcome"):
     state_period_ns: Nanoseconds
     endpoints: Endpoints
     key_fingerprint: Name = ""
+    task_robots: Names = ()
 
 
 class Refused(Message, frozen=True, tag="refused"):

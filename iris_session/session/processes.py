@@ -210,7 +210,7 @@ class SessionProcesses:
         self._note_writer.offer(ResumeNote(self.session_id, listening, self.front.link.handback))
 
     def _make_front_config(self) -> FrontConfig:
-        config, web = self._config, self.web
+        config, web, task = self._config, self.web, self._core.config.authority.task
         return FrontConfig(
             host=config.host,
             listen=addresses_of(config.interfaces) if config.interfaces else (),
@@ -227,6 +227,7 @@ class SessionProcesses:
             adapt_media=config.adapt_media,
             session_id=self.session_id,
             session_name=self.name,
+            task_robots=() if task is None else task.robots[:32],
             origin_ns=self._origin_ns,
             state_period_ns=self.state_period_ns,
             curve=config.curve,

@@ -31,6 +31,7 @@ class _RecordedAuthorityConfig(AuthorityConfig, frozen=True):
     explains: bool = False
     episode_rules: bool = False
     strict_episodes: bool = False
+    self_rename: bool = False
 
 
 class _RecordedControlConfig(ControlConfig, frozen=True):

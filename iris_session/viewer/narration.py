@@ -128,7 +128,7 @@ _AUDITS: Final = {
     AuditKind.KEY_REVOKED: (WARN, "a key is revoked"),
     AuditKind.ROLE_REFUSED: (WARN, "a role that the key may not have is refused"),
     AuditKind.REMOVED: (WARN, "a director removes a participant"),
-    AuditKind.RENAMED: (INFO, "a director changes a name"),
+    AuditKind.RENAMED: (INFO, "a name is changed"),
     AuditKind.ROLE_CHANGED: (INFO, "a director changes a role"),
     AuditKind.GATEWAY_REFUSED: (WARN, "a message in the name of another is refused"),
     AuditKind.TOKEN_REFUSED: (DEBUG, "joins anew, its resume token is not known here"),

@@ -1,11 +1,11 @@
-"""A director renames participants and gives them other roles."""
+"""Participants rename themselves; a director renames anyone and gives other roles."""
 
 from __future__ import annotations
 
 import msgspec
 import pytest
 
-from iris_session.authority import is_same_snapshot
+from iris_session.authority import AuthorityConfig, is_same_snapshot
 from iris_session.authority.state import AGEING_FIELDS
 from iris_session.protocol.client_messages import Control, GetSnapshot, Rename, SetRole
 from iris_session.protocol.entries import Lost
@@ -51,9 +51,19 @@ class TestRename:
         _, dora, ann = meet()
         assert dora.denied(Rename(1, ann.id, name)) == "invalid"
 
-    def test_directors_only(self) -> None:
-        _, dora, ann = meet()
-        assert ann.denied(Rename(1, dora.id, "eva")) == "role"
+    @pytest.mark.parametrize("role", ["operator", "observer", "agent"])
+    def test_everyone_renames_themselves_with_the_same_checks(self, role: str) -> None:
+        t, dora, _ = meet()
+        bob = t.join(role, name="bob")
+        assert bob.asks(Rename(1, bob.id, "ann")).ok
+        assert t.since(ParticipantChanged)[0].participant.name == "ann-2"
+        assert [(a.kind, a.subject, a.detail) for a in t.since(Audited)] == [("renamed", bob.id, "bob: was bob")]
+        assert bob.denied(Rename(2, bob.id, "\x1b[2J")) == "invalid"
+        assert bob.denied(Rename(3, dora.id, "eva")) == "role"
+
+    def test_recordings_before_self_rename_replay_as_they_were(self) -> None:
+        ann = Table(AuthorityConfig(self_rename=False)).operator(name="ann")
+        assert ann.denied(Rename(1, ann.id, "eva")) == "role"
 
 
 class TestSetRole:

@@ -71,10 +71,11 @@ def test_what_a_header_does_not_name_was_not_in_force() -> None:
     assert decode_recorded_config(msgspec.msgpack.encode(fields)).control.compensate_sag
     del (
         fields["authority"]["explains"],
+        fields["authority"]["self_rename"],
         fields["control"]["compensate_sag"],
         fields["control"]["few_joints_orientation_cost"],
     )
     recorded = decode_recorded_config(msgspec.msgpack.encode(fields))
-    assert not recorded.authority.explains
+    assert (recorded.authority.explains, recorded.authority.self_rename) == (False, False)
     control = recorded.control
     assert (control.compensate_sag, control.few_joints_orientation_cost) == (False, None)

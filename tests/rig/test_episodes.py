@@ -41,6 +41,8 @@ def states(rig: Rig, name: str) -> list[tuple[int, str]]:
 def test_two_people_record_a_task_whose_objects_lie_elsewhere_each_time(task: Path) -> None:
     with Rig(timestep=TICK, task=task) as rig:
         ann, bob = rig.drive("ann", "left"), rig.drive("bob", "right")
+        assert ann.client.connection.welcome is not None
+        assert ann.client.connection.welcome.task_robots == ("left", "right")
         first = see_objects(ann.client)
         begun = ann.client.start_episode("blue")
         assert begun == bob.client.mirror.episode

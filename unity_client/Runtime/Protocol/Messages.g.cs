@@ -1579,7 +1579,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>Give a participant another name.</summary>
+    /// <summary>Give a participant another name: oneself, or as a director anyone.</summary>
     public sealed class Rename : ClientMessage
     {
         public const string TagName = "rename";
@@ -1679,6 +1679,7 @@ namespace IrisSession.Protocol
         public long StatePeriodNs;
         public Endpoints Endpoints = new Endpoints();
         public string KeyFingerprint = "";
+        public string[] TaskRobots = Array.Empty<string>();
 
         public static Welcome Read(WireReader reader) => reader.ReadInto(new Welcome());
 
@@ -1698,6 +1699,7 @@ namespace IrisSession.Protocol
             codec.Require("state_period_ns", ref StatePeriodNs, long.MinValue, long.MaxValue);
             codec.Require("endpoints", ref Endpoints, Protocol.Endpoints.New);
             codec.Allow("key_fingerprint", ref KeyFingerprint, 64, "");
+            codec.Allow("task_robots", ref TaskRobots, 0, 32, 64);
         }
     }
 

@@ -85,8 +85,8 @@ export type ToWorker =
    * void.
    */
   | { type: "rejoin"; devices: wire.Device[]; alignment: wire.AlignmentKind }
-  /** Have another name at every hello from now on. `rejoins`: say hello now, without leaving. */
-  | { type: "set_name"; name: string; rejoins: boolean }
+  /** Have another name at every hello from now on. */
+  | { type: "set_name"; name: string }
   /** Put this browser on the allow-list with a join code. Answered by `paired`. */
   | { type: "pair"; base_url: string; code: string; name: string; software?: string }
   /** A request of the wire. Answered by one `reply` with the same `id`. */

@@ -125,7 +125,7 @@ export class ClientWorker {
         this.rejoin(command.devices, command.alignment);
         break;
       case "set_name":
-        this.setName(command.name, command.rejoins);
+        this.setName(command.name);
         break;
       case "pair":
         void this.pair(command);
@@ -226,12 +226,10 @@ export class ClientWorker {
     this.connection?.rejoin(this.makeHello(this.options), this.environment.nowNs());
   }
 
-  private setName(name: string, rejoins: boolean): void {
+  private setName(name: string): void {
     if (this.options === null) return;
     this.options = { ...this.options, name };
-    const hello = this.makeHello(this.options);
-    if (rejoins) this.connection?.rejoin(hello, this.environment.nowNs());
-    else if (this.connection) this.connection.hello = hello;
+    if (this.connection) this.connection.hello = this.makeHello(this.options);
   }
 
   private disconnect(): void {

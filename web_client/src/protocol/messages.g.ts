@@ -1268,7 +1268,7 @@ export interface RemoveParticipant {
   reason?: string;
 }
 
-/** Give a participant another name. Directors only. A name that another participant has gets a number. */
+/** Give a participant another name: oneself, or as a director anyone. A name that another one has gets a number. */
 export interface Rename {
   type: "rename";
   request_id: number;
@@ -1327,7 +1327,8 @@ export interface ClientReport {
 /**
  * Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once.
  *
- * `tick_period_ns`: of the present scene; another scene may have another (`SceneChanged`).
+ * `tick_period_ns`: of the present scene; another scene may have another (`SceneChanged`). `task_robots`: robots of
+ * the task, whose holders start its episodes; empty: any robot.
  */
 export interface Welcome {
   type: "welcome";
@@ -1345,6 +1346,7 @@ export interface Welcome {
   state_period_ns: number;
   endpoints: Endpoints;
   key_fingerprint?: string;
+  task_robots?: string[];
 }
 
 /** A `hello` that the front refused (`RefusalCode`), or that the authority denied (`DenialReason`). */
@@ -2486,7 +2488,7 @@ export const DEFAULTS = {
   set_role: {},
   get_status: { request_id: 0 },
   client_report: { missed: 0, rtt_ms: 0.0, bytes_per_s: 0.0, media_bytes_per_s: 0.0, media_age_ms: 0.0, display_hz: 0.0, media_limit_mbit_per_s: 0.0, battery: -1.0, charging: false, thermal: "", dropped_frames: 0, shown_age_ms: 0.0 },
-  welcome: { key_fingerprint: "" },
+  welcome: { key_fingerprint: "", task_robots: [] },
   refused: { advice: "", supported_versions: [1] },
   protocol_fault: { reason: "" },
   clock_pong: {},

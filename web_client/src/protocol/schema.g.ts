@@ -750,6 +750,7 @@ export const STRUCTS: Readonly<Record<string, StructTable>> = {
       ["state_period_ns", ["int", null, null], []],
       ["endpoints", ["struct", "Endpoints"], []],
       ["key_fingerprint", ["str", 64, ""], [""]],
+      ["task_robots", ["array", ["str", 64, ""], 0, 32], [[]]],
     ],
   },
   Refused: {
@@ -1720,7 +1721,7 @@ export const CLIENT_LIMITS: Readonly<Record<string, number>> = {
 
 /** Most bytes of a whole envelope to a client, by tag. */
 export const SERVER_LIMITS: Readonly<Record<string, number>> = {
-  welcome: 4000,
+  welcome: 16000,
   refused: 8000,
   protocol_fault: 4000,
   clock_pong: 512,

@@ -62,6 +62,14 @@ export function describeEpisode(now: EpisodeNow | null, now_ns: number, leader: 
   return [now.instruction || now.task, `${episodeTitle(now)}${advice ? `: ${advice}` : ""}`].filter((line) => line !== "");
 }
 
+/** Return whether the session lets this page start an episode or reset the scene: directors and holders of a robot of the task. */
+export function mayBegin(state: PageState): boolean {
+  const wanted = state.welcome?.task_robots ?? [];
+  const robots = (state.session?.robots ?? []).map(({ name }) => name).filter((name) => wanted.length === 0 || wanted.includes(name));
+  const held = state.heldBy(state.selfId);
+  return state.isDirector || robots.length === 0 || robots.some((name) => held.includes(name));
+}
+
 export interface EpisodeStrip {
   /** Over the picture. */
   element: HTMLElement;
@@ -108,8 +116,8 @@ export function makeEpisodeStrip(state: PageState, actions: Actions): EpisodeStr
     const episode = state.session?.episode ?? null;
     if (key === undefined || isTyped || event.repeat || event.ctrlKey || event.metaKey || event.altKey || event.shiftKey || !mayAct() || strip.hidden) return;
     const isOver = isEpisodeOver(episode);
-    if (key === "begin") send(isOver ? "start" : "success");
-    else if (!isOver) send(key);
+    if (!isOver) send(key === "begin" ? "success" : key);
+    else if (key === "begin" && mayBegin(state)) send("start");
   });
 
   const update = (): void => {
@@ -132,9 +140,8 @@ export function makeEpisodeStrip(state: PageState, actions: Actions): EpisodeStr
     now.classList.toggle("running", isRecorded);
     field.hidden = controls.hidden = extra.hidden = !mayAct();
     const hasLeft = episode?.state === "left";
-    start.hidden = !isOver;
-    reset.hidden = !isOver;
-    begin.hidden = episode !== null;
+    start.hidden = reset.hidden = !isOver || !mayBegin(state);
+    begin.hidden = episode !== null || !mayBegin(state);
     stop.hidden = !isRecorded || hasLeft;
     for (const verdict of verdicts) verdict.hidden = hasLeft || !(isRecorded || isAwaited);
     discard.hidden = hasLeft || !(isRecorded || isAwaited || episode?.state === "countdown");

@@ -22,6 +22,8 @@ export class Joining {
     isAsked: false,
   });
   private untried: string[] = [];
+  /** This page has asked for another name since it joined. */
+  private isRenamed = false;
 
   constructor(
     private readonly client: WorkerClient,
@@ -30,6 +32,7 @@ export class Joining {
     private readonly baseUrl: string,
   ) {
     if (this.name === "" || this.name === "Web") this.keep({ name: `Web ${10 + Math.floor(90 * Math.random())}` });
+    client.on("session", () => this.followName());
   }
 
   get name(): string {
@@ -91,17 +94,24 @@ export class Joining {
     }
   }
 
-  /** Take another name, in this session and in those to come. Robots stay: directors rename, others say hello anew. */
+  /** Take another name, in this session and in those to come. */
   async rename(name: string): Promise<void> {
     const { state } = this;
-    if (name === state.self?.name) return;
-    const isRenamed = state.isDirector;
-    if (isRenamed && !(await this.actions.request({ type: "rename", participant: state.selfId, name }))) return;
+    if (name === state.self?.name || !(await this.actions.request({ type: "rename", participant: state.selfId, name }))) return;
+    this.isRenamed = true;
+    this.followName();
+  }
+
+  /** Remember the name that the session lists: one that is taken got a number. It may come after the reply. */
+  private followName(): void {
+    const name = this.state.self?.name ?? this.name;
+    if (!this.isRenamed || name === this.name) return;
     this.keep({ name });
-    this.client.post({ type: "set_name", name, rejoins: !isRenamed });
+    this.client.post({ type: "set_name", name });
   }
 
   private connect(role: string): void {
+    this.isRenamed = false; // what the session still lists may be of before
     this.client.post({ type: "connect", base_url: this.baseUrl, role, name: this.name, ...this.state.entry, software: SOFTWARE });
   }
 

@@ -1,7 +1,8 @@
 // What is said of an episode, on the page and before the eyes.
 
-import { describe, expect, test } from "vitest";
-import { describeEpisode, type EpisodeNow, episodeAdvice, episodeTitle, isEpisodeOver, isUrgent, secondsLeft } from "../../src/ui/episodes.ts";
+import { afterEach, describe, expect, test, vi } from "vitest";
+import { describeEpisode, type EpisodeNow, episodeAdvice, episodeTitle, isEpisodeOver, isUrgent, makeEpisodeStrip, secondsLeft } from "../../src/ui/episodes.ts";
+import { PageState } from "../../src/ui/state.ts";
 
 const NOW: EpisodeNow = {
   event: "episode_changed",
@@ -50,5 +51,44 @@ describe("words", () => {
     const states = ["countdown", "running", "confirm", "left", "closing", "success", "cancelled"];
     expect(states.filter((state) => isUrgent({ ...NOW, state }))).toEqual(["countdown", "confirm", "left", "closing"]);
     expect(states.filter((state) => isEpisodeOver({ ...NOW, state }))).toEqual(["success", "cancelled"]);
+  });
+});
+
+describe("offers", () => {
+  afterEach(() => vi.unstubAllGlobals());
+
+  /** Return the buttons that are offered after the last episode, and what key 1 sends. */
+  function offer(role: string, held: string, task_robots: string[], robots = ["left", "right"]): unknown[] {
+    const texts: [string, { hidden?: boolean; value: string }][] = [];
+    const createElement = (): object => {
+      const element = { classList: { toggle: () => undefined }, value: "", setAttribute: () => undefined, addEventListener: () => undefined };
+      return Object.assign(element, { append: (child: unknown) => typeof child === "string" && texts.push([child, element]) });
+    };
+    let press = (_event: object): void => undefined;
+    vi.stubGlobal("HTMLElement", class {});
+    vi.stubGlobal("document", { createElement });
+    vi.stubGlobal("window", { addEventListener: (_type: string, listener: typeof press) => (press = listener) });
+    const state = new PageState({ on: () => undefined } as unknown as ConstructorParameters<typeof PageState>[0]);
+    const leases = [{ target: held, holder: "p1", sub_holders: [] }];
+    const session = { participant_id: "p1", participants: [{ id: "p1", name: "ann", role }], leases, robots: robots.map((name) => ({ name })), episode: { ...NOW, state: "success" } };
+    Object.assign(state, { session, welcome: { task_robots }, phase: { phase: "ready" } });
+    const sent: string[] = [];
+    const request = async ({ action }: { action: string }): Promise<boolean> => sent.push(action) > 0;
+    const strip = makeEpisodeStrip(state, { request } as unknown as Parameters<typeof makeEpisodeStrip>[1]);
+    strip.update();
+    press({ code: "Digit1" });
+    return [texts.flatMap(([text, { hidden }]) => (["Start", "Reset scene"].includes(text) && !hidden ? [text] : [])), sent];
+  }
+  const ALL = [["Start", "Reset scene"], ["start"]];
+  const NONE = [[], []];
+
+  test("who may start an episode is offered it: directors, holders of a robot of the task, all where there is none", () => {
+    expect(offer("director", "", ["left"])).toEqual(ALL);
+    expect(offer("operator", "", ["left"])).toEqual(NONE);
+    expect(offer("operator", "right", ["left"])).toEqual(NONE);
+    expect(offer("operator", "left", ["left"])).toEqual(ALL);
+    expect(offer("operator", "right", [])).toEqual(ALL);
+    expect(offer("operator", "", [])).toEqual(NONE);
+    expect(offer("operator", "", [], [])).toEqual(ALL);
   });
 });
