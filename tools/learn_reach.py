@@ -42,9 +42,11 @@ X_RANGE: Final = (-0.30, 0.00)
 Y_RANGE: Final = (-0.22, 0.22)
 ABOVE_M: Final = 0.12
 REACHED_M: Final = 0.03
+#: Rate of the policy, and frames a second of the data set: a demonstration takes half a second.
 HZ: Final = 20
+FPS: Final = 50
 #: A network says the action of so many frames later: half a second of motion.
-AHEAD: Final = 10
+AHEAD: Final = 25
 #: Longest time of a trial [s]; a person corrects a policy that is not there after the second one.
 TRIAL_S: Final = 4.0
 PATIENCE_S: Final = 2.0
@@ -291,8 +293,8 @@ def _add_one(x: Floats) -> Floats:
 def export(recordings: list[Path], folder: Path) -> Episodes:
     """Export recordings as a data set by the command, and read it."""
     shutil.rmtree(folder, ignore_errors=True)
-    command = [sys.executable, "-m", "iris_session.cli.main", "export", *map(str, recordings)]
-    subprocess.run([*command, "--to", "lerobot", "--out", str(folder), "--fps", str(HZ)], check=True, stdout=sys.stderr)
+    command = [sys.executable, "-m", "iris_session.cli.main", "export", *map(str, recordings), "--fps", str(FPS)]
+    subprocess.run([*command, "--to", "lerobot", "--out", str(folder)], check=True, stdout=sys.stderr)
     return Episodes(folder)
 
 
@@ -303,7 +305,7 @@ def say(text: str) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--demonstrations", type=int, default=60, help="episodes that are shown (default %(default)s)")
+    parser.add_argument("--demonstrations", type=int, default=120, help="episodes that are shown (default %(default)s)")
     parser.add_argument("--first", type=int, default=8, help="of these, for the first policy (default %(default)s)")
     parser.add_argument(
         "--corrections", type=int, default=15, help="episodes of the first policy (default %(default)s)"
