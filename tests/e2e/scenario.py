@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, Final
 
 import pytest
 
@@ -14,6 +14,10 @@ from iris_session.protocol.names import HoldReason, RejectReason
 from iris_session.protocol.server_messages import Event, ParticipantJoined
 from tests.e2e.session_process import DEADLINE_S, SessionProcess, read_output_tails
 from tests.rig.session import is_driven
+
+
+#: Why a robot holds until its clutch was opened, when a process has to wait for its turn.
+LATE: Final = frozenset({HoldReason.STALE, HoldReason.REJECTED, HoldReason.GAP, HoldReason.REARM})
 
 
 class Hand:
@@ -98,16 +102,31 @@ class Scenario:
         return hand
 
     def engage(self, hand: Hand) -> None:
-        """Open and close the clutch, so that the robot follows. Limits of time do not count here: `PATIENT_COMMAND`."""
-        hand.clutch = False
-        self.run_until(lambda: self.is_open(hand), f"the session knows that the clutch of {hand.client.name} is open")
-        hand.clutch = True
-        self.run_until(lambda: self.is_following(hand), f"{hand.robot} follows {hand.client.name}")
+        """Open and close the clutch, so that the robot follows. Limits of time do not count here: `PATIENT_COMMAND`.
+
+        A sample that is rejected as the clutch closes leaves the robot held until it is opened again, as for a person.
+        """
+        must_let_go = True
+        while must_let_go:
+            hand.clutch = False
+            self.run_until(
+                lambda: self.is_open(hand), f"the session knows that the clutch of {hand.client.name} is open"
+            )
+            hand.clutch = True
+            self.run_until(
+                lambda: self.is_following(hand) or self._find_hold(hand) in LATE,
+                f"{hand.robot} follows {hand.client.name}",
+            )
+            must_let_go = not self.is_following(hand)
+
+    def _find_hold(self, hand: Hand) -> str:
+        """Return why the robot holds, as its holder was told last."""
+        feedback = hand.client.feedback.get(hand.robot)
+        return feedback.hold_reason if feedback is not None else ""
 
     def is_open(self, hand: Hand) -> bool:
         """Return whether the robot holds because the clutch of the hand is open."""
-        feedback = hand.client.feedback.get(hand.robot)
-        return feedback is not None and feedback.hold_reason == HoldReason.CLUTCH_OPEN
+        return self._find_hold(hand) == HoldReason.CLUTCH_OPEN
 
     def is_following(self, hand: Hand) -> bool:
         """Return whether samples of the hand's participant were applied to its robot within 100 ms."""
@@ -124,7 +143,9 @@ class Scenario:
         deadline = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline:
-                pytest.fail(f"not within {timeout_s:g} s: {what}\n{read_output_tails(self.server.folder.parent)}")
+                pytest.fail(
+                    f"not within {timeout_s:g} s: {what}: {[hand.client.feedback.get(hand.robot) for hand in self.hands]}\n{read_output_tails(self.server.folder.parent)}"
+                )
             self.poll()
 
     def wait_for(self, condition: Callable[[], object], timeout_s: float) -> bool:

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from iris_session.demo.scenes import scene_path
-from iris_session.protocol.names import HoldReason
 from iris_session.protocol.server_messages import EngagementChanged
 from tests.e2e.browser import Page, decode_picture, join_as
-from tests.e2e.scenario import Scenario, assert_only_late
+from tests.e2e.scenario import LATE, Scenario, assert_only_late
 from tests.e2e.session_process import SessionProcess
 
 pytestmark = pytest.mark.e2e
@@ -29,8 +28,8 @@ VIEW = {"lookat": [0, 0, 0.2], "azimuth": 90, "elevation": -25, "distance": 2.0}
 SPEED = 0.1  # of the tip by default [m/s]
 #: A robot that stops has this long [s]; its tip is at rest within this of where it stays [m].
 STOP_S, REST_M = 0.2, 0.001
-#: Why a robot holds when the machine was late; duration of a drag [s].
-LATE, DRAG_S = {HoldReason.STALE, HoldReason.REJECTED, HoldReason.GAP}, 2.5
+#: Duration of a drag [s].
+DRAG_S = 2.5
 #: Another camera: half a metre before the tip of the left robot, whose picture is 17 cm high there.
 CLOSE = '<camera name="close" pos="-0.2 -0.5 0.28" xyaxes="1 0 0 0 0 1" fovy="20"/>'
 
