@@ -15,7 +15,6 @@ from iris_session.protocol.server_messages import Event, ParticipantJoined
 from tests.e2e.session_process import DEADLINE_S, SessionProcess, read_output_tails
 from tests.rig.session import is_driven
 
-
 #: Why a robot holds until its clutch was opened, when a process has to wait for its turn.
 LATE: Final = frozenset({HoldReason.STALE, HoldReason.REJECTED, HoldReason.GAP, HoldReason.REARM})
 
