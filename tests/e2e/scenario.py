@@ -142,9 +142,9 @@ class Scenario:
         deadline = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline:
-                pytest.fail(
-                    f"not within {timeout_s:g} s: {what}: {[hand.client.feedback.get(hand.robot) for hand in self.hands]}\n{read_output_tails(self.server.folder.parent)}"
-                )
+                feedback = [hand.client.feedback.get(hand.robot) for hand in self.hands]
+                tails = read_output_tails(self.server.folder.parent)
+                pytest.fail(f"not within {timeout_s:g} s: {what}; feedback: {feedback}\n{tails}")
             self.poll()
 
     def wait_for(self, condition: Callable[[], object], timeout_s: float) -> bool:
