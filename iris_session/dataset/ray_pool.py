@@ -14,8 +14,8 @@ import re
 import signal
 import tempfile
 import warnings
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -81,15 +81,15 @@ class RayPool:
     @property
     def depth(self) -> int:
         # Asked again and again: a cluster may grow with what waits.
-        return self._jobs or max(2, 2 * int(self._ray.cluster_resources().get("CPU", 1)))
+        with _naming_lost_cluster():
+            return self._jobs or max(2, 2 * int(self._ray.cluster_resources().get("CPU", 1)))
 
     def begin(self, task: EpisodeTask) -> Any:
         planned = msgspec.structs.replace(task.planned, path=os.path.abspath(task.planned.path))
         data = pickle.dumps(msgspec.structs.replace(task, planned=planned))
         try:
-            begun = self._make.options(name=_name(task)).remote(data, self._versions)
-        except ConnectionError as error:  # of Ray Client
-            raise DatasetError(f"the Ray cluster is lost: {_shorten(error)}") from error
+            with _naming_lost_cluster():
+                begun = self._make.options(name=_name(task)).remote(data, self._versions)
         except ImportError as error:  # from the server of Ray Client
             raise _make_import_error("the head of the cluster", _shorten(error)) from error
         self._running.add(begun)
@@ -99,15 +99,14 @@ class RayPool:
         from ray.exceptions import RayError, RayTaskError
 
         try:
-            result: TaskResult = self._ray.get(begun)
+            with _naming_lost_cluster():
+                result: TaskResult = self._ray.get(begun)
         except RayTaskError as error:
             if _NOT_IMPORTED not in (said := str(error.cause)):
                 raise  # a defect, with its traceback
             reason = said.strip().rpartition("\n")[2]
             at = re.search(r"ip=([^,)]+)", str(error))
             raise _make_import_error(f"node {at[1] if at else 'of the cluster'}", reason) from error
-        except ConnectionError as error:  # of Ray Client
-            raise DatasetError(f"the Ray cluster is lost: {_shorten(error)}") from error
         except RayError as error:
             attempts = f"{RETRIES + 1} attempts"
             raise DatasetError(f"{_name(task)} was not made in {attempts}: {_shorten(error)}") from error
@@ -132,6 +131,14 @@ class RayPool:
         finally:
             if self._is_owner:
                 self._ray.shutdown()
+
+
+@contextmanager
+def _naming_lost_cluster() -> Iterator[None]:
+    try:
+        yield
+    except ConnectionError as error:  # of Ray Client
+        raise DatasetError(f"the Ray cluster is lost: {_shorten(error)}") from error
 
 
 def _name(task: EpisodeTask) -> str:

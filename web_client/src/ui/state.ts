@@ -50,6 +50,8 @@ export interface ConsentAsked {
 }
 
 const TABS_KEY = "iris-session.tabs";
+/** Participants that are remembered as tabs of this browser, the newest. */
+const MAX_TABS = 16;
 const HAND = "hand";
 /** State of a robot that does not move. */
 const HOLD = "hold";
@@ -179,7 +181,8 @@ export class PageState {
   /** Let the other tabs of this browser know which participant this one is. */
   private noteTab({ session_id, participant_id }: WelcomeUpdate["welcome"]): void {
     const known = recall(TABS_KEY, { session: "", ids: [] as string[] });
-    this.ownIds = [...new Set([...(known.session === session_id ? known.ids : []), participant_id])];
+    const others = known.session === session_id ? known.ids.filter((id) => id !== participant_id) : [];
+    this.ownIds = [...others.slice(1 - MAX_TABS), participant_id];
     remember(TABS_KEY, { session: session_id, ids: this.ownIds });
   }
 

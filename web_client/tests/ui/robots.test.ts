@@ -87,7 +87,7 @@ test.each([
   expect(findOffer(state, "left")).toEqual(offer);
 });
 
-test("who holds a robot, or waits for one, cannot wait for another, and is told so", () => {
+test("a holder of a robot, or of a place in a queue, cannot wait for another robot, and is told so", () => {
   saySession([{ target: "left", holder: "p2" }, { target: "right", holder: "p1" }]);
   expect(findOffer(state, "left")).toEqual({ take: "", waits: false, none: "Release right to wait for it." });
   saySession([{ target: "left", holder: "p2" }, { target: "right", holder: "p3", queue: ["p1"] }]);
