@@ -55,7 +55,7 @@ from iris_session.session.resume import (
 )
 from iris_session.session.shared_scene import SharedScenes
 from iris_session.session.status import StatusReporter, make_recorder_report, make_report
-from iris_session.session.stepper import NextPatch, NextScene, ResumedFrom, Stepper, label_robots
+from iris_session.session.stepper import NextPatch, NextScene, PendingInputs, ResumedFrom, Stepper, label_robots
 from iris_session.session.unique_name import NameFinder
 from iris_session.session.web_page import WebPage, open_web_page
 
@@ -254,7 +254,9 @@ class SessionProcesses:
         assert self.front.link.ports is not None
         return self.front.link.ports
 
-    def make_stepper(self, core: SessionCore, clock: Callable[[], int], *, user_owned: bool) -> Stepper:
+    def make_stepper(
+        self, core: SessionCore, clock: Callable[[], int], inputs: PendingInputs, *, user_owned: bool
+    ) -> Stepper:
         """Return the stepper of this session's core, tied to the front's link and the recorder's feed."""
         assert self.front is not None
         chain = b""
@@ -269,6 +271,7 @@ class SessionProcesses:
         after = None if past is None else ResumedFrom(past.step, past.now_ns, past.anchors, past.is_gap_known)
         front, feed = self.front.link, self.feed
         stepper = Stepper(core, front, feed, clock, self.state_period_ns, keyframe_ns, chain, after)
+        stepper.inputs = inputs
         stepper.on_scene.append(self._follow_scene)
         meshes = list_deformables(core.world) if self._published_deformables is None else self._published_deformables
         self._deformables = DeformableStreams(meshes, self._publish_vertices)
@@ -342,7 +345,7 @@ class SessionProcesses:
     def _announce(self, stepper: Stepper, text: str) -> None:
         """Announce an event of the session itself in the recording, to participants and in the log."""
         _log.warning("%s", text)
-        stepper.post_own(Marker(request_id=0, text=text))
+        stepper.inputs.post_own(Marker(request_id=0, text=text))
 
     def _report_overflows(self, stepper: Stepper) -> None:
         """Count the contacts that MuJoCo drops, which change what happens, and announce the first."""

@@ -179,7 +179,7 @@ class PublishLoop:
         if self._due_ns <= now_ns:
             self._due_ns = now_ns + self._period_ns
         if frame.anew:
-            self._stepper.post_own(ExternalReset())
+            self._stepper.inputs.post_own(ExternalReset())
         ticks = self._count_ticks(frame)
         self._step(ticks, self._kinematic_model.encode_state(frame.time_s, frame.poses))
         self._vertices.newest = frame.vertices

@@ -41,7 +41,7 @@ from iris_session.session.pending_state import PendingState
 from iris_session.session.processes import PublishedScene, SessionProcesses
 from iris_session.session.publish_loop import PublishedVertices, PublishLoop
 from iris_session.session.session_base import SessionBase
-from iris_session.session.stepper import NextPatch, make_session_clock
+from iris_session.session.stepper import NextPatch, PendingInputs, make_session_clock
 
 #: Period at which `run` calls `until` [s].
 RUN_PERIOD_S: Final = 1.0 / 60.0
@@ -93,7 +93,7 @@ class ScenePublisher(SessionBase):
         self._time_s: float | None = None
         self._own_time = False
         self._anew = False
-        self._early_patches = []  # stays empty: the stepper exists before the session counts as started
+        self._inputs = PendingInputs()
         #: After `close()`, why the recording is incomplete; empty when it is complete.
         self.recording_fault = ""
 
@@ -130,7 +130,7 @@ class ScenePublisher(SessionBase):
         processes.notes += composed.notes
         self._processes = processes
         try:
-            self._stepper = processes.make_stepper(core, self.clock, user_owned=True)
+            self._stepper = processes.make_stepper(core, self.clock, self._inputs, user_owned=True)
             self._pending = PendingState(composed)
             self._loop = PublishLoop(kinematic_model, vertices, self._stepper, processes, processes.state_period_ns)
             sources = [self._loop.warnings, self._pending.warnings, lambda: composed.notes]
@@ -341,8 +341,7 @@ class ScenePublisher(SessionBase):
         """
         self._require_started()
         self._require_parts()[1].raise_if_ended()  # else the input would stay in the queue
-        assert self._stepper is not None
-        self._stepper.post(message)
+        self._inputs.post(message)
 
     # --- inside ------------------------------------------------------------------------------------------------------
 

@@ -37,7 +37,7 @@ from iris_session.journal.environment import use_one_blas_thread
 from iris_session.physics import Pacer, PacerStats, load_model
 from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.physics.names import list_body_names
-from iris_session.protocol.client_messages import Assign, Control, EStop, SetScale
+from iris_session.protocol.client_messages import Assign, Control, SetScale
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
@@ -70,13 +70,11 @@ from iris_session.session.session_base import SessionBase
 from iris_session.session.simulation import copy_state, require_simulation, unwrap_data, unwrap_model
 from iris_session.session.status import DataFault
 from iris_session.session.stepper import (
-    MAX_HOST_ENTRIES,
-    RESERVED_HOST_ENTRIES,
     NextPatch,
     NextScene,
+    PendingInputs,
     Stepper,
     make_session_clock,
-    normalize_message,
 )
 from iris_session.session.tasks import TaskRunner, check_same_task, find_progress_path, load_task
 from iris_session.session.tick_times import TickTimes
@@ -155,9 +153,7 @@ class Session(SessionBase):
         self._core: SessionCore | None = None
         self._stepper: Stepper | None = None
         self._user_loop: UserLoop | None = None
-        self._early: list[EntryMessage] = []  # posted before the first step
-        self._early_lock = threading.RLock()  # a signal handler may post, too
-        self._early_patches = []
+        self._inputs = PendingInputs()
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
         self._attachment: Attachment | None = None
@@ -590,14 +586,7 @@ class Session(SessionBase):
             OwnershipError: The queue is full, or the session is closed.
         """
         self._require_open()
-        with self._early_lock:
-            if self._stepper is not None:
-                self._stepper.post(message)
-            elif len(self._early) < MAX_HOST_ENTRIES + (RESERVED_HOST_ENTRIES if isinstance(message, EStop) else 0):
-                self._early.append(normalize_message(message))
-            else:
-                text = f"queue of inputs full ({MAX_HOST_ENTRIES} wait for the first step): call run() first"
-                raise OwnershipError(text)
+        self._inputs.post(message)
 
     def pause(self) -> None:
         """Pause physics; leases, heartbeats and requests continue."""
@@ -708,7 +697,7 @@ class Session(SessionBase):
                 found = choose_robots(loaded, chosen, self.config.control)
                 scene = prepare_scene(stepper.core, scenes, loaded, state, found, things, shown)
                 with scenes.lock:
-                    stepper.queue_scene(scene)
+                    self._inputs.queue_scene(scene)
                     scenes.show(scene.shown)
             except BaseException as error:  # raised by the future
                 done.set_exception(error)
@@ -735,27 +724,22 @@ class Session(SessionBase):
                 raise OwnershipError("a session is driven either by run(), or by begin_tick() and end_tick()")
         else:
             live, core = self._require_started(), self._make_core(user_owned=user_owned)
-            stepper = live.make_stepper(core, self.clock, user_owned=user_owned)
+            stepper = live.make_stepper(core, self.clock, self._inputs, user_owned=user_owned)
             stepper.list_notices = lambda: self._robot_notices
             if core.config.authority.task is not None:
                 given = self.config.task
                 progress = find_progress_path(Path(given)) if isinstance(given, str | Path) else None
                 self._task_runner = TaskRunner(stepper, progress, is_new=self._past is None)
-            if not user_owned:
+            if user_owned:  # its data is used as it is now: there is nothing to reset
+                for message in self._inputs.messages.copy():
+                    if isinstance(message, Control) and message.action == ControlAction.RESET:
+                        self._inputs.messages.remove(message)
+            else:
                 self.data = core.world.data
                 stepper.on_scene.append(self._follow_scene)
             self._follower = ModelFollower(live.scenes, stepper, self.patch_scene)
             stepper.on_publish.append(self._follower.follow_publish)
-            with live.scenes.lock, self._early_lock:  # against other threads
-                self._stepper = stepper  # first: what a signal handler posts meanwhile goes there
-                for patch in self._early_patches:
-                    stepper.queue_scene(patch)
-                for message in self._early:
-                    # The data of a user loop is used as it is now: there is nothing to reset.
-                    if not (user_owned and isinstance(message, Control) and message.action == ControlAction.RESET):
-                        stepper.post_own(message)
-                self._early_patches.clear()
-                self._early.clear()
+            self._stepper = stepper
         return self._stepper
 
     def _make_core(self, *, user_owned: bool) -> SessionCore:

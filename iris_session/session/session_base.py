@@ -27,7 +27,7 @@ from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.scene_change import check_patch
 from iris_session.session.status import DataFault, SessionStatus, make_report, make_session_status
-from iris_session.session.stepper import MAX_PENDING_SCENES, NextPatch, OwnerRequest, Stepper
+from iris_session.session.stepper import NextPatch, OwnerRequest, PendingInputs, Stepper
 
 
 class SessionBase:
@@ -36,7 +36,7 @@ class SessionBase:
     config: SessionConfig
     clock: Callable[[], int]
     _stop: threading.Event
-    _early_patches: list[NextPatch]  # before the first step; guarded by the lock of the scenes
+    _inputs: PendingInputs
     _processes: SessionProcesses | None = None
     _stepper: Stepper | None = None
     _pacer: Pacer | None = None
@@ -261,12 +261,7 @@ class SessionBase:
             raise ConfigError(f"patch_scene: {error}") from error
 
     def _queue_patch(self, patch: NextPatch) -> None:
-        if self._stepper is not None:
-            self._stepper.queue_scene(patch)
-        elif len(self._early_patches) < MAX_PENDING_SCENES:
-            self._early_patches.append(patch)
-        else:
-            raise SceneError(f"queue of scene changes full ({MAX_PENDING_SCENES}): call run() first")
+        self._inputs.queue_scene(patch)
 
     # --- state of the session ----------------------------------------------------------------------------------------
 

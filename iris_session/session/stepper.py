@@ -80,6 +80,51 @@ class NextPatch(NamedTuple):
     shown: SharedScene
 
 
+class PendingInputs:
+    """Queues for the next steps: inputs of the session's owner, scenes and patches. From any thread.
+
+    Attributes:
+        messages: Inputs of the owner and of the session itself, oldest first.
+        scenes: Scenes and patches, each for a step of its own.
+    """
+
+    def __init__(self) -> None:
+        self.messages: deque[EntryMessage] = deque()
+        self.scenes: deque[NextScene | NextPatch] = deque()
+
+    def post(self, message: EntryMessage) -> None:
+        """Queue an input of the session's owner for the next step. Texts are cut to the length of a `Text`.
+
+        Raises:
+            ValueError: A value that the protocol does not allow.
+            OwnershipError: The queue is full; an e-stop is accepted all the same.
+        """
+        is_full = len(self.messages) >= MAX_HOST_ENTRIES
+        if is_full and isinstance(message, EStop) and any(isinstance(one, EStop) for one in self.messages.copy()):
+            return  # an e-stop waits already
+        if is_full and not isinstance(message, EStop):
+            raise OwnershipError(
+                f"queue of inputs full ({MAX_HOST_ENTRIES} wait for one step): is the loop running? Call run() first"
+            )
+        self.post_own(message)
+
+    def post_own(self, message: EntryMessage) -> None:
+        """Queue an entry of the session itself; it has room reserved beside what the owner has posted."""
+        if len(self.messages) >= MAX_HOST_ENTRIES + RESERVED_HOST_ENTRIES:
+            raise RuntimeError(f"queue of inputs full ({len(self.messages)} wait for one step): is the loop running?")
+        self.messages.append(normalize_message(message))
+
+    def queue_scene(self, scene: NextScene | NextPatch) -> None:
+        """Load a scene or patch with the next step, each with a step of its own.
+
+        Raises:
+            RuntimeError: The queue is full.
+        """
+        if len(self.scenes) >= MAX_PENDING_SCENES:
+            raise RuntimeError(f"queue of scene changes full ({MAX_PENDING_SCENES}): is the loop running?")
+        self.scenes.append(scene)
+
+
 class OwnerRequest(msgspec.Struct, frozen=True):
     """A request of a participant that only the owner of a user loop can fulfil, from `Session.poll_requests`.
 
@@ -124,6 +169,7 @@ class Stepper:
         resumed_from: The end of the recording that `core` was restored from.
 
     Attributes:
+        inputs: Queues of the owner's inputs.
         last: Outcome of the newest step.
         view: Participants, leases and events so far.
         requests: What participants ask of the owner of a user loop, oldest first.
@@ -157,8 +203,7 @@ class Stepper:
         self.last: StepOutcome | None = None
         self._ended: Exception | None = None
         self._ended_at: TracebackType | None = None
-        self._host: deque[EntryMessage] = deque()
-        self._scenes: deque[NextScene | NextPatch] = deque()
+        self.inputs = PendingInputs()
         self.on_scene: list[Callable[[NextScene | NextPatch], None]] = []
         self._state_period_ns = state_period_ns
         self._keyframe_period_ns = keyframe_period_ns
@@ -184,38 +229,6 @@ class Stepper:
     @property
     def paused(self) -> bool:
         return self.last is not None and self.last.decision.paused
-
-    def post(self, message: EntryMessage) -> None:
-        """Queue an input of the session's owner for the next step. Thread-safe (`deque.append`).
-
-        Texts are cut to the length of a `Text`.
-
-        Raises:
-            ValueError: A value that the protocol does not allow.
-            OwnershipError: The queue is full; an e-stop is accepted all the same.
-        """
-        is_full = len(self._host) >= MAX_HOST_ENTRIES
-        if is_full and isinstance(message, EStop) and any(isinstance(one, EStop) for one in self._host.copy()):
-            return  # an e-stop waits already
-        if is_full and not isinstance(message, EStop):
-            raise OwnershipError(f"queue of inputs full ({MAX_HOST_ENTRIES} wait for one step): is the loop running?")
-        self.post_own(message)
-
-    def post_own(self, message: EntryMessage) -> None:
-        """Queue an entry of the session itself; it has room reserved beside what the owner has posted."""
-        if len(self._host) >= MAX_HOST_ENTRIES + RESERVED_HOST_ENTRIES:
-            raise RuntimeError(f"queue of inputs full ({len(self._host)} wait for one step): is the loop running?")
-        self._host.append(normalize_message(message))
-
-    def queue_scene(self, scene: NextScene | NextPatch) -> None:
-        """Load a scene or patch with the next step, each with a step of its own. From any thread.
-
-        Raises:
-            RuntimeError: The queue is full.
-        """
-        if len(self._scenes) >= MAX_PENDING_SCENES:
-            raise RuntimeError(f"queue of scene changes full ({MAX_PENDING_SCENES}): is the loop running?")
-        self._scenes.append(scene)
 
     def step(self, n_ticks: int, plant: bytes = b"", *, publish: bool = True) -> StepOutcome:
         """Take one step now.
@@ -275,8 +288,8 @@ class Stepper:
             if isinstance(entry.message, Join) and ROBOT_STATES in entry.message.capabilities:
                 self._publishes_robots = True
         if outcome.diverged and (self.last is None or not self.last.diverged):
-            self.post_own(PhysicsDiverged(outcome.decision.scene_epoch, outcome.diverged[:MAX_TEXT]))
-            self.post_own(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
+            self.inputs.post_own(PhysicsDiverged(outcome.decision.scene_epoch, outcome.diverged[:MAX_TEXT]))
+            self.inputs.post_own(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
         outcome = self._explain_denials(outcome)
         self.last = outcome
         self.front.send_decision(self.step_count, outcome.decision)
@@ -307,15 +320,15 @@ class Stepper:
             past = self._resumed_from
             begin = (SessionResumed(now_ns - past.now_ns, dict(past.anchors), past.is_gap_known), GetSnapshot())
             host += [Entry(HOST, HOST, now_ns, message) for message in begin]
-        if self._scenes:
+        if self.inputs.scenes:
             host += [Entry(HOST, HOST, now_ns, message) for message in self._announce_scene()]
-        while self._host:
-            host.append(Entry(HOST, HOST, now_ns, self._host.popleft()))
+        while self.inputs.messages:
+            host.append(Entry(HOST, HOST, now_ns, self.inputs.messages.popleft()))
         return host + entries if host else entries
 
     def _announce_scene(self) -> Sequence[EntryMessage]:
         """Give the next scene or patch to recorder, front and callbacks before its step; return its entries."""
-        scene = self._scenes.popleft()
+        scene = self.inputs.scenes.popleft()
         messages: Sequence[EntryMessage]
         assets = scene.shown.info.asset_root, scene.shown.info.scene_hash
         if isinstance(scene, NextPatch):
@@ -356,11 +369,6 @@ class Stepper:
                     sender = self.core.authority.find_sender(entry.connection)
                     self.requests.append(OwnerRequest(kind, *sender, label, entry.receive_ns * 1e-9))
                     break
-
-    @property
-    def has_pending_scenes(self) -> bool:
-        """Return whether scenes or patches wait for steps of their own."""
-        return bool(self._scenes)
 
     def is_state_due(self, end_ns: int) -> bool:
         """Return whether `publish` would publish now."""
@@ -443,7 +451,7 @@ class Stepper:
             if now_ns >= self._next_gap_log_ns:
                 _log.warning("gap in the recording: %d rows are lost", self._lost_rows)
                 self._lost_rows, self._next_gap_log_ns = 0, now_ns + GAP_LOG_PERIOD_NS
-            self.post_own(RecordingGap(lost))
+            self.inputs.post_own(RecordingGap(lost))
         if recorder.wants_keyframe or now_ns >= self._next_keyframe_ns:
             self._record_keyframe(now_ns)
 

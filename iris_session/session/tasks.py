@@ -32,7 +32,7 @@ from iris_session.protocol.server_messages import EpisodeChanged
 from iris_session.protocol.specs import ObjectRange, TaskSpec
 from iris_session.protocol.steps import Decision
 from iris_session.session.errors import ConfigError
-from iris_session.session.stepper import Stepper
+from iris_session.session.stepper import Stepper, normalize_message
 from iris_session.system.files import Replacement
 
 #: Places that are tried for one episode.
@@ -201,7 +201,7 @@ class TaskRunner:
                 raise ConfigError(f"task {task.name!r}: {error}") from error
             episode = stepper.core.authority.episode
             if is_new or (episode is not None and episode.verdict):
-                stepper.post_own(placed)
+                stepper.inputs.messages.appendleft(normalize_message(placed))  # before an episode that waits, too
         stepper.on_decision = self.follow
 
     def _prepare(self, number: int) -> None:
@@ -239,9 +239,9 @@ class TaskRunner:
             placed = self._draws[number].result()  # drawn while the episode ran
         except PlacementError as error:
             _log.warning("%s", error)
-            self._stepper.post_own(Marker(request_id=0, text=str(error)))
+            self._stepper.inputs.post_own(Marker(request_id=0, text=str(error)))
             placed = ObjectsPlaced((), (), number, self._task.seed)
-        self._stepper.post_own(placed)
+        self._stepper.inputs.post_own(placed)
 
     def close(self) -> None:
         """Wait until the progress is on disk."""

@@ -344,10 +344,10 @@ class UserLoop:
             else:
                 assert scenes is not None
                 with scenes.lock:  # no patch comes between
-                    while self._stepper.has_pending_scenes:  # patches of the present scene
+                    while self._stepper.inputs.scenes:  # patches of the present scene
                         self._step(0, self._plant)
                     scenes.show(scene.shown)
-                    self._stepper.queue_scene(scene)
+                    self._stepper.inputs.queue_scene(scene)
                 self._plant = plant
                 self._step(0, plant, publish=False)
                 self._use(model, data)
@@ -446,7 +446,7 @@ class UserLoop:
         if round_ns > max(GAP_NS, LONG_ROUND * usual_ns):
             silence_ns += round_ns
         if silence_ns > GAP_NS:
-            self._stepper.post_own(StalledGap(silence_ns))
+            self._stepper.inputs.post_own(StalledGap(silence_ns))
         self._last_tick_ns = self._began_ns = now_ns
 
     def _detect_reset(self) -> bool:
@@ -483,11 +483,11 @@ class UserLoop:
                 self._fault_ns = self._stepper.clock()
                 self.fault = DataFault(self._find_bad_arrays(state), self._fault_ns * 1e-9)
                 text = f"the user's simulation has numbers that are not finite: {self.fault.text}"
-                self._stepper.post_own(Marker(request_id=0, text=text))
+                self._stepper.inputs.post_own(Marker(request_id=0, text=text))
             return False
         if self.fault is not None:
             self.fault = None
-            self._stepper.post_own(StalledGap(self._stepper.clock() - self._fault_ns))
+            self._stepper.inputs.post_own(StalledGap(self._stepper.clock() - self._fault_ns))
         self._plant = state.tobytes()
         return True
 
@@ -505,7 +505,7 @@ class UserLoop:
         if self._was_reset:
             self._began_time = None
             self._left = {}
-            self._stepper.post_own(ExternalReset())
+            self._stepper.inputs.post_own(ExternalReset())
             self._was_reset = False  # at last: Ctrl-C must not lose it
 
     def _wake_helper(self) -> None:

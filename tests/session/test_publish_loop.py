@@ -112,7 +112,7 @@ def test_session_steps_while_nothing_is_published(rig: PublishLoopRig) -> None:
     before = rig.front.states[-1].session_time
     join = Join("key", Role.OBSERVER, "ann", devices=(), alignment="not_needed")
     rig.front.waiting.append(Entry(1, 1, rig.now_ns, join))
-    rig.stepper.post(Marker(0, "quiet"))
+    rig.stepper.inputs.post(Marker(0, "quiet"))
     rig.advance(REPEAT_NS)
     assert any(isinstance(e.body, MarkerAdded) for d in rig.front.decisions for e in d.events)
     assert len(rig.shown) == 3

@@ -46,7 +46,7 @@ def test_integers_in_a_configuration_are_stored_as_floats() -> None:
 def test_posted_messages_are_used_as_journaled() -> None:
     core = make_core()
     stepper = Stepper(core, Front(), None, iter(range(1, 100)).__next__, 10**9, 10**9)
-    stepper.post(PlaceAlignment(1, "p1", Pose((1, 0, 0), (1, 0, 0, 0))))
+    stepper.inputs.post(PlaceAlignment(1, "p1", Pose((1, 0, 0), (1, 0, 0, 0))))
     seen: list[Entry] = []
     stepper.on_entries = seen.extend
     stepper.step(0)

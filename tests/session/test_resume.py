@@ -362,7 +362,7 @@ def gone_on(session: Path) -> tuple[Stepper, Front, Path]:
     stepper = Stepper(
         past.core, front, journal, clock, 10**9, 10**10, header_root(header), ResumedFrom(past.step, past.now_ns)
     )  # fmt: skip
-    stepper.post(Marker(0, "on we go"))
+    stepper.inputs.post(Marker(0, "on we go"))
     for _ in range(40):
         stepper.step(1)
     past.close()

@@ -73,7 +73,7 @@ def test_loop_uses_the_timestep_of_a_new_scene_at_once() -> None:
     pacer = Pacer(TICK_NS, rig.stepper.clock())
     times = TickTimes(TICK_NS, rig.stepper.clock)
     scene = prepare_scene(rig.stepper.core, SharedScenes(False, "test"), bench_scene(0.001), b"", FoundRobots(()), None)
-    rig.stepper.queue_scene(scene)
+    rig.stepper.inputs.queue_scene(scene)
     assert not adopt_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
     rig.steps(1)
     assert adopt_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)

@@ -22,7 +22,7 @@ from iris_session.protocol.scene import RemoveVisual, SetVisual, encode_scene
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, SceneChanged
 from iris_session.protocol.status import StatusReport
 from iris_session.rrd.file import scan_file
-from iris_session.session import processes, session_base
+from iris_session.session import processes, stepper
 from iris_session.session.core import read_plant_state
 from iris_session.session.stepper import MAX_HOST_ENTRIES
 from iris_session.session.verification import verify_recording
@@ -159,7 +159,7 @@ def test_scene_can_be_patched_before_the_first_step(tmp_path: Path, monkeypatch:
     with pytest.raises(OwnershipError):
         Session(scene_path("handover"), config=config).patch_scene(RemoveVisual(0))
     with Session(scene_path("handover"), config=config) as session:
-        monkeypatch.setattr(session_base, "MAX_PENDING_SCENES", 2)
+        monkeypatch.setattr(stepper, "MAX_PENDING_SCENES", 2)
         assert session.scene is not None
         seen = session.scene.visuals[0]
         for green in (0.5, 1.0):

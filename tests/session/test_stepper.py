@@ -128,7 +128,7 @@ def test_every_step_is_a_row_of_one_chain(rig: Rig) -> None:
 
 def test_input_that_crashes_a_step_is_recorded(rig: Rig) -> None:
     rig.steps(3)
-    rig.stepper.post(Marker(0, "the last words"))
+    rig.stepper.inputs.post(Marker(0, "the last words"))
     step = rig.stepper.core.controller.begin
     rig.stepper.core.controller.begin = lambda *_: {}["key"]  # type: ignore[method-assign,assignment]
     with pytest.raises(KeyError):
@@ -203,28 +203,28 @@ def test_lost_rows_are_a_gap_in_the_next_step(rig: Rig) -> None:
 
 def test_host_entries_are_bounded(rig: Rig) -> None:
     for i in range(MAX_HOST_ENTRIES):
-        rig.stepper.post(Marker(0, f"m{i}"))
+        rig.stepper.inputs.post(Marker(0, f"m{i}"))
     with pytest.raises(OwnershipError, match="loop"):
-        rig.stepper.post(Marker(0, "one more"))
-    rig.stepper.post_own(ExternalReset())  # a reset that a script's loop has seen, whatever else that script says
+        rig.stepper.inputs.post(Marker(0, "one more"))
+    rig.stepper.inputs.post_own(ExternalReset())  # a reset that a script's loop has seen
     for _ in range(2 * RESERVED_HOST_ENTRIES):
-        rig.stepper.post(EStop("a hand is in the way"))  # one that waits is enough
+        rig.stepper.inputs.post(EStop("a hand is in the way"))  # one that waits is enough
     for _ in range(RESERVED_HOST_ENTRIES - 2):
-        rig.stepper.post_own(ExternalReset())
+        rig.stepper.inputs.post_own(ExternalReset())
     with pytest.raises(RuntimeError, match="loop"):
-        rig.stepper.post_own(ExternalReset())
+        rig.stepper.inputs.post_own(ExternalReset())
     rig.steps(1)
     assert rig.stepper.last is not None
     assert rig.stepper.last.decision.estop
-    rig.stepper.post(Marker(0, "there is room again"))
+    rig.stepper.inputs.post(Marker(0, "there is room again"))
 
 
 def test_long_texts_are_truncated_and_other_excess_raises(rig: Rig) -> None:
     """Front and recorder check every limit of the protocol: excess must not reach them."""
-    rig.stepper.post(Marker(0, "m" * 3000))
-    rig.stepper.post(EStop("r" * 3000))
+    rig.stepper.inputs.post(Marker(0, "m" * 3000))
+    rig.stepper.inputs.post(EStop("r" * 3000))
     with pytest.raises(ValueError, match="Assign"):
-        rig.stepper.post(Assign(0, ("r" * 65,)))
+        rig.stepper.inputs.post(Assign(0, ("r" * 65,)))
     rig.steps(1)
     assert [e.message for e in decode_entries(rig.recorder.rows[-1].entries) if e.connection == HOST] == [
         Marker(0, "m" * 509 + "..."),

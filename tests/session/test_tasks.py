@@ -167,7 +167,7 @@ class Desk:
     def step(self, *messages: EntryMessage) -> str:
         """Return the state of the episode after a step."""
         for message in messages:
-            self.stepper.post_own(message)
+            self.stepper.inputs.post_own(message)
         self.now_ns += 2_000_000
         self.stepper.step(1)
         assert self.core.authority.episode is not None

@@ -152,7 +152,7 @@ def test_what_directors_ask_reaches_the_owner_once(rig: Rig) -> None:
     """Whom the authority answers how: `tests/authority/test_session_control.py`."""
     boss, watcher = Agent(rig, role=Role.DIRECTOR), Agent(rig, connection=2, role=Role.OBSERVER)
     rig.round()
-    rig.stepper.post_own(OwnerListens())
+    rig.stepper.inputs.post_own(OwnerListens())
     watcher.say(Control(1, "reset"))
     boss.say(Control(4, "reset"))
     boss.say(Episode(5, "start", "stack", 0))
