@@ -192,9 +192,6 @@ class Attachment:
         self._ticks = 0
         #: Session time at which the environment's step began, `None` outside of it.
         self._environment_began_ns: int | None = None
-        #: Session time and time of the data [s] before the first step that is not noted yet, and time after the newest.
-        self._unnoted: tuple[int, float] | None = None
-        self._passed_time = 0.0
         #: The environment advances its data by functions that are not wrapped: then its step is the tick.
         self._is_opaque = False
         self._unwrap = contextlib.ExitStack()
@@ -230,36 +227,7 @@ class Attachment:
             return
         self._ticks += 1
         self._thread, self._other_since_ns = threading.get_ident(), None
-        if self._environment_began_ns is None or self._loop.is_driving:
-            self._note_steps()
-            self._take_step(lambda: advance(model, data), 1)
-        else:
-            self._pass_step(model, data, advance)
-
-    def _pass_step(self, model: Any, data: Any, advance: Callable[..., None]) -> None:
-        """Take one of the steps in that of an environment, which are noted together while nothing is driven."""
-        began_time, now_ns = data.time, self._loop.read_clock()
-        if self._unnoted is None:
-            self._unnoted = now_ns, began_time
-        elif began_time < self._passed_time:
-            self._loop.reset()
-        self._is_stepping = True
-        try:
-            advance(model, data)
-        finally:
-            self._is_stepping = False
-        self._passed_time = data.time
-        if self._environment_began_ns is not None and now_ns - self._environment_began_ns > LONG_STEP_NS:
-            self._note_steps()
-            self._unless_ended(self._loop.look)
-
-    def _note_steps(self) -> None:
-        """Note the steps that were passed."""
-        if self._unnoted is not None:
-            if self._loop.data.time < self._passed_time:
-                self._loop.reset()
-            self._loop.note_step(*self._unnoted)
-            self._unnoted = None
+        self._take_step(lambda: advance(model, data), 1)
 
     def _take_step(self, advance: Callable[[], Any], n_ticks: int) -> Any:
         """Call `advance` as a tick of the session when it drives; else look at what it has done, when that is due."""
@@ -273,7 +241,7 @@ class Attachment:
             began_ns, began_time = loop.read_clock(), float(loop.data.time)
             result = advance()
             loop.note_step(began_ns, began_time)
-            if self._environment_began_ns is None:
+            if self._environment_began_ns is None or began_ns - self._environment_began_ns > LONG_STEP_NS:
                 self._unless_ended(loop.look)
             return result
         finally:
@@ -386,7 +354,6 @@ class Attachment:
             result = original()
         finally:
             self._environment_began_ns = None
-            self._note_steps()
         self._is_opaque = self._ticks == ticks and self._loop.data.time > before
         self._look()
         return result
