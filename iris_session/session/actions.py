@@ -80,10 +80,6 @@ class ActionDrive:
         self._refused: dict[str, str] = {}  # why robots that participants drive are the owner's
         self._logged: set[str] = set()
 
-    def list_replaced(self) -> tuple[str, ...]:
-        """Return the robots whose entries in the newest action are not the owner's."""
-        return self._replaced
-
     def list_interventions(self, driven: Sequence[str]) -> tuple[str, ...]:
         """Return the robots in whose part of the newest step participants came in: of those that they drive, the ones
         that the action can move, and those on their way back to the owner.

@@ -148,6 +148,11 @@ class SessionCore:
         self.authority = Authority(_limit_scales(config), config.robots, config.objects)
         self._status: tuple[ControlStatus, ...] = ()
 
+    @property
+    def driven(self) -> tuple[str, ...]:
+        """Robots of a user loop that are not wholly their owner's."""
+        return () if self.sharing is None else self.sharing.driven
+
     def step(
         self,
         now_ns: int,

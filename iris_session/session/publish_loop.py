@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.physics.kinematic_model import TICK_S, KinematicModel
-from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import ExternalReset
 from iris_session.protocol.status import NOT_PUBLISHED
 from iris_session.scene.result import ComposedScene
@@ -57,6 +56,7 @@ class PublishLoop:
 
     Attributes:
         superseded: Frames that a newer one replaced before they were published.
+        core: That of the stepper.
         lock: Held while a step is taken; hold it to read what steps change.
         grippers: How far the participants who drive have closed grippers, 0 to 1, by robot.
     """
@@ -71,7 +71,7 @@ class PublishLoop:
     ) -> None:
         self._kinematic_model = kinematic_model
         self._vertices = vertices
-        self._stepper = stepper
+        self._stepper, self.core = stepper, stepper.core
         self._processes = processes
         self._period_ns = period_ns
         self._repeat_ns = max(REPEAT_NS, 2 * period_ns)
@@ -137,15 +137,6 @@ class PublishLoop:
             return ()
         return (f"{NOT_PUBLISHED} {silent_ns * 1e-9:.1f} s: the program that publishes stands still",)
 
-    def list_driven(self) -> tuple[str, ...]:
-        """Return the robots that a participant drives. With the lock held."""
-        sharing = self._stepper.core.sharing
-        return () if sharing is None else sharing.driven
-
-    def read_targets(self) -> dict[str, Pose]:
-        """Return the end-effector targets by robot. With the lock held."""
-        return dict(self._stepper.core.controller.get_targets())
-
     @property
     def has_ended(self) -> bool:
         """True after an error in a step, and after `close`."""
@@ -196,7 +187,7 @@ class PublishLoop:
     def _count_ticks(self, frame: Frame) -> int:
         """Return the ticks since the frame before, in which targets of robots move; without robots one will do."""
         before, self._time_s = self._time_s, frame.time_s
-        if not self._stepper.core.scene.robots or frame.anew:
+        if not self.core.scene.robots or frame.anew:
             return 1
         return min(MAX_TICKS, max(1, round((frame.time_s - before) / TICK_S)))
 
@@ -205,7 +196,7 @@ class PublishLoop:
         for command in outcome.decision.commands:
             if command.gripper is not None:
                 self.grippers[command.robot] = command.gripper
-        driven = self.list_driven()  # the next participant begins without the gripper of the one before
+        driven = self.core.driven  # the next participant begins without the gripper of the one before
         self.grippers = {name: closed for name, closed in self.grippers.items() if name in driven}
         self._processes.supervise(self._stepper)
         self._step_ns = self._stepper.clock()

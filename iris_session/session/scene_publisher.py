@@ -30,7 +30,6 @@ from iris_session.control.config import OUTPUT_TARGETS, ControlError
 from iris_session.physics import PhysicsError
 from iris_session.physics.kinematic_model import KinematicModel
 from iris_session.protocol.common import Pose
-from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.specs import RobotSpec
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.builder import SceneBuilder
@@ -41,7 +40,7 @@ from iris_session.session.pending_state import PendingState
 from iris_session.session.processes import PublishedScene, SessionProcesses
 from iris_session.session.publish_loop import PublishedVertices, PublishLoop
 from iris_session.session.session_base import SessionBase
-from iris_session.session.stepper import NextPatch, PendingInputs, make_session_clock
+from iris_session.session.stepper import PendingInputs, make_session_clock
 
 #: Period at which `run` calls `until` [s].
 RUN_PERIOD_S: Final = 1.0 / 60.0
@@ -301,7 +300,7 @@ class ScenePublisher(SessionBase):
         """
         loop = self._require_parts()[1]
         with loop.lock:
-            return loop.list_driven()
+            return loop.core.driven
 
     def targets(self) -> dict[str, Pose]:
         """Return the end-effector targets `T_world_tip` by robot, for your program's own controller [m].
@@ -314,7 +313,7 @@ class ScenePublisher(SessionBase):
         """
         loop = self._require_parts()[1]
         with loop.lock:
-            return loop.read_targets()
+            return dict(loop.core.controller.get_targets())
 
     def grippers(self) -> dict[str, float]:
         """Return how far participants want grippers closed, 0 open to 1 closed, by robot. Those are missing that no
@@ -327,27 +326,11 @@ class ScenePublisher(SessionBase):
         with loop.lock:
             return dict(loop.grippers)
 
-    # --- inputs of the owner -----------------------------------------------------------------------------------------
-
-    def post(self, message: EntryMessage) -> None:
-        """Queue an input of the owner (connection 0, rights of a director) for the next step. From any thread.
-
-        Args:
-            message: A message of `iris_session.protocol.client_messages`.
-
-        Raises:
-            ValueError: A value that the protocol does not allow.
-            OwnershipError: The queue is full, or the session is not started, or closed.
-        """
-        self._require_started()
-        self._require_parts()[1].raise_if_ended()  # else the input would stay in the queue
-        self._inputs.post(message)
-
     # --- inside ------------------------------------------------------------------------------------------------------
 
-    def _queue_patch(self, patch: NextPatch) -> None:
+    def _require_steps(self) -> None:
+        self._require_started()
         self._require_parts()[1].raise_if_ended()
-        super()._queue_patch(patch)
 
     def _hold_steps(self) -> AbstractContextManager[object]:
         return nullcontext() if self._loop is None else self._loop.lock

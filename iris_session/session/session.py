@@ -39,7 +39,6 @@ from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.physics.names import list_body_names
 from iris_session.protocol.client_messages import Assign, Control, SetScale
 from iris_session.protocol.common import MAX_TEXT, Pose
-from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.session.actions import ActionDrive
@@ -164,15 +163,10 @@ class Session(SessionBase):
         self._scheduling = "normal"
         self._next_overrun_log_ns = 0
         self.recording_fault = ""
-        self._start_notes: tuple[str, ...] = ()
-        self._process = 0  # in which it was started
         self._log_robot_notices()
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes for the user, one line each: how the session started (another name, other addresses), which robots can
-        only be watched, and which parts of the present scene clients do not see."""
-        return (*self._start_notes, *self._robot_notices, *super().notes)
+    def _list_world_notes(self) -> Sequence[str]:
+        return self._robot_notices
 
     def _log_robot_notices(self) -> None:
         for text in self._robot_notices:
@@ -212,7 +206,7 @@ class Session(SessionBase):
         Returns:
             False when the recording is incomplete; `recording_fault` says why.
         """
-        if self._process not in (0, os.getpid()):  # a child that was forked has none of it
+        if self._is_forked:
             return True
         self._stop.set()
         self._is_closed = True
@@ -385,7 +379,7 @@ class Session(SessionBase):
             ConfigError: No adapter fits this environment and action, or the session was not shared in this way.
             OwnershipError: The session was not started.
         """
-        if self._is_closed or self._process not in (0, os.getpid()):  # by another thread; or the parent has the session
+        if self._is_closed or self._is_forked:  # by another thread; or the parent has the session
             return action
         self._require_started()
         if self._attachment is None and self._user_loop is not None and self.config.control.output == OUTPUT_TARGETS:
@@ -548,7 +542,7 @@ class Session(SessionBase):
                 self._log_robot_notices()
             return scene
 
-        loop.change_model(model, data, prepare, scenes)
+        loop.change_model(model, data, prepare)
         self.model, self.data = model, data
         if self._follower is not None:
             self._follower.follow_model(model)
@@ -557,8 +551,7 @@ class Session(SessionBase):
     def _hold_steps(self) -> AbstractContextManager[object]:
         """Return a context in which the helper thread of a user loop takes no step."""
         # In a child that was forked the helper thread does not go on, and may have held the lock.
-        is_forked = self._process not in (0, os.getpid())
-        return nullcontext() if self._user_loop is None or is_forked else self._user_loop.lock
+        return nullcontext() if self._user_loop is None or self._is_forked else self._user_loop.lock
 
     def _find_data_fault(self) -> DataFault | None:
         return None if self._user_loop is None else self._user_loop.fault
@@ -574,19 +567,6 @@ class Session(SessionBase):
         return self._user_loop
 
     # --- inputs of the owner ---------------------------------------------------------------------------------------
-
-    def post(self, message: EntryMessage) -> None:
-        """Queue an input of the owner (connection 0, rights of a director) for the next step. From any thread.
-
-        Args:
-            message: A message of `iris_session.protocol.client_messages`.
-
-        Raises:
-            ValueError: A value that the protocol does not allow.
-            OwnershipError: The queue is full, or the session is closed.
-        """
-        self._require_open()
-        self._inputs.post(message)
 
     def pause(self) -> None:
         """Pause physics; leases, heartbeats and requests continue."""

@@ -9,7 +9,7 @@ import os
 import signal
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -44,6 +44,8 @@ class SessionBase:
     _recording: Path | None = None  # of the closed session
     _is_closed = False
     _listens = False  # to requests
+    _process = 0  # that has started it
+    _start_notes: tuple[str, ...] = ()
 
     # --- life --------------------------------------------------------------------------------------------------------
 
@@ -52,9 +54,6 @@ class SessionBase:
 
     @abstractmethod
     def close(self) -> bool: ...
-
-    @abstractmethod
-    def post(self, message: EntryMessage) -> None: ...
 
     def _find_data_fault(self) -> DataFault | None:
         """Return what is not finite in the data of a user loop."""
@@ -93,6 +92,19 @@ class SessionBase:
             yield
 
     # --- inputs of the owner -----------------------------------------------------------------------------------------
+
+    def post(self, message: EntryMessage) -> None:
+        """Queue an input of the owner (connection 0, rights of a director) for the next step. From any thread.
+
+        Args:
+            message: A message of `iris_session.protocol.client_messages`.
+
+        Raises:
+            ValueError: A value that the protocol does not allow.
+            OwnershipError: The queue is full, or the session is closed; a `ScenePublisher` must be started, too.
+        """
+        self._require_steps()
+        self._inputs.post(message)
 
     def estop(self, reason: str = "") -> None:
         """Stop every robot until `clear_estop()`. Not a safety-rated stop.
@@ -251,17 +263,15 @@ class SessionBase:
             OwnershipError: The session is not started.
         """
         scenes = self._require_started().scenes
+        self._require_steps()
         try:
             checked = check_patch(ops)
             with scenes.lock:
                 shown = scenes.patch(checked)
-                self._queue_patch(NextPatch(ScenePatched(checked, shown.info.scene_hash), shown))
+                self._inputs.queue_scene(NextPatch(ScenePatched(checked, shown.info.scene_hash), shown))
                 scenes.show(shown)
         except (SceneError, OSError, RuntimeError) as error:
             raise ConfigError(f"patch_scene: {error}") from error
-
-    def _queue_patch(self, patch: NextPatch) -> None:
-        self._inputs.queue_scene(patch)
 
     # --- state of the session ----------------------------------------------------------------------------------------
 
@@ -312,15 +322,29 @@ class SessionBase:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes for the user, one line each: how the session started (another name, other addresses), and which parts
-        of the present scene clients do not see."""
+        """Notes for the user, one line each: how the session started (another name, other addresses), which robots can
+        only be watched, and which parts of the present scene clients do not see."""
         live = self._processes
-        return () if live is None else tuple(dict.fromkeys((*live.notes, *live.scenes.notes)))
+        shown = () if live is None else (*live.notes, *live.scenes.notes)
+        return tuple(dict.fromkeys((*self._start_notes, *self._list_world_notes(), *shown)))
 
     @property
     def recording(self) -> Path | None:
         """Path of the recording, after `close()` too; `None` when nothing is recorded."""
         return self._recording if self._processes is None else self._processes.recording
+
+    def _list_world_notes(self) -> Sequence[str]:
+        """Return notes about the robots, or about the simulation."""
+        return ()
+
+    @property
+    def _is_forked(self) -> bool:
+        """True in a child that was forked from the process of the session, which has none of it."""
+        return self._process not in (0, os.getpid())
+
+    def _require_steps(self) -> None:
+        """Raise `OwnershipError` where no step will take an input any more."""
+        self._require_open()
 
     def _require_open(self) -> None:
         if self._is_closed:

@@ -6,7 +6,7 @@ It needs no snapshot and no query of the pure core. `status` makes reports for u
 from __future__ import annotations
 
 import logging
-from collections import deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
@@ -77,7 +77,7 @@ class SessionView:
         # Session time since when a participant has its alignment, or lost it to a jump of its tracking frame.
         self._aligned_ns: dict[str, int] = {}
         self._void_ns: dict[str, int] = {}
-        self._receive_to_step_ns: dict[str, deque[int]] = {}
+        self._receive_to_step_ns: defaultdict[str, deque[int]] = defaultdict(lambda: deque(maxlen=RECEIVE_TO_STEP))
         self._hold_reasons: dict[str, str] = {}
 
     def apply_step(self, decision: Decision, status: tuple[ControlStatus, ...]) -> None:
@@ -100,11 +100,8 @@ class SessionView:
             elif isinstance(body, SamplesRejected):
                 self.rejected[body.participant, body.device, body.reason] = body.count
             elif isinstance(body, Handover):
-                self.handovers.append(
-                    HandoverStatus(
-                        body.object, body.giver, body.receiver, event.session_time * 1e-9, body.duration_ns * 1e-9
-                    )
-                )
+                times_s = event.session_time * 1e-9, body.duration_ns * 1e-9
+                self.handovers.append(HandoverStatus(body.object, body.giver, body.receiver, *times_s))
         for outgoing in decision.outgoing:
             message = outgoing.message
             if outgoing.connection == HOST and isinstance(message, Snapshot):
@@ -131,10 +128,7 @@ class SessionView:
         before = self.applied.get(robot)
         self.applied[robot] = applied
         if before is None or applied.step_ns != before.step_ns:
-            delays = self._receive_to_step_ns.get(robot)
-            if delays is None:
-                delays = self._receive_to_step_ns[robot] = deque(maxlen=RECEIVE_TO_STEP)
-            delays.append(applied.step_ns - applied.receive_ns)
+            self._receive_to_step_ns[robot].append(applied.step_ns - applied.receive_ns)
 
     def _note_alignment(self, event: Event) -> None:
         """Note since when alignments hold, which events do not say. Call before the mirror applies `event`."""
@@ -163,14 +157,6 @@ class SessionView:
         """Return the name of each participant by id."""
         return {info.id: info.name for info in self.mirror.participants.values()}
 
-    def _list_held(self) -> dict[str, list[str]]:
-        """Return the robots and objects that each participant holds, by participant id."""
-        held: dict[str, list[str]] = {}
-        for lease in self.mirror.leases.values():
-            for holder in lease.sub_holders or ((lease.holder,) if lease.holder else ()):
-                held.setdefault(holder, []).append(lease.target)
-        return held
-
     def make_participant_reports(
         self, now_ns: int, alignments: Mapping[str, AlignmentReport] = MappingProxyType({})
     ) -> tuple[ParticipantReport, ...]:
@@ -180,15 +166,16 @@ class SessionView:
             now_ns: Session time.
             alignments: By participant id.
         """
-        held = self._list_held()
-        waits: dict[str, list[str]] = {}
+        held: defaultdict[str, list[str]] = defaultdict(list)
+        waits: defaultdict[str, list[str]] = defaultdict(list)
         for lease in self.mirror.leases.values():
+            for holder in lease.sub_holders or (lease.holder,):
+                held[holder].append(lease.target)
             for waiting in lease.queue:
-                waits.setdefault(waiting, []).append(lease.target)
-        rejected: dict[str, dict[str, int]] = {}
+                waits[waiting].append(lease.target)
+        rejected: defaultdict[str, Counter[str]] = defaultdict(Counter)
         for (participant, _, reason), count in self.rejected.items():
-            counts = rejected.setdefault(participant, {})
-            counts[reason] = counts.get(reason, 0) + count
+            rejected[participant][reason] += count
         return tuple(
             ParticipantReport(
                 info.id,
@@ -201,9 +188,9 @@ class SessionView:
                 alignment_void_ns=now_ns - self._void_ns[info.id] if info.id in self._void_ns else -1,
                 alignment_error_m=_state_error(info, alignments.get(info.id)),
                 tracking_epoch=info.tracking_epoch,
-                holds=tuple(held.get(info.id, ())),
-                waits_for=tuple(waits.get(info.id, ())),
-                rejected=rejected.get(info.id, {}),
+                holds=tuple(held[info.id]),
+                waits_for=tuple(waits[info.id]),
+                rejected=dict(rejected[info.id]),
                 alignment_report=alignments.get(info.id),
             )
             for info in self.mirror.participants.values()

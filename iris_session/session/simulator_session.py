@@ -22,7 +22,7 @@ from iris_session.protocol.specs import RobotSpec
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.errors import SceneBuildError
 from iris_session.session.config import SessionConfig
-from iris_session.session.errors import ConfigError, OwnershipError, PublishError
+from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.robots import AUTO, NONE
 from iris_session.session.scene_publisher import ScenePublisher
 from iris_session.simulators.adapter import Adapter, SimulationState, TipTarget
@@ -57,15 +57,11 @@ class SimulatorSession(ScenePublisher):
         self._drives = drives and adapter.drives
         self._unwrap: Any = None
         self._driven: tuple[str, ...] = ()  # by the newest step
-        self._process = 0  # that has started it
         self._due_ns = 0
         self._fault = ""
-        self._start_notes: tuple[str, ...] = ()
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes for the user, one line each: how the session started, and what clients do not see."""
-        return tuple(dict.fromkeys((*self._start_notes, *self._adapter.notes, *super().notes)))
+    def _list_world_notes(self) -> Sequence[str]:
+        return self._adapter.notes
 
     def start(self) -> None:
         """Start the session, publish the present state, and follow the simulation from here on.
@@ -97,7 +93,7 @@ class SimulatorSession(ScenePublisher):
         Robots that participants drive stop where they are. In a process that was forked from that of the session it
         does nothing.
         """
-        if self._process not in (0, os.getpid()):
+        if self._is_forked:
             return True
         atexit.unregister(self.close)
         self._end_steps()
@@ -169,8 +165,6 @@ class SimulatorSession(ScenePublisher):
         try:
             self._publish_state(self._adapter.read_state())
             self._fault = ""
-        except PublishError as error:
-            self._note_fault(error)
         except Exception as error:  # of the simulator: its program goes on as without a session
             self._note_fault(error)
 

@@ -44,7 +44,6 @@ from iris_session.protocol.entries import ExternalReset, StalledGap
 from iris_session.session.core import read_plant_state
 from iris_session.session.errors import OwnershipError
 from iris_session.session.processes import SessionProcesses
-from iris_session.session.shared_scene import SharedScenes
 from iris_session.session.status import DataFault
 from iris_session.session.stepper import NextScene, Stepper
 
@@ -310,15 +309,10 @@ class UserLoop:
     @property
     def driven(self) -> tuple[str, ...]:
         """Robots that the session drives: a participant holds them and has engaged, or they are being given back."""
-        sharing = self._stepper.core.sharing
-        return () if sharing is None or self.is_closed or self.has_ended else sharing.driven
+        return () if self.is_closed or self.has_ended else self._stepper.core.driven
 
     def change_model(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        prepare: Callable[[bytes], NextScene | None],
-        scenes: SharedScenes | None = None,
+        self, model: mujoco.MjModel, data: mujoco.MjData, prepare: Callable[[bytes], NextScene | None]
     ) -> None:
         """Go on with another model and data, which is a reset: the owner's program has built its world anew.
 
@@ -327,13 +321,11 @@ class UserLoop:
             data: The data from now on.
             prepare: Makes the new scene from the state of `data`, and `None` when it is the present one. It takes long,
                 and steps without ticks go on meanwhile.
-            scenes: Where the new scene is shown.
         """
         plant = read_plant_state(model, data)
         scene = prepare(plant)
         with self.lock:
-            if self._in_tick:
-                self._in_tick = False
+            self._in_tick = False
             self._ctrl.read(self._data.ctrl)
             self._ctrl.put_owner(self._data.ctrl)
             self._forces.read(self._data.xfrc_applied)
@@ -342,7 +334,7 @@ class UserLoop:
                 self.reset()
                 self._use(model, data)
             else:
-                assert scenes is not None
+                scenes = self._processes.scenes
                 with scenes.lock:  # no patch comes between
                     while self._stepper.inputs.scenes:  # patches of the present scene
                         self._step(0, self._plant)
