@@ -163,6 +163,15 @@ class Agent:
             self.rig.round()
 
 
+def take_over(rig: Rig, robot: str = "left") -> Agent:
+    """Return a participant that has engaged a robot."""
+    agent = Agent(rig, robot=robot)
+    rig.round()
+    agent.acquire()
+    agent.engage()
+    return agent
+
+
 def largest_step(applied: Sequence[NDArray[np.float64]], actuators: Sequence[int]) -> float:
     """The largest change of the `ctrl` of some actuators from one tick to the next."""
     return float(np.abs(np.diff(np.array(applied)[:, list(actuators)], axis=0)).max(initial=0.0))

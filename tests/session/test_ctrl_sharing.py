@@ -12,7 +12,7 @@ from iris_session.protocol.client_messages import Assign, ClearEStop, EStop
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import MarkerAdded
-from tests.session.loops import Agent, Rig, largest_step
+from tests.session.loops import Agent, Rig, largest_step, take_over
 from tests.session.play import TICK_NS
 
 #: Position actuators of a robot within its speed limit: 2.5 rad/s in a tick of 2 ms, and the owner's own motion.
@@ -104,10 +104,7 @@ def test_engaging_begins_at_the_present_ctrl_and_the_policy_is_out(rig: Rig) -> 
 
 def test_a_release_gives_the_owners_ctrl_back_without_a_jump(rig: Rig) -> None:
     rig.policy = swing(rig)
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
+    agent = take_over(rig)
     agent.drive(sideways(agent.tip(), 0.2), 1.5)
     agent.release()
     rig.applied = rig.applied[-1:]
@@ -122,14 +119,10 @@ def test_a_release_gives_the_owners_ctrl_back_without_a_jump(rig: Rig) -> None:
 
 
 def test_what_the_owner_writes_while_a_robot_is_driven_counts_when_it_is_given_back(rig: Rig) -> None:
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
+    agent = take_over(rig)
     arm = rig.actuators()[:-1]
     rig.data.ctrl[arm[0]] = 0.2
-    driven = sideways(agent.tip())
-    agent.drive(driven, 0.1)
+    agent.drive(sideways(agent.tip()), 0.1)
     assert rig.data.ctrl[arm[0]] != 0.2
     agent.release()
     rig.rounds(1000)
@@ -138,11 +131,8 @@ def test_what_the_owner_writes_while_a_robot_is_driven_counts_when_it_is_given_b
 
 def test_the_clutch_open_holds_and_a_new_holder_has_to_engage(rig: Rig) -> None:
     rig.policy = swing(rig)
-    agent, other = Agent(rig), Agent(rig, connection=2)
+    agent, other = take_over(rig), Agent(rig, connection=2)
     boss = Agent(rig, connection=3, role=Role.DIRECTOR)
-    rig.round()
-    agent.acquire()
-    agent.engage()
     agent.drive(sideways(agent.tip()), 0.4)
     here = agent.tip()
     agent.drive(lambda t: here, 0.5, clutch=False)
@@ -156,11 +146,7 @@ def test_the_clutch_open_holds_and_a_new_holder_has_to_engage(rig: Rig) -> None:
 
 def test_during_an_estop_nothing_is_given_back(rig: Rig) -> None:
     rig.policy = swing(rig)
-    agent = Agent(rig)
-    boss = Agent(rig, connection=2, role=Role.DIRECTOR)
-    rig.round()
-    agent.acquire()
-    agent.engage()
+    agent, boss = take_over(rig), Agent(rig, connection=2, role=Role.DIRECTOR)
     agent.drive(sideways(agent.tip(), 0.2), 0.5)
     agent.release()
     rig.rounds(50)
@@ -179,10 +165,7 @@ def test_during_an_estop_nothing_is_given_back(rig: Rig) -> None:
 
 def test_a_robot_that_is_taken_again_on_its_way_back_does_not_jump(rig: Rig) -> None:
     rig.policy = swing(rig)
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
+    agent = take_over(rig)
     agent.drive(sideways(agent.tip(), 0.2), 0.8)
     agent.release()
     rig.rounds(60)
@@ -196,10 +179,7 @@ def test_a_robot_that_is_taken_again_on_its_way_back_does_not_jump(rig: Rig) -> 
 @pytest.mark.parametrize("how", ["time", "pose", "said"])
 def test_after_a_reset_a_driven_robot_is_where_its_owner_put_it(rig: Rig, how: str) -> None:
     home = rig.data.ctrl.copy()
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
+    agent = take_over(rig)
     agent.drive(sideways(agent.tip(), 0.2), 1.0)
     joint = rig.joints()[0]
     if how == "time":
@@ -226,10 +206,7 @@ def test_after_a_reset_a_driven_robot_is_where_its_owner_put_it(rig: Rig, how: s
 
 def test_a_real_robot_may_be_moved_by_its_owner_between_ticks(rig: Rig) -> None:
     """Measured joints are written into the data, nothing is simulated: no reset."""
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
+    agent = take_over(rig)
     arm, joints = rig.actuators()[:-1], rig.joints()
     goal = sideways(agent.tip(), 0.1)
     for i in range(200):
@@ -246,10 +223,7 @@ def test_a_real_robot_may_be_moved_by_its_owner_between_ticks(rig: Rig) -> None:
 
 @pytest.mark.parametrize("array", ["qvel", "ctrl", "xfrc_applied"])
 def test_numbers_that_are_not_finite_are_reported_once_and_never_written(rig: Rig, array: str) -> None:
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
+    agent = take_over(rig)
     agent.drive(sideways(agent.tip(), 0.2), 0.2)
     arm = rig.actuators()
     before = rig.data.ctrl[arm].copy()
@@ -271,10 +245,7 @@ def test_numbers_that_are_not_finite_are_reported_once_and_never_written(rig: Ri
 
 
 def test_ctrl_that_is_changed_inside_of_a_tick_is_reported(rig: Rig) -> None:
-    agent = Agent(rig)
-    rig.round()
-    agent.acquire()
-    agent.engage()
+    take_over(rig)
     rig.now_ns += TICK_NS
     rig.loop.begin_tick()
     rig.data.ctrl[rig.actuators()[0]] += 0.5

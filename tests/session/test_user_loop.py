@@ -16,7 +16,7 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import OwnerListens, StalledGap
 from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import SceneChanged
-from tests.session.loops import Agent, Rig
+from tests.session.loops import Agent, Rig, take_over
 from tests.session.play import TICK_NS
 from tests.session.test_session import QUIET
 from tests.session.test_stepper import MS
@@ -112,11 +112,7 @@ VELOCITY = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody>
 
 def test_at_the_end_driven_robots_rest_and_objects_are_free() -> None:
     rig = Rig(mujoco.MjModel.from_xml_string(VELOCITY))
-    robot = rig.stepper.core.config.robots[0].name
-    agent = Agent(rig, robot=robot)
-    rig.round()
-    agent.acquire()
-    agent.engage()
+    agent = take_over(rig, rig.stepper.core.config.robots[0].name)
     here = agent.tip()
     agent.drive(lambda t: Pose((here.p[0], here.p[1] + t, here.p[2]), here.q), 0.1)
     ball = rig.model.body("ball").id
