@@ -45,8 +45,6 @@ EXIT_S: Final = 1.0
 #: Of the drops of a camera process, those that a session reports: frames that are replaced by newer ones, as at every
 #: camera that is faster than its stream, are none.
 REPORTED_DROPS: Final = frozenset({"send", "join", "pose", "unusable", "cells", "failed"})
-_MODULE: Final = "iris_session.cloud.process"
-_PICTURES_MODULE: Final = "iris_session.cameras.process"
 _PICTURES: Final = "model"
 
 
@@ -86,7 +84,9 @@ class SessionCameras:
         self._ports = ports
         for settings, key in zip(self._settings, self._keys, strict=False):
             start = CameraStart(**self._join(ports, key), settings=settings)
-            self._add(settings.stream, f"the camera process of {settings.stream!r}", _MODULE, start)
+            self._add(
+                settings.stream, f"the camera process of {settings.stream!r}", "iris_session.cloud.process", start
+            )
         if self._pictures and self._model is not None:
             self._add_pictures(ports, pack_model(bytes(encode_model(self._model))))
         return [f"cameras: {', '.join(self._processes)}"] if self._processes else []
@@ -118,7 +118,7 @@ class SessionCameras:
             packed_model=packed_model,
             plain=self._config.plain_pictures,
         )
-        self._add(_PICTURES, "the process of pictures of the model", _PICTURES_MODULE, start)
+        self._add(_PICTURES, "the process of pictures of the model", "iris_session.cameras.process", start)
 
     def _add(self, name: str, title: str, module: str, start: ProcessStart) -> None:
         spawn = partial(self._spawn, name, module, start)

@@ -54,7 +54,7 @@ from iris_session.session.resume import (
     wait_for_free_ports,
 )
 from iris_session.session.shared_scene import SharedScenes
-from iris_session.session.status import StatusReporter, make_recorder_report, make_report
+from iris_session.session.status import StatusReporter, make_recorder_report
 from iris_session.session.stepper import NextPatch, NextScene, PendingInputs, ResumedFrom, Stepper, label_robots
 from iris_session.session.unique_name import NameFinder
 from iris_session.session.web_page import WebPage, open_web_page
@@ -364,9 +364,8 @@ class SessionProcesses:
         for reason in drops.keys() - self._dropped:
             _log.info("drops begin: %s", reason)
         self._dropped |= drops.keys()
-        report = make_report(stepper, self.reporter.scheduling, drops, self.count_restarts())
-        report = msgspec.structs.replace(report, recorder=make_recorder_report(self.feed, self.recorder))
-        return self.reporter.make_report(stepper, report, self._config.sheet_sizes())
+        recorder, sizes = make_recorder_report(self.feed, self.recorder), self._config.sheet_sizes()
+        return self.reporter.make_report(stepper, recorder, sizes, drops=drops, restarts=self.count_restarts())
 
     @property
     def front_pid(self) -> int:

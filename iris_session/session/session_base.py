@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Self
+from typing import Any, Self
 
 from iris_session.physics import Pacer
 from iris_session.protocol.client_messages import ClearEStop, Episode, EStop, Marker
@@ -26,7 +26,7 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError, OwnershipError
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.scene_change import check_patch
-from iris_session.session.status import DataFault, SessionStatus, make_report, make_session_status
+from iris_session.session.status import DataFault, SessionStatus, make_session_status
 from iris_session.session.stepper import NextPatch, OwnerRequest, PendingInputs, Stepper
 
 
@@ -283,12 +283,12 @@ class SessionBase:
         """
         processes, stepper = self._processes, self._stepper
         with self._hold_steps():
-            drops = {} if processes is None else processes.count_drops()
-            restarts = {} if processes is None else processes.count_restarts()
+            own: dict[str, Any] = {"scheduling": self._scheduling, "data_fault": self._find_data_fault()}
+            if processes is not None:
+                own |= {"drops": processes.count_drops(), "restarts": processes.count_restarts()}
             if stepper is None or stepper.last is None:
-                return SessionStatus(drops=drops, restarts=restarts, scheduling=self._scheduling)
-            report = make_report(stepper, self._scheduling, drops, restarts)
-            return make_session_status(report, stepper, self._pacer, self._find_data_fault())
+                return SessionStatus(**own)
+            return make_session_status(stepper, self._pacer, **own)
 
     def recent_events(self) -> list[Event]:
         """Return the newest events.

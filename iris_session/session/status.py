@@ -98,36 +98,24 @@ class SessionStatus(msgspec.Struct, frozen=True):
         return dict(msgspec.to_builtins(self))
 
 
-def make_report(
-    stepper: Stepper, scheduling: str, drops: dict[str, int] | None = None, restarts: dict[str, int] | None = None
-) -> StatusReport:
-    """Return the part of a `StatusReport` that owners get, too; all other fields keep their defaults."""
-    now_ns, core, last = stepper.clock(), stepper.core, stepper.last
-    return StatusReport(
-        0,
-        "",
-        "",
-        now_ns,
-        tick=core.world.view().tick,
-        paused=stepper.paused,
-        estop=last is not None and last.decision.estop,
-        scheduling=scheduling,
-        participants=stepper.view.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
-        drops=drops or {},
-        restarts=restarts or {},
-        stops=core.authority.build_stop_reports(),
-        pause_reason=core.authority.pause_reason,
-        paused_by=stepper.view.paused_by,
-    )
+def list_shared_fields(stepper: Stepper, now_ns: int) -> dict[str, Any]:
+    """Return the fields that a `SessionStatus` and a `StatusReport` share, from the session itself."""
+    core, last = stepper.core, stepper.last
+    return {
+        "tick": core.world.view().tick,
+        "paused": stepper.paused,
+        "estop": last is not None and last.decision.estop,
+        "participants": stepper.view.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
+        "stops": core.authority.build_stop_reports(),
+        "pause_reason": core.authority.pause_reason,
+    }
 
 
-def make_session_status(
-    report: StatusReport, stepper: Stepper, pacer: Pacer | None, data_fault: DataFault | None
-) -> SessionStatus:
-    """Return what `report` says, with what its owner knows besides."""
-    lateness = {}
+def make_session_status(stepper: Stepper, pacer: Pacer | None, **given: Any) -> SessionStatus:
+    """Return the status of a session that has taken a step; `given`: fields that the stepper does not know."""
+    now_ns, lateness = stepper.clock(), {}
     if pacer is not None:
-        stats = pacer.get_stats(report.session_time)
+        stats = pacer.get_stats(now_ns)
         lateness = {
             "ticks": stats.ticks,
             "late": stats.late,
@@ -136,17 +124,14 @@ def make_session_status(
             "p99_ms": stats.p99_ns * 1e-6,
             "max_ms": stats.max_ns * 1e-6,
         }
-    own = {name: getattr(report, name) for name in SessionStatus.__struct_fields__ if hasattr(report, name)}
     return SessionStatus(
-        **own
-        | {
-            "session_time_s": report.session_time * 1e-9,
-            "sim_time": stepper.core.world.view().sim_time,
-            "handovers": tuple(stepper.view.handovers),
-            "lateness": lateness,
-            "input_to_ctrl_ms": stepper.view.compute_input_to_ctrl_ms(),
-            "data_fault": data_fault,
-        }
+        **list_shared_fields(stepper, now_ns),
+        **given,
+        session_time_s=now_ns * 1e-9,
+        sim_time=stepper.core.world.view().sim_time,
+        handovers=tuple(stepper.view.handovers),
+        lateness=lateness,
+        input_to_ctrl_ms=stepper.view.compute_input_to_ctrl_ms(),
     )
 
 
@@ -177,22 +162,32 @@ class StatusReporter:
         self._next_ns = now_ns + PERIOD_NS
         return True
 
-    def make_report(self, stepper: Stepper, report: StatusReport, sizes: Mapping[str, float]) -> StatusReport:
+    def make_report(
+        self, stepper: Stepper, recorder: RecorderReport, sizes: Mapping[str, float], **given: Any
+    ) -> StatusReport:
         """Return the authority's half of a report, once a second; fields of the front keep their defaults.
 
         Args:
             stepper: Of the session.
-            report: That of `make_report`, with the recorder.
+            recorder: How the recording does.
             sizes: Edges of the printed sheets [m], where known.
+            given: Other fields.
         """
-        pacer, times, core = self.pacer, self.times, stepper.core
-        stats = None if pacer is None else pacer.get_stats(report.session_time)
+        pacer, times, core, now_ns = self.pacer, self.times, stepper.core, stepper.clock()
+        stats = None if pacer is None else pacer.get_stats(now_ns)
         if times is not None and stats is not None:
             times.mark(stats)
         warnings = [text for source in self.warning_sources for text in source()]
-        recorder = report.recorder or RecorderReport()
-        return msgspec.structs.replace(
-            report,
+        return StatusReport(
+            0,
+            "",
+            "",
+            now_ns,
+            **list_shared_fields(stepper, now_ns),
+            **given,
+            scheduling=self.scheduling,
+            recorder=recorder,
+            paused_by=stepper.view.paused_by,
             tick_period_ns=core.world.tick_period_ns,
             late_share=0.0 if times is None else times.compute_late_share(),
             late_share_total=0.0 if stats is None else stats.late_share,

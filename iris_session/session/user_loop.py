@@ -67,18 +67,10 @@ MOVED: Final = 1e-6
 
 _CTRL: Final = int(mujoco.mjtState.mjSTATE_CTRL)
 _XFRC: Final = int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
-_FIELDS: Final = {
-    "time": int(mujoco.mjtState.mjSTATE_TIME),
-    "qpos": int(mujoco.mjtState.mjSTATE_QPOS),
-    "qvel": int(mujoco.mjtState.mjSTATE_QVEL),
-    "act": int(mujoco.mjtState.mjSTATE_ACT),
-    "qacc_warmstart": int(mujoco.mjtState.mjSTATE_WARMSTART),
-    "ctrl": _CTRL,
-    "qfrc_applied": int(mujoco.mjtState.mjSTATE_QFRC_APPLIED),
-    "xfrc_applied": _XFRC,
-    "mocap_pos": int(mujoco.mjtState.mjSTATE_MOCAP_POS),
-    "mocap_quat": int(mujoco.mjtState.mjSTATE_MOCAP_QUAT),
-}
+#: Arrays of the data that are part of the state.
+_ARRAYS: Final = ("time", "qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat")
+_FIELDS: Final = {name: int(getattr(mujoco.mjtState, f"mjSTATE_{name.upper()}")) for name in _ARRAYS}
+_FIELDS["qacc_warmstart"] = int(mujoco.mjtState.mjSTATE_WARMSTART)
 
 Floats = NDArray[np.float64]
 _log = logging.getLogger(__name__)
