@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import pytest
 
-from iris_session import Session, SessionConfig
+from iris_session import Session
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.physics import FoundRobots, Pacer, find_objects, find_robots
 from iris_session.physics.load import compute_scene_hash, decode_model, encode_model
@@ -18,6 +18,7 @@ from iris_session.session.scene_change import adopt_timestep, prepare_scene
 from iris_session.session.shared_scene import SharedScenes
 from iris_session.session.tick_times import TickTimes
 from tests.session.play import TICK_NS, entries, host, make_core
+from tests.session.test_session import QUIET
 from tests.session.test_stepper import Rig
 
 AT = 90  # step of the change: Ann's clutch is closed since step 50
@@ -89,8 +90,7 @@ def test_load_scene_requires_a_running_session() -> None:
     session = Session(str(scene_path("handover")))
     with pytest.raises(OwnershipError, match="run"):
         session.load_scene(bench_scene())
-    ports = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, web=False)
-    with Session(str(scene_path("handover")), config=ports) as run:
+    with Session(str(scene_path("handover")), config=QUIET) as run:
         run.run(seconds=0.01)
         with pytest.raises(ConfigError, match=r"robots\[0\] is 3"):
             run.load_scene(bench_scene(), robots=[3])  # type: ignore[list-item]
@@ -99,7 +99,7 @@ def test_load_scene_requires_a_running_session() -> None:
         run.run(seconds=0.05)
         assert run.objects == find_objects(bench_scene())
     model: Any = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
-    with Session(model, mujoco.MjData(model), config=ports) as mine:
+    with Session(model, mujoco.MjData(model), config=QUIET) as mine:
         mine.begin_tick()
         with pytest.raises(OwnershipError, match="loop"):
             mine.load_scene(bench_scene())

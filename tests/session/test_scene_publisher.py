@@ -22,8 +22,8 @@ from iris_session.protocol.scene import Environment, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from tests.rig.owned import simulate_sessions
 from tests.rig.simulation import Simulation
+from tests.session.test_session import QUIET
 
-CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, web=False)
 NAN = float("nan")
 
 
@@ -44,7 +44,7 @@ def simulation() -> Iterator[Simulation]:
 @pytest.fixture(scope="module")
 def session(simulation: Simulation) -> Iterator[ScenePublisher]:
     """One publisher for all tests that leave it running; like a simulator it gives a time with every state."""
-    with ScenePublisher(scene(), CONFIG) as session:
+    with ScenePublisher(scene(), QUIET) as session:
         yield session
 
 
@@ -133,7 +133,7 @@ def test_time_going_back_begins_a_scene_epoch(session: ScenePublisher) -> None:
 
 
 def test_setting_before_start_and_publishing_after_close_raise() -> None:
-    session = ScenePublisher(scene(), CONFIG)
+    session = ScenePublisher(scene(), QUIET)
     for call in (session.publish, session.reset, session.run, lambda: session.marker("x"), lambda: session.address):
         with pytest.raises(OwnershipError, match="not started"):
             call()
@@ -155,7 +155,7 @@ def test_invalid_scene_or_configuration_raises(tmp_path: Path) -> None:
     broken.add_box("box", half_size=(1.0, 1.0, 1.0), movable=True)
     broken.environment = Environment(extent=math.nan)
     for builder, config, value in (
-        ("scene.xml", CONFIG, "SceneBuilder"),
+        ("scene.xml", QUIET, "SceneBuilder"),
         (scene(), "config", "SessionConfig"),
         (scene(), SessionConfig(resume=tmp_path), "recording"),
         (scene(), SessionConfig(assets=False), "assets|draw"),
@@ -163,10 +163,10 @@ def test_invalid_scene_or_configuration_raises(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=value):
             ScenePublisher(builder, config)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="scene"):
-        ScenePublisher(broken, CONFIG).start()
+        ScenePublisher(broken, QUIET).start()
 
 
 def test_robots_that_the_scene_does_not_have_are_refused_in_one_line(simulation: Simulation) -> None:
     with pytest.raises(ConfigError, match="'nowhere'") as caught:
-        ScenePublisher(scene(), CONFIG, robots=[RobotSpec("arm", (), (), "", "box", tip_body="nowhere")]).start()
+        ScenePublisher(scene(), QUIET, robots=[RobotSpec("arm", (), (), "", "box", tip_body="nowhere")]).start()
     assert "\n" not in str(caught.value)

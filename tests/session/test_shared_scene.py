@@ -14,13 +14,13 @@ from iris_session.physics import FoundRobots, World
 from iris_session.protocol.scene import AddMesh, Mesh, MeshLevel, SceneError, SetVisual
 from iris_session.scene import AssetStore
 from iris_session.session import shared_scene
-from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError
 from iris_session.session.scene_change import prepare_scene
 from iris_session.session.session import Session
 from iris_session.session.shared_scene import SharedScenes
 from tests.scene.models import flexes
 from tests.session.play import make_core
+from tests.session.test_session import QUIET
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_groups_and_sites_of_a_session_are_chosen(tmp_path: Path, way: str) -> N
     xml = """<mujoco><worldbody><body name="arm"><joint/><geom size=".1" group="3"/><site name="end" group="4"/></body>
         <site name="goal"/></worldbody></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
-    plain = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, web=False, assets=tmp_path)
+    plain = replace(QUIET, assets=tmp_path)
     with Session(model, config=plain) as session:
         assert session.scene is not None
         assert ([one.name for one in session.scene.visuals], session.scene.groups_shown) == (["", "goal"], (0, 1, 2))
