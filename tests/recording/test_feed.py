@@ -199,9 +199,13 @@ def test_rows_not_received_before_the_end_are_counted(played) -> None:  # type: 
     assert not feed.close(0.0), "asked again"
 
 
-@pytest.mark.parametrize(("cpu_step_s", "waits"), [(0.01, 50), (0.0, 4)], ids=["slow", "hanging"])
-def test_close_waits_for_a_slow_recorder_but_not_for_one_that_hangs(
-    feed: RecorderFeed, played, cpu_step_s: float, waits: int
+@pytest.mark.parametrize(
+    ("cpu_step_s", "alive", "waits"),
+    [(0.01, True, 50), (0.0, True, 4), (0.01, False, 1)],
+    ids=["slow", "hangs", "gone"],
+)
+def test_close_waits_for_a_slow_recorder_but_not_for_one_that_hangs_or_is_gone(
+    feed: RecorderFeed, played, cpu_step_s: float, alive: bool, waits: int
 ) -> None:  # type: ignore[no-untyped-def]
     played[0].say(feed, 1, -1, -1)
     steps(feed, 0, 10)
@@ -211,7 +215,7 @@ def test_close_waits_for_a_slow_recorder_but_not_for_one_that_hangs(
         asked.append(cpu_step_s * len(asked))
         return asked[-1]
 
-    assert not feed.close(1.0, silence_s=0.06, cpu_s=cpu_s)
+    assert not feed.close(1.0, lambda: alive, 0.06, cpu_s)
     assert len(asked) == pytest.approx(waits, abs=1)
 
 
