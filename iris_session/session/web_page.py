@@ -11,7 +11,7 @@ import os
 import select
 import socket
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
@@ -82,35 +82,33 @@ class WebPage:
         config = self._config
         names = tuple(filter(None, (*ports.reachable, config.advertise)))
         note = ""
+        secured: dict[str, Any] = {}
         if self._keys is not None:
             try:
-                self.certificate = find_certificate(config, names)
+                self.certificate = certificate = find_certificate(config, names)
             except (KeysError, MissingExtraError) as error:
                 if config.web_cert:
                     raise StartError(str(error)) from None
                 self.close()
                 return [f"no page for browsers: {error}"]
-            note = f" (certificate {self.certificate.fingerprint})"
+            note, names = f" (certificate {certificate.fingerprint})", (*names, *certificate.names)
+            secured = {
+                "server_key": load_server_key(config),
+                "public_key": self._keys.public,
+                "secret_key": self._keys.secret,
+                "certificate_path": str(certificate.certificate_path),
+                "key_path": str(certificate.key_path),
+                "certificate_hash": certificate.spki_hash,
+            }
         self.address = format_page_address(ports.reachable[0], self.port, secure=self._keys is not None)
-        made = GatewayConfig(
+        self._gateway = GatewayConfig(
             host=find_connect_host(ports),
             control_port=ports.control,
             names=names,
             session_name=self._name,
             asset_root=asset_root,
+            **secured,
         )
-        if self._keys is not None and self.certificate is not None:
-            made = msgspec.structs.replace(
-                made,
-                server_key=load_server_key(config),
-                public_key=self._keys.public,
-                secret_key=self._keys.secret,
-                certificate_path=str(self.certificate.certificate_path),
-                key_path=str(self.certificate.key_path),
-                certificate_hash=self.certificate.spki_hash,
-                names=(*names, *self.certificate.names),
-            )
-        self._gateway = made
         return [f"in a browser: {self.address}{note}{describe_missing_page()}"]
 
     @property

@@ -119,6 +119,9 @@ def test_resumed_state_is_that_after_the_last_row(session: Path) -> None:
     assert past.header.session_id == "s1"
     assert len(past.notes) == 1
     assert "resume.tokens" in past.notes[0]
+    assert ResumeTokens(8, past.handback).allocate_connection() == ANN + 1, "without a note: after the journal's"
+    assert past.is_gap_known, "of the same boot: session time goes on"
+    assert past.origin_ns == past.header.origin_ns
     past.close()
 
 
@@ -306,10 +309,6 @@ def test_tokens_stay_valid_and_connection_numbers_continue(session: Path) -> Non
     assert after.allocate_connection() > ANN
 
 
-def test_connection_numbers_without_a_note_follow_the_journal(session: Path) -> None:
-    assert ResumeTokens(8, PastSession(session).handback).allocate_connection() == ANN + 1
-
-
 @pytest.mark.parametrize("fault", ["another session", "open to others", "damaged", "nothing"])
 def test_untrusted_note_is_ignored(session: Path, fault: str) -> None:
     path = find_note_path(session)
@@ -323,12 +322,6 @@ def test_untrusted_note_is_ignored(session: Path, fault: str) -> None:
 
 
 # --- time -------------------------------------------------------------------------------------------------------------
-
-
-def test_session_time_continues_within_a_boot(session: Path) -> None:
-    past = PastSession(session)
-    assert past.origin_ns == past.header.origin_ns
-    assert past.is_gap_known
 
 
 @pytest.mark.parametrize("header", [{"boot_id": "another"}, {"boot_id": ""}, {"origin_ns": 2**62}])

@@ -116,16 +116,6 @@ def rig() -> Rig:
     return Rig()
 
 
-def test_every_step_is_a_row_of_one_chain(rig: Rig) -> None:
-    rig.steps(120)
-    chain = b"root"
-    for i, row in enumerate(rig.recorder.rows):
-        assert row.step == i
-        assert check_row(chain, row) is None
-        chain = row.chain
-    assert len(rig.recorder.rows) == 120
-
-
 def test_input_that_crashes_a_step_is_recorded(rig: Rig) -> None:
     rig.steps(3)
     rig.stepper.inputs.post(Marker(0, "the last words"))
@@ -163,18 +153,14 @@ def test_interrupted_step_is_the_last(rig: Rig) -> None:
     assert len(rig.recorder.rows) == 3
 
 
-def test_keyframes_at_start_and_every_interval(rig: Rig) -> None:
-    rig.steps(120)  # 240 ms
-    assert [k.step for k in rig.recorder.keyframes] == [-1, 50, 100]
-    core = make_core()
-    assert rig.recorder.keyframes[0].plant == core.snapshot().plant
-
-
-def test_keyframe_on_request_of_the_recorder(rig: Rig) -> None:
-    rig.steps(3)
+def test_keyframes_at_start_every_interval_and_on_request_of_the_recorder(rig: Rig) -> None:
+    rig.steps(60)  # 120 ms
     rig.recorder.wants_keyframe = True
     rig.steps(1)
-    assert [k.step for k in rig.recorder.keyframes] == [-1, 3]
+    rig.recorder.wants_keyframe = False
+    rig.steps(59)
+    assert [k.step for k in rig.recorder.keyframes] == [-1, 50, 60, 110]
+    assert rig.recorder.keyframes[0].plant == make_core().snapshot().plant
 
 
 def test_session_time_grows_although_the_clock_stands_still(rig: Rig) -> None:
