@@ -55,12 +55,7 @@ _log = logging.getLogger(__name__)
 
 
 class ActionDrive:
-    """The action of one environment, as an adapter understands it.
-
-    Args:
-        environment: What the session shares.
-        config: Bounds of control.
-    """
+    """The action of one environment, as an adapter understands it."""
 
     def __init__(self, environment: Any, config: ControlConfig) -> None:
         self._environment, self._config = environment, config

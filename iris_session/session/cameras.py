@@ -49,11 +49,7 @@ _PICTURES: Final = "model"
 
 
 class SessionCameras:
-    """The camera processes of one session.
-
-    Args:
-        config: Settings of the session.
-        model: Its model; `None` for a world that MuJoCo does not simulate.
+    """The camera processes of one session. `model`: `None` for a world that MuJoCo does not simulate.
 
     Attributes:
         public_keys: Public keys (Z85) of the processes, which the front admits as cameras; none without encryption.
@@ -76,11 +72,7 @@ class SessionCameras:
         self.public_keys = tuple(one.public for one in self._keys if one is not None)
 
     def start(self, ports: Ports) -> list[str]:
-        """Let `poll` start the processes. Return notes for people about what they show.
-
-        Args:
-            ports: Of the front, which listens.
-        """
+        """Let `poll` start the processes, with the front at `ports`. Return notes for people about what they show."""
         self._ports = ports
         for settings, key in zip(self._settings, self._keys, strict=False):
             start = CameraStart(**self._join(ports, key), settings=settings)

@@ -82,9 +82,8 @@ class CtrlSharing:
         """Take over what is engaged in this step; call it before the controller's `begin`.
 
         Args:
-            decision: That of the step.
-            holders: Participants that hold each robot.
-            data: The plant at the beginning of the step.
+            decision, holders: Of the step.
+            data: The plant at its beginning.
             owner: The owner's `ctrl`, shape (nu,).
         """
         engaged = {

@@ -34,10 +34,7 @@ _log = logging.getLogger(__name__)
 class ModelFollower:
     """Looks at the model of a session after published states, and patches the scene where its looks have changed.
 
-    Args:
-        scenes: The scenes of the session.
-        stepper: Its stepper.
-        patch: `Session.patch_scene`.
+    `patch`: `Session.patch_scene`.
     """
 
     def __init__(self, scenes: SharedScenes, stepper: Stepper, patch: Callable[..., None]) -> None:

@@ -88,10 +88,9 @@ class SessionProcesses:
     """Front, recorder, web gateway and camera processes of one session.
 
     Args:
-        config: Settings of the session.
+        config, past: As of the session; `past` is the one that is resumed.
         core: The session's core, in the state that clients see first.
         origin_ns: `time.monotonic_ns()` at session time 0.
-        past: The session that is resumed.
         published: The scene of `core` where it cannot be read off its model.
 
     Attributes:

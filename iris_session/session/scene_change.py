@@ -58,12 +58,9 @@ def prepare_scene(
     objects: tuple[ObjectSpec, ...] | None,
     shown: Shown | None = None,
 ) -> NextScene:
-    """Make everything of a scene that takes long, without touching the session of `core`.
+    """Make everything of a scene that takes long, without touching the session of `core`, whose configuration it has.
 
     Args:
-        core: Its configuration is kept.
-        scenes: Where the specification and its assets are stored.
-        model: The new model.
         state: `mjSTATE_INTEGRATION` to begin with; empty for the model's own.
         found: The robots to offer, and what is unclear about them.
         objects: `None` to find them in the model.

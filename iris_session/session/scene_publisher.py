@@ -54,7 +54,9 @@ class ScenePublisher(SessionBase):
     """A shared session over a scene of a `SceneBuilder`, whose poses and vertices your program publishes.
 
     `set_pose`, `set_poses`, `set_joints`, `set_vertices` and `publish` may be called from any thread: a `publish` sends
-    everything that any thread has set before it. Call `start`, `close` and `signals` from one thread.
+    everything that any thread has set before it. Call `start`, `close` and `signals` from one thread. Methods that need
+    a running session raise `OwnershipError` before `start` and after `close`; inputs such as `marker` and
+    `start_episode` are queued as by `post`, and raise as it does.
 
     Args:
         scene: The scene. What is added to it after `start` is not shown.
@@ -164,9 +166,6 @@ class ScenePublisher(SessionBase):
         Args:
             seconds: Session time to run [s]; `None` for no limit.
             until: Called at 60 Hz; a true result ends the run. It may set poses and publish.
-
-        Raises:
-            OwnershipError: The session is not started, or closed.
         """
         loop = self._require_parts()[1]
         with self.signals():
@@ -191,7 +190,6 @@ class ScenePublisher(SessionBase):
 
         Raises:
             PublishError: No such body, or a value that cannot be used; nothing has changed.
-            OwnershipError: The session is not started, or closed.
         """
         self._require_parts()[0].set_pose(name, position, quaternion)
 
@@ -205,7 +203,6 @@ class ScenePublisher(SessionBase):
 
         Raises:
             PublishError: No such body, a name given twice, or a value that cannot be used; nothing has changed.
-            OwnershipError: The session is not started, or closed.
         """
         self._require_parts()[0].set_poses(names, positions, quaternions)
 
@@ -221,7 +218,6 @@ class ScenePublisher(SessionBase):
 
         Raises:
             PublishError: No such articulation or joint, or a value that cannot be used; nothing has changed.
-            OwnershipError: The session is not started, or closed.
         """
         self._require_parts()[0].set_joints(name, positions)
 
@@ -234,7 +230,6 @@ class ScenePublisher(SessionBase):
 
         Raises:
             PublishError: No such deformable, another shape, or a value that cannot be used; nothing has changed.
-            OwnershipError: The session is not started, or closed.
         """
         self._require_parts()[0].set_vertices(name, vertices)
 
@@ -252,7 +247,6 @@ class ScenePublisher(SessionBase):
 
         Raises:
             PublishError: A time that is out of range, out of order, or given only sometimes.
-            OwnershipError: The session is not started, or closed.
         """
         pending, loop = self._require_parts()
         loop.raise_if_ended()
@@ -276,11 +270,7 @@ class ScenePublisher(SessionBase):
             loop.offer(pending.make_frame(captured_ns, at_s, anew))
 
     def reset(self) -> None:
-        """Declare that the world is reset before the next `publish`, which begins a new `scene_epoch`.
-
-        Raises:
-            OwnershipError: The session is not started, or closed.
-        """
+        """Declare that the world is reset before the next `publish`, which begins a new `scene_epoch`."""
         self._require_parts()
         with self._order:
             self._anew = True
@@ -293,11 +283,7 @@ class ScenePublisher(SessionBase):
     # --- robots ------------------------------------------------------------------------------------------------------
 
     def driven_robots(self) -> tuple[str, ...]:
-        """Return the robots that a participant holds and has engaged: your program moves them to their `targets()`.
-
-        Raises:
-            OwnershipError: The session is not started, or closed.
-        """
+        """Return the robots that a participant holds and has engaged: your program moves them to their `targets()`."""
         loop = self._require_parts()[1]
         with loop.lock:
             return loop.core.driven
@@ -307,9 +293,6 @@ class ScenePublisher(SessionBase):
 
         Use those of `driven_robots()`; for other robots they are where the robot was when it was published last. They
         move with `publish`, at bounded speed, and lead the published tip by at most 5 cm and 0.25 rad.
-
-        Raises:
-            OwnershipError: The session is not started, or closed.
         """
         loop = self._require_parts()[1]
         with loop.lock:
@@ -318,9 +301,6 @@ class ScenePublisher(SessionBase):
     def grippers(self) -> dict[str, float]:
         """Return how far participants want grippers closed, 0 open to 1 closed, by robot. Those are missing that no
         participant has moved since the robot is driven.
-
-        Raises:
-            OwnershipError: The session is not started, or closed.
         """
         loop = self._require_parts()[1]
         with loop.lock:

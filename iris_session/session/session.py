@@ -98,7 +98,8 @@ _log = logging.getLogger(__name__)
 class Session(SessionBase):
     """A shared session over one MuJoCo model.
 
-    With `config.resume`, model, state, robots and objects come from the recording.
+    With `config.resume`, model, state, robots and objects come from the recording. Inputs such as `marker`, `pause` and
+    `start_episode` are queued as by `post`, and raise as it does.
 
     Args:
         model: An `MjModel`, or the path of an MJCF or MJB file.

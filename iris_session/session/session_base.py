@@ -122,9 +122,6 @@ class SessionBase:
 
         It ends the stops of all steps so far. When another comes before the next step, the session stays stopped;
         `status().stops` lists who has stopped it.
-
-        Raises:
-            OwnershipError: The queue of inputs is full, or the session is closed.
         """
         seen = 0 if self._stepper is None else self._stepper.core.authority.stop_seq
         self.post(ClearEStop(request_id=0, stop_seq=seen))
@@ -137,7 +134,6 @@ class SessionBase:
 
         Raises:
             ValueError: `text` is not a valid string.
-            OwnershipError: The queue of inputs is full, or the session is closed.
         """
         self.post(Marker(request_id=0, text=text))
 
@@ -152,19 +148,12 @@ class SessionBase:
         Args:
             label: Free text about it.
             countdown_s: Time until it is recorded, 0 to 60 [s]; `None` for 3.
-
-        Raises:
-            OwnershipError: The queue of inputs is full, or the session is closed.
         """
         countdown_ns = None if countdown_s is None else round(countdown_s * 1e9)
         self.post(Episode(0, EpisodeAction.START, label, countdown_ns))
 
     def end_episode(self, verdict: str = EpisodeAction.SUCCESS) -> None:
-        """Give the verdict of the episode: `success`, `failure` or `unknown`; `stop` lets robots hold until it comes.
-
-        Raises:
-            OwnershipError: The queue of inputs is full, or the session is closed.
-        """
+        """Give the verdict of the episode: `success`, `failure`, `unknown`; `stop` lets robots hold until it comes."""
         self.post(Episode(0, verdict))
 
     def discard_episode(self, *, again: bool = False) -> None:
@@ -172,18 +161,11 @@ class SessionBase:
 
         Args:
             again: Count down to the same number again.
-
-        Raises:
-            OwnershipError: The queue of inputs is full, or the session is closed.
         """
         self.post(Episode(0, EpisodeAction.RERECORD if again else EpisodeAction.DISCARD))
 
     def take_over_episode(self) -> None:
-        """Lead the episode from the next step on, instead of a participant.
-
-        Raises:
-            OwnershipError: The queue of inputs is full, or the session is closed.
-        """
+        """Lead the episode from the next step on, instead of a participant."""
         self.post(Episode(0, EpisodeAction.TAKE_OVER))
 
     def poll_requests(self) -> list[OwnerRequest]:

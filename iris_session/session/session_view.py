@@ -160,12 +160,7 @@ class SessionView:
     def make_participant_reports(
         self, now_ns: int, alignments: Mapping[str, AlignmentReport] = MappingProxyType({})
     ) -> tuple[ParticipantReport, ...]:
-        """Return the authority's part of the participants in a `StatusReport`.
-
-        Args:
-            now_ns: Session time.
-            alignments: By participant id.
-        """
+        """Return the authority's part of the participants in a `StatusReport`; `alignments` by participant id."""
         held: defaultdict[str, list[str]] = defaultdict(list)
         waits: defaultdict[str, list[str]] = defaultdict(list)
         for lease in self.mirror.leases.values():

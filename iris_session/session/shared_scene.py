@@ -123,8 +123,7 @@ class SharedScenes:
         """Make specification and assets of a scene. Slow for a model that was never shared before. From any thread.
 
         Args:
-            world: The world of the scene.
-            initial_state: `mjSTATE_INTEGRATION` of its first state; empty for the model's own.
+            world, initial_state: Of the scene; `mjSTATE_INTEGRATION`, empty for the model's own.
             patches: Patches since then, so that a resumed session shows what it showed.
             shown: What clients see of the model; `None` for what they see of every one.
         """

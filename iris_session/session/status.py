@@ -167,11 +167,7 @@ class StatusReporter:
     ) -> StatusReport:
         """Return the authority's half of a report, once a second; fields of the front keep their defaults.
 
-        Args:
-            stepper: Of the session.
-            recorder: How the recording does.
-            sizes: Edges of the printed sheets [m], where known.
-            given: Other fields.
+        `sizes`: edges of the printed sheets [m], where known; `given`: other fields.
         """
         pacer, times, core, now_ns = self.pacer, self.times, stepper.core, stepper.clock()
         stats = None if pacer is None else pacer.get_stats(now_ns)

@@ -45,10 +45,7 @@ USUAL_WEIGHT: Final = 0.05
 class TickTimes:
     """Measures one pacing loop with ticks of `period_ns`, from the thread that takes them.
 
-    Args:
-        period_ns: Period of a tick.
-        clock: Returns session time [ns].
-        delayed: Returns how long the thread was ready and did not run so far [ns]; the default asks the system.
+    `delayed` returns how long the thread was ready and did not run so far [ns]; the default asks the system.
     """
 
     def __init__(self, period_ns: int, clock: Callable[[], int], delayed: Callable[[], int] | None = None) -> None:

@@ -208,12 +208,7 @@ class UserLoop:
         return self._stepper.clock()
 
     def note_step(self, began_ns: int, began_time: float) -> None:
-        """Note a step of the program during which the session drove nothing.
-
-        Args:
-            began_ns: Session time at which it began.
-            began_time: Time of the data then [s].
-        """
+        """Note a step of the program during which the session drove nothing: its begin in session and data time [s]."""
         time = float(self._data.time)
         if began_time < self._last_time or time < began_time:
             self.reset()
@@ -308,11 +303,8 @@ class UserLoop:
     ) -> None:
         """Go on with another model and data, which is a reset: the owner's program has built its world anew.
 
-        Args:
-            model: The model from now on.
-            data: The data from now on.
-            prepare: Makes the new scene from the state of `data`, and `None` when it is the present one. It takes long,
-                and steps without ticks go on meanwhile.
+        `prepare` makes the new scene from the state of `data`, and `None` when it is the present one. It takes long,
+        and steps without ticks go on meanwhile.
         """
         plant = read_plant_state(model, data)
         scene = prepare(plant)

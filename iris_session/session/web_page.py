@@ -68,11 +68,10 @@ class WebPage:
         self.certificate: Certificate | None = None
 
     def start(self, ports: Ports, asset_root: str) -> list[str]:
-        """Let the process start with the first connection. Return notes for people about where the page is.
+        """Let the process start with the first connection; the front listens at `ports`.
 
-        Args:
-            ports: Of the front, which listens.
-            asset_root: Folder of the session's asset store.
+        Returns:
+            Notes for people about where the page is.
 
         Raises:
             StartError: The certificate that was given cannot be used.
