@@ -175,7 +175,7 @@ class RobotEntries(NamedTuple):
 
 
 class TipEntries:
-    """Entries that move a frame of the end effector.
+    """`ArmEntries` that move a frame of the end effector.
 
     Args:
         at: Places of x, y, z and, where they turn the frame, of a rotation vector or of the yaw alone.
@@ -205,13 +205,11 @@ class TipEntries:
         self._read_axes, self._read_goal, self._speeds = read_axes, read_goal, absolute_speeds
 
     def read_commanded(self, before: Floats | None) -> PoseTuple:
-        """See `ArmEntries`."""
         if self._speeds is not None and before is not None:
             return self._decode(before)
         return self.read_pose() if self._read_goal is None else self._read_goal()
 
     def write(self, action: Floats, before: Floats | None, T_world_frame: PoseTuple, period: float) -> None:
-        """See `ArmEntries`."""
         now = self.read_commanded(before)
         if self._speeds is not None:
             T = step_toward(now, T_world_frame, self._speeds[0] * period + 1e-9, self._speeds[1] * period + 1e-9)
@@ -227,7 +225,6 @@ class TipEntries:
         action[self.at] = entries
 
     def return_to(self, action: Floats, before: Floats, period: float) -> bool:
-        """See `ArmEntries`."""
         if self._speeds is None:
             return True
         theirs = self._decode(action)
@@ -255,7 +252,7 @@ class TipEntries:
 
 
 class JointEntries:
-    """Entries that are joint positions, `entry = q * scale + offset`, or ways to them, `entry = way * scale`.
+    """`ArmEntries` that are joint positions, `entry = q * scale + offset`, or ways to them, `entry = way * scale`.
 
     Args:
         robot, simulation: Whose joints they are.
@@ -301,17 +298,14 @@ class JointEntries:
         self._rest = self._q = self._measure()
 
     def read_pose(self) -> PoseTuple:
-        """See `ArmEntries`."""
         return self._tip.read_pose(self._data)
 
     def read_commanded(self, before: Floats | None) -> PoseTuple:
-        """See `ArmEntries`."""
         self._q = self._measure() if before is None or self._is_way else self._decode(before)
         self._rest = self._q.copy()
         return compose(self._read_root(), self._arm.forward_kinematics(self._q))
 
     def write(self, action: Floats, before: Floats | None, T_world_frame: PoseTuple, period: float) -> None:
-        """See `ArmEntries`."""
         start = self._q if before is None or self._is_way else self._decode(before)
         most = self._speed * period
         # A joint outside its range may stay there, and may come back; it is never thrown back.
@@ -328,7 +322,6 @@ class JointEntries:
         action[self.at] = (q - now) * self._scale if self._is_way else q * self._scale + self._offset
 
     def return_to(self, action: Floats, before: Floats, period: float) -> bool:
-        """See `ArmEntries`."""
         if self._is_way:
             return True
         most = np.abs(self._scale) * self._speed * period

@@ -94,6 +94,7 @@ class SessionProcesses:
         published: The scene of `core` where it cannot be read off its model.
 
     Attributes:
+        address: `host:port` of the control channel; it stays the same when the front is replaced.
         name: Name of the session; with a number where another session on the network has the configured one.
         notes: Messages for people about how the session started, one line each.
     """
@@ -129,7 +130,7 @@ class SessionProcesses:
         self._deformables: DeformableStreams | None = None
         self.reporter = StatusReporter()
         self._next_supervise_ns = 0
-        self._address = ""
+        self.address = ""
         self._overflows: dict[str, int] = {}  # contacts that MuJoCo had no room for
         self._world_overflows: dict[str, int] = {}  # the same since the world was reset
         self._dropped: set[str] = set()  # reasons that were logged
@@ -179,17 +180,17 @@ class SessionProcesses:
                 wait_for_free_ports(self._config)
             ports = self.front.start()
             self._save_resume_note()
-            self._address = f"{ports.host}:{ports.control}"
+            self.address = f"{ports.host}:{ports.control}"
             reachable = [f"{host_in_address(host)}:{ports.control}" for host in ports.reachable]
             if ports.key_fingerprint:
                 how = "keys in that folder join" if self._config.curve_clients else "new devices: `iris-session pair`"
                 self.notes.append(f"encrypted, key {ports.key_fingerprint}; {how}")
-            if reachable != [self._address]:
+            if reachable != [self.address]:
                 self.notes.append(f"others reach it at {', '.join(reachable)}")
             self.notes += self.web.start(ports, self.scenes.asset_root)
             self.notes += self.cameras.start(ports)
             self.reporter.warning_sources += [self.cameras.list_warnings, lambda: self.scenes.advice]
-            _log.info("session %r on %s, recording: %s", self.name, self._address, self.recording or "none")
+            _log.info("session %r on %s, recording: %s", self.name, self.address, self.recording or "none")
         except (FrontError, RecordingError) as error:
             self.close()
             raise StartError(str(error)) from None  # the text says it all
@@ -240,11 +241,6 @@ class SessionProcesses:
             recorder_media_endpoint="" if self.recorder is None else self.recorder.media_endpoint,
             record_clouds_hz=config.record_clouds_hz,
         )
-
-    @property
-    def address(self) -> str:
-        """`host:port` of the control channel; it stays the same when the front is replaced."""
-        return self._address
 
     @property
     def front_ports(self) -> Ports:

@@ -88,8 +88,26 @@ class SessionBase:
         SIGHUP stays ignored where it was (`nohup`). A second Ctrl-C raises `KeyboardInterrupt`. In another thread than
         the main one the context does nothing.
         """
-        with stop_on_signals(self._stop):
+        if threading.current_thread() is not threading.main_thread():
             yield
+            return
+
+        def on_signal(number: int, _: FrameType | None) -> None:
+            if self._stop.is_set() and number == signal.SIGINT:
+                raise KeyboardInterrupt  # the second Ctrl-C interrupts at once
+            if number == signal.SIGHUP:
+                _leave_terminal()
+            self._stop.set()
+
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            numbers.append(signal.SIGHUP)
+        previous = {s: signal.signal(s, on_signal) for s in numbers}
+        try:
+            yield
+        finally:
+            for s, handler in previous.items():
+                signal.signal(s, handler)
 
     # --- inputs of the owner -----------------------------------------------------------------------------------------
 
@@ -338,34 +356,6 @@ class SessionBase:
             name = type(self).__name__
             raise OwnershipError(f"the session is not started: use `with {name}(...) as session`, or session.start()")
         return self._processes
-
-
-@contextmanager
-def stop_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Set `stop` on SIGINT, SIGTERM and SIGHUP; a SIGINT after that raises `KeyboardInterrupt`. Main thread only.
-
-    SIGHUP: the terminal was closed, or the connection to it. Where it is ignored (`nohup`), it stays so.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def on_signal(number: int, _: FrameType | None) -> None:
-        if stop.is_set() and number == signal.SIGINT:
-            raise KeyboardInterrupt  # the second Ctrl-C interrupts at once
-        if number == signal.SIGHUP:
-            _leave_terminal()
-        stop.set()
-
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
-    previous = {s: signal.signal(s, on_signal) for s in numbers}
-    try:
-        yield
-    finally:
-        for s, handler in previous.items():
-            signal.signal(s, handler)
 
 
 def _leave_terminal() -> None:

@@ -118,6 +118,7 @@ class UserLoop:
     `lock` is held while a step is taken; hold it to read what steps change.
 
     Attributes:
+        model, data: That the user advances now.
         fault: What is not finite in the user's data now, `None` while all is well.
         overwritten: Rounds in which the owner has changed what the session had written, between the two ends of it.
         is_attached: The loop is driven by the wrapped step of its data, so no time should pass outside of rounds.
@@ -158,7 +159,7 @@ class UserLoop:
         self._helper.start()
 
     def _use(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self._model, self._data = model, data
+        self.model, self.data = model, data
         scene = self._stepper.core.scene
         self._objects = {spec.name: int(model.body(spec.body).id) for spec in scene.objects}
         self._joints = {
@@ -171,16 +172,6 @@ class UserLoop:
         self._forces_at = mujoco.mj_stateSize(model, STATE & (_XFRC - 1))
         self._noted.clear()
         self._left: dict[str, Floats] = {}  # joints of driven robots after the newest round in which time passed
-
-    @property
-    def data(self) -> mujoco.MjData:
-        """The data that the user advances now."""
-        return self._data
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """The model of `data`."""
-        return self._model
 
     @property
     def is_driving(self) -> bool:
@@ -209,7 +200,7 @@ class UserLoop:
 
     def note_step(self, began_ns: int, began_time: float) -> None:
         """Note a step of the program during which the session drove nothing: its begin in session and data time [s]."""
-        time = float(self._data.time)
+        time = float(self.data.time)
         if began_time < self._last_time or time < began_time:
             self.reset()
         elif self._last_time >= 0.0:
@@ -232,7 +223,7 @@ class UserLoop:
                 self._show_reset()
             return
         state = np.empty(self._state_size)
-        mujoco.mj_getState(self._model, self._data, state, STATE)
+        mujoco.mj_getState(self.model, self.data, state, STATE)
         self._noted.append(state)
         # A step of the idle helper has shown the state before this one once more: this one does not wait for its turn.
         if self._has_idled or self._stepper.is_state_due(self._last_tick_ns):
@@ -260,17 +251,17 @@ class UserLoop:
             if self._in_tick:
                 self._finish_tick()
             self._in_tick = True
-            passed = float(self._data.time) - self._last_time if self._last_time >= 0.0 else 0.0
+            passed = float(self.data.time) - self._last_time if self._last_time >= 0.0 else 0.0
             self.unseen_s += max(0.0, passed)
             self._detect_reset()
             if passed == 0.0:
                 self._detect_move()
             self._post_gap()
-            self._ctrl.read(self._data.ctrl)
-            self._forces.read(self._data.xfrc_applied)
+            self._ctrl.read(self.data.ctrl)
+            self._forces.read(self.data.xfrc_applied)
             if not self._read_plant():
                 self._step(0, self._plant)
-                self._ctrl.put_written(self._data.ctrl)
+                self._ctrl.put_written(self.data.ctrl)
                 return
             self._post_reset()
             counted = self._count_ticks()
@@ -310,10 +301,10 @@ class UserLoop:
         scene = prepare(plant)
         with self.lock:
             self._in_tick = False
-            self._ctrl.read(self._data.ctrl)
-            self._ctrl.put_owner(self._data.ctrl)
-            self._forces.read(self._data.xfrc_applied)
-            self._forces.put_owner(self._data.xfrc_applied)
+            self._ctrl.read(self.data.ctrl)
+            self._ctrl.put_owner(self.data.ctrl)
+            self._forces.read(self.data.xfrc_applied)
+            self._forces.put_owner(self.data.xfrc_applied)
             if scene is None:
                 self.reset()
                 self._use(model, data)
@@ -337,12 +328,12 @@ class UserLoop:
         if self._helper is not threading.current_thread():
             self._helper.join(timeout=2.0)
         with self.lock:
-            self._ctrl.read(self._data.ctrl)
-            self._forces.read(self._data.xfrc_applied)
+            self._ctrl.read(self.data.ctrl)
+            self._forces.read(self.data.xfrc_applied)
             if (self._ctrl.indices.size or self._forces.indices.size) and self._read_plant():
                 self._stepper.core.write_rest_controls(self._plant)
                 self._write_controls()
-            self._ctrl, self._forces = _BorrowedArray(self._data.ctrl), _BorrowedArray(self._data.xfrc_applied)
+            self._ctrl, self._forces = _BorrowedArray(self.data.ctrl), _BorrowedArray(self.data.xfrc_applied)
             self._drives = False
 
     def end(self, error: Exception) -> None:
@@ -359,7 +350,7 @@ class UserLoop:
                 "begin_tick(), and not in a control callback"
             )
         # A loop of which nothing is seen has begun no round.
-        unseen_s = self.unseen_s + (float(self._data.time) if self._last_time < 0.0 else 0.0)
+        unseen_s = self.unseen_s + (float(self.data.time) if self._last_time < 0.0 else 0.0)
         if self.is_attached and unseen_s > UNSEEN_S:
             found.append(
                 f"{unseen_s:.1f} s were simulated outside of the session's ticks: share the environment, as share(env)"
@@ -374,11 +365,11 @@ class UserLoop:
     def _finish_tick(self) -> bool:
         """Publish the state after a tick; return whether it is one after time went back."""
         self._in_tick = False
-        if self._ctrl.is_overwritten(self._data.ctrl):
+        if self._ctrl.is_overwritten(self.data.ctrl):
             self.overwritten += 1
-        passed = self._last_time < self._data.time
+        passed = self._last_time < self.data.time
         went_back = self._detect_reset()
-        self._left = {name: self._data.qpos[self._joints[name]] for name in self.driven} if passed else {}
+        self._left = {name: self.data.qpos[self._joints[name]] for name in self.driven} if passed else {}
         good = self._read_plant()
         # The epoch of a state after a reset is that of the next step.
         if good and not self._was_reset and self._stepper.is_state_due(self._stepper.clock()):
@@ -397,20 +388,20 @@ class UserLoop:
         """Write `ctrl` of driven robots and wrenches on held objects; give back what is neither any more."""
         core = self._stepper.core
         assert core.sharing is not None
-        self._ctrl.write(self._data.ctrl, core.sharing.actuators, core.world.ctrl)
+        self._ctrl.write(self.data.ctrl, core.sharing.actuators, core.world.ctrl)
         held = np.array([self._objects[name] for name in core.controller.list_held_objects()], np.intp)
-        self._forces.write(self._data.xfrc_applied, held, core.world.data.xfrc_applied)
+        self._forces.write(self.data.xfrc_applied, held, core.world.data.xfrc_applied)
 
     def _count_ticks(self) -> int:
         """Return for how many ticks of the model this round counts: as many as the last round took, at most as many as
         the round before it, so that a single long round makes no leap."""
-        began, self._began_time = self._began_time, float(self._data.time)
+        began, self._began_time = self._began_time, float(self.data.time)
         if began is None:
             self._ticks_before = 0
             return 1
-        ticks = max(1, round((self._began_time - began) / float(self._model.opt.timestep)))
+        ticks = max(1, round((self._began_time - began) / float(self.model.opt.timestep)))
         before, self._ticks_before = self._ticks_before, ticks
-        most = min(MAX_TICKS, max(1, int(MAX_ROUND_S / float(self._model.opt.timestep))))
+        most = min(MAX_TICKS, max(1, int(MAX_ROUND_S / float(self.model.opt.timestep))))
         return min(most, ticks, before or ticks)
 
     def _post_gap(self) -> None:
@@ -427,10 +418,10 @@ class UserLoop:
 
     def _detect_reset(self) -> bool:
         """Return whether time went back, which is a reset: by the user between ticks, or by MuJoCo within `mj_step`."""
-        went_back = bool(self._data.time < self._last_time)
+        went_back = bool(self.data.time < self._last_time)
         if went_back:
             self.reset()
-        self._last_time = float(self._data.time)
+        self._last_time = float(self.data.time)
         return went_back
 
     def _detect_move(self) -> None:
@@ -440,16 +431,16 @@ class UserLoop:
         """
         if self._left and not self._was_reset:
             for name, left in self._left.items():
-                if not np.allclose(self._data.qpos[self._joints[name]], left, rtol=0.0, atol=MOVED):
+                if not np.allclose(self.data.qpos[self._joints[name]], left, rtol=0.0, atol=MOVED):
                     self.reset()
 
     def _read_plant(self) -> bool:
         """Read the user's state with the owner's inputs; return False, and announce it once, while it is not finite."""
         state = np.empty(self._state_size)
-        mujoco.mj_getState(self._model, self._data, state, STATE)
+        mujoco.mj_getState(self.model, self.data, state, STATE)
         self._noted.clear()
-        self._ctrl.put_owner(state[self._ctrl_at :][: self._model.nu])
-        self._forces.put_owner(state[self._forces_at :][: 6 * self._model.nbody].reshape(-1, 6))
+        self._ctrl.put_owner(state[self._ctrl_at :][: self.model.nu])
+        self._forces.put_owner(state[self._forces_at :][: 6 * self.model.nbody].reshape(-1, 6))
         return self._accept(state)
 
     def _accept(self, state: Floats) -> bool:
@@ -471,8 +462,8 @@ class UserLoop:
         """Return the arrays of a state that are not finite."""
         found = []
         for name, part in _FIELDS.items():
-            begin = mujoco.mj_stateSize(self._model, STATE & (part - 1))
-            if not np.isfinite(state[begin:][: mujoco.mj_stateSize(self._model, part)]).all():
+            begin = mujoco.mj_stateSize(self.model, STATE & (part - 1))
+            if not np.isfinite(state[begin:][: mujoco.mj_stateSize(self.model, part)]).all():
                 found.append(name)
         return tuple(found) or ("plugin_state",)
 
