@@ -62,14 +62,10 @@ OWN_REFERENCES: Final = 3
 #: Share of the bodies of two models, by name, that must be the same.
 ALIKE: Final = 0.5
 
-#: Results of an environment's step that end with `info`: of Gymnasium, and of Gym and robosuite.
-INFO_LENGTHS: Final = (5, 4)
-
 _log = logging.getLogger(__name__)
 
 _lock = threading.RLock()
 _originals: Final[dict[str, Callable[..., None]]] = {name: getattr(mujoco, name) for name in STEP_FUNCTIONS}
-_wrappers: Final[dict[str, Callable[..., None]]] = {}
 #: By the identity of their data, which the loop keeps alive.
 _loops: Final[dict[int, Attachment]] = {}
 
@@ -81,27 +77,23 @@ def _find_loop(model: Any, data: Any) -> Attachment | None:
     return loop
 
 
-def _make_wrappers() -> None:
-    step, step2 = _originals["mj_step"], _originals["mj_step2"]
-
-    @functools.wraps(step)
-    def mj_step(m: Any, d: Any, nstep: int = 1) -> None:
-        loop = _find_loop(m, d)
-        if loop is None:
-            return step(m, d, nstep)
-        for _ in range(nstep):
-            loop.step(m, d, step)
-        return None
-
-    @functools.wraps(step2)
-    def mj_step2(m: Any, d: Any) -> None:
-        loop = _find_loop(m, d)
-        return step2(m, d) if loop is None else loop.step(m, d, step2)
-
-    _wrappers.update(mj_step=mj_step, mj_step2=mj_step2)
+@functools.wraps(_originals["mj_step"])
+def _mj_step(m: Any, d: Any, nstep: int = 1) -> None:
+    loop = _find_loop(m, d)
+    if loop is None:
+        return _originals["mj_step"](m, d, nstep)
+    for _ in range(nstep):
+        loop.step(m, d, _originals["mj_step"])
+    return None
 
 
-_make_wrappers()
+@functools.wraps(_originals["mj_step2"])
+def _mj_step2(m: Any, d: Any) -> None:
+    loop = _find_loop(m, d)
+    return _originals["mj_step2"](m, d) if loop is None else loop.step(m, d, _originals["mj_step2"])
+
+
+_wrappers: Final[dict[str, Callable[..., None]]] = {"mj_step": _mj_step, "mj_step2": _mj_step2}
 
 
 def require_free(data: Any) -> None:
@@ -329,19 +321,14 @@ class Attachment:
         self.follow_environment()
         if self._is_stepping or self._environment_began_ns is not None:
             return original()
-        result = self._take_reported_step(original)
-        self._unless_ended(lambda: self.on_environment(False))
-        return result
-
-    def _take_reported_step(self, original: Callable[[], Any]) -> Any:
-        if self._list_interventions is None:
-            return self._take_environment_step(original)
-        driven = self._loop.driven
+        before = self._loop.driven
         result = self._take_environment_step(original)
-        driven = self._list_interventions((*driven, *self._loop.driven))
-        if type(result) is tuple and len(result) in INFO_LENGTHS and isinstance(result[-1], dict):
-            info = {**result[-1], "intervention": driven}
-            result = (*result[:-1], info)
+        # Results end with `info` in Gymnasium (5), and in Gym and robosuite (4).
+        has_info = type(result) is tuple and len(result) in (4, 5) and isinstance(result[-1], dict)
+        if has_info and self._list_interventions is not None:
+            driven = self._list_interventions((*before, *self._loop.driven))
+            result = (*result[:-1], {**result[-1], "intervention": driven})
+        self._unless_ended(lambda: self.on_environment(False))
         return result
 
     def _take_environment_step(self, original: Callable[[], Any]) -> Any:

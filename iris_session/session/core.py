@@ -192,8 +192,11 @@ class SessionCore:
         for _ in range(0 if world.diverged else n_ticks):
             self.controller.tick(world.data, is_crowded)
             lap(LateCause.CONTROL)
-            if not plant and not self._tick():
-                break
+            if not plant:
+                try:
+                    world.tick()
+                except SimulationDivergedError:  # physics stands still until a reset
+                    break
             lap(LateCause.PHYSICS)
         if self.sharing is not None and n_ticks:
             self.sharing.apply(world.ctrl, owner_ctrl, n_ticks, estop=decision.estop)
@@ -219,14 +222,6 @@ class SessionCore:
         self.controller.write_rest(self.world.data)
         if self.sharing is not None:
             self.sharing.restore_owner_ctrl(self.world.ctrl, owner_ctrl)
-
-    def _tick(self) -> bool:
-        """Advance physics by a tick; False when the state is no longer finite: physics stands still until a reset."""
-        try:
-            self.world.tick()
-        except SimulationDivergedError:
-            return False
-        return True
 
     def _reset_world(self) -> None:
         self.world.reset()

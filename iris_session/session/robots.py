@@ -190,13 +190,9 @@ def _read_choice(model: mujoco.MjModel, choice: RobotChoice) -> Sequence[RobotSp
     assert choice is not None
     if isinstance(choice, str) and choice == NONE:
         return ()
-    if isinstance(choice, Path) or (isinstance(choice, str) and _is_file(choice)):
-        return load_robots_toml(Path(choice), model)
-    return [name.strip() for name in choice.split(",")] if isinstance(choice, str) else tuple(choice)
-
-
-def _is_file(text: str) -> bool:
-    return text.endswith(".toml") or os.path.isfile(os.path.expanduser(text))
+    if isinstance(choice, str) and not (choice.endswith(".toml") or os.path.isfile(os.path.expanduser(choice))):
+        return [name.strip() for name in choice.split(",")]
+    return load_robots_toml(Path(choice), model) if isinstance(choice, str | Path) else tuple(choice)
 
 
 def _find_all(model: mujoco.MjModel, control: ControlConfig) -> tuple[dict[str, RobotSpec], dict[str, RobotNotice]]:
