@@ -53,8 +53,8 @@ class Rig:
         self.data = mujoco.MjData(self.model)
         if self.model.nkey:
             mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
-        self.front, self.recorder = Front(), Recorder()
         core = make_core(self.model, control, user_owned_loop=True)
+        self.front, self.recorder = Front(), Recorder(core)
         self.stepper = Stepper(core, self.front, self.recorder, lambda: self.now_ns, MS, 1000 * MS, b"root")
         self.read: list[tuple[int, Entry, bytes]] = []  # step, entry and the plant of that step
         self.stepper.on_entries = self._note

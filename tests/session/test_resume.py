@@ -48,8 +48,9 @@ from iris_session.session.stepper import ResumedFrom, Stepper
 from iris_session.session.verification import verify_recording
 from tests.recording.support import write
 from tests.replay.support import keyframe_of, make_header
+from tests.rig.journal import Journal
 from tests.session.play import ANN, TICK_NS, entries, host, make_core, play
-from tests.session.test_stepper import Front, Recorder
+from tests.session.test_stepper import Front
 
 STEPS = 100
 KEYFRAMES = (39, 79)
@@ -335,11 +336,11 @@ def test_session_time_after_a_reboot_continues_above_recorded_times(tmp_path: Pa
 # --- the first steps --------------------------------------------------------------------------------------------------
 
 
-class Journal(Recorder):
+class SealedJournal(Journal):
     """Keeps what a recorder would write, ready for a file."""
 
     def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
-        self.keyframes.append(seal_keyframe(keyframe, chain))
+        super().add_keyframe(seal_keyframe(keyframe, chain), chain)
 
 
 @pytest.fixture
@@ -353,7 +354,7 @@ def gone_on(session: Path) -> tuple[Stepper, Front, Path]:
         return now_ns[0]
 
     header = msgspec.structs.replace(past.header, continues=past.continues)
-    front, journal = Front(STEPS), Journal()
+    front, journal = Front(STEPS), SealedJournal(past.core.config, b"")
     stepper = Stepper(
         past.core, front, journal, clock, 10**9, 10**10, header_root(header), ResumedFrom(past.step, past.now_ns)
     )  # fmt: skip

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from iris_session.journal.rows import CRASHED, JournalRow, Keyframe, check_row
+from iris_session.journal.rows import CRASHED, Keyframe, check_row
 from iris_session.link import messages as link_messages
 from iris_session.protocol.client_messages import Assign, EStop, Marker
 from iris_session.protocol.entries import HOST, Entry, ExternalReset, RecordingGap, decode_entries
-from iris_session.protocol.server_messages import BodyInfo, RobotState, StateHeader
+from iris_session.protocol.server_messages import RobotState, StateHeader
 from iris_session.protocol.steps import Decision
+from iris_session.session.core import SessionCore
 from iris_session.session.errors import OwnershipError
 from iris_session.session.stepper import MAX_HOST_ENTRIES, RESERVED_HOST_ENTRIES, Stepper
+from tests.rig.journal import Journal
 from tests.session.play import TICK_NS, entries, make_core
 
 MS = 1_000_000
@@ -46,42 +48,24 @@ class Front:
         self.states.append(header)
 
 
-class Recorder:
-    """Keeps what is recorded; loses `gap` rows once."""
+class Recorder(Journal):
+    """A journal that knows when states were recorded; loses `gap` rows once."""
 
-    def __init__(self) -> None:
-        self.wants_keyframe = False
-        self.gap = 0
-        self.rows: list[JournalRow] = []
-        self.keyframes: list[Keyframe] = []
-        self.states = 0
+    def __init__(self, core: SessionCore) -> None:
+        super().__init__(core.config, core.world.encode_model())
+        self.gap = self.flushed = 0
         self.state_times: list[int] = []
-        self.scenes: list[tuple[int, str]] = []  # rows before it, hash
-
-    def send_scene(self, model_hash: str, packed_model: bytes, bodies: tuple[BodyInfo, ...], *_: Any) -> None:
-        assert packed_model
-        assert bodies
-        self.scenes.append((len(self.rows), model_hash))
-
-    def send_patch(self, root: str, scene_hash: str) -> None: ...
-
-    def add_row(self, row: JournalRow) -> None:
-        self.rows.append(row)
 
     def flush(self) -> None:
         self.flushed = len(self.rows)
 
     def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
         assert chain == (self.rows[-1].chain if self.rows else b"root")
-        self.keyframes.append(keyframe)
+        super().add_keyframe(keyframe, chain)
 
-    def add_state(self, step: int, tick: int, sim_time: float, session_time: int, *_: Any) -> None:
-        self.states += 1
+    def add_state(self, step: int, tick: int, sim_time: float, session_time: int, *_: Any) -> bool:
         self.state_times.append(session_time)
-
-    def add_decision(self, *_: Any) -> None: ...
-
-    def add_metric(self, *_: Any) -> None: ...
+        return True
 
     def take_gap(self) -> int:
         gap, self.gap = self.gap, 0
@@ -93,9 +77,10 @@ class Rig:
 
     def __init__(self, state_ms: float = 16.0, keyframe_ms: float = 100.0) -> None:
         self.now_ns = 0
-        self.front, self.recorder = Front(), Recorder()
+        core = make_core()
+        self.front, self.recorder = Front(), Recorder(core)
         self.stepper = Stepper(
-            make_core(),
+            core,
             self.front,
             self.recorder,
             lambda: self.now_ns,
@@ -172,7 +157,7 @@ def test_session_time_grows_although_the_clock_stands_still(rig: Rig) -> None:
 def test_state_keeps_its_rate_without_bursts_after_a_gap(rig: Rig) -> None:
     rig.steps(400)  # 0.8 s
     assert len(rig.front.states) == pytest.approx(0.8 / 0.016, abs=1)
-    assert rig.recorder.states == len(rig.front.states)
+    assert len(rig.recorder.state_times) == len(rig.front.states)
     before = len(rig.front.states)
     rig.now_ns += 3_000 * MS
     rig.steps(8)  # 16 ms
