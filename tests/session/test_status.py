@@ -28,24 +28,12 @@ from iris_session.session.status import (
 )
 from iris_session.session.stepper import Stepper
 from tests.session.play import TICK_NS, entries, host, make_core
-from tests.session.test_stepper import Front
+from tests.session.test_stepper import Front, Rig
 
 BOB = 2
 
 
-class Session:
-    """A stepper whose clock moves by a tick per step, in front of ports that keep what they are given."""
-
-    def __init__(self) -> None:
-        self.now_ns = 0
-        self.front = Front()
-        self.stepper = Stepper(make_core(), self.front, None, lambda: self.now_ns, 16_000_000, 5_000_000_000)
-
-    def step(self, *arrived: Entry) -> None:
-        self.now_ns += TICK_NS
-        self.front.waiting = list(arrived)
-        self.stepper.step(1)
-
+class Session(Rig):
     def people(self) -> dict[str, ParticipantReport]:
         return {row.name: row for row in self.stepper.view.make_participant_reports(self.now_ns)}
 

@@ -75,25 +75,22 @@ class Recorder(Journal):
 class Rig:
     """A stepper whose clock the test moves."""
 
-    def __init__(self, state_ms: float = 16.0, keyframe_ms: float = 100.0) -> None:
+    def __init__(self, core: SessionCore | None = None) -> None:
         self.now_ns = 0
-        core = make_core()
-        self.front, self.recorder = Front(), Recorder(core)
+        self.core = core or make_core()
+        self.front, self.recorder = Front(), Recorder(self.core)
         self.stepper = Stepper(
-            core,
-            self.front,
-            self.recorder,
-            lambda: self.now_ns,
-            round(state_ms * MS),
-            round(keyframe_ms * MS),
-            b"root",
-        )
+            self.core, self.front, self.recorder, lambda: self.now_ns, 16 * MS, 100 * MS, b"root"
+        )  # fmt: skip
+
+    def step(self, *arrived: Entry, distance_ns: int = TICK_NS) -> None:
+        self.now_ns += distance_ns
+        self.front.waiting = list(arrived)
+        self.stepper.step(1)
 
     def steps(self, n: int, distance_ns: int = TICK_NS) -> None:
         for _ in range(n):
-            self.now_ns += distance_ns
-            self.front.waiting = entries(self.stepper.step_count)
-            self.stepper.step(1)
+            self.step(*entries(self.stepper.step_count), distance_ns=distance_ns)
 
 
 @pytest.fixture

@@ -18,7 +18,6 @@ from iris_session.protocol.specs import ObjectRange, TaskSpec
 from iris_session.session.config import SessionConfig
 from iris_session.session.core import make_session_core
 from iris_session.session.errors import ConfigError
-from iris_session.session.stepper import Stepper
 from iris_session.session.tasks import (
     PlacementError,
     TaskRunner,
@@ -27,8 +26,7 @@ from iris_session.session.tasks import (
     load_task,
     write_progress,
 )
-
-from .test_stepper import Front
+from tests.session.test_stepper import Rig
 
 POUR = """
 name = "swap"
@@ -152,24 +150,20 @@ def test_without_a_free_place_the_objects_are_named() -> None:
         draw_places(make_world(), b"", TaskSpec("swap", objects=(inside,)), 1)
 
 
-class Desk:
-    """A session of a task in steps of one tick, without a front."""
+class Desk(Rig):
+    """A session of a task in steps of one tick."""
 
     def __init__(self) -> None:
         model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
-        objects = find_objects(model)
+        objects, data = find_objects(model), mujoco.MjData(model)
         self.task = TaskSpec("swap", objects=(HAMMER, BOARD))
-        data = mujoco.MjData(model)
-        self.core = make_session_core(SessionConfig(), model, data, (), objects, user_owned=False, task=self.task)
-        self.now_ns = 0
-        self.stepper = Stepper(self.core, Front(), None, lambda: self.now_ns, 16_000_000, 100_000_000, b"root")
+        super().__init__(make_session_core(SessionConfig(), model, data, (), objects, user_owned=False, task=self.task))
 
-    def step(self, *messages: EntryMessage) -> str:
+    def say(self, *messages: EntryMessage) -> str:
         """Return the state of the episode after a step."""
         for message in messages:
             self.stepper.inputs.post_own(message)
-        self.now_ns += 2_000_000
-        self.stepper.step(1)
+        self.step()
         assert self.core.authority.episode is not None
         return self.core.authority.episode.state
 
@@ -181,10 +175,10 @@ class Desk:
 
 def test_a_session_that_ended_before_its_objects_were_placed_places_them_when_it_resumes() -> None:
     desk = Desk()
-    assert desk.step(ObjectsPlaced((), (), 1), Episode(0, "start", countdown_ns=0)) == "running"
-    assert desk.step(Episode(0, "success")) == "closing"
+    assert desk.say(ObjectsPlaced((), (), 1), Episode(0, "start", countdown_ns=0)) == "running"
+    assert desk.say(Episode(0, "success")) == "closing"
     runner = TaskRunner(desk.stepper, None, is_new=False)
-    assert desk.step() == "success"
+    assert desk.say() == "success"
     assert desk.is_placed(2)
     runner.close()
 
@@ -198,10 +192,10 @@ def test_an_episode_that_begins_beside_a_reset_has_its_own_places(order: str) ->
         "reset": Control(0, "reset"),
         "start": Episode(0, "start", countdown_ns=countdown_ns),
     }
-    desk.step()
-    states = [desk.step(*(words[word] for word in step.split())) for step in order.split(" | ")]
+    desk.say()
+    states = [desk.say(*(words[word] for word in step.split())) for step in order.split(" | ")]
     while states[-1] != "running":
-        states.append(desk.step())
+        states.append(desk.say())
     assert len(states) <= 3
     assert desk.is_placed(1)
     runner.close()
