@@ -13,14 +13,26 @@ import numpy as np
 import pytest
 
 import iris_session
-from anchors.pose import quat_angle, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
+from anchors.pose import (
+    PoseTuple,
+    Quat,
+    compose,
+    inverse,
+    quat_angle,
+    quat_conj,
+    quat_from_rotvec,
+    quat_mul,
+    quat_rotate,
+    quat_to_rotvec,
+)
 from iris_session import ConfigError, ControlConfig
-from iris_session.control.arm_model import ArmModel
+from iris_session.control.arm_model import ArmModel, read_site_pose
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import find_robots, load_model
 from iris_session.physics.tip import Tip
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import GripperActuator, RobotSpec
+from iris_session.session.action_entries import measure_way
 from iris_session.session.actions import ActionDrive
 from iris_session.session.attachment import Attachment
 from iris_session.session.user_loop import UserLoop
@@ -252,29 +264,29 @@ class Osc(World):
 
     def step(self, action: Any) -> tuple[Any, ...]:
         entries = np.clip(action, -1.0, 1.0)
-        R = self.data.site("base_center").xmat.reshape(3, 3)
-        frame = self.data.site("frame")
-        p, q = frame.xpos + R @ (0.05 * entries[:3]), np.empty(4)
-        mujoco.mju_mat2Quat(q, frame.xmat)
-        goal = quat_mul(quat_from_rotvec(tuple((R @ (0.5 * entries[3:6])).tolist())), tuple(q.tolist()))
-        self.current = float(np.clip(self.current + 0.2 * np.sign(entries[6]), -1.0, 1.0))
+        base, (p, q) = self.read_site("base_center")[1], self.read_site("frame")
+        way = np.array(quat_rotate(base, tuple((0.05 * entries[:3]).tolist())))
+        turn = quat_from_rotvec(quat_rotate(base, tuple((0.5 * entries[3:6]).tolist())))
+        self.move_gripper(entries[6])
+        return self.pull(p + way, quat_mul(turn, q))
+
+    def read_site(self, name: str) -> PoseTuple:
+        return read_site_pose(self.data, self.model.site(name).id)
+
+    def move_gripper(self, entry: float) -> None:
+        self.current = float(np.clip(self.current + 0.2 * np.sign(entry), -1.0, 1.0))
         self.data.ctrl[7] = 0.02 - 0.02 * self.current
+
+    def pull(self, p: Any, q: Quat) -> tuple[Any, ...]:
+        """Step towards a goal, half of the way in a tick, for soft servos."""
+        J, frame = np.zeros((6, self.model.nv)), self.model.site("frame").id
         for _ in range(FRAMES):
-            self._pull(p, np.array(goal))
+            e = measure_way(self.read_site("frame"), (tuple(p), q))
+            mujoco.mj_jacSite(self.model, self.data, J[:3], J[3:], frame)
+            A = J[:, :7]
+            self.data.ctrl[:7] = self.data.qpos[:7] + 0.5 * A.T @ np.linalg.solve(A @ A.T + 1e-4 * np.eye(6), e)
             mujoco.mj_step(self.model, self.data)
         return None, 0.0, False, {}
-
-    def _pull(self, p: np.ndarray, q: np.ndarray) -> None:
-        """Half of the way to a goal, for soft servos."""
-        J, e, now = np.zeros((6, self.model.nv)), np.empty(6), np.empty(4)
-        frame = self.data.site("frame")
-        mujoco.mju_mat2Quat(now, frame.xmat)
-        e[:3] = p - frame.xpos
-        mujoco.mju_subQuat(e[3:], q, now)
-        mujoco.mju_rotVecQuat(e[3:], e[3:].copy(), now)
-        mujoco.mj_jacSite(self.model, self.data, J[:3], J[3:], frame.id)
-        J = J[:, :7]
-        self.data.ctrl[:7] = self.data.qpos[:7] + 0.5 * J.T @ np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), e)
 
     def policy(self, t: float) -> np.ndarray:
         return np.array([0.3 * math.sin(3.0 * t), 0.0, 0.3 * math.cos(3.0 * t), 0.0, 0.0, 0.0, -1.0])
@@ -287,22 +299,13 @@ class OscAbsolute(Osc):
 
     def __init__(self) -> None:
         super().__init__()
-        base, frame, q = self.data.site("base_center"), self.data.site("frame"), np.empty(4)
-        R = base.xmat.reshape(3, 3)
-        mujoco.mju_mat2Quat(q, np.ravel(R.T @ frame.xmat.reshape(3, 3)))
-        turn = np.empty(3)
-        mujoco.mju_quat2Vel(turn, q, 1.0)
-        self.fixed = np.array([*(R.T @ (frame.xpos - base.xpos)), *turn, -1.0])
+        p, q = compose(inverse(self.read_site("base_center")), self.read_site("frame"))
+        self.fixed = np.array([*p, *quat_to_rotvec(q), -1.0])
 
     def step(self, action: Any) -> tuple[Any, ...]:
-        base, q = self.data.site("base_center"), np.empty(4)
-        mujoco.mju_mat2Quat(q, base.xmat)
-        p = base.xpos + base.xmat.reshape(3, 3) @ action[:3]
-        goal = np.array(quat_mul(tuple(q.tolist()), quat_from_rotvec(tuple(np.asarray(action[3:6]).tolist()))))
-        for _ in range(FRAMES):
-            self._pull(p, goal)
-            mujoco.mj_step(self.model, self.data)
-        return None, 0.0, False, {}
+        x, y, z, *turn = np.asarray(action)[:6].tolist()
+        goal = ((x, y, z), quat_from_rotvec((turn[0], turn[1], turn[2])))
+        return self.pull(*compose(self.read_site("base_center"), goal))
 
     def policy(self, t: float) -> np.ndarray:
         return self.fixed
@@ -375,25 +378,16 @@ class OgBench(Osc):
         self._pinch_site_id = int(self.model.site("frame").id)
         self._gripper_opening_joint_id = int(self.model.jnt_qposadr[self.model.joint("left/finger_joint_left").id])
         self.action_high = np.array([0.05, 0.05, 0.05, 0.3, 1.0])
-        self.upright = self._read_turn()  # rolls and pitches stay
-
-    def _read_turn(self) -> Any:
-        q = np.empty(4)
-        mujoco.mju_mat2Quat(q, self.data.site("frame").xmat)
-        return tuple(q.tolist())
+        self.upright = self.read_site("frame")[1]  # rolls and pitches stay
 
     def unnormalize_action(self, action: np.ndarray) -> np.ndarray:
         return action * self.action_high
 
     def step(self, action: Any) -> tuple[Any, ...]:
         entries = self.unnormalize_action(np.clip(action, -1.0, 1.0))
-        yaw = quat_to_rotvec(quat_mul(self._read_turn(), quat_conj(self.upright)))[2]
-        p = self.data.site("frame").xpos + entries[:3]
-        goal = np.array(quat_mul(quat_from_rotvec((0.0, 0.0, yaw + entries[3])), self.upright))
-        for _ in range(FRAMES):
-            self._pull(p, goal)
-            mujoco.mj_step(self.model, self.data)
-        return None, 0.0, False, {}
+        p, q = self.read_site("frame")
+        yaw = quat_to_rotvec(quat_mul(q, quat_conj(self.upright)))[2]
+        return self.pull(p + entries[:3], quat_mul(quat_from_rotvec((0.0, 0.0, yaw + entries[3])), self.upright))
 
     def policy(self, t: float) -> np.ndarray:
         return np.array([0.3 * math.sin(3.0 * t), 0.0, 0.3 * math.cos(3.0 * t), 0.0, 0.0])
@@ -415,8 +409,7 @@ class JointWays(Osc):
 
     def step(self, action: Any) -> tuple[Any, ...]:
         entries = np.clip(action, -1.0, 1.0)
-        self.current = float(np.clip(self.current + 0.2 * np.sign(entries[7]), -1.0, 1.0))
-        self.data.ctrl[7] = 0.02 - 0.02 * self.current
+        self.move_gripper(entries[7])
         self.data.ctrl[:7] = self.data.qpos[:7] + 0.05 * entries[:7]
         self.advance()
         return None, 0.0, False, {}
