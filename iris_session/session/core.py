@@ -178,8 +178,7 @@ class SessionCore:
             world.restore_state(plant)
         decision = self.authority.step(now_ns, entries, n_ticks, world.view(), self._status)
         if decision.reset:
-            self._reset_world()
-            self._place_objects(entries)
+            self._reset_world(entries)
             self._reset_control()
         elif any(entry.connection == HOST and isinstance(entry.message, ExternalReset) for entry in entries):
             self._reset_control()  # the owner moved the robots: they are where they stand now
@@ -223,12 +222,11 @@ class SessionCore:
         if self.sharing is not None:
             self.sharing.restore_owner_ctrl(self.world.ctrl, owner_ctrl)
 
-    def _reset_world(self) -> None:
+    def _reset_world(self, entries: Sequence[Entry]) -> None:
+        """Return to the initial state, with objects where `entries` place them."""
         self.world.reset()
         if self.scene.initial_state:
             self.world.restore_state(self.scene.initial_state)
-
-    def _place_objects(self, entries: Sequence[Entry]) -> None:
         for entry in entries:
             m = entry.message
             if not isinstance(m, ObjectsPlaced) or not entry.connection == entry.connection_epoch == HOST:

@@ -366,10 +366,6 @@ class SessionProcesses:
     def front_pid(self) -> int:
         return 0 if self.front is None else self.front.pid
 
-    @property
-    def recorder_pid(self) -> int:
-        return 0 if self.recorder is None else self.recorder.pid
-
     def count_drops(self) -> dict[str, int]:
         """Return how much was not delivered, by reason."""
         return {**({} if self.front is None else self.front.link.status.drops), **self.count_own_drops()}

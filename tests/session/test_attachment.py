@@ -279,49 +279,6 @@ def test_a_robot_that_is_engaged_in_a_step_of_the_helper_is_driven_from_the_next
     np.testing.assert_allclose(attached.data.ctrl, ctrl + 0.1, atol=0.01)
 
 
-@pytest.mark.parametrize("is_opaque", [False, True])
-def test_while_someone_drives_every_step_is_a_tick(is_opaque: bool) -> None:
-    """An environment whose steps are not seen through gives as many ticks as its step had."""
-    rig = Rig()
-    rig.stepper._state_period_ns = 16 * MS
-    advance = functools.partial(ORIGINALS["mj_step"]) if is_opaque else mujoco.mj_step
-    environment = types.SimpleNamespace(model=rig.model, data=rig.data)
-    attachment = None
-
-    def step() -> None:
-        for _ in range(5):
-            (advance if is_opaque else mujoco.mj_step)(rig.model, rig.data)
-
-    def round_(steps: int = 1) -> None:
-        rig.now_ns += 10 * MS
-        environment.step()
-
-    environment.step = step
-    try:
-        attachment = Attachment(rig.loop, environment, "step", lambda model, data: None)
-        rig.round = round_  # type: ignore[method-assign]
-        ann = Agent(rig)
-        rig.rounds(4)
-        ann.acquire()
-        ann.engage(0.04)
-        assert rig.loop.is_driving
-        before = len(rig.recorder.rows)
-        rig.rounds(3)
-        counts = [row.n_ticks for row in rig.recorder.rows[before:] if row.n_ticks]
-        assert counts == ([5] * 3 if is_opaque else [1] * 15)
-        assert rig.loop.overwritten == 0
-        ann.release()
-        rig.rounds(60)
-        assert not rig.loop.is_driving
-        before = len(rig.recorder.rows)
-        rig.rounds(16)
-        assert len(rig.recorder.rows) - before == 10, "16 steps of 10 ms, a look each 16 ms"
-    finally:
-        if attachment is not None:
-            attachment.close()
-        rig.loop.close()
-
-
 # --- other data -------------------------------------------------------------------------------------------------------
 
 
@@ -448,6 +405,35 @@ def owned() -> Iterator[Owned]:
     owned = Owned()
     yield owned
     owned.close()
+
+
+@pytest.mark.parametrize("is_opaque", [False, True])
+def test_while_someone_drives_every_step_is_a_tick(owned: Owned, is_opaque: bool) -> None:
+    """An environment whose steps are not seen through gives as many ticks as its step had."""
+    rig = owned.rig
+    rig.stepper.clock, rig.stepper._state_period_ns = lambda: rig.now_ns, 16 * MS
+    owned.environment.advance = functools.partial(ORIGINALS["mj_step"]) if is_opaque else None
+
+    def take_step(steps: int = 1) -> None:
+        rig.now_ns += 10 * MS
+        owned.environment.step()
+
+    rig.round = take_step  # type: ignore[method-assign]
+    ann = Agent(rig)
+    rig.rounds(4)
+    ann.acquire()
+    ann.engage(0.04)
+    assert rig.loop.is_driving
+    before = len(owned.counts)
+    rig.rounds(3)
+    assert [n for n in owned.counts[before:] if n] == ([5] * 3 if is_opaque else [1] * 15)
+    assert rig.loop.overwritten == 0
+    ann.release()
+    rig.rounds(60)
+    assert not rig.loop.is_driving
+    before = len(owned.counts)
+    rig.rounds(16)
+    assert len(owned.counts) - before == 10, "16 steps of 10 ms, a look each 16 ms"
 
 
 def test_a_copy_or_pickle_of_the_environment_steps_itself(owned: Owned) -> None:
