@@ -117,8 +117,7 @@ class SessionProcesses:
         self._in_use: RecordingLock | None = None
         self._note_writer: ResumeNoteWriter | None = None
         self._core = core
-        self._is_published = published is not None
-        self._published_deformables = None if published is None else published.deformables
+        self._published = published
         scene = None if published is None else published.scene
         self.scenes = SharedScenes(config.assets, config.name, scene, Shown(config.groups, config.sites))
         self.state_period_ns = round(1e9 / config.state_hz)
@@ -147,7 +146,7 @@ class SessionProcesses:
                 "SessionConfig(record=False))"
             )
         # The model of a published world has its bodies, and nothing to be drawn.
-        self.cameras = SessionCameras(self._config, None if self._is_published else self._core.world.model)
+        self.cameras = SessionCameras(self._config, None if self._published else self._core.world.model)
         others = NameFinder(self._config.beacon_port)
         try:
             if self.recording is not None:
@@ -268,7 +267,7 @@ class SessionProcesses:
         stepper = Stepper(core, front, feed, clock, self.state_period_ns, keyframe_ns, chain, after)
         stepper.inputs = inputs
         stepper.on_scene.append(self._follow_scene)
-        meshes = list_deformables(core.world) if self._published_deformables is None else self._published_deformables
+        meshes = list_deformables(core.world) if self._published is None else self._published.deformables
         self._deformables = DeformableStreams(meshes, self._publish_vertices)
         stepper.on_publish.append(self._deformables.publish)
         return stepper

@@ -61,26 +61,14 @@ def find_simulation(environment: Any) -> Simulation | None:
 
 def find_path(environment: Any, data: mujoco.MjData) -> tuple[str, ...]:
     """Return the names of attributes from an environment to its data, for `read_path`; empty if there are none."""
-    level: list[tuple[Any, tuple[str, ...]]] = [(environment, ())]
-    seen = {id(environment)}
-    for _ in range(_MAX_DEPTH):
-        deeper = []
-        for owner, path in level:
-            for name in _DATA:
-                value = read_attribute(owner, name)
-                if value is data:
-                    return (*path, name)
-                binding = next(
-                    (one for one in _BINDINGS if value is not None and read_attribute(value, one) is data), ""
-                )
-                if binding:
+    for owner, path in _walk_owners(environment):
+        for name in _DATA:
+            value = read_attribute(owner, name)
+            if value is data:
+                return (*path, name)
+            for binding in _BINDINGS:
+                if read_attribute(value, binding) is data:
                     return (*path, name, binding)
-            for name in _OWNERS:
-                inner = read_attribute(owner, name)
-                if inner is not None and id(inner) not in seen:
-                    seen.add(id(inner))
-                    deeper.append((inner, (*path, name)))
-        level = deeper
     return ()
 
 
@@ -138,17 +126,23 @@ def copy_state(source: Any, data: mujoco.MjData) -> None:
 
 def list_owners(environment: Any) -> Iterator[Any]:
     """Return the environment and what it wraps, breadth first. A wrapper comes after what it stands for."""
-    level, seen = [environment], {id(environment)}
+    return (owner for owner, _ in _walk_owners(environment))
+
+
+def _walk_owners(environment: Any) -> Iterator[tuple[Any, tuple[str, ...]]]:
+    """Yield what `list_owners` returns, and the names of attributes from the environment to it."""
+    level: list[tuple[Any, tuple[str, ...]]] = [(environment, ())]
+    seen = {id(environment)}
     for _ in range(_MAX_DEPTH):
         deeper = []
-        for owner in level:
-            inner = [read_attribute(owner, name) for name in _OWNERS]
-            if inner[0] is None or inner[0] is owner:
-                yield owner
-            for one in inner:
+        for owner, path in level:
+            inner = {name: read_attribute(owner, name) for name in _OWNERS}
+            if inner["unwrapped"] is None or inner["unwrapped"] is owner:
+                yield owner, path
+            for name, one in inner.items():
                 if one is not None and id(one) not in seen:
                     seen.add(id(one))
-                    deeper.append(one)
+                    deeper.append((one, (*path, name)))
         level = deeper
 
 
