@@ -30,11 +30,6 @@ from tests.session.test_stepper import MS
 ORIGINALS = {name: getattr(mujoco, name) for name in STEP_FUNCTIONS}
 
 
-@pytest.fixture
-def model() -> mujoco.MjModel:
-    return load_model(scene_path("handover"))
-
-
 @pytest.fixture(autouse=True)
 def _no_trace() -> Iterator[None]:
     yield

@@ -9,8 +9,6 @@ import msgspec
 import mujoco
 import pytest
 
-from iris_session.demo.scenes import scene_path
-from iris_session.physics import load_model
 from iris_session.protocol.client_messages import Control
 from iris_session.protocol.server_messages import EpisodeChanged, Event, EventBody, Notice, Snapshot
 from iris_session.protocol.steps import Decision, OutgoingMessage
@@ -76,8 +74,7 @@ def test_digest_has_the_four_fields_of_episodes_that_do_not_say_who_started_them
     assert encode_for_digest(led) == msgspec.msgpack.encode(led)
 
 
-def test_initial_state_is_used_at_start_and_by_reset() -> None:
-    model = load_model(scene_path("handover"))
+def test_initial_state_is_used_at_start_and_by_reset(model: mujoco.MjModel) -> None:
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     data.joint("hammer").qpos[0] += 0.05

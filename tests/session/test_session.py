@@ -14,7 +14,6 @@ from iris_session import ConfigError, OwnershipError, Session, SessionConfig
 from iris_session.control import ControlConfig
 from iris_session.demo.scenes import scene_path
 from iris_session.journal.feed import FeedStats
-from iris_session.physics import load_model
 from iris_session.protocol.client_messages import Control
 from iris_session.protocol.scene import RemoveVisual, SetVisual, encode_scene
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, SceneChanged
@@ -112,8 +111,7 @@ def test_run_ends_after_its_seconds_and_by_stop(session: Session, simulation: Si
 
 
 @pytest.mark.usefixtures("simulation")
-def test_session_has_one_kind_of_loop() -> None:
-    model = load_model(scene_path("handover"))
+def test_session_has_one_kind_of_loop(model: mujoco.MjModel) -> None:
     with Session(model, mujoco.MjData(model), QUIET) as session:
         session.begin_tick()
         with pytest.raises(OwnershipError, match="run"):
@@ -125,8 +123,7 @@ def test_session_has_one_kind_of_loop() -> None:
 
 
 @pytest.mark.usefixtures("simulation")
-def test_targets_for_an_environment_with_its_own_controller() -> None:
-    model = load_model(scene_path("handover"))
+def test_targets_for_an_environment_with_its_own_controller(model: mujoco.MjModel) -> None:
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     ctrl = data.ctrl.copy()
@@ -176,9 +173,8 @@ def test_scene_can_be_patched_before_the_first_step(tmp_path: Path, monkeypatch:
     assert journal.verify() >= 2
 
 
-def test_loaded_scene_begins_with_its_given_data(session: Session) -> None:
+def test_loaded_scene_begins_with_its_given_data(session: Session, model: mujoco.MjModel) -> None:
     path = scene_path("handover")
-    model = load_model(path)
     data = mujoco.MjData(model)
     data.qpos[0] = 0.3
     begun = read_plant_state(model, data)

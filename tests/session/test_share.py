@@ -16,7 +16,7 @@ import pytest
 import iris_session
 from iris_session import ConfigError, OwnershipError, PublishError, Session, StartError
 from iris_session.demo.scenes import scene_path
-from iris_session.physics import ModelInvalidError, ModelNotFoundError, load_model
+from iris_session.physics import ModelInvalidError, ModelNotFoundError
 from iris_session.session.share import _complete_config
 from iris_session.session.simulation import find_simulation
 from tests.session.test_session import QUIET
@@ -26,11 +26,6 @@ UNCLEAR_ARM = """<mujoco><worldbody><body name="arm"><joint name="a"/><geom size
 <joint name="b" axis="0 1 0"/><geom size=".1"/><body name="c" pos=".3 0 0"><joint name="c" axis="0 1 0"/>
 <geom size=".1"/></body></body></body></worldbody><actuator><general joint="a" biastype="user"/>
 <general joint="b" biastype="user"/><general joint="c" biastype="user"/></actuator></mujoco>"""
-
-
-@pytest.fixture
-def model() -> mujoco.MjModel:
-    return load_model(scene_path("handover"))
 
 
 @pytest.fixture

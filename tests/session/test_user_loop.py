@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from iris_session import DataFault, OwnerRequest, OwnershipError, Session
-from iris_session.demo.scenes import scene_path
-from iris_session.physics import load_model
 from iris_session.protocol.client_messages import Control, Episode
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import OwnerListens, StalledGap
@@ -128,20 +126,22 @@ def test_at_the_end_driven_robots_rest_and_objects_are_free() -> None:
     assert (rig.data.xfrc_applied[ball] == 0.125).all(), "the owner's forces are back"
 
 
-@pytest.mark.usefixtures("simulation")
-def test_reset_before_the_first_tick_has_nothing_to_go_back_from() -> None:
-    model = load_model(scene_path("handover"))
-    data = mujoco.MjData(model)
-    with Session(model, data, QUIET) as session:
-        session.reset()
-        session.set_scale("left", 0.5)
-        session.begin_tick()
-        mujoco.mj_step(model, data)
-        session.end_tick()
-        assert session.recent_events() == []
-        session.reset()
-        session.begin_tick()
-        assert [type(event.body) for event in session.recent_events()] == [SceneChanged]
+@pytest.fixture
+def session(simulation: object, model: mujoco.MjModel) -> Iterator[Session]:
+    with Session(model, mujoco.MjData(model), QUIET) as session:
+        yield session
+
+
+def test_reset_before_the_first_tick_has_nothing_to_go_back_from(session: Session) -> None:
+    session.reset()
+    session.set_scale("left", 0.5)
+    session.begin_tick()
+    mujoco.mj_step(session.model, session.data)
+    session.end_tick()
+    assert session.recent_events() == []
+    session.reset()
+    session.begin_tick()
+    assert [type(event.body) for event in session.recent_events()] == [SceneChanged]
 
 
 def test_what_directors_ask_reaches_the_owner_once(rig: Rig) -> None:
@@ -160,22 +160,18 @@ def test_what_directors_ask_reaches_the_owner_once(rig: Rig) -> None:
     assert asked == [("reset", "p1", ""), ("rerecord", "p1", "again")]
 
 
-@pytest.mark.usefixtures("simulation")
-def test_polling_requests_is_known_to_the_authority_from_then_on() -> None:
-    model = load_model(scene_path("handover"))
-    data = mujoco.MjData(model)
-    with Session(model, data, QUIET) as session:
-        assert session.poll_requests() == []
-        session.begin_tick()
-        session.stepper.requests.append(OwnerRequest("reset", "p1", "ann"))
-        assert session.poll_requests() == [OwnerRequest("reset", "p1", "ann")]
-        assert session.poll_requests() == []
-        assert session.stepper.core.authority._ctx.state.owner_listens
-        assert session.driven_robots() == ()
-        assert session.status().data_fault is None
-        data.qvel[0] = np.nan
-        session.begin_tick()
-        assert session.status().data_fault == DataFault(("qvel",), pytest.approx(session.clock() * 1e-9, abs=60.0))
+def test_polling_requests_is_known_to_the_authority_from_then_on(session: Session) -> None:
+    assert session.poll_requests() == []
+    session.begin_tick()
+    session.stepper.requests.append(OwnerRequest("reset", "p1", "ann"))
+    assert session.poll_requests() == [OwnerRequest("reset", "p1", "ann")]
+    assert session.poll_requests() == []
+    assert session.stepper.core.authority._ctx.state.owner_listens
+    assert session.driven_robots() == ()
+    assert session.status().data_fault is None
+    session.data.qvel[0] = np.nan
+    session.begin_tick()
+    assert session.status().data_fault == DataFault(("qvel",), pytest.approx(session.clock() * 1e-9, abs=60.0))
 
 
 def test_error_beside_a_step_of_the_helper_is_raised_at_every_tick(rig: Rig) -> None:
