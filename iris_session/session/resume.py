@@ -287,12 +287,17 @@ def prepare_session(
         raise
 
 
-def wait_for_free_ports(config: SessionConfig, patience_s: float = PORTS_S) -> None:
+def wait_for_free_ports(config: SessionConfig) -> None:
     """Wait for the front of a killed session to free its ports; if they stay in use, our front reports it."""
-    ports = [port for port in (config.control_port - 1, config.control_port, config.state_port) if port > 0]
-    until = time.monotonic() + patience_s
-    while time.monotonic() < until and not all(is_port_free(config.host, port) for port in ports):
+    until = time.monotonic() + PORTS_S
+    while time.monotonic() < until and not has_free_ports(config):
         time.sleep(0.05)
+
+
+def has_free_ports(config: SessionConfig) -> bool:
+    """Return whether the ports of a session can be listened on."""
+    ports = (config.control_port - 1, config.control_port, config.state_port)
+    return all(is_port_free(config.host, port) for port in ports if port > 0)
 
 
 def is_port_free(host: str, port: int) -> bool:

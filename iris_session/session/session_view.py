@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections import Counter, defaultdict, deque
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Final
 
 import msgspec
@@ -158,7 +157,7 @@ class SessionView:
         return {info.id: info.name for info in self.mirror.participants.values()}
 
     def make_participant_reports(
-        self, now_ns: int, alignments: Mapping[str, AlignmentReport] = MappingProxyType({})
+        self, now_ns: int, alignments: Mapping[str, AlignmentReport]
     ) -> tuple[ParticipantReport, ...]:
         """Return the authority's part of the participants in a `StatusReport`; `alignments` by participant id."""
         held: defaultdict[str, list[str]] = defaultdict(list)

@@ -18,7 +18,7 @@ from iris_session.control.config import OUTPUT_CTRL, OUTPUT_TARGETS
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.session.config import SessionConfig
 from iris_session.session.errors import ConfigError, OwnershipError
-from iris_session.session.resume import is_port_free
+from iris_session.session.resume import has_free_ports
 from iris_session.session.robots import RobotChoice, explain_no_robots
 from iris_session.session.session import Session
 from iris_session.session.session_base import SessionBase
@@ -121,8 +121,7 @@ def _complete_config(config: SessionConfig | None, output: str) -> tuple[Session
     notes = []
     if config is None:
         config = SessionConfig()
-        ports = (config.control_port - 1, config.control_port, config.state_port)
-        if not all(is_port_free(config.host, port) for port in ports if port > 0):  # of another session on this machine
+        if not has_free_ports(config):  # of another session on this machine
             config = dataclasses.replace(config, control_port=0, state_port=0)
             notes.append(OTHER_PORTS)
     elif not isinstance(config, SessionConfig):

@@ -184,7 +184,7 @@ def test_a_specification_is_compiled_and_a_scene_without_robots_is_a_note(shared
 
 
 def test_a_second_program_on_a_machine_takes_other_ports(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("iris_session.session.share.is_port_free", lambda host, port: port != 7722)
+    monkeypatch.setattr("iris_session.session.resume.is_port_free", lambda host, port: port != 7722)
     config, notes = _complete_config(None, "ctrl")
     assert (config.control_port, config.state_port) == (0, 0)
     assert any("session.address" in note for note in notes)

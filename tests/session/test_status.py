@@ -35,7 +35,7 @@ BOB = 2
 
 class Session(Rig):
     def people(self) -> dict[str, ParticipantReport]:
-        return {row.name: row for row in self.stepper.view.make_participant_reports(self.now_ns)}
+        return {row.name: row for row in self.stepper.view.make_participant_reports(self.now_ns, {})}
 
 
 @pytest.fixture
