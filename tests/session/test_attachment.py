@@ -577,11 +577,6 @@ def test_steps_that_are_not_seen_are_a_warning(attached: Attached) -> None:
     assert any("outside of the session's ticks" in text for text in attached.rig.loop.list_warnings())
 
 
-def test_attach_offers_the_robots_that_are_chosen(model: mujoco.MjModel) -> None:
-    with Session.attach(model, make_data(model), QUIET, robots="right") as session:
-        assert [robot.name for robot in session.robots] == ["right"]
-
-
 @pytest.mark.usefixtures("simulation")
 @pytest.mark.parametrize("choice", ["none", "arm1"])
 def test_the_choice_of_robots_holds_for_the_model_that_is_built_at_a_reset(choice: str) -> None:
