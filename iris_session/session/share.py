@@ -30,8 +30,6 @@ S = TypeVar("S", bound=SessionBase)
 
 #: How participants drive, and the output of control that this means.
 DRIVES: Final = {"ctrl": OUTPUT_CTRL, "action": OUTPUT_TARGETS}
-OTHER_PORTS: Final = "the usual ports are in use, by another session perhaps: this one is at session.address"
-NOT_RECORDED: Final = "not recorded, because rerun is not installed: pip install 'iris-session[recording]'"
 
 _log = logging.getLogger(__name__)
 #: Environments that are shown by `sync`, with their sessions, whose data is their own.
@@ -123,7 +121,7 @@ def _complete_config(config: SessionConfig | None, output: str) -> tuple[Session
         config = SessionConfig()
         if not has_free_ports(config):  # of another session on this machine
             config = dataclasses.replace(config, control_port=0, state_port=0)
-            notes.append(OTHER_PORTS)
+            notes.append("the usual ports are in use, by another session perhaps: this one is at session.address")
     elif not isinstance(config, SessionConfig):
         raise TypeError(
             f"config must be a SessionConfig, not {type(config).__name__}: share(x, config=SessionConfig())"
@@ -132,7 +130,7 @@ def _complete_config(config: SessionConfig | None, output: str) -> tuple[Session
         config = dataclasses.replace(config, control=msgspec.structs.replace(config.control, output=output))
     if config.record is True and importlib.util.find_spec("rerun") is None:  # the default, beside a suite
         config = dataclasses.replace(config, record=False)
-        notes.append(NOT_RECORDED)
+        notes.append("not recorded, because rerun is not installed: pip install 'iris-session[recording]'")
     return config, notes
 
 

@@ -28,7 +28,6 @@ from iris_session.web.config import WEB_FROM_STATE, GatewayConfig, GatewayReport
 from iris_session.web.listener import open_listening_sockets
 from iris_session.web.page import describe_missing_page
 
-PACKAGES: Final = ("aiohttp", "cryptography")
 #: Time for browsers to read that the session has ended.
 EXIT_S: Final = 1.5
 
@@ -158,7 +157,7 @@ def open_web_page(config: SessionConfig, name: str) -> WebPage:
         return WebPage(config, name)
     if config.web_cert and not needs_encryption(config):
         raise StartError("web_cert: this session is not encrypted, so its page is plain HTTP: add --curve")
-    if any(importlib.util.find_spec(package) is None for package in PACKAGES):
+    if any(importlib.util.find_spec(package) is None for package in ("aiohttp", "cryptography")):
         return WebPage(config, name, note="no page for browsers: pip install 'iris-session[web]'")
     if config.curve_clients and needs_encryption(config):  # such a folder holds no identities of browsers
         return WebPage(config, name, note="no page for browsers: --curve-clients admits certificates only")
