@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import re
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -138,16 +137,11 @@ def test_truncated_file_resumes_at_its_last_readable_row(session: Path, share: f
 
 
 @pytest.mark.parametrize(
-    ("digest", "reason"),
-    [
-        (None, r"step 90 was changed \(n_ticks\)"),
-        (bytes(16), "step 90 gives another result here"),  # as with another version of a library
-        (CRASHED, "step 90 ended the session with an error"),
-    ],
+    ("digest", "why"),
+    [(None, "was changed (n_ticks)"), (bytes(16), "gives another result"), (CRASHED, "ended the session")],
 )
-def test_rows_from_one_that_cannot_be_used_are_left_out_and_reported(
-    tmp_path: Path, digest: bytes | None, reason: str
-) -> None:
+def test_rows_from_one_that_cannot_be_used_are_left_out(tmp_path: Path, digest: bytes | None, why: str) -> None:
+    """Of another result: as with another version of a library."""
     chains: list[bytes] = []
 
     def change(row: JournalRow) -> JournalRow:
@@ -161,7 +155,7 @@ def test_rows_from_one_that_cannot_be_used_are_left_out_and_reported(
     past = PastSession(recorded(tmp_path / "session.rrd", change))
     assert past.step == 89
     assert past.core.snapshot() == state_after(89)
-    assert any(re.search(reason, note) for note in past.notes)
+    assert any(f"step 90 {why}" in note for note in past.notes)
 
 
 def test_damaged_keyframe_is_replaced_by_the_previous_one(tmp_path: Path) -> None:
@@ -222,14 +216,10 @@ def test_given_scene_must_equal_the_recorded_one(session: Path) -> None:
 def test_settings_fixed_by_the_recording_are_refused(session: Path) -> None:
     past = PastSession(session)
     past.close()
-    for change in (
-        {"name": "other"},
-        {"record": False},
-        {"record": "x.rrd"},
-        {"authority": AuthorityConfig(grace_ns=1)},
-    ):
+    rules = AuthorityConfig(grace_ns=1)
+    for name, value in (("name", "other"), ("record", False), ("record", "x.rrd"), ("authority", rules)):
         with pytest.raises(ConfigError, match="resumed session"):
-            past.merge_config(SessionConfig(**change), None, None, None, None)  # type: ignore[arg-type]
+            past.merge_config(SessionConfig(**{name: value}), None, None, None, None)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="robots"):
         past.merge_config(SessionConfig(), None, None, (), None)
 
