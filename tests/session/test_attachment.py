@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import os
@@ -97,32 +98,25 @@ def test_models_can_be_compiled_and_forward_is_no_tick(attached: Attached) -> No
     assert data.time == pytest.approx(5 * 0.002)
 
 
-def test_names_bound_before_are_wrapped_in_every_module_and_restored() -> None:
+def test_names_bound_before_are_wrapped_in_every_module_and_restored(monkeypatch: pytest.MonkeyPatch) -> None:
     script, late = types.ModuleType("a_script"), types.ModuleType("imported_later")
     exec("from mujoco import mj_step\nfrom mujoco import mj_step as advance, mj_step2", script.__dict__)
-    sys.modules["a_script"] = script
-    attached = Attached()
-    model, data = attached.model, attached.data
-    try:
-        script.mj_step(model, data)
-        script.advance(model, data)
+    monkeypatch.setitem(sys.modules, "a_script", script)
+    with contextlib.closing(Attached()) as attached:
+        script.mj_step(attached.model, attached.data)
+        script.advance(attached.model, attached.data)
         exec("from mujoco import mj_step", late.__dict__)
-        sys.modules["imported_later"] = late
-        late.mj_step(model, data)
+        monkeypatch.setitem(sys.modules, "imported_later", late)
+        late.mj_step(attached.model, attached.data)
         assert attached.counts == [0, 0, 0]
-        attached.close()
-        assert script.mj_step is script.advance is late.mj_step is ORIGINALS["mj_step"]
-        assert script.mj_step2 is ORIGINALS["mj_step2"]
-    finally:
-        attached.close()
-        sys.modules.pop("a_script", None)
-        sys.modules.pop("imported_later", None)
+    assert script.mj_step is script.advance is late.mj_step is ORIGINALS["mj_step"]
+    assert script.mj_step2 is ORIGINALS["mj_step2"]
 
 
 @pytest.mark.parametrize("first", [0, 1])
 def test_two_sessions_in_one_process_close_in_any_order(first: int) -> None:
-    both = [Attached(), Attached()]
-    try:
+    with contextlib.closing(Attached()) as a, contextlib.closing(Attached()) as b:
+        both = [a, b]
         with pytest.raises(OwnershipError, match="attached"):
             Attachment(both[0].rig.loop, None, "step", lambda model, data: None)
         for one in both:
@@ -132,9 +126,6 @@ def test_two_sessions_in_one_process_close_in_any_order(first: int) -> None:
         for one in both:
             mujoco.mj_step(one.model, one.data)
         assert [len(one.counts) for one in both] == ([1, 2] if first == 0 else [2, 1])
-    finally:
-        for one in both:
-            one.close()
 
 
 @pytest.mark.usefixtures("simulation")
