@@ -917,19 +917,13 @@ def test_a_hold_is_known(rig: Rig) -> None:
     assert controller.list_held() == ["left", "right"]
 
 
-class Simulated:
-    """As MuJoCo Playground: a model, and states that JAX has."""
-
-    def __init__(self) -> None:
-        self.mj_model = load_model(scene_path("handover"))
-
-
 @pytest.mark.usefixtures("simulation")
 def test_a_simulation_that_sync_shows_keeps_its_action(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """As MuJoCo Playground: a model, and states that JAX has."""
     action = np.zeros((4, 16))
-    with iris_session.share(Simulated(), config=QUIET, drive="action") as session:
+    with iris_session.share(Space(mj_model=model), config=QUIET, drive="action") as session:
         assert session.action(action) is action
         sources = session.processes.reporter.warning_sources
         before = len(caplog.records), [text for source in sources for text in source()]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import pytest
 
@@ -86,7 +84,7 @@ def test_loop_uses_the_timestep_of_a_new_scene_at_once() -> None:
 
 
 @pytest.mark.usefixtures("simulation")
-def test_load_scene_requires_a_running_session() -> None:
+def test_load_scene_requires_a_running_session(model: mujoco.MjModel) -> None:
     session = Session(str(scene_path("handover")))
     with pytest.raises(OwnershipError, match="run"):
         session.load_scene(bench_scene())
@@ -98,7 +96,6 @@ def test_load_scene_requires_a_running_session() -> None:
         change.result(timeout=60)
         run.run(seconds=0.05)
         assert run.objects == find_objects(bench_scene())
-    model: Any = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
     with Session(model, mujoco.MjData(model), config=QUIET) as mine:
         mine.begin_tick()
         with pytest.raises(OwnershipError, match="loop"):
