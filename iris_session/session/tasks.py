@@ -32,7 +32,7 @@ from iris_session.protocol.server_messages import EpisodeChanged
 from iris_session.protocol.specs import ObjectRange, TaskSpec
 from iris_session.protocol.steps import Decision
 from iris_session.session.errors import ConfigError
-from iris_session.session.stepper import Stepper, normalize_message
+from iris_session.session.stepper import Stepper
 from iris_session.system.files import Replacement
 
 #: Places that are tried for one episode.
@@ -201,7 +201,7 @@ class TaskRunner:
                 raise ConfigError(f"task {task.name!r}: {error}") from error
             episode = stepper.core.authority.episode
             if is_new or (episode is not None and episode.verdict):
-                stepper.inputs.messages.appendleft(normalize_message(placed))  # before an episode that waits, too
+                stepper.inputs.post_own(placed)
         stepper.on_decision = self.follow
 
     def _prepare(self, number: int) -> None:

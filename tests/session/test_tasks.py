@@ -183,6 +183,15 @@ def test_a_session_that_ended_before_its_objects_were_placed_places_them_when_it
     runner.close()
 
 
+def test_an_episode_that_was_started_before_the_first_step_has_its_places() -> None:
+    desk = Desk()
+    desk.stepper.inputs.post(Episode(0, "start", countdown_ns=0))
+    runner = TaskRunner(desk.stepper, None)
+    assert desk.say() == "running"
+    assert desk.is_placed(1)
+    runner.close()
+
+
 @pytest.mark.parametrize("order", ["reset | start", "start reset", "start | reset"])
 def test_an_episode_that_begins_beside_a_reset_has_its_own_places(order: str) -> None:
     desk = Desk()
