@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -199,14 +199,13 @@ class Wearer:
 
 
 class Room:
-    """One session with its headsets. `sheets`: true poses; `anchors`: configured ones."""
+    """One session with two headsets. `sheets`: true poses; `anchors`: configured ones."""
 
     def __init__(
         self,
         rng: np.random.Generator,
         anchors: Mapping[str, PoseTuple],
         source: SheetSource,
-        headsets: int = 2,
         *,
         drift_m_per_min: float | None = None,
         marks: Mapping[str, Mapping[str, Vec3]] | None = None,
@@ -217,7 +216,6 @@ class Room:
             rng: Everything random comes from it.
             anchors: Configured `T_world_anchor`.
             source: Of sheet poses, of every headset.
-            headsets: Number of headsets.
             drift_m_per_min: Of every tracking frame; default: that of docs/anchors.md.
             marks: Positions of marks by anchor and id of the mark.
         """
@@ -245,14 +243,14 @@ class Room:
         turn = rng.uniform(-math.pi, math.pi)
         way = np.array([math.cos(turn), math.sin(turn), 0.0])
         self.points = (self.sheets[next(iter(anchors))][0], centre + way, centre + 2.0 * way)
-        names = [f"robot{i + 1}" for i in range(headsets)]
+        names = ["robot1", "robot2"]
         tip = Pose(to_vec3(centre + way), IDENTITY_QUAT)
         self._view = FixedView(tips=dict.fromkeys(names, tip), q=dict.fromkeys(names, (0.0,)))
         robots = [RobotSpec(n, (f"{n}/j",), (f"{n}/j",), f"{n}/tcp", f"{n}/base") for n in names]
         self.authority = Authority(msgspec.structs.replace(CONFIG, anchors=poses), robots, ())
         self._stepped_ns = 0
         drift = {} if drift_m_per_min is None else {"drift_m_per_min": drift_m_per_min}
-        self.people = [Wearer(self, i + 1, HeadsetMotion(rng, source, **drift)) for i in range(headsets)]
+        self.people = [Wearer(self, i + 1, HeadsetMotion(rng, source, **drift)) for i in range(len(names))]
         for p in self.people:
             p.say(Join(f"key{p.number}", "operator", f"person{p.number}"))
         self.step()
@@ -334,34 +332,22 @@ class Room:
 
     def probe(self, label: str = "") -> None:
         """Record what each headset and each pair would do and see now."""
-        found = [self._probe_person(p) for p in self.people]
-        for one, finding in zip(self.people, found, strict=True):
-            if self.is_absolute:
-                self.findings.append((label, finding))
-            for other, theirs in zip(self.people, found, strict=True):
-                if other.number > one.number:
-                    self.findings.append((label, self._probe_pair((one, finding), (other, theirs))))
+        allowed = {p.number: self._try_clutch(p) for p in self.people}
+        groups = [[p] for p in self.people] if self.is_absolute else []
+        self.findings += [(label, self._probe(group, allowed)) for group in [*groups, self.people]]
 
-    def _probe_person(self, p: Wearer) -> ProbeResult:
-        is_allowed = self._try_clutch(p)
-        is_told = p.is_told or not is_allowed
-        if p.alignment is None:
-            return ProbeResult((p.number,), is_allowed, is_told)
-        errors, stated = [], []
-        for X in self.points:
-            errors.append(float(np.linalg.norm(self.compute_offset(p, X))))
-            stated.append(length_p95(self.state_covariance(p, X)))
-        return ProbeResult((p.number,), is_allowed, is_told, tuple(errors), tuple(stated))
-
-    def _probe_pair(self, a: tuple[Wearer, ProbeResult], b: tuple[Wearer, ProbeResult]) -> ProbeResult:
-        who = (a[0].number, b[0].number)
-        is_allowed, is_told = a[1].is_allowed and b[1].is_allowed, a[1].is_told or b[1].is_told
-        if a[0].alignment is None or b[0].alignment is None:
+    def _probe(self, group: Sequence[Wearer], allowed: Mapping[int, bool]) -> ProbeResult:
+        """Return how far from the truth one headset places the points, or from each other a pair does."""
+        who = tuple(p.number for p in group)
+        is_allowed = all(allowed[number] for number in who)
+        is_told = not is_allowed or any(p.is_told for p in group)
+        if any(p.alignment is None for p in group):
             return ProbeResult(who, is_allowed, is_told)
         errors, stated = [], []
         for X in self.points:
-            errors.append(float(np.linalg.norm(self.compute_offset(a[0], X) - self.compute_offset(b[0], X))))
-            stated.append(length_p95(self.state_covariance(a[0], X) + self.state_covariance(b[0], X)))
+            first, *others = (self.compute_offset(p, X) for p in group)
+            errors.append(float(np.linalg.norm(first - sum(others))))
+            stated.append(length_p95(sum((self.state_covariance(p, X) for p in group), np.zeros((3, 3)))))
         return ProbeResult(who, is_allowed, is_told, tuple(errors), tuple(stated))
 
     def compute_offset(self, p: Wearer, X: Array) -> Array:

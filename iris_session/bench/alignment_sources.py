@@ -140,11 +140,8 @@ class HeadsetMotion:
 
     def T_world_tracking(self, at_s: float) -> tuple[Array, Array]:
         """Return the true pose of the tracking frame at a time."""
-        p = self._p0 + at_s * self.velocity
-        if not self.yaw_rad_per_s:
-            return p, self._q0
-        dq = quat_exp(np.array([0.0, 0.0, self.yaw_rad_per_s * max(at_s - self._turned_from_s, 0.0)]))
-        return self._turned_about + quat_to_matrix(dq) @ (p - self._turned_about), quat_multiply(dq, self._q0)
+        p, q = self.compute_frames(np.array([at_s]))
+        return p[0], q[0]
 
     def shift_frame(self, by: Array) -> None:
         """Move the tracking frame at once, without a word."""
@@ -213,8 +210,8 @@ class HeadsetMotion:
         head_s = start_s + np.arange(max(1, round(seconds * head_hz))) / head_hz
         at_p, at_q = path.compute(head_s)
         at_p = at_p + rng.normal(0.0, HEAD_SIGMA_M, at_p.shape)
-        heads = _to_poses(*self.to_tracking(head_s, at_p, at_q))
-        poses = _to_poses(p, q)
+        heads = to_poses(*self.to_tracking(head_s, at_p, at_q))
+        poses = to_poses(p, q)
         self.last[name] = poses[-1]
         return Glance(head_s.tolist(), heads, times.tolist(), poses)
 
@@ -322,13 +319,21 @@ def _solve_corner_errors(p: Array, q: Array, corners_px: Array) -> tuple[Array, 
     return step[:, :3], step[:, 3:]
 
 
-def _to_poses(p: Array, q: Array) -> list[PoseTuple]:
+def to_poses(p: Array, q: Array) -> list[PoseTuple]:
+    """Return poses (n, 3), (n, 4) as tuples."""
     return [(to_vec3(a), to_quat(b)) for a, b in zip(p, q, strict=True)]
 
 
 def to_array_pose(T: PoseTuple) -> tuple[Array, Array]:
     """Return a pose as arrays (3,) and (4,)."""
     return np.array(T[0]), np.array(T[1])
+
+
+def draw_held_poses(rng: np.random.Generator, held: tuple[Array, Array], n: int) -> tuple[Array, Array]:
+    """Return `n` observations, in the frame of `held`, of a controller in its holder: the noise of docs/anchors.md."""
+    noise = mix_viewpoint_noise(rng.normal(size=6), rng.normal(size=(n, 6)))
+    turns = quat_exp(HOLDER_SIGMA_RAD * noise[:, 3:])
+    return held[0] + TIP_SIGMA_M * noise[:, :3], quat_multiply(turns, np.broadcast_to(held[1], (n, 4)))
 
 
 def draw_level(rng: np.random.Generator, size: float) -> Array:

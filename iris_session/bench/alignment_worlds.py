@@ -34,17 +34,17 @@ from anchors.lie import quat_exp, quat_multiply, quat_to_matrix, to_quat, to_vec
 from anchors.pose import IDENTITY_POSE, PoseTuple
 from iris_session.bench.alignment_room import SECOND, ProbeResult, Room, Wearer
 from iris_session.bench.alignment_sources import (
-    HOLDER_SIGMA_RAD,
     MARKS,
     ONE,
     TIP_SIGMA_M,
     TRIANGLE,
     SheetSource,
+    draw_held_poses,
     draw_level,
     draw_vector,
+    to_poses,
 )
 from iris_session.bench.report import Bar, BenchError, make_bar
-from iris_session.emulator.sheet_noise import mix_viewpoint_noise
 from iris_session.protocol.names import AnchorKind, Device, ObservationSource
 
 TOUCH_COVARIANCE: Final = tuple(TIP_SIGMA_M**2 if i % 7 == 0 else 0.0 for i in range(36))
@@ -228,12 +228,9 @@ def _report_holder(p: Wearer) -> Iterator[int]:
     at, turn = room.sheets["a"]
     for _ in range(3):
         p.viewpoint += 1
-        common = rng.normal(size=6)
-        for _ in range(20):
+        for pose in to_poses(*draw_held_poses(rng, (at + off_p, quat_multiply(turn, off_q)), 20)):
             yield room.now_ns + SECOND // 10
-            noise = mix_viewpoint_noise(common, rng.normal(size=6))  # docs/anchors.md: controller in its holder
-            q = quat_multiply(quat_exp(HOLDER_SIGMA_RAD * noise[3:]), quat_multiply(turn, off_q))
-            T = p.motion.place(room.now_s, (to_vec3(at + off_p + TIP_SIGMA_M * noise[:3]), to_quat(q)))
+            T = p.motion.place(room.now_s, pose)
             p.report_sheet("a", T, AnchorKind.CONTROLLER, device=Device.CONTROLLER_RIGHT)
         yield from p.pause(3.0)
 
