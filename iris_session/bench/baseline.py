@@ -16,7 +16,7 @@ import numpy as np
 import zmq
 
 from iris_session.bench.plugins import Plugin, PluginProcess
-from iris_session.bench.report import BenchError, compute_percentile
+from iris_session.bench.report import BenchError, compute_percentile, summarize_percentiles
 from iris_session.system.priority import freeze_garbage_collector, tick_priority
 
 PERIOD_NS: Final = 2_000_000
@@ -61,8 +61,7 @@ def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, floa
         ages = np.array([age_ns for worker in workers for age_ns in _read_ages(worker)]) * 1e-6
     late = np.array(lateness) * 1e-6
     return {
-        "bare_age_ms_p50": compute_percentile(ages, 50),
-        "bare_age_ms_p99": compute_percentile(ages, 99),
+        **summarize_percentiles("bare_age_ms", ages),
         "bare_late_tick_share": round(float((late > PERIOD_NS * 1e-6).mean()), 6),
         "bare_lateness_ms_p99": compute_percentile(late, 99),
     }

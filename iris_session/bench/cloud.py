@@ -48,16 +48,7 @@ def run_cloud(
 ) -> BenchReport:
     """Make clouds of depth pictures, and send them.
 
-    Args:
-        points: Pixels of a cloud, shared by its cameras.
-        cameras: Number of cameras.
-        seconds: Length of the measured part, which the cases share.
-        seed: Random seed of noise and holes.
-        beside: Measure beside a session in which two arms are driven.
-        progress: Called with short texts.
-
-    Returns:
-        The report. Results are those of cells of 1 cm and 50,000 points; other cases are in objects of their own.
+    Results are those of cells of 1 cm and 50,000 points; other cases are in objects of their own.
     """
     require_package("numba", "bench cloud")
     require_package("cv2", "bench cloud")

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.harness import BROWSERS, CLIENTS, Group, Log, measure
+from iris_session.bench.harness import BROWSERS, CLIENTS, Group, Log, compute_ages_ms, measure
 from iris_session.bench.plugins import Plugin
-from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar
+from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, summarize_percentiles
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.codec import encode_presence, encode_server, encode_state_header
 from iris_session.protocol.common import Applied, Pose
@@ -79,14 +79,6 @@ def run_csharp(
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
     """Decode many frames after the first ones; then receive the state of a session, behind its web gateway.
-
-    Args:
-        bodies: Number of moving bodies.
-        points: Points of the cloud.
-        seed: Random seed.
-        frames: Frames that count, after the first `WARM_UP`.
-        seconds: Length of the window in which state is received.
-        progress: Called with short texts.
 
     Returns:
         The report: the worse of both runtimes, and each by itself. Reference: the decoders of the Python client, and
@@ -144,8 +136,7 @@ def _summarize_ages(name: str, log: Log) -> dict[str, float]:
     """Return percentiles of the age of state when an application could have it [ms]."""
     if not len(log["ticks"]):
         raise BenchError(f"the client {name} received no state: increase --seconds")
-    ages = (log["handed_ns"] - log["state_ns"]) * 1e-6
-    return {f"age_ms_p{q}": compute_percentile(ages, q) for q in (50, 99)}
+    return summarize_percentiles("age_ms", compute_ages_ms([log]))
 
 
 class _Frames:

@@ -27,7 +27,14 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import Log, Measurement, assign_links, group_clients, measure
 from iris_session.bench.media_clients import MediaColumn as Column
 from iris_session.bench.media_clients import sum_counts
-from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, make_link_report
+from iris_session.bench.report import (
+    BenchError,
+    BenchReport,
+    compute_percentile,
+    make_bar,
+    make_link_report,
+    summarize_percentiles,
+)
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.names import BudgetClass
 from iris_session.session.session import Session
@@ -54,17 +61,7 @@ def run_deformable(
 ) -> BenchReport:
     """Stream a cloth at 60 Hz to observers, beside 50 rigid bodies.
 
-    Args:
-        vertices: Vertices of the cloth, a square number.
-        clients: Number of observers.
-        seconds: Length of the measured window.
-        seed: Random seed.
-        curve: Encrypt and authenticate.
-        profile: Link profile of every client; bars do not apply then.
-        progress: Called with short texts.
-
-    Returns:
-        The report. Reference: the same frames as float32, and as float32 compressed by deflate.
+    Reference: the same frames as float32, and as float32 compressed by deflate.
     """
     side = math.isqrt(vertices)
     if side * side != vertices:
@@ -152,16 +149,13 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
     counts, heads = sum_counts(logs)
     sent = sizes.sum() + np.count_nonzero(sizes) * heads / len(ages)
     return {
-        "encode_ms_p50": compute_percentile(spent[:, 0], 50),
-        "encode_ms_p99": compute_percentile(spent[:, 0], 99),
+        **summarize_percentiles("encode_ms", spent[:, 0]),
         "mbit_per_s": round(float(sent) * 8e-6 / got.seconds, 3),
         "max_error_mm": round(_compute_max_error_m(got.logs, source) * 1e3, 5),
         "delivered_hz_min": round(min(len(log["frames"]) for log in logs) / got.seconds, 2),
-        "encode_cpu_ms_p50": compute_percentile(spent[:, 1], 50),
-        "encode_cpu_ms_p99": compute_percentile(spent[:, 1], 99),
+        **summarize_percentiles("encode_cpu_ms", spent[:, 1]),
         "decode_cpu_ms_p50": compute_percentile(decode, 50),
-        "age_ms_p50": compute_percentile(ages, 50),
-        "age_ms_p99": compute_percentile(ages, 99),
+        **summarize_percentiles("age_ms", ages),
         "bytes_per_frame": round(float(sizes[sizes > 0].mean()), 1),
         "frames_encoded": len(spent),
         "frames_refused": source.refused,
@@ -212,9 +206,7 @@ def _measure_offline(motion: ClothMotion, topology: DeformableTopology) -> dict[
     pairs = range(0, len(motion.nodes) - 1, _SAMPLE)
     steps = np.stack([motion.vertices(index + 1) - motion.vertices(index) for index in pairs])
     speeds = np.linalg.norm(steps, axis=2) * HZ
-    found["vertex_speed_m_per_s_p50"] = compute_percentile(speeds, 50)
-    found["vertex_speed_m_per_s_p99"] = compute_percentile(speeds, 99)
-    return found
+    return found | summarize_percentiles("vertex_speed_m_per_s", speeds.ravel())
 
 
 def _measure_reference(motion: ClothMotion) -> dict[str, float]:

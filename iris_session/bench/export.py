@@ -72,16 +72,7 @@ def run_export(
     python: str = "",
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """Measure the export of one recording.
-
-    Args:
-        episodes: Number of its episodes, at least 3.
-        seconds: Length of each.
-        shadows: Draw pictures in full, which takes much longer without a graphics card.
-        jobs: Processes.
-        python: A Python with LeRobot, for the reference; empty: none.
-        progress: Called with short texts.
-    """
+    """Measure the export of one recording."""
     if episodes < 3:
         raise BenchError(f"{episodes} episodes: give 3 or more, of which the first and last are compared")
     with tempfile.TemporaryDirectory(prefix="iris-bench-", ignore_cleanup_errors=True) as name:

@@ -287,13 +287,7 @@ def count_false_holds(device: str, rate_hz: int, seconds: float, seed: int) -> F
 
 
 def run_hands(seconds: float = 300.0, seed: int = 0, progress: Callable[[str], None] = lambda _: None) -> BenchReport:
-    """Disturb every device at every rate, and count the holds of people who only move fast.
-
-    Args:
-        seconds: Simulated time of fast motion for every device and rate [s].
-        seed: Random seed.
-        progress: Called with short texts.
-    """
+    """Disturb every device at every rate, and count the holds of people who only move fast."""
     cases: dict[str, Any] = {}
     worst_by_kind: dict[str, float] = {}
     missed: dict[str, float] = {}

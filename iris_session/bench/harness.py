@@ -88,13 +88,15 @@ def select_between(times_ns: NDArray[Any], begin_ns: int, from_s: float, to_s: f
     return np.asarray((times_ns - begin_ns >= from_s * 1e9) & (times_ns - begin_ns < to_s * 1e9))
 
 
-def compute_age_p99_ms(logs: Iterable[Log], begin_ns: int, from_s: float, to_s: float) -> float:
-    """Return the 99th percentile of the age of state when it was handed to applications between two times of a window
-    [ms], infinite where none was."""
-    ages = [
-        (log["handed_ns"] - log["state_ns"])[select_between(log["handed_ns"], begin_ns, from_s, to_s)] for log in logs
-    ]
-    return compute_percentile(np.concatenate(ages) * 1e-6, 99)
+def compute_ages_ms(logs: Iterable[Log]) -> NDArray[np.float64]:
+    """Return the ages of all states when they were handed to applications [ms]."""
+    return np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in logs])
+
+
+def compute_age_p99_ms(logs: Sequence[Log], begin_ns: int, from_s: float, to_s: float) -> float:
+    """Return the 99th percentile of the ages between two times of a window [ms], infinite where no state came."""
+    is_between = [select_between(log["handed_ns"], begin_ns, from_s, to_s) for log in logs]
+    return compute_percentile(compute_ages_ms(logs)[np.concatenate(is_between)], 99)
 
 
 def measure_after_stall(log: Log, begin_ns: int, interval: Interval, resumed_ns: int) -> tuple[float, float]:

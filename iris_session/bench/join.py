@@ -52,17 +52,8 @@ def run_join(
 ) -> BenchReport:
     """Join with one client while observers watch.
 
-    Args:
-        objects: Number of moving bodies with meshes.
-        assets_mb: Size of the assets [MB].
-        clients: Number of observers.
-        seconds: Length of the measured window.
-        seed: Random seed.
-        progress: Called with short texts.
-
-    Returns:
-        The report. References, in the same run: the same bytes in one message, and the age of the others' state while
-        memory is copied at the priority at which a client loads assets.
+    References, in the same run: the same bytes in one message, and the age of the others' state while memory is copied
+    at the priority at which a client loads assets.
     """
     progress("compiling the scene")
     model = make_join_model(objects, assets_mb, seed).compile()
@@ -150,7 +141,7 @@ def _prepare_scene(model: Path, store: Path) -> dict[str, Any]:
 
 def _compute_age_p99_ms(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:
     """Return the 99th percentile of the age of state at all clients [ms], of frames between two session times."""
-    p99_ms = compute_age_p99_ms(logs.values(), begin_ns, 0.0, (end_ns - begin_ns) * 1e-9)
+    p99_ms = compute_age_p99_ms(list(logs.values()), begin_ns, 0.0, (end_ns - begin_ns) * 1e-9)
     if not math.isfinite(p99_ms):
         raise BenchError("no client received state while the client joined, or before or after it: increase --seconds")
     return p99_ms

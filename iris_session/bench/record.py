@@ -110,14 +110,7 @@ def run_record(
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """Measure a session of two operators and 50 bodies with and without a recording, and kill recorded sessions.
-
-    Args:
-        seconds: Measured time of all rounds together.
-        kills: Number of kills.
-        seed: Random seed of motion and kills.
-        progress: Called with short texts.
-    """
+    """Measure a session of two operators and 50 bodies with and without a recording, and kill recorded sessions."""
     rounds = max(1, min(ROUNDS, int(seconds / (2.0 * SHORTEST_S))))
     length_s = max(SHORTEST_S, seconds / (2.0 * rounds))
     with tempfile.TemporaryDirectory(prefix="iris-bench-", ignore_cleanup_errors=True) as name:

@@ -169,6 +169,16 @@ def compute_percentile(values: NDArray[Any], q: float) -> float:
     return round(float(np.percentile(values, q)), 3) if len(values) else math.inf
 
 
+def summarize_percentiles(key: str, values: NDArray[Any], percentiles: Sequence[int] = (50, 99)) -> dict[str, float]:
+    """Return percentiles of values under the keys `KEY_p50`, `KEY_p99`."""
+    return {f"{key}_p{q}": compute_percentile(values, q) for q in percentiles}
+
+
+def allow_increase(age_ms: float) -> float:
+    """Return the bar of a disturbed age of state: a fifth more than without the disturbance, or 1 ms more."""
+    return round(age_ms + max(0.2 * age_ms, 1.0), 3)
+
+
 def _replace_infinite(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _replace_infinite(one) for key, one in value.items()}

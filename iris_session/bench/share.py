@@ -87,12 +87,7 @@ def measure_steps(environment: SharedProgram, seconds: float, *, paced: bool) ->
 
 
 def run_share(seconds: float = 100.0, progress: Callable[[str], None] = lambda _: None) -> BenchReport:
-    """Measure what sharing adds to a step.
-
-    Args:
-        seconds: Time of all measured steps together [s].
-        progress: Called with short texts.
-    """
+    """Measure what sharing adds to a step."""
     slot_s = seconds / (ROUNDS * len(SUBSTEPS) * 4)
     added: dict[str, list[float]] = {}
     alone: dict[str, list[float]] = {}

@@ -9,8 +9,16 @@ import numpy as np
 
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import CLIENTS, Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, make_link_report
+from iris_session.bench.harness import (
+    CLIENTS,
+    WARM_UP_S,
+    Measurement,
+    assign_links,
+    compute_ages_ms,
+    group_clients,
+    measure,
+)
+from iris_session.bench.report import BenchError, BenchReport, make_bar, make_link_report, summarize_percentiles
 from iris_session.demo.scenes import free_bodies_scene
 
 #: The bar applies under input: this many of the clients send 3 devices x 72 Hz of samples.
@@ -32,17 +40,7 @@ def run_state(
 ) -> BenchReport:
     """Publish free bodies in motion without contact to observers, at 60 Hz.
 
-    Args:
-        clients: Number of observers.
-        bodies: Number of moving bodies.
-        seconds: Length of the measured window.
-        seed: Random seed.
-        curve: Encrypt and authenticate.
-        profile: Link profile of every client; results then include the link, and bars do not apply.
-        progress: Called with short texts.
-
-    Returns:
-        The report. Reference: `measure_baseline`.
+    Reference: `measure_baseline`.
     """
     model = free_bodies_scene(bodies, seed).compile()
     specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS) for i in range(clients)]
@@ -52,26 +50,23 @@ def run_state(
     groups = {CLIENTS: group_clients(specs)}
     got = measure(model, groups, seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress)
     progress("comparing every delivered frame with the state at its tick")
-    ages = np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
-    inside = np.concatenate([(log["published_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
+    logs = list(got.logs.values())
+    ages = compute_ages_ms(logs)
     if not len(ages):
         raise BenchError("no client received state: increase --seconds")
     position_mm, rotation_deg = compute_errors(got)
-    messages = sum(int(log["counts"][3]) for log in got.logs.values())
-    total = sum(int(log["counts"][4]) for log in got.logs.values())
+    samples, _, _, messages, total = np.sum([log["counts"] for log in logs], axis=0).tolist()
+    inside = np.concatenate([(log["published_ns"] - log["state_ns"]) * 1e-6 for log in logs])
     results: dict[str, Any] = {
-        "delivered_hz_min": round(min(len(log["ticks"]) for log in got.logs.values()) / got.seconds, 2),
-        "age_ms_p50": compute_percentile(ages, 50),
-        "age_ms_p95": compute_percentile(ages, 95),
-        "age_ms_p99": compute_percentile(ages, 99),
-        "age_at_publish_ms_p50": compute_percentile(inside, 50),
-        "age_at_publish_ms_p99": compute_percentile(inside, 99),
+        "delivered_hz_min": round(min(len(log["ticks"]) for log in logs) / got.seconds, 2),
+        **summarize_percentiles("age_ms", ages, (50, 95, 99)),
+        **summarize_percentiles("age_at_publish_ms", inside),
         "bytes_per_frame": round(total / messages, 1),
         "bytes_per_body": round(total / messages / bodies, 2),
         "max_position_error_mm": round(position_mm, 5),
         "max_rotation_error_deg": round(rotation_deg, 5),
-        "client_cpu_share": round(float(np.mean([log["cpu_share"][0] for log in got.logs.values()])), 4),
-        "samples_per_s": round(sum(int(log["counts"][0]) for log in got.logs.values()) / (got.seconds + 3.0), 1),
+        "client_cpu_share": round(float(np.mean([log["cpu_share"][0] for log in logs])), 4),
+        "samples_per_s": round(samples / (got.seconds + WARM_UP_S), 1),
         **got.summarize(*SESSION_KEYS),
     }
     bars = [

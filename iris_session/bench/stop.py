@@ -260,12 +260,7 @@ def run_case(run: StopScenario, cause: str) -> Case:
 
 
 def run_stop(seconds: float = 1.0, progress: Callable[[str], None] = lambda _: None) -> BenchReport:
-    """Measure every kind of actuator and every cause of a hold.
-
-    Args:
-        seconds: Time for which each arm presses against the wall [s of simulation], at most `MAX_PRESS_S`.
-        progress: Called with short texts.
-    """
+    """Measure every kind of actuator and every cause of a hold."""
     seconds = min(seconds, MAX_PRESS_S)
     cases: dict[str, dict[str, Case]] = {}
     for kind in KINDS:
