@@ -74,7 +74,7 @@ class SheetSource:
     `hz`: rate of new poses, each reported `repeats` times at `hz * repeats`. `late_s`: by how much later than its
     picture an observation is stamped, uniform. `size_sigma`: of the source's own measure of the sheet, as share;
     `focal`: share by which its focal length is wrong. `corner_px`: constant error of each detected corner, per axis.
-    `weight`: of a new pose in a smoothing filter. `remembers`: the first second repeats a pose of an earlier session.
+    `shake_m`: of the head from frame to frame, per axis, which moves what it sees. `weight`: of a new pose in a smoothing filter. `remembers`: the first second repeats a pose of an earlier session.
     `viewpoints`: `head` (a new number at every place), `each` (a new one at every observation), `zero`.
     `reported_as`: `ObservationSource`.
     """
@@ -85,6 +85,7 @@ class SheetSource:
     size_sigma: float = 0.0
     focal: float = 0.0
     corner_px: float = 0.0
+    shake_m: float = HEAD_SIGMA_M
     weight: float = 1.0
     remembers: bool = False
     viewpoints: str = "head"
@@ -201,7 +202,7 @@ class HeadsetMotion:
         p, q = path.place_sheet(stamped - self._late_s, sheet)
         p, q = self._detect(p, q, print_scale)
         head_p, head_q = path.compute(stamped)
-        head_p = head_p + rng.normal(0.0, HEAD_SIGMA_M, (n, 3))
+        head_p = head_p + rng.normal(0.0, s.shake_m, (n, 3))
         world_p = head_p + np.einsum("nij,nj->ni", quat_to_matrix(head_q), p)
         p, q = self.to_tracking(stamped, world_p, quat_multiply(head_q, q))
         p, q = self._filter(name, p, q)

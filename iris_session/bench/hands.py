@@ -18,14 +18,14 @@ import numpy as np
 
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.bench.hand_motion import PEAK_SPEED, PEOPLE, make_fast_motion, move_minimum_jerk, report_pose
+from iris_session.bench.operator import OPENING_STEPS, ScriptedOperator
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.control import ControlConfig
 from iris_session.demo.scenes.generators import n_arms_scene
 from iris_session.physics.robots import find_robots
-from iris_session.protocol.client_messages import Acquire, Sample
-from iris_session.protocol.common import IDENTITY, Pose, Target
-from iris_session.protocol.entries import AlignmentProposal, Entry, EntryMessage, Join
-from iris_session.protocol.names import CommandKind, Role
+from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.names import CommandKind
 from iris_session.protocol.server_messages import EngagementChanged
 from iris_session.protocol.steps import Decision, FixedView
 from iris_session.session.core import CoreConfig, SessionCore
@@ -49,34 +49,8 @@ MOTION_S: Final = 0.3
 MAX_TIP_MOTION_MM: Final = 20.0
 MAX_FALSE_HOLDS: Final = 1.0
 MAX_RECLUTCH_RAD: Final = 0.001
-_PILOT: Final = 1
-_COVARIANCE: Final = tuple(1e-8 if i % 7 == 0 else 0.0 for i in range(36))
-
 #: Seconds since it began, and the sample that would be sent -> that which is sent, or none.
 Disturbance = Callable[[float, Sample], Sample | None]
-
-
-class Opening:
-    """Messages and samples of the one operator, who is aligned and holds the robot."""
-
-    def __init__(self, device: str, robot: str) -> None:
-        self.device, self.robot = device, robot
-        self._seq = 0
-
-    def make_entries(self, step: int, now_ns: int) -> list[Entry]:
-        """Return what is sent in the first steps."""
-        first: dict[int, EntryMessage] = {
-            0: Join("key", Role.OPERATOR, "ann", devices=(self.device,)),
-            1: AlignmentProposal(IDENTITY, 0, _COVARIANCE, (0.0, 0.0, 0.0), 1e-3),
-            2: Acquire(1, (self.robot,)),
-        }
-        return [Entry(_PILOT, _PILOT, now_ns, first[step])] if step in first else []
-
-    def make_sample(self, pose: Pose, capture_ns: int, clutch: bool) -> Sample:
-        """Return the next sample."""
-        self._seq += 1
-        targets = (Target(self.robot, 1),)
-        return Sample(self.device, "pose", self._seq, capture_ns, 1, 0, 1, targets, clutch=clutch, pose=pose)
 
 
 class HandScenario:
@@ -89,7 +63,7 @@ class HandScenario:
         self.robot = robots[0].name
         self.device, self.rate_hz = device, rate_hz
         self.length, self.speed = MOTIONS[motion]
-        self.opening = Opening(device, self.robot)
+        self.operator = ScriptedOperator(device, self.robot)
         self.step_number = 0
         self.clutch = True
         self.disturbance: Disturbance = lambda _, sample: sample
@@ -122,16 +96,16 @@ class HandScenario:
     def step(self) -> None:
         """Take one step, with the sample that is due."""
         now_ns = self.now_ns
-        entries = self.opening.make_entries(self.step_number, now_ns)
+        entries = self.operator.make_opening(self.step_number, now_ns)
         count, before = now_ns * self.rate_hz // 10**9, (now_ns - STEP_NS) * self.rate_hz // 10**9
-        if count > before and self.step_number > 3:
+        if count > before and self.step_number > OPENING_STEPS:
             capture_ns = count * 10**9 // self.rate_hz
             clutch = self.clutch and capture_ns >= CLUTCH_S * 1e9
-            sample: Sample | None = self.opening.make_sample(self.make_pose(capture_ns), capture_ns, clutch)
+            sample: Sample | None = self.operator.make_sample(self.make_pose(capture_ns), capture_ns, clutch)
             if capture_ns >= self.disturbed_ns and sample is not None:
                 sample = self.disturbance((capture_ns - self.disturbed_ns) * 1e-9, sample)
             if sample is not None:
-                entries.append(Entry(_PILOT, _PILOT, now_ns, sample))
+                entries.append(self.operator.make_entry(sample, now_ns))
         self.decision = self.core.step(now_ns, entries, 1, digest=False).decision
         self.step_number += 1
 
@@ -221,12 +195,12 @@ def run_disturbances(device: str, rate_hz: int, motion: str, seed: int) -> dict[
     if not run.is_driven():
         raise BenchError(f"{device} at {rate_hz} Hz does not drive: {run.decision.commands[0].hold_reason}")
     end_ns = run.disturbed_ns + int(WATCHED_S * 1e9)
-    state, step_number, seq = run.core.snapshot(), run.step_number, run.opening._seq
+    state, step_number = run.core.snapshot(), run.step_number
     undisturbed = np.concatenate([before, run.run_until(end_ns)])
     out: dict[str, tuple[str, Disturbed]] = {}
     for name, (kind, length_s, disturbance) in list_disturbances(rate_hz).items():
         run.core.restore(state)
-        run.step_number, run.opening._seq, run.disturbance = step_number, seq, disturbance
+        run.step_number, run.disturbance = step_number, disturbance
         reason, worst, k = "", 0.0, len(before)
         until_ns = min(end_ns, run.disturbed_ns + int((length_s + 0.25) * 1e9))
         while run.now_ns <= until_ns:
@@ -271,14 +245,14 @@ def count_false_holds(device: str, rate_hz: int, seconds: float, seed: int) -> F
     robot = robots[0]
     view = FixedView(tips={robot.name: IDENTITY}, q={robot.name: (0.0,) * len(robot.joints)})
     authority = Authority(AuthorityConfig(), robots, ())
-    opening, holds, clutch = Opening(device, robot.name), 0, False
-    for step in range(3):
-        authority.step((step + 1) * MS, opening.make_entries(step, (step + 1) * MS), 1, view, ())
+    operator, holds, clutch = ScriptedOperator(device, robot.name), 0, False
+    for step in range(OPENING_STEPS):
+        authority.step((step + 1) * MS, operator.make_opening(step, (step + 1) * MS), 1, view, ())
     for index, numbers in enumerate(make_fast_motion(person, rate_hz, seconds, rng)):
         now_ns = 10 * MS + index * 10**9 // rate_hz
         pose = report_pose(numbers + np.append(AT, np.zeros(3)), person, rng)
-        sample = opening.make_sample(pose, now_ns, clutch)
-        decision = authority.step(now_ns, [Entry(_PILOT, _PILOT, now_ns, sample)], 1, view, ())
+        sample = operator.make_entry(operator.make_sample(pose, now_ns, clutch), now_ns)
+        decision = authority.step(now_ns, [sample], 1, view, ())
         clutch = True
         for event in decision.events:
             if isinstance(event.body, EngagementChanged) and not event.body.engaged:
