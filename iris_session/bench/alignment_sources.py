@@ -74,9 +74,9 @@ class SheetSource:
     `hz`: rate of new poses, each reported `repeats` times at `hz * repeats`. `late_s`: by how much later than its
     picture an observation is stamped, uniform. `size_sigma`: of the source's own measure of the sheet, as share;
     `focal`: share by which its focal length is wrong. `corner_px`: constant error of each detected corner, per axis.
-    `shake_m`: of the head from frame to frame, per axis, which moves what it sees. `weight`: of a new pose in a smoothing filter. `remembers`: the first second repeats a pose of an earlier session.
-    `viewpoints`: `head` (a new number at every place), `each` (a new one at every observation), `zero`.
-    `reported_as`: `ObservationSource`.
+    `shake_m`: of the head from frame to frame, per axis, which moves what it sees. `weight`: of a new pose in a
+    smoothing filter. `remembers`: the first second repeats a pose of an earlier session. `viewpoints`: `head` (a new
+    number at every place), `each` (a new one at every observation), `zero`. `reported_as`: `ObservationSource`.
     """
 
     hz: float = 10.0

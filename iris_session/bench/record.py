@@ -11,6 +11,7 @@ would be missing if the session had ended with it.
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import select
@@ -31,7 +32,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.harness import CLIENTS, Measurement, group_clients, make_session_config, measure
+from iris_session.bench.harness import CLIENTS, group_clients, make_session_config, measure
 from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.demo.scenes import free_bodies_scene, scene_path
@@ -45,7 +46,6 @@ from iris_session.demo.scenes.generators import (
     place_arm,
 )
 from iris_session.journal.feed import RATE_NS
-from iris_session.protocol.common import Pose
 from iris_session.recording import NotARecordingError, RecordedState, Recording
 from iris_session.rrd import paths
 from iris_session.rrd.batches import read_index
@@ -58,22 +58,14 @@ from iris_session.viewer.timelines import Moment, to_time_columns
 #: Rounds with a recording, and as many without; and the shortest of them.
 ROUNDS: Final = 3
 SHORTEST_S: Final = 2.0
-MAX_CPU_SHARE: Final = 0.05
-MAX_LOSS_S: Final = 0.25
-MAX_SIZE_RATIO: Final = 1.5
-MAX_REST_MB: Final = 20.0
 #: Time at rest [s]: the rate of a file is measured over `RATE_NS`, after half of it for scene and assets.
 REST_S: Final = 1.5 * RATE_NS * 1e-9 + 5.0
 RECORDER, AUTHORITY, BOTH = "recorder", "authority", "both"
 #: Kills in their order. A session survives that of its recorder, so it has one of the others, too.
 KINDS: Final = (RECORDER, AUTHORITY, RECORDER, BOTH)
-#: From the moment that a recorder is up to date to the kill, drawn at random [s]: at any place between two writes.
-KILL_AFTER_S: Final = (0.5, 1.0)
-POLL_S: Final = 0.02
 START_S: Final = 60.0
 END_S: Final = 30.0
 SESSION: Final = "iris_session.bench.record:RecordedSession"
-_RECORDER: Final = "iris_session.recording.process"
 
 
 class Round(NamedTuple):
@@ -93,10 +85,8 @@ class Kill(NamedTuple):
 
 
 class FileSize(NamedTuple):
-    """Size of a recording and of naive logs of its values [bytes], and their session time [s].
-
-    `naive`: in long batches; `live`: in those of `rerun.log`.
-    """
+    """Size of a recording, and of naive logs of its values in long batches and in those of `rerun.log` [bytes], and
+    their session time [s]."""
 
     recorded: int
     naive: int
@@ -116,47 +106,45 @@ def run_record(
     with tempfile.TemporaryDirectory(prefix="iris-bench-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         measured: list[Round] = []
-        scheduling, drops = "", dict[str, int]()
+        files: list[Path] = []
+        drops: dict[str, int] = {}
         for i in range(2 * rounds):
             recorded = i % 4 in (0, 3)  # in turn, and neither is always the first
             path = folder / f"round{i}.rrd"
-            kind = "with" if recorded else "without"
-            got = _measure_round(path if recorded else False, length_s, seed, _prefix(progress, i, 2 * rounds, kind))
+            progress(f"round {i + 1} of {2 * rounds}, {'with' if recorded else 'without'} recording")
+            got = measure(
+                make_record_scene(seed).compile(),
+                {CLIENTS: group_clients(_make_operators())},
+                length_s,
+                record=path if recorded else False,
+                seed=seed,
+                progress=progress,
+            )
             measured.append(Round(recorded, got.stats.late, got.stats.ticks, got.recorder_cpu_share))
-            scheduling = got.scheduling
-            drops |= got.drops if recorded else {}
             if recorded:
+                drops |= got.drops
+                files.append(path)
                 _wait_for_index(path)
         progress("writing the same values as naive logs")
-        sizes = [measure_size(folder / f"round{i}.rrd", folder) for i in range(2 * rounds) if i % 4 in (0, 3)]
+        sizes = [measure_size(path, folder) for path in files]
         progress("a session at rest")
         rest_mb = measure_rest(folder / "rest.rrd")
         losses, missing = _kill_sessions(folder, kills, seed, progress)
     results = summarize_rounds(measured) | summarize_sizes(sizes) | summarize_kills(losses)
-    results |= {"rest_mb_per_hour": rest_mb, "kill_rows_missing": missing, "scheduling": scheduling, "drops": drops}
+    results |= {"rest_mb_per_hour": rest_mb, "kill_rows_missing": missing, "scheduling": got.scheduling, "drops": drops}
     params = {"operators": OPERATORS, "bodies": BODIES, "seconds": 2 * rounds * length_s, "rounds": rounds}
     return BenchReport("record", params | {"kills": kills, "seed": seed}, results, tuple(make_record_bars(results)))
-
-
-def _prefix(progress: Callable[[str], None], i: int, n: int, kind: str) -> Callable[[str], None]:
-    return lambda text: progress(f"round {i + 1} of {n}, {kind} recording: {text}")
 
 
 def _make_operators() -> list[ClientJob]:
     return [ClientJob(f"operator{i}", "operator", arm, samples=True) for i, arm in enumerate(arm_names(OPERATORS))]
 
 
-def _measure_round(record: Path | bool, seconds: float, seed: int, progress: Callable[[str], None]) -> Measurement:
-    model = make_record_scene(seed).compile()
-    groups = {CLIENTS: group_clients(_make_operators())}
-    return measure(model, groups, seconds, record=record, seed=seed, progress=progress)
-
-
 def _wait_for_index(path: Path) -> None:
     """Wait until a finished recording has its index: the next round is measured without the process that adds it."""
     until = time.monotonic() + END_S
     while time.monotonic() < until and not scan_file(path).indexed:
-        time.sleep(POLL_S)
+        time.sleep(0.02)
 
 
 # --- results ----------------------------------------------------------------------------------------------------------
@@ -218,25 +206,25 @@ def summarize_sizes(sizes: Sequence[FileSize]) -> dict[str, Any]:
 def summarize_kills(kills: Sequence[Kill]) -> dict[str, Any]:
     """Return what kills take from the files, of all and by kind."""
     losses = [kill.loss_s for kill in kills]
-    results: dict[str, Any] = {
-        "kills": {kind: sum(k.kind == kind for k in kills) for kind in (RECORDER, AUTHORITY, BOTH)}
+    by_kind = {kind: [k.loss_s for k in kills if k.kind == kind] for kind in (RECORDER, AUTHORITY, BOTH)}
+    return {
+        "kills": {kind: len(of) for kind, of in by_kind.items()},
+        "kill_loss_s_p50": round(float(np.percentile(losses, 50)), 4),
+        "kill_loss_s_p95": round(float(np.percentile(losses, 95)), 4),
+        "kill_loss_s_max": round(max(losses), 4),
+        "kill_loss_s_max_by_kind": {kind: round(max(of), 4) for kind, of in by_kind.items() if of},
     }
-    for label, percentile in (("p50", 50), ("p95", 95), ("max", 100)):
-        results[f"kill_loss_s_{label}"] = round(float(np.percentile(losses, percentile)), 4)
-    largest = {kind: [k.loss_s for k in kills if k.kind == kind] for kind in (RECORDER, AUTHORITY, BOTH)}
-    results["kill_loss_s_max_by_kind"] = {kind: round(max(of), 4) for kind, of in largest.items() if of}
-    return results
 
 
 def make_record_bars(results: dict[str, Any]) -> list[Any]:
     """Return the bars. Those with a recording are compared with those without it, and their spread."""
     late = round(results["late_tick_share_off"] + results["late_tick_share_off_spread"], 6)
     return [
-        make_bar(results, "writer_cpu_share", "<=", MAX_CPU_SHARE),
+        make_bar(results, "writer_cpu_share", "<=", 0.05),
         make_bar(results, "late_tick_share_on", "<=", late),
-        make_bar(results, "size_ratio", "<=", MAX_SIZE_RATIO),
-        make_bar(results, "rest_mb_per_hour", "<=", MAX_REST_MB),
-        make_bar(results, "kill_loss_s_max", "<=", MAX_LOSS_S),
+        make_bar(results, "size_ratio", "<=", 1.5),
+        make_bar(results, "rest_mb_per_hour", "<=", 20.0),
+        make_bar(results, "kill_loss_s_max", "<=", 0.25),
         make_bar(results, "kill_rows_missing", "<=", 0),
     ]
 
@@ -259,7 +247,7 @@ def _kill_sessions(folder: Path, kills: int, seed: int, progress: Callable[[str]
         progress(f"kill {i + 1} of {kills}: {', then '.join(pair)}")
         path = folder / f"killed{i}" / paths.FIRST_FILE
         with KilledSession(path, seed) as session:
-            killed = [(kind, session.kill(kind, random_of.uniform(*KILL_AFTER_S))) for kind in pair]
+            killed = [(kind, session.kill(kind, random_of.uniform(0.5, 1.0))) for kind in pair]
         lost, gaps = read_losses(path, killed)
         losses += lost
         missing += gaps
@@ -267,14 +255,9 @@ def _kill_sessions(folder: Path, kills: int, seed: int, progress: Callable[[str]
 
 
 def read_losses(path: Path, kills: Sequence[tuple[str, int]]) -> tuple[list[Kill], int]:
-    """Read what kills have left of a recording.
+    """Return the losses of kills of a recording, and how many rows are missing between others in what is left.
 
-    Args:
-        path: Its first file.
-        kills: What was killed, and the session time of the kill [ns], in order.
-
-    Returns:
-        The kills with their losses, and the number of rows that are missing between others.
+    `kills`: what was killed, and the session time of the kill [ns], in order.
     """
     losses = []
     for part, (kind, at_ns) in enumerate(kills, 1):
@@ -292,12 +275,7 @@ def read_losses(path: Path, kills: Sequence[tuple[str, int]]) -> tuple[list[Kill
 
 
 class KilledSession:
-    """A session with its operators in other processes, all of which end with this context.
-
-    Args:
-        path: First file of its recording.
-        seed: Random seed of the motion.
-    """
+    """A session with its operators in other processes, all of which end with this context."""
 
     def __init__(self, path: Path, seed: int) -> None:
         self._started: list[psutil.Process] = []
@@ -318,35 +296,21 @@ class KilledSession:
         self._stack.close()
 
     def kill(self, kind: str, after_s: float) -> int:
-        """Kill processes some time after the recorder has caught up.
-
-        Args:
-            kind: `RECORDER`, `AUTHORITY` or `BOTH`.
-            after_s: Seconds to wait.
+        """Kill processes, as `kind` says, some time after the recorder has caught up: anywhere between two writes.
 
         Returns:
             The session time of the kill [ns].
         """
-        if not self._session.ask("wait_until_written", START_S):
+        recorder = self._session.ask("wait_until_written", START_S)
+        if not recorder:
             raise BenchError("the recorder of a session that is to be killed is not up to date")
         self._started = psutil.Process(self._session.pid).children(recursive=True)
         time.sleep(after_s)
-        recorder = self._find_recorder()
         victims = {RECORDER: [recorder], AUTHORITY: [self._session.pid], BOTH: [recorder, self._session.pid]}[kind]
-        if 0 in victims:
-            raise BenchError("the recorder ended before it was killed")
         now_ns = time.monotonic_ns()
         for pid in victims:
             os.kill(pid, signal.SIGKILL)
         return now_ns - self._origin_ns
-
-    def _find_recorder(self) -> int:
-        """Return the process id of the recorder, 0 if there is none."""
-        for process in self._started:
-            with suppress(psutil.Error):
-                if _RECORDER in process.cmdline():
-                    return int(process.pid)
-        return 0
 
     def _end(self) -> None:
         """End the session, and wait for its processes: a recorder whose session was killed writes the rest first."""
@@ -381,13 +345,12 @@ def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
     log = rr.RecordingStream("naive", recording_id="naive")
     log.set_log_time_enabled(False)
     log.save(output)
-    states = list(recording.states())
+    states, header = list(recording.states()), recording.header
     if states:
-        header, first = recording.header, _make_moment(states[0], recording.header.origin_utc_ns)
         picture = SceneLayer(log)
         picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
-        picture.draw(first)
-    for rows in _split(_list_poses(states, recording.header.origin_utc_ns), batch_s):
+        picture.draw(_make_moment(states[0], header.origin_utc_ns))
+    for rows in _split(_list_poses(states, header.origin_utc_ns), batch_s):
         for entity, taken in rows.items():
             poses = np.array([pose for _, pose in taken], np.float32)
             columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]])
@@ -412,7 +375,7 @@ def _list_poses(states: list[RecordedState], origin_utc_ns: int) -> Iterator[tup
             if body.moving:
                 yield f"bodies/{escape_entity_part(body.name)}", moment, pose
         for item in state.presence:
-            yield f"people/{item.participant}/{item.device}", moment, _list_numbers(item.pose)
+            yield f"people/{item.participant}/{item.device}", moment, [*item.pose.p, *item.pose.q]
 
 
 def _list_scalars(recording: Recording) -> Iterator[tuple[str, Moment, list[float]]]:
@@ -429,25 +392,16 @@ def _list_scalars(recording: Recording) -> Iterator[tuple[str, Moment, list[floa
 
 def _split(rows: Iterable[tuple[str, Moment, list[float]]], batch_s: float) -> Iterator[_Rows]:
     """Collect rows in order of time by entity, in batches."""
-    begin_ns: int | None = None
-    batch: _Rows = {}
-    for entity, moment, values in rows:
-        if begin_ns is None or not 0 <= moment.session_ns - begin_ns < batch_s * 1e9:
-            if batch:
-                yield batch
-            begin_ns, batch = moment.session_ns, {}
-        batch.setdefault(entity, []).append((moment, values))
-    if batch:
+    for _, taken in itertools.groupby(rows, lambda row: row[1].session_ns // round(batch_s * 1e9)):
+        batch: _Rows = {}
+        for entity, moment, values in taken:
+            batch.setdefault(entity, []).append((moment, values))
         yield batch
 
 
 def _make_moment(state: RecordedState, origin_utc_ns: int) -> Moment:
     time_ns = state.session_time
     return Moment(state.step, round(state.sim_time * 1e9), time_ns, time_ns + origin_utc_ns)
-
-
-def _list_numbers(pose: Pose) -> list[float]:
-    return [*pose.p, *pose.q]
 
 
 def _send(log: rr.RecordingStream, entity: str, moments: list[Moment], columns: Any) -> None:
@@ -461,14 +415,12 @@ def _send(log: rr.RecordingStream, entity: str, moments: list[Moment], columns: 
 #: Moving bodies: those that fly, and ten of each of the two arms.
 BODIES: Final = 50
 OPERATORS: Final = 2
-POLL_NS: Final = 20_000_000
 #: Age of the newest row at its write [ns] from which on a recorder has caught up.
 CURRENT_NS: Final = 250_000_000
-_FREE: Final = BODIES - 10 * OPERATORS
 
 
 class SessionJob(msgspec.Struct, frozen=True):
-    """Job of the process. `path`: first file of the recording."""
+    """Job of the process. `path`: first file of the recording; `seed`: of the motion."""
 
     path: str
     seed: int
@@ -476,7 +428,7 @@ class SessionJob(msgspec.Struct, frozen=True):
 
 def make_record_scene(seed: int) -> Any:
     """Return an `mujoco.MjSpec` with two arms and as many flying bodies as make `BODIES` that move."""
-    spec = free_bodies_scene(_FREE, seed)
+    spec = free_bodies_scene(BODIES - 10 * OPERATORS, seed)
     home = spec.key("home")
     qpos, qvel = list(home.qpos), list(home.qvel)
     spec.delete(home)
@@ -512,8 +464,8 @@ class RecordedSession(Plugin):
         """Return the address of the session, and its origin: session time zero on CLOCK_MONOTONIC [ns]."""
         return self._session.address, self._session.origin_ns
 
-    def wait_until_written(self, timeout_s: float) -> bool:
-        """Run until a recorder that is new has written the rows that waited for it; return whether it has."""
+    def wait_until_written(self, timeout_s: float) -> int:
+        """Run until a recorder that is new has written the rows that waited for it; return its process id, or 0."""
         due_ns = 0
 
         def is_written() -> bool:
@@ -521,7 +473,7 @@ class RecordedSession(Plugin):
             feed, now_ns = self._session.processes.feed, self._session.clock()
             if now_ns < due_ns or feed is None:
                 return False
-            due_ns = now_ns + POLL_NS
+            due_ns = now_ns + 20_000_000
             last = feed.stats.recorder
             if last is None or last.instance == self._known or last.written < 0 or not 0 < last.lag_ns < CURRENT_NS:
                 return False
@@ -530,7 +482,7 @@ class RecordedSession(Plugin):
 
         before = self._known
         self._session.run(seconds=timeout_s, until=is_written)
-        return self._known != before
+        return self._session.processes.recorder_pid if self._known != before else 0
 
     def close(self) -> None:
         """Close the session."""
