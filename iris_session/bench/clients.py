@@ -219,11 +219,10 @@ class BenchClient:
 class StateClients(Plugin):
     """Clients of one process."""
 
-    job_type = Job
     client_type: ClassVar[type[BenchClient]] = BenchClient
 
     def __init__(self, job: Job) -> None:
-        super().__init__(job)
+        self._job = job
         self._clients = [self.client_type(job, spec) for spec in job.clients]
         for client in self._clients:
             client.join()
@@ -234,11 +233,11 @@ class StateClients(Plugin):
 
     def poll(self) -> None:
         """Send the samples that are due, and receive."""
-        now = self.job.session_time_ns()
+        now = self._job.session_time_ns()
         for client in self._clients:
             client.step(now)
         wake = min(now + round(POLL_S * 1e9), *(client.next_ns for client in self._clients))
-        self._group.poll(max(0.0, (wake - self.job.session_time_ns()) * 1e-9))
+        self._group.poll(max(0.0, (wake - self._job.session_time_ns()) * 1e-9))
         for client in self._clients:
             client.receive()
 
@@ -247,13 +246,13 @@ class StateClients(Plugin):
         for client in self._clients:
             client.prepare((end_ns - begin_ns) * 1e-9)
         cpu_s = time.process_time()
-        while (now := self.job.session_time_ns()) < end_ns:
+        while (now := self._job.session_time_ns()) < end_ns:
             for client in self._clients:
                 client.recording = begin_ns <= now
             self.poll()
         cpu_share = (time.process_time() - cpu_s) / ((end_ns - begin_ns) * 1e-9)
         share = {"cpu_share": np.array([cpu_share / len(self._clients)])}
-        self.job.write_log({client.spec.name: client.to_columns() | share for client in self._clients})
+        self._job.write_log({client.spec.name: client.to_columns() | share for client in self._clients})
 
     def close(self) -> None:
         """Leave the session."""

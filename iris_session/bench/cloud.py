@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.cloud_camera import CloudCase, CloudJob
+from iris_session.bench.cloud_camera import CloudCase
 from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure, plan_rounds
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchReport, make_bar
@@ -55,7 +55,7 @@ def run_cloud(
     cases = _make_cases(points, cameras, beside, progress)
     params: dict[str, Any] = {"points": points, "cameras": cameras, "seconds": seconds, "seed": seed, "beside": beside}
     progress("making the pictures")
-    with PluginProcess(CAMERA, CloudJob(cases, seed)) as camera:
+    with PluginProcess(CAMERA, cases, seed) as camera:
         camera.read()
         if beside:
             return BenchReport("cloud", params, *_measure_beside(camera, seconds, seed, progress))

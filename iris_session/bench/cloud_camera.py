@@ -147,13 +147,6 @@ class CloudCase(msgspec.Struct, frozen=True):
     hz: float = 0.0
 
 
-class CloudJob(msgspec.Struct, frozen=True):
-    """Cases of one process. `seed`: of the noise of the pictures."""
-
-    cases: tuple[CloudCase, ...]
-    seed: int
-
-
 class Rig(msgspec.Struct, frozen=True):
     """The cameras of a case: intrinsics, limits, and for each camera its pictures."""
 
@@ -238,17 +231,16 @@ class CloudCamera:
 class CameraPublisher(MediaPublisher):
     """Publisher of the clouds of its cases."""
 
-    job_type = CloudJob
     role = "camera"
 
-    def __init__(self, job: CloudJob) -> None:
-        super().__init__(job)
-        self._cameras = {case.name: CloudCamera(case, job.seed) for case in job.cases}
+    def __init__(self, cases: tuple[CloudCase, ...], seed: int) -> None:
+        super().__init__()
+        self._cameras = {case.name: CloudCamera(case, seed) for case in cases}
 
     def compare(self) -> dict[str, float | None]:
         """Return what the voxel filters of numpy and open3d take for a picture of the first case [ms]."""
-        case = self.job.cases[0]
-        return compare_filters(self._cameras[case.name].rig, case.voxel_m)
+        first = next(iter(self._cameras.values()))
+        return compare_filters(first.rig, first.case.voxel_m)
 
     def run(self, case: str, seconds: float) -> dict[str, Any]:
         """Make and send clouds of a case for some seconds. Return the results."""

@@ -55,14 +55,6 @@ _PAINT: Final = np.array(((215, 210, 200), (190, 200, 215), (130, 110, 90)))
 _LOW, _HIGH = np.array(((-2.0, -2.0, 0.0), (2.0, 2.0, 2.4)), np.float32)
 
 
-class SourceJob(msgspec.Struct, frozen=True):
-    """Job of the source. `seed`: of the points."""
-
-    points: int
-    hz: int
-    seed: int
-
-
 class MovingCloud:
     """Points on the walls and the floor of a room, which swing: where they are depends on seed and frame only."""
 
@@ -94,8 +86,7 @@ class MediaPublisher(Plugin):
 
     role: ClassVar[str]
 
-    def __init__(self, job: Any) -> None:
-        super().__init__(job)
+    def __init__(self) -> None:
         lower_thread_priority()  # of this thread and those that it starts, as in a camera process
         self._client: Client | None = None
 
@@ -135,17 +126,16 @@ class MediaPublisher(Plugin):
 class Source(MediaPublisher):
     """Publisher of a moving cloud."""
 
-    job_type = SourceJob
     role = "source"
 
-    def __init__(self, job: SourceJob) -> None:
-        super().__init__(job)
-        self._cloud = MovingCloud(job.points, job.seed)
+    def __init__(self, points: int, hz: int, seed: int) -> None:
+        super().__init__()
+        self._cloud, self._hz = MovingCloud(points, seed), hz
 
     def run(self, seconds: float) -> dict[str, Any]:
         """Publish for some seconds. Return captures [ns] of the frames by number, and what their encoding took [ms]."""
         assert self._client is not None
-        hz: int = self.job.hz
+        hz = self._hz
         captures: dict[int, int] = {}
         encode_ms, refused = [], 0
         begin = time.perf_counter()
@@ -209,7 +199,7 @@ def run_cloud_stream(
         links = {spec.link: "none" for spec in specs}
     with (
         tempfile.TemporaryDirectory(prefix="iris-bench-") as folder,
-        PluginProcess(SOURCE, SourceJob(points, hz, seed)) as source,
+        PluginProcess(SOURCE, points, hz, seed) as source,
     ):
         source.read()
         profile = Path(folder) / "slow.json"

@@ -333,10 +333,8 @@ def make_environment() -> dict[str, str]:
 class CsharpClient(Plugin):
     """One C# client on the runtime that its name is."""
 
-    job_type = Job
-
     def __init__(self, job: Job) -> None:
-        super().__init__(job)
+        self._job = job
         (spec,) = job.clients
         command = [*make_command(spec.name), "live", job.page, spec.name, str(job.origin_ns)]
         self._name = spec.name
@@ -348,13 +346,12 @@ class CsharpClient(Plugin):
     def measure(self, begin_ns: int, end_ns: int) -> None:
         """Let the client log a window of session time [ns], and write its log."""
         assert self._process.stdin is not None
-        with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
-            file = Path(folder, "log")
-            self._process.stdin.write(f"measure {begin_ns} {end_ns} {file}\n")
-            self._process.stdin.flush()
-            self._expect("done")
-            rows = np.loadtxt(file, np.int64, ndmin=2).reshape(-1, 3)
-        self.job.write_log({self._name: dict(zip(("ticks", "handed_ns", "state_ns"), rows.T, strict=True))})
+        file = f"{self._job.log}.txt"
+        self._process.stdin.write(f"measure {begin_ns} {end_ns} {file}\n")
+        self._process.stdin.flush()
+        self._expect("done")
+        rows = np.loadtxt(file, np.int64, ndmin=2).reshape(-1, 3)
+        self._job.write_log({self._name: dict(zip(("ticks", "handed_ns", "state_ns"), rows.T, strict=True))})
 
     def close(self) -> None:
         """Let the client leave the session."""

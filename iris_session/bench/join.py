@@ -17,7 +17,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
 import mujoco
 import numpy as np
 import psutil
@@ -69,7 +68,7 @@ def run_join(
             raise BenchError(f"{ready['built']} assets were encoded again although the cache is warm")
         paths = [store.path(address) for address in ready["addresses"]]
         port = stack.enter_context(_serve_in_bulk(paths))
-        joiner = stack.enter_context(PluginProcess("iris_session.bench.join:Joiner", JoinJob(str(folder / "cache"))))
+        joiner = stack.enter_context(PluginProcess("iris_session.bench.join:Joiner", str(folder / "cache")))
         joiner.read()  # it is made
 
         def start_join(run: BenchRun) -> None:
@@ -120,7 +119,7 @@ def run_join(
 
 
 def _prepare_scene(model: Path, store: Path) -> dict[str, Any]:
-    with PluginProcess("iris_session.bench.join:ScenePreparer", SceneJob(str(model), str(store))) as process:
+    with PluginProcess("iris_session.bench.join:ScenePreparer", str(model), str(store)) as process:
         process.read()  # it is made
         prepared: dict[str, Any] = process.ask("prepare")
         return prepared
@@ -164,19 +163,15 @@ JOIN_S: Final = 60.0
 COPY_THREADS: Final = 2
 
 
-class JoinJob(msgspec.Struct, frozen=True):
-    """Job of the process. `cache`: folder of assets, empty at first."""
-
-    cache: str
-
-
 class Joiner(Plugin):
-    """Plug-in that joins. It is started before it is needed: starting Python is not part of joining."""
+    """Plug-in that joins. It is started before it is needed: starting Python is not part of joining.
 
-    job_type = JoinJob
+    Args:
+        cache: Folder of assets, empty at first.
+    """
 
-    def __init__(self, job: JoinJob) -> None:
-        super().__init__(job)
+    def __init__(self, cache: str) -> None:
+        self._cache = cache
         gc.collect()
         gc.freeze()  # Python and its libraries are not part of joining
 
@@ -188,7 +183,7 @@ class Joiner(Plugin):
         """
         begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
         with Client(address, role="observer", name="joiner", alignment="not_needed") as client:
-            client.assets.cache = AssetStore(self.job.cache)
+            client.assets.cache = AssetStore(self._cache)
             scene = client.connection.mirror.scene_hash
             first = client.assets.fetch([scene], decode=lambda _, data: decode_scene(data))
             client.wait_for(lambda _: first.done, JOIN_S)
@@ -326,20 +321,14 @@ def _make_stone(
     return points.reshape(-1, 3), np.concatenate([faces, *caps]), np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
-class SceneJob(msgspec.Struct, frozen=True):
-    """Files of a compiled model and of the store of its assets."""
-
-    model: str
-    store: str
-
-
 class ScenePreparer(Plugin):
     """Plug-in that prepares a compiled model as a server does at its start.
 
     The memory of a scene can only be measured in a process that did nothing else.
     """
 
-    job_type = SceneJob
+    def __init__(self, model: str, store: str) -> None:
+        self._model, self._store = load_model(model), AssetStore(store)
 
     def prepare(self) -> dict[str, Any]:
         """Prepare the scene, and measure it.
@@ -348,13 +337,11 @@ class ScenePreparer(Plugin):
             `seconds` from the compiled model to assets that can be fetched; `rss_mib`, peak memory meanwhile above that
             of the process with the model; `built`, the number of assets that were encoded; `addresses` of all assets.
         """
-        model = load_model(self.job.model)
-        store = AssetStore(Path(self.job.store))
         before = psutil.Process().memory_info().rss
         Path("/proc/self/clear_refs").write_text("5")  # the peak of memory is counted from now on (Linux)
         began_s = time.perf_counter()
-        parsed = parse_mujoco(model, store)
-        scene = store.put(encode_scene(parsed.spec))
+        parsed = parse_mujoco(self._model, self._store)
+        scene = self._store.put(encode_scene(parsed.spec))
         seconds = time.perf_counter() - began_s
         rss_mib = (_read_peak_rss() - before) / 2**20
         addresses = [scene, *list_assets(parsed.spec)]

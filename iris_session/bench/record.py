@@ -24,7 +24,6 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
-import msgspec
 import mujoco
 import numpy as np
 import psutil
@@ -280,7 +279,7 @@ class KilledSession:
     def __init__(self, path: Path, seed: int) -> None:
         self._started: list[psutil.Process] = []
         with ExitStack() as stack:
-            self._session = PluginProcess(SESSION, SessionJob(str(path), seed))
+            self._session = PluginProcess(SESSION, str(path), seed)
             stack.callback(self._end)
             self._session.read(START_S)
             self._origin_ns: int
@@ -419,13 +418,6 @@ OPERATORS: Final = 2
 CURRENT_NS: Final = 250_000_000
 
 
-class SessionJob(msgspec.Struct, frozen=True):
-    """Job of the process. `path`: first file of the recording; `seed`: of the motion."""
-
-    path: str
-    seed: int
-
-
 def make_record_scene(seed: int) -> Any:
     """Return an `mujoco.MjSpec` with two arms and as many flying bodies as make `BODIES` that move."""
     spec = free_bodies_scene(BODIES - 10 * OPERATORS, seed)
@@ -443,14 +435,11 @@ def make_record_scene(seed: int) -> Any:
 
 
 class RecordedSession(Plugin):
-    """Plug-in that runs a recorded session of the scene."""
+    """Plug-in that runs a recorded session of the scene. `path`: first file of the recording."""
 
-    job_type = SessionJob
-
-    def __init__(self, job: SessionJob) -> None:
-        super().__init__(job)
-        model = make_record_scene(job.seed).compile()
-        self._session = Session(model, config=make_session_config(record=Path(job.path)))
+    def __init__(self, path: str, seed: int) -> None:
+        model = make_record_scene(seed).compile()
+        self._session = Session(model, config=make_session_config(record=Path(path)))
         self._session.start()
         self._known = 0
         self._calls = select.poll()

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
 import mujoco
 import numpy as np
 
@@ -33,20 +32,11 @@ MAX_ENV_STEP_MS: Final = 0.5
 _OBSERVER: Final = "iris_session.bench.share:Observer"
 
 
-class ObserverJob(msgspec.Struct):
-    """The session to watch."""
-
-    address: str
-
-
 class Observer(Plugin):
     """A client that watches."""
 
-    job_type = ObserverJob
-
-    def __init__(self, job: ObserverJob) -> None:
-        super().__init__(job)
-        self._client = Client(job.address, role="observer", name="observer")
+    def __init__(self, address: str) -> None:
+        self._client = Client(address, role="observer", name="observer")
         self._client.start()
 
     def poll(self) -> None:
@@ -101,7 +91,7 @@ def run_share(seconds: float = 100.0, progress: Callable[[str], None] = lambda _
                 before = {paced: measure_steps(environment, slot_s, paced=paced) for paced in (True, False)}
                 with share(environment, config=config) as session:
                     environment.step()
-                    observer = PluginProcess(_OBSERVER, ObserverJob(session.address))
+                    observer = PluginProcess(_OBSERVER, session.address)
                     try:
                         while not observer.has_answered():
                             environment.step()
