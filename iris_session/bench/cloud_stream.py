@@ -30,6 +30,7 @@ from iris_session.bench.harness import (
     measure,
     plan_intervals,
     plan_rounds,
+    select_between,
 )
 from iris_session.bench.media_clients import UNCHECKED, sum_counts
 from iris_session.bench.media_clients import MediaColumn as Column
@@ -332,7 +333,7 @@ def _make_bars(results: dict[str, Any], hz: int, mbit: float) -> list[Bar]:
 
 def _select(rows: NDArray[Any], column: int, got: Measurement, interval: Interval) -> NDArray[Any]:
     """Return the rows with a session time within an interval."""
-    return np.asarray(rows[interval.contains(rows[:, column], got.begin_ns)])
+    return np.asarray(rows[select_between(rows[:, column], got.begin_ns, interval.begin_s, interval.end_s)])
 
 
 def _compare(clouds: NDArray[Any], runs: Sequence[dict[str, Any]], cloud: MovingCloud, hz: int) -> tuple[float, float]:

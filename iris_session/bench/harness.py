@@ -11,8 +11,9 @@ import hashlib
 import os
 import signal
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -29,12 +30,13 @@ from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchError, compute_percentile
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.physics import PacerStats
-from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.client_messages import EStop, Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import Role
 from iris_session.security import WEB, KeyHome, KeyPair, encode_key
 from iris_session.session.config import SessionConfig
 from iris_session.session.session import Session
+from iris_session.session.status import SessionStatus
 
 Log = dict[str, NDArray[Any]]
 STALL_S: Final = 3.0
@@ -63,10 +65,6 @@ class Interval(NamedTuple):
     @property
     def length_s(self) -> float:
         return self.end_s - self.begin_s
-
-    def contains(self, times_ns: NDArray[Any], begin_ns: int) -> NDArray[np.bool_]:
-        """Return which session times lie within, in a window that begins at `begin_ns`."""
-        return select_between(times_ns, begin_ns, self.begin_s, self.end_s)
 
 
 def plan_intervals(kinds: Sequence[str], length_s: float, begin_s: float = 0.0) -> list[Interval]:
@@ -163,51 +161,98 @@ def assign_links(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJ
     return placed, dict.fromkeys((spec.link for spec in placed), profile)
 
 
-@dataclass
-class Measurement:
+class _Reading(NamedTuple):
+    """Statistics of ticks and of processes at one time."""
+
+    at_s: float
+    stats: PacerStats
+    late_causes: dict[str, int]
+    cpu_s: dict[str, float]
+    rss: dict[str, int]
+
+
+class Usage(NamedTuple):
+    """What a session used of the machine in a window.
+
+    `cpu_shares`: of one core, of `server` (authority and front), `recorder` and `gateway`, where they ran at both ends;
+    `rss`: their memory at both ends [bytes]. `late_causes`: late ticks of the last ten seconds by cause.
+    """
+
+    stats: PacerStats
+    late_causes: dict[str, int]
+    cpu_shares: dict[str, float]
+    rss: dict[str, tuple[int, int]]
+
+
+def _read_usage(session: Session, *, anew: bool) -> _Reading:
+    processes = session.processes
+    page = processes.web
+    pids = {
+        "server": (os.getpid(), processes.front_pid),
+        "recorder": (processes.recorder_pid,),
+        "gateway": (0 if page is None else page.pid,),
+    }
+    found = {name: [psutil.Process(pid) for pid in own] for name, own in pids.items() if all(own)}
+    stats, times = session.lateness(anew=anew), processes.reporter.times
+    assert stats is not None
+    return _Reading(
+        time.monotonic(),
+        stats,
+        {} if times is None else times.count_late_causes(),
+        {name: sum(p.cpu_times().user + p.cpu_times().system for p in own) for name, own in found.items()},
+        {name: sum(p.memory_info().rss for p in own) for name, own in found.items()},
+    )
+
+
+def _compute_usage(begin: _Reading, end: _Reading) -> Usage:
+    before, after = begin.stats, end.stats
+    ticks, late = after.ticks - before.ticks, after.late - before.late
+    stats = after._replace(
+        ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
+    )
+    both = begin.cpu_s.keys() & end.cpu_s.keys()
+    shares = {name: (end.cpu_s[name] - begin.cpu_s[name]) / (end.at_s - begin.at_s) for name in both}
+    return Usage(stats, end.late_causes, shares, {name: (begin.rss[name], end.rss[name]) for name in both})
+
+
+class Measurement(NamedTuple):
     """Measurements of one window.
 
     Attributes:
         seconds: Length of the window.
-        stats: Lateness of its ticks.
-        cpu_share: Processor time of authority and front as a share of one core.
+        begin_ns: Session time of its beginning.
         logs: Logs by client name.
-        scheduling: Priority of the tick loop.
+        usage: What the session used of the machine.
         truth: Poses by tick in the authority.
         received: Sequence number and session time of receipt of samples, by connection and device.
-        rejected: Rejected samples by reason.
+        stops: Session time at which the front received each e-stop, and at which the step that holds had ended.
         connections: Connection numbers by client name.
-        drops: Drops by reason.
-        late_causes: Late ticks of the last ten seconds by cause.
-        begin_ns: Session time of its beginning.
-        recorder_cpu_share: Processor time of the recorder as a share of one core; 0 without a recording.
+        status: Status of the session at the end.
+        rejected: Rejected samples by reason.
     """
 
     seconds: float
-    stats: PacerStats
-    cpu_share: float
+    begin_ns: int
     logs: dict[str, Log]
-    scheduling: str
-    truth: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    received: dict[tuple[int, str], list[tuple[int, int]]] = field(default_factory=dict)
-    rejected: dict[str, int] = field(default_factory=dict)
-    connections: dict[str, int] = field(default_factory=dict)
-    drops: dict[str, int] = field(default_factory=dict)
-    late_causes: dict[str, int] = field(default_factory=dict)
-    begin_ns: int = 0
-    recorder_cpu_share: float = 0.0
+    usage: Usage
+    truth: dict[int, NDArray[np.float64]]
+    received: dict[tuple[int, str], list[tuple[int, int]]]
+    stops: list[tuple[int, int]]
+    connections: dict[str, int]
+    status: SessionStatus
+    rejected: dict[str, int]
 
     def summarize(self, *keys: str) -> dict[str, Any]:
         """Return some of what is measured of the session itself, under the keys of reports."""
         found = {
-            "server_cpu_share": round(self.cpu_share, 3),
-            "late_tick_share": round(self.stats.late_share, 6),
-            "lateness_ms_p99": round(self.stats.p99_ns * 1e-6, 3),
-            "ticks": self.stats.ticks,
+            "server_cpu_share": round(self.usage.cpu_shares["server"], 3),
+            "late_tick_share": round(self.usage.stats.late_share, 6),
+            "lateness_ms_p99": round(self.usage.stats.p99_ns * 1e-6, 3),
+            "ticks": self.usage.stats.ticks,
             "frames_not_logged": sum(int(log["counts"][1]) for log in self.logs.values() if "counts" in log),
-            "late_causes": self.late_causes,
-            "scheduling": self.scheduling,
-            "drops": self.drops,
+            "late_causes": self.usage.late_causes,
+            "scheduling": self.status.scheduling,
+            "drops": self.status.drops,
         }
         return {key: found[key] for key in keys}
 
@@ -367,53 +412,58 @@ def _run_session(
     progress(f"warm-up, then measuring {seconds:g} s")
     truth: dict[int, NDArray[np.float64]] = {}
     received: dict[tuple[int, str], list[tuple[int, int]]] = {}
+    stops: list[tuple[int, int]] = []
+    begin = session.clock() + round(WARM_UP_S * 1e9)
+    end = begin + round(seconds * 1e9)
 
     def store_receipts(entries: Sequence[Entry]) -> None:
         for entry in entries:
+            if not begin <= entry.receive_ns < end:
+                continue
             if isinstance(entry.message, Sample):
                 key = (entry.connection, entry.message.device)
                 received.setdefault(key, []).append((entry.message.seq, entry.receive_ns))
+            elif isinstance(entry.message, EStop):
+                stops.append((entry.receive_ns, session.clock()))
 
     if keep_poses:
         session.stepper.on_state = lambda header, poses: truth.update({header.tick: poses.copy()})
     session.stepper.on_entries = store_receipts
-    connections, names = dict(session.stepper.view.connections), session.stepper.view.names_by_id()
-    begin = session.clock() + round(WARM_UP_S * 1e9)
-    end = begin + round(seconds * 1e9)
+    view = session.stepper.view
+    names = view.names_by_id()
+    connections = {names[participant]: number for participant, number in view.connections.items()}
     for worker in workers:
         worker.send("measure", begin, end)
-    meter, pending = _Meter(session, begin, end), list(actions)
+    readings: list[_Reading] = []
+    pending = list(actions)
     if run.proxy is not None:  # the times of link profiles count from the beginning of the window
         pending.insert(0, (0.0, lambda run: run.proxy.send("start")))  # type: ignore[union-attr]
 
-    def until() -> bool:
+    def is_over() -> bool:
         on_tick(session)
-        while pending and session.clock() >= begin + round(pending[0][0] * 1e9):
+        now = session.clock()
+        while pending and now >= begin + round(pending[0][0] * 1e9):
             pending.pop(0)[1](run)
-        return meter.is_window_over()
+        if now >= (end if readings else begin):
+            readings.append(_read_usage(session, anew=not readings))
+        return len(readings) == 2
 
-    session.run(until=until)
+    session.run(until=is_over)
     _raise_if_stopped(session)
-    stats, cpu_share, recorder_cpu_share = meter.result()
+    if len(readings) < 2:
+        raise BenchError("the session ended before the window was over")
     _run_until_answered(session, workers, EXIT_S)
-    received = {key: [s for s in samples if begin <= s[1] < end] for key, samples in received.items()}
-    logs = {name: log for worker in workers for name, log in worker.read_logs().items()}
-    status = session.status()
-    view = session.stepper.view
     return Measurement(
         seconds,
-        stats,
-        cpu_share,
-        logs,
-        status.scheduling,
+        begin,
+        {name: log for worker in workers for name, log in worker.read_logs().items()},
+        _compute_usage(*readings),
         truth,
         received,
+        stops,
+        connections,
+        session.status(),
         {"/".join(key): count for key, count in view.rejected.items()},
-        {names[p]: c for p, c in connections.items()},
-        status.drops,
-        meter.late_causes,
-        begin,
-        recorder_cpu_share,
     )
 
 
@@ -437,43 +487,6 @@ def _raise_if_stopped(session: Session) -> None:
     """Raise `KeyboardInterrupt` if the session was stopped by Ctrl-C: the benchmark has no result then."""
     if session.stopping:
         raise KeyboardInterrupt
-
-
-class _Meter:
-    """Reads lateness and processor time at both ends of the window, within one run of the session."""
-
-    def __init__(self, session: Session, begin_ns: int, end_ns: int) -> None:
-        self._session, self._begin_ns, self._end_ns = session, begin_ns, end_ns
-        self._processes = [psutil.Process(pid) for pid in (os.getpid(), session.processes.front_pid)]
-        self._readings: list[tuple[PacerStats, float, float]] = []
-        self.late_causes: dict[str, int] = {}
-
-    def is_window_over(self) -> bool:
-        """Return whether the window is over, for `Session.run(until=...)`."""
-        now = self._session.clock()
-        if now >= (self._end_ns if self._readings else self._begin_ns):
-            times = self._session.processes.reporter.times
-            self.late_causes = {} if times is None else times.count_late_causes()
-            stats = self._session.lateness(anew=not self._readings)
-            assert stats is not None
-            recorder = self._session.processes.recorder
-            cpu_s = sum(p.cpu_times().user + p.cpu_times().system for p in self._processes)
-            self._readings.append((stats, cpu_s, 0.0 if recorder is None else recorder.cpu_s))
-        return len(self._readings) == 2
-
-    def result(self) -> tuple[PacerStats, float, float]:
-        """Return the tick statistics of the window, and the CPU of authority and front, and of the recorder, as shares
-        of one core.
-        """
-        if len(self._readings) < 2:
-            raise BenchError("the session ended before the window was over")
-        (before, cpu0, recorder0), (after, cpu1, recorder1) = self._readings
-        window_s = (self._end_ns - self._begin_ns) * 1e-9
-        ticks, late = after.ticks - before.ticks, after.late - before.late
-        stats = after._replace(
-            ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
-        )
-        return stats, (cpu1 - cpu0) / window_s, (recorder1 - recorder0) / window_s
 
 
 @contextlib.contextmanager

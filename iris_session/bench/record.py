@@ -119,9 +119,10 @@ def run_record(
                 seed=seed,
                 progress=progress,
             )
-            measured.append(Round(recorded, got.stats.late, got.stats.ticks, got.recorder_cpu_share))
+            stats = got.usage.stats
+            measured.append(Round(recorded, stats.late, stats.ticks, got.usage.cpu_shares.get("recorder", 0.0)))
             if recorded:
-                drops |= got.drops
+                drops |= got.status.drops
                 files.append(path)
                 _wait_for_index(path)
         progress("writing the same values as naive logs")
@@ -130,7 +131,12 @@ def run_record(
         rest_mb = measure_rest(folder / "rest.rrd")
         losses, missing = _kill_sessions(folder, kills, seed, progress)
     results = summarize_rounds(measured) | summarize_sizes(sizes) | summarize_kills(losses)
-    results |= {"rest_mb_per_hour": rest_mb, "kill_rows_missing": missing, "scheduling": got.scheduling, "drops": drops}
+    results |= {
+        "rest_mb_per_hour": rest_mb,
+        "kill_rows_missing": missing,
+        "scheduling": got.status.scheduling,
+        "drops": drops,
+    }
     params = {"operators": OPERATORS, "bodies": BODIES, "seconds": 2 * rounds * length_s, "rounds": rounds}
     return BenchReport("record", params | {"kills": kills, "seed": seed}, results, tuple(make_record_bars(results)))
 

@@ -8,13 +8,11 @@ tab presses the e-stop. Without Chromium, or with `tab=False`, all browsers are 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 from typing import Any, Final
 
 import numpy as np
-import psutil
 
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
@@ -22,7 +20,6 @@ from iris_session.bench.harness import (
     CLIENTS,
     SHORTEST_STALL_S,
     TABS,
-    BenchRun,
     Group,
     Interval,
     Log,
@@ -48,8 +45,6 @@ from iris_session.bench.report import (
 from iris_session.bench.slow_client import BASELINE
 from iris_session.bench.web_tab import STOPS_S, MissingToolError, find_tools
 from iris_session.demo.scenes.aloha import aloha_scene
-from iris_session.protocol.client_messages import EStop
-from iris_session.protocol.entries import Entry
 from iris_session.system.extras import require_package
 
 PERCENTILES: Final = (50, 95, 99)
@@ -60,7 +55,6 @@ FROZEN, LOADING = "frozen", "loading"
 #: Lengths of the intervals [s].
 LENGTHS: Final = {BASELINE: SHORTEST_STALL_S, FROZEN: SHORTEST_STALL_S, LOADING: 10.0}
 REFERENCE, TAB, SPECIAL = "zeromq", "tab", "special"
-_CPU_END_S: Final = 0.1  # before the end of the window
 #: The scene: the ALOHA stations in free motion, and a sheet of vertices that swings above them. What it moves is what a
 #: page has to draw; its physics costs little, so that it is not what is measured. Speed of the hinges at the beginning
 #: [rad/s], and of the sheet.
@@ -115,7 +109,7 @@ def run_web(
     plan = plan_web_intervals(seconds)
     total_s = max(seconds, plan[-1].end_s + STOPS_S)
     others = [ClientJob(f"browser{i}", "observer") for i in range(clients - (1 if missing else 2))]
-    gateway, stops, resumed = _GatewayMeter(), _StopMeter(), dict[Interval, int]()
+    resumed: dict[Interval, int] = {}
     special = ClientJob(SPECIAL, "observer", loads_s=tuple(one.stall_s for one in plan if one.kind == LOADING))
     groups: dict[str, list[Group]] = {
         CLIENTS: [(ClientJob(REFERENCE, "observer"),)],
@@ -125,15 +119,7 @@ def run_web(
         make_web_model(vertices, seed),
         groups if missing else {**groups, TABS: [(ClientJob(TAB, "director"),)]},
         total_s,
-        actions=sorted(
-            [
-                (0.0, gateway.read),
-                (0.0, stops.attach),
-                *plan_stalls(plan, {FROZEN: stop_client(SPECIAL)}, resumed),
-                (max(0.0, total_s - _CPU_END_S), gateway.read),
-            ],
-            key=lambda action: action[0],
-        ),
+        actions=plan_stalls(plan, {FROZEN: stop_client(SPECIAL)}, resumed),
         curve=curve,
         assets=True,
         progress=progress,
@@ -143,9 +129,14 @@ def run_web(
         raise BenchError("a client received no state in the measured window")
     results = summarize_browsers(got, names, plan, resumed)
     if not missing:
-        results |= summarize_tab(got.logs[TAB], stops.stops)
+        results |= summarize_tab(got.logs[TAB], got.stops)
         results["delivered_hz_min"] = min(results["delivered_hz_min"], results["tab_state_hz"])
-    results |= gateway.summarize() | got.summarize(
+    if "gateway" in got.usage.rss:
+        rss, rss_after = got.usage.rss["gateway"]
+        results["gateway_cpu_share"] = round(got.usage.cpu_shares["gateway"], 3)
+        results["gateway_memory_mib"] = round(rss_after / 2**20, 1)
+        results["gateway_growth_mib"] = round((rss_after - rss) / 2**20, 1)
+    results |= got.summarize(
         *("server_cpu_share", "late_tick_share", "lateness_ms_p99", "ticks", "frames_not_logged", "scheduling", "drops")
     )
     params: dict[str, Any] = {"clients": clients, "vertices": vertices, "seconds": total_s}
@@ -244,9 +235,6 @@ def _find_first_after(stops: Sequence[tuple[int, int]], at_ns: int) -> tuple[int
     return next((stop for stop in stops if stop[0] >= at_ns), None)
 
 
-# --- actions ----------------------------------------------------------------------------------------------------------
-
-
 def _find_missing_tool() -> str:
     """Return in one line what is not installed for a tab, empty if nothing is missing."""
     try:
@@ -254,50 +242,6 @@ def _find_missing_tool() -> str:
     except MissingToolError as error:
         return str(error)
     return ""
-
-
-class _StopMeter:
-    """E-stops of the window: session time when the front received each, and when the step that holds had ended."""
-
-    def __init__(self) -> None:
-        self.stops: list[tuple[int, int]] = []
-
-    def attach(self, run: BenchRun) -> None:
-        """Watch the entries of every step from now on."""
-        session, before = run.session, run.session.stepper.on_entries
-
-        def note_stops(entries: Sequence[Entry]) -> None:
-            self.stops += [(e.receive_ns, session.clock()) for e in entries if isinstance(e.message, EStop)]
-            if before is not None:
-                before(entries)
-
-        session.stepper.on_entries = note_stops
-
-
-class _GatewayMeter:
-    """Processor time and memory of the gateway between two readings."""
-
-    def __init__(self) -> None:
-        self._readings: list[tuple[float, float, int]] = []
-
-    def read(self, run: BenchRun) -> None:
-        """Take a reading."""
-        page = run.session.processes.web
-        if page is not None and page.pid:
-            process = psutil.Process(page.pid)
-            times = process.cpu_times()
-            self._readings.append((time.monotonic(), times.user + times.system, process.memory_info().rss))
-
-    def summarize(self) -> dict[str, float]:
-        """Return the share of one core between the readings, and the memory at the last [MiB]; without two, nothing."""
-        if len(self._readings) < 2:
-            return {}
-        (begin_s, before, rss), (end_s, after, rss_after) = self._readings[0], self._readings[-1]
-        return {
-            "gateway_cpu_share": round(max(0.0, (after - before) / (end_s - begin_s)), 3),
-            "gateway_memory_mib": round(rss_after / 2**20, 1),
-            "gateway_growth_mib": round((rss_after - rss) / 2**20, 1),
-        }
 
 
 def make_web_model(vertices: int, seed: int) -> Any:
