@@ -18,11 +18,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.harness import BROWSERS, CLIENTS, Group, Log, compute_ages_ms, measure
+from iris_session.bench.join import split_quads
 from iris_session.bench.plugins import Plugin
 from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, summarize_percentiles
 from iris_session.demo.scenes import free_bodies_scene
@@ -47,8 +49,6 @@ from iris_session.streams.rigid import RigidDecoder, RigidEncoder
 from iris_session.system.extras import require_package
 from iris_session.system.process import ROOT, module_command
 
-#: In which a client ends after its input [s].
-EXIT_S: Final = 5.0
 RUNTIMES: Final = ("dotnet", "mono")
 CSHARP_CLIENTS: Final = "iris_session.bench.csharp:CsharpClient"
 #: Beside them: the Python client, which has no gateway between, and one over the same WebSocket.
@@ -65,7 +65,7 @@ CLOTH_SIDE: Final = 30
 CLOTH_BOUND_M: Final = 0.0005
 CLOUDS: Final = 8
 #: Time in which a runtime decodes all frames [s].
-PATIENCE_S: Final = 300.0
+DECODE_S: Final = 300.0
 _INT: Final = struct.Struct("<i")
 Floats = NDArray[np.float64]
 
@@ -152,11 +152,14 @@ class _Frames:
 
     def __init__(self, bodies: int, points: int, frames: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        motion = _Motion(rng, bodies)
+        model = free_bodies_scene(bodies, seed).compile()
+        model.opt.timestep = PERIOD_S
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
         topology = _make_cloth_topology()
         parts = [struct.pack("<4i", bodies, frames + WARM_UP, WARM_UP, SAMPLE)]
-        first = motion.compute_poses(0.0)
-        parts += map(_pack, (_welcome(), *_make_snapshot(first), topology.to_bytes()))
+        mujoco.mj_forward(model, data)
+        parts += map(_pack, (_welcome(), *_make_snapshot(_read_poses(data)), topology.to_bytes()))
         clouds = [_make_cloud(rng, points, k) for k in range(CLOUDS)]
         cloud_frames = [encode_cloud(*cloud)["full"] for cloud in clouds]
         self.last_cloud = decode_cloud(cloud_frames[(frames + WARM_UP - 1) % CLOUDS]).positions
@@ -165,7 +168,8 @@ class _Frames:
         rigid, rigid_decoder = RigidEncoder(bodies), RigidDecoder(bodies)
         cloth, cloth_decoder = DeformableEncoder(topology, CLOTH_BOUND_M), DeformableDecoder(topology)
         for i in range(frames + WARM_UP):
-            now = motion.compute_poses(i * PERIOD_S)
+            mujoco.mj_step(model, data)
+            now = _read_poses(data)
             sheet = _move_cloth(i * PERIOD_S)
             encoded = rigid.encode(now, 1)
             drawn = (cloth.encode(sheet) or {}).get("full", b"")
@@ -189,22 +193,9 @@ class _Frames:
         self.content = b"".join([*parts, b"rigid", b"presence"])
 
 
-class _Motion:
-    """Smooth motion of bodies around places in a room."""
-
-    def __init__(self, rng: np.random.Generator, bodies: int) -> None:
-        self._place = rng.uniform(-3.0, 3.0, (bodies, 3))
-        self._reach = rng.uniform(0.1, 0.5, (bodies, 3))
-        self._rate = rng.uniform(0.5, 4.0, (bodies, 3))
-        axis = rng.normal(size=(bodies, 3))
-        self._axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
-        self._spin = rng.uniform(-3.0, 3.0, (bodies, 1))
-
-    def compute_poses(self, t: float) -> Floats:
-        """Return rows `x y z qw qx qy qz` at a time [s]."""
-        position = self._place + self._reach * np.sin(self._rate * t)
-        half = 0.5 * self._spin * t
-        return np.hstack([position, np.cos(half), np.sin(half) * self._axis])
+def _read_poses(data: mujoco.MjData) -> Floats:
+    """Return rows `x y z qw qx qy qz` of all bodies but the world."""
+    return np.hstack([data.xpos[1:], data.xquat[1:]])
 
 
 def _pack(data: bytes) -> bytes:
@@ -250,10 +241,8 @@ def _make_presence(i: int) -> Presence:
 
 
 def _make_cloth_topology() -> DeformableTopology:
-    corner = np.arange(CLOTH_SIDE**2).reshape(CLOTH_SIDE, CLOTH_SIDE)
-    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    return DeformableTopology(CLOTH_SIDE**2, faces)
+    corners = np.arange(CLOTH_SIDE**2).reshape(CLOTH_SIDE, CLOTH_SIDE)
+    return DeformableTopology(CLOTH_SIDE**2, split_quads(corners))
 
 
 def _move_cloth(t: float) -> Floats:
@@ -273,20 +262,17 @@ def _decode(made: _Frames, runtime: str, file: Path, out: Path) -> dict[str, flo
     command = [*make_command(runtime), "decode", str(file), str(out)]
     try:
         done = subprocess.run(
-            command, cwd=ROOT, env=make_environment(), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            command, cwd=ROOT, env=make_environment(), capture_output=True, text=True, timeout=DECODE_S, check=False
         )
     except subprocess.TimeoutExpired:
-        raise BenchError(f"{runtime} has not decoded the frames within {PATIENCE_S:g} s") from None
+        raise BenchError(f"{runtime} has not decoded the frames within {DECODE_S:g} s") from None
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
         raise BenchError(f"the C# decoders do not run on {runtime}: {lines[0] if lines else done.returncode}")
     got = json.loads(done.stdout)
     position, rotation, cloth, cloud = _measure_errors(made, out.read_bytes())
     return {
-        "decode_us_p50": got["decode_us_p50"],
-        "decode_us_p99": got["decode_us_p99"],
-        "cloth_us_p50": got["cloth_us_p50"],
-        "cloud_us_p50": got["cloud_us_p50"],
+        **{key: got[key] for key in ("decode_us_p50", "decode_us_p99", "cloth_us_p50", "cloud_us_p50")},
         "allocated_bytes_per_frame": got["allocated_bytes"] / got["frames"],
         "max_error_mm": position,
         "max_rotation_error_deg": rotation,
@@ -307,14 +293,9 @@ def _measure_errors(made: _Frames, data: bytes) -> tuple[float, float, float, fl
     dot = np.abs(np.einsum("nbi,nbi->nb", poses[..., 3:], made.poses[..., 3:]))
     rotation = 2.0 * np.degrees(np.arccos(np.minimum(dot.min(), 1.0)))
     cloth = np.linalg.norm(vertices - made.vertices, axis=-1).max()
-    return (
-        round(float(position) * 1e3, 5),
-        round(float(rotation), 5),
-        round(float(cloth) * 1e3, 5),
-        round(float(np.abs(points - made.last_cloud).max()) * 1e3, 5)
-        if points.shape == made.last_cloud.shape
-        else math.inf,
-    )
+    cloud = np.abs(points - made.last_cloud).max() if points.shape == made.last_cloud.shape else math.inf
+    found = (position * 1e3, rotation, cloth * 1e3, cloud * 1e3)
+    return tuple(round(float(value), 5) for value in found)  # type: ignore[return-value]
 
 
 # --- C# programs ---
@@ -358,7 +339,7 @@ class CsharpClient(Plugin):
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
-            self._process.wait(EXIT_S)
+            self._process.wait(5.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
 

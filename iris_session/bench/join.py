@@ -313,12 +313,17 @@ def _make_stone(
         [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1
     )
     at = np.arange(rows * columns).reshape(rows, columns)
-    right = np.roll(at, -1, axis=1)
-    a, b, c, d = at[:-1], at[1:], right[1:], right[:-1]
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    top, bottom = np.full((columns,), at[0, 0]), np.full((columns,), at[-1, 0])
-    caps = [np.stack([top, at[0], right[0]], -1)[1:-1], np.stack([bottom, right[-1], at[-1]], -1)[1:-1]]
-    return points.reshape(-1, 3), np.concatenate([faces, *caps]), np.stack([u, v], axis=-1).reshape(-1, 2)
+    at = np.hstack([at, at[:, :1]])  # closed
+    top, bottom = np.full(columns, at[0, 0]), np.full(columns, at[-1, 0])
+    caps = [np.stack([top, at[0, :-1], at[0, 1:]], -1), np.stack([bottom, at[-1, 1:], at[-1, :-1]], -1)]
+    faces = np.concatenate([split_quads(at), *(cap[1:-1] for cap in caps)])
+    return points.reshape(-1, 3), faces, np.stack([u, v], axis=-1).reshape(-1, 2)
+
+
+def split_quads(grid: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the triangles (n, 3) of a grid of vertices, two for each of its cells."""
+    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
 
 
 class ScenePreparer(Plugin):
