@@ -8,21 +8,20 @@ kept in the user's cache folder: the first run with a seed takes that much longe
 from __future__ import annotations
 
 import math
-import os
 import tempfile
 import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.assets.store import default_root
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import Log, Measurement, assign_links, group_clients, measure
 from iris_session.bench.media_clients import MediaColumn as Column
@@ -40,6 +39,7 @@ from iris_session.protocol.names import BudgetClass
 from iris_session.session.session import Session
 from iris_session.streams.deformable import COARSER, DeformableDecoder, DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
+from iris_session.system.files import Replacement
 
 STREAM: Final = "cloth"
 CLIENTS: Final = "iris_session.bench.media_clients:DeformableClients"
@@ -67,7 +67,7 @@ def run_deformable(
     if side * side != vertices:
         raise BenchError(f"--vertices {vertices}: the cloth is square, choose {side * side} or {(side + 1) ** 2}")
     motion = load_cloth_motion(side, seed, progress)
-    topology = DeformableTopology(motion.n_vertices, motion.faces)
+    topology = DeformableTopology(vertices, motion.faces)
     specs, links = assign_links([ClientJob(f"client{i}", "observer") for i in range(clients)], profile)
     source = _ClothSource(motion, topology)
     with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
@@ -124,8 +124,8 @@ class _ClothSource:
         if due < self._next:
             return
         self._next = due + 1  # frames for which the loop had no time are skipped
-        index = self.motion.frame_index(due)
-        vertices = self.motion.vertices(index)
+        index = self.motion.find_frame(due)
+        vertices = self.motion.vertices[index]
         wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         made = self._encoder.encode(vertices)
         wall_ns, cpu_ns = time.perf_counter_ns() - wall_ns, time.thread_time_ns() - cpu_ns
@@ -176,7 +176,7 @@ def _compute_max_error_m(logs: dict[str, Log], source: _ClothSource) -> float:
                 decoded = decoder.decode(payload)
                 if zlib.crc32(decoded.data) != checksum:
                     raise BenchError(f"{name} decoded other vertices than its payload contains")
-                truth = source.motion.vertices(source.frames[capture_ns])
+                truth = source.motion.vertices[source.frames[capture_ns]]
                 errors[key] = float(np.linalg.norm(decoded - truth, axis=1).max())
             worst = max(worst, errors[key])
     return worst
@@ -196,29 +196,27 @@ def _measure_offline(motion: ClothMotion, topology: DeformableTopology) -> dict[
     for name in (BudgetClass.HALF, BudgetClass.QUARTER):
         encoder = DeformableEncoder(topology, BOUND_M)
         sizes = []
-        for index in range(0, len(motion.nodes), _SAMPLE):
+        for vertices in motion.vertices[::_SAMPLE]:
             encoder.reset()
-            made = encoder.encode(motion.vertices(index), (name,))
+            made = encoder.encode(vertices, (name,))
             assert made is not None
             sizes.append(len(made[name]))
         found[f"{name}_bound_mm"] = BOUND_M * COARSER[name] * 1e3
         found[f"{name}_mbit_per_s"] = round(float(np.mean(sizes)) * 8e-6 * HZ, 3)
-    pairs = range(0, len(motion.nodes) - 1, _SAMPLE)
-    steps = np.stack([motion.vertices(index + 1) - motion.vertices(index) for index in pairs])
-    speeds = np.linalg.norm(steps, axis=2) * HZ
+    speeds = np.linalg.norm(np.diff(motion.vertices, axis=0)[::_SAMPLE], axis=2) * HZ
     return found | summarize_percentiles("vertex_speed_m_per_s", speeds.ravel())
 
 
 def _measure_reference(motion: ClothMotion) -> dict[str, float]:
     """Return the bit rate of the same frames as float32, and as float32 compressed by deflate, level 1."""
     sizes, spent_ns = [], []
-    for index in range(0, len(motion.nodes), _SAMPLE):
-        raw = motion.vertices(index).astype("<f4").tobytes()
+    for vertices in motion.vertices[::_SAMPLE]:
+        raw = vertices.astype("<f4").tobytes()
         began_ns = time.perf_counter_ns()
         sizes.append(len(zlib.compress(raw, 1)))
         spent_ns.append(time.perf_counter_ns() - began_ns)
     return {
-        "float32_mbit_per_s": round(12 * motion.n_vertices * HZ * 8e-6, 3),
+        "float32_mbit_per_s": round(12 * motion.vertices.shape[1] * HZ * 8e-6, 3),
         "float32_deflate_mbit_per_s": round(float(np.mean(sizes)) * HZ * 8e-6, 3),
         "float32_deflate_encode_ms_p50": compute_percentile(np.array(spent_ns) * 1e-6, 50),
     }
@@ -238,9 +236,7 @@ TIMESTEP_S: Final = 1.0 / (STEPS_PER_FRAME * HZ)
 #: Share of an edge that one hand holds.
 _GRIP: Final = 0.1
 #: Version of the scene and of the file: increment it with either.
-VERSION: Final = 2
-#: Coordinates are kept in 16 bits: 2 m of them in steps of 0.03 mm.
-_LEVELS: Final = 2**16 - 1
+VERSION: Final = 3
 
 _SCENE: Final = """
 <mujoco model="cloth">
@@ -264,75 +260,48 @@ _SCENE: Final = """
 """
 
 
-@dataclass(frozen=True)
-class ClothMotion:
-    """Motion of a cloth at 60 Hz. `nodes` (frames, n, 3): coordinates in units of `scale` [m] from `origin` (3,) [m].
-    `faces` (m, 3): vertex indices."""
+class ClothMotion(NamedTuple):
+    """Motion of a cloth at 60 Hz: `vertices` (frames, n, 3) [m], world frame, and `faces` (m, 3), their indices."""
 
-    nodes: NDArray[np.uint16]
-    origin: NDArray[np.float64]
-    scale: float
+    vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
 
-    @property
-    def n_vertices(self) -> int:
-        """Number of vertices."""
-        return int(self.nodes.shape[1])
-
-    def frame_index(self, frame: int) -> int:
-        """Return the index of the recorded frame for frame number `frame`: the motion runs to its end and back."""
-        period = 2 * (len(self.nodes) - 1)
-        return min(frame % period, period - frame % period)
-
-    def vertices(self, index: int) -> NDArray[np.float64]:
-        """Return the vertices of a recorded frame, (n, 3) [m], world frame."""
-        p_world: NDArray[np.float64] = self.origin + self.nodes[index] * self.scale
-        return p_world
+    def find_frame(self, number: int) -> int:
+        """Return the index of the recorded frame for frame `number`: the motion runs to its end and back."""
+        period = 2 * (len(self.vertices) - 1)
+        return min(number % period, period - number % period)
 
 
-def load_cloth_motion(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
+def load_cloth_motion(side: int, seed: int, progress: Callable[[str], None]) -> ClothMotion:
     """Return the motion of a cloth of `side` x `side` vertices: from the cache, or simulated and stored there."""
-    path = _cache_folder() / f"cloth-v{VERSION}-{side}x{side}-{seed}-mujoco-{version('mujoco')}.npz"
+    path = default_root("bench") / f"cloth-v{VERSION}-{side}x{side}-{seed}-mujoco-{version('mujoco')}.npz"
     try:
         with path.open("rb") as file, np.load(file) as kept:  # numpy leaves a damaged file open
-            return ClothMotion(kept["nodes"], kept["origin"], float(kept["scale"]), kept["faces"])
+            return ClothMotion(kept["vertices"], kept["faces"])
     except FileNotFoundError:
         pass
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         progress(f"{path} cannot be read ({error}): simulating again")
     motion = simulate_cloth(side, seed, progress)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")  # numpy insists on the ending
     try:
-        np.savez(
-            part, allow_pickle=False, nodes=motion.nodes, origin=motion.origin, scale=motion.scale, faces=motion.faces
-        )
-        part.replace(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with Replacement(path) as replacement:
+            np.savez(replacement.file, allow_pickle=False, **motion._asdict())
     except OSError as error:
-        part.unlink(missing_ok=True)
         progress(f"the motion cannot be cached: {error}")
     return motion
 
 
-def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
+def simulate_cloth(side: int, seed: int, progress: Callable[[str], None]) -> ClothMotion:
     """Simulate `SECONDS` of the cloth. The same arguments give the same motion on the same version of MuJoCo."""
     spacing = EDGE_M / (side - 1)
     hands = _Hands(seed)
     left, right = (" ".join(map(str, p)) for p in hands.positions_at(0.0))
     progress(f"simulating a cloth of {side} x {side} vertices once: this takes ten minutes for 100 x 100")
-    model = mujoco.MjModel.from_xml_string(
-        _SCENE.format(
-            grips=_format_grips(side),
-            timestep=TIMESTEP_S,
-            top=TOP_M,
-            left=left,
-            right=right,
-            side=side,
-            spacing=spacing,
-        )
-    )
+    fields = {"timestep": TIMESTEP_S, "top": TOP_M, "left": left, "right": right, "side": side, "spacing": spacing}
+    model = mujoco.MjModel.from_xml_string(_SCENE.format(grips=_format_grips(side), **fields))
     data = mujoco.MjData(model)
-    frames = np.empty((HZ * SECONDS, model.nflexvert, 3))
+    frames = np.empty((HZ * SECONDS, model.nflexvert, 3), np.float32)
     began_s = time.monotonic()
     for frame in range(len(frames)):
         if frame and frame % (HZ // 2) == 0:
@@ -346,10 +315,7 @@ def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambd
         raise BenchError(
             f"the simulated cloth of {side} x {side} vertices (seed {seed}) diverged: choose another --seed"
         )
-    origin = frames.min(axis=(0, 1))
-    scale = float((frames.max(axis=(0, 1)) - origin).max()) / _LEVELS
-    nodes = np.rint((frames - origin) / scale).astype(np.uint16)
-    return ClothMotion(nodes, origin, scale, np.array(model.flex_elem, np.int32).reshape(-1, 3))
+    return ClothMotion(frames, np.array(model.flex_elem, np.int32).reshape(-1, 3))
 
 
 def _format_grips(side: int) -> str:
@@ -379,7 +345,3 @@ class _Hands:
         shake = 0.05 * ramp * (np.sin(2.0 * math.pi * self._hz * t + self._phase) - np.sin(self._phase))
         base = np.array(((-0.5 + reach, -gap, height), (-0.5 + reach, gap, height)))
         return np.asarray(base + shake)
-
-
-def _cache_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iris-session" / "bench"
