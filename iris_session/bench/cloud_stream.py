@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
+    MEDIA_CLIENTS,
     Action,
     BenchRun,
     Interval,
@@ -161,7 +162,6 @@ class Source(MediaPublisher):
 
 
 SOURCE: Final = "iris_session.bench.cloud_stream:Source"
-CLIENTS: Final = "iris_session.bench.media_clients:CloudClients"
 #: Moving rigid bodies beside the cloud.
 BODIES: Final = 50
 ROUNDS: Final = 4
@@ -223,7 +223,7 @@ def run_cloud_stream(
                 actions.append((one.begin_s, lambda _: source.send("run", plan[0].length_s)))
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
-            {CLIENTS: [(spec,) for spec in specs]},
+            {MEDIA_CLIENTS: [(spec,) for spec in specs]},
             plan[-1].end_s,
             links=links,
             seed=seed,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from iris_session.assets.store import default_root
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import Log, Measurement, assign_links, group_clients, measure
+from iris_session.bench.harness import MEDIA_CLIENTS, Log, Measurement, assign_links, group_clients, measure
 from iris_session.bench.media_clients import MediaColumn as Column
 from iris_session.bench.media_clients import sum_counts
 from iris_session.bench.report import (
@@ -42,7 +42,6 @@ from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.system.files import Replacement
 
 STREAM: Final = "cloth"
-CLIENTS: Final = "iris_session.bench.media_clients:DeformableClients"
 BOUND_M: Final = 0.0005
 #: Moving rigid bodies beside the cloth.
 BODIES: Final = 50
@@ -75,7 +74,7 @@ def run_deformable(
         file.write_bytes(topology.to_bytes())
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
-            {CLIENTS: group_clients(specs)},
+            {MEDIA_CLIENTS: group_clients(specs)},
             seconds,
             links=links,
             seed=seed,

@@ -37,18 +37,14 @@ RATES_HZ: Final = (30, 60, 72, 90)
 MOTIONS: Final = {"still": (0.0, 0.0), "half_a_metre_per_second": (0.2, 0.5), "a_metre_per_second": (0.3, 1.0)}
 JUMPS_M: Final = (0.03, 0.06, 0.15, 0.3, 1.0)
 HITCHES_S: Final = (0.02, 0.05, 0.1, 0.14, 0.5)
-#: Longest time for which a disturbance is watched [s], and that after a hold has begun.
+#: Longest time for which a disturbance is watched [s].
 WATCHED_S: Final = 1.2
-AFTER_HOLD_S: Final = 0.15
-RECLUTCHES: Final = 20
 #: Where the hand is in its tracking frame [m].
 AT: Final = np.array([0.3, -0.2, 1.1])
 #: Seconds in which the session begins, the clutch closes, and the motion begins.
 CLUTCH_S: Final = 0.1
 MOTION_S: Final = 0.3
 MAX_TIP_MOTION_MM: Final = 20.0
-MAX_FALSE_HOLDS: Final = 1.0
-MAX_RECLUTCH_RAD: Final = 0.001
 #: Seconds since it began, and the sample that would be sent -> that which is sent, or none.
 Disturbance = Callable[[float, Sample], Sample | None]
 
@@ -181,15 +177,8 @@ def list_disturbances(rate_hz: int) -> dict[str, tuple[str, float, Disturbance]]
     return out
 
 
-class Disturbed(msgspec.Struct, frozen=True):
-    """Outcome of one disturbance. `reason`: of the hold that it began, empty: it went on."""
-
-    tip_motion_mm: float
-    reason: str
-
-
-def run_disturbances(device: str, rate_hz: int, motion: str, seed: int) -> dict[str, tuple[str, Disturbed]]:
-    """Return kind and outcome of every disturbance, by name."""
+def run_disturbances(device: str, rate_hz: int, motion: str, seed: int) -> dict[str, tuple[str, float]]:
+    """Return kind of every disturbance, and the motion of the tip that it causes [mm], by name."""
     run = HandScenario(device, rate_hz, motion, seed)
     before = run.run_until(run.disturbed_ns - STEP_NS)
     if not run.is_driven():
@@ -197,21 +186,21 @@ def run_disturbances(device: str, rate_hz: int, motion: str, seed: int) -> dict[
     end_ns = run.disturbed_ns + int(WATCHED_S * 1e9)
     state, step_number = run.core.snapshot(), run.step_number
     undisturbed = np.concatenate([before, run.run_until(end_ns)])
-    out: dict[str, tuple[str, Disturbed]] = {}
+    out: dict[str, tuple[str, float]] = {}
     for name, (kind, length_s, disturbance) in list_disturbances(rate_hz).items():
         run.core.restore(state)
         run.step_number, run.disturbance = step_number, disturbance
-        reason, worst, k = "", 0.0, len(before)
+        is_held, worst, k = False, 0.0, len(before)
         until_ns = min(end_ns, run.disturbed_ns + int((length_s + 0.25) * 1e9))
         while run.now_ns <= until_ns:
             run.step()
             k += 1
-            if not reason and not run.is_driven():
-                reason = run.decision.commands[0].hold_reason
-                until_ns = min(until_ns, run.now_ns + int(AFTER_HOLD_S * 1e9))
+            if not is_held and not run.is_driven():
+                is_held = True
+                until_ns = min(until_ns, run.now_ns + 150 * MS)
             tip = run.core.world.view().tip_pose(run.robot).p
             worst = max(worst, float(np.linalg.norm(undisturbed[:k] - tip, axis=1).min()))
-        out[name] = (kind, Disturbed(round(1e3 * worst, 2), reason))
+        out[name] = (kind, round(1e3 * worst, 2))
     return out
 
 
@@ -221,7 +210,7 @@ def measure_reclutches(device: str, rate_hz: int, seed: int) -> float:
     run.run_until(run.disturbed_ns)
     q0 = np.array(run.core.world.view().joints(run.robot))
     worst = 0.0
-    for _ in range(RECLUTCHES):
+    for _ in range(20):
         for clutch in (False, True):
             run.clutch = clutch
             run.run_until(run.now_ns + 100 * MS)
@@ -231,15 +220,8 @@ def measure_reclutches(device: str, rate_hz: int, seed: int) -> float:
     return worst
 
 
-class FastHour(msgspec.Struct, frozen=True):
-    """Holds of people who move fast, in simulated hours."""
-
-    holds: int
-    hours: float
-
-
-def count_false_holds(device: str, rate_hz: int, seconds: float, seed: int) -> FastHour:
-    """Drive by fast motion; after a hold the clutch is opened and closed."""
+def count_false_holds(device: str, rate_hz: int, seconds: float, seed: int) -> int:
+    """Return the holds of a person who drives by fast motion; after a hold the clutch is opened and closed."""
     rng = np.random.default_rng(seed)
     person, robots = PEOPLE[device], find_robots(n_arms_scene(1, 0).compile()).robots
     robot = robots[0]
@@ -257,36 +239,35 @@ def count_false_holds(device: str, rate_hz: int, seconds: float, seed: int) -> F
         for event in decision.events:
             if isinstance(event.body, EngagementChanged) and not event.body.engaged:
                 holds, clutch = holds + 1, False
-    return FastHour(holds, seconds / 3600.0)
+    return holds
 
 
 def run_hands(seconds: float = 300.0, seed: int = 0, progress: Callable[[str], None] = lambda _: None) -> BenchReport:
     """Disturb every device at every rate, and count the holds of people who only move fast."""
     cases: dict[str, Any] = {}
-    worst_by_kind: dict[str, float] = {}
     missed: dict[str, float] = {}
-    holds, hours, reclutch = 0, 0.0, 0.0
     for device in PEOPLE:
         for rate_hz in RATES_HZ:
             progress(f"{device} at {rate_hz} Hz")
             name = f"{device} {rate_hz} Hz"
             worst: dict[str, float] = {}
             for motion in MOTIONS:
-                for label, (kind, outcome) in run_disturbances(device, rate_hz, motion, seed).items():
-                    worst[kind] = max(worst.get(kind, 0.0), outcome.tip_motion_mm)
-                    if outcome.tip_motion_mm > MAX_TIP_MOTION_MM:
-                        missed[f"{name} {motion} {label}"] = outcome.tip_motion_mm
-            fast = count_false_holds(device, rate_hz, seconds, seed)
-            holds, hours = holds + fast.holds, hours + fast.hours
-            again = measure_reclutches(device, rate_hz, seed)
-            reclutch = max(reclutch, again)
-            cases[name] = {"tip_motion_mm": worst, "false_holds": fast.holds, "reclutch_joint_rad": round(again, 6)}
-            for kind, value in worst.items():
-                worst_by_kind[kind] = max(worst_by_kind.get(kind, 0.0), value)
+                for label, (kind, mm) in run_disturbances(device, rate_hz, motion, seed).items():
+                    worst[kind] = max(worst.get(kind, 0.0), mm)
+                    if mm > MAX_TIP_MOTION_MM:
+                        missed[f"{name} {motion} {label}"] = mm
+            cases[name] = {
+                "tip_motion_mm": worst,
+                "false_holds": count_false_holds(device, rate_hz, seconds, seed),
+                "reclutch_joint_rad": round(measure_reclutches(device, rate_hz, seed), 6),
+            }
+    hours = len(cases) * seconds / 3600.0
+    kinds = next(iter(cases.values()))["tip_motion_mm"]
+    worst_by_kind = {kind: max(case["tip_motion_mm"][kind] for case in cases.values()) for kind in kinds}
     results: dict[str, Any] = {
         "worst_tip_motion_mm": max(worst_by_kind.values()),
-        "false_holds_per_hour": round(holds / hours, 3),
-        "reclutch_joint_rad": round(reclutch, 6),
+        "false_holds_per_hour": round(sum(case["false_holds"] for case in cases.values()) / hours, 3),
+        "reclutch_joint_rad": max(case["reclutch_joint_rad"] for case in cases.values()),
         "fast_hours": round(hours, 3),
         "tip_motion_mm": worst_by_kind,
         "over_the_bar": missed,
@@ -294,7 +275,7 @@ def run_hands(seconds: float = 300.0, seed: int = 0, progress: Callable[[str], N
     }
     bars = (
         make_bar(results, "worst_tip_motion_mm", "<=", MAX_TIP_MOTION_MM),
-        make_bar(results, "false_holds_per_hour", "<=", MAX_FALSE_HOLDS),
-        make_bar(results, "reclutch_joint_rad", "<=", MAX_RECLUTCH_RAD),
+        make_bar(results, "false_holds_per_hour", "<=", 1.0),
+        make_bar(results, "reclutch_joint_rad", "<=", 0.001),
     )
     return BenchReport("hands", {"seconds": seconds, "seed": seed}, results, bars)

@@ -143,6 +143,7 @@ ASK_NS: Final = 50_000_000
 LEAVE_S: Final = 5.0
 #: Plug-ins of clients.
 CLIENTS: Final = "iris_session.bench.clients:StateClients"
+MEDIA_CLIENTS: Final = "iris_session.bench.media_clients:MediaClients"
 BROWSERS: Final = "iris_session.bench.web_clients:Browsers"
 TABS: Final = "iris_session.bench.web_tab:Tab"
 Group = tuple[ClientJob, ...]  # the clients of one process
@@ -354,8 +355,8 @@ def measure(
 
     Args:
         model: Model of the session.
-        groups: Clients by process, by plug-in: `CLIENTS`, `BROWSERS` at the session's page without a picture, `TABS`
-            in a real Chromium, or that of a benchmark.
+        groups: Clients by process, by plug-in: `CLIENTS`, `MEDIA_CLIENTS`, `BROWSERS` at the session's page without a
+            picture, `TABS` in a real Chromium, or that of a benchmark.
         seconds: Length of the measured window.
         links: Link profile by address.
         seed: Random seed of the links.
