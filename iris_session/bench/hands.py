@@ -10,8 +10,9 @@ measures, at 30 to 90 Hz.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -45,8 +46,70 @@ AT: Final = np.array([0.3, -0.2, 1.1])
 CLUTCH_S: Final = 0.1
 MOTION_S: Final = 0.3
 MAX_TIP_MOTION_MM: Final = 20.0
-#: Seconds since it began, and the sample that would be sent -> that which is sent, or none.
-Disturbance = Callable[[float, Sample], Sample | None]
+#: Seconds since it began, and the sample that would be sent -> that which is sent.
+Change = Callable[[float, Sample], Sample]
+
+
+class Disturbance(NamedTuple):
+    """Nothing is sent for `silence_s`, then what `change` makes of samples for `change_s` [s]."""
+
+    kind: str
+    silence_s: float
+    change_s: float = 0.0
+    change: Change = lambda _, sample: sample
+
+    def apply(self, s: float, sample: Sample) -> Sample | None:
+        """Return what is sent instead of a sample, `s` seconds after the disturbance began."""
+        if s < self.silence_s:
+            return None
+        return self.change(s, sample) if s < self.silence_s + self.change_s else sample
+
+
+def _shift(x: float, y: float = 0.0) -> Change:
+    def change(_: float, sample: Sample) -> Sample:
+        assert sample.pose is not None
+        p = sample.pose.p
+        return msgspec.structs.replace(sample, pose=Pose((p[0] + x, p[1] + y, p[2]), sample.pose.q))
+
+    return change
+
+
+def _freeze() -> Change:
+    frozen: list[Pose | None] = []
+
+    def change(_: float, sample: Sample) -> Sample:
+        frozen.append(frozen[0] if frozen else sample.pose)
+        return msgspec.structs.replace(sample, pose=frozen[0])
+
+    return change
+
+
+def _emulate(s: float, sample: Sample) -> Sample:
+    """Return a sample by dead reckoning, which goes astray with 1 m/s."""
+    return msgspec.structs.replace(_shift(s)(s, sample), emulated=True)
+
+
+def list_disturbances(rate_hz: int) -> dict[str, Disturbance]:
+    """Return every disturbance by name."""
+    out = {
+        "zero_pose": Disturbance(
+            "zero_pose", 0.0, 0.2, lambda _, sample: msgspec.structs.replace(sample, pose=IDENTITY)
+        ),
+        "emulated": Disturbance("emulated", 0.0, 0.3, _emulate),
+    }
+    for seconds in (0.2, 0.8):
+        out[f"freeze_{1e3 * seconds:.0f}_ms"] = Disturbance("freeze", 0.0, seconds, _freeze())
+    for seconds in HITCHES_S:
+        out[f"hitch_{1e3 * seconds:.0f}_ms"] = Disturbance("hitch", seconds)
+    for size in JUMPS_M:
+        mm = f"{1e3 * size:.0f}_mm"
+        for name, change in (("along", _shift(0.0, size)), ("across", _shift(size)), ("back", _shift(0.0, -size))):
+            out[f"jump_{mm}_{name}"] = Disturbance("jump", 0.0, math.inf, change)
+        for silence_s in (0.05, 0.1):
+            name = f"hitch_{1e3 * silence_s:.0f}_ms_jump_{mm}"
+            out[name] = Disturbance("hitch_and_jump", silence_s, math.inf, _shift(size))
+        out[f"outlier_{mm}"] = Disturbance("outlier", 0.0, 0.9 / rate_hz, _shift(size))
+    return out
 
 
 class HandScenario:
@@ -62,7 +125,7 @@ class HandScenario:
         self.operator = ScriptedOperator(device, self.robot)
         self.step_number = 0
         self.clutch = True
-        self.disturbance: Disturbance = lambda _, sample: sample
+        self.disturbance = Disturbance("", 0.0)
         stroke_s = self.stroke_s
         self.disturbed_ns = int((MOTION_S + 2.5 * stroke_s) * 1e9) if stroke_s else int(0.8e9)
         self._noise = np.random.default_rng(seed).standard_normal((4096, 6))
@@ -97,11 +160,12 @@ class HandScenario:
         if count > before and self.step_number > OPENING_STEPS:
             capture_ns = count * 10**9 // self.rate_hz
             clutch = self.clutch and capture_ns >= CLUTCH_S * 1e9
-            sample: Sample | None = self.operator.make_sample(self.make_pose(capture_ns), capture_ns, clutch)
-            if capture_ns >= self.disturbed_ns and sample is not None:
-                sample = self.disturbance((capture_ns - self.disturbed_ns) * 1e-9, sample)
-            if sample is not None:
-                entries.append(self.operator.make_entry(sample, now_ns))
+            sample = self.operator.make_sample(self.make_pose(capture_ns), capture_ns, clutch)
+            sent: Sample | None = sample
+            if capture_ns >= self.disturbed_ns:
+                sent = self.disturbance.apply((capture_ns - self.disturbed_ns) * 1e-9, sample)
+            if sent is not None:
+                entries.append(self.operator.make_entry(sent, now_ns))
         self.decision = self.core.step(now_ns, entries, 1, digest=False).decision
         self.step_number += 1
 
@@ -117,66 +181,6 @@ class HandScenario:
         return self.decision.commands[0].kind != CommandKind.HOLD
 
 
-def _shift(sample: Sample, way: tuple[float, float, float]) -> Sample:
-    assert sample.pose is not None
-    x, y, z = (a + b for a, b in zip(sample.pose.p, way, strict=True))
-    return msgspec.structs.replace(sample, pose=Pose((x, y, z), sample.pose.q))
-
-
-def _jump(way: tuple[float, float, float], silence_s: float = 0.0) -> Disturbance:
-    return lambda s, sample: None if s < silence_s else _shift(sample, way)
-
-
-def _hitch(silence_s: float) -> Disturbance:
-    return lambda s, sample: None if s < silence_s else sample
-
-
-def _spike(way: tuple[float, float, float], seconds: float) -> Disturbance:
-    return lambda s, sample: _shift(sample, way) if s < seconds else sample
-
-
-def _freeze(seconds: float) -> Disturbance:
-    frozen: list[Pose | None] = []
-
-    def disturb(s: float, sample: Sample) -> Sample:
-        if s >= seconds:
-            return sample
-        frozen.append(frozen[0] if frozen else sample.pose)
-        return msgspec.structs.replace(sample, pose=frozen[0])
-
-    return disturb
-
-
-def _report_zero(s: float, sample: Sample) -> Sample:
-    return msgspec.structs.replace(sample, pose=IDENTITY) if s < 0.2 else sample
-
-
-def _emulate(s: float, sample: Sample) -> Sample:
-    """Dead reckoning for 0.3 s, which goes astray with 1 m/s."""
-    return msgspec.structs.replace(_shift(sample, (s, 0.0, 0.0)), emulated=True) if s < 0.3 else sample
-
-
-def list_disturbances(rate_hz: int) -> dict[str, tuple[str, float, Disturbance]]:
-    """Return kind, length [s] and function of every disturbance, by name."""
-    out: dict[str, tuple[str, float, Disturbance]] = {
-        "zero_pose": ("zero_pose", 0.2, _report_zero),
-        "emulated": ("emulated", 0.3, _emulate),
-    }
-    for seconds in (0.2, 0.8):
-        out[f"freeze_{1e3 * seconds:.0f}_ms"] = ("freeze", seconds, _freeze(seconds))
-    for seconds in HITCHES_S:
-        out[f"hitch_{1e3 * seconds:.0f}_ms"] = ("hitch", seconds, _hitch(seconds))
-    for size in JUMPS_M:
-        mm = f"{1e3 * size:.0f}_mm"
-        for name, way in (("along", (0.0, size, 0.0)), ("across", (size, 0.0, 0.0)), ("back", (0.0, -size, 0.0))):
-            out[f"jump_{mm}_{name}"] = ("jump", 0.0, _jump(way))
-        for silence_s in (0.05, 0.1):
-            jump = _jump((size, 0.0, 0.0), silence_s)
-            out[f"hitch_{1e3 * silence_s:.0f}_ms_jump_{mm}"] = ("hitch_and_jump", silence_s, jump)
-        out[f"outlier_{mm}"] = ("outlier", 0.0, _spike((size, 0.0, 0.0), 0.9 / rate_hz))
-    return out
-
-
 def run_disturbances(device: str, rate_hz: int, motion: str, seed: int) -> dict[str, tuple[str, float]]:
     """Return kind of every disturbance, and the motion of the tip that it causes [mm], by name."""
     run = HandScenario(device, rate_hz, motion, seed)
@@ -187,7 +191,8 @@ def run_disturbances(device: str, rate_hz: int, motion: str, seed: int) -> dict[
     state, step_number = run.core.snapshot(), run.step_number
     undisturbed = np.concatenate([before, run.run_until(end_ns)])
     out: dict[str, tuple[str, float]] = {}
-    for name, (kind, length_s, disturbance) in list_disturbances(rate_hz).items():
+    for name, disturbance in list_disturbances(rate_hz).items():
+        length_s = disturbance.silence_s + (disturbance.change_s if disturbance.change_s < math.inf else 0.0)
         run.core.restore(state)
         run.step_number, run.disturbance = step_number, disturbance
         is_held, worst, k = False, 0.0, len(before)
@@ -200,7 +205,7 @@ def run_disturbances(device: str, rate_hz: int, motion: str, seed: int) -> dict[
                 until_ns = min(until_ns, run.now_ns + 150 * MS)
             tip = run.core.world.view().tip_pose(run.robot).p
             worst = max(worst, float(np.linalg.norm(undisturbed[:k] - tip, axis=1).min()))
-        out[name] = (kind, round(1e3 * worst, 2))
+        out[name] = (disturbance.kind, round(1e3 * worst, 2))
     return out
 
 

@@ -95,7 +95,7 @@ def measure_push(data: mujoco.MjData) -> NDArray[np.float64]:
 
 
 class Case(msgspec.Struct, frozen=True):
-    """One case: see the module."""
+    """Results of one kind of actuators and one cause of a hold: see the module."""
 
     force_ratio: float
     lunge_rad: float
@@ -230,11 +230,10 @@ def run_case(run: StopScenario, cause: str) -> Case:
     else:
         raise BenchError(f"no hold began by {cause}")
     run.run(FORCE_AFTER_S)
-    after = 0.0
+    after, data = 0.0, run.core.world.data
     for _ in range(round((WALL_AFTER_S - FORCE_AFTER_S) * 1e9) // TICK_NS):
-        after = max(after, float(np.abs(measure_push(run.core.world.data)).max()))
+        after = max(after, float(np.abs(measure_push(data)).max()))
         run.step()
-    data = run.core.world.data
     remove_wall(data)
     q0, lunge, speed = data.qpos[:3].copy(), 0.0, 0.0
     for _ in range(round(LUNGE_S * 1e9) // TICK_NS):
