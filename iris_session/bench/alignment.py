@@ -79,12 +79,10 @@ def run_alignment(
         bars.append(make_bar(results, f"{case}.coverage_share", ">=", 0.93))
         bars.append(make_bar(results, f"{case}.coverage_share", "<=", 0.97))
     bars += [make_bar(results, f"{load}update_us_p50", "<=", 200.0) for load in ("", "loaded_")]
-    params: dict[str, Any] = {"pairs": pairs, "seed": seed}
     if names:
         results |= run_worlds(names, headsets, seed, progress)
         bars += make_world_bars(names, results)
-        params |= {"worlds": worlds, "headsets": headsets}
-    return BenchReport("alignment", params, results, tuple(bars))
+    return BenchReport(results, bars)
 
 
 # --- headsets ---------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -47,12 +47,11 @@ def run_cloud(
     require_package("numba", "bench cloud")
     require_package("cv2", "bench cloud")
     cases = _make_cases(points, cameras, beside, progress)
-    params: dict[str, Any] = {"points": points, "cameras": cameras, "seconds": seconds, "seed": seed, "beside": beside}
     progress("making the pictures")
     with PluginProcess(CAMERA, cases, seed) as camera:
         camera.read()
         if beside:
-            return BenchReport("cloud", params, *_measure_beside(camera, seconds, seed, progress))
+            return _measure_beside(camera, seconds, seed, progress)
         with ScenePublisher(
             SceneBuilder("bench"), SessionConfig(control_port=0, state_port=0, record=False)
         ) as session:
@@ -68,7 +67,7 @@ def run_cloud(
         results = {**found.pop(ROOM), **compared, **found}
     bars = [make_bar(results, "hz", ">=", 30.0)]
     bars += [make_bar(results, f"{name}.hz", ">=", 30.0) for name in found]
-    return BenchReport("cloud", params, results, tuple(bars))
+    return BenchReport(results, bars)
 
 
 def _make_cases(points: int, cameras: int, beside: bool, progress: Callable[[str], None]) -> tuple[CloudCase, ...]:
@@ -86,10 +85,8 @@ def _make_cases(points: int, cameras: int, beside: bool, progress: Callable[[str
 # --- beside a session -------------------------------------------------------------------------------------------------
 
 
-def _measure_beside(
-    camera: PluginProcess, seconds: float, seed: int, progress: Callable[[str], None]
-) -> tuple[dict[str, Any], tuple[Any, ...]]:
-    """Return results and bars of intervals with and without clouds."""
+def _measure_beside(camera: PluginProcess, seconds: float, seed: int, progress: Callable[[str], None]) -> BenchReport:
+    """Return the report of intervals with and without clouds."""
     plan = plan_rounds((WITHOUT, WITH), seconds, ROUNDS, SHORTEST_S, LEAD_S)  # without a camera first
     readings: list[PacerStats] = []  # at the end of the lead and of each interval
 
@@ -127,4 +124,4 @@ def _measure_beside(
     }
     bound = max(0.001, results["late_tick_share_without"])
     bars = (make_bar(results, "hz", ">=", 10.0), make_bar(results, "late_tick_share", "<=", bound))
-    return results, bars
+    return BenchReport(results, bars)

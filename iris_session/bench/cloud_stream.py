@@ -236,9 +236,8 @@ def run_cloud_stream(
         runs = [source.read() for one in plan if one.kind in (WITH, SLOW)]
     progress("comparing the delivered clouds with those of the source")
     results = summarize(got, plan, runs, MovingCloud(points, seed), hz)
-    params: dict[str, Any] = {"points": points, "hz": hz, "clients": clients, "seconds": plan[-1].end_s}
-    params |= {"seed": seed, "curve": curve, "mbit": mbit, "bodies": BODIES}
-    return BenchReport("cloud-stream", params, results, tuple(_make_bars(results, hz, mbit)))
+    params = {"seconds": plan[-1].end_s, "bodies": BODIES}
+    return BenchReport(results, _make_bars(results, hz, mbit), params=params)
 
 
 def summarize(

@@ -112,9 +112,7 @@ def run_csharp(
         make_bar(results, "cloth_max_error_mm", "<=", CLOTH_BOUND_M * 1e3),
         make_bar(results, "age_ms_p99", "<=", reference[f"{PYTHON_WEB}_age_ms_p99"]),
     ]
-    params = {"bodies": bodies, "points": points, "vertices": CLOTH_SIDE**2, "frames": frames, "seconds": seconds}
-    params |= {"seed": seed}
-    return BenchReport("csharp", params, results, tuple(bars), reference)
+    return BenchReport(results, bars, reference, {"vertices": CLOTH_SIDE**2, "frames": frames})
 
 
 def _measure_ages(

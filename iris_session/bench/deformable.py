@@ -31,7 +31,6 @@ from iris_session.bench.report import (
     BenchReport,
     compute_percentile,
     make_bar,
-    make_link_report,
     summarize_percentiles,
 )
 from iris_session.demo.scenes import free_bodies_scene
@@ -93,9 +92,7 @@ def run_deformable(
         make_bar(results, "max_error_mm", "<=", 0.5),
         make_bar(results, "delivered_hz_min", ">=", 59.0),
     ]
-    params: dict[str, Any] = {"vertices": vertices, "clients": clients, "seconds": seconds, "seed": seed}
-    params |= {"curve": curve, "hz": HZ, "bound_mm": BOUND_M * 1e3}
-    return make_link_report("deformable", params, results, bars, profile, _measure_reference(motion))
+    return BenchReport(results, bars, _measure_reference(motion), {"hz": HZ, "bound_mm": BOUND_M * 1e3})
 
 
 class _ClothSource:

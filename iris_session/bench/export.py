@@ -108,17 +108,9 @@ def run_export(
     bars = [make_bar(results, "first_to_last_ratio", "<=", MAX_RATIO)]
     if reference is not None:
         bars.append(make_bar(results, "write_ms_per_frame", "<=", reference["write_ms_per_frame"]))
-    params = {
-        "episodes": episodes,
-        "seconds": seconds,
-        "cameras": N_CAMERAS,
-        "size": f"{WIDTH}x{HEIGHT}",
-        "fps": FPS,
-        "shadows": shadows,
-        "jobs": jobs,
-        "lerobot": python or "none: give a Python with LeRobot, --python, for a reference",
-    }
-    return BenchReport("export", params, results, tuple(bars), reference)
+    params: dict[str, Any] = {"cameras": N_CAMERAS, "size": f"{WIDTH}x{HEIGHT}", "fps": FPS}
+    params["lerobot"] = python or "none: give a Python with LeRobot, --python, for a reference"
+    return BenchReport(results, bars, reference, params)
 
 
 def measure_growth(recording: Path, folder: Path, pictures: PictureSpec) -> tuple[float, float]:

@@ -283,4 +283,4 @@ def run_hands(seconds: float = 300.0, seed: int = 0, progress: Callable[[str], N
         make_bar(results, "false_holds_per_hour", "<=", 1.0),
         make_bar(results, "reclutch_joint_rad", "<=", 0.001),
     )
-    return BenchReport("hands", {"seconds": seconds, "seed": seed}, results, bars)
+    return BenchReport(results, bars)

@@ -10,7 +10,7 @@ import numpy as np
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import CLIENTS, Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import BenchReport, make_bar, make_link_report, summarize_percentiles
+from iris_session.bench.report import BenchReport, make_bar, summarize_percentiles
 from iris_session.bench.state import SESSION_KEYS
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.demo.scenes.generators import arm_names
@@ -57,9 +57,7 @@ def run_input(
         make_bar(results, "samples_per_s", ">=", 0.98 * 3 * 72.0 * operators),
         make_bar(results, "samples_followed", ">=", 0.95 * 72.0 * operators * (seconds - 1.0)),
     ]
-    params = {"operators": operators, "robots": robots, "observers": observers, "seconds": seconds, "curve": curve}
-    params |= {"seed": seed} if profile else {}
-    return make_link_report("input", params, results, bars, profile, reference)
+    return BenchReport(results, bars, reference)
 
 
 def compute_response_ms(got: Measurement, names: list[str]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -103,7 +103,6 @@ def run_join(
         "others_age_ms_p99_baseline": _compute_age_p99_ms(got.logs, got.begin_ns, begin_ns),
         **got.summarize("late_tick_share", "scheduling", "drops"),
     }
-    params = {"objects": objects, "assets_mb": assets_mb, "clients": clients, "seconds": seconds, "seed": seed}
     reference = {
         "bare_transfer_s": round(bare_s, 3),
         "others_age_ms_p99_memory_copied": _compute_age_p99_ms(got.logs, *copied),
@@ -115,7 +114,7 @@ def run_join(
         make_bar(results, "warm_bytes", "<=", 0.01 * first["bytes"]),
         make_bar(results, "others_age_ms_p99", "<=", 3.0),
     )
-    return BenchReport("join", params, results, bars, reference)
+    return BenchReport(results, bars, reference)
 
 
 def _prepare_scene(model: Path, store: Path) -> dict[str, Any]:

@@ -138,7 +138,7 @@ def run_record(
         "drops": drops,
     }
     params = {"operators": OPERATORS, "bodies": BODIES, "seconds": 2 * rounds * length_s, "rounds": rounds}
-    return BenchReport("record", params | {"kills": kills, "seed": seed}, results, tuple(make_record_bars(results)))
+    return BenchReport(results, make_record_bars(results), params=params)
 
 
 def _make_operators() -> list[ClientJob]:

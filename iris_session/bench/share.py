@@ -109,4 +109,4 @@ def run_share(seconds: float = 100.0, progress: Callable[[str], None] = lambda _
         make_bar(results, "mj_step_added_ms_p50", "<=", 0.1),
         make_bar(results, "env_step_added_ms_p50", "<=", 0.5),
     )
-    return BenchReport("share", {"seconds": seconds, "bodies": BODIES}, results, bars)
+    return BenchReport(results, bars, params={"bodies": BODIES})

@@ -29,7 +29,7 @@ from iris_session.bench.harness import (
     summarize_runs,
     summarize_stalls,
 )
-from iris_session.bench.report import BenchReport, allow_increase, make_bar, make_link_report
+from iris_session.bench.report import BenchReport, allow_increase, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.netsim.process import make_link_address
 
@@ -71,9 +71,8 @@ def run_slow_client(
         p99s = [compute_age_p99_ms(others, got.begin_ns, one.stall_s, one.end_s) for one in stretches]
         results |= summarize_runs(f"others_age_ms_p99{key}", p99s)
     results |= got.summarize("late_tick_share", "scheduling", "drops")
-    params: dict[str, Any] = {"clients": clients, "bodies": bodies, "seconds": total_s, "stall_s": STALL_S}
-    params |= {"rounds": len(plan) // 3, "seed": seed, "curve": curve}
-    return make_link_report("slow-client", params, results, _make_bars(results), profile, REFERENCE)
+    params = {"seconds": total_s, "stall_s": STALL_S, "rounds": len(plan) // 3}
+    return BenchReport(results, _make_bars(results), REFERENCE, params)
 
 
 def _stall_link(link: str) -> Callable[[BenchRun, bool], None]:

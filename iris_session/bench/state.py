@@ -18,7 +18,7 @@ from iris_session.bench.harness import (
     group_clients,
     measure,
 )
-from iris_session.bench.report import BenchError, BenchReport, make_bar, make_link_report, summarize_percentiles
+from iris_session.bench.report import BenchError, BenchReport, make_bar, summarize_percentiles
 from iris_session.demo.scenes import free_bodies_scene
 
 #: The bar applies under input: this many of the clients send 3 devices x 72 Hz of samples.
@@ -77,8 +77,7 @@ def run_state(
         make_bar(results, "bytes_per_frame", "<=", 200.0 + 12.0 * bodies),  # 3,800 for 300 bodies
         make_bar(results, "delivered_hz_min", ">=", 59.0),
     ]
-    params = {"clients": clients, "bodies": bodies, "seconds": seconds, "seed": seed, "curve": curve, "hz": 60}
-    return make_link_report("state", params, results, bars, profile, reference)
+    return BenchReport(results, bars, reference, {"hz": 60})
 
 
 def compute_errors(got: Measurement) -> tuple[float, float]:

@@ -267,4 +267,4 @@ def run_stop(seconds: float = 1.0, progress: Callable[[str], None] = lambda _: N
         make_bar(results, "worst_lunge_rad", "<=", MAX_LUNGE_RAD),
         make_bar(results, "grips_kept", ">=", len(every)),
     )
-    return BenchReport("stop", {"seconds": seconds}, results, bars)
+    return BenchReport(results, bars, params={"seconds": seconds})

@@ -139,15 +139,14 @@ def run_web(
     results |= got.summarize(
         *("server_cpu_share", "late_tick_share", "lateness_ms_p99", "ticks", "frames_not_logged", "scheduling", "drops")
     )
-    params: dict[str, Any] = {"clients": clients, "vertices": vertices, "seconds": total_s}
-    params |= {"rounds": len(plan) // 3, "seed": seed, "curve": curve, "tab": missing or "chromium", "hz": 60}
+    params = {"seconds": total_s, "rounds": len(plan) // 3, "tab": missing or "chromium", "hz": 60}
     log = got.logs[REFERENCE]
     measured = {
         "delivered_hz_min": compute_rate(log, got.seconds),
         **summarize_percentiles("age_ms", compute_ages_ms([log]), PERCENTILES),
     }
     reference = {f"{REFERENCE}_{key}": value for key, value in measured.items()}
-    return BenchReport("web", params, results, tuple(make_web_bars(results, total_s)), reference)
+    return BenchReport(results, make_web_bars(results, total_s), reference, params)
 
 
 def make_web_bars(results: dict[str, Any], seconds: float) -> list[Bar]:
