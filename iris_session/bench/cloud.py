@@ -15,8 +15,8 @@ import numpy as np
 
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloud_camera import CloudCase
-from iris_session.bench.cloud_stream import LEAD_S, ROUNDS, SHORTEST_S, WITH, WITHOUT
-from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure, plan_rounds
+from iris_session.bench.cloud_stream import LEAD_S, WITH, plan_stream
+from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchReport, make_bar
 from iris_session.demo.scenes import n_arms_scene
@@ -87,7 +87,7 @@ def _make_cases(points: int, cameras: int, beside: bool, progress: Callable[[str
 
 def _measure_beside(camera: PluginProcess, seconds: float, seed: int, progress: Callable[[str], None]) -> BenchReport:
     """Return the report of intervals with and without clouds."""
-    plan = plan_rounds((WITHOUT, WITH), seconds, ROUNDS, SHORTEST_S, LEAD_S)  # without a camera first
+    plan = plan_stream(seconds)  # without a camera first
     readings: list[PacerStats] = []  # at the end of the lead and of each interval
 
     def read_ticks(run: BenchRun) -> None:

@@ -29,7 +29,6 @@ from iris_session.bench.harness import (
     Measurement,
     compute_age_p99_ms,
     measure,
-    plan_intervals,
     plan_rounds,
     select_between,
 )
@@ -164,7 +163,6 @@ class Source(MediaPublisher):
 SOURCE: Final = "iris_session.bench.cloud_stream:Source"
 #: Moving rigid bodies beside the cloud.
 BODIES: Final = 50
-ROUNDS: Final = 4
 #: Before the first interval, so that the source has joined; and shortest interval [s].
 LEAD_S: Final = 1.0
 SHORTEST_S: Final = 0.5
@@ -173,12 +171,10 @@ MAX_LOWER_S: Final = 1.0
 WITHOUT, WITH, SLOW, SLOW_WITHOUT = "without", "with", "slow", "slow_without"
 
 
-def plan_stream(seconds: float, mbit: float) -> list[Interval]:
-    """Return the intervals of a window."""
-    if not mbit:
-        return plan_rounds((WITHOUT, WITH), seconds, ROUNDS, SHORTEST_S, LEAD_S)
-    kinds = (WITH, SLOW, SLOW_WITHOUT)
-    return plan_intervals(kinds, max(SHORTEST_S, (seconds - LEAD_S) / len(kinds)), LEAD_S)
+def plan_stream(seconds: float, *, slow: bool = False) -> list[Interval]:
+    """Return the intervals of a window, `slow`: in whose middle links become slow."""
+    kinds, rounds = ((WITH, SLOW, SLOW_WITHOUT), 1) if slow else ((WITHOUT, WITH), 4)
+    return plan_rounds(dict.fromkeys(kinds, SHORTEST_S), seconds, rounds, LEAD_S)
 
 
 def run_cloud_stream(
@@ -192,7 +188,7 @@ def run_cloud_stream(
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
     """Stream a cloud to observers, beside 50 rigid bodies."""
-    plan = plan_stream(seconds, mbit)
+    plan = plan_stream(seconds, slow=mbit > 0.0)
     specs = [ClientJob(f"client{i}", "observer") for i in range(clients)]
     links: dict[str, str] = {}
     if mbit:

@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -67,18 +68,16 @@ class Interval(NamedTuple):
         return self.end_s - self.begin_s
 
 
-def plan_intervals(kinds: Sequence[str], length_s: float, begin_s: float = 0.0) -> list[Interval]:
-    """Return intervals of one length, one after the other."""
-    return [Interval(kind, begin_s + i * length_s, begin_s + (i + 1) * length_s) for i, kind in enumerate(kinds)]
+def plan_rounds(lengths_s: Mapping[str, float], seconds: float, rounds: int, lead_s: float = 0.0) -> list[Interval]:
+    """Return rounds of intervals that fill the seconds after the lead: as many as fit, 1 to `rounds`.
 
-
-def plan_rounds(
-    kinds: Sequence[str], seconds: float, rounds: int, shortest_s: float, lead_s: float = 0.0
-) -> list[Interval]:
-    """Return rounds of the kinds in turn that fill the seconds after the lead: as many as fit, 1 to `rounds`."""
-    rounds = max(1, min(rounds, int((seconds - lead_s) / (len(kinds) * shortest_s))))
-    length_s = max(shortest_s, (seconds - lead_s) / (len(kinds) * rounds))
-    return plan_intervals(list(kinds) * rounds, length_s, lead_s)
+    `lengths_s`: the shortest length of an interval by its kind.
+    """
+    round_s = sum(lengths_s.values())
+    rounds = max(1, min(rounds, int((seconds - lead_s) / round_s)))
+    stretch = max(1.0, (seconds - lead_s) / (rounds * round_s))
+    times_s = [round(lead_s + stretch * s, 6) for s in accumulate(list(lengths_s.values()) * rounds, initial=0.0)]
+    return [Interval(*one) for one in zip(list(lengths_s) * rounds, times_s[:-1], times_s[1:], strict=True)]
 
 
 def select_between(times_ns: NDArray[Any], begin_ns: int, from_s: float, to_s: float) -> NDArray[np.bool_]:

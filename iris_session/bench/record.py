@@ -20,9 +20,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -251,9 +251,7 @@ def _kill_sessions(folder: Path, kills: int, seed: int, progress: Callable[[str]
         pair = kinds[i : i + 2]
         progress(f"kill {i + 1} of {kills}: {', then '.join(pair)}")
         path = folder / f"killed{i}" / paths.FIRST_FILE
-        with KilledSession(path, seed) as session:
-            killed = [(kind, session.kill(kind, random_of.uniform(0.5, 1.0))) for kind in pair]
-        lost, gaps = read_losses(path, killed)
+        lost, gaps = read_losses(path, kill_session(path, seed, pair, random_of))
         losses += lost
         missing += gaps
     return losses, missing
@@ -279,53 +277,36 @@ def read_losses(path: Path, kills: Sequence[tuple[str, int]]) -> tuple[list[Kill
     return losses, gaps
 
 
-class KilledSession:
-    """A session with its operators in other processes, all of which end with this context."""
+def kill_session(path: Path, seed: int, kinds: Sequence[str], random_of: random.Random) -> list[tuple[str, int]]:
+    """Record a session, and kill processes of it, as `kinds` says, each time after the recorder has caught up.
 
-    def __init__(self, path: Path, seed: int) -> None:
-        self._started: list[psutil.Process] = []
-        with ExitStack() as stack:
-            self._session = PluginProcess(SESSION, str(path), seed)
-            stack.callback(self._end)
-            self._session.read(START_S)
-            self._origin_ns: int
-            address, self._origin_ns = self._session.ask("describe", timeout_s=START_S)
-            job = Job(address, self._origin_ns, "", tuple(_make_operators()))
-            stack.enter_context(PluginProcess(CLIENTS, job)).read(START_S)
-            self._stack = stack.pop_all()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def kill(self, kind: str, after_s: float) -> int:
-        """Kill processes, as `kind` says, some time after the recorder has caught up: anywhere between two writes.
-
-        Returns:
-            The session time of the kill [ns].
-        """
-        recorder = self._session.ask("wait_until_written", START_S)
-        if not recorder:
-            raise BenchError("the recorder of a session that is to be killed is not up to date")
-        self._started = psutil.Process(self._session.pid).children(recursive=True)
-        time.sleep(after_s)
-        victims = {RECORDER: [recorder], AUTHORITY: [self._session.pid], BOTH: [recorder, self._session.pid]}[kind]
-        now_ns = time.monotonic_ns()
-        for pid in victims:
-            os.kill(pid, signal.SIGKILL)
-        return now_ns - self._origin_ns
-
-    def _end(self) -> None:
-        """End the session, and wait for its processes: a recorder whose session was killed writes the rest first."""
+    Returns:
+        What was killed, and the session time of the kill [ns].
+    """
+    killed: list[tuple[str, int]] = []
+    children: list[psutil.Process] = []
+    session = PluginProcess(SESSION, str(path), seed)
+    try:
+        session.read(START_S)
+        for kind in kinds:
+            recorder, origin_ns = session.ask("wait_until_written", START_S)
+            if not recorder:
+                raise BenchError("the recorder of a session that is to be killed is not up to date")
+            children = psutil.Process(session.pid).children(recursive=True)
+            time.sleep(random_of.uniform(0.5, 1.0))  # until any moment between two writes
+            now_ns = time.monotonic_ns()
+            for pid in {RECORDER: [recorder], AUTHORITY: [session.pid], BOTH: [recorder, session.pid]}[kind]:
+                os.kill(pid, signal.SIGKILL)
+            killed.append((kind, now_ns - origin_ns))
+    finally:
         with suppress(psutil.Error):
-            self._started = psutil.Process(self._session.pid).children(recursive=True) or self._started
-        self._session.close(exit_s=END_S)
-        _, alive = psutil.wait_procs(self._started, timeout=END_S)
-        for process in alive:
+            children = psutil.Process(session.pid).children(recursive=True) or children
+        session.close(exit_s=END_S)
+        # A recorder whose session was killed writes the rest first.
+        for process in psutil.wait_procs(children, timeout=END_S)[1]:
             with suppress(psutil.Error):
                 process.kill()
+    return killed
 
 
 # --- naive logs of the same values ------------------------------------------------------------------------------------
@@ -441,12 +422,16 @@ def make_record_scene(seed: int) -> Any:
 
 
 class RecordedSession(Plugin):
-    """Plug-in that runs a recorded session of the scene. `path`: first file of the recording."""
+    """Plug-in that runs a recorded session of the scene with its operators. `path`: first file of the recording."""
 
     def __init__(self, path: str, seed: int) -> None:
         model = make_record_scene(seed).compile()
         self._session = Session(model, config=make_session_config(record=Path(path)))
         self._session.start()
+        job = Job(self._session.address, self._session.origin_ns, "", tuple(_make_operators()))
+        self._operators = PluginProcess(CLIENTS, job)
+        self._session.run(seconds=START_S, until=self._operators.has_answered)
+        self._operators.read()
         self._known = 0
         self._calls = select.poll()
         self._calls.register(sys.stdin.fileno(), select.POLLIN)
@@ -455,12 +440,12 @@ class RecordedSession(Plugin):
         """Run the session until the next call: every begin of a run costs it a moment."""
         self._session.run(until=lambda: self._calls.poll(0))
 
-    def describe(self) -> tuple[str, int]:
-        """Return the address of the session, and its origin: session time zero on CLOCK_MONOTONIC [ns]."""
-        return self._session.address, self._session.origin_ns
+    def wait_until_written(self, timeout_s: float) -> tuple[int, int]:
+        """Run until a recorder that is new has written the rows that waited for it.
 
-    def wait_until_written(self, timeout_s: float) -> int:
-        """Run until a recorder that is new has written the rows that waited for it; return its process id, or 0."""
+        Returns:
+            Its process id, 0 if there is none; and session time zero on CLOCK_MONOTONIC [ns].
+        """
         due_ns = 0
 
         def is_written() -> bool:
@@ -477,8 +462,9 @@ class RecordedSession(Plugin):
 
         before = self._known
         self._session.run(seconds=timeout_s, until=is_written)
-        return self._session.processes.recorder_pid if self._known != before else 0
+        return self._session.processes.recorder_pid if self._known != before else 0, self._session.origin_ns
 
     def close(self) -> None:
         """Close the session."""
+        self._operators.close()
         self._session.close()

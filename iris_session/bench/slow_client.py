@@ -57,7 +57,7 @@ def run_slow_client(
     specs[-1] = msgspec.structs.replace(specs[-1], link=stalled)
     links[stalled] = profile or "none"
     groups = {CLIENTS: [*group_clients(specs[:-2]), *((spec,) for spec in specs[-2:])]}
-    plan = plan_rounds((BASELINE, STOPPED, STALLED), seconds, ROUNDS, SHORTEST_STALL_S)
+    plan = plan_rounds(dict.fromkeys((BASELINE, STOPPED, STALLED), SHORTEST_STALL_S), seconds, ROUNDS)
     total_s = plan[-1].end_s
     resumed: dict[Interval, int] = {}  # session time [ns] at which the stall ended
     actions = plan_stalls(plan, {STOPPED: stop_client(STOPPED), STALLED: _stall_link(stalled)}, resumed)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from itertools import accumulate
 from typing import Any, Final
 
 import numpy as np
@@ -28,6 +27,7 @@ from iris_session.bench.harness import (
     compute_ages_ms,
     group_clients,
     measure,
+    plan_rounds,
     plan_stalls,
     stop_client,
     summarize_runs,
@@ -52,8 +52,8 @@ PERCENTILES: Final = (50, 95, 99)
 FLAT_S: Final = 300.0
 ROUNDS: Final = 3
 FROZEN, LOADING = "frozen", "loading"
-#: Lengths of the intervals [s].
-LENGTHS: Final = {BASELINE: SHORTEST_STALL_S, FROZEN: SHORTEST_STALL_S, LOADING: 10.0}
+#: Shortest lengths of the intervals [s].
+LENGTHS_S: Final = {BASELINE: SHORTEST_STALL_S, FROZEN: SHORTEST_STALL_S, LOADING: 10.0}
 REFERENCE, TAB, SPECIAL = "zeromq", "tab", "special"
 #: The scene: the ALOHA stations in free motion, and a sheet of vertices that swings above them. What it moves is what a
 #: page has to draw; its physics costs little, so that it is not what is measured. Speed of the hinges at the beginning
@@ -78,14 +78,6 @@ _SHEET: Final = """
 """
 
 
-def plan_web_intervals(seconds: float) -> list[Interval]:
-    """Return rounds of baseline, frozen and loading before the e-stops: as many as fit, at least one, at most three."""
-    rounds = max(1, min(ROUNDS, int((seconds - STOPS_S) / sum(LENGTHS.values()))))
-    ends_s = accumulate(list(LENGTHS.values()) * rounds)
-    kinds = list(LENGTHS) * rounds
-    return [Interval(kind, end_s - LENGTHS[kind], end_s) for kind, end_s in zip(kinds, ends_s, strict=True)]
-
-
 def run_web(
     clients: int = 8,
     vertices: int = 10_000,
@@ -106,7 +98,7 @@ def run_web(
     missing = "not asked for" if not tab else _find_missing_tool()
     if missing:
         progress(f"no tab of a real browser: {missing}")
-    plan = plan_web_intervals(seconds)
+    plan = plan_rounds(LENGTHS_S, seconds - STOPS_S, ROUNDS)
     total_s = max(seconds, plan[-1].end_s + STOPS_S)
     others = [ClientJob(f"browser{i}", "observer") for i in range(clients - (1 if missing else 2))]
     resumed: dict[Interval, int] = {}
