@@ -42,7 +42,7 @@ class ClientJob(msgspec.Struct, frozen=True):
         role: Its role.
         robot: Robot to drive with the right controller.
         samples: Send 3 devices x 72 Hz.
-        link: Address of its impaired link; empty: none.
+        profile: Profile of its impaired link; empty: none.
         loads_s: Of a browser: times in the window at which it fetches assets [s].
     """
 
@@ -50,7 +50,7 @@ class ClientJob(msgspec.Struct, frozen=True):
     role: str
     robot: str = ""
     samples: bool = False
-    link: str = ""
+    profile: str = ""
     loads_s: tuple[float, ...] = ()
 
 
@@ -67,6 +67,7 @@ class Job(msgspec.Struct, frozen=True):
         topology: File of the topology of a deformable stream, instead of the scene's asset.
         server_public, public, secret: CURVE keys, Z85 text; empty: plain.
         page: Address of the session's page, for browsers.
+        links: Addresses of impaired links by client.
     """
 
     address: str
@@ -80,6 +81,7 @@ class Job(msgspec.Struct, frozen=True):
     public: str = ""
     secret: str = ""
     page: str = ""
+    links: dict[str, str] = {}
 
     @property
     def curve(self) -> CurveKeys | None:
@@ -144,12 +146,12 @@ class BenchClient:
     def __init__(self, job: Job, spec: ClientJob) -> None:
         self.spec = spec
         self._job = job
-        devices = DEVICES if spec.samples else ()
+        link = job.links.get(spec.name)
         self.client = Client(
-            f"{spec.link}:{job.address.rpartition(':')[2]}" if spec.link else job.address,
+            f"{link}:{job.address.rpartition(':')[2]}" if link else job.address,
             role=spec.role,
             name=spec.name,
-            devices=devices,
+            devices=DEVICES if spec.samples else (),
             alignment="not_needed",
             curve=job.curve,
             on_state=self._on_state,

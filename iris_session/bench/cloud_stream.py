@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,7 +39,6 @@ from iris_session.client import Client, CurveKeys
 from iris_session.client.errors import NotConnectedError
 from iris_session.cloud.pipeline import CLASSES
 from iris_session.demo.scenes import free_bodies_scene
-from iris_session.netsim.process import make_link_address
 from iris_session.streams.cloud import decode_cloud, encode_cloud, order_points, read_header
 from iris_session.system.priority import lower_thread_priority
 
@@ -189,11 +187,7 @@ def run_cloud_stream(
 ) -> BenchReport:
     """Stream a cloud to observers, beside 50 rigid bodies."""
     plan = plan_stream(seconds, slow=mbit > 0.0)
-    specs = [ClientJob(f"client{i}", "observer") for i in range(clients)]
-    links: dict[str, str] = {}
-    if mbit:
-        specs = [msgspec.structs.replace(spec, link=make_link_address(i)) for i, spec in enumerate(specs)]
-        links = {spec.link: "none" for spec in specs}
+    specs = [ClientJob(f"client{i}", "observer", profile="none" if mbit else "") for i in range(clients)]
     with (
         tempfile.TemporaryDirectory(prefix="iris-bench-") as folder,
         PluginProcess(SOURCE, points, hz, seed) as source,
@@ -207,21 +201,16 @@ def run_cloud_stream(
             keys = [job.server_public, job.public, job.secret] if job.server_public else []
             source.send("connect", run.session.address, *keys)
 
-        def slow_links(run: BenchRun) -> None:
-            assert run.proxy is not None
-            run.proxy.send(f"profile {profile}")
-
         actions: list[Action] = [(0.0, connect)]
         for one in plan:
             if one.kind == SLOW:
-                actions.append((one.begin_s, slow_links))
+                actions.append((one.begin_s, lambda run: run.command_links(f"profile {profile}")))
             if one.kind in (WITH, SLOW):
                 actions.append((one.begin_s, lambda _: source.send("run", plan[0].length_s)))
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
             {MEDIA_CLIENTS: [(spec,) for spec in specs]},
             plan[-1].end_s,
-            links=links,
             seed=seed,
             actions=actions,
             curve=curve,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from iris_session.assets.store import default_root
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import MEDIA_CLIENTS, Log, Measurement, assign_links, group_clients, measure
+from iris_session.bench.harness import MEDIA_CLIENTS, Log, Measurement, group_clients, measure
 from iris_session.bench.media_clients import MediaColumn as Column
 from iris_session.bench.media_clients import sum_counts
 from iris_session.bench.report import (
@@ -66,7 +66,7 @@ def run_deformable(
         raise BenchError(f"--vertices {vertices}: the cloth is square, choose {side * side} or {(side + 1) ** 2}")
     motion = load_cloth_motion(side, seed, progress)
     topology = DeformableTopology(vertices, motion.faces)
-    specs, links = assign_links([ClientJob(f"client{i}", "observer") for i in range(clients)], profile)
+    specs = [ClientJob(f"client{i}", "observer", profile=profile) for i in range(clients)]
     source = _ClothSource(motion, topology)
     with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
         file = Path(folder) / "topology"
@@ -75,7 +75,6 @@ def run_deformable(
             free_bodies_scene(BODIES, seed).compile(),
             {MEDIA_CLIENTS: group_clients(specs)},
             seconds,
-            links=links,
             seed=seed,
             curve=curve,
             stream=STREAM,

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -153,14 +152,6 @@ def group_clients(specs: Sequence[ClientJob]) -> list[Group]:
     return [tuple(specs[i : i + CLIENTS_PER_PROCESS]) for i in range(0, len(specs), CLIENTS_PER_PROCESS)]
 
 
-def assign_links(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJob], dict[str, str]]:
-    """Give each client a link of its own. Return the clients, and the profile by link; unchanged without a profile."""
-    if not profile:
-        return list(specs), {}
-    placed = [msgspec.structs.replace(spec, link=make_link_address(i)) for i, spec in enumerate(specs)]
-    return placed, dict.fromkeys((spec.link for spec in placed), profile)
-
-
 class _Reading(NamedTuple):
     """Statistics of ticks and of processes at one time."""
 
@@ -277,12 +268,18 @@ class ClientProcess(PluginProcess):
 
 @dataclass
 class BenchRun:
-    """Running benchmark, on which an action of `measure` acts. `by_client`: processes by client name."""
+    """Running benchmark, on which an action of `measure` acts. `by_client`: processes by client; `links`: addresses."""
 
     session: Session
     processes: list[ClientProcess]
     by_client: dict[str, ClientProcess]
+    links: dict[str, str]
     proxy: ImpairmentProcess | None
+
+    def command_links(self, command: str) -> None:
+        """Send a command to the process of the links (`netsim.process`)."""
+        assert self.proxy is not None
+        self.proxy.send(command)
 
 
 def make_session_config(
@@ -333,12 +330,16 @@ def stop_client(name: str) -> Callable[[BenchRun, bool], None]:
     return lambda run, begins: run.by_client[name].send_signal(signal.SIGSTOP if begins else signal.SIGCONT)
 
 
+def stall_link(name: str) -> Callable[[BenchRun, bool], None]:
+    """Return a stall of the link of a client, which passes nothing meanwhile."""
+    return lambda run, begins: run.command_links(f"{'stall' if begins else 'resume'} @{run.links[name]}")
+
+
 def measure(
     model: mujoco.MjModel,
     groups: Mapping[str, Sequence[Group]],
     seconds: float,
     *,
-    links: Mapping[str, str] = MappingProxyType({}),
     seed: int = 0,
     actions: Sequence[Action] = (),
     keep_poses: bool = False,
@@ -357,7 +358,6 @@ def measure(
         groups: Clients by process, by plug-in: `CLIENTS`, `MEDIA_CLIENTS`, `BROWSERS` at the session's page without a
             picture, `TABS` in a real Chromium, or that of a benchmark.
         seconds: Length of the measured window.
-        links: Link profile by address.
         seed: Random seed of the links.
         actions: Functions to call during the window, in order of their times.
         keep_poses: Keep the true poses of every published tick.
@@ -375,20 +375,22 @@ def measure(
         keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else {}
         config = make_session_config(assets=assets, record=record, curve=curve)
         session = stack.enter_context(Session(model, config=config))
+        specs = [spec for own in groups.values() for group in own for spec in group]
+        links = {spec.name: make_link_address(i) for i, spec in enumerate(specs) if spec.profile}
         proxy = None
         if links:
-            ports = session.processes.front_ports
-            proxy = stack.enter_context(ImpairmentProcess(links, ports.for_clients, target=ports.host, seed=seed))
-        run = BenchRun(session, [], {}, proxy)
+            ports, profiles = session.processes.front_ports, {links[s.name]: s.profile for s in specs if s.profile}
+            proxy = stack.enter_context(ImpairmentProcess(profiles, ports.for_clients, target=ports.host, seed=seed))
+        run = BenchRun(session, [], {}, links, proxy)
         page = "" if session.processes.web is None else session.processes.web.address
         if groups.keys() & {BROWSERS, TABS} and not page:
             raise BenchError("the session has no page for browsers")
-        job = Job(session.address, session.origin_ns, "", (), keep_poses, stream, topology, page=page, **keys)
+        job = Job(session.address, session.origin_ns, "", (), keep_poses, stream, topology, links=links, **keys)
         for plugin, own in groups.items():
             for group in own:
-                job = msgspec.structs.replace(job, log=str(folder / f"log{len(run.processes)}.npz"), clients=group)
+                log = str(folder / f"log{len(run.processes)}.npz")
                 code = _make_code(session) if plugin == TABS else ""
-                worker = ClientProcess(plugin, msgspec.structs.replace(job, page=page + code))
+                worker = ClientProcess(plugin, msgspec.structs.replace(job, log=log, clients=group, page=page + code))
                 stack.callback(worker.close, exit_s=LEAVE_S)
                 run.processes.append(worker)
                 run.by_client.update((spec.name, worker) for spec in group)
@@ -437,7 +439,7 @@ def _run_session(
     readings: list[_Reading] = []
     pending = list(actions)
     if run.proxy is not None:  # the times of link profiles count from the beginning of the window
-        pending.insert(0, (0.0, lambda run: run.proxy.send("start")))  # type: ignore[union-attr]
+        pending.insert(0, (0.0, lambda run: run.command_links("start")))
 
     def is_over() -> bool:
         on_tick(session)

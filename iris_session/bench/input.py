@@ -9,7 +9,7 @@ import numpy as np
 
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import CLIENTS, Measurement, assign_links, group_clients, measure
+from iris_session.bench.harness import CLIENTS, Measurement, group_clients, measure
 from iris_session.bench.report import BenchReport, make_bar, summarize_percentiles
 from iris_session.bench.state import SESSION_KEYS
 from iris_session.demo.scenes import n_arms_scene
@@ -33,13 +33,12 @@ def run_input(
     """
     model = n_arms_scene(robots).compile()
     arms = arm_names(robots)
-    specs = [ClientJob(f"operator{i}", "operator", arms[i % robots], samples=True) for i in range(operators)]
-    specs += [ClientJob(f"observer{i}", "observer") for i in range(observers)]
-    specs, links = assign_links(specs, profile)
+    specs = [ClientJob(f"operator{i}", "operator", arms[i], True, profile) for i in range(operators)]
+    specs += [ClientJob(f"observer{i}", "observer", profile=profile) for i in range(observers)]
     progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(operators + observers)
     groups = {CLIENTS: group_clients(specs)}
-    got = measure(model, groups, seconds, links=links, seed=seed, curve=curve, progress=progress)
+    got = measure(model, groups, seconds, seed=seed, curve=curve, progress=progress)
     responses = compute_response_ms(got, [spec.name for spec in specs if spec.robot])
     tick_ms = model.opt.timestep * 1e3
     received = sum(map(len, got.received.values()))

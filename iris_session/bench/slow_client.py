@@ -9,29 +9,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-import msgspec
-
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
     CLIENTS,
     CLIENTS_PER_PROCESS,
     SHORTEST_STALL_S,
     STALL_S,
-    BenchRun,
     Interval,
-    assign_links,
     compute_age_p99_ms,
     group_clients,
     measure,
     plan_rounds,
     plan_stalls,
+    stall_link,
     stop_client,
     summarize_runs,
     summarize_stalls,
 )
 from iris_session.bench.report import BenchReport, allow_increase, make_bar
 from iris_session.demo.scenes import free_bodies_scene
-from iris_session.netsim.process import make_link_address
 
 ROUNDS: Final = 3
 STOPPED, STALLED, BASELINE = "stopped", "stalled", "baseline"
@@ -50,22 +46,22 @@ def run_slow_client(
 ) -> BenchReport:
     """Stall two of the clients in turn."""
     model = free_bodies_scene(bodies, seed).compile()
-    specs = [ClientJob(f"client{i}", "observer", samples=i < CLIENTS_PER_PROCESS) for i in range(clients - 2)]
-    names = [spec.name for spec in specs]
-    specs, links = assign_links([*specs, ClientJob(STOPPED, "observer"), ClientJob(STALLED, "observer")], profile)
-    stalled = make_link_address(clients - 1)
-    specs[-1] = msgspec.structs.replace(specs[-1], link=stalled)
-    links[stalled] = profile or "none"
-    groups = {CLIENTS: [*group_clients(specs[:-2]), *((spec,) for spec in specs[-2:])]}
+    specs = [
+        ClientJob(f"client{i}", "observer", samples=i < CLIENTS_PER_PROCESS, profile=profile)
+        for i in range(clients - 2)
+    ]
+    stopped = ClientJob(STOPPED, "observer", profile=profile)
+    stalled = ClientJob(STALLED, "observer", profile=profile or "none")
+    groups = {CLIENTS: [*group_clients(specs), (stopped,), (stalled,)]}
     plan = plan_rounds(dict.fromkeys((BASELINE, STOPPED, STALLED), SHORTEST_STALL_S), seconds, ROUNDS)
     total_s = plan[-1].end_s
     resumed: dict[Interval, int] = {}  # session time [ns] at which the stall ended
-    actions = plan_stalls(plan, {STOPPED: stop_client(STOPPED), STALLED: _stall_link(stalled)}, resumed)
-    got = measure(model, groups, total_s, links=links, seed=seed, actions=actions, curve=curve, progress=progress)
+    actions = plan_stalls(plan, {STOPPED: stop_client(STOPPED), STALLED: stall_link(STALLED)}, resumed)
+    got = measure(model, groups, total_s, seed=seed, actions=actions, curve=curve, progress=progress)
     results: dict[str, Any] = {}
     for kind, prefix in ((STOPPED, ""), (STALLED, "link_")):
         results |= summarize_stalls(got.logs[kind], got.begin_ns, resumed, kind, prefix)
-    others = [got.logs[name] for name in names]
+    others = [got.logs[spec.name] for spec in specs]
     for kind, key in ((STOPPED, ""), (STALLED, "_link"), (BASELINE, "_baseline")):
         stretches = [one for one in plan if one.kind == kind]
         p99s = [compute_age_p99_ms(others, got.begin_ns, one.stall_s, one.end_s) for one in stretches]
@@ -73,16 +69,6 @@ def run_slow_client(
     results |= got.summarize("late_tick_share", "scheduling", "drops")
     params = {"seconds": total_s, "stall_s": STALL_S, "rounds": len(plan) // 3}
     return BenchReport(results, _make_bars(results), REFERENCE, params)
-
-
-def _stall_link(link: str) -> Callable[[BenchRun, bool], None]:
-    """Return a stall of a link, which passes nothing meanwhile."""
-
-    def stall(run: BenchRun, begins: bool) -> None:
-        assert run.proxy is not None
-        run.proxy.send(f"{'stall' if begins else 'resume'} @{link}")
-
-    return stall
 
 
 def _make_bars(results: dict[str, Any]) -> list[Any]:

@@ -13,7 +13,6 @@ from iris_session.bench.harness import (
     CLIENTS,
     WARM_UP_S,
     Measurement,
-    assign_links,
     compute_ages_ms,
     group_clients,
     measure,
@@ -43,12 +42,11 @@ def run_state(
     Reference: `measure_baseline`.
     """
     model = free_bodies_scene(bodies, seed).compile()
-    specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS) for i in range(clients)]
-    specs, links = assign_links(specs, profile)
+    specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS, profile=profile) for i in range(clients)]
     progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(clients)
     groups = {CLIENTS: group_clients(specs)}
-    got = measure(model, groups, seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress)
+    got = measure(model, groups, seconds, seed=seed, keep_poses=True, curve=curve, progress=progress)
     progress("comparing every delivered frame with the state at its tick")
     logs = list(got.logs.values())
     ages = compute_ages_ms(logs)
