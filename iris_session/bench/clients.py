@@ -32,6 +32,11 @@ MAX_FRAMES: Final = 8192
 #: State comes at 60 Hz; twice as many frames are room enough.
 MAX_HZ: Final = 120.0
 JOIN_S: Final = 30.0
+#: Plug-ins of clients. `BROWSERS` are at the session's page without a picture, `TABS` in a real Chromium.
+CLIENTS: Final = "iris_session.bench.clients:StateClients"
+MEDIA_CLIENTS: Final = "iris_session.bench.media_clients:MediaClients"
+BROWSERS: Final = "iris_session.bench.web_clients:Browsers"
+TABS: Final = "iris_session.bench.web_tab:Tab"
 
 
 class ClientJob(msgspec.Struct, frozen=True):
@@ -43,6 +48,8 @@ class ClientJob(msgspec.Struct, frozen=True):
         robot: Robot to drive with the right controller.
         samples: Send 3 devices x 72 Hz.
         profile: Profile of its impaired link; empty: none.
+        plugin: Its plug-in.
+        alone: It has a process of its own.
         loads_s: Of a browser: times in the window at which it fetches assets [s].
     """
 
@@ -51,6 +58,8 @@ class ClientJob(msgspec.Struct, frozen=True):
     robot: str = ""
     samples: bool = False
     profile: str = ""
+    plugin: str = CLIENTS
+    alone: bool = False
     loads_s: tuple[float, ...] = ()
 
 

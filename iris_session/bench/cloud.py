@@ -16,7 +16,7 @@ import numpy as np
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloud_camera import CloudCase
 from iris_session.bench.cloud_stream import LEAD_S, WITH, plan_stream
-from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure
+from iris_session.bench.harness import Action, BenchRun, measure
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchReport, make_bar
 from iris_session.demo.scenes import n_arms_scene
@@ -104,7 +104,7 @@ def _measure_beside(camera: PluginProcess, seconds: float, seed: int, progress: 
     people = [ClientJob(f"operator{i}", "operator", arm, samples=True) for i, arm in enumerate(arms)]
     got = measure(
         n_arms_scene(2).compile(),
-        {CLIENTS: group_clients([*people, ClientJob("observer", "observer")])},
+        [*people, ClientJob("observer", "observer")],
         plan[-1].end_s + 0.2,
         seed=seed,
         actions=actions,

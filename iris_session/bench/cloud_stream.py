@@ -18,9 +18,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import ClientJob
+from iris_session.bench.clients import MEDIA_CLIENTS, ClientJob
 from iris_session.bench.harness import (
-    MEDIA_CLIENTS,
     Action,
     BenchRun,
     Interval,
@@ -187,7 +186,10 @@ def run_cloud_stream(
 ) -> BenchReport:
     """Stream a cloud to observers, beside 50 rigid bodies."""
     plan = plan_stream(seconds, slow=mbit > 0.0)
-    specs = [ClientJob(f"client{i}", "observer", profile="none" if mbit else "") for i in range(clients)]
+    link = "none" if mbit else ""
+    specs = [
+        ClientJob(f"client{i}", "observer", profile=link, plugin=MEDIA_CLIENTS, alone=True) for i in range(clients)
+    ]
     with (
         tempfile.TemporaryDirectory(prefix="iris-bench-") as folder,
         PluginProcess(SOURCE, points, hz, seed) as source,
@@ -209,7 +211,7 @@ def run_cloud_stream(
                 actions.append((one.begin_s, lambda _: source.send("run", plan[0].length_s)))
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
-            {MEDIA_CLIENTS: [(spec,) for spec in specs]},
+            specs,
             plan[-1].end_s,
             seed=seed,
             actions=actions,

@@ -22,8 +22,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.harness import BROWSERS, CLIENTS, Group, Log, compute_ages_ms, measure
+from iris_session.bench.clients import BROWSERS, ClientJob, Job
+from iris_session.bench.harness import Log, compute_ages_ms, measure
 from iris_session.bench.join import split_quads
 from iris_session.bench.plugins import Plugin
 from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, summarize_percentiles
@@ -121,12 +121,9 @@ def _measure_ages(
     """Return the age of state at clients of one session, by their names."""
     for package in ("aiohttp", "cryptography"):
         require_package(package, "bench csharp")
-    groups: dict[str, list[Group]] = {
-        CLIENTS: [(ClientJob(PYTHON, "observer"),)],
-        BROWSERS: [(ClientJob(PYTHON_WEB, "observer"),)],
-        CSHARP_CLIENTS: [(ClientJob(runtime, "observer"),) for runtime in RUNTIMES],
-    }
-    got = measure(free_bodies_scene(bodies, seed).compile(), groups, seconds, seed=seed, progress=progress)
+    clients = [ClientJob(PYTHON, "observer"), ClientJob(PYTHON_WEB, "observer", plugin=BROWSERS)]
+    clients += [ClientJob(runtime, "observer", plugin=CSHARP_CLIENTS, alone=True) for runtime in RUNTIMES]
+    got = measure(free_bodies_scene(bodies, seed).compile(), clients, seconds, seed=seed, progress=progress)
     return {name: _summarize_ages(name, log) for name, log in got.logs.items()}
 
 

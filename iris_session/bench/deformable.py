@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.assets.store import default_root
-from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import MEDIA_CLIENTS, Log, Measurement, group_clients, measure
+from iris_session.bench.clients import MEDIA_CLIENTS, ClientJob
+from iris_session.bench.harness import Log, Measurement, measure
 from iris_session.bench.media_clients import MediaColumn as Column
 from iris_session.bench.media_clients import sum_counts
 from iris_session.bench.report import (
@@ -66,14 +66,14 @@ def run_deformable(
         raise BenchError(f"--vertices {vertices}: the cloth is square, choose {side * side} or {(side + 1) ** 2}")
     motion = load_cloth_motion(side, seed, progress)
     topology = DeformableTopology(vertices, motion.faces)
-    specs = [ClientJob(f"client{i}", "observer", profile=profile) for i in range(clients)]
+    specs = [ClientJob(f"client{i}", "observer", profile=profile, plugin=MEDIA_CLIENTS) for i in range(clients)]
     source = _ClothSource(motion, topology)
     with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
         file = Path(folder) / "topology"
         file.write_bytes(topology.to_bytes())
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
-            {MEDIA_CLIENTS: group_clients(specs)},
+            specs,
             seconds,
             seed=seed,
             curve=curve,

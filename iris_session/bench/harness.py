@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, groupby
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -25,7 +25,7 @@ import psutil
 from numpy.typing import NDArray
 
 from iris_session.authority.config import UNALIGNED, AuthorityConfig
-from iris_session.bench.clients import ClientJob, Job, make_web_secret
+from iris_session.bench.clients import BROWSERS, TABS, ClientJob, Job, make_web_secret
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchError, compute_percentile
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
@@ -139,17 +139,15 @@ EXIT_S: Final = 60.0
 ASK_NS: Final = 50_000_000
 #: Time in which client processes leave the session [s].
 LEAVE_S: Final = 5.0
-#: Plug-ins of clients.
-CLIENTS: Final = "iris_session.bench.clients:StateClients"
-MEDIA_CLIENTS: Final = "iris_session.bench.media_clients:MediaClients"
-BROWSERS: Final = "iris_session.bench.web_clients:Browsers"
-TABS: Final = "iris_session.bench.web_tab:Tab"
-Group = tuple[ClientJob, ...]  # the clients of one process
 
 
-def group_clients(specs: Sequence[ClientJob]) -> list[Group]:
-    """Group clients into processes of at most `CLIENTS_PER_PROCESS`."""
-    return [tuple(specs[i : i + CLIENTS_PER_PROCESS]) for i in range(0, len(specs), CLIENTS_PER_PROCESS)]
+def _group_clients(clients: Sequence[ClientJob]) -> list[list[ClientJob]]:
+    """Return the clients of each process: at most `CLIENTS_PER_PROCESS` of one plug-in."""
+    groups: list[list[ClientJob]] = []
+    for _, own in groupby(clients, lambda one: (one.plugin, one.alone and one.name)):
+        together = list(own)
+        groups += [together[i : i + CLIENTS_PER_PROCESS] for i in range(0, len(together), CLIENTS_PER_PROCESS)]
+    return groups
 
 
 class _Reading(NamedTuple):
@@ -251,9 +249,9 @@ class Measurement(NamedTuple):
 class ClientProcess(PluginProcess):
     """Process of one group of clients."""
 
-    def __init__(self, plugin: str, job: Job) -> None:
+    def __init__(self, job: Job) -> None:
         self.job = job
-        super().__init__(plugin, job)
+        super().__init__(job.clients[0].plugin, job)
 
     def read_logs(self) -> dict[str, Log]:
         """Return the logs by client name, once the window is over."""
@@ -337,7 +335,7 @@ def stall_link(name: str) -> Callable[[BenchRun, bool], None]:
 
 def measure(
     model: mujoco.MjModel,
-    groups: Mapping[str, Sequence[Group]],
+    clients: Sequence[ClientJob],
     seconds: float,
     *,
     seed: int = 0,
@@ -355,8 +353,7 @@ def measure(
 
     Args:
         model: Model of the session.
-        groups: Clients by process, by plug-in: `CLIENTS`, `MEDIA_CLIENTS`, `BROWSERS` at the session's page without a
-            picture, `TABS` in a real Chromium, or that of a benchmark.
+        clients: Its clients.
         seconds: Length of the measured window.
         seed: Random seed of the links.
         actions: Functions to call during the window, in order of their times.
@@ -371,29 +368,27 @@ def measure(
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
-        people = [spec.name for group in groups.get(BROWSERS, ()) for spec in group]
+        people = [spec.name for spec in clients if spec.plugin == BROWSERS]
         keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else {}
         config = make_session_config(assets=assets, record=record, curve=curve)
         session = stack.enter_context(Session(model, config=config))
-        specs = [spec for own in groups.values() for group in own for spec in group]
-        links = {spec.name: make_link_address(i) for i, spec in enumerate(specs) if spec.profile}
+        links = {spec.name: make_link_address(i) for i, spec in enumerate(clients) if spec.profile}
         proxy = None
         if links:
-            ports, profiles = session.processes.front_ports, {links[s.name]: s.profile for s in specs if s.profile}
+            ports, profiles = session.processes.front_ports, {links[s.name]: s.profile for s in clients if s.profile}
             proxy = stack.enter_context(ImpairmentProcess(profiles, ports.for_clients, target=ports.host, seed=seed))
         run = BenchRun(session, [], {}, links, proxy)
         page = "" if session.processes.web is None else session.processes.web.address
-        if groups.keys() & {BROWSERS, TABS} and not page:
+        if any(spec.plugin in (BROWSERS, TABS) for spec in clients) and not page:
             raise BenchError("the session has no page for browsers")
         job = Job(session.address, session.origin_ns, "", (), keep_poses, stream, topology, links=links, **keys)
-        for plugin, own in groups.items():
-            for group in own:
-                log = str(folder / f"log{len(run.processes)}.npz")
-                code = _make_code(session) if plugin == TABS else ""
-                worker = ClientProcess(plugin, msgspec.structs.replace(job, log=log, clients=group, page=page + code))
-                stack.callback(worker.close, exit_s=LEAVE_S)
-                run.processes.append(worker)
-                run.by_client.update((spec.name, worker) for spec in group)
+        for group in _group_clients(clients):
+            log = str(folder / f"log{len(run.processes)}.npz")
+            code = _make_code(session) if group[0].plugin == TABS else ""
+            worker = ClientProcess(msgspec.structs.replace(job, log=log, clients=tuple(group), page=page + code))
+            stack.callback(worker.close, exit_s=LEAVE_S)
+            run.processes.append(worker)
+            run.by_client.update((spec.name, worker) for spec in group)
         return _run_session(run, seconds, actions, on_tick, keep_poses, progress)
 
 

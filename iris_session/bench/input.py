@@ -9,7 +9,7 @@ import numpy as np
 
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import CLIENTS, Measurement, group_clients, measure
+from iris_session.bench.harness import Measurement, measure
 from iris_session.bench.report import BenchReport, make_bar, summarize_percentiles
 from iris_session.bench.state import SESSION_KEYS
 from iris_session.demo.scenes import n_arms_scene
@@ -37,8 +37,7 @@ def run_input(
     specs += [ClientJob(f"observer{i}", "observer", profile=profile) for i in range(observers)]
     progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(operators + observers)
-    groups = {CLIENTS: group_clients(specs)}
-    got = measure(model, groups, seconds, seed=seed, curve=curve, progress=progress)
+    got = measure(model, specs, seconds, seed=seed, curve=curve, progress=progress)
     responses = compute_response_ms(got, [spec.name for spec in specs if spec.robot])
     tick_ms = model.opt.timestep * 1e3
     received = sum(map(len, got.received.values()))

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import CLIENTS, BenchRun, Log, compute_age_p99_ms, group_clients, measure
+from iris_session.bench.harness import BenchRun, Log, compute_age_p99_ms, measure
 from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.client import Client
@@ -78,7 +78,7 @@ def run_join(
 
         got = measure(
             model,
-            {CLIENTS: group_clients([ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)])},
+            [ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)],
             seconds,
             actions=[(BEGIN_S, start_join)],
             assets=store.root,

@@ -30,8 +30,8 @@ import psutil
 import rerun as rr
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.harness import CLIENTS, group_clients, make_session_config, measure
+from iris_session.bench.clients import CLIENTS, ClientJob, Job
+from iris_session.bench.harness import make_session_config, measure
 from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.demo.scenes import free_bodies_scene, scene_path
@@ -113,7 +113,7 @@ def run_record(
             progress(f"round {i + 1} of {2 * rounds}, {'with' if recorded else 'without'} recording")
             got = measure(
                 make_record_scene(seed).compile(),
-                {CLIENTS: group_clients(_make_operators())},
+                _make_operators(),
                 length_s,
                 record=path if recorded else False,
                 seed=seed,

@@ -11,13 +11,11 @@ from typing import Any, Final
 
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
-    CLIENTS,
     CLIENTS_PER_PROCESS,
     SHORTEST_STALL_S,
     STALL_S,
     Interval,
     compute_age_p99_ms,
-    group_clients,
     measure,
     plan_rounds,
     plan_stalls,
@@ -50,14 +48,14 @@ def run_slow_client(
         ClientJob(f"client{i}", "observer", samples=i < CLIENTS_PER_PROCESS, profile=profile)
         for i in range(clients - 2)
     ]
-    stopped = ClientJob(STOPPED, "observer", profile=profile)
-    stalled = ClientJob(STALLED, "observer", profile=profile or "none")
-    groups = {CLIENTS: [*group_clients(specs), (stopped,), (stalled,)]}
+    stopped = ClientJob(STOPPED, "observer", profile=profile, alone=True)
+    stalled = ClientJob(STALLED, "observer", profile=profile or "none", alone=True)
     plan = plan_rounds(dict.fromkeys((BASELINE, STOPPED, STALLED), SHORTEST_STALL_S), seconds, ROUNDS)
     total_s = plan[-1].end_s
     resumed: dict[Interval, int] = {}  # session time [ns] at which the stall ended
     actions = plan_stalls(plan, {STOPPED: stop_client(STOPPED), STALLED: stall_link(STALLED)}, resumed)
-    got = measure(model, groups, total_s, seed=seed, actions=actions, curve=curve, progress=progress)
+    every = [*specs, stopped, stalled]
+    got = measure(model, every, total_s, seed=seed, actions=actions, curve=curve, progress=progress)
     results: dict[str, Any] = {}
     for kind, prefix in ((STOPPED, ""), (STALLED, "link_")):
         results |= summarize_stalls(got.logs[kind], got.begin_ns, resumed, kind, prefix)

@@ -10,11 +10,9 @@ import numpy as np
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
-    CLIENTS,
     WARM_UP_S,
     Measurement,
     compute_ages_ms,
-    group_clients,
     measure,
 )
 from iris_session.bench.report import BenchError, BenchReport, make_bar, summarize_percentiles
@@ -45,8 +43,7 @@ def run_state(
     specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS, profile=profile) for i in range(clients)]
     progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(clients)
-    groups = {CLIENTS: group_clients(specs)}
-    got = measure(model, groups, seconds, seed=seed, keep_poses=True, curve=curve, progress=progress)
+    got = measure(model, specs, seconds, seed=seed, keep_poses=True, curve=curve, progress=progress)
     progress("comparing every delivered frame with the state at its tick")
     logs = list(got.logs.values())
     ages = compute_ages_ms(logs)

@@ -13,19 +13,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from iris_session.bench.clients import ClientJob
+from iris_session.bench.clients import BROWSERS, TABS, ClientJob
 from iris_session.bench.harness import (
-    BROWSERS,
-    CLIENTS,
     SHORTEST_STALL_S,
-    TABS,
-    Group,
     Interval,
     Log,
     Measurement,
     compute_age_p99_ms,
     compute_ages_ms,
-    group_clients,
     measure,
     plan_rounds,
     plan_stalls,
@@ -100,23 +95,25 @@ def run_web(
         progress(f"no tab of a real browser: {missing}")
     plan = plan_rounds(LENGTHS_S, seconds - STOPS_S, ROUNDS)
     total_s = max(seconds, plan[-1].end_s + STOPS_S)
-    others = [ClientJob(f"browser{i}", "observer") for i in range(clients - (1 if missing else 2))]
+    names = [f"browser{i}" for i in range(clients - (1 if missing else 2))]
+    loads_s = tuple(one.stall_s for one in plan if one.kind == LOADING)
+    every = [
+        ClientJob(REFERENCE, "observer"),
+        *(ClientJob(name, "observer", plugin=BROWSERS) for name in names),
+        ClientJob(SPECIAL, "observer", plugin=BROWSERS, alone=True, loads_s=loads_s),
+    ]
+    if not missing:
+        every.append(ClientJob(TAB, "director", plugin=TABS))
     resumed: dict[Interval, int] = {}
-    special = ClientJob(SPECIAL, "observer", loads_s=tuple(one.stall_s for one in plan if one.kind == LOADING))
-    groups: dict[str, list[Group]] = {
-        CLIENTS: [(ClientJob(REFERENCE, "observer"),)],
-        BROWSERS: [*group_clients(others), (special,)],
-    }
     got = measure(
         make_web_model(vertices, seed),
-        groups if missing else {**groups, TABS: [(ClientJob(TAB, "director"),)]},
+        every,
         total_s,
         actions=plan_stalls(plan, {FROZEN: stop_client(SPECIAL)}, resumed),
         curve=curve,
         assets=True,
         progress=progress,
     )
-    names = [spec.name for spec in others]
     if any(not len(got.logs[name]["ticks"]) for name in [*names, REFERENCE]):
         raise BenchError("a client received no state in the measured window")
     results = summarize_browsers(got, names, plan, resumed)
