@@ -80,7 +80,10 @@ class ProbeResult(NamedTuple):
 
 @dataclass
 class Wearer:
-    """A wearer as the product sees it. `notices`: those that it has not acted on yet."""
+    """A wearer as the product sees it.
+
+    `notices`: those that it has not acted on yet; `sheets`: prints that lie elsewhere for it than for the room.
+    """
 
     room: Room
     number: int
@@ -101,10 +104,6 @@ class Wearer:
     def robot(self) -> str:
         return f"robot{self.number}"
 
-    def find_sheet(self, name: str) -> tuple[Array, Array]:
-        """Return the true pose of the sheet that this wearer looks at: there may be two prints."""
-        return self.sheets.get(name) or self.room.sheets[name]
-
     # --- what wearers do: generators of the time at which each goes on ---
 
     def look(self, name: str, seconds: float = 0.0, **how: Any) -> Iterator[int]:
@@ -113,7 +112,8 @@ class Wearer:
         seconds = seconds or max(2.0, 6.0 / source.hz)
         how.setdefault("print_scale", room.print_scale.get(name, 0.0))
         yield room.now_ns + TURN_NS
-        found = self.motion.look(name, self.find_sheet(name), room.now_s, seconds, head_hz=HEAD_HZ, **how)
+        sheet = self.sheets.get(name) or room.sheets[name]
+        found = self.motion.look(name, sheet, room.now_s, seconds, head_hz=HEAD_HZ, **how)
         self._last_sheet = name
         self.viewpoint += 1
         events = [(t, "", T) for t, T in zip(found.head_s, found.heads, strict=True)]
@@ -132,7 +132,7 @@ class Wearer:
                 yield from self.look(name, **how)
                 yield from self.pause(WALK_S)
 
-    def pause(self, seconds: float, *, heeds: bool = False, look_s: float = 0.0) -> Iterator[int]:
+    def pause(self, seconds: float, *, heeds: bool = False) -> Iterator[int]:
         """Walk about and look at no sheet; `heeds`: glance at one when a notice asks for it."""
         room = self.room
         end_s = room.now_s + seconds
@@ -146,7 +146,7 @@ class Wearer:
             if heeds and asked:
                 yield round((room.now_s + REACTION_S) * SECOND)
                 named = [name for name in room.anchors if any(f"'{name}'" in text for text in asked)]
-                yield from self.look((named or [self._last_sheet or next(iter(room.anchors))])[0], look_s)
+                yield from self.look((named or [self._last_sheet or next(iter(room.anchors))])[0])
                 self.notices.clear()
                 yield room.now_ns + TURN_NS
         yield round(max(end_s, room.now_s) * SECOND)
@@ -157,15 +157,14 @@ class Wearer:
         p = (1.5 * math.cos(self._walked), 1.5 * math.sin(self._walked), 1.6)
         return self.motion.place(self.room.now_s, (p, quat_from_yaw(self._walked + 0.5 * math.pi)))
 
-    def repeat_last(self, name: str, seconds: float, hz: float, heads: bool = True) -> Iterator[int]:
+    def repeat_last(self, name: str, seconds: float, hz: float) -> Iterator[int]:
         """Let the source repeat its last pose of a sheet while its wearer looks elsewhere."""
         room = self.room
         end_s = room.now_s + seconds
         yield room.now_ns + TURN_NS
         while room.now_s < end_s:
             yield round((room.now_s + 1.0 / hz) * SECOND)
-            if heads:
-                self.report_head(self.walk(1.0 / hz), to_authority=True)
+            self.report_head(self.walk(1.0 / hz), to_authority=True)
             self.report_sheet(name, self.motion.last[name])
 
     # --- messages ---
@@ -207,18 +206,10 @@ class Room:
         anchors: Mapping[str, PoseTuple],
         source: SheetSource,
         *,
-        drift_m_per_min: float | None = None,
-        marks: Mapping[str, Mapping[str, Vec3]] | None = None,
+        drift_m_per_min: float,
+        marks: Mapping[str, Mapping[str, Vec3]],
     ) -> None:
-        """Create a room with robots 1 m from the middle of the anchors.
-
-        Args:
-            rng: Everything random comes from it.
-            anchors: Configured `T_world_anchor`.
-            source: Of sheet poses, of every headset.
-            drift_m_per_min: Of every tracking frame; default: that of docs/anchors.md.
-            marks: Positions of marks by anchor and id of the mark.
-        """
+        """Create a room with robots 1 m from the middle of the anchors; everything random comes from `rng`."""
         self.rng = rng
         self.anchors = dict(anchors)
         self.sheets = {name: to_array_pose(T) for name, T in anchors.items()}
@@ -230,13 +221,12 @@ class Room:
         self.is_absolute = True  # the world is where the configured sheets are
         self.quiet_hours = 0.0  # headset hours without a cause for an alarm
         poses = {name: Pose(*T) for name, T in anchors.items()}
-        sizes = dict.fromkeys(anchors, SHEET_M)
         self.service = AlignmentService(
             self._offer,
             Drops(),
             anchors=poses,
-            anchor_sizes=sizes,
-            anchor_marks=marks or {},
+            anchor_sizes=dict.fromkeys(anchors, SHEET_M),
+            anchor_marks=marks,
             proposal_period_ns=PROPOSAL_NS,
         )
         centre = np.mean([p for p, _ in self.sheets.values()], axis=0)
@@ -249,8 +239,7 @@ class Room:
         robots = [RobotSpec(n, (f"{n}/j",), (f"{n}/j",), f"{n}/tcp", f"{n}/base") for n in names]
         self.authority = Authority(msgspec.structs.replace(CONFIG, anchors=poses), robots, ())
         self._stepped_ns = 0
-        drift = {} if drift_m_per_min is None else {"drift_m_per_min": drift_m_per_min}
-        self.people = [Wearer(self, i + 1, HeadsetMotion(rng, source, **drift)) for i in range(len(names))]
+        self.people = [Wearer(self, i + 1, HeadsetMotion(rng, source, drift_m_per_min)) for i in range(len(names))]
         for p in self.people:
             p.say(Join(f"key{p.number}", "operator", f"person{p.number}"))
         self.step()

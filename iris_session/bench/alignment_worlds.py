@@ -218,7 +218,7 @@ class Variant:
     steps: Sequence[Step]
     source: SheetSource = field(default_factory=SheetSource)
     anchors: dict[str, PoseTuple] = field(default_factory=lambda: ONE)
-    drift_m_per_min: float | None = None
+    drift_m_per_min: float = DRIFT_M_PER_MIN
     print_max: float = 0.0
     survey_sigma_m: float = 0.0
     has_marks: bool = False

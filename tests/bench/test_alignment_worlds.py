@@ -63,7 +63,7 @@ def test_smoothed_and_repeated_poses() -> None:
 
 
 def test_wearers_of_a_plain_source_are_aligned_and_move_robots() -> None:
-    room = Room(np.random.default_rng(1), ONE, SheetSource())
+    room = Room(np.random.default_rng(1), ONE, SheetSource(), drift_m_per_min=0.003, marks={})
     room.probe()
     assert [f.is_allowed for _, f in room.findings] == [False] * 3, "nobody is aligned yet"
     survey()(room)
