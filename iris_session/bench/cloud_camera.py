@@ -139,16 +139,11 @@ class CloudCase(msgspec.Struct, frozen=True):
     hz: float = 0.0
 
 
-class Rig(msgspec.Struct, frozen=True):
-    """The cameras of a case: intrinsics, limits, and for each camera its pictures."""
-
-    model: CameraModel
-    limits: DepthLimits
-    pictures: list[list[RoomPicture]]
+Rig = tuple[CameraModel, DepthLimits, list[list[RoomPicture]]]
 
 
 def make_rig(case: CloudCase, seed: int) -> Rig:
-    """Make the pictures of a case."""
+    """Return the intrinsics and limits of the cameras of a case, and for each camera its pictures."""
     if not case.pixels:
         return _load_recorded_rig(case)
     width = max(32, 8 * round(math.sqrt(case.pixels / case.cameras * 16.0 / 9.0) / 8.0))
@@ -161,7 +156,7 @@ def make_rig(case: CloudCase, seed: int) -> Rig:
         ]
         for number, angle in enumerate(np.linspace(0.0, 1.2, case.cameras).tolist())
     ]
-    return Rig(model, limits, pictures)
+    return model, limits, pictures
 
 
 def _load_recorded_rig(case: CloudCase) -> Rig:
@@ -172,7 +167,7 @@ def _load_recorded_rig(case: CloudCase) -> Rig:
     pictures = [_load_picture(file) for file in files]
     height, width = pictures[0].depth.shape
     model = CameraModel(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    return Rig(model, DepthLimits(farthest_m=3.5), [pictures[i : i + CYCLE] for i in range(case.cameras)])
+    return model, DepthLimits(farthest_m=3.5), [pictures[i : i + CYCLE] for i in range(case.cameras)]
 
 
 def _load_picture(file: Path) -> RoomPicture:
@@ -189,18 +184,17 @@ class CloudCamera:
 
     def __init__(self, case: CloudCase, seed: int) -> None:
         self.case = case
-        self.rig = make_rig(case, seed)
-        names = [f"camera{i}" for i in range(case.cameras)]
-        low, high, nearest_m, farthest_m, _ = self.rig.limits
+        self.model, self.limits, pictures = make_rig(case, seed)
+        self.pictures = {f"camera{i}": own for i, own in enumerate(pictures)}
+        low, high, nearest_m, farthest_m, _ = self.limits
         cameras = tuple(
             CameraSettings(name=name, source="folder", nearest_m=nearest_m, farthest_m=farthest_m, error_mm=10.0)
-            for name in names
+            for name in self.pictures
         )
         settings = CloudSettings(
             stream=STREAM, points=case.points, voxel_m=case.voxel_m, low=low, high=high, cameras=cameras
         )
         self._pipeline = CloudPipeline(settings, time.perf_counter_ns)
-        self._names = names
         self._next = 0
         for _ in range(WARM_UP):
             self.make_cloud(0)
@@ -209,10 +203,10 @@ class CloudCamera:
         """Make a cloud of the next pictures. Return it, and the duration of their copying [ms]."""
         began_ns = time.perf_counter_ns()
         frames = {}
-        for name, pictures in zip(self._names, self.rig.pictures, strict=True):
+        for name, pictures in self.pictures.items():
             depth, color, pose = pictures[self._next % len(pictures)]
             frame = DepthFrame(depth.copy(), color.copy(), now_ns)
-            frames[name] = PlacedFrame(SourceFrame(frame, self.rig.model, 0.001), pose)
+            frames[name] = PlacedFrame(SourceFrame(frame, self.model, 0.001), pose)
         self._next += 1
         read_ms = (time.perf_counter_ns() - began_ns) * 1e-6
         return self._pipeline.make_cloud(frames), read_ms
@@ -229,8 +223,7 @@ class CameraPublisher(MediaPublisher):
 
     def compare(self) -> dict[str, float | None]:
         """Return what the voxel filters of numpy and open3d take for a picture of the first case [ms]."""
-        first = next(iter(self._cameras.values()))
-        return compare_filters(first.rig, first.case.voxel_m)
+        return compare_filters(next(iter(self._cameras.values())))
 
     def run(self, case: str, seconds: float) -> dict[str, Any]:
         """Make and send clouds of a case for some seconds. Return the results."""
@@ -268,13 +261,13 @@ class CameraPublisher(MediaPublisher):
         }
 
 
-def compare_filters(rig: Rig, voxel_m: float) -> dict[str, float | None]:
+def compare_filters(cameras: CloudCamera) -> dict[str, float | None]:
     """Return what the voxel filters of numpy and open3d take for a picture [ms].
 
     Both get points that lie in memory, cropped, with colours, so that they deproject nothing and leave out no outliers.
     """
-    depth, color, pose = rig.pictures[0][0]
-    camera, limits = rig.model, rig.limits
+    depth, color, pose = cameras.pictures["camera0"][0]
+    camera, limits, voxel_m = cameras.model, cameras.limits, cameras.case.voxel_m
     v, u = np.nonzero((depth > 0) & (depth < 0xFFFF) & (depth <= limits.farthest_m * 1000.0))
     z = depth[v, u] * 0.001
     points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)

@@ -47,8 +47,7 @@ class MediaClient(BenchClient):
     """One client with its log of states and of the frames of one stream: deformables if there is a topology, clouds if
     there is none.
 
-    Payloads of deformables are kept, so that the benchmark can compare them with the truth; their checksums are of the
-    vertices. Those of clouds are of payloads, `UNCHECKED` for most.
+    Checksums of deformables are of their vertices, those of clouds of payloads, `UNCHECKED` for most.
     """
 
     def __init__(self, job: Job, spec: ClientJob) -> None:
@@ -59,7 +58,6 @@ class MediaClient(BenchClient):
         self.feed = self.client.media.subscribe(job.stream)
         self.rows: list[tuple[int, ...]] = []
         self.levels: list[tuple[int, int]] = []  # session time at which a class was received, and the class
-        self.payloads: list[bytes] = []
         self.heads = 0
 
     def receive(self) -> None:
@@ -84,7 +82,6 @@ class MediaClient(BenchClient):
         self.heads += topic + len(header.budget_class) + len(encode_media_header(header))
         checksum = UNCHECKED
         if self._decoder:
-            self.payloads.append(data)
             checksum = zlib.crc32(points.data)
         elif len(self.rows) % CHECK_EVERY == 0:
             checksum = zlib.crc32(data)
@@ -98,7 +95,6 @@ class MediaClient(BenchClient):
         return super().to_columns() | {
             "frames": np.array(self.rows, np.int64).reshape(-1, len(MediaColumn)),
             "levels": np.array(self.levels, np.int64).reshape(-1, 2),
-            "payloads": np.frombuffer(b"".join(self.payloads), np.uint8),
             "counts": np.array(counts, np.int64),
         }
 

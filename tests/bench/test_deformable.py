@@ -45,18 +45,18 @@ def test_errors_are_relative_to_motion_and_wrong_decoding_is_detected() -> None:
     motion = ClothMotion(rng.uniform(0.0, 1.3, (2, 9, 3)).astype(np.float32), np.zeros((0, 3), np.int32))
     topology = DeformableTopology(9)
     source = _ClothSource(motion, topology)
-    source.frames = {700: 0}
     made = DeformableEncoder(topology).encode(motion.vertices[0])
     assert made is not None
     payload = made["full"]
+    source.frames = {700: (0, payload)}
     row = np.zeros((1, len(MediaColumn)), np.int64)
     row[0, MediaColumn.CAPTURE], row[0, MediaColumn.SIZE] = 700, len(payload)
     row[0, MediaColumn.CHECKSUM] = zlib.crc32(DeformableDecoder(topology).decode(payload).data)
-    log = {"frames": row, "payloads": np.frombuffer(payload, np.uint8)}
+    log = {"frames": row}
     wrong = row.copy()
     wrong[0, MediaColumn.CHECKSUM] += 1
     assert 0.0 < _compute_max_error_m({"a": log}, source) <= 0.0005
-    source.frames = {700: 1}
+    source.frames = {700: (1, payload)}
     assert _compute_max_error_m({"a": log}, source) > 0.1
     with pytest.raises(BenchError, match=r"^b decoded"):
-        _compute_max_error_m({"a": log, "b": {**log, "frames": wrong}}, source)
+        _compute_max_error_m({"a": log, "b": {"frames": wrong}}, source)
