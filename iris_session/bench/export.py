@@ -74,8 +74,6 @@ def run_export(
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
     """Measure the export of one recording."""
-    if episodes < 3:
-        raise BenchError(f"{episodes} episodes: give 3 or more, of which the first and last are compared")
     with tempfile.TemporaryDirectory(prefix="iris-bench-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         progress(f"computing a session with {episodes} episodes of {seconds:g} s")

@@ -87,7 +87,7 @@ _BENCHMARKS: Final = {
     "export": _Benchmark(
         "a data set is made of a recording with episodes, pictures drawn and encoded",
         {"episodes": 20, "seconds": 20.0, "shadows": False, "jobs": 1, "python": ""},
-        {"episodes": (2, 10_000), "jobs": (1, 1024)},
+        {"episodes": (3, 10_000), "jobs": (1, 1024)},
     ),
     # A tab, one that is disturbed and one that is not; a gateway has three quarters of all connections.
     "web": _Benchmark(
