@@ -318,7 +318,7 @@ LONG_BATCH_S: Final = 8.0
 LOG_BATCH_S: Final = 0.2
 _SCALARS: Final = "Scalars:scalars"
 _TIMELINES: Final = (paths.STEP, paths.SIM_TIME, paths.SESSION_TIME, paths.WALL_TIME)
-_Rows = dict[str, list[tuple[Moment, list[float]]]]
+_Row = tuple[str, Moment, list[float]]  # entity, time, values
 
 
 def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
@@ -336,16 +336,8 @@ def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
         picture = SceneLayer(log)
         picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
         picture.draw(_make_moment(states[0], header.origin_utc_ns))
-    for rows in _split(_list_poses(states, header.origin_utc_ns), batch_s):
-        for entity, taken in rows.items():
-            poses = np.array([pose for _, pose in taken], np.float32)
-            columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]])
-            _send(log, entity, [moment for moment, _ in taken], columns)
-    for rows in _split(sorted(_list_scalars(recording), key=lambda row: row[1].session_ns), batch_s):
-        for entity, taken in rows.items():
-            values = np.array([row for _, row in taken], np.float64)
-            columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
-            _send(log, entity, [moment for moment, _ in taken], columns)
+    _send(log, _list_poses(states, header.origin_utc_ns), batch_s, _make_transforms)
+    _send(log, _list_scalars(recording), batch_s, _make_scalars)
     for event in recording.events():
         log.set_time(paths.SESSION_TIME, duration=np.timedelta64(event.session_time, "ns"))
         log.log("events", rr.TextLog(repr(event.body)))
@@ -353,8 +345,8 @@ def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
     return output.stat().st_size
 
 
-def _list_poses(states: list[RecordedState], origin_utc_ns: int) -> Iterator[tuple[str, Moment, list[float]]]:
-    """Yield entity, time and pose (`x y z qw qx qy qz`) of every moving body and device at every state."""
+def _list_poses(states: list[RecordedState], origin_utc_ns: int) -> Iterator[_Row]:
+    """Yield the pose (`x y z qw qx qy qz`) of every moving body and device at every state."""
     for state in states:
         moment = _make_moment(state, origin_utc_ns)
         for body, pose in zip(state.bodies, state.poses.tolist(), strict=True):
@@ -364,8 +356,8 @@ def _list_poses(states: list[RecordedState], origin_utc_ns: int) -> Iterator[tup
             yield f"people/{item.participant}/{item.device}", moment, [*item.pose.p, *item.pose.q]
 
 
-def _list_scalars(recording: Recording) -> Iterator[tuple[str, Moment, list[float]]]:
-    """Yield entity, time and values of what the recording plots: joints, grippers, speeds, delays."""
+def _list_scalars(recording: Recording) -> Iterator[_Row]:
+    """Yield the values of what the recording plots: joints, grippers, speeds, delays."""
     for file in recording.readable_files:
         for chunk in read_chunks(file, (f"{paths.ROBOTS}/**", f"{paths.METRICS}/**")):
             batch = chunk.to_record_batch()
@@ -376,23 +368,33 @@ def _list_scalars(recording: Recording) -> Iterator[tuple[str, Moment, list[floa
                 yield str(chunk.entity_path), Moment(*moment), values
 
 
-def _split(rows: Iterable[tuple[str, Moment, list[float]]], batch_s: float) -> Iterator[_Rows]:
-    """Collect rows in order of time by entity, in batches."""
-    for _, taken in itertools.groupby(rows, lambda row: row[1].session_ns // round(batch_s * 1e9)):
-        batch: _Rows = {}
-        for entity, moment, values in taken:
-            batch.setdefault(entity, []).append((moment, values))
-        yield batch
-
-
 def _make_moment(state: RecordedState, origin_utc_ns: int) -> Moment:
     time_ns = state.session_time
     return Moment(state.step, round(state.sim_time * 1e9), time_ns, time_ns + origin_utc_ns)
 
 
-def _send(log: rr.RecordingStream, entity: str, moments: list[Moment], columns: Any) -> None:
-    times: NDArray[np.int64] = np.array(moments, np.int64).T
-    rr.send_columns(entity, to_time_columns(times), [*columns], recording=log, strict=True)
+def _make_transforms(poses: NDArray[np.float64]) -> Any:
+    numbers = poses.astype(np.float32)
+    return rr.Transform3D.columns(translation=numbers[:, :3], quaternion=numbers[:, [4, 5, 6, 3]])
+
+
+def _make_scalars(values: NDArray[np.float64]) -> Any:
+    return rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
+
+
+def _send(
+    log: rr.RecordingStream, rows: Iterable[_Row], batch_s: float, make_columns: Callable[[NDArray[np.float64]], Any]
+) -> None:
+    """Send the rows of every entity in batches."""
+
+    def find_batch(row: _Row) -> tuple[str, int]:
+        return row[0], row[1].session_ns // round(batch_s * 1e9)
+
+    for (entity, _), batch in itertools.groupby(sorted(rows, key=find_batch), find_batch):
+        _, moments, values = zip(*batch, strict=True)
+        times: NDArray[np.int64] = np.array(moments, np.int64).T
+        columns = make_columns(np.array(values, np.float64))
+        rr.send_columns(entity, to_time_columns(times), [*columns], recording=log, strict=True)
 
 
 # --- the session that is killed ---------------------------------------------------------------------------------------

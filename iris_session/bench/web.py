@@ -90,7 +90,12 @@ def run_web(
         require_package(package, "bench web")
     if math.isqrt(vertices) ** 2 != vertices:
         raise BenchError(f"--vertices {vertices}: the sheet is square, choose {math.isqrt(vertices) ** 2}")
-    missing = "not asked for" if not tab else _find_missing_tool()
+    missing = "" if tab else "not asked for"
+    if tab:
+        try:
+            find_tools()
+        except MissingToolError as error:
+            missing = str(error)
     if missing:
         progress(f"no tab of a real browser: {missing}")
     plan = plan_rounds(LENGTHS_S, seconds - STOPS_S, ROUNDS)
@@ -189,15 +194,11 @@ def summarize_browsers(
 
 
 def summarize_tab(log: Log, stops: Sequence[tuple[int, int]]) -> dict[str, Any]:
-    """Return the results of the tab.
-
-    Args:
-        log: Its log.
-        stops: Of each e-stop that the session got: session time when the front received it, and when it was in force.
-    """
+    """Return the results of the tab. `stops`: as in `Measurement`."""
     if not len(log["js_ms"]) or not len(log["ages_ms"]):
         raise BenchError("the tab drew nothing in the measured window")
-    pairs = [(at, *found) for at in log["clicks_ns"].tolist() if (found := _find_first_after(stops, at))]
+    clicks_ns = log["clicks_ns"].tolist()
+    pairs = [(at, *found) for at in clicks_ns if (found := next((stop for stop in stops if stop[0] >= at), None))]
     parts = np.array(pairs, np.float64).reshape(-1, 3) * 1e-6
     total, sending, holding = (parts[:, b] - parts[:, a] for a, b in ((0, 2), (0, 1), (1, 2)))
     memory = log["memory"]
@@ -219,25 +220,8 @@ def summarize_tab(log: Log, stops: Sequence[tuple[int, int]]) -> dict[str, Any]:
     }
 
 
-def _find_first_after(stops: Sequence[tuple[int, int]], at_ns: int) -> tuple[int, int] | None:
-    return next((stop for stop in stops if stop[0] >= at_ns), None)
-
-
-def _find_missing_tool() -> str:
-    """Return in one line what is not installed for a tab, empty if nothing is missing."""
-    try:
-        find_tools()
-    except MissingToolError as error:
-        return str(error)
-    return ""
-
-
 def make_web_model(vertices: int, seed: int) -> Any:
-    """Return the model as an `mujoco.MjModel`, keyframe `home`.
-
-    Args:
-        vertices: Vertices of the sheet, a square number.
-        seed: Of the velocities.
+    """Return the model as an `mujoco.MjModel`, keyframe `home`. `seed`: of the velocities.
 
     Raises:
         ModelNotFoundError: The model of ALOHA is not installed.
