@@ -6,24 +6,26 @@ They show a room with tables and boxes, rendered by intersecting rays, with the 
 from __future__ import annotations
 
 import importlib
+import itertools
 import math
 import os
 import time
 from collections import defaultdict
 from pathlib import Path
 from statistics import median
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import CameraModel
+from anchors.camera import CameraModel, parse_camera
 from iris_session.bench.cloud_stream import STREAM, MediaPublisher
 from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceFrame
 from iris_session.cloud.pipeline import Cloud, CloudPipeline, PlacedFrame
+from iris_session.cloud.sources.folder import FolderSource
 from iris_session.cloud.voxels import DepthLimits, pack_keys
 
 #: Inner corners of the room; boxes in it: low corner, high corner, red, green, blue [m].
@@ -52,14 +54,6 @@ HOLES: Final = 0.02
 PATCHES: Final = 60
 
 
-class RoomPicture(NamedTuple):
-    """A depth picture [mm], its colours, and the pose of its camera (4, 4)."""
-
-    depth: NDArray[np.uint16]
-    color: NDArray[np.uint8]
-    T_world_camera: NDArray[np.float64]
-
-
 def make_room_camera(width: int, height: int) -> CameraModel:
     """Return a camera of that size with a field of view of 70 degrees."""
     focal = 0.5 * width / math.tan(math.radians(35.0))
@@ -79,7 +73,7 @@ def make_room_pose(angle: float) -> NDArray[np.float64]:
     return pose
 
 
-def render_room(camera: CameraModel, T_world_camera: NDArray[np.float64], seed: int) -> RoomPicture:
+def render_room(camera: CameraModel, T_world_camera: NDArray[np.float64], seed: int) -> DepthFrame:
     """Render the room for a camera without lens distortion. `seed`: of noise and holes."""
     random = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
@@ -106,7 +100,7 @@ def render_room(camera: CameraModel, T_world_camera: NDArray[np.float64], seed: 
     z[random.random(z.shape, np.float32) < HOLES] = 0.0
     for row, column in random.integers(0, z.shape, (PATCHES, 2)):
         z[row : row + camera.height // 40, column : column + camera.width // 40] = 0.0
-    return RoomPicture(np.clip(np.rint(z * 1000.0), 0, 65_535).astype(np.uint16), color, T_world_camera)
+    return DepthFrame(np.clip(np.rint(z * 1000.0), 0, 65_535).astype(np.uint16), color, 0, T_world_camera)
 
 
 # --- the camera process -----------------------------------------------------------------------------------------------
@@ -139,7 +133,7 @@ class CloudCase(msgspec.Struct, frozen=True):
     hz: float = 0.0
 
 
-Rig = tuple[CameraModel, DepthLimits, list[list[RoomPicture]]]
+Rig = tuple[CameraModel, DepthLimits, list[list[DepthFrame]]]
 
 
 def make_rig(case: CloudCase, seed: int) -> Rig:
@@ -162,21 +156,12 @@ def make_rig(case: CloudCase, seed: int) -> Rig:
 def _load_recorded_rig(case: CloudCase) -> Rig:
     """Load the recorded frames; each further camera begins some frames later in the recording."""
     folder = Path(os.environ["IRIS_DATA"]) / "rgbd"
-    matrix = np.loadtxt(folder / "camera-intrinsics.txt")
-    files = sorted(folder.glob("*.depth.png"))[: CYCLE + case.cameras - 1]
-    pictures = [_load_picture(file) for file in files]
-    height, width = pictures[0].depth.shape
-    model = CameraModel(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    model = parse_camera((folder / "camera-intrinsics.txt").read_text(), 640, 480)
+    settings = CameraSettings(name="recorded", source="folder", path=str(folder), intrinsics=model)
+    source = FolderSource(settings, itertools.count(0, 10**9).__next__)  # a frame is due whenever it is read
+    frames = [source.read(0.0) for _ in range(CYCLE + case.cameras - 1)]
+    pictures = [frame for frame in frames if frame is not None]
     return model, DepthLimits(farthest_m=3.5), [pictures[i : i + CYCLE] for i in range(case.cameras)]
-
-
-def _load_picture(file: Path) -> RoomPicture:
-    stem = str(file).removesuffix(".depth.png")
-    depth, color = cv2.imread(str(file), cv2.IMREAD_UNCHANGED), cv2.imread(f"{stem}.color.jpg")
-    assert depth is not None, file
-    assert color is not None, file
-    rgb = np.ascontiguousarray(color[:, :, ::-1], np.uint8)
-    return RoomPicture(depth.astype(np.uint16), rgb, np.loadtxt(f"{stem}.pose.txt"))
 
 
 class CloudCamera:
@@ -204,7 +189,8 @@ class CloudCamera:
         began_ns = time.perf_counter_ns()
         frames = {}
         for name, pictures in self.pictures.items():
-            depth, color, pose = pictures[self._next % len(pictures)]
+            depth, color, _, pose = pictures[self._next % len(pictures)]
+            assert pose is not None
             frame = DepthFrame(depth.copy(), color.copy(), now_ns)
             frames[name] = PlacedFrame(SourceFrame(frame, self.model, 0.001), pose)
         self._next += 1
@@ -266,7 +252,8 @@ def compare_filters(cameras: CloudCamera) -> dict[str, float | None]:
 
     Both get points that lie in memory, cropped, with colours, so that they deproject nothing and leave out no outliers.
     """
-    depth, color, pose = cameras.pictures["camera0"][0]
+    depth, color, _, pose = cameras.pictures["camera0"][0]
+    assert pose is not None
     camera, limits, voxel_m = cameras.model, cameras.limits, cameras.case.voxel_m
     v, u = np.nonzero((depth > 0) & (depth < 0xFFFF) & (depth <= limits.farthest_m * 1000.0))
     z = depth[v, u] * 0.001
