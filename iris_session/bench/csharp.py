@@ -27,6 +27,7 @@ from iris_session.bench.harness import Log, compute_ages_ms, measure
 from iris_session.bench.join import split_quads
 from iris_session.bench.plugins import Plugin
 from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, summarize_percentiles
+from iris_session.bench.state import compute_pose_errors
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.codec import encode_presence, encode_server, encode_state_header
 from iris_session.protocol.common import Applied, Pose
@@ -279,17 +280,14 @@ def _decode(made: _Frames, runtime: str, file: Path, out: Path) -> dict[str, flo
 def _measure_errors(made: _Frames, data: bytes) -> tuple[float, float, float, float]:
     """Return the largest errors of what C# decoded: positions [mm], rotations [deg], vertices [mm]; and by how much
     points differ from those of the Python decoder [mm]."""
-    n, bodies = made.poses.shape[:2]
-    size, drawn = 8 * n * bodies * 7, made.vertices.size * 4
-    poses = np.frombuffer(data, "<f8", count=size // 8).reshape(n, bodies, 7)
+    size, drawn = made.poses.size * 8, made.vertices.size * 4
+    poses = np.frombuffer(data, "<f8", count=made.poses.size).reshape(-1, 7)
     vertices = np.frombuffer(data, "<f4", count=made.vertices.size, offset=size).reshape(made.vertices.shape)
     points = np.frombuffer(data, "<f8", offset=size + drawn).reshape(-1, 3)
-    position = np.linalg.norm(poses[..., :3] - made.poses[..., :3], axis=-1).max()
-    dot = np.abs(np.einsum("nbi,nbi->nb", poses[..., 3:], made.poses[..., 3:]))
-    rotation = 2.0 * np.degrees(np.arccos(np.minimum(dot.min(), 1.0)))
+    position_mm, rotation_deg = compute_pose_errors(poses, made.poses.reshape(-1, 7))
     cloth = np.linalg.norm(vertices - made.vertices, axis=-1).max()
     cloud = np.abs(points - made.last_cloud).max() if points.shape == made.last_cloud.shape else math.inf
-    found = (position * 1e3, rotation, cloth * 1e3, cloud * 1e3)
+    found = (position_mm, rotation_deg, cloth * 1e3, cloud * 1e3)
     return tuple(round(float(value), 5) for value in found)  # type: ignore[return-value]
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
@@ -77,16 +78,15 @@ def run_state(
 
 def compute_errors(got: Measurement) -> tuple[float, float]:
     """Return the largest position [mm] and rotation [deg] error of all bodies in all delivered frames."""
-    position = rotation = 0.0
-    for log in got.logs.values():
-        for tick, poses in zip(log["ticks"], log["poses"], strict=True):
-            truth = got.truth[int(tick)]
-            position = max(position, float(np.linalg.norm(poses[:, :3] - truth[:, :3], axis=1).max()))
-            rotation = max(rotation, _max_angle(poses[:, 3:], truth[:, 3:]))
-    return position * 1e3, float(np.degrees(rotation))
+    frames = [pair for log in got.logs.values() for pair in zip(log["ticks"].tolist(), log["poses"], strict=True)]
+    errors = [compute_pose_errors(poses, got.truth[tick]) for tick, poses in frames]
+    position_mm, rotation_deg = np.max(errors, axis=0).tolist()
+    return position_mm, rotation_deg
 
 
-def _max_angle(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
-    """Return the largest angle between two sets of unit quaternions (n, 4), by the chord, which is exact near zero."""
-    chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
-    return float(4.0 * np.arcsin(np.minimum(chord.max() / 2.0, 1.0)))
+def compute_pose_errors(poses: NDArray[np.float64], truth: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the largest position [mm] and rotation [deg] error of poses (n, 7). The chord is exact near zero."""
+    a, b = poses[:, 3:], truth[:, 3:]
+    chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1)).max()
+    position_m = np.linalg.norm(poses[:, :3] - truth[:, :3], axis=1).max()
+    return float(position_m) * 1e3, float(np.degrees(4.0 * np.arcsin(min(chord / 2.0, 1.0))))
