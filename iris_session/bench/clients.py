@@ -12,6 +12,7 @@ import hashlib
 import math
 import time
 import zlib
+from collections.abc import Sequence
 from typing import Any, ClassVar, Final
 
 import msgspec
@@ -74,7 +75,7 @@ class Job(msgspec.Struct, frozen=True):
         keep_poses: Log every decoded pose of every frame.
         stream: Media stream to subscribe to; empty: none.
         topology: File of the topology of a deformable stream, instead of the scene's asset.
-        server_public, public, secret: CURVE keys, Z85 text; empty: plain.
+        keys: CURVE keys of `CurveKeys`, Z85 text; empty: plain.
         page: Address of the session's page, for browsers.
         links: Addresses of impaired links by client.
     """
@@ -86,18 +87,9 @@ class Job(msgspec.Struct, frozen=True):
     keep_poses: bool = False
     stream: str = ""
     topology: str = ""
-    server_public: str = ""
-    public: str = ""
-    secret: str = ""
+    keys: tuple[str, ...] = ()
     page: str = ""
     links: dict[str, str] = {}
-
-    @property
-    def curve(self) -> CurveKeys | None:
-        """Keys of a client, `None` for a plain session."""
-        if not self.server_public:
-            return None
-        return CurveKeys(self.server_public.encode(), self.public.encode(), self.secret.encode())
 
     def session_time_ns(self) -> int:
         """Return the present session time [ns]."""
@@ -109,9 +101,14 @@ class Job(msgspec.Struct, frozen=True):
         np.savez(self.log, allow_pickle=False, **flat)
 
 
-def make_web_secret(secret: str, name: str) -> bytes:
-    """Return the secret of a browser at an encrypted session, made from the secret of its job."""
-    return hashlib.sha256(f"{secret} {name}".encode()).digest()
+def make_curve_keys(keys: Sequence[str]) -> CurveKeys | None:
+    """Return the keys of a client, `None` for a plain session."""
+    return CurveKeys(*(key.encode() for key in keys)) if keys else None
+
+
+def make_web_secret(keys: Sequence[str], name: str) -> bytes:
+    """Return the secret of a browser at an encrypted session, made from the keys of its job."""
+    return hashlib.sha256(f"{keys[-1]} {name}".encode()).digest()
 
 
 class StateLog:
@@ -162,7 +159,7 @@ class BenchClient:
             name=spec.name,
             devices=DEVICES if spec.samples else (),
             alignment="not_needed",
-            curve=job.curve,
+            curve=make_curve_keys(job.keys),
             on_state=self._on_state,
         )
         self.recording = False

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import MEDIA_CLIENTS, ClientJob
+from iris_session.bench.clients import MEDIA_CLIENTS, ClientJob, make_curve_keys
 from iris_session.bench.harness import (
     Action,
     BenchRun,
@@ -34,7 +34,7 @@ from iris_session.bench.media_clients import UNCHECKED, sum_counts
 from iris_session.bench.media_clients import MediaColumn as Column
 from iris_session.bench.plugins import POLL_S, Plugin, PluginProcess
 from iris_session.bench.report import Bar, BenchError, BenchReport, allow_increase, make_bar, summarize_percentiles
-from iris_session.client import Client, CurveKeys
+from iris_session.client import Client
 from iris_session.client.errors import NotConnectedError
 from iris_session.cloud.pipeline import CLASSES
 from iris_session.demo.scenes import free_bodies_scene
@@ -90,7 +90,7 @@ class MediaPublisher(Plugin):
 
     def connect(self, address: str, *keys: str) -> None:
         """Join a session, with the keys of an encrypted one."""
-        curve = CurveKeys(*(key.encode() for key in keys)) if keys else None
+        curve = make_curve_keys(keys)
         self._client = Client(address, role=self.role, name=self.role, alignment="not_needed", curve=curve)
         self._client.connect(30.0)
         nothing = encode_cloud(np.empty((0, 3)), np.empty((0, 3), np.uint8))
@@ -199,9 +199,7 @@ def run_cloud_stream(
         profile.write_text(json.dumps({"phases": [{"rate_mbit": mbit, "delay_ms": 2}]}))
 
         def connect(run: BenchRun) -> None:
-            job = run.processes[0].job
-            keys = [job.server_public, job.public, job.secret] if job.server_public else []
-            source.send("connect", run.session.address, *keys)
+            source.send("connect", run.session.address, *run.processes[0].job.keys)
 
         actions: list[Action] = [(0.0, connect)]
         for one in plan:

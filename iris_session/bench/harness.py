@@ -369,7 +369,7 @@ def measure(
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
         people = [spec.name for spec in clients if spec.plugin == BROWSERS]
-        keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else {}
+        keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else ()
         config = make_session_config(assets=assets, record=record, curve=curve)
         session = stack.enter_context(Session(model, config=config))
         links = {spec.name: make_link_address(i) for i, spec in enumerate(clients) if spec.profile}
@@ -381,7 +381,7 @@ def measure(
         page = "" if session.processes.web is None else session.processes.web.address
         if any(spec.plugin in (BROWSERS, TABS) for spec in clients) and not page:
             raise BenchError("the session has no page for browsers")
-        job = Job(session.address, session.origin_ns, "", (), keep_poses, stream, topology, links=links, **keys)
+        job = Job(session.address, session.origin_ns, "", (), keep_poses, stream, topology, links=links, keys=keys)
         for group in _group_clients(clients):
             log = str(folder / f"log{len(run.processes)}.npz")
             code = _make_code(session) if group[0].plugin == TABS else ""
@@ -487,22 +487,22 @@ def _raise_if_stopped(session: Session) -> None:
 
 
 @contextlib.contextmanager
-def _open_key_home(folder: Path, people: Sequence[str]) -> Iterator[dict[str, str]]:
+def _open_key_home(folder: Path, people: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Use a key home in `folder`, which admits one key for all clients, and browsers by their names.
 
     Yields:
         The keys of a job.
     """
     home, pair = KeyHome(folder), KeyPair.generate()
-    server = home.load_server_key()
+    keys = (home.load_server_key().public, pair.public, pair.secret)
     home.clients.allow_key("clients", pair.public)
     for name in people:
-        identity = hashlib.sha256(make_web_secret(pair.secret, name)).digest()
+        identity = hashlib.sha256(make_web_secret(keys, name)).digest()
         home.clients.allow_key(name, encode_key(identity), kind=WEB)
     before = os.environ.get("IRIS_HOME")
     os.environ["IRIS_HOME"] = str(folder)  # of the session and its processes
     try:
-        yield {"server_public": server.public, "public": pair.public, "secret": pair.secret}
+        yield keys
     finally:
         if before is None:
             del os.environ["IRIS_HOME"]

@@ -43,8 +43,8 @@ class BenchBrowser:
         self._job = job
         hello = Hello(spec.role, spec.name, software="bench", alignment=AlignmentKind.NOT_NEEDED)
         identity = Identity.in_memory()
-        if job.secret:
-            identity.secret = make_web_secret(job.secret, spec.name)
+        if job.keys:
+            identity.secret = make_web_secret(job.keys, spec.name)
         self.connection = ClientConnection(hello, identity)
         self._ticket = ""
         self._socket: aiohttp.ClientWebSocketResponse | None = None
